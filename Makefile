@@ -1,0 +1,27 @@
+# Two targets do it all on a fresh machine: `make quickstart` and `make test`.
+PYTHON ?= $(shell command -v python3.11 || command -v python3)
+BIN := .venv/bin
+
+.PHONY: quickstart test test-fast lint clean
+
+.venv/.ok: pyproject.toml constraints.txt
+	test -x $(BIN)/python || $(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install -q -e ".[dev]" -c constraints.txt
+	@touch $@
+
+quickstart: .venv/.ok
+	$(BIN)/python scripts/quickstart.py
+
+test: .venv/.ok
+	$(BIN)/python -m pytest
+
+test-fast: .venv/.ok
+	$(BIN)/python -m pytest -m "not slow"
+
+lint: .venv/.ok
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+clean:
+	rm -rf .venv build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache

@@ -1,0 +1,97 @@
+"""Every exception that pharos raises on purpose.
+
+PharosError
+├── ParameterError (ValueError)     a parameter, name or option is wrong: nothing was computed  (exit code 2)
+│   └── UnknownName                 no such environment, measure, observation, agent ...: nearest match suggested
+├── RuleError                       an environment's rules broke their contract, for a named state and action
+├── StateSpaceError                 something is wrong with a folder that holds a state space
+│   ├── StateSpaceTooLarge          more states than `max_states`
+│   ├── StateSpaceIncomplete        the build has not finished; the same command resumes it
+│   ├── StateSpaceCorrupted         truncated or tampered files
+│   ├── StateSpaceMismatch          the folder holds another environment, parameters or version of its rules
+│   ├── StateSpaceLocked            another process is building there
+│   └── DiskFull                    no room; finished work is kept
+├── FileFormatError (ValueError)    an imported file lacks something or holds nonsense
+├── PrecisionError                  the requested precision is finer than the error bound allows
+├── DivergenceError (ValueError)    the value asked for may be infinite
+├── UndefinedMeasure                the measure does not exist for this MDP; the message says what would define it
+└── MissingExtra (ImportError)      an optional dependency is needed; the message names the extra
+
+A message says whose, expected, found, and what to try, in one line.
+"""
+
+import difflib
+from collections.abc import Iterable
+
+
+class PharosError(Exception):
+    """Base class: `except PharosError` catches everything that pharos raises on purpose."""
+
+
+class ParameterError(PharosError, ValueError):
+    """A parameter, name or option is wrong; nothing was computed."""
+
+
+class UnknownName(ParameterError):
+    """No such name; the message suggests the nearest one."""
+
+    def __init__(self, kind: str, found: object, known: Iterable[str]):
+        known = sorted(map(str, known))
+        nearest = difflib.get_close_matches(str(found), known, n=1, cutoff=0.5)
+        hint = f"did you mean {nearest[0]!r}?" if nearest else f"known: {', '.join(known) or 'none'}"
+        super().__init__(f"unknown {kind} {str(found)!r}; {hint}")
+
+
+class RuleError(PharosError):
+    """An environment's rules broke their contract."""
+
+
+class StateSpaceError(PharosError):
+    """Something is wrong with a folder that holds a state space."""
+
+
+class StateSpaceTooLarge(StateSpaceError):
+    """The build passed `max_states`."""
+
+
+class StateSpaceIncomplete(StateSpaceError):
+    """The build has not finished; the same command resumes it."""
+
+
+class StateSpaceCorrupted(StateSpaceError):
+    """A file of the folder is truncated, missing or tampered with."""
+
+
+class StateSpaceMismatch(StateSpaceError):
+    """The folder holds another environment, other parameters or another version of its rules."""
+
+
+class StateSpaceLocked(StateSpaceError):
+    """Another process is building in the folder."""
+
+
+class DiskFull(StateSpaceError):
+    """The disk has no room left; what was committed is kept."""
+
+
+class FileFormatError(PharosError, ValueError):
+    """An imported file lacks something or holds nonsense."""
+
+
+class PrecisionError(PharosError):
+    """The requested precision is finer than the error bound of the solution allows."""
+
+
+class DivergenceError(PharosError, ValueError):
+    """The value asked for may be infinite."""
+
+
+class UndefinedMeasure(PharosError):
+    """The measure does not exist for this MDP; the message says what would define it."""
+
+
+class MissingExtra(PharosError, ImportError):
+    """An optional dependency is missing; the message names the extra that brings it."""
+
+    def __init__(self, purpose: str, package: str, extra: str):
+        super().__init__(f"{purpose} needs {package}; install it with: pip install 'pharos[{extra}]'")
