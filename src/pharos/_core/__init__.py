@@ -1,0 +1,1 @@
+"""Compiled loops: flat arrays in, flat arrays out, nothing else. Importing a module here loads Numba."""

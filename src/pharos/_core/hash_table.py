@@ -1,0 +1,105 @@
+"""The table of states already found: index of a state, or -1, in the first free slot from the one that its hash names.
+
+The keys are not in the table: slot -> index -> states[index], so it costs 4 bytes a slot, whatever the width of a state.
+"""
+
+import numpy as np
+from numba import int64, njit
+
+from pharos._core.packed import mixed, prefetch, slot_of
+
+_BATCH = 32
+
+
+@njit(forceinline=True)
+def _hash_of(states, i):
+    h = mixed(states[i, 0])
+    for k in range(1, states.shape[1]):
+        h = mixed(h ^ states[i, k])
+    return h
+
+
+@njit(cache=True, nogil=True)
+def fill(table, states, count):
+    """Put states [0, count), all different, into an empty table (every slot -1)."""
+    capacity = table.shape[0]
+    slots = np.empty(_BATCH, np.int64)
+    for first in range(0, count, _BATCH):
+        n = min(_BATCH, count - first)
+        for i in range(n):
+            slots[i] = slot_of(_hash_of(states, first + i), capacity)
+            prefetch(table, slots[i])
+        for i in range(n):
+            slot = slots[i]
+            while table[slot] >= 0:
+                slot = slot + 1 if slot + 1 < capacity else 0
+            table[slot] = first + i
+
+
+@njit(cache=True, nogil=True)
+def find(table, states, keys, out):
+    """out[j] = index of keys[j] among the states, or -1. keys (N, W) uint64."""
+    capacity = table.shape[0]
+    words = states.shape[1]
+    for j in range(len(keys)):
+        slot = slot_of(_hash_of(keys, j), capacity)
+        out[j] = -1
+        while table[slot] >= 0:
+            index = int64(table[slot])
+            equal = True
+            for k in range(words):
+                equal = equal and states[index, k] == keys[j, k]
+            if equal:
+                out[j] = index
+                break
+            slot = slot + 1 if slot + 1 < capacity else 0
+
+
+@njit(cache=True, nogil=True)
+def slots_of(keys, capacity, out):
+    """out[j] = the slot from which to search for keys[j]."""
+    for j in range(len(keys)):
+        out[j] = slot_of(_hash_of(keys, j), capacity)
+
+
+@njit(cache=True, nogil=True)
+def insert_missing(table, states, keys, found, successors, first, count, level_end, depth, progress):
+    """Number the successors that threads did not find, in order; the serial half of a wide frontier.
+
+    found (rows * A,): index, or -1 - slot from which to search on. Row i belongs to state first + i; successors (rows, A).
+    progress gets (first + rows, count, level_end, depth).
+    """
+    capacity = table.shape[0]
+    words = states.shape[1]
+    rows, num_actions = successors.shape
+    ahead = 24
+    for j in range(min(ahead, rows * num_actions)):
+        if found[j] < 0:
+            prefetch(table, -1 - found[j])
+    for i in range(rows):
+        for a in range(num_actions):
+            j = i * num_actions + a
+            if j + ahead < rows * num_actions and found[j + ahead] < 0:
+                prefetch(table, -1 - found[j + ahead])
+            index = found[j]
+            slot = -1 - index
+            while index < 0:
+                index = int64(table[slot])
+                if index < 0:
+                    index = count
+                    for k in range(words):
+                        states[count, k] = keys[j, k]
+                    table[slot] = count
+                    count += 1
+                    break
+                equal = True
+                for k in range(words):
+                    equal = equal and states[index, k] == keys[j, k]
+                if not equal:
+                    index = -1
+                    slot = slot + 1 if slot + 1 < capacity else 0
+            successors[i, a] = index
+        if first + i + 1 == level_end:
+            level_end = count
+            depth += 1
+    progress[0], progress[1], progress[2], progress[3] = first + rows, count, level_end, depth

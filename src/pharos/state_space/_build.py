@@ -1,0 +1,527 @@
+"""build: enumerate the reachable states of an environment, onto disk. Algorithm 1 of the paper, compiled.
+
+Breadth-first search: the array of states, in the order of discovery, is the queue; a table of indices keyed by hash is the
+only other memory. Successors and terminal bits are appended to files as the states are expanded. While the frontier is
+wide, threads compute successors and look up those already known, and one thread numbers the new ones in order: so states
+are numbered as one thread would number them. While it is narrow (Freeway: 148 thousand levels of 9 states) one thread does
+everything. docs/decisions/building.md has the measurements.
+"""
+
+import contextlib
+import hashlib
+import json
+import mmap
+import os
+import sys
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pharos import paths
+from pharos.environment import Environment, start_distribution
+from pharos.errors import ParameterError, RuleError, StateSpaceMismatch, StateSpaceTooLarge
+from pharos.state_space._files import GrowingFile, lock
+from pharos.state_space._packing import layout_of, pack, unpack
+from pharos.state_space._store import (
+    FORMAT_VERSION,
+    MANIFEST,
+    STATES,
+    SUCCESSORS,
+    TERMINAL,
+    WIDE_SUCCESSORS,
+    StateSpace,
+    check_lengths,
+    identity_of,
+    load,
+    read_manifest,
+    successors_name,
+    write_manifest,
+)
+
+OUR_FILES = (STATES, SUCCESSORS, WIDE_SUCCESSORS, TERMINAL, MANIFEST + ".tmp", "lock")
+CHUNK = 1 << 16  # states expanded between two looks at the clock; a multiple of 8, so that terminal bits fill whole bytes
+WIDE = 1 << 13  # a frontier of this many states is worth sharing between threads
+CHECKPOINT_SECONDS = 15.0
+LOAD = 0.7  # the table grows beyond this share of used slots
+INT32_STATES = 2**31 - 1
+
+
+@dataclass(frozen=True)
+class BuildProgress:
+    """What a progress callback receives: states found and expanded so far, levels finished, seconds."""
+
+    num_states: int
+    num_expanded: int
+    depth: int
+    seconds: float
+    finished: bool = False
+
+
+Progress = Callable[[BuildProgress], None]
+
+
+def build(
+    env: Environment,
+    folder: str | os.PathLike | None = None,
+    *,
+    max_states: int | None = None,
+    memory: int | None = None,
+    workers: int | None = None,
+    progress: Progress | bool | None = None,
+    checkpoint_seconds: float = CHECKPOINT_SECONDS,
+) -> StateSpace:
+    """Enumerate the states of `env` that can be reached from its start states, and their transitions.
+
+    Args:
+        env: the environment.
+        folder: where to write; None for the user's cache, keyed by environment, parameters and version of the rules. A
+            folder that holds the finished state space is loaded; one that holds part of it is resumed, with the same result.
+        max_states: StateSpaceTooLarge when there are more.
+
+        Cost only (the files are the same, byte for byte):
+        memory: bytes that states and table may take; None for as much as there is.
+        workers: threads; None for all processors.
+        progress: None for a bar on a terminal; False for silence; or a function that gets a BuildProgress now and then.
+        checkpoint_seconds: at most this much work is lost when the process is killed.
+    Returns:
+        The StateSpace, whose files are in `folder`.
+    Raises:
+        StateSpaceTooLarge, DiskFull: what was found is kept; the same command resumes.
+        StateSpaceMismatch: the folder holds another environment. StateSpaceLocked: somebody else is building there.
+        StateSpaceCorrupted: files were changed. RuleError: a rule left the declared ranges, in the state that is named.
+    Cost: see docs/performance.md; 40 to 110 ns a state, 8 W + 4 / 0.35 bytes of memory a state (W words of 64 bits).
+    Source: the pharos paper, appendix A, Algorithm 1 (whose successors are stored under the wrong index there).
+    """
+    if max_states is not None and max_states < 1:
+        raise ParameterError(f"max_states is {max_states}; expected at least 1")
+    if memory is not None and memory < 1 << 24:
+        raise ParameterError(f"memory is {memory} bytes; expected at least 16 MiB")
+    identity = identity_of(env)
+    path = Path(folder) if folder is not None else cached_folder(identity)
+    manifest = _manifest_of(env, path, identity)
+    if manifest is not None and manifest["complete"]:
+        _check_size(env, manifest["num_states"], 0, max_states)
+        space = load(path)
+        space.environment = env
+        return space
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ParameterError(f"{path}: cannot be made a folder: {error.strerror}; choose another one") from error
+    with lock(path), _reporter(progress, env) as report:
+        manifest = _manifest_of(env, path, identity)  # it may have grown while we waited
+        if manifest is None or not manifest["complete"]:
+            _Builder(env, path, identity, max_states, memory, workers, report, checkpoint_seconds).run(manifest)
+    space = load(path, verify=False)
+    space.environment = env
+    return space
+
+
+def cached_folder(identity: dict[str, Any]) -> Path:
+    """The folder of a state space in the user's cache."""
+    digest = hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()[:16]
+    return paths.cache_directory() / "spaces" / f"{identity['environment']}-{digest}"
+
+
+def _manifest_of(env: Environment, path: Path, identity: dict[str, Any]) -> dict[str, Any] | None:
+    manifest = read_manifest(path)
+    if manifest is None:
+        if path.exists() and any(item.name not in OUR_FILES for item in path.iterdir()):
+            raise ParameterError(f"{path}: is not empty and holds no state space; choose another folder")
+        return None
+    for key, expected in identity.items():
+        if key != "class" and manifest.get(key) != expected:
+            raise StateSpaceMismatch(
+                f"{path}: holds {manifest['environment']} with {key} = {_short(manifest.get(key))}; expected {_short(expected)} "
+                f"for {env}; choose another folder, or delete this one"
+            )
+    check_lengths(path, manifest)
+    return manifest
+
+
+def _short(value: Any) -> str:
+    text = str(value)
+    return text if len(text) <= 120 else text[:117] + "..."
+
+
+def _check_size(env: Environment, count: int, left: int, max_states: int | None) -> None:
+    if max_states is not None and count > max_states:
+        raise StateSpaceTooLarge(
+            f"{env} passed max_states={max_states}, {left} left to expand; raise it or choose a smaller instance"
+        )
+
+
+class _Builder:
+    """One run of the build: memory, files and the loop."""
+
+    def __init__(self, env, path, identity, max_states, memory, workers, report, checkpoint_seconds):
+        from pharos._core.compiling import compiled_rules, usable_workers
+
+        self.env, self.path, self.identity = env, path, identity
+        self.max_states, self.memory, self.report = max_states, memory, report
+        self.checkpoint_seconds = checkpoint_seconds
+        self.layout = layout_of(env.components)
+        self.rules = compiled_rules(env, self.layout.num_words)
+        self.workers = usable_workers(workers)
+        self.start_states, self.start_probabilities = start_distribution(env)
+        self.first = 0  # states expanded
+        self.count = 0  # states found
+        self.level_end = 0  # states up to the end of the current level
+        self.depth = -1  # levels finished, the start states' own level not counted
+        self.terminals = 0
+        self.index_dtype = np.dtype("<i4")
+        self.margin = 16 * env.num_actions + len(self.start_states)
+
+    def run(self, manifest: dict[str, Any] | None) -> None:
+        self.began = self.last_checkpoint = time.perf_counter()
+        self.states = _reserved_states(self.layout.num_words)
+        self.table = np.empty(0, self.index_dtype)
+        self._open(manifest)
+        try:
+            self._grow_table(self.count)
+            with ThreadPoolExecutor(self.workers) as pool:
+                while self.first < self.count:
+                    self._expand_chunk(pool)
+                    if time.perf_counter() - self.last_checkpoint > self.checkpoint_seconds:
+                        self._checkpoint(complete=False)
+            self._checkpoint(complete=True)
+        except (StateSpaceTooLarge, KeyboardInterrupt):
+            self._checkpoint(complete=False)
+            raise
+        finally:
+            for file in self.files.values():
+                file.close()
+        self.report(self._progress(finished=True))
+
+    def _open(self, manifest: dict[str, Any] | None) -> None:
+        """Start afresh, or from the last checkpoint."""
+        arrays = manifest["arrays"] if manifest else {}
+        self.successors_name = successors_name(arrays) if manifest else SUCCESSORS
+        if manifest:
+            self.index_dtype = np.dtype(arrays[self.successors_name]["dtype"])
+        names = (STATES, self.successors_name, TERMINAL)
+        self.files = {name: GrowingFile(self.path / name, arrays.get(name)) for name in names}
+        if manifest is None:
+            self.count = self.level_end = len(self.start_states)
+            self.states[: self.count] = pack(self.layout, np.array(self.start_states, np.int64))
+            self.files[STATES].append(self.states[: self.count])
+            self._flushed()
+            return
+        self.first, self.count = manifest["num_expanded"], manifest["num_states"]
+        self.level_end, self.depth = manifest["level_end"], manifest["depth"]
+        self.terminals = manifest["num_terminal_states"]
+        stored = np.memmap(self.path / STATES, "<u8", "r", shape=(self.count, self.layout.num_words))
+        self.states[: self.count] = stored
+        self._flushed()
+
+    def _flushed(self) -> None:
+        """Everything up to here is in the files: the next checkpoint commits this, and a resumed build goes on from it."""
+        self.flushed = {
+            "num_states": self.count,
+            "num_expanded": self.first,
+            "num_terminal_states": self.terminals,
+            "depth": self.depth,
+            "level_end": self.level_end,
+        }
+
+    # Expanding -----------------------------------------------------------------------------------------------------------
+
+    def _expand_chunk(self, pool: ThreadPoolExecutor) -> None:
+        """Expand up to CHUNK states, then append their rows to the files."""
+        if self.index_dtype.itemsize == 4 and self.count + CHUNK * self.env.num_actions + self.margin > INT32_STATES:
+            self._widen_indices()
+        base = self.first
+        last = base + CHUNK
+        successors = np.empty((CHUNK, self.env.num_actions), self.index_dtype)
+        terminal = np.zeros(CHUNK, np.uint8)
+        while self.first < min(last, self.count):
+            if self.count + self.margin > self._room():
+                self._make_room()
+            if self.rules is None:
+                self._expand_interpreted(successors, terminal, base, min(last, self.count))
+            elif self.workers > 1 and min(last, self.count) - self.first >= WIDE:
+                self._expand_wide(pool, successors, terminal, base, min(last, self.count))
+            else:
+                self._expand_narrow(successors, terminal, base, last)
+            _check_size(self.env, self.count, self.count - self.first, self.max_states)
+        rows = self.first - base
+        self.files[STATES].append(self.states[self.flushed["num_states"] : self.count])
+        self.files[self.successors_name].append(successors[:rows])
+        self.files[TERMINAL].append(np.packbits(terminal[:rows], bitorder="little"))
+        self.terminals += int(terminal[:rows].sum())
+        self._flushed()
+        self.report(self._progress())
+
+    def _expand_narrow(self, successors, terminal, base, last) -> None:
+        progress = np.array([self.first, self.count, self.level_end, self.depth, 0, 0], np.int64)
+        # look at the width and the limit again after a while
+        stop = min(last, max(self.first + 2048, self.count)) if self.workers > 1 else last
+        self.rules.kernels.explore(
+            self.rules.parameters,
+            self.layout.tables,
+            self.states,
+            successors,
+            terminal,
+            self.table,
+            base,
+            stop,
+            self._room(),
+            progress,
+        )
+        self._take(progress)
+        if progress[4]:
+            self._raise_fault(self.first, min(self.first + 16, self.count))
+
+    def _expand_wide(self, pool, successors, terminal, base, stop) -> None:
+        first, num_actions = self.first, self.env.num_actions
+        room = (self._room() - self.count) // num_actions
+        stop = min(stop, first + room)
+        rows = stop - first
+        keys = np.empty((rows * num_actions, self.layout.num_words), np.uint64)
+        found = np.empty(rows * num_actions, np.int64)
+        faults = [np.zeros(6, np.int64) for _ in range(self.workers)]
+        cuts = [first + rows * i // self.workers for i in range(self.workers + 1)]
+
+        def share(i: int) -> None:
+            self.rules.kernels.expand_and_find(
+                self.rules.parameters,
+                self.layout.tables,
+                self.states,
+                cuts[i],
+                cuts[i + 1],
+                first,
+                keys,
+                found,
+                terminal[first - base :],
+                self.table,
+                faults[i],
+            )
+
+        list(pool.map(share, range(self.workers)))
+        if any(fault[4] for fault in faults):
+            self._raise_fault(first, stop)
+        from pharos._core.hash_table import insert_missing
+
+        progress = np.zeros(6, np.int64)
+        insert_missing(
+            self.table,
+            self.states,
+            keys,
+            found,
+            successors[first - base : first - base + rows],
+            first,
+            self.count,
+            self.level_end,
+            self.depth,
+            progress,
+        )
+        self._take(progress)
+
+    def _expand_interpreted(self, successors, terminal, base, stop) -> None:
+        """The same with rules that Numba cannot compile: Python calls them, arrays do the rest."""
+        from pharos._core.hash_table import find, insert_missing
+
+        num_actions = self.env.num_actions
+        stop = min(stop, self.first + min(4096, (self._room() - self.count) // num_actions))
+        rows = unpack(self.layout, self.states[self.first : stop]).tolist()
+        following = np.empty((len(rows) * num_actions, len(self.layout.word)), np.int64)
+        _interpreted_successors(self.env, rows, following, terminal[self.first - base :])
+        outside = (following < self.layout.low) | (following >= self.layout.low + self.layout.size)
+        if outside.any():
+            self._raise_fault(self.first, stop)
+        keys = pack(self.layout, following)
+        found = np.empty(len(keys), np.int64)
+        find(self.table, self.states, keys, found)
+        slots = np.flatnonzero(found < 0)
+        found[slots] = -1 - _slots_of(keys[slots], len(self.table))
+        progress = np.zeros(6, np.int64)
+        part = successors[self.first - base : stop - base]
+        insert_missing(
+            self.table, self.states, keys, found, part, self.first, self.count, self.level_end, self.depth, progress
+        )
+        self._take(progress)
+
+    def _take(self, progress: np.ndarray) -> None:
+        self.first, self.count, self.level_end, self.depth = (int(value) for value in progress[:4])
+
+    def _raise_fault(self, start: int, stop: int) -> None:
+        """A rule left the declared ranges somewhere in [start, stop): find where, by running it interpreted."""
+        components = self.env.components
+        for state in unpack(self.layout, self.states[start:stop]).tolist():
+            if self.env.is_terminal(tuple(state)):
+                continue
+            for action, name in enumerate(self.env.actions):
+                try:
+                    out = self.env.next_state(state, action)
+                except IndexError as error:
+                    raise RuleError(f"{self.env}: action {name!r} in state {tuple(state)} fails: {error}") from error
+                for i, value in enumerate(out):
+                    if not components.low[i] <= value <= components.high[i]:
+                        raise RuleError(
+                            f"{self.env}: action {name!r} in state {tuple(state)} leads to {components.names[i]} = {value}; "
+                            f"declared: {components.low[i]} to {components.high[i]}"
+                        )
+        raise RuleError(
+            f"{self.env}: compiled rules read or wrote a component that does not exist, in one of the states {start} to "
+            f"{stop - 1}; run pharos.check_environment to find it"
+        )
+
+    # Room ----------------------------------------------------------------------------------------------------------------
+
+    def _room(self) -> int:
+        """States that table and array of states can hold."""
+        return min(int(len(self.table) * LOAD), len(self.states))
+
+    def _make_room(self) -> None:
+        if self.count + self.margin > len(self.states):
+            raise MemoryError(f"{self.env}: no address space for more than {len(self.states)} states; set a larger ulimit -v")
+        self._grow_table(self.count)
+
+    def _grow_table(self, count: int) -> None:
+        """A table with room for about twice as many states, filled from the array of states."""
+        from pharos._core.hash_table import fill
+
+        slots = 1 << 16
+        while slots * LOAD < 1.4 * count + self.margin:
+            slots *= 2
+        needed = slots * self.index_dtype.itemsize + int(slots * LOAD) * self.layout.num_words * 8
+        self._check_memory(count, needed)
+        self.table = np.empty(0, self.index_dtype)  # free the old one first
+        self.table = _huge_pages(slots, self.index_dtype)
+        self.table.fill(-1)
+        fill(self.table, self.states, count)
+
+    def _check_memory(self, count: int, needed: int) -> None:
+        available = self.memory if self.memory is not None else _available_memory()
+        if needed > available:
+            raise StateSpaceTooLarge(
+                f"{self.env}: {count} states found, {count - self.first} left to expand, and the next "
+                f"{needed / 2**30:.1f} GiB of table and states pass the memory of {available / 2**30:.1f} GiB; "
+                f"what was found is kept: give more memory and the same command resumes, or choose a smaller instance"
+            )
+
+    # Files ---------------------------------------------------------------------------------------------------------------
+
+    def _widen_indices(self) -> None:
+        """From int32 to int64 indices: a new file of successors and a new table; the old file goes once this is committed."""
+        old, self.index_dtype = self.files.pop(self.successors_name), np.dtype("<i8")
+        old.close()
+        self.successors_name = WIDE_SUCCESSORS
+        self.files[WIDE_SUCCESSORS] = GrowingFile(self.path / WIDE_SUCCESSORS)
+        rows = np.memmap(old.path, "<i4", "r", shape=(self.first, self.env.num_actions)) if self.first else ()
+        for start in range(0, self.first, CHUNK):
+            self.files[WIDE_SUCCESSORS].append(rows[start : start + CHUNK].astype(self.index_dtype))
+        self._checkpoint(complete=False)
+        old.path.unlink()
+        self._grow_table(self.count)
+
+    def _checkpoint(self, *, complete: bool) -> None:
+        """Commit what was appended: data first, then the manifest that speaks of it."""
+        for file in self.files.values():
+            file.sync()
+        dtypes = {STATES: "<u8", self.successors_name: self.index_dtype.str, TERMINAL: "|u1"}
+        manifest = {
+            "format": "pharos state space",
+            "format_version": FORMAT_VERSION,
+            "complete": complete,
+            **self.identity,
+            "num_actions": self.env.num_actions,
+            **self.flushed,
+            "initial": [[i, float(p)] for i, p in enumerate(self.start_probabilities)],
+            "arrays": {name: {"dtype": dtypes[name], **file.entry()} for name, file in self.files.items()},
+        }
+        write_manifest(self.path, manifest)
+        self.last_checkpoint = time.perf_counter()
+
+    def _progress(self, finished: bool = False) -> BuildProgress:
+        return BuildProgress(self.count, self.first, self.depth, time.perf_counter() - self.began, finished)
+
+
+def _interpreted_successors(env: Environment, rows: list, following: np.ndarray, terminal: np.ndarray) -> None:
+    """following[i * A + a] = successor of rows[i] by a, called in Python; terminal states lead to themselves."""
+    num_actions = env.num_actions
+    transition, is_terminal = env.transition, env.is_terminal
+    out: list = []
+    for i, row in enumerate(rows):
+        state = tuple(row)
+        ended = bool(is_terminal(state))
+        terminal[i] = ended
+        for action in range(num_actions):
+            successor = row.copy()
+            if not ended:
+                transition(state, action, successor)
+            out.append(successor)
+    try:  # small non-negative integers, the usual case, go through bytes ten times as fast
+        following[:] = np.frombuffer(b"".join(map(bytes, out)), np.uint8).reshape(following.shape)
+    except (ValueError, TypeError):
+        following[:] = np.array(out, np.int64)
+
+
+def _slots_of(keys: np.ndarray, capacity: int) -> np.ndarray:
+    from pharos._core.hash_table import slots_of
+
+    out = np.empty(len(keys), np.int64)
+    slots_of(keys, capacity, out)
+    return out
+
+
+def _reserved_states(num_words: int) -> np.ndarray:
+    """(rows, W) uint64 of address space: memory is taken as it is written, in huge pages, and never copied to grow."""
+    for rows in (1 << 32, 1 << 30, 1 << 28, 1 << 26):
+        try:
+            return _huge_pages(rows * num_words, np.dtype("<u8")).reshape(-1, num_words)
+        except (OSError, ValueError):
+            continue
+    raise MemoryError("no address space for 2^26 states; set a larger ulimit -v")
+
+
+def _huge_pages(length: int, dtype: np.dtype) -> np.ndarray:
+    """An array of zeros in huge pages, where the system has them."""
+    if not hasattr(mmap, "MAP_PRIVATE"):
+        return np.zeros(min(length, 1 << 28), dtype)
+    flags = mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS | getattr(mmap, "MAP_NORESERVE", 0)
+    memory = mmap.mmap(-1, length * dtype.itemsize, flags=flags)
+    if hasattr(mmap, "MADV_HUGEPAGE"):
+        with contextlib.suppress(OSError):
+            memory.madvise(mmap.MADV_HUGEPAGE)
+    return np.frombuffer(memory, dtype)
+
+
+def _available_memory() -> int:
+    """Bytes that this process may still take: free memory of the machine, or of its control group where that is less."""
+    free = 1 << 62
+    with contextlib.suppress(OSError, StopIteration, ValueError), open("/proc/meminfo") as file:
+        free = next(int(line.split()[1]) * 1024 for line in file if line.startswith("MemAvailable"))
+    with contextlib.suppress(OSError, ValueError):
+        limit = int(Path("/sys/fs/cgroup/memory.max").read_text())
+        free = min(free, limit - int(Path("/sys/fs/cgroup/memory.current").read_text()))
+    return free
+
+
+@contextlib.contextmanager
+def _reporter(progress: Progress | bool | None, env: Environment):
+    """The function that gets each BuildProgress: the caller's, a bar on a terminal, or nothing."""
+    if callable(progress):
+        yield progress
+    elif progress is False or not sys.stderr.isatty():
+        yield lambda _: None
+    else:
+        from rich.console import Console
+        from rich.progress import Progress as Bar
+        from rich.progress import SpinnerColumn, TextColumn, TimeElapsedColumn
+
+        columns = (SpinnerColumn(), TextColumn("{task.description}"), TextColumn("{task.fields[text]}"), TimeElapsedColumn())
+        with Bar(*columns, console=Console(stderr=True), transient=True) as bar:
+            task = bar.add_task(f"building {env.name}", text="", total=None)
+
+            def show(done: BuildProgress) -> None:
+                left = done.num_states - done.num_expanded
+                rate = done.num_states / max(done.seconds, 1e-9)
+                bar.update(task, text=f"{done.num_states:,} states, {left:,} to expand, level {done.depth}, {rate:,.0f} states/s")
+
+            yield show

@@ -1,0 +1,100 @@
+"""Rewards of the stored transitions: computed in parallel after the build, replaced without building again."""
+
+import inspect
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pharos.environment import Environment
+from pharos.errors import ParameterError, RuleError, StateSpaceError
+
+if TYPE_CHECKING:
+    from pharos.mdp._rewards import Rewards
+    from pharos.state_space._store import StateSpace
+
+_ROWS = 1 << 16
+
+
+def rewards_of_space(space: "StateSpace", rewards: Any = None, *, workers: int | None = None) -> "Rewards":
+    """The rewards of all transitions of a state space.
+
+    Args:
+        rewards: None, an (S, A) array, or a function reward(self, state, action, next_state) -> float.
+        workers: threads; the result does not depend on them.
+    Raises:
+        ParameterError: the array has the wrong shape, or holds NaN or infinity.
+        RuleError: the reward function gave NaN or infinity for a transition, which the message names.
+    """
+    from pharos.mdp._rewards import Rewards, RewardsCollector
+
+    shape = (space.num_states, space.num_actions)
+    if rewards is not None and not callable(rewards):
+        array = np.asarray(rewards, np.float64)
+        if array.shape != shape:
+            raise ParameterError(f"{space}: rewards have shape {array.shape}; expected {shape}, one for each state and action")
+        return Rewards.from_array(array)
+    if space.environment is None:
+        raise StateSpaceError(
+            f"{space.folder}: pharos does not know the class {space.manifest['environment']!r}, so it cannot compute the "
+            f"rewards; import the module that registers it, or pass rewards as an (S, A) array"
+        )
+    env = space.environment if rewards is None else _with_reward(space.environment, rewards)
+    collector = RewardsCollector(shape)
+    for start, block in _blocks(space, env, workers):
+        if not np.isfinite(block).all():
+            s, a = map(int, np.argwhere(~np.isfinite(block))[0])
+            raise RuleError(
+                f"{env}: reward of action {env.actions[a]!r} in state {space.state(start + s)} is {block[s, a]}; expected a finite number"
+            )
+        collector.add(start, block)
+    return collector.finish()
+
+
+def _blocks(space: "StateSpace", env: Environment, workers: int | None):
+    """(start, rewards of the states from start on), in order."""
+    from pharos._core.compiling import compiled_rules, usable_workers
+
+    starts = range(0, space.num_states, _ROWS)
+    rules = compiled_rules(env, space.layout.num_words)
+    states, successors, terminal = space.packed_states, space.successors, space.terminal
+
+    def compiled(start: int) -> np.ndarray:
+        assert rules is not None
+        stop = min(start + _ROWS, space.num_states)
+        out = np.empty((stop - start, space.num_actions))
+        rules.kernels.rewards_of(rules.parameters, space.layout.tables, states, successors, terminal, start, stop, out)
+        return out
+
+    def interpreted(start: int) -> np.ndarray:
+        stop = min(start + _ROWS, space.num_states)
+        out = np.zeros((stop - start, space.num_actions))
+        rows = space.states(slice(start, stop)).tolist()
+        for a in range(space.num_actions):
+            following = space.states(successors[start:stop, a]).tolist()
+            for i, (state, next_state) in enumerate(zip(rows, following, strict=True)):
+                if not terminal[start + i]:
+                    out[i, a] = env.reward(state, a, next_state)
+        return out
+
+    if rules is None:
+        yield from ((start, interpreted(start)) for start in starts)
+        return
+    with ThreadPoolExecutor(usable_workers(workers)) as pool:
+        window = 2 * usable_workers(workers)
+        pending = [pool.submit(compiled, start) for start in starts[:window]]
+        for i, start in enumerate(starts):
+            block = pending[i % window].result()
+            if i + window < len(starts):
+                pending[i % window] = pool.submit(compiled, starts[i + window])
+            yield start, block
+
+
+def _with_reward(env: Environment, reward: Callable) -> Environment:
+    """An environment with the same rules and parameters but another reward function."""
+    names = list(inspect.signature(reward).parameters)
+    if len(names) != 4:
+        raise ParameterError(f"a reward function takes (self, state, action, next_state); found ({', '.join(names)})")
+    cls: type[Environment] = type(type(env).__name__, (type(env),), {"reward": reward, "__module__": reward.__module__})
+    return cls(**env.parameters)
