@@ -15,7 +15,7 @@ import os
 import sys
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -47,7 +47,7 @@ OUR_FILES = (STATES, SUCCESSORS, WIDE_SUCCESSORS, TERMINAL, MANIFEST + ".tmp", "
 CHUNK = 1 << 16  # states expanded between two looks at the clock; a multiple of 8, so that terminal bits fill whole bytes
 WIDE = 1 << 13  # a frontier of this many states is worth sharing between threads
 CHECKPOINT_SECONDS = 15.0
-LOAD = 0.7  # the table grows beyond this share of used slots
+LOAD = 0.5  # the table grows beyond this share of used slots
 INT32_STATES = 2**31 - 1
 
 
@@ -94,7 +94,7 @@ def build(
         StateSpaceTooLarge, DiskFull: what was found is kept; the same command resumes.
         StateSpaceMismatch: the folder holds another environment. StateSpaceLocked: somebody else is building there.
         StateSpaceCorrupted: files were changed. RuleError: a rule left the declared ranges, in the state that is named.
-    Cost: see docs/performance.md; 40 to 110 ns a state, 8 W + 4 / 0.35 bytes of memory a state (W words of 64 bits).
+    Cost: see docs/performance.md; 40 to 110 ns a state, 8 W + 8 to 16 bytes of memory a state (W words of 64 bits).
     Source: the pharos paper, appendix A, Algorithm 1 (whose successors are stored under the wrong index there).
     """
     if max_states is not None and max_states < 1:
@@ -182,14 +182,15 @@ class _Builder:
         self.states = _reserved_states(self.layout.num_words)
         self.table = np.empty(0, self.index_dtype)
         self._open(manifest)
+        self.writes: list[Future] = []
         try:
             self._grow_table(self.count)
-            with ThreadPoolExecutor(self.workers) as pool:
+            with ThreadPoolExecutor(self.workers) as pool, ThreadPoolExecutor(1) as self.writer:
                 while self.first < self.count:
                     self._expand_chunk(pool)
                     if time.perf_counter() - self.last_checkpoint > self.checkpoint_seconds:
                         self._checkpoint(complete=False)
-            self._checkpoint(complete=True)
+                self._checkpoint(complete=True)
         except (StateSpaceTooLarge, KeyboardInterrupt):
             self._checkpoint(complete=False)
             raise
@@ -250,9 +251,7 @@ class _Builder:
                 self._expand_narrow(successors, terminal, base, last)
             _check_size(self.env, self.count, self.count - self.first, self.max_states)
         rows = self.first - base
-        self.files[STATES].append(self.states[self.flushed["num_states"] : self.count])
-        self.files[self.successors_name].append(successors[:rows])
-        self.files[TERMINAL].append(np.packbits(terminal[:rows], bitorder="little"))
+        self._append(self.states[self.flushed["num_states"] : self.count], successors[:rows], terminal[:rows])
         self.terminals += int(terminal[:rows].sum())
         self._flushed()
         self.report(self._progress())
@@ -409,6 +408,7 @@ class _Builder:
 
     def _widen_indices(self) -> None:
         """From int32 to int64 indices: a new file of successors and a new table; the old file goes once this is committed."""
+        self._finish_writes()
         old, self.index_dtype = self.files.pop(self.successors_name), np.dtype("<i8")
         old.close()
         self.successors_name = WIDE_SUCCESSORS
@@ -420,8 +420,26 @@ class _Builder:
         old.path.unlink()
         self._grow_table(self.count)
 
+    def _append(self, states: np.ndarray, successors: np.ndarray, terminal: np.ndarray) -> None:
+        """Append in the background, while the next chunk is expanded; at most two chunks wait."""
+        files, name = self.files, self.successors_name
+
+        def write() -> None:
+            files[STATES].append(states)
+            files[name].append(successors)
+            files[TERMINAL].append(np.packbits(terminal, bitorder="little"))
+
+        if len(self.writes) > 1:
+            self.writes.pop(0).result()
+        self.writes.append(self.writer.submit(write))
+
+    def _finish_writes(self) -> None:
+        while self.writes:
+            self.writes.pop(0).result()
+
     def _checkpoint(self, *, complete: bool) -> None:
         """Commit what was appended: data first, then the manifest that speaks of it."""
+        self._finish_writes()
         for file in self.files.values():
             file.sync()
         dtypes = {STATES: "<u8", self.successors_name: self.index_dtype.str, TERMINAL: "|u1"}
