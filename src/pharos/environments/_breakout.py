@@ -16,16 +16,16 @@ class Breakout(Environment):
     Rules    The ball moves one cell diagonally at each step; side walls and the ceiling turn it within the step. Row 0
              is free, so the ball can run above the bricks, which fill rows 1 to `brick_rows`. A ball that meets a
              brick breaks it, stays in its cell for that step and turns back vertically. The paddle lies in the bottom
-             row and moves first, by at most one cell. A ball that meets the paddle stays in its cell for that step and
-             goes up again: to the left from cells left of the paddle's middle, to the right from cells right of it,
-             onwards from the middle itself; and back where it came from when the paddle is straight below the ball
-             but not where the ball was heading. So a paddle of one cell steers the ball, too.
+             row and moves first, by at most one cell. A ball is hit by the paddle in the row above it: when the paddle
+             lies ahead of the ball, the ball bounces, one column on in its row, and goes up onwards; when the paddle
+             lies straight below the ball but not ahead, its edge turns the ball back where it came from. So the
+             player steers by where the paddle is hit, whatever its width.
     State    (ball row, ball column, ball goes right, ball goes down, leftmost cell of the paddle, bricks row by row).
     Start    ball below the middle of the bricks, going down to the right; paddle in the middle; all bricks there.
     Actions  left, stay, right.
     Reward   1 a brick, otherwise 0.
     Ends     when the ball reaches the bottom row; without `respawn` also when no brick is left.
-    Respawn  when no brick is left, all come back as the ball next meets the paddle.
+    Respawn  when no brick is left, all come back as the paddle next hits the ball.
     Limit    1000 steps.
     Ours     the paper prints height, columns and extra paddle width; brick rows, respawn, angles and limit are ours.
     Source   the pharos paper, section 3.3 and appendix B.
@@ -40,7 +40,7 @@ class Breakout(Environment):
 
     height: int = 12
     columns: int = 8
-    brick_rows: int = 1
+    brick_rows: int = 2
     extra_paddle_width: int = 0
     respawn: bool = True
 
@@ -107,20 +107,16 @@ class Breakout(Environment):
 
         if ahead_row == self.height - 1:
             if paddle <= ahead_column < paddle + self.paddle_width:
-                middle = paddle + self.extra_paddle_width
-                if ahead_column < middle:
-                    right = 0
-                elif ahead_column > middle:
-                    right = 1
                 down = 0
             elif paddle <= column < paddle + self.paddle_width:
                 right = 1 - right
                 down = 0
+                ahead_column = column
             if down == 0:
+                ahead_row = row
                 if self.respawn and no_brick_is_left(self.num_bricks, state):
                     for i in range(self.num_bricks):
                         out[BRICKS + i] = 1
-                ahead_row, ahead_column = row, column
         elif 1 <= ahead_row <= self.brick_rows:
             brick = BRICKS + (ahead_row - 1) * self.columns + ahead_column
             if state[brick] == 1:
