@@ -193,7 +193,9 @@ def start_distribution(env: Environment) -> tuple[list[State], np.ndarray]:
     for state, probability in env.initial_states():
         values = np.asarray(state)
         if values.shape != (len(components),):
-            raise ParameterError(f"{env}: start state {tuple(state)} has {values.size} components; expected {len(components)}")
+            raise ParameterError(
+                f"{env}: start state {tuple(state)} has {values.size} components; expected {len(components)}"
+            )
         outside = np.flatnonzero((values < components.low) | (values > components.high))
         if outside.size:
             i = int(outside[0])
@@ -202,7 +204,9 @@ def start_distribution(env: Environment) -> tuple[list[State], np.ndarray]:
                 f"expected {components.low[i]} to {components.high[i]}"
             )
         if not (math.isfinite(probability) and probability > 0):
-            raise ParameterError(f"{env}: start state {tuple(state)} has probability {probability}; expected one in (0, 1]")
+            raise ParameterError(
+                f"{env}: start state {tuple(state)} has probability {probability}; expected one in (0, 1]"
+            )
         key = tuple(int(value) for value in state)
         merged[key] = merged.get(key, 0.0) + float(probability)
     if not merged or abs(sum(merged.values()) - 1) > 1e-9:

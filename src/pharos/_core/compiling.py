@@ -55,15 +55,17 @@ def _kernels(cls: type[Environment], names: tuple[str, ...], num_words: int, num
     can_cache = _write_once(file, source)
     module = python_types.ModuleType(f"pharos_compiled_{digest}")
     sys.modules[module.__name__] = module  # Numba looks functions up by their module when it reads its cache
-    vars(module).update({
-        "__file__": str(file),
-        "Parameters": namedtuple("Parameters", names),  # noqa: PYI024  (its fields are known only now)
-        "NUM_WORDS": num_words,
-        "WORDS": (0,) * num_words,
-        "NUM_ACTIONS": num_actions,
-        "CACHE": can_cache,
-        **rules,
-    })
+    vars(module).update(
+        {
+            "__file__": str(file),
+            "Parameters": namedtuple("Parameters", names),
+            "NUM_WORDS": num_words,
+            "WORDS": (0,) * num_words,
+            "NUM_ACTIONS": num_actions,
+            "CACHE": can_cache,
+            **rules,
+        }
+    )
     exec(compile(source, str(file), "exec"), vars(module))
     return module
 
@@ -106,7 +108,11 @@ def _first_lines(message: str) -> str:
     """What went wrong and in which line, out of Numba's long message."""
     lines = [line.strip() for line in message.splitlines() if line.strip()]
     what = next((line for line in lines if not line.startswith(("Failed in", "During:"))), lines[0] if lines else "")
-    where = [line for line in lines if line.startswith("File ") and "rules_template" not in line and "pharos_compiled" not in line]
+    where = [
+        line
+        for line in lines
+        if line.startswith("File ") and "rules_template" not in line and "pharos_compiled" not in line
+    ]
     return what + (f" ({where[-1].rstrip(':')})" if where else "")
 
 

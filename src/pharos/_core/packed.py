@@ -51,7 +51,9 @@ def packed_view(typing_context, words, word, shift, mask, low, size):
         view.words = builder.bitcast(words, _WORD.as_pointer())
         view.fault = cgutils.alloca_once(builder, _WORD)
         builder.store(ir.Constant(_WORD, 0), view.fault)
-        for name, array_type, value in zip(("word", "shift", "mask", "low", "size"), sig.args[1:], args[1:], strict=True):
+        for name, array_type, value in zip(
+            ("word", "shift", "mask", "low", "size"), sig.args[1:], args[1:], strict=True
+        ):
             array = context.make_array(array_type)(context, builder, value)
             setattr(view, name, builder.bitcast(array.data, _WORD.as_pointer()))
         array = context.make_array(sig.args[1])(context, builder, args[1])

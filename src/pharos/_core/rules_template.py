@@ -8,11 +8,13 @@ what the rules see as `self`; the constants NUM_WORDS, NUM_ACTIONS and WORDS, a 
 """
 
 import numpy as np
-from numba import int64, njit, uint64
+from numba import int64, njit
 
-from pharos._core.packed import clear_fault, fault, get_word, mixed, packed_view, prefetch, set_word, slot_of
+from pharos._core.packed import fault, get_word, mixed, packed_view, prefetch, set_word, slot_of
 
-BATCH = 16  # states expanded before their successors are looked up: enough look-ups under way to hide the memory's latency
+BATCH = (
+    16  # states expanded before their successors are looked up: enough look-ups under way to hide the memory's latency
+)
 FIRST, COUNT, LEVEL_END, DEPTH, FAULT, FAULT_ACTION = range(6)  # fields of `progress`
 
 

@@ -48,7 +48,7 @@ class Breakout(Environment):
     actions = ("left", "stay", "right")
     version = 1
     max_episode_steps = 1000
-    layers = {  # noqa: RUF012
+    layers = {
         "bricks": Layer("#", (200, 72, 72)),
         "paddle": Layer("=", (66, 158, 130)),
         "ball": Layer("o", (236, 236, 236)),
@@ -150,7 +150,7 @@ class Breakout(Environment):
 
 
 def no_brick_is_left(num_bricks, state):
-    for i in range(num_bricks):  # noqa: SIM110  (compiled)
+    for i in range(num_bricks):
         if state[BRICKS + i] == 1:
             return False
     return True

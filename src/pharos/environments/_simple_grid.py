@@ -47,7 +47,7 @@ class SimpleGrid(Environment):
     name = "simple_grid"
     actions = ("up", "right", "down", "left")
     version = 1
-    layers = {  # noqa: RUF012
+    layers = {
         "penalty": Layer("x", (200, 72, 72)),
         "reward": Layer("r", (214, 186, 92)),
         "goal": Layer("G", (236, 236, 236)),

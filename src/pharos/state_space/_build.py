@@ -44,7 +44,9 @@ from pharos.state_space._store import (
 )
 
 OUR_FILES = (STATES, SUCCESSORS, WIDE_SUCCESSORS, TERMINAL, MANIFEST + ".tmp", "lock")
-CHUNK = 1 << 16  # states expanded between two looks at the clock; a multiple of 8, so that terminal bits fill whole bytes
+CHUNK = (
+    1 << 16
+)  # states expanded between two looks at the clock; a multiple of 8, so that terminal bits fill whole bytes
 WIDE = 1 << 13  # a frontier of this many states is worth sharing between threads
 CHECKPOINT_SECONDS = 15.0
 LOAD = 0.5  # the table grows beyond this share of used slots
@@ -166,7 +168,7 @@ class _Builder:
         self.max_states, self.memory, self.report = max_states, memory, report
         self.checkpoint_seconds = checkpoint_seconds
         self.layout = layout_of(env.components)
-        self.rules = compiled_rules(env, self.layout.num_words)
+        self.rules: Any = compiled_rules(env, self.layout.num_words)
         self.workers = usable_workers(workers)
         self.start_states, self.start_probabilities = start_distribution(env)
         self.first = 0  # states expanded
@@ -174,7 +176,7 @@ class _Builder:
         self.level_end = 0  # states up to the end of the current level
         self.depth = -1  # levels finished, the start states' own level not counted
         self.terminals = 0
-        self.index_dtype = np.dtype("<i4")
+        self.index_dtype: np.dtype = np.dtype("<i4")
         self.margin = 16 * env.num_actions + len(self.start_states)
 
     def run(self, manifest: dict[str, Any] | None) -> None:
@@ -378,7 +380,9 @@ class _Builder:
 
     def _make_room(self) -> None:
         if self.count + self.margin > len(self.states):
-            raise MemoryError(f"{self.env}: no address space for more than {len(self.states)} states; set a larger ulimit -v")
+            raise MemoryError(
+                f"{self.env}: no address space for more than {len(self.states)} states; set a larger ulimit -v"
+            )
         self._grow_table(self.count)
 
     def _grow_table(self, count: int) -> None:
@@ -413,7 +417,11 @@ class _Builder:
         old.close()
         self.successors_name = WIDE_SUCCESSORS
         self.files[WIDE_SUCCESSORS] = GrowingFile(self.path / WIDE_SUCCESSORS)
-        rows = np.memmap(old.path, "<i4", "r", shape=(self.first, self.env.num_actions)) if self.first else ()
+        rows = (
+            np.memmap(old.path, "<i4", "r", shape=(self.first, self.env.num_actions))
+            if self.first
+            else np.empty((0, 1))
+        )
         for start in range(0, self.first, CHUNK):
             self.files[WIDE_SUCCESSORS].append(rows[start : start + CHUNK].astype(self.index_dtype))
         self._checkpoint(complete=False)
@@ -533,13 +541,21 @@ def _reporter(progress: Progress | bool | None, env: Environment):
         from rich.progress import Progress as Bar
         from rich.progress import SpinnerColumn, TextColumn, TimeElapsedColumn
 
-        columns = (SpinnerColumn(), TextColumn("{task.description}"), TextColumn("{task.fields[text]}"), TimeElapsedColumn())
+        columns = (
+            SpinnerColumn(),
+            TextColumn("{task.description}"),
+            TextColumn("{task.fields[text]}"),
+            TimeElapsedColumn(),
+        )
         with Bar(*columns, console=Console(stderr=True), transient=True) as bar:
             task = bar.add_task(f"building {env.name}", text="", total=None)
 
             def show(done: BuildProgress) -> None:
                 left = done.num_states - done.num_expanded
                 rate = done.num_states / max(done.seconds, 1e-9)
-                bar.update(task, text=f"{done.num_states:,} states, {left:,} to expand, level {done.depth}, {rate:,.0f} states/s")
+                bar.update(
+                    task,
+                    text=f"{done.num_states:,} states, {left:,} to expand, level {done.depth}, {rate:,.0f} states/s",
+                )
 
             yield show

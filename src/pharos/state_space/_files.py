@@ -39,7 +39,7 @@ class GrowingFile:
 
     def append(self, rows: np.ndarray) -> None:
         """Append the bytes of an array; DiskFull where the disk has no room."""
-        data = memoryview(np.ascontiguousarray(rows)).cast("B")
+        data = np.ascontiguousarray(rows).data.cast("B")
         self._note(data)
         written = 0
         try:

@@ -35,7 +35,9 @@ def layout_of(components: Components) -> Layout:
     word, shift, used, current = [], [], 0, 0
     for width in bits:
         if width > 63:
-            raise ParameterError(f"a component with 2^{width} values does not fit; a range may have at most 2^63 values")
+            raise ParameterError(
+                f"a component with 2^{width} values does not fit; a range may have at most 2^63 values"
+            )
         if used + width > 64:
             current, used = current + 1, 0
         word.append(current)

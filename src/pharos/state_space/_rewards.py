@@ -33,7 +33,9 @@ def rewards_of_space(space: "StateSpace", rewards: Any = None, *, workers: int |
     if rewards is not None and not callable(rewards):
         array = np.asarray(rewards, np.float64)
         if array.shape != shape:
-            raise ParameterError(f"{space}: rewards have shape {array.shape}; expected {shape}, one for each state and action")
+            raise ParameterError(
+                f"{space}: rewards have shape {array.shape}; expected {shape}, one for each state and action"
+            )
         return Rewards.from_array(array)
     if space.environment is None:
         raise StateSpaceError(

@@ -127,7 +127,9 @@ class StateSpace:
         find(self._table, self.packed_states, keys, out)
         wrong = np.flatnonzero((out < 0) | ~inside.all(axis=1))
         if wrong.size:
-            raise ParameterError(f"{self}: state {tuple(int(v) for v in states[wrong[0]])} is not reachable from the start")
+            raise ParameterError(
+                f"{self}: state {tuple(int(v) for v in states[wrong[0]])} is not reachable from the start"
+            )
         return out
 
     @cached_property
@@ -189,7 +191,9 @@ def load(folder: str | os.PathLike, *, verify: bool = True) -> StateSpace:
     folder = Path(folder)
     manifest = read_manifest(folder)
     if manifest is None:
-        raise StateSpaceError(f"{folder}: no state space there (no {MANIFEST}); build one with pharos.build or `pharos build`")
+        raise StateSpaceError(
+            f"{folder}: no state space there (no {MANIFEST}); build one with pharos.build or `pharos build`"
+        )
     if not manifest["complete"]:
         raise StateSpaceIncomplete(
             f"{folder}: the build stopped at {manifest['num_states']} states; the same build command resumes it"
