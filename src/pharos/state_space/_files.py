@@ -39,7 +39,7 @@ class GrowingFile:
 
     def append(self, rows: np.ndarray) -> None:
         """Append the bytes of an array; DiskFull where the disk has no room."""
-        data = np.ascontiguousarray(rows).data.cast("B")
+        data = memoryview(np.ascontiguousarray(rows).reshape(-1).view(np.uint8))
         self._note(data)
         written = 0
         try:

@@ -1,0 +1,100 @@
+"""Random environments for the tests of the builder: a transition table dressed as an Environment."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from hypothesis import strategies as st
+
+from pharos.environment import Environment
+
+
+@dataclass(frozen=True, kw_only=True)
+class TableWorld(Environment):
+    """`num_positions` positions; position p goes to moves[p][a] by action a, and ends the episode where ends[p].
+
+    A position is written into the state in several components, of which only the first and the last together tell it; the
+    ones between are wide or narrow, negative or constant, so that states differ in any of their words.
+    """
+
+    num_positions: int = 1
+    seed: int = 0
+    lows: str = "0"  # text: compiled rules see numbers only, and tuples of every length would be compiled anew
+    sizes: str = "1"
+    num_starts: int = 1
+    end_share: float = 0.2
+
+    name = "table_world"
+    actions = ("first", "second", "third")
+    BASE = 4
+
+    @property
+    def low(self) -> np.ndarray:
+        """Lowest value of each component: the first, those between, the last."""
+        return np.array([-3, *map(int, self.lows.split(",")), 5], np.int64)
+
+    @property
+    def size(self) -> np.ndarray:
+        """Number of values of each component."""
+        return np.array([-(-self.num_positions // self.BASE), *map(int, self.sizes.split(",")), self.BASE], np.int64)
+
+    @cached_property
+    def codes(self) -> np.ndarray:
+        """(positions, D) the state of each position."""
+        rng = np.random.default_rng(self.seed)
+        codes = self.low + rng.integers(0, self.size, (self.num_positions, len(self.size)))
+        position = np.arange(self.num_positions)
+        codes[:, 0] = self.low[0] + position // self.BASE
+        codes[:, -1] = self.low[-1] + position % self.BASE
+        return codes
+
+    @cached_property
+    def moves(self) -> np.ndarray:
+        """(positions, A) where each action leads."""
+        rng = np.random.default_rng(self.seed + 1)
+        return rng.integers(0, self.num_positions, (self.num_positions, len(self.actions)))
+
+    @cached_property
+    def ends(self) -> np.ndarray:
+        """(positions,) whether the episode ends there."""
+        rng = np.random.default_rng(self.seed + 2)
+        return rng.random(self.num_positions) < self.end_share
+
+    def variables(self):
+        ranges = [range(int(low), int(low + size)) for low, size in zip(self.low, self.size, strict=True)]
+        return {"high": ranges[0], "middle": ranges[1:-1], "low": ranges[-1]}
+
+    def initial_states(self):
+        positions = np.random.default_rng(self.seed + 3).integers(0, self.num_positions, self.num_starts)
+        return [(tuple(self.codes[p].tolist()), 1 / self.num_starts) for p in positions]
+
+    def transition(self, state, action, out):
+        position = (state[0] - self.low[0]) * self.BASE + state[-1] - self.low[-1]
+        target = self.moves[position, action]
+        for i in range(len(state)):
+            out[i] = self.codes[target, i]
+
+    def is_terminal(self, state):
+        return self.ends[(state[0] - self.low[0]) * self.BASE + state[-1] - self.low[-1]]
+
+    def reward(self, state, action, next_state):
+        return float(state[0] + 10 * action) - 0.5 * next_state[-1]
+
+
+@st.composite
+def table_worlds(draw, max_positions: int = 300) -> TableWorld:
+    """Random transition tables, one to a few words wide."""
+    ranges = st.tuples(
+        st.integers(-(2**40), 2**40),
+        st.sampled_from([1, 1, 2, 3, 7, 256, 2**20, 2**33, 2**62]) | st.integers(1, 2**63 - 1),
+    )
+    middle = draw(st.lists(ranges, min_size=1, max_size=9))
+    middle = [(low, min(size, 2**63 - 1 - max(low, 0))) for low, size in middle]
+    return TableWorld(
+        num_positions=draw(st.integers(1, max_positions)),
+        seed=draw(st.integers(0, 2**32)),
+        lows=",".join(str(low) for low, _ in middle),
+        sizes=",".join(str(size) for _, size in middle),
+        num_starts=draw(st.integers(1, 5)),
+        end_share=draw(st.sampled_from([0.0, 0.2, 1.0])),
+    )
