@@ -3,6 +3,7 @@
 import math
 import numbers
 import operator
+from collections.abc import Callable, Iterable
 from typing import Any
 
 from pharos.environment import Environment
@@ -48,3 +49,18 @@ def store(env: Environment, name: str, value: Any) -> Any:
     """Set a field of a frozen dataclass while it is being made."""
     object.__setattr__(env, name, value)
     return value
+
+
+def integers(env: Environment, name: str, expected: str, allowed: Callable[[int], bool]) -> tuple[int, ...]:
+    """Store parameter `name` of `env`, a number, a sequence or text such as "1,2,3", as a non-empty tuple of ints."""
+    found = getattr(env, name)
+    try:
+        if isinstance(found, str):
+            values = tuple(int(part) for part in found.split(","))
+        else:
+            values = tuple(map(operator.index, found)) if isinstance(found, Iterable) else (operator.index(found),)
+    except (TypeError, ValueError):
+        values = ()
+    if not values or not all(map(allowed, values)):
+        raise ParameterError(f"{type(env).__name__}: {name}={found!r}; expected integers, each {expected}")
+    return store(env, name, values)
