@@ -39,7 +39,7 @@ class GrowingFile:
 
     def append(self, rows: np.ndarray) -> None:
         """Append the bytes of an array; DiskFull where the disk has no room."""
-        data = memoryview(np.ascontiguousarray(rows).reshape(-1).view(np.uint8))
+        data = memoryview(np.ascontiguousarray(rows).reshape(-1).view(np.uint8))  # type: ignore[arg-type]  # NumPy does not declare the buffer protocol before Python 3.12
         self._note(data)
         written = 0
         try:
