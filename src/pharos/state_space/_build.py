@@ -15,7 +15,7 @@ import os
 import sys
 import time
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,8 +24,8 @@ import numpy as np
 
 from pharos import paths
 from pharos.environment import Environment, start_distribution
-from pharos.errors import ParameterError, RuleError, StateSpaceMismatch, StateSpaceTooLarge
-from pharos.state_space._files import GrowingFile, lock
+from pharos.errors import DiskFull, ParameterError, RuleError, StateSpaceMismatch, StateSpaceTooLarge
+from pharos.state_space._files import GrowingFile, lock, write_manifest
 from pharos.state_space._packing import layout_of, pack, unpack
 from pharos.state_space._store import (
     FORMAT_VERSION,
@@ -40,7 +40,6 @@ from pharos.state_space._store import (
     load,
     read_manifest,
     successors_name,
-    write_manifest,
 )
 
 OUR_FILES = (STATES, SUCCESSORS, WIDE_SUCCESSORS, TERMINAL, MANIFEST + ".tmp", "lock")
@@ -183,18 +182,22 @@ class _Builder:
         self.began = self.last_checkpoint = time.perf_counter()
         self.states = _reserved_states(self.layout.num_words)
         self.table = np.empty(0, self.index_dtype)
-        self._open(manifest)
+        self.files: dict[str, GrowingFile] = {}
         self.writes: list[Future] = []
+        self.written: dict[str, Any] | None = None
         try:
-            self._grow_table(self.count)
+            self._open(manifest)
             with ThreadPoolExecutor(self.workers) as pool, ThreadPoolExecutor(1) as self.writer:
+                self._grow_table(self.count)
                 while self.first < self.count:
                     self._expand_chunk(pool)
-                    if time.perf_counter() - self.last_checkpoint > self.checkpoint_seconds:
+                    if time.perf_counter() - self.last_checkpoint >= self.checkpoint_seconds:
                         self._checkpoint(complete=False)
                 self._checkpoint(complete=True)
-        except (StateSpaceTooLarge, KeyboardInterrupt):
-            self._checkpoint(complete=False)
+        except BaseException:  # whatever it is, what is in the files is kept; the same command resumes
+            with contextlib.suppress(DiskFull):
+                wait(self.writes)
+                self._commit(complete=False)
             raise
         finally:
             for file in self.files.values():
@@ -204,33 +207,41 @@ class _Builder:
     def _open(self, manifest: dict[str, Any] | None) -> None:
         """Start afresh, or from the last checkpoint."""
         arrays = manifest["arrays"] if manifest else {}
-        self.successors_name = successors_name(arrays) if manifest else SUCCESSORS
+        self.successors_name = successors_name(arrays)
         if manifest:
             self.index_dtype = np.dtype(arrays[self.successors_name]["dtype"])
         names = (STATES, self.successors_name, TERMINAL)
-        self.files = {name: GrowingFile(self.path / name, arrays.get(name)) for name in names}
+        for name in {STATES, SUCCESSORS, WIDE_SUCCESSORS, TERMINAL} - set(names):
+            (self.path / name).unlink(missing_ok=True)  # left by a process killed while it widened the indices
+        for name in names:
+            self.files[name] = GrowingFile(self.path / name, arrays.get(name))
         if manifest is None:
             self.count = self.level_end = len(self.start_states)
             self.states[: self.count] = pack(self.layout, np.array(self.start_states, np.int64))
             self.files[STATES].append(self.states[: self.count])
-            self._flushed()
-            return
-        self.first, self.count = manifest["num_expanded"], manifest["num_states"]
-        self.level_end, self.depth = manifest["level_end"], manifest["depth"]
-        self.terminals = manifest["num_terminal_states"]
-        stored = np.memmap(self.path / STATES, "<u8", "r", shape=(self.count, self.layout.num_words))
-        self.states[: self.count] = stored
-        self._flushed()
+        else:
+            self.first, self.count = manifest["num_expanded"], manifest["num_states"]
+            self.level_end, self.depth = manifest["level_end"], manifest["depth"]
+            self.terminals = manifest["num_terminal_states"]
+            stored = np.memmap(self.path / STATES, "<u8", "r", shape=(self.count, self.layout.num_words))
+            self.states[: self.count] = stored
+        self.appended = self.count  # states handed over to the files
+        self.written = self._written(self._counts())
 
-    def _flushed(self) -> None:
-        """Everything up to here is in the files: the next checkpoint commits this, and a resumed build goes on from it."""
-        self.flushed = {
+    def _counts(self) -> dict[str, int]:
+        """Where the search stands."""
+        return {
             "num_states": self.count,
             "num_expanded": self.first,
             "num_terminal_states": self.terminals,
             "depth": self.depth,
             "level_end": self.level_end,
         }
+
+    def _written(self, counts: dict[str, int]) -> dict[str, Any]:
+        """What a checkpoint commits: counts and files that belong together."""
+        dtypes = {STATES: "<u8", self.successors_name: self.index_dtype.str, TERMINAL: "|u1"}
+        return {**counts, "arrays": {name: {"dtype": dtypes[name], **self.files[name].entry()} for name in dtypes}}
 
     # Expanding -----------------------------------------------------------------------------------------------------------
 
@@ -253,9 +264,8 @@ class _Builder:
                 self._expand_narrow(successors, terminal, base, last)
             _check_size(self.env, self.count, self.count - self.first, self.max_states)
         rows = self.first - base
-        self._append(self.states[self.flushed["num_states"] : self.count], successors[:rows], terminal[:rows])
         self.terminals += int(terminal[:rows].sum())
-        self._flushed()
+        self._append(self.states[self.appended : self.count], successors[:rows], terminal[:rows])
         self.report(self._progress())
 
     def _expand_narrow(self, successors, terminal, base, last) -> None:
@@ -413,53 +423,64 @@ class _Builder:
     def _widen_indices(self) -> None:
         """From int32 to int64 indices: a new file of successors and a new table; the old file goes once this is committed."""
         self._finish_writes()
-        old, self.index_dtype = self.files.pop(self.successors_name), np.dtype("<i8")
-        old.close()
-        self.successors_name = WIDE_SUCCESSORS
-        self.files[WIDE_SUCCESSORS] = GrowingFile(self.path / WIDE_SUCCESSORS)
-        rows = (
-            np.memmap(old.path, "<i4", "r", shape=(self.first, self.env.num_actions))
-            if self.first
-            else np.empty((0, 1))
-        )
+        old = self.files[self.successors_name]
+        wide = GrowingFile(self.path / WIDE_SUCCESSORS)
         for start in range(0, self.first, CHUNK):
-            self.files[WIDE_SUCCESSORS].append(rows[start : start + CHUNK].astype(self.index_dtype))
-        self._checkpoint(complete=False)
+            shape = (min(CHUNK, self.first - start), self.env.num_actions)
+            rows = np.memmap(old.path, "<i4", "r", offset=4 * start * self.env.num_actions, shape=shape)
+            wide.append(rows.astype("<i8"))
+        self.files[WIDE_SUCCESSORS] = wide
+        self.successors_name, self.index_dtype = WIDE_SUCCESSORS, np.dtype("<i8")
+        self.written = self._written(self._counts())
+        self._commit(complete=False)
+        del self.files[SUCCESSORS]
+        old.close()
         old.path.unlink()
         self._grow_table(self.count)
 
     def _append(self, states: np.ndarray, successors: np.ndarray, terminal: np.ndarray) -> None:
-        """Append in the background, while the next chunk is expanded; at most two chunks wait."""
-        files, name = self.files, self.successors_name
+        """Append in the background, while the next chunk is expanded; at most two chunks wait.
+
+        Counts and checksums are noted by the thread that writes, once a chunk is in all files: whatever interrupts the
+        main thread, and wherever, a checkpoint finds counts and files that belong together.
+        """
+        files, name, counts = self.files, self.successors_name, self._counts()
 
         def write() -> None:
             files[STATES].append(states)
             files[name].append(successors)
             files[TERMINAL].append(np.packbits(terminal, bitorder="little"))
+            self.written = self._written(counts)
 
-        if len(self.writes) > 1:
+        while len(self.writes) > 1:
             self.writes.pop(0).result()
         self.writes.append(self.writer.submit(write))
+        self.appended = self.count
 
     def _finish_writes(self) -> None:
         while self.writes:
             self.writes.pop(0).result()
 
     def _checkpoint(self, *, complete: bool) -> None:
-        """Commit what was appended: data first, then the manifest that speaks of it."""
+        """Commit everything found so far."""
         self._finish_writes()
+        self._commit(complete=complete)
+
+    def _commit(self, *, complete: bool) -> None:
+        """Commit what was written: data first, then the manifest that speaks of it."""
+        if self.written is None:
+            return
+        written = self.written
         for file in self.files.values():
             file.sync()
-        dtypes = {STATES: "<u8", self.successors_name: self.index_dtype.str, TERMINAL: "|u1"}
         manifest = {
             "format": "pharos state space",
             "format_version": FORMAT_VERSION,
             "complete": complete,
             **self.identity,
             "num_actions": self.env.num_actions,
-            **self.flushed,
             "initial": [[i, float(p)] for i, p in enumerate(self.start_probabilities)],
-            "arrays": {name: {"dtype": dtypes[name], **file.entry()} for name, file in self.files.items()},
+            **written,
         }
         write_manifest(self.path, manifest)
         self.last_checkpoint = time.perf_counter()

@@ -1,6 +1,7 @@
 """Files that grow by appending, with a checksum for every block; room on the disk; one builder at a time."""
 
 import contextlib
+import json
 import os
 import shutil
 from pathlib import Path
@@ -9,8 +10,8 @@ from typing import Any
 import numpy as np
 import xxhash
 
-from pharos.errors import DiskFull, StateSpaceCorrupted, StateSpaceLocked
-from pharos.state_space._store import CHECKSUM_BYTES
+from pharos.errors import DiskFull, ParameterError, StateSpaceCorrupted, StateSpaceLocked
+from pharos.state_space._store import CHECKSUM_BYTES, MANIFEST, digest_of
 
 
 class GrowingFile:
@@ -22,7 +23,12 @@ class GrowingFile:
         self.checksums: list[str] = []
         self._partial = xxhash.xxh3_128()
         self._partial_bytes = 0
-        self._file = open(path, "r+b" if committed else "w+b", buffering=0)  # noqa: SIM115
+        self._failure: DiskFull | None = None
+        self._unsynced: DiskFull | None = None
+        try:
+            self._file = open(path, "r+b" if committed else "w+b", buffering=0)  # noqa: SIM115
+        except OSError as error:
+            raise cannot_write(path, error) from error
         if committed:
             self._take_over(committed)
 
@@ -38,15 +44,18 @@ class GrowingFile:
             )
 
     def append(self, rows: np.ndarray) -> None:
-        """Append the bytes of an array; DiskFull where the disk has no room."""
-        data = memoryview(np.ascontiguousarray(rows).reshape(-1).view(np.uint8))  # type: ignore[arg-type]  # NumPy does not declare the buffer protocol before Python 3.12
-        self._note(data)
+        """Append the bytes of an array; DiskFull where the disk has no room, and ever after: a file has no gaps."""
+        if self._failure:
+            raise self._failure
+        data = np.ascontiguousarray(rows).reshape(-1).view(np.uint8).data
         written = 0
         try:
             while written < len(data):
                 written += self._file.write(data[written:])
         except OSError as error:
-            raise disk_full(self.path, error) from error
+            self._failure = cannot_write(self.path, error)
+            raise self._failure from error
+        self._note(data)
 
     def _note(self, data: memoryview) -> None:
         self.bytes += len(data)
@@ -65,18 +74,21 @@ class GrowingFile:
         return {"bytes": self.bytes, "checksums": self.checksums + partial}
 
     def sync(self) -> None:
-        """Wait until everything appended is on the disk."""
+        """Wait until everything appended is on the disk; a second try after a failure would not tell the truth."""
+        if self._unsynced:
+            raise self._unsynced
         try:
             os.fsync(self._file.fileno())
         except OSError as error:
-            raise disk_full(self.path, error) from error
+            self._unsynced = cannot_write(self.path, error)
+            raise self._unsynced from error
 
     def close(self) -> None:
         """Close the file."""
         self._file.close()
 
 
-def disk_full(path: Path, error: OSError) -> DiskFull:
+def cannot_write(path: Path, error: OSError) -> DiskFull:
     """The error for a write that failed."""
     free = shutil.disk_usage(path.parent).free
     return DiskFull(
@@ -91,7 +103,11 @@ def lock(folder: Path):
     import fcntl
 
     path = folder / "lock"
-    with open(path, "a+") as file:
+    try:
+        file = open(path, "a+")  # noqa: SIM115
+    except OSError as error:
+        raise ParameterError(f"{folder}: cannot be written to: {error.strerror}; choose another folder") from error
+    with file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
@@ -101,9 +117,28 @@ def lock(folder: Path):
                 f"{folder}: another process{f' ({holder})' if holder else ''} is building there; wait for it, or use another folder"
             ) from None
         file.truncate(0)
-        file.write(f"process {os.getpid()}")
-        file.flush()
+        with contextlib.suppress(OSError):  # a full disk: the name of the holder is a courtesy
+            os.write(file.fileno(), f"process {os.getpid()}".encode())
         try:
             yield
         finally:
             file.truncate(0)
+
+
+def write_manifest(folder: Path, manifest: dict[str, Any]) -> None:
+    """Replace the manifest in one step: it is the commit point of everything else in the folder."""
+    manifest = {**manifest, "digest": digest_of(json.loads(json.dumps(manifest)))}
+    temporary = folder / (MANIFEST + ".tmp")
+    try:
+        with open(temporary, "w") as file:
+            json.dump(manifest, file, indent=1)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, folder / MANIFEST)
+        directory = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(directory)
+        finally:
+            os.close(directory)
+    except OSError as error:
+        raise cannot_write(temporary, error) from error

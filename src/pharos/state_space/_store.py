@@ -239,22 +239,6 @@ def digest_of(manifest: dict[str, Any]) -> str:
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
-def write_manifest(folder: Path, manifest: dict[str, Any]) -> None:
-    """Replace the manifest in one step: it is the commit point of everything else in the folder."""
-    manifest = {**manifest, "digest": digest_of(json.loads(json.dumps(manifest)))}
-    temporary = folder / (MANIFEST + ".tmp")
-    with open(temporary, "w") as file:
-        json.dump(manifest, file, indent=1)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(temporary, folder / MANIFEST)
-    directory = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(directory)
-    finally:
-        os.close(directory)
-
-
 def check_lengths(folder: Path, manifest: dict[str, Any]) -> None:
     """StateSpaceCorrupted where a file is missing or shorter than what was committed."""
     for name, entry in manifest["arrays"].items():

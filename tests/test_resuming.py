@@ -1,0 +1,332 @@
+"""The files of a state space do not depend on threads, blocks, or on how often the build was killed, stopped or refused."""
+
+import multiprocessing
+import os
+import resource
+import signal
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import pharos
+from pharos.errors import DiskFull, StateSpaceIncomplete, StateSpaceLocked, StateSpaceTooLarge
+from pharos.state_space import _build as building
+from table_worlds import TableWorld
+
+BREAKOUT = pharos.make("breakout", height=7, columns=5)  # 27,692 states; a frontier of hundreds
+NARROW = TableWorld(num_positions=5000, lows="-1000,0,7", sizes=f"{2**40},{2**30},1", num_starts=3, end_share=0.05)
+fork = multiprocessing.get_context("fork")
+
+
+@pytest.fixture
+def small_blocks(monkeypatch):
+    """Blocks so small that a build of 27,692 states goes through every path: narrow, wide, table growing, checkpoints."""
+    monkeypatch.setattr(building, "CHUNK", 512)
+    monkeypatch.setattr(building, "WIDE", 200)
+
+
+def build(env, folder, **options) -> pharos.StateSpace:
+    return pharos.build(env, folder, progress=options.pop("progress", False), **options)
+
+
+def files_of(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
+
+
+def assert_same_files(folder: Path, expected: Path) -> None:
+    found, reference = files_of(folder), files_of(expected)
+    assert found.keys() == reference.keys()
+    for name in reference:
+        assert found[name] == reference[name], name
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory) -> dict[str, Path]:
+    folder = tmp_path_factory.mktemp("undisturbed")
+    for env in (BREAKOUT, NARROW):
+        build(env, folder / env.name, workers=1)
+    return {env.name: folder / env.name for env in (BREAKOUT, NARROW)}
+
+
+@pytest.mark.parametrize("env", (BREAKOUT, NARROW), ids=lambda env: env.name)
+@pytest.mark.parametrize("workers", (1, 2, 3))
+@pytest.mark.parametrize(("chunk", "wide"), ((64, 8), (512, 100), (1 << 16, 1 << 13)))
+def test_files_do_not_depend_on_threads_or_blocks(env, workers, chunk, wide, tmp_path, undisturbed, monkeypatch):
+    monkeypatch.setattr(building, "CHUNK", chunk)
+    monkeypatch.setattr(building, "WIDE", wide)
+    build(env, tmp_path / "space", workers=workers, checkpoint_seconds=0.01)
+    assert_same_files(tmp_path / "space", undisturbed[env.name])
+
+
+def in_a_child(work, *args) -> multiprocessing.Process:
+    """Run `work` in a forked process and return it; forked, so that nothing is imported or compiled again."""
+    process = fork.Process(target=work, args=args)
+    process.start()
+    return process
+
+
+def _build_slowly(env, folder):
+    build(env, folder, checkpoint_seconds=0.0, workers=2, progress=lambda _: time.sleep(0.02))
+
+
+def test_a_build_killed_again_and_again_ends_in_the_same_files(tmp_path, undisturbed, small_blocks):
+    folder = tmp_path / "space"
+    rng = np.random.default_rng(0)
+    for _ in range(8):  # 55 blocks that take 0.02 s each are more than 8 times 0.12 s
+        process = in_a_child(_build_slowly, BREAKOUT, folder)
+        process.join(timeout=rng.uniform(0.03, 0.12))
+        os.kill(process.pid, signal.SIGKILL)
+        process.join()
+        assert process.exitcode == -signal.SIGKILL
+    with pytest.raises(StateSpaceIncomplete):
+        pharos.load(folder)
+    build(BREAKOUT, folder)
+    assert_same_files(folder, undisturbed["breakout"])
+
+
+def _build_and_die_at(call: int, env, folder):
+    """Build, and die at this call of write, fsync or rename: before it, or in the middle of writing."""
+    calls = 0
+
+    def counted(real):
+        def dying(*args):
+            nonlocal calls
+            calls += 1
+            if calls == call:
+                os._exit(9)
+            return real(*args)
+
+        return dying
+
+    append = building.GrowingFile.append
+
+    def append_half(self, rows):
+        nonlocal calls
+        calls += 1
+        if calls == call:
+            append(self, rows[: len(rows) // 2])
+            os._exit(9)
+        append(self, rows)
+
+    os.fsync, os.replace, os.truncate = counted(os.fsync), counted(os.replace), counted(os.truncate)
+    building.GrowingFile.append = append_half
+    build(env, folder, checkpoint_seconds=0.0)
+
+
+def test_a_build_that_dies_at_any_step_of_a_checkpoint_ends_in_the_same_files(tmp_path, undisturbed, monkeypatch):
+    monkeypatch.setattr(building, "CHUNK", 4096)
+    for call in range(1, 30):
+        folder = tmp_path / f"space{call}"
+        process = in_a_child(_build_and_die_at, call, BREAKOUT, folder)
+        process.join()
+        assert process.exitcode == 9
+        build(BREAKOUT, folder)
+        assert_same_files(folder, undisturbed["breakout"])
+
+
+def test_what_was_written_after_the_last_checkpoint_does_not_count(tmp_path, undisturbed, small_blocks):
+    folder = tmp_path / "space"
+    with pytest.raises(StateSpaceTooLarge):
+        build(BREAKOUT, folder, max_states=9000)
+    for name in ("states.bin", "successors.bin", "terminal.bin"):
+        with open(folder / name, "ab") as file:
+            file.write(b"\x07" * 1000)
+    (folder / "manifest.json.tmp").write_text('{"format": "pharos sta')
+    build(BREAKOUT, folder)
+    assert_same_files(folder, undisturbed["breakout"])
+
+
+def test_a_keyboard_interrupt_keeps_what_was_found(tmp_path, undisturbed, small_blocks):
+    folder = tmp_path / "space"
+    found = []
+
+    def interrupt(done):
+        if done.num_states > 3000 * (len(found) + 1):
+            found.append(done.num_expanded)
+            raise KeyboardInterrupt
+
+    for _ in range(4):
+        with pytest.raises(KeyboardInterrupt):
+            build(BREAKOUT, folder, progress=interrupt, checkpoint_seconds=1e9)
+        assert building.read_manifest(folder)["num_expanded"] == found[-1]
+    build(BREAKOUT, folder)
+    assert_same_files(folder, undisturbed["breakout"])
+
+
+class _InterruptAtLine:
+    """Raises KeyboardInterrupt in the main thread at the n-th line that the builder runs in Python."""
+
+    def __init__(self, n: int):
+        self.left = n
+
+    def __call__(self, frame, event, arg):
+        if not frame.f_code.co_filename.startswith(os.path.dirname(building.__file__)):
+            return None
+        if event == "line":
+            self.left -= 1
+            if self.left == 0:
+                raise KeyboardInterrupt
+        return self
+
+    def build(self, env, folder):
+        previous = sys.gettrace()
+        sys.settrace(self)
+        try:
+            build(env, folder, checkpoint_seconds=1e9, workers=2)
+        finally:
+            sys.settrace(previous)
+
+
+@pytest.mark.filterwarnings(
+    "ignore::pytest.PytestUnraisableExceptionWarning"
+)  # a file interrupted between open and with
+def test_an_interrupt_at_any_line_keeps_counts_and_files_together(tmp_path, undisturbed, monkeypatch):
+    monkeypatch.setattr(building, "CHUNK", 4096)
+    counter = _InterruptAtLine(-1)
+    counter.build(BREAKOUT, tmp_path / "counted")
+    num_lines = -1 - counter.left
+    for line in range(1, num_lines, max(1, num_lines // 60)):
+        folder = tmp_path / f"space{line}"
+        with pytest.raises(KeyboardInterrupt):
+            _InterruptAtLine(line).build(BREAKOUT, folder)
+        build(BREAKOUT, folder)
+        assert_same_files(folder, undisturbed["breakout"])
+
+
+def test_raising_max_states_goes_on_where_the_build_stopped(tmp_path, undisturbed, small_blocks):
+    folder = tmp_path / "space"
+    for limit in (1000, 5000, 20000):
+        with pytest.raises(StateSpaceTooLarge, match=rf"passed max_states={limit}, \d+ left to expand"):
+            build(BREAKOUT, folder, max_states=limit)
+    assert building.read_manifest(folder)["num_states"] > 15000
+    space = build(BREAKOUT, folder, max_states=27692)
+    assert_same_files(folder, undisturbed["breakout"])
+    assert space.num_states == 27692
+    with pytest.raises(StateSpaceTooLarge):
+        build(BREAKOUT, folder, max_states=27691)
+
+
+def test_more_memory_goes_on_where_the_build_stopped(tmp_path, monkeypatch):
+    env = pharos.make("breakout", height=8, columns=6)  # 142,899 states: the table grows twice
+    build(env, tmp_path / "undisturbed")
+    monkeypatch.setattr(building, "_available_memory", lambda: 1 << 20)
+    with pytest.raises(StateSpaceTooLarge, match="give more memory"):
+        build(env, tmp_path / "space")
+    monkeypatch.undo()
+    build(env, tmp_path / "space")
+    assert_same_files(tmp_path / "space", tmp_path / "undisturbed")
+
+
+# More than 2^31 states ---------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def widened(tmp_path_factory) -> Path:
+    """A build that passed the limit of 32-bit indices, lowered to 5000 states."""
+    folder = tmp_path_factory.mktemp("widened") / "space"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(building, "CHUNK", 512)
+        patch.setattr(building, "INT32_STATES", 5000)
+        build(BREAKOUT, folder, workers=1)
+    return folder
+
+
+def test_beyond_32_bit_indices_only_the_width_of_the_successors_changes(widened, undisturbed):
+    narrow, wide = pharos.load(undisturbed["breakout"]), pharos.load(widened)
+    assert sorted(files_of(widened)) == ["lock", "manifest.json", "states.bin", "successors64.bin", "terminal.bin"]
+    assert wide.successors.dtype == np.int64
+    assert (wide.successors == narrow.successors).all()
+    assert (wide.packed_states == narrow.packed_states).all()
+    assert (wide.terminal == narrow.terminal).all()
+    assert wide.indices(wide.states()).tolist() == list(range(wide.num_states))
+
+
+@pytest.mark.parametrize("limit", (1000, 4000, 6000, 20000))
+def test_a_build_that_widens_its_indices_resumes_to_the_same_files(limit, widened, tmp_path, small_blocks, monkeypatch):
+    monkeypatch.setattr(building, "INT32_STATES", 5000)
+    folder = tmp_path / "space"
+    with pytest.raises(StateSpaceTooLarge):
+        build(BREAKOUT, folder, max_states=limit)
+    build(BREAKOUT, folder, workers=2)
+    assert_same_files(folder, widened)
+
+
+def test_a_build_that_dies_while_it_widens_its_indices_resumes_to_the_same_files(widened, tmp_path, monkeypatch):
+    monkeypatch.setattr(building, "INT32_STATES", 5000)
+    monkeypatch.setattr(building, "CHUNK", 512)
+    start = tmp_path / "start"
+    with pytest.raises(StateSpaceTooLarge):
+        build(BREAKOUT, start, max_states=3000)
+    for call in range(1, 25):
+        folder = tmp_path / f"space{call}"
+        folder.mkdir()
+        for name, content in files_of(start).items():
+            (folder / name).write_bytes(content)
+        process = in_a_child(_build_and_die_at, call, BREAKOUT, folder)
+        process.join()
+        assert process.exitcode == 9
+        build(BREAKOUT, folder)
+        assert_same_files(folder, widened)
+
+
+# Disks and other processes -----------------------------------------------------------------------------------------------
+
+
+def _build_with_little_disk(limit, env, folder):
+    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)  # so that writing fails instead
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+    try:
+        build(env, folder, checkpoint_seconds=0.0)
+    except DiskFull as error:
+        os._exit(7 if "cannot write" in str(error) else 1)
+    os._exit(0)
+
+
+@pytest.mark.parametrize("limit", (0, 100, 3000, 20_000, 100_000, 200_000))
+def test_a_full_disk_loses_nothing(limit, tmp_path, undisturbed, small_blocks):
+    folder = tmp_path / "space"
+    process = in_a_child(_build_with_little_disk, limit, BREAKOUT, folder)
+    process.join()
+    assert process.exitcode == 7
+    manifest = building.read_manifest(folder)
+    if limit >= 20_000:
+        assert 12 * (manifest["num_expanded"] + 2 * 512) > limit  # all that fitted, but for the blocks under way
+    build(BREAKOUT, folder)
+    assert_same_files(folder, undisturbed["breakout"])
+
+
+def _hold(env, folder, ready, release):
+    def wait(_):
+        ready.set()
+        release.wait()
+
+    build(env, folder, progress=wait)
+
+
+def test_two_builds_do_not_share_a_folder(tmp_path, undisturbed, small_blocks):
+    folder = tmp_path / "space"
+    ready, release = fork.Event(), fork.Event()
+    process = in_a_child(_hold, BREAKOUT, folder, ready, release)
+    ready.wait()
+    try:
+        with pytest.raises(StateSpaceLocked, match=rf"another process \(process {process.pid}\) is building there"):
+            build(BREAKOUT, folder)
+    finally:
+        release.set()
+        process.join()
+    assert process.exitcode == 0
+    assert_same_files(folder, undisturbed["breakout"])
+
+
+def test_a_killed_build_leaves_no_lock(tmp_path, undisturbed, small_blocks):
+    folder = tmp_path / "space"
+    ready, release = fork.Event(), fork.Event()
+    process = in_a_child(_hold, BREAKOUT, folder, ready, release)
+    ready.wait()
+    os.kill(process.pid, signal.SIGKILL)
+    process.join()
+    build(BREAKOUT, folder)
+    assert_same_files(folder, undisturbed["breakout"])
