@@ -1,0 +1,136 @@
+"""The study's statistics against their formulas, and against fits done another way."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from pharos.errors import ParameterError
+from pharos.study import (
+    aggregate_r_squared,
+    fit,
+    fit_models,
+    interquartile_mean,
+    leave_one_class_out_r_squared,
+    paper_regressions,
+    paper_returns,
+    stratified_interval,
+)
+
+
+def study_table(noise: float, seed: int = 0, num_instances: int = 12) -> pd.DataFrame:
+    """regret = 2 + 3 [image] - 1 [lake] + 0.5 log H + 0.25 log gaps - 0.125 log D + noise."""
+    rng = np.random.default_rng(seed)
+    rows = []
+    for environment in ("grid", "lake"):
+        for _ in range(num_instances):
+            horizon, gaps, diameter = np.exp(rng.normal(size=3))
+            for observation in ("image", "vector"):
+                regret = 2 + 3 * (observation == "image") - (environment == "lake")
+                regret += 0.5 * np.log(horizon) + 0.25 * np.log(gaps) - 0.125 * np.log(diameter) + noise * rng.normal()
+                rows.append((environment, observation, horizon, gaps, diameter, regret))
+    names = ["environment", "observation", "effective_horizon", "sum_of_reciprocal_gaps", "diameter", "regret"]
+    return pd.DataFrame(rows, columns=names)
+
+
+def test_a_table_made_by_a_linear_model_gives_its_coefficients_back():
+    single = fit_models(study_table(noise=0.0))[0]
+    assert single.r_squared == pytest.approx(1)
+    estimates = single.coefficients["estimate"]
+    assert estimates["np.log(effective_horizon)"] == pytest.approx(0.5)
+    assert estimates["np.log(sum_of_reciprocal_gaps)"] == pytest.approx(0.25)
+    assert estimates["np.log(diameter)"] == pytest.approx(-0.125)
+    assert estimates["C(observation)[T.vector]"] == pytest.approx(-3)
+    assert estimates["C(environment)[T.lake]"] == pytest.approx(-1)
+
+
+def test_there_is_one_model_in_all_one_a_representation_and_one_a_class():
+    fits = fit_models(study_table(noise=0.5))
+    assert [(f.model, f.subset) for f in fits] == [
+        ("single", "all"),
+        ("representation", "image"),
+        ("representation", "vector"),
+        ("class", "grid"),
+        ("class", "lake"),
+    ]
+
+
+def test_cross_validated_r_squared_is_that_of_leaving_each_row_out_and_fitting_again():
+    table = study_table(noise=1.0, num_instances=5)
+    found = fit(table, "single", "all", ["observation", "environment", "diameter"])
+    design = np.column_stack(
+        [
+            np.ones(len(table)),
+            table["observation"] == "vector",
+            table["environment"] == "lake",
+            np.log(table["diameter"]),
+        ]
+    ).astype(float)
+    regret = table["regret"].to_numpy()
+    press = 0.0
+    for i in range(len(table)):
+        others = np.arange(len(table)) != i
+        coefficients, *_ = np.linalg.lstsq(design[others], regret[others], rcond=None)
+        press += (regret[i] - design[i] @ coefficients) ** 2
+    assert found.cross_validated_r_squared == pytest.approx(1 - press / ((regret - regret.mean()) ** 2).sum())
+
+
+def test_collinear_predictors_are_dropped_and_named():
+    table = study_table(noise=0.5)
+    table["diameter"] = table["effective_horizon"] ** 2
+    assert fit_models(table)[0].dropped == ("diameter",)
+
+
+def test_aggregate_r_squared_of_one_fit_is_its_own():
+    single = fit_models(study_table(noise=0.5))[0]
+    assert aggregate_r_squared([single]) == pytest.approx(single.r_squared)
+
+
+def test_models_fitted_per_class_explain_at_least_as_much_together_as_one_for_all_without_class_effects():
+    table = study_table(noise=1.0)
+    one = fit(table, "single", "all", ["observation", "effective_horizon", "sum_of_reciprocal_gaps", "diameter"])
+    per_class = [f for f in fit_models(table) if f.model == "class"]
+    assert aggregate_r_squared(per_class) >= one.r_squared
+
+
+def test_predicting_an_unseen_class_is_perfect_where_classes_do_not_differ():
+    table = study_table(noise=0.0)
+    table["regret"] += table["environment"] == "lake"
+    assert leave_one_class_out_r_squared(table) == pytest.approx(1)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda t: t.drop(columns="diameter"), "no column 'diameter'"),
+        (lambda t: t.assign(diameter=0.0), "values <= 0"),
+        (lambda t: t.assign(regret=np.nan), "not finite"),
+        (lambda t: t.iloc[:5], "has 5 rows; needs at least"),
+    ],
+)
+def test_unusable_tables_get_a_clear_error(change, message):
+    with pytest.raises(ParameterError, match=message):
+        fit_models(change(study_table(noise=0.5)))
+
+
+def test_interquartile_mean_is_the_mean_of_the_middle_half():
+    assert interquartile_mean(np.arange(8.0)) == np.arange(2, 6).mean()
+
+
+def test_interval_contains_the_estimate_and_shrinks_with_more_runs():
+    rng = np.random.default_rng(1)
+    few = stratified_interval([rng.normal(size=5), rng.normal(size=5)])
+    many = stratified_interval([rng.normal(size=80), rng.normal(size=80)])
+    assert few.lower <= few.value <= few.upper
+    assert many.upper - many.lower < few.upper - few.lower
+
+
+def test_an_interval_of_equal_results_is_a_point():
+    estimate = stratified_interval([np.full(5, 0.25), np.full(3, 0.25)])
+    assert (estimate.value, estimate.lower, estimate.upper) == (0.25, 0.25, 0.25)
+
+
+def test_the_papers_tables_hold_every_printed_block():
+    returns = paper_returns()
+    assert len(returns) == 336
+    assert set(returns["environment"]) == {"simple_grid", "frozen_lake", "freeway", "breakout"}
+    assert list(paper_regressions()["r_squared"])[:5] == ["0.09", "0.3", "0.6", "0.48", "0.96"]
