@@ -34,9 +34,9 @@ class FrozenLake(Environment):
     Ours     the ice is not slippery here: slips come from outside, as random or sticky actions. Gymnasium's slippery
              ice executes the chosen action or one of the two perpendicular ones, 1/3 each, and never the opposite
              one. No `random_actions(p)` expresses that, because it executes each action with at least p / 4: Gymnasium's
-             law is 4/3 of the uniform law minus 1/3 of the opposite action, which would be p = 4/3. Only policies that
-             are uniform in every state (and what depends on them alone, such as the value of the uniform policy) are
-             the same in both, for every p.
+             law is 4/3 of the uniform law minus 1/3 of the opposite action, which would be p = 4/3. The nearest, p = 2/3,
+             differs by 1/6 in the probability of an action. Only under the uniform policy (its states, its value) are
+             the two the same, for every p.
     Source   Gymnasium FrozenLake-v1 (Brockman et al., 2016); the pharos paper, section 3.3.
 
     Attributes:

@@ -1,0 +1,77 @@
+"""Short games, drawn frame by frame in golden/*.txt, to be read in review. `python tests/golden_games.py` writes them anew.
+
+Look at every frame that changed: a golden game is right because someone has read it.
+"""
+
+from pathlib import Path
+
+import pharos
+from pharos.environments import text_drawing
+
+FOLDER = Path(__file__).with_name("golden")
+
+# name of the file -> (environment, parameters, actions by their first letters)
+GAMES = {
+    "simple_grid_penalty_then_goal": (
+        "simple_grid",
+        {"height": 3, "penalties": "0,2:-0.5", "rewards": "1,1:0.1"},
+        "lurrurdldr",
+    ),
+    "simple_grid_decoy": ("simple_grid/4x4-decoy", {}, "rrddd"),
+    "frozen_lake_goal": ("frozen_lake/4x4", {}, "ddrrdr"),
+    "frozen_lake_hole": ("frozen_lake/4x4", {}, "urrdl"),
+    "freeway_across_after_a_hit": (
+        "freeway",
+        {"num_cars": 4, "lane_length": 5, "car_speeds": "1,2,3,2"},
+        "usuuuduuusuuuuuuu",
+    ),
+    "freeway_slow_player_pushed_back": (
+        "freeway",
+        {"num_cars": 3, "lane_length": 5, "player_speed": 2, "car_speeds": 2, "restart_on_hit": False},
+        "uuuuuuuuuuuuuuuuuu",
+    ),
+    "breakout_bounces_and_loses": (
+        "breakout",
+        {"height": 8, "columns": 5, "brick_rows": 2},
+        "srrlllssssrrrrsslllssrrss" + "s" * 20,
+    ),
+    "breakout_wall_comes_back": (
+        "breakout",
+        {"height": 5, "columns": 3, "brick_rows": 1, "extra_paddle_width": 1},
+        "s" * 24,
+    ),
+    "breakout_cleared_without_respawn": (
+        "breakout",
+        {"height": 5, "columns": 3, "brick_rows": 1, "extra_paddle_width": 1, "respawn": False},
+        "s" * 24,
+    ),
+}
+
+
+def file_of(game: str) -> Path:
+    return FOLDER / f"{game}.txt"
+
+
+def played(game: str) -> str:
+    """The game as text: environment, then state, drawing, action and reward of every step up to its end."""
+    name, parameters, letters = GAMES[game]
+    env = pharos.make(name, **parameters)
+    lines = [str(env), ""]
+    state, total = tuple(env.initial_state()), 0.0
+    lines += [f"state {state}", text_drawing(env, state), ""]
+    for step, letter in enumerate(letters, start=1):
+        action = next(i for i, action in enumerate(env.actions) if action.startswith(letter))
+        following = env.next_state(state, action)
+        reward = env.reward(state, action, following)
+        state, total = following, total + reward
+        lines += [f"{step}. {env.actions[action]}, reward {reward:g}", f"state {state}", text_drawing(env, state), ""]
+        if env.is_terminal(state):
+            lines.append("the end")
+            break
+    return "\n".join([*lines, f"return {total:g}", ""])
+
+
+if __name__ == "__main__":
+    FOLDER.mkdir(exist_ok=True)
+    for game in GAMES:
+        file_of(game).write_text(played(game))

@@ -1,0 +1,120 @@
+"""The built-in environments once more, written to be obviously right: objects, sets, sentences; no state vectors inside.
+
+Each twin is a game one plays: `state()` is the vector that the environment should be in, `step(action)` plays a step and
+returns (reward, terminated). Nothing is shared with `pharos.environments` but the names of the actions.
+"""
+
+OFFSETS = {"up": (-1, 0), "down": (1, 0), "left": (0, -1), "right": (0, 1)}
+
+
+class Walk:
+    """On a grid of letters: '.' open, and a value and an end for special cells."""
+
+    def __init__(self, height, width, start, values, ends):
+        self.cells = {(row, column) for row in range(height) for column in range(width)}
+        self.at, self.values, self.ends = start, values, ends
+
+    def state(self):
+        return self.at
+
+    def step(self, action):
+        target = tuple(a + b for a, b in zip(self.at, OFFSETS[action], strict=True))
+        if target not in self.cells:
+            return 0.0, False
+        self.at = target
+        return self.values.get(target, 0.0), target in self.ends
+
+
+def simple_grid(height, width, goal, rewards, penalties):
+    goal = goal or (height - 1, width - 1)
+    values = {goal: 1.0, **dict(rewards), **dict(penalties)}
+    return Walk(height, width, (0, 0), values, {goal, *dict(rewards)})
+
+
+def frozen_lake(rows):
+    tiles = {(r, c): tile for r, row in enumerate(rows) for c, tile in enumerate(row)}
+    where = {letter: {cell for cell, tile in tiles.items() if tile == letter} for letter in "SFHG"}
+    return Walk(len(rows), len(rows[0]), *where["S"], dict.fromkeys(where["G"], 1.0), where["G"] | where["H"])
+
+
+class Freeway:
+    """Cars as closed formulas of the time: after t steps a car of period p has moved t // p cells."""
+
+    def __init__(self, num_cars, lane_length, player_speed, car_speeds, directions, restart_on_hit, hit_penalty):
+        self.num_cars, self.lane_length, self.player_speed = num_cars, lane_length, player_speed
+        self.periods = [car_speeds[i % len(car_speeds)] for i in range(num_cars)]
+        self.directions = [directions[i % len(directions)] for i in range(num_cars)]
+        self.restart_on_hit, self.hit_penalty = restart_on_hit, hit_penalty
+        self.time = 0
+        self.lanes_crossed = 0  # 0: at the start; num_cars + 1: across
+
+    def car_columns(self):
+        return [
+            direction * (self.time // period) % self.lane_length
+            for period, direction in zip(self.periods, self.directions, strict=True)
+        ]
+
+    def state(self):
+        timers = [self.time % period for period in self.periods]
+        row = self.num_cars + 1 - self.lanes_crossed
+        return (row, self.time % self.player_speed, *self.car_columns(), *timers)
+
+    def step(self, action):
+        if self.time % self.player_speed == 0:
+            self.lanes_crossed += {"up": 1, "stay": 0, "down": -1}[action]
+            self.lanes_crossed = max(self.lanes_crossed, 0)
+        self.time += 1
+        if self.lanes_crossed == self.num_cars + 1:
+            return 1.0, True
+        if self.lanes_crossed > 0 and self.car_columns()[-self.lanes_crossed] == self.lane_length // 2:
+            self.lanes_crossed = 0 if self.restart_on_hit else self.lanes_crossed - 1
+            return -self.hit_penalty, False
+        return 0.0, False
+
+
+class Breakout:
+    """The ball has a cell and a velocity; bricks and paddle are sets of cells."""
+
+    def __init__(self, height, columns, brick_rows, extra_paddle_width, respawn):
+        self.height, self.columns, self.respawn = height, columns, respawn
+        self.wall = {(row, column) for row in range(1, brick_rows + 1) for column in range(columns)}
+        self.bricks = set(self.wall)
+        self.width = 2 * extra_paddle_width + 1
+        self.left_end = (columns - self.width) // 2
+        self.ball, self.velocity = (brick_rows + 1, (columns - 1) // 2), (1, 1)
+
+    def paddle(self):
+        return {(self.height - 1, self.left_end + i) for i in range(self.width)}
+
+    def state(self):
+        bricks = [int(cell in self.bricks) for cell in sorted(self.wall)]
+        return (*self.ball, int(self.velocity[1] > 0), int(self.velocity[0] > 0), self.left_end, *bricks)
+
+    def step(self, action):
+        shifted = self.left_end + {"left": -1, "stay": 0, "right": 1}[action]
+        if shifted >= 0 and shifted + self.width <= self.columns:
+            self.left_end = shifted
+        (row, column), (down, right) = self.ball, self.velocity
+        if not 0 <= column + right < self.columns:
+            right = -right
+        if row + down < 0:
+            down = -down
+        ahead = (row + down, column + right)
+        reward = 0.0
+        if ahead in self.bricks:
+            self.bricks.remove(ahead)
+            reward, down = 1.0, -down
+        elif ahead in self.paddle():
+            self.ball, down = (row, ahead[1]), -1
+            self._come_back()
+        elif ahead[0] == self.height - 1 and (self.height - 1, column) in self.paddle():
+            down, right = -1, -right
+            self._come_back()
+        else:
+            self.ball = ahead
+        self.velocity = (down, right)
+        return reward, self.ball[0] == self.height - 1 or not (self.bricks or self.respawn)
+
+    def _come_back(self):
+        if self.respawn and not self.bricks:
+            self.bricks = set(self.wall)
