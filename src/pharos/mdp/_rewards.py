@@ -1,0 +1,99 @@
+"""Rewards of all transitions, held exactly and compactly.
+
+Games pay few different rewards: up to 256 distinct values are kept as one byte for each transition and a palette of
+float64, an eighth of the memory of (S, A) float64 and an eighth of what a sweep has to stream; more are kept as float64.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from pharos.errors import ParameterError
+
+_BLOCK = 1 << 16
+
+
+@dataclass(frozen=True)
+class Rewards:
+    """Rewards of S states and A actions: `palette[table[s, a]]`, or `table[s, a]` where the palette is empty.
+
+    Attributes:
+        table: (S, A) uint8 codes, or (S, A) float64 rewards.
+        palette: (at most 256,) float64, or empty.
+    """
+
+    table: np.ndarray
+    palette: np.ndarray
+
+    @staticmethod
+    def from_array(rewards: np.ndarray) -> "Rewards":
+        """From (S, A) numbers; ParameterError where one is NaN or infinite."""
+        rewards = np.asarray(rewards, np.float64)
+        collector = RewardsCollector((rewards.shape[0], rewards.shape[1]))
+        for start in range(0, len(rewards), _BLOCK):
+            block = rewards[start : start + _BLOCK]
+            if not np.isfinite(block).all():
+                s, a = map(int, np.argwhere(~np.isfinite(block))[0])
+                raise ParameterError(
+                    f"the reward of state {start + s}, action {a} is {block[s, a]}; expected a finite number"
+                )
+            collector.add(start, block)
+        return collector.finish()
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(S, A)."""
+        return self.table.shape  # type: ignore[return-value]
+
+    @property
+    def array(self) -> np.ndarray:
+        """(S, A) float64; made anew by each call where the rewards are kept as a palette."""
+        return self.rows(slice(None))
+
+    def rows(self, states: slice | np.ndarray) -> np.ndarray:
+        """(N, A) float64, the rewards of some states."""
+        return self.palette[self.table[states]] if len(self.palette) else self.table[states]
+
+    @property
+    def lowest(self) -> float:
+        """The smallest reward."""
+        return float(self.palette.min() if len(self.palette) else self.table.min())
+
+    @property
+    def highest(self) -> float:
+        """The largest reward."""
+        return float(self.palette.max() if len(self.palette) else self.table.max())
+
+
+@dataclass
+class RewardsCollector:
+    """Takes rewards block by block and ends with a palette where there are few distinct ones."""
+
+    shape: tuple[int, int]
+    _codes: np.ndarray | None = None
+    _values: np.ndarray | None = None
+    _palette: np.ndarray = field(default_factory=lambda: np.empty(0))
+
+    def add(self, start: int, block: np.ndarray) -> None:
+        """Rewards of the states from `start` on."""
+        if self._values is None:
+            if self._codes is None:
+                self._codes = np.zeros(self.shape, np.uint8)
+            known = self._palette
+            new = np.setdiff1d(block, known)  # sorted and unique
+            if len(known) + len(new) <= 256:
+                self._palette = palette = np.concatenate([known, new])
+                order = np.argsort(palette)
+                codes = order[np.searchsorted(palette[order], block)]
+                self._codes[start : start + len(block)] = codes
+                return
+            self._values = known[self._codes] if len(known) else np.zeros(self.shape)
+            self._codes = None
+        self._values[start : start + len(block)] = block
+
+    def finish(self) -> Rewards:
+        """The rewards of all states."""
+        if self._values is not None:
+            return Rewards(self._values, np.empty(0))
+        codes = self._codes if self._codes is not None else np.zeros(self.shape, np.uint8)
+        return Rewards(codes, self._palette if len(self._palette) else np.zeros(1))
