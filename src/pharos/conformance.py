@@ -55,14 +55,14 @@ def check_environment(env: Environment, *, max_states: int = 1000, seed: int = 0
     """Test an environment against the contract that the docstring of `Environment` states.
 
     Declarations: name, actions, version, time limit, layers, parameters that survive JSON, variables, start states. Rules, on
-    the states nearest to the start and on random walks: values are integers in their declared ranges, the same question has
+    the states nearest to the start and on states far from it: values are integers in their declared ranges, the same question has
     the same answer, nothing but `out` and the planes is written to, rewards are finite, drawings stay inside their planes,
     and compiled rules agree with interpreted ones. Where all states fit into `max_states`, the state space is built, too, and
     compared: the same states in the same order, terminal states absorbing.
 
     Args:
-        max_states: how many states are looked at; half of them by breadth-first search, half by random walks.
-        seed: of the random walks.
+        max_states: how many states are looked at; half of them nearest to the start, half by depth-first search.
+        seed: of the order of the depth-first search.
     Returns:
         a Conformance; print it.
     Raises:
@@ -74,10 +74,12 @@ def check_environment(env: Environment, *, max_states: int = 1000, seed: int = 0
     if max_states < 1:
         raise ParameterError(f"check_environment: max_states={max_states}; expected at least 1")
     notes: list[str] = []
-    _check_declarations(env, notes)
+    _check_declarations(env)
     _check_layers(env, notes)
     check = _InterpretedCheck(env)
     states, complete = _some_states(env, check, max_states, seed)
+    if not check.transitions:
+        notes.append("every start state is terminal: episodes end before they begin")
     _check_again(check, states, seed)
     if env.layers:
         for state in states:
@@ -99,7 +101,7 @@ def check_environment(env: Environment, *, max_states: int = 1000, seed: int = 0
 # Declarations ------------------------------------------------------------------------------------------------------------
 
 
-def _check_declarations(env: Environment, notes: list[str]) -> None:
+def _check_declarations(env: Environment) -> None:
     cls = type(env)
     whose = cls.__name__
     parameters = getattr(cls, "__dataclass_params__", None)
@@ -141,8 +143,6 @@ def _check_declarations(env: Environment, notes: list[str]) -> None:
         raise RuleError(f"{env}: variables() declares {len(env.variables())} names; expected the same at every call")
     if starts[0] != again_starts[0] or (starts[1] != again_starts[1]).any():
         raise RuleError(f"{env}: initial_states() differs from call to call; expected always the same")
-    if len(starts[0]) == sum(bool(env.is_terminal(state)) for state in starts[0]):
-        notes.append("every start state is terminal: episodes end before they begin")
 
 
 def _check_layers(env: Environment, notes: list[str]) -> None:
@@ -359,7 +359,7 @@ SAME = "expected the same answer to the same question"
 
 def _some_states(env: Environment, check: _InterpretedCheck, max_states: int, seed: int) -> tuple[list[State], bool]:
     """Expanded states, in the order of discovery, and whether these are all that can be reached."""
-    starts, probabilities = start_distribution(env)
+    starts, _ = start_distribution(env)
     found = dict.fromkeys(starts)
     queue = deque(starts)
     while queue and len(found) <= max_states:
@@ -371,16 +371,18 @@ def _some_states(env: Environment, check: _InterpretedCheck, max_states: int, se
         return list(found), True
     chosen = dict.fromkeys(list(check.terminal)[: (max_states + 1) // 2])
     rng = random.Random(seed)
-    state = None
-    for _ in range(50 * max_states):
-        if len(chosen) >= max_states:
-            break
-        if state is None or rng.random() < 1 / 500:
-            state = rng.choices(starts, probabilities.tolist())[0]
+    stack, visited = list(starts), set()
+    while stack and len(chosen) < max_states:
+        state = stack.pop()
+        if state in visited:
+            continue
+        visited.add(state)
+        chosen[state] = None
         if state not in check.terminal:
             check.expand(state)
-        chosen[state] = None
-        state = None if check.terminal[state] else check.transitions[state, rng.randrange(env.num_actions)]
+        if not check.terminal[state]:
+            successors = [check.transitions[state, action] for action in range(env.num_actions)]
+            stack += rng.sample(successors, len(successors))
     return list(chosen), False
 
 

@@ -1,0 +1,440 @@
+"""check_environment accepts what keeps the contract, and names the rule and the state of every kind of breach."""
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+import pharos
+from pharos.environment import Environment, Layer
+from pharos.errors import ParameterError, RuleError
+
+COUNTER = itertools.count()
+RED, BLUE = (200, 60, 60), (60, 60, 200)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Corridor(Environment):
+    """Walk right to the end of a corridor. A good class, which the tests below break in one place each."""
+
+    length: int = 5
+
+    name = "corridor"
+    actions = ("left", "right")
+    layers = {"end": Layer("E", RED), "agent": Layer(("A", "a"), (BLUE, RED))}
+
+    def variables(self):
+        return {"position": range(self.length)}
+
+    def initial_state(self):
+        return (0,)
+
+    def transition(self, state, action, out):
+        if action == 1:
+            out[0] = state[0] + 1
+        elif state[0] > 0:
+            out[0] = state[0] - 1
+
+    def is_terminal(self, state):
+        return state[0] == self.length - 1
+
+    def reward(self, state, action, next_state):
+        return 1.0 if next_state[0] == self.length - 1 else 0.0
+
+    def grid(self):
+        return 1, self.length
+
+    def draw(self, state, planes):
+        planes[0, 0, self.length - 1] = 1
+        planes[1, 0, state[0]] = 1 + state[0] % 2
+
+
+def corridor(**attributes):
+    """A Corridor in which `attributes` (rules, declarations) are replaced."""
+    return dataclass(frozen=True, kw_only=True)(type("Broken", (Corridor,), attributes))()
+
+
+def message(env, **options):
+    with pytest.raises(RuleError) as error:
+        pharos.check_environment(env, **options)
+    assert "\n" not in str(error.value)
+    return str(error.value)
+
+
+def test_a_good_class_passes_and_the_report_says_what_was_checked():
+    report = pharos.check_environment(Corridor())
+    assert (report.num_states, report.num_transitions, report.complete, report.compiled) == (5, 8, True, True)
+    assert report.notes == ()
+    assert str(report) == "Corridor(length=5) keeps the contract in all 5 states"
+
+
+def test_a_large_space_is_sampled_near_the_start_and_far_from_it():
+    report = pharos.check_environment(Corridor(length=10_000), max_states=60)
+    assert (report.num_states, report.complete) == (60, False)
+    assert len(report.notes) == 1
+    assert "position is declared as 0 to 9999; in the 60 states looked at it takes 0 to" in report.notes[0]
+    assert "a sample of its 60 states" in str(report)
+
+
+def test_the_sample_does_not_depend_on_anything_but_the_seed():
+    env = pharos.make("breakout")
+    assert pharos.check_environment(env, max_states=50) == pharos.check_environment(env, max_states=50)
+
+
+def test_max_states_must_be_positive():
+    with pytest.raises(ParameterError, match="max_states=0"):
+        pharos.check_environment(Corridor(), max_states=0)
+
+
+# Declarations ------------------------------------------------------------------------------------------------------------
+
+
+def test_what_is_no_environment_is_refused():
+    assert "expected an instance of a subclass" in message(Corridor)
+
+
+def test_a_class_must_be_a_frozen_dataclass():
+    class Plain(Corridor):
+        pass
+
+    @dataclass(kw_only=True, eq=False)
+    class Thawed(Environment):
+        pass
+
+    for env in (Plain(), Thawed()):
+        assert "is no frozen dataclass" in message(env)
+
+
+@pytest.mark.parametrize(
+    ("attribute", "value", "words"),
+    [
+        ("name", "", "Broken.name is ''"),
+        ("name", None, "Broken.name is None"),
+        ("actions", (), "Broken.actions is ()"),
+        ("actions", ["left", "right"], "expected a tuple"),
+        ("actions", ("left", "left"), "different names"),
+        ("version", 0, "version is 0"),
+        ("max_episode_steps", 0.5, "max_episode_steps is 0.5"),
+        ("variables", lambda self: {}, "variables() declares nothing"),
+        ("variables", lambda self: {"position": range(0)}, "non-empty range"),
+        ("variables", lambda self: {"position": range(0, 10, 2)}, "step 1"),
+        ("initial_state", lambda self: (5,), "position = 5; expected 0 to 4"),
+        ("initial_state", lambda self: (0, 0), "has 2 components; expected 1"),
+        ("initial_states", lambda self: [((0,), 0.5)], "sum to 0.5"),
+        ("initial_states", lambda self: [((0,), -1.0), ((1,), 2.0)], "probability -1.0"),
+        ("initial_states", lambda self: [((next(COUNTER),), 1.0)], "differs from call to call"),
+        ("layers", {"agent": "A"}, "expected a Layer"),
+        ("layers", ["agent"], "expected a dict"),
+        ("layers", {"agent": Layer("AB", RED)}, "expected one character"),
+        ("layers", {"agent": Layer("A", (0, 0, 256))}, "0 to 255"),
+        ("layers", {"agent": Layer("A", (0, 0))}, "(red, green, blue)"),
+        ("layers", {"agent": Layer("A", (RED, BLUE))}, "1 glyphs and 2 colors"),
+        ("layers", {"agent": Layer("A", RED, ("##", "#"))}, "rows of equal length"),
+        ("layers", {"agent": Layer("A", RED, ("#x",))}, "letters . # 1-9"),
+        ("layers", {"agent": Layer(("A", "B", "C"), RED, (("#",), ("#",)))}, "2 sprites for 3 values"),
+        ("grid", lambda self: (0, 3), "two integers, at least 1"),
+        ("grid", Environment.grid, "grid() does not give"),
+    ],
+)
+def test_a_wrong_declaration_is_named(attribute, value, words):
+    assert words in message(corridor(**{attribute: value}))
+
+
+def test_parameters_must_survive_json():
+    @dataclass(frozen=True, kw_only=True)
+    class WithSet(Corridor):
+        holes: frozenset = frozenset({1})
+
+    @dataclass(frozen=True, kw_only=True)
+    class WithTuple(Corridor):
+        holes: tuple = (1, 2)
+
+    assert "do not survive JSON" in message(WithSet())
+    assert "expected an equal instance" in message(WithTuple())
+
+
+# Transition --------------------------------------------------------------------------------------------------------------
+
+
+def test_a_transition_that_leaves_the_range_is_named_with_state_and_action():
+    def transition(self, state, action, out):
+        out[0] = state[0] + 2 * action
+
+    words = message(corridor(transition=transition, is_terminal=lambda self, state: False))
+    assert "transition of action 'right' in state (position=4) writes position = 6; declared: 0 to 4" in words
+
+
+def test_a_transition_must_not_write_to_its_state():
+    def transition(self, state, action, out):
+        state[0] = 1
+
+    assert "transition of action 'left' in state (position=0) writes to its state" in message(
+        corridor(transition=transition)
+    )
+
+
+@pytest.mark.parametrize("value", [0.5, 1.0, "1", None])
+def test_a_transition_must_write_integers(value):
+    def transition(self, state, action, out):
+        out[0] = self.value
+
+    assert f"writes position = {value!r}; expected an integer" in message(corridor(transition=transition, value=value))
+
+
+def test_a_transition_must_write_instead_of_returning():
+    def transition(self, state, action, out):
+        return (1,)
+
+    assert "returns (1,); expected nothing" in message(corridor(transition=transition))
+
+
+def test_a_transition_must_keep_the_length_of_the_state():
+    def transition(self, state, action, out):
+        out.append(1)
+
+    assert "leaves 2 components" in message(corridor(transition=transition))
+
+
+def test_a_transition_must_not_draw_lots():
+    rng = itertools.cycle([0, 1])
+
+    def transition(self, state, action, out):
+        out[0] = next(rng)
+
+    assert "leads to (position=0), then to (position=1); expected the same answer" in message(
+        corridor(transition=transition)
+    )
+
+
+def test_a_transition_must_not_remember():
+    asked = []
+
+    def transition(self, state, action, out):
+        asked.append(state[0])
+        out[0] = 1 if len(asked) <= 8 else 0
+
+    words = message(corridor(transition=transition))
+    assert "now leads to (position=0), before to (position=1)" in words
+
+
+def test_an_exception_in_a_rule_is_reported_with_its_state():
+    def transition(self, state, action, out):
+        out[action] = 0
+
+    assert "transition of action 'right' in state (position=0) raises IndexError" in message(
+        corridor(transition=transition)
+    )
+
+
+# is_terminal, reward -----------------------------------------------------------------------------------------------------
+
+
+def test_is_terminal_must_say_true_or_false():
+    assert "is_terminal in state (position=0) says 0; expected True or False" in message(
+        corridor(is_terminal=lambda self, state: state[0])
+    )
+
+
+def test_is_terminal_must_not_draw_lots():
+    rng = itertools.cycle([False, True])
+    assert "is_terminal in state (position=0) says False, then True" in message(
+        corridor(is_terminal=lambda self, state: next(rng))
+    )
+
+
+def test_is_terminal_must_not_remember():
+    asked = []
+
+    def is_terminal(self, state):
+        asked.append(state)
+        return len(asked) > 4 and state[0] == 0
+
+    env = corridor(is_terminal=is_terminal, transition=lambda self, state, action, out: out.__setitem__(0, action))
+    assert "is_terminal in state (position=0) now says True" in message(env)
+
+
+def test_is_terminal_must_not_write_to_its_state():
+    def is_terminal(self, state):
+        state[0] = 0
+
+    assert "is_terminal in state (position=0) writes to its state" in message(corridor(is_terminal=is_terminal))
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), None, "1", 1j])
+def test_a_reward_must_be_a_finite_number(value):
+    env = corridor(reward=lambda self, state, action, next_state: self.value, value=value)
+    assert f"reward of action 'left' in state (position=0) is {value!r}; expected a finite number" in message(env)
+
+
+def test_a_reward_must_not_draw_lots():
+    rng = itertools.count()
+    env = corridor(reward=lambda self, state, action, next_state: float(next(rng)))
+    assert "is 0.0, then 1.0; expected the same answer" in message(env)
+
+
+def test_a_reward_must_not_remember():
+    asked = []
+
+    def reward(self, state, action, next_state):
+        asked.append(state)
+        return float(len(asked) > 18)
+
+    assert "reward of action" in (words := message(corridor(reward=reward)))
+    assert "is now 1.0, before 0.0" in words
+
+
+@pytest.mark.parametrize("which", [0, 1])
+def test_a_reward_must_not_write_to_the_states(which):
+    def reward(self, state, action, next_state):
+        (state, next_state)[self.which][0] = 0
+
+    assert "reward of action 'left' in state (position=0) writes to its state" in message(
+        corridor(reward=reward, which=which)
+    )
+
+
+# draw --------------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("index", [(0, 0, 5), (0, 0, -1), (2, 0, 0), (0, 1, 0)])
+def test_a_drawing_must_stay_in_its_planes(index):
+    def draw(self, state, planes):
+        planes[self.index] = 1
+
+    assert f"lies outside of planes {(2, 1, 5)}" in message(corridor(draw=draw, index=index))
+
+
+def test_a_drawing_may_only_use_values_that_have_a_glyph():
+    def draw(self, state, planes):
+        planes[0, 0, 0] = 2
+
+    assert "draw in state (position=0) writes 2 on layer 'end'; expected 0 to 1" in message(corridor(draw=draw))
+
+
+def test_a_drawing_must_not_draw_lots():
+    rng = itertools.cycle([0, 1])
+
+    def draw(self, state, planes):
+        planes[0, 0, next(rng)] = 1
+
+    assert "draws two different things" in message(corridor(draw=draw))
+
+
+def test_a_drawing_must_not_write_to_its_state():
+    def draw(self, state, planes):
+        state[0] = 0
+
+    assert "draw in state (position=0) writes to its state" in message(corridor(draw=draw))
+
+
+def test_slices_of_the_planes_may_be_drawn():
+    def draw(self, state, planes):
+        planes[0, :, 1:3] = 1
+
+    assert pharos.check_environment(corridor(draw=draw)).notes == ()
+
+
+# Interpreted and compiled ------------------------------------------------------------------------------------------------
+
+LAST_BIT = 63  # integers of compiled code have 64 bits, those of Python any number
+
+
+def test_rules_must_say_the_same_compiled():
+    def transition(self, state, action, out):
+        out[0] = (state[0] + action) % self.length if (1 + state[0]) << LAST_BIT > 0 else 0
+
+    def is_terminal(self, state):
+        return state[0] == self.length - 1 or (1 + state[0]) << LAST_BIT < 0
+
+    def reward(self, state, action, next_state):
+        return float((1 + state[0]) << LAST_BIT)
+
+    def draw(self, state, planes):
+        planes[0, 0, 0] = 1 if (1 + state[0]) << LAST_BIT > 0 else 0
+
+    assert "transition of action 'right' in state (position=0) leads to (position=0) compiled, to (position=1)" in (
+        message(corridor(transition=transition))
+    )
+    assert "is_terminal in state (position=0) says True compiled, False interpreted" in message(
+        corridor(is_terminal=is_terminal)
+    )
+    assert f"is {-(2.0**63)} compiled, {2.0**63} interpreted" in message(corridor(reward=reward))
+    assert "draw in state (position=0) writes 0 at [0, 0, 0] compiled, 1 interpreted" in message(corridor(draw=draw))
+
+
+def test_a_value_in_between_must_stay_in_the_range_too():
+    def transition(self, state, action, out):
+        out[0] = state[0] + 2 * action - 1
+        if out[0] < 0:
+            out[0] = 0
+
+    assert "compiled, it reads or writes position outside its declared range" in message(
+        corridor(transition=transition)
+    )
+
+
+def test_rules_that_numba_cannot_compile_are_noted():
+    def transition(self, state, action, out):
+        out[0] = max(0, state[0] + eval("2 * action - 1"))
+
+    report = pharos.check_environment(corridor(transition=transition))
+    assert not report.compiled
+    assert report.complete
+    assert len(report.notes) == 1
+    assert "Numba cannot compile its rules, so they run interpreted" in report.notes[0]
+
+
+def test_a_drawing_that_numba_cannot_compile_is_noted():
+    def draw(self, state, planes):
+        planes[0, 0, eval("0")] = 1
+
+    report = pharos.check_environment(corridor(draw=draw))
+    assert report.compiled
+    assert len(report.notes) == 1
+    assert "Numba cannot compile draw" in report.notes[0]
+
+
+def test_the_built_state_space_is_compared(monkeypatch):
+    import pharos.state_space
+
+    build = pharos.state_space.build
+    monkeypatch.setattr(pharos.state_space, "build", lambda env, *a, **k: build(Corridor(length=4), *a, **k))
+    assert "the builder finds 4 states, calling the rules one by one 5" in message(Corridor())
+
+    def other(self, state, action, out):
+        out[0] = min(state[0] + 1, self.length - 1)
+
+    monkeypatch.setattr(pharos.state_space, "build", lambda env, *a, **k: build(corridor(transition=other), *a, **k))
+    assert "built, it leads to states [1, 1]; expected [0, 1]" in message(Corridor())
+
+
+# Notes -------------------------------------------------------------------------------------------------------------------
+
+
+def test_declared_values_that_no_state_takes_are_noted():
+    env = corridor(variables=lambda self: {"position": range(-1, 8)})
+    assert pharos.check_environment(env).notes == (
+        "position is declared as -1 to 7; in any reachable state it takes 0 to 4",
+    )
+
+
+def test_an_environment_that_cannot_be_drawn_is_noted():
+    report = pharos.check_environment(corridor(layers={}, grid=Environment.grid, draw=Environment.draw))
+    assert report.notes == ("it declares no layers: it cannot be drawn, and has no image observations",)
+
+
+def test_episodes_that_end_before_they_begin_are_noted():
+    report = pharos.check_environment(corridor(initial_state=lambda self: (4,)))
+    assert report.notes[0].startswith("every start state is terminal")
+    assert report.num_states == 1
+
+
+def test_truths_and_numbers_of_numpy_are_accepted():
+    def reward(self, state, action, next_state):
+        return np.float64(next_state[0])
+
+    def is_terminal(self, state):
+        return np.bool_(state[0] == self.length - 1)
+
+    assert pharos.check_environment(corridor(reward=reward, is_terminal=is_terminal)).complete
