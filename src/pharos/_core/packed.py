@@ -11,7 +11,7 @@ goes on with a harmless value; the caller looks at `fault` and stops.
 import operator
 
 from llvmlite import ir
-from numba import int64, njit, types, uint64
+from numba import int64, types
 from numba.core import cgutils
 from numba.extending import intrinsic, models, overload, register_model
 
@@ -180,37 +180,3 @@ def _length(typing_context, view):
 def _len(view):
     if isinstance(view, PackedView):
         return lambda view: _length(view)
-
-
-@intrinsic
-def prefetch(typing_context, array, index):
-    """Ask the processor to fetch array[index] (first axis, C order), which will be read soon."""
-
-    def codegen(context, builder, sig, args):
-        array = context.make_array(sig.args[0])(context, builder, args[0])
-        stride = cgutils.unpack_tuple(builder, array.strides)[0]
-        base = builder.bitcast(array.data, ir.IntType(8).as_pointer())
-        address = builder.gep(base, [builder.mul(args[1], stride)])
-        i32 = ir.IntType(32)
-        function_type = ir.FunctionType(ir.VoidType(), [address.type, i32, i32, i32])
-        function = cgutils.get_or_insert_function(builder.module, function_type, "llvm.prefetch.p0")
-        builder.call(function, [address, i32(0), i32(3), i32(1)])
-        return context.get_dummy_value()
-
-    return types.void(array, types.int64), codegen
-
-
-@njit(forceinline=True)
-def mixed(h):
-    """A 64-bit mixer (two rounds of multiply and xor-shift): every input bit reaches the high bits of the result."""
-    h ^= h >> uint64(32)
-    h *= uint64(0x9E3779B97F4A7C15)
-    h ^= h >> uint64(29)
-    h *= uint64(0xD6E8FEB86659FD93)
-    return h
-
-
-@njit(forceinline=True)
-def slot_of(h, capacity):
-    """The slot of hash h in a table of `capacity` slots, a multiple of 65536 below 2^40: floor(h / 2^64 * capacity)."""
-    return int64(((h >> uint64(24)) * (uint64(capacity) >> uint64(16))) >> uint64(24))

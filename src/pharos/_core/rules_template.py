@@ -3,18 +3,18 @@
 """The kernels that call an environment's rules; a template, run once per class of environments by `compiling.py`.
 
 Names that the template gets from there: the rules `transition`, `is_terminal`, `reward`, `draw`; `Parameters`, a namedtuple,
-what the rules see as `self`; the constants NUM_WORDS, NUM_ACTIONS and WORDS, a tuple of NUM_WORDS zeros; CACHE, whether compiled code is kept on disk.
+what the rules see as `self`; the constants NUM_WORDS, NUM_ACTIONS and WORDS, a tuple of NUM_WORDS zeros; CACHE, whether
+compiled code is kept on disk.
 `layout` stands for five (D,) tables (word, shift, mask, low, size): where component i of a state sits.
 """
 
 import numpy as np
 from numba import int64, njit
 
-from pharos._core.packed import fault, get_word, mixed, packed_view, prefetch, set_word, slot_of
+from pharos._core.hash_table import mixed, prefetch, slot_of
+from pharos._core.packed import fault, get_word, packed_view, set_word
 
-BATCH = (
-    16  # states expanded before their successors are looked up: enough look-ups under way to hide the memory's latency
-)
+BATCH = 16  # states expanded before their successors are looked up: enough look-ups to hide the memory's latency
 FIRST, COUNT, LEVEL_END, DEPTH, FAULT, FAULT_ACTION = range(6)  # fields of `progress`
 
 
@@ -177,23 +177,3 @@ def rewards_of(parameters, layout, states, successors, terminal, start, stop, ou
             finite = finite and np.isfinite(value)
             out[s - start, a] = value
     return finite
-
-
-@njit(cache=CACHE, nogil=True)
-def compile_check(parameters):
-    """Does nothing, but compiles only where the rules that the builder and the rewards need do."""
-    self = Parameters(*parameters)
-    layout = (
-        np.zeros(1, np.uint64),
-        np.zeros(1, np.uint64),
-        np.zeros(1, np.uint64),
-        np.zeros(1, np.int64),
-        np.zeros(1, np.int64),
-    )
-    state = packed_view(WORDS, *layout)
-    out = packed_view(WORDS, *layout)
-    if len(layout) == 0:
-        transition(self, state, 0, out)
-        reward(self, state, 0, out)
-        return is_terminal(self, state)
-    return False

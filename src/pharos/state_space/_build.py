@@ -167,7 +167,7 @@ class _Builder:
         self.max_states, self.memory, self.report = max_states, memory, report
         self.checkpoint_seconds = checkpoint_seconds
         self.layout = layout_of(env.components)
-        self.rules: Any = compiled_rules(env, self.layout.num_words)
+        self.rules: Any = compiled_rules(env, self.layout.num_words, ["explore"])
         self.workers = usable_workers(workers)
         self.start_states, self.start_probabilities = start_distribution(env)
         self.first = 0  # states expanded

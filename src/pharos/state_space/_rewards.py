@@ -59,7 +59,7 @@ def _blocks(space: "StateSpace", env: Environment, workers: int | None):
     from pharos._core.compiling import compiled_rules, usable_workers
 
     starts = range(0, space.num_states, _ROWS)
-    rules = compiled_rules(env, space.layout.num_words)
+    rules = compiled_rules(env, space.layout.num_words, ["rewards_of"])
     states, successors, terminal = space.packed_states, space.successors, space.terminal
 
     def compiled(start: int) -> np.ndarray:
