@@ -14,8 +14,9 @@ from hypothesis import strategies as st
 import golden_games
 import naive_environments as naive
 import pharos
+from pharos import environments
 from pharos.environment import Environment
-from pharos.environments import classes, named_instances, register, text_drawing
+from pharos.environments import named_instances, register, text_drawing
 from pharos.errors import ParameterError, UnknownName
 
 GRIDS = ("simple_grid", "frozen_lake")
@@ -432,22 +433,53 @@ def test_a_misspelled_name_gets_a_suggestion():
         pharos.make("breakout", colums=3)
 
 
-def test_a_registered_class_is_made_by_name_and_built_in_names_are_kept():
+def test_a_registered_class_is_made_by_name_and_built_in_names_are_kept(monkeypatch):
     class Registered(type(pharos.make("simple_grid"))):
         name = "my_grid"
 
-    try:
-        assert register(Registered) is Registered
-        assert type(pharos.make("my_grid", height=3)) is Registered
-        assert pharos.list_environments()[: len(ALL)] != ALL
-    finally:
-        from pharos import environments
-
-        environments._REGISTERED.pop("my_grid")
+    monkeypatch.setattr(environments, "_REGISTERED", {})
+    assert register(Registered) is Registered
+    assert type(pharos.make("my_grid", height=3)) is Registered
+    assert "my_grid" in pharos.list_environments()
     for wrong in (int, Environment, type(pharos.make("breakout"))):
         with pytest.raises(ParameterError, match="register"):
             register(wrong)
-    assert "my_grid" not in classes()
+
+
+MINE = """
+from dataclasses import dataclass
+from pharos.environments import SimpleGrid
+
+@dataclass(frozen=True, kw_only=True)
+class Mine(SimpleGrid):
+    name = "mine"
+"""
+
+
+@pytest.mark.parametrize("written", ["my_rules:Mine", "my_rules.py:Mine", "{folder}/my_rules.py:Mine"])
+def test_a_class_of_ones_own_file_is_made_by_its_path(tmp_path, monkeypatch, written):
+    (tmp_path / "my_rules.py").write_text(MINE)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(environments, "_REGISTERED", {})
+    path = list(sys.path)
+    env = pharos.make(written.format(folder=tmp_path), height=3)
+    assert (env.name, env.height) == ("mine", 3)
+    assert pharos.make("mine", height=3) == env
+    assert sys.path == path
+    sys.modules.pop("my_rules", None)
+
+
+@pytest.mark.parametrize("path", ["no_such_module:Mine", "no_such.py:Mine", "my_rules.py:Yours", "json:loads", ":Mine"])
+def test_a_path_that_leads_to_no_class_is_refused(tmp_path, monkeypatch, path):
+    (tmp_path / "my_rules.py").write_text(MINE)
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ParameterError) as error:
+        pharos.make(path)
+    assert "\n" not in str(error.value)
+
+
+def test_built_in_classes_have_a_path_too():
+    assert pharos.make("pharos.environments:Breakout") == pharos.make("breakout")
 
 
 def test_listing_environments_loads_nothing_heavy():

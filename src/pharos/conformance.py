@@ -46,8 +46,8 @@ class Conformance:
     notes: tuple[str, ...]
 
     def __str__(self) -> str:
-        kind = "all" if self.complete else "a sample of its"
-        first = f"{self.environment} keeps the contract in {kind} {self.num_states} states"
+        which = f"all {self.num_states}" if self.complete else f"a sample of {self.num_states}"
+        first = f"{self.environment} keeps the contract in {which} states"
         return "\n".join([first, *(f"  note: {note}" for note in self.notes)])
 
 

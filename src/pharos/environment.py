@@ -218,18 +218,21 @@ def make(name: str, **parameters: Any) -> Environment:
     """Return the environment called `name`, with `parameters` for its class.
 
     Args:
-        name: a class (`"breakout"`) or a named instance of the paper (`"breakout/12x10x1"`, see `list_environments`).
+        name: a class (`"breakout"`), a named instance of the paper (`"breakout/12x10x1"`, see `list_environments`), or where
+            your own class is (`"my_module:MyClass"`, `"folder/my_file.py:MyClass"`), which registers it.
         parameters: of the class; those of a named instance may be overridden.
     Raises:
         UnknownName: no such environment or parameter; the nearest name is suggested.
-        ParameterError: a parameter is out of range.
+        ParameterError: a parameter is out of range, or there is no such module or class.
     """
-    from pharos.environments import classes, named_instances
+    from pharos.environments import classes, imported, named_instances
 
     defaults: Mapping[str, Any] = {}
     class_name = name
     if name in named_instances():
         class_name, defaults = named_instances()[name]
+    if ":" in class_name:
+        class_name = imported(class_name).name
     if class_name not in classes():
         raise UnknownName("environment", name, [*classes(), *named_instances()])
     cls = classes()[class_name]

@@ -3,7 +3,13 @@
 This is the only list of environments. A user's own class joins it with `register`.
 """
 
+import importlib
+import importlib.util
+import os
+import sys
 from collections.abc import Mapping
+from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from pharos.environment import Environment
@@ -20,6 +26,7 @@ __all__ = [
     "FrozenLake",
     "SimpleGrid",
     "classes",
+    "imported",
     "named_instances",
     "register",
     "text_drawing",
@@ -61,6 +68,43 @@ def named_instances() -> dict[str, tuple[str, Mapping[str, Any]]]:
 
 _COURTS = ((12, 10), (12, 8), (16, 8), (20, 8), (24, 8))  # of the paper's table
 _DRAWN = ((14, 8, 1), (14, 10, 3), (20, 10, 1), (20, 10, 3), (24, 10, 3))  # in its appendix B
+
+
+def imported(path: str) -> type[Environment]:
+    """Import a user's class from "module:Class" or "file.py:Class", register it and return it.
+
+    Modules are also looked for in the current directory. A file is read again at every call.
+
+    Raises:
+        ParameterError: no such module, file or class; or one that `register` refuses.
+    """
+    where, _, class_name = path.rpartition(":")
+    try:
+        cls = getattr(_module_of_file(Path(where)) if where.endswith(".py") else _module_called(where), class_name)
+    except Exception as error:
+        reason = " ".join(str(error).split())
+        raise ParameterError(
+            f"{path!r}: {type(error).__name__}: {reason}; expected 'module:Class' or 'file.py:Class'"
+        ) from error
+    return cls if cls in _BUILT_IN.values() else register(cls)
+
+
+def _module_called(name: str) -> ModuleType:
+    sys.path.insert(0, os.getcwd())
+    try:
+        return importlib.import_module(name)
+    finally:
+        sys.path.remove(os.getcwd())
+
+
+def _module_of_file(file: Path) -> ModuleType:
+    name = f"pharos_user_{file.stem}"
+    spec = importlib.util.spec_from_file_location(name, file)
+    if spec is None or spec.loader is None:
+        raise ImportError(f"cannot read {file}")
+    module = sys.modules[name] = importlib.util.module_from_spec(spec)  # dataclasses look their module up there
+    spec.loader.exec_module(module)
+    return module
 
 
 def register(cls: type[Environment]) -> type[Environment]:
