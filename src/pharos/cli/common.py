@@ -1,0 +1,289 @@
+"""What the verbs share: parameters, TARGET, sizes, and the two ways of answering, JSON and tables."""
+
+import ast
+import dataclasses
+import importlib
+import json
+import math
+import os
+import re
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from pharos.errors import ParameterError, UnknownName
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from pharos.environment import Environment
+    from pharos.state_space import StateSpace
+
+Json = Annotated[bool, typer.Option("--json", help="One JSON object on standard output, nothing else.")]
+TargetArgument = Annotated[
+    str, typer.Argument(metavar="TARGET", help="Environment, module:Class, built folder or imported file.")
+]
+Parameters = Annotated[
+    list[str] | None,
+    typer.Argument(metavar="[NAME=VALUE]...", help="Parameters of the environment.", show_default=False),
+]
+Memory = Annotated[
+    str | None, typer.Option("--memory", metavar="SIZE", help="Memory to use at most, such as 2GiB or 500MB.")
+]
+Workers = Annotated[int | None, typer.Option("--workers", min=1, help="Threads; all processors when not given.")]
+MaxStates = Annotated[
+    int | None, typer.Option("--max-states", min=1, help="Stop with an error beyond this many states.")
+]
+
+# Parameters -------------------------------------------------------------------------------------------------------------
+
+
+def parse_parameters(words: Iterable[str] | None) -> dict[str, Any]:
+    """`["height=12", "speeds=1,2"]` -> `{"height": 12, "speeds": (1, 2)}`; ParameterError where one is not name=value."""
+    parameters: dict[str, Any] = {}
+    for word in words or ():
+        name, sign, text = word.partition("=")
+        if not sign or not name.isidentifier():
+            raise ParameterError(f"found {word!r}; expected a parameter name=value, such as height=12")
+        if name in parameters:
+            raise ParameterError(f"parameter {name!r} is given twice; give it once")
+        parameters[name] = parse_value(text)
+    return parameters
+
+
+def parse_value(text: str) -> Any:
+    """A value as Python or JSON writes it: 1, 0.5, true, null, [[1,1],-1], (1,2), 1,2,3; lists become tuples; else text."""
+    words = {"true": True, "false": False, "null": None, "none": None}
+    if text.lower() in words:
+        return words[text.lower()]
+    for read in (json.loads, ast.literal_eval):
+        try:
+            return _tuples(read(text))
+        except (ValueError, SyntaxError, MemoryError, RecursionError):
+            continue
+    return text
+
+
+def _tuples(value: Any) -> Any:
+    return tuple(_tuples(item) for item in value) if isinstance(value, list | tuple) else value
+
+
+_UNITS = {"": 1, "K": 10**3, "M": 10**6, "G": 10**9, "T": 10**12, "KI": 2**10, "MI": 2**20, "GI": 2**30, "TI": 2**40}
+
+
+def parse_size(text: str | None, option: str = "--memory") -> int | None:
+    """`2GiB` -> 2147483648, `500MB` -> 500000000, `4096` -> 4096; ParameterError where it is no size."""
+    if text is None:
+        return None
+    match = re.fullmatch(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*([KMGT]I?)?B?\s*", text.upper())
+    if match is None:
+        raise ParameterError(f"{option} {text!r}; expected a size such as 2GiB, 500MB or 4096 (bytes)")
+    return int(float(match[1]) * _UNITS[match[2] or ""])
+
+
+# TARGET -----------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Target:
+    """What a command works on: an environment, or a folder or file that holds something already made.
+
+    Attributes:
+        text: as it was typed.
+        environment: for a name or module:Class.
+        path: for a folder or file.
+    """
+
+    text: str
+    environment: "Environment | None" = None
+    path: Path | None = None
+
+    def space(
+        self,
+        *,
+        memory: int | None = None,
+        workers: int | None = None,
+        max_states: int | None = None,
+        out: Path | None = None,
+    ) -> "StateSpace":
+        """The state space: built (or taken from the cache) for an environment, loaded from a folder."""
+        from pharos.state_space import build, load
+
+        if self.environment is not None:
+            return build(self.environment, out, memory=memory, workers=workers, max_states=max_states)
+        assert self.path is not None
+        if self.path.is_file():
+            raise ParameterError(f"{self.path}: is an imported file, which has no environment to build")
+        space = load(self.path)
+        if max_states is not None and space.num_states > max_states:
+            raise ParameterError(f"{self.path}: has {space.num_states} states; expected at most {max_states}")
+        return space
+
+
+def parse_target(text: str, words: Iterable[str] | None = None) -> Target:
+    """The target that a command names.
+
+    Raises:
+        UnknownName: no such environment, class or parameter. ParameterError: no such folder or file, a parameter is wrong.
+    """
+    parameters = parse_parameters(words)
+    from pharos.environment import list_environments, make
+
+    if text in list_environments():
+        return Target(text, environment=make(text, **parameters))
+    path = Path(text).expanduser()
+    if path.exists():
+        if parameters:
+            raise ParameterError(
+                f"{text}: is a {'folder' if path.is_dir() else 'file'}, which has its parameters already; "
+                f"leave out {', '.join(f'{name}=...' for name in parameters)}"
+            )
+        return Target(text, path=path)
+    if ":" in text and os.sep not in text:
+        return Target(text, environment=_own_class(text, parameters))
+    if path.suffix or text.startswith((".", "~", os.sep)):
+        raise ParameterError(f"{text}: no such folder or file")
+    return Target(text, environment=make(text, **parameters))
+
+
+def parse_environment(text: str, words: Iterable[str] | None = None) -> "Environment":
+    """Like `parse_target`, for commands that need an environment: a folder stands for the environment it was built from."""
+    target = parse_target(text, words)
+    if target.environment is not None:
+        return target.environment
+    environment = target.space().environment
+    if environment is None:
+        raise ParameterError(f"{text}: pharos does not know the class of this environment; name it as module:Class")
+    return environment
+
+
+def _own_class(text: str, parameters: Mapping[str, Any]) -> "Environment":
+    """`module:Class` -> an instance; modules of the current folder are found first."""
+    from pharos.environment import Environment
+
+    module_name, _, class_name = text.partition(":")
+    if "" not in sys.path and os.getcwd() not in sys.path:
+        sys.path.insert(0, os.getcwd())
+    try:
+        module = importlib.import_module(module_name)
+    except ModuleNotFoundError as error:
+        raise ParameterError(f"{text}: {error}; expected module:Class, found from the current folder") from error
+    except Exception as error:
+        raise ParameterError(f"{text}: importing {module_name} fails: {type(error).__name__}: {error}") from error
+    found = {
+        name: value
+        for name, value in vars(module).items()
+        if isinstance(value, type) and issubclass(value, Environment) and value is not Environment
+    }
+    if class_name not in found:
+        raise UnknownName(f"environment class of module {module_name}", class_name, found)
+    cls = found[class_name]
+    known = {field.name for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
+    for name in parameters:
+        if name not in known:
+            raise UnknownName(f"parameter of {class_name}", name, known)
+    try:
+        return cls(**parameters)
+    except TypeError as error:
+        raise ParameterError(f"{text}: {error}") from error
+
+
+# Answers ----------------------------------------------------------------------------------------------------------------
+
+
+def print_json(answer: Mapping[str, Any]) -> None:
+    """One JSON object on standard output; what JSON cannot say (infinity, not a number) is null."""
+    print(json.dumps(_plain(answer), allow_nan=False))
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple | set | frozenset):
+        return [_plain(item) for item in value]
+    if hasattr(value, "tolist"):  # numbers and arrays of NumPy
+        return _plain(value.tolist())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if value is None or isinstance(value, bool | int | str):
+        return value
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return _plain(dataclasses.asdict(value))
+    if hasattr(value, "to_dict"):
+        return _plain(value.to_dict())
+    return str(value)
+
+
+def console(*, stderr: bool = False) -> "Console":
+    """A Rich console; wide where nobody looks, so that a pipe gets whole lines."""
+    from rich.console import Console
+
+    stream = sys.stderr if stderr else sys.stdout
+    width = None if stream.isatty() or "COLUMNS" in os.environ else 160
+    return Console(stderr=stderr, width=width, highlight=False)
+
+
+def print_facts(title: str, facts: Sequence[tuple[str, object]]) -> None:
+    """A table of two columns: what, and how much."""
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table(show_header=False, box=None, pad_edge=False)
+    table.add_column(style="cyan", no_wrap=True)
+    table.add_column(overflow="fold")
+    for name, value in facts:
+        table.add_row(name, escape(str(value)))
+    to = console()
+    to.print(f"[bold]{escape(title)}[/bold]", soft_wrap=True)
+    to.print(table)
+
+
+def size_text(count: float) -> str:
+    """Bytes for people: 1.5 GiB."""
+    for unit in ("B", "KiB", "MiB", "GiB"):
+        if count < 1024:
+            return f"{count:.0f} {unit}" if unit == "B" else f"{count:.1f} {unit}"
+        count /= 1024
+    return f"{count:.1f} TiB"
+
+
+def describe(environment: "Environment") -> str:
+    """An environment in one line: `breakout height=12 columns=8`, as the command line writes it."""
+    words = (f"{name}={_written(value)}" for name, value in environment.parameters.items())
+    return " ".join((environment.name, *words))
+
+
+def _written(value: Any) -> str:
+    return json.dumps(value, separators=(",", ":")) if isinstance(value, tuple | list) else str(value)
+
+
+def peak_memory_bytes() -> int:
+    """The most memory that this process has held so far."""
+    import resource
+
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024
+
+
+def bytes_of(folder: Path) -> int:
+    """Bytes of the files in a folder and below."""
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+
+
+def complain(message: object) -> None:
+    """One line on standard error."""
+    print(f"pharos: {' '.join(str(message).split())}", file=sys.stderr)
+
+
+def check_format(path: Path, suffixes: Sequence[str], option: str = "--out") -> str:
+    """The suffix of `path`, lower case; ParameterError unless it is among `suffixes` and the folder above exists."""
+    suffix = path.suffix.lower()
+    if suffix not in suffixes:
+        raise ParameterError(f"{option} {path}; expected a file name that ends in {' or '.join(suffixes)}")
+    if not path.absolute().parent.is_dir():
+        raise ParameterError(f"{option} {path}: there is no folder {path.absolute().parent}; make it first")
+    return suffix

@@ -1,0 +1,328 @@
+"""The command line: what it answers, in JSON and for people, and how it fails."""
+
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+from typer.testing import CliRunner
+
+from pharos.cli import app
+from pharos.cli.common import parse_parameters, parse_size, parse_value
+from pharos.errors import ParameterError
+
+BUILD_KEYS = set(
+    [
+        "environment",
+        "parameters",
+        "num_states",
+        "num_actions",
+        "num_terminal_states",
+        "depth",
+        "seconds",
+        "states_per_second",
+        "peak_memory_bytes",
+        "bytes_on_disk",
+        "folder",
+    ]
+)
+
+
+@pytest.fixture(scope="session")
+def cache(tmp_path_factory):
+    """One cache for all tests here, so that rules are compiled once."""
+    return tmp_path_factory.mktemp("cache")
+
+
+@pytest.fixture
+def pharos(cache, monkeypatch):
+    """Run the command line in this process."""
+    monkeypatch.setenv("PHAROS_CACHE_DIR", str(cache))
+
+    def run(*words):
+        return CliRunner().invoke(app, [str(word) for word in words])
+
+    return run
+
+
+@pytest.fixture
+def answer(pharos):
+    """Run a command with --json and return the object it prints, which is all it prints."""
+
+    def run(*words):
+        result = pharos(*words, "--json")
+        assert (result.exit_code, result.stderr) == (0, ""), result.output
+        assert result.stdout.count("\n") == 1
+        return json.loads(result.stdout)
+
+    return run
+
+
+@pytest.fixture
+def failure(pharos):
+    """Run a command that fails and return its exit code and the one line that it says."""
+
+    def run(*words):
+        result = pharos(*words)
+        assert result.stdout == ""
+        assert result.stderr.count("\n") == 1
+        assert result.stderr.startswith("pharos: ")
+        return result.exit_code, result.stderr
+
+    return run
+
+
+def process(*words, cache=None, **options):
+    """Run the command line as a process of its own."""
+    environment = {**os.environ, **({"PHAROS_CACHE_DIR": str(cache)} if cache else {})}
+    command = [sys.executable, "-c", "from pharos.cli import main; main()", *map(str, words)]
+    return subprocess.run(command, capture_output=True, text=True, env=environment, timeout=300, **options)
+
+
+# Parameters --------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("12", 12),
+        ("-3", -3),
+        ("0.25", 0.25),
+        ("1e-3", 0.001),
+        ("true", True),
+        ("False", False),
+        ("none", None),
+        ("null", None),
+        ("1,2,3", (1, 2, 3)),
+        ("(3,3)", (3, 3)),
+        ("[[[1,1],-1]]", (((1, 1), -1),)),
+        ("SFFF/FHFG", "SFFF/FHFG"),
+        ("2,2:0.1; 0,3:0.5", "2,2:0.1; 0,3:0.5"),
+        ('"12"', "12"),
+        ("", ""),
+    ],
+)
+def test_values_are_read_as_python_or_json_writes_them(text, value):
+    read = parse_value(text)
+    assert read == value
+    assert type(read) is type(value)
+
+
+def test_parameters_are_names_and_values():
+    assert parse_parameters(["height=12", "map=S=G"]) == {"height": 12, "map": "S=G"}
+
+
+@pytest.mark.parametrize("words", [["height"], ["=3"], ["a b=3"], ["height=3", "height=4"]])
+def test_what_is_no_parameter_is_refused(words):
+    with pytest.raises(ParameterError):
+        parse_parameters(words)
+
+
+@pytest.mark.parametrize(
+    ("text", "size"),
+    [("2GiB", 2**31), ("500MB", 5 * 10**8), ("1.5g", 15 * 10**8), ("64 KiB", 65536), ("4096", 4096), ("1TiB", 2**40)],
+)
+def test_sizes_are_read_with_their_units(text, size):
+    assert parse_size(text) == size
+
+
+@pytest.mark.parametrize("text", ["", "GiB", "2XB", "-1GB", "1..5G", "2GiBs"])
+def test_what_is_no_size_is_refused(text):
+    with pytest.raises(ParameterError, match="expected a size"):
+        parse_size(text)
+
+
+# list, build, cache -------------------------------------------------------------------------------------------------------
+
+
+def test_list_names_every_environment_with_its_parameters(answer, pharos):
+    found = {each["name"]: each for each in answer("list")["environments"]}
+    assert set(found) >= {"simple_grid", "frozen_lake", "freeway", "breakout"}
+    assert found["breakout"]["parameters"]["height"] == 12
+    assert found["breakout"]["instances"]["breakout/12x10x1"]["columns"] == 10
+    shown = pharos("list").stdout
+    assert "breakout" in shown and "brick_rows=2" in shown and "24x10x3" in shown
+
+
+def test_build_answers_with_the_keys_of_its_contract(answer, tmp_path):
+    built = answer(
+        "build", "simple_grid", "height=3", "width=5", "--out", tmp_path / "grid", "--memory", "1GiB", "--workers", 1
+    )
+    assert set(built) >= BUILD_KEYS
+    assert (built["num_states"], built["num_actions"], built["num_terminal_states"], built["depth"]) == (15, 4, 1, 6)
+    assert built["parameters"]["width"] == 5
+    assert built["folder"] == str(tmp_path / "grid")
+    assert built["bytes_on_disk"] == sum(file.stat().st_size for file in (tmp_path / "grid").iterdir())
+
+
+def test_a_built_folder_is_a_target(answer, tmp_path):
+    built = answer("build", "simple_grid", "penalties=[[[1,1],-1]]", "--out", tmp_path / "grid")
+    again = answer("build", tmp_path / "grid", "--out", tmp_path / "copy")
+    assert again["parameters"] == built["parameters"]
+    assert again["parameters"]["penalties"] == [[[1, 1], -1.0]]
+
+
+def test_a_users_own_class_is_a_target(answer, tmp_path, monkeypatch):
+    (tmp_path / "corridor_of_mine.py").write_text(
+        "from dataclasses import dataclass\n"
+        "from pharos import Environment\n"
+        "@dataclass(frozen=True, kw_only=True)\n"
+        "class Corridor(Environment):\n"
+        "    length: int = 5\n"
+        "    name = 'corridor'\n"
+        "    actions = ('left', 'right')\n"
+        "    def variables(self):\n"
+        "        return {'cell': range(self.length)}\n"
+        "    def initial_state(self):\n"
+        "        return (0,)\n"
+        "    def transition(self, state, action, out):\n"
+        "        out[0] = min(max(state[0] + 2 * action - 1, 0), self.length - 1)\n"
+        "    def is_terminal(self, state):\n"
+        "        return state[0] == self.length - 1\n"
+        "    def reward(self, state, action, next_state):\n"
+        "        return 1.0 if next_state[0] == self.length - 1 else 0.0\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    built = answer("build", "corridor_of_mine:Corridor", "length=9")
+    assert (built["num_states"], built["depth"]) == (9, 8)
+
+
+def test_the_cache_is_listed_and_cleared(tmp_path, monkeypatch):
+    monkeypatch.setenv("PHAROS_CACHE_DIR", str(tmp_path))
+    run = CliRunner()
+    assert json.loads(run.invoke(app, ["cache", "list", "--json"]).stdout)["spaces"] == []
+    for words in (["simple_grid"], ["simple_grid", "height=5"]):
+        assert run.invoke(app, ["build", *words]).exit_code == 0
+    (tmp_path / "compiled").mkdir(exist_ok=True)
+    (tmp_path / "compiled" / "rules.py").write_text("pass")
+    listed = json.loads(run.invoke(app, ["cache", "list", "--json"]).stdout)
+    assert sorted(space["num_states"] for space in listed["spaces"]) == [16, 20]
+    assert listed["total_bytes"] == sum(file.stat().st_size for file in tmp_path.rglob("*") if file.is_file())
+    cleared = json.loads(run.invoke(app, ["cache", "clear", "simple_grid", "--json"]).stdout)
+    assert len(cleared["removed"]) == 2
+    assert list((tmp_path / "spaces").iterdir()) == []
+    assert (tmp_path / "compiled").is_dir()
+    assert run.invoke(app, ["cache", "clear"]).exit_code == 0
+    assert not (tmp_path / "compiled").exists()
+
+
+# render ------------------------------------------------------------------------------------------------------------------
+
+
+def test_render_writes_pictures_and_episodes(answer, tmp_path):
+    from PIL import Image
+
+    state = answer(
+        "render",
+        "breakout",
+        "height=8",
+        "--state",
+        "5,1,0,1,3,1,1,1,1,1,1,1,1,0,1,1,1,1,1,1,1",
+        "--out",
+        tmp_path / "a.png",
+    )
+    assert state["state"][:5] == [5, 1, 0, 1, 3]
+    with Image.open(tmp_path / "a.png") as picture:
+        assert picture.format == "PNG" and min(picture.size) > 200
+    played = answer("render", "freeway/16x7-speed1", "--out", tmp_path / "a.gif", "--steps", 12, "--policy", "uniform")
+    assert played["steps"] == 12
+    with Image.open(tmp_path / "a.gif") as episode:
+        assert episode.format == "GIF" and episode.n_frames > 2
+    assert answer("render", "frozen_lake", "--out", tmp_path / "a.txt")["bytes"] == 20
+
+
+def test_render_draws_in_the_terminal(pharos):
+    shown = pharos("render", "frozen_lake").stdout
+    assert [line.split() for line in shown.splitlines()] == [list("A..."), list(".O.O"), list("...O"), list("O..G")]
+
+
+# Failures ----------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["build", "brekout"], "did you mean 'breakout'?"),
+        (["build", "breakout", "hight=3"], "did you mean 'height'?"),
+        (["build", "breakout", "height"], "expected a parameter name=value"),
+        (["build", "breakout", "height=two"], "expected an integer of at least"),
+        (["build", "breakout", "--memory", "much"], "expected a size"),
+        (["build", "breakout", "--workers", "0"], "--workers"),
+        (["build", "no_such_module_at_all:World"], "No module named"),
+        (["build", "pharos.environments:Breakuot"], "did you mean 'Breakout'?"),
+        (["build", "./nowhere"], "no such folder or file"),
+        (["build"], "Missing argument"),
+        (["bild", "breakout"], "No such command 'bild'"),
+        (["build", "breakout", "--fast"], "No such option"),
+        (["render", "breakout", "--observation", "humane"], "did you mean 'human'?"),
+        (["render", "breakout", "--out", "a.jpg"], "expected a file name that ends in"),
+        (["render", "breakout", "--out", "nowhere/a.png"], "there is no folder"),
+        (["render", "breakout", "--state", "1,2"], "expected 21"),
+        (["cache", "clear", "nothing_like_it"], "unknown environment in the cache"),
+    ],
+)
+def test_bad_usage_is_one_line_and_exit_code_2(failure, words, said):
+    code, line = failure(*words)
+    assert code == 2
+    assert said in line
+
+
+def test_what_fails_is_one_line_and_exit_code_1(failure, tmp_path):
+    code, line = failure("build", "simple_grid", "--max-states", 3, "--out", tmp_path / "small")
+    assert code == 1
+    assert "passed max_states=3" in line
+    (tmp_path / "empty").mkdir()
+    code, line = failure("build", tmp_path / "empty")
+    assert code == 1
+    assert "no state space there" in line
+
+
+def test_an_interrupted_command_says_so_and_exits_with_130(failure, monkeypatch):
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("pharos.state_space.build", interrupted)
+    code, line = failure("build", "simple_grid")
+    assert code == 130
+    assert "interrupted" in line
+
+
+def test_a_full_or_forbidden_disk_is_one_line(failure, monkeypatch):
+    def forbidden(*_, **__):
+        raise PermissionError(13, "Permission denied", "/somewhere")
+
+    monkeypatch.setattr("pharos.state_space.build", forbidden)
+    assert failure("build", "simple_grid") == (1, "pharos: /somewhere: Permission denied\n")
+
+
+# As a process -------------------------------------------------------------------------------------------------------------
+
+
+def test_a_pipe_gets_one_json_object_and_silence_beside_it(cache, tmp_path):
+    done = process("build", "simple_grid", "--out", tmp_path / "grid", "--json", cache=cache)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert set(json.loads(done.stdout)) >= BUILD_KEYS
+
+
+def test_exit_codes_reach_the_shell(cache):
+    for words, code in ((["build", "brekout"], 2), ([], 0), (["--help"], 0), (["--version"], 0)):
+        done = process(*words, cache=cache)
+        assert done.returncode == code
+        assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("words", [["list"], ["--help"], ["list", "--json"]])
+def test_help_and_list_load_nothing_heavy(words):
+    script = (
+        "import sys\n"
+        "from pharos.cli import app\n"
+        "try:\n"
+        f"    app({words!r})\n"
+        "finally:\n"
+        "    heavy = {'numba', 'scipy', 'pandas', 'matplotlib', 'torch', 'gymnasium'} & set(sys.modules)\n"
+        "    assert not heavy, heavy\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
