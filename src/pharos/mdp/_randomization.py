@@ -17,12 +17,19 @@ if TYPE_CHECKING:
 class Chance:
     """Which action is executed: the chosen one, the previously executed one, or any one; the weights sum to 1.
 
-    On the first step there is no previous action: the chosen one takes its share.
+    On the first step there is no previous action: the chosen one is executed with probability `first_chosen`, else a uniform
+    one. (Only where random actions come before sticky ones does this differ from `chosen + previous`.)
     """
 
     chosen: float = 1.0
     previous: float = 0.0
     uniform: float = 0.0
+    first_chosen: float = 1.0
+
+    @property
+    def first_uniform(self) -> float:
+        """Probability that a uniform action is executed on the first step."""
+        return 1 - self.first_chosen
 
 
 def random_actions(mdp: "TabularMDP", p: float) -> "TabularMDP":
@@ -38,7 +45,8 @@ def random_actions(mdp: "TabularMDP", p: float) -> "TabularMDP":
     """
     _check_probability("random_actions", p)
     old = mdp.chance
-    return replace(mdp, chance=Chance((1 - p) * old.chosen, old.previous, p * old.chosen + old.uniform))
+    chance = Chance((1 - p) * old.chosen, old.previous, p * old.chosen + old.uniform, (1 - p) * old.first_chosen)
+    return replace(mdp, chance=chance)
 
 
 def sticky_actions(mdp: "TabularMDP", p: float) -> "TabularMDP":
@@ -54,7 +62,8 @@ def sticky_actions(mdp: "TabularMDP", p: float) -> "TabularMDP":
     """
     _check_probability("sticky_actions", p)
     old = mdp.chance
-    return replace(mdp, chance=Chance((1 - p) * old.chosen, p * old.chosen + old.previous, old.uniform))
+    chance = Chance((1 - p) * old.chosen, p * old.chosen + old.previous, old.uniform, old.first_chosen)
+    return replace(mdp, chance=chance)
 
 
 def _check_probability(name: str, p: float) -> None:

@@ -1,0 +1,77 @@
+"""MDPs written out in full, and solved by linear algebra: the slow twin of pharos.mdp and pharos.solvers."""
+
+import itertools
+
+import numpy as np
+
+
+def augmented(mdp):
+    """The MDP as explicit matrices (P, R, start), over its own states with every kind of chance written out.
+
+    States are pairs (s, b): b is the previously executed action, or A for none. P[(s, b), a, (t, x)], R[(s, b), a].
+    A pair has index s (A + 1) + b; one more state, the last, is the end.
+    """
+    num_states, num_actions = mdp.num_states, mdp.num_actions
+    chance = mdp.chance
+    size = num_states * (num_actions + 1) + 1
+    P = np.zeros((size, num_actions, size))
+    R = np.zeros((size, num_actions))
+    P[-1, :, -1] = 1
+    for s, b, a in itertools.product(range(num_states), range(num_actions + 1), range(num_actions)):
+        if b == num_actions:
+            executed = np.full(num_actions, (1 - chance.first_chosen) / num_actions)
+            executed[a] += chance.first_chosen
+        else:
+            executed = np.full(num_actions, chance.uniform / num_actions)
+            executed[a] += chance.chosen
+            executed[b] += chance.previous
+        i = s * (num_actions + 1) + b
+        for x in range(num_actions):
+            R[i, a] += executed[x] * mdp.rewards[s, x]
+            for t, probability in outcomes(mdp, s, x):
+                j = size - 1 if t < 0 else t * (num_actions + 1) + x
+                P[i, a, j] += executed[x] * probability
+    start = np.zeros(size)
+    start[mdp.start_states * (num_actions + 1) + num_actions] = mdp.start_probabilities
+    return P, R, start
+
+
+def outcomes(mdp, s, x):
+    """[(next state or -1, probability)] of executing x in s."""
+    if mdp.transitions is None:
+        return [(int(mdp.next_states[s, x]), 1.0)]
+    row = mdp.transitions[s * mdp.num_actions + x].toarray().ravel()
+    return [(-1, 1 - row.sum()), *((t, row[t]) for t in np.flatnonzero(row))]
+
+
+def values_of(P, R, gamma, policy):
+    """Values of a policy (N, A) by one linear solve."""
+    chain = np.einsum("ia,iaj->ij", policy, P)
+    return np.linalg.solve(np.eye(len(P)) - gamma * chain, (policy * R).sum(axis=1))
+
+
+def optimal_values(P, R, gamma, sign=1):
+    """Optimal (or worst) values by policy iteration."""
+    policy = np.zeros(len(P), int)
+    for _ in range(1000):
+        v = values_of(P, R, gamma, np.eye(P.shape[1])[policy])
+        q = R + gamma * P @ v
+        better = np.argmax(sign * q, axis=1)
+        improved = sign * (q[np.arange(len(q)), better] - q[np.arange(len(q)), policy]) > 1e-12
+        if not improved.any():
+            return v
+        policy = np.where(improved, better, policy)
+    raise AssertionError("policy iteration did not settle")
+
+
+def finite_values(P, R, gamma, horizon, sign=1):
+    """Optimal (or worst) values with `horizon` steps to go."""
+    v = np.zeros(len(P))
+    for _ in range(horizon):
+        v = sign * (sign * (R + gamma * P @ v)).max(axis=1)
+    return v
+
+
+def by_state(mdp, v):
+    """Values of the pairs as (S, A + 1); the last column: no previous action."""
+    return v[:-1].reshape(mdp.num_states, mdp.num_actions + 1)

@@ -1,0 +1,158 @@
+"""TabularMDP: what it accepts and refuses, rewards kept exactly, and chance nested step by step."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+import pharos
+from pharos.errors import ParameterError
+from pharos.mdp import Rewards, TabularMDP, random_actions, sticky_actions
+from pharos.mdp._rewards import RewardsCollector
+from strategies import deterministic_mdps, probabilities
+
+often = settings(max_examples=100, deadline=None)
+
+
+@often
+@given(hnp.arrays(np.float64, st.tuples(st.integers(1, 40), st.integers(1, 3)), elements=st.floats(-1e6, 1e6)))
+def test_rewards_are_kept_to_the_last_bit(array):
+    assert (Rewards.from_array(array).array == array).all()
+
+
+def test_few_distinct_rewards_take_one_byte_and_many_take_eight():
+    assert Rewards.from_array(np.arange(256.0)[:, None]).table.dtype == np.uint8
+    many = Rewards.from_array(np.arange(257.0)[:, None])
+    assert many.table.dtype == np.float64
+    assert (many.array.ravel() == np.arange(257.0)).all()
+
+
+def test_rewards_collected_in_blocks_turn_from_a_palette_into_numbers_without_loss():
+    array = np.random.default_rng(0).normal(size=(300, 2))
+    collector = RewardsCollector((300, 2))
+    for start in range(0, 300, 50):
+        collector.add(start, array[start : start + 50])
+    assert (collector.finish().array == array).all()
+
+
+def executed_distribution(stages, choice, previous, num_actions):
+    """Which action is executed, by simulating the stages of chance from the outermost in, in exact arithmetic."""
+    distribution = np.eye(num_actions)[choice]
+    for kind, p in stages:
+        if kind == "random":
+            distribution = (1 - p) * distribution + p / num_actions
+        elif previous is not None:
+            distribution = (1 - p) * distribution + p * np.eye(num_actions)[previous]
+    return distribution
+
+
+@often
+@given(st.lists(st.tuples(st.sampled_from(["random", "sticky"]), probabilities), max_size=4))
+def test_any_nesting_of_chance_is_three_weights(stages):
+    mdp = TabularMDP.from_arrays([[0, 0, 0]], [[0.0, 0.0, 0.0]])
+    for kind, p in reversed(stages):  # the innermost is applied first
+        mdp = random_actions(mdp, p) if kind == "random" else sticky_actions(mdp, p)
+    chance = mdp.chance
+    later = chance.chosen * np.eye(3)[0] + chance.previous * np.eye(3)[1] + chance.uniform / 3
+    first = chance.first_chosen * np.eye(3)[0] + chance.first_uniform / 3
+    assert later == pytest.approx(executed_distribution(stages, 0, 1, 3))
+    assert first == pytest.approx(executed_distribution(stages, 0, None, 3))
+
+
+@often
+@given(deterministic_mdps())
+def test_an_mdp_made_of_the_arrays_of_another_is_the_same(mdp):
+    again = TabularMDP.from_arrays(
+        mdp.next_states, mdp.rewards, gamma=mdp.gamma, initial=mdp.initial, terminal=mdp.terminal
+    )
+    assert (again.next_states == mdp.next_states).all()
+    assert (again.rewards == mdp.rewards).all()
+    assert (again.start_states == mdp.start_states).all()
+    assert again.start_probabilities == pytest.approx(mdp.start_probabilities)
+
+
+def test_matrices_may_be_dense_stacked_or_one_for_each_action():
+    from scipy import sparse
+
+    rng = np.random.default_rng(0)
+    dense = rng.dirichlet(np.ones(4), (4, 2))
+    rewards = rng.normal(size=(4, 2))
+    made = [
+        TabularMDP.from_matrices(dense, rewards),
+        TabularMDP.from_matrices(sparse.csr_matrix(dense.reshape(8, 4)), rewards),
+        TabularMDP.from_matrices([sparse.csr_matrix(dense[:, a]) for a in range(2)], rewards),
+    ]
+    for mdp in made:
+        assert np.abs(mdp.transitions.toarray() - dense.reshape(8, 4)).max() == 0
+
+
+def test_rewards_of_transitions_are_averaged_over_them():
+    P = np.array([[[0.25, 0.75]], [[0.0, 1.0]]])
+    R = np.array([[[4.0, 8.0]], [[0.0, 2.0]]])
+    assert TabularMDP.from_matrices(P, R).rewards.tolist() == [[7.0], [2.0]]
+
+
+def test_a_row_of_minus_one_without_reward_is_a_terminal_state():
+    mdp = TabularMDP.from_arrays([[1, 1], [-1, -1]], [[0, 1], [0, 0]])
+    assert mdp.terminal.tolist() == [False, True]
+
+
+def test_a_row_of_minus_one_that_pays_is_no_terminal_state():
+    mdp = TabularMDP.from_arrays([[1, 1], [-1, -1]], [[0, 1], [0, 1]])
+    assert mdp.terminal.tolist() == [False, False]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"next_states": [[0, 5], [1, 0]]}, r"next_states\[0, 1\] is 5"),
+        ({"next_states": [[0, -2], [1, 0]]}, r"is -2"),
+        ({"next_states": [[0.5, 1.0], [1.0, 0.0]]}, "expected integers"),
+        ({"next_states": [0, 1]}, "expected integers of shape"),
+        ({"rewards": [[0, np.nan], [0, 0]]}, "state 0, action 1 is nan"),
+        ({"rewards": [[0, np.inf], [0, 0]]}, "inf"),
+        ({"rewards": [[0, 1]]}, r"shape \(1, 2\)"),
+        ({"gamma": 1.5}, "gamma"),
+        ({"gamma": float("nan")}, "gamma"),
+        ({"initial": 2}, "initial names state 2"),
+        ({"initial": [0.5, 0.6]}, "sum to 1"),
+        ({"horizon": 0}, "horizon"),
+        ({"terminal": [True, False]}, "terminal"),
+    ],
+)
+def test_arrays_that_are_no_mdp_get_a_clear_error(change, message):
+    good = {"next_states": [[0, 1], [1, 0]], "rewards": [[0.0, 1.0], [0.0, 0.0]]}
+    with pytest.raises(ParameterError, match=message):
+        TabularMDP.from_arrays(**{**good, **change})
+
+
+@pytest.mark.parametrize(
+    ("P", "R", "message"),
+    [
+        (np.ones((2, 1, 2)), np.zeros((2, 1)), "sums to 2"),
+        (-np.ones((2, 1, 2)) / 2, np.zeros((2, 1)), "negative"),
+        (np.ones((2, 1, 3)), np.zeros((2, 1)), "expected"),
+        (np.ones((2, 1, 2)) / 2, np.zeros((3, 1)), "shape"),
+        (np.full((2, 1, 2), np.nan), np.zeros((2, 1)), "NaN"),
+    ],
+)
+def test_matrices_that_are_no_mdp_get_a_clear_error(P, R, message):
+    with pytest.raises(ParameterError, match=message):
+        TabularMDP.from_matrices(P, R)
+
+
+@pytest.mark.parametrize("p", [-0.1, 1.1, float("nan"), "often"])
+@pytest.mark.parametrize("randomize", [sticky_actions, random_actions])
+def test_a_probability_lies_between_zero_and_one(randomize, p):
+    with pytest.raises(ParameterError, match="probability"):
+        randomize(TabularMDP.from_arrays([[0]], [[0.0]]), p)
+
+
+def test_a_state_space_becomes_an_mdp_with_its_own_or_other_rewards(tmp_path):
+    space = pharos.build(pharos.make("simple_grid/4x4-decoy"), tmp_path / "grid", progress=False)
+    own = space.mdp(gamma=0.9)
+    goal = int(np.flatnonzero(own.rewards.max(axis=1) == 1)[0])
+    assert own.rewards[goal].max() == 1
+    assert (space.mdp(rewards=2 * own.rewards).rewards == 2 * own.rewards).all()
+    assert (space.mdp(rewards=lambda self, state, action, next_state: 3.0).rewards[~own.terminal] == 3).all()
