@@ -1,0 +1,132 @@
+"""What a measure returns that may be out of reach: a proven interval; and how much may be spent on it."""
+
+import math
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from pharos.errors import ParameterError
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A value between two proven bounds.
+
+    Attributes:
+        lower, upper: the value lies in [lower, upper]; both are infinite where the value is.
+        exact: whether the interval is the value: lower == upper for counted steps, a relative width of at most `tolerance`
+            for expected ones.
+        unreachable_pairs: ordered pairs (s, s') such that no policy leads from s to s' with probability 1.
+        finite_part: the largest value among the other pairs; equal to `upper` where the value is finite and exact.
+        counted: whether `unreachable_pairs` and `finite_part` are exact; else both are lower bounds.
+        tolerance: relative width up to which the interval counts as exact.
+        searches: searches of the graph, or targets solved, that it took.
+        method: how it was computed.
+        conventions: what the value refers to.
+        note: why it is not exact or not finite, or anything else worth knowing; empty otherwise.
+        seconds: time that it took.
+    """
+
+    lower: float
+    upper: float
+    exact: bool
+    unreachable_pairs: int = 0
+    finite_part: float = 0.0
+    counted: bool = True
+    tolerance: float = 0.0
+    searches: int = 0
+    method: str = ""
+    conventions: Mapping[str, Any] = field(default_factory=dict)
+    note: str = ""
+    seconds: float = 0.0
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able; an infinite bound is None, as in JSON nothing else is, and `infinite` says so."""
+        result: dict[str, Any] = {
+            "lower": self.lower if math.isfinite(self.lower) else None,
+            "upper": self.upper if math.isfinite(self.upper) else None,
+            "exact": self.exact,
+            "infinite": math.isinf(self.lower),
+            "unreachable_pairs": self.unreachable_pairs,
+            "finite_part": self.finite_part,
+            "counted": self.counted,
+            "tolerance": self.tolerance,
+            "searches": self.searches,
+            "method": self.method,
+            "note": self.note,
+        }
+        return result
+
+    def __str__(self) -> str:
+        if math.isinf(self.lower):
+            at_least = "" if self.counted else "at least "
+            return f"infinite ({at_least}{self.unreachable_pairs} unreachable pairs; else up to {self.finite_part:g})"
+        if self.exact:
+            return f"{self.upper:.10g}"
+        return f"[{self.lower:.10g}, {self.upper:.10g}]"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Budget:
+    """What may be spent before a proven interval is returned instead of the exact value. The first limit met counts.
+
+    Attributes:
+        seconds: of wall clock, looked at between searches.
+        searches: searches of the graph, or targets solved; unlike seconds, the same on every machine.
+    """
+
+    seconds: float = 300.0
+    searches: float = math.inf
+
+    def __post_init__(self) -> None:
+        for name in ("seconds", "searches"):
+            value = getattr(self, name)
+            if not (isinstance(value, int | float) and value >= 0):
+                raise ParameterError(
+                    f"budget of {value!r} {name}; expected a number of at least 0 (math.inf: no limit)"
+                )
+
+    @staticmethod
+    def of(budget: "Budget | float | None") -> "Budget":
+        """`budget`, where a number stands for seconds and None for the default of 300 seconds."""
+        if budget is None:
+            return Budget()
+        return budget if isinstance(budget, Budget) else Budget(seconds=budget)
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far a measure is: the interval so far, the searches done, how many candidates are left, and seconds since the start."""
+
+    lower: float
+    upper: float
+    searches: int
+    candidates: int
+    seconds: float
+
+
+class Spending:
+    """A budget being spent: tells when to stop, and reports progress at most every tenth of a second."""
+
+    def __init__(self, budget: Budget, progress: Callable[[Progress], None] | None):
+        self.budget, self.progress = budget, progress
+        self.started = time.perf_counter()
+        self.searches = 0
+        self._reported = -math.inf
+
+    @property
+    def seconds(self) -> float:
+        """Seconds since the start."""
+        return time.perf_counter() - self.started
+
+    @property
+    def is_over(self) -> bool:
+        """Whether a limit is met."""
+        return self.searches >= self.budget.searches or self.seconds >= self.budget.seconds
+
+    def report(self, lower: float, upper: float, candidates: int, *, now: bool = False) -> None:
+        """Call `progress`, where there is one and the last call is long enough ago."""
+        if self.progress is not None and (now or self.seconds - self._reported >= 0.1):
+            self._reported = self.seconds
+            self.progress(Progress(lower, upper, self.searches, candidates, self.seconds))

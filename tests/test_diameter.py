@@ -1,0 +1,176 @@
+"""The diameter of deterministic MDPs: against all pairs, theory, and its own intervals."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from naive_hardness import distances
+from pharos import TabularMDP, hardness
+from pharos.errors import ParameterError
+
+
+@st.composite
+def deterministic_mdps(draw, max_states=24, ends=True):
+    num_states = draw(st.integers(1, max_states))
+    num_actions = draw(st.integers(1, 3))
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    low = -1 if ends else 0
+    if draw(st.booleans()):  # narrow steps make long distances
+        table = np.arange(num_states)[:, None] + rng.integers(-2, 3, (num_states, num_actions))
+        table = np.clip(table, low, num_states - 1)
+    else:
+        table = rng.integers(low, num_states, (num_states, num_actions))
+    if ends and draw(st.booleans()):
+        table[rng.random(num_states) < 0.2] = -1
+    return TabularMDP.from_arrays(table, np.zeros(table.shape), initial=int(rng.integers(num_states)))
+
+
+@settings(max_examples=150, deadline=None)
+@given(deterministic_mdps(), st.booleans())
+def test_the_diameter_is_the_largest_distance_between_any_two_states(mdp, restart):
+    d = distances(mdp, restart=restart)
+    found = hardness.diameter(mdp, restart=restart)
+    assert found.exact
+    assert found.counted
+    assert found.lower == found.upper == d.max()
+    assert found.unreachable_pairs == np.isinf(d).sum()
+    assert found.finite_part == d[np.isfinite(d)].max()
+
+
+@settings(max_examples=60, deadline=None)
+@given(deterministic_mdps(), st.booleans())
+def test_the_start_eccentricity_is_the_largest_distance_from_the_start(mdp, restart):
+    d = distances(mdp, restart=restart)
+    assert hardness.start_eccentricity(mdp, restart=restart) == d[mdp.initial].max()
+
+
+def strongly_connected(rng, num_states, num_actions):
+    """A random cycle through all states, and random edges."""
+    order = rng.permutation(num_states)
+    table = rng.integers(0, num_states, (num_states, num_actions))
+    table[order, 0] = np.roll(order, 1)
+    return TabularMDP.from_arrays(table, np.zeros(table.shape), initial=int(order[0]))
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(1, 60), st.integers(1, 3), st.integers(0, 40))
+def test_every_budget_gives_an_interval_that_holds_the_diameter_and_larger_budgets_narrower_ones(
+    seed, size, num_actions, most
+):
+    mdp = strongly_connected(np.random.default_rng(seed), size, num_actions)
+    true = distances(mdp).max()
+    width = math.inf
+    for searches in (0, most // 2, most, math.inf):
+        found = hardness.diameter(mdp, budget=hardness.Budget(searches=searches))
+        assert found.lower <= true <= found.upper
+        assert found.upper - found.lower <= width
+        assert found.exact == (found.lower == found.upper)
+        width = found.upper - found.lower
+    assert width == 0
+
+
+@pytest.mark.parametrize("size", [1, 2, 5, 100])
+def test_a_ring_has_diameter_one_less_than_its_states(size):
+    table = ((np.arange(size) + 1) % size)[:, None]
+    assert hardness.diameter(TabularMDP.from_arrays(table, np.zeros(table.shape))).upper == size - 1
+
+
+@pytest.mark.parametrize("size", [2, 5, 100])
+def test_a_path_walked_both_ways_has_the_diameter_of_its_length(size):
+    s = np.arange(size)
+    table = np.clip(np.stack([s - 1, s + 1], axis=1), 0, size - 1)
+    assert hardness.diameter(TabularMDP.from_arrays(table, np.zeros(table.shape), initial=size // 2)).upper == size - 1
+
+
+def test_a_complete_graph_has_diameter_one():
+    table = np.tile(np.arange(7), (7, 1))
+    assert hardness.diameter(TabularMDP.from_arrays(table, np.zeros(table.shape))).upper == 1
+
+
+def test_a_terminal_state_leads_to_the_start_in_one_step():
+    table = [[1], [2], [-1]]  # state 2 is terminal, as its whole row is -1
+    mdp = TabularMDP.from_arrays(table, np.zeros((3, 1)))
+    assert hardness.diameter(mdp).upper == 2
+    without = hardness.diameter(mdp, restart=False)
+    assert (without.lower, without.upper, without.unreachable_pairs, without.finite_part) == (math.inf, math.inf, 3, 2)
+    assert "infinite" in str(without)
+
+
+def test_the_implicit_end_is_a_state_on_the_way_back_to_the_start():
+    mdp = TabularMDP.from_arrays(
+        [[1], [2], [-1]], [[0], [0], [1]]
+    )  # a reward: state 2 is not terminal, its action ends
+    assert hardness.diameter(mdp).upper == 3  # 0 -> 1 -> 2 -> end, and 1 -> 2 -> end -> 0
+
+
+def test_a_general_mdp_without_chance_is_the_deterministic_one():
+    table = np.array([[1, 0], [2, 0], [0, 2]])
+    P = np.zeros((3, 2, 3))
+    for s in range(3):
+        for a in range(2):
+            P[s, a, table[s, a]] = 1
+    assert hardness.diameter(TabularMDP.from_matrices(P, np.zeros((3, 2)))).upper == 2
+
+
+def test_progress_is_reported_and_ends_with_the_result():
+    seen = []
+    mdp = strongly_connected(np.random.default_rng(0), 500, 2)
+    found = hardness.diameter(mdp, progress=seen.append)
+    assert seen[-1].lower == seen[-1].upper == found.upper
+    assert all(p.lower <= found.upper <= p.upper for p in seen)
+
+
+def test_wrong_options_are_named():
+    mdp = TabularMDP.from_arrays([[0]], [[0.0]])
+    with pytest.raises(ParameterError, match="tolerance is 0"):
+        hardness.diameter(mdp, tolerance=0)
+    with pytest.raises(ParameterError, match=r"budget of -1 .*seconds"):
+        hardness.diameter(mdp, budget=-1)
+
+
+# Clocks: products of an autonomous clock with a walker ---------------------------------------------------------------------
+
+
+def clocked(period, rows, blocked):
+    """A walker on `rows` rows beside a clock of `period` phases; where blocked[phase, row] it falls back to row 0."""
+    phase, row = np.divmod(np.arange(period * rows), rows)
+    table = np.empty((period * rows, 3), np.int64)
+    for a in range(3):
+        target = np.clip(row + (a - 1), 0, rows - 1)
+        ahead = (phase + 1) % period
+        target = np.where(blocked[ahead, target], 0, target)
+        table[:, a] = ahead * rows + target
+    # only what the start reaches, numbered in the order of discovery
+    order, found = [0], {0: 0}
+    for s in order:
+        for t in table[s]:
+            if int(t) not in found:
+                found[int(t)] = len(order)
+                order.append(int(t))
+    return TabularMDP.from_arrays([[found[int(t)] for t in table[s]] for s in order], np.zeros((len(order), 3)))
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(8, 60), st.integers(1, 9), st.floats(0, 0.6))
+def test_clocked_spaces_have_the_largest_distance_too(seed, period, rows, density):
+    rng = np.random.default_rng(seed)
+    blocked = rng.random((period, rows)) < density
+    blocked[:, 0] = False
+    mdp = clocked(period, rows, blocked)
+    d = distances(mdp)
+    found = hardness.diameter(mdp)
+    assert found.exact
+    assert found.upper == d.max()
+
+
+def test_a_clock_with_layers_of_many_words_is_followed():
+    period, rows = 300, 90
+    blocked = np.zeros((period, rows), bool)
+    mdp = clocked(period, rows, blocked)
+    found = hardness.diameter(mdp)
+    assert "clock" in found.method
+    # the walker crosses 89 rows in 89 steps, and misses the other end one step before
+    assert (found.lower, found.upper) == (period + rows - 2, period + rows - 2)
