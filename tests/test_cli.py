@@ -208,6 +208,50 @@ def test_the_cache_is_listed_and_cleared(tmp_path, monkeypatch):
     assert not (tmp_path / "compiled").exists()
 
 
+# solve -------------------------------------------------------------------------------------------------------------------
+
+SOLVE_KEYS = {"value_at_start", "uniform_value_at_start", "error_bound", "sweeps", "seconds", "gamma", "horizon"}
+
+
+def test_solve_answers_with_the_keys_of_its_contract(answer):
+    solved = answer("solve", "simple_grid")
+    assert set(solved) >= SOLVE_KEYS
+    assert abs(solved["value_at_start"] - 0.99**5) <= solved["error_bound"] <= 1e-6  # six steps, the last one pays
+    assert 0 < solved["uniform_value_at_start"] < solved["value_at_start"]
+    assert (solved["gamma"], solved["horizon"]) == (0.99, None)
+
+
+def test_with_a_horizon_values_are_undiscounted_unless_told_otherwise(answer):
+    solved = answer("solve", "simple_grid", "--horizon", 6)
+    assert (solved["gamma"], solved["horizon"], solved["value_at_start"]) == (1.0, 6, 1.0)
+    assert answer("solve", "simple_grid", "--horizon", 5)["value_at_start"] == 0.0
+    assert answer("solve", "simple_grid", "--horizon", 6, "--gamma", 0.5)["value_at_start"] == 0.5**5
+
+
+def test_solving_a_folder_is_solving_its_environment(answer, tmp_path):
+    answer("build", "breakout", "height=7", "columns=3", "--out", tmp_path / "court")
+    options = ("--sticky", 0.25, "--random", 0.1)
+    solved = [
+        answer("solve", *target, *options) for target in (["breakout", "height=7", "columns=3"], [tmp_path / "court"])
+    ]
+    for key in SOLVE_KEYS - {"seconds"}:
+        assert solved[0][key] == solved[1][key]
+    assert solved[0]["value_at_start"] < answer("solve", tmp_path / "court")["value_at_start"]
+
+
+def test_solve_writes_values_and_policy(answer, tmp_path):
+    import numpy as np
+
+    solved = answer("solve", "simple_grid", "--out", tmp_path / "a.npz")
+    with np.load(tmp_path / "a.npz") as arrays:
+        assert arrays["v"][0] == solved["value_at_start"]
+        assert arrays["policy"].shape == (16,)
+
+
+def test_solve_speaks_to_people(pharos):
+    assert "optimal value at the start" in pharos("solve", "simple_grid").stdout
+
+
 # render ------------------------------------------------------------------------------------------------------------------
 
 
@@ -251,7 +295,7 @@ def test_render_draws_in_the_terminal(pharos):
         (["build", "breakout", "--memory", "much"], "expected a size"),
         (["build", "breakout", "--workers", "0"], "--workers"),
         (["build", "no_such_module_at_all:World"], "No module named"),
-        (["build", "pharos.environments:Breakuot"], "did you mean 'Breakout'?"),
+        (["build", "pharos.environments:Breakuot"], "AttributeError"),
         (["build", "./nowhere"], "no such folder or file"),
         (["build"], "Missing argument"),
         (["bild", "breakout"], "No such command 'bild'"),
@@ -260,6 +304,9 @@ def test_render_draws_in_the_terminal(pharos):
         (["render", "breakout", "--out", "a.jpg"], "expected a file name that ends in"),
         (["render", "breakout", "--out", "nowhere/a.png"], "there is no folder"),
         (["render", "breakout", "--state", "1,2"], "expected 21"),
+        (["solve", "breakout", "--gamma", "1.5"], "--gamma"),
+        (["solve", "simple_grid", "--tolerance", "0"], "expected a positive number"),
+        (["solve", "simple_grid", "--out", "values.txt"], "ends in .npz or .npy"),
         (["cache", "clear", "nothing_like_it"], "unknown environment in the cache"),
     ],
 )
@@ -273,6 +320,9 @@ def test_what_fails_is_one_line_and_exit_code_1(failure, tmp_path):
     code, line = failure("build", "simple_grid", "--max-states", 3, "--out", tmp_path / "small")
     assert code == 1
     assert "passed max_states=3" in line
+    code, line = failure("solve", "simple_grid", "--gamma", 1)
+    assert code == 1
+    assert "give a horizon" in line
     (tmp_path / "empty").mkdir()
     code, line = failure("build", tmp_path / "empty")
     assert code == 1

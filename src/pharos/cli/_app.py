@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from pharos.cli import _build, _cache, _list, _render
+from pharos.cli import _build, _cache, _list, _render, _solve
 from pharos.cli.common import complain
 from pharos.errors import ParameterError, PharosError
 
@@ -96,6 +96,7 @@ def _options(
 
 app.command("list")(_list.list_)
 app.command("build")(_build.build)
+app.command("solve")(_solve.solve)
 app.command("render")(_render.render)
 app.add_typer(_cache.app, name="cache")
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -164,8 +164,7 @@ def _optimal(target: Target, gamma: float, max_states: int | None) -> Callable[[
     from pharos.solvers import value_iteration
 
     space = target.space(max_states=max_states)
-    solution = value_iteration(space.mdp(gamma=gamma))
-    policy: Any = solution.policy
+    policy = value_iteration(space.mdp(gamma=gamma)).policy
     return lambda state: int(policy[space.index(state)])
 
 

@@ -1,26 +1,27 @@
 """What the verbs share: parameters, TARGET, sizes, and the two ways of answering, JSON and tables."""
 
 import ast
+import contextlib
 import dataclasses
-import importlib
 import json
 import math
 import os
 import re
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pharos.errors import ParameterError, UnknownName
+from pharos.errors import ParameterError
 
 if TYPE_CHECKING:
     from rich.console import Console
 
     from pharos.environment import Environment
+    from pharos.mdp import TabularMDP
     from pharos.state_space import StateSpace
 
 Json = Annotated[bool, typer.Option("--json", help="One JSON object on standard output, nothing else.")]
@@ -35,6 +36,21 @@ Memory = Annotated[
     str | None, typer.Option("--memory", metavar="SIZE", help="Memory to use at most, such as 2GiB or 500MB.")
 ]
 Workers = Annotated[int | None, typer.Option("--workers", min=1, help="Threads; all processors when not given.")]
+Gamma = Annotated[
+    float | None,
+    typer.Option(
+        "--gamma", min=0, max=1, help="Discount; 0.99 when not given, or 1 with a horizon.", show_default=False
+    ),
+]
+Horizon = Annotated[
+    int | None, typer.Option("--horizon", min=1, help="Steps after which an episode ends; without end when not given.")
+]
+Sticky = Annotated[
+    float, typer.Option("--sticky", min=0, max=1, help="Probability that the previous action is executed again.")
+]
+Random = Annotated[
+    float, typer.Option("--random", min=0, max=1, help="Probability that a uniformly random action is executed.")
+]
 MaxStates = Annotated[
     int | None, typer.Option("--max-states", min=1, help="Stop with an error beyond this many states.")
 ]
@@ -123,6 +139,36 @@ class Target:
             raise ParameterError(f"{self.path}: has {space.num_states} states; expected at most {max_states}")
         return space
 
+    def mdp(
+        self,
+        *,
+        gamma: float | None = None,
+        horizon: int | None = None,
+        sticky: float = 0.0,
+        random: float = 0.0,
+        **building: Any,
+    ) -> "TabularMDP":
+        """The tabular MDP, with chance; `gamma` None stands for 0.99, or 1 with a horizon. `building` as for `space`."""
+        from pharos.mdp import random_actions, sticky_actions
+
+        space = self.space(**building)
+        if space.environment is None:
+            raise ParameterError(
+                f"{self.text}: pharos does not know the class {space.manifest['class']} of this environment, so not its "
+                f"rewards; name it as module:Class instead of its folder"
+            )
+        mdp = space.mdp(gamma=discount(gamma, horizon)).with_horizon(horizon)
+        if sticky:
+            mdp = sticky_actions(mdp, sticky)
+        return random_actions(mdp, random) if random else mdp
+
+
+def discount(gamma: float | None, horizon: int | None) -> float:
+    """The discount that `--gamma` names: when not given 0.99, or 1 with a horizon."""
+    if gamma is not None:
+        return gamma
+    return 0.99 if horizon is None else 1.0
+
 
 def parse_target(text: str, words: Iterable[str] | None = None) -> Target:
     """The target that a command names.
@@ -134,6 +180,8 @@ def parse_target(text: str, words: Iterable[str] | None = None) -> Target:
     from pharos.environment import list_environments, make
 
     if text in list_environments():
+        if Path(text).is_dir():
+            complain(f"{text}: is taken as the environment of this name; write ./{text} for the folder")
         return Target(text, environment=make(text, **parameters))
     path = Path(text).expanduser()
     if path.exists():
@@ -143,9 +191,7 @@ def parse_target(text: str, words: Iterable[str] | None = None) -> Target:
                 f"leave out {', '.join(f'{name}=...' for name in parameters)}"
             )
         return Target(text, path=path)
-    if ":" in text and os.sep not in text:
-        return Target(text, environment=_own_class(text, parameters))
-    if path.suffix or text.startswith((".", "~", os.sep)):
+    if ":" not in text and (path.suffix or text.startswith((".", "~", os.sep))):
         raise ParameterError(f"{text}: no such folder or file")
     return Target(text, environment=make(text, **parameters))
 
@@ -159,37 +205,6 @@ def parse_environment(text: str, words: Iterable[str] | None = None) -> "Environ
     if environment is None:
         raise ParameterError(f"{text}: pharos does not know the class of this environment; name it as module:Class")
     return environment
-
-
-def _own_class(text: str, parameters: Mapping[str, Any]) -> "Environment":
-    """`module:Class` -> an instance; modules of the current folder are found first."""
-    from pharos.environment import Environment
-
-    module_name, _, class_name = text.partition(":")
-    if "" not in sys.path and os.getcwd() not in sys.path:
-        sys.path.insert(0, os.getcwd())
-    try:
-        module = importlib.import_module(module_name)
-    except ModuleNotFoundError as error:
-        raise ParameterError(f"{text}: {error}; expected module:Class, found from the current folder") from error
-    except Exception as error:
-        raise ParameterError(f"{text}: importing {module_name} fails: {type(error).__name__}: {error}") from error
-    found = {
-        name: value
-        for name, value in vars(module).items()
-        if isinstance(value, type) and issubclass(value, Environment) and value is not Environment
-    }
-    if class_name not in found:
-        raise UnknownName(f"environment class of module {module_name}", class_name, found)
-    cls = found[class_name]
-    known = {field.name for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
-    for name in parameters:
-        if name not in known:
-            raise UnknownName(f"parameter of {class_name}", name, known)
-    try:
-        return cls(**parameters)
-    except TypeError as error:
-        raise ParameterError(f"{text}: {error}") from error
 
 
 # Answers ----------------------------------------------------------------------------------------------------------------
@@ -225,6 +240,20 @@ def console(*, stderr: bool = False) -> "Console":
     stream = sys.stderr if stderr else sys.stdout
     width = None if stream.isatty() or "COLUMNS" in os.environ else 160
     return Console(stderr=stderr, width=width, highlight=False)
+
+
+@contextlib.contextmanager
+def progress_line(what: str) -> Iterator[Callable[[str], None]]:
+    """A line on standard error that says how far one is, on a terminal; nothing elsewhere. Gone at the end."""
+    if not sys.stderr.isatty():
+        yield lambda _: None
+        return
+    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+    columns = (SpinnerColumn(), TextColumn(what), TextColumn("{task.fields[text]}"), TimeElapsedColumn())
+    with Progress(*columns, console=console(stderr=True), transient=True) as bar:
+        task = bar.add_task(what, total=None, text="")
+        yield lambda text: bar.update(task, text=text)
 
 
 def print_facts(title: str, facts: Sequence[tuple[str, object]]) -> None:

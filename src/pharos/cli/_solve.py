@@ -1,0 +1,117 @@
+"""pharos solve: optimal values, beside those of the uniformly random policy."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from pharos.cli.common import (
+    Gamma,
+    Horizon,
+    Json,
+    MaxStates,
+    Memory,
+    Parameters,
+    Random,
+    Sticky,
+    TargetArgument,
+    Workers,
+    check_format,
+    parse_size,
+    parse_target,
+    print_facts,
+    print_json,
+    progress_line,
+)
+
+
+def solve(
+    target: TargetArgument,
+    parameters: Parameters = None,
+    gamma: Gamma = None,
+    horizon: Horizon = None,
+    sticky: Sticky = 0.0,
+    random: Random = 0.0,
+    tolerance: Annotated[
+        float, typer.Option("--tolerance", help="Largest error of a value, in units of return.")
+    ] = 1e-6,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="FILE.npz for the arrays v and policy, FILE.npy for the policy alone.")
+    ] = None,
+    memory: Memory = None,
+    workers: Workers = None,
+    max_states: MaxStates = None,
+    json: Json = False,
+) -> None:
+    """Find the optimal values and policy, with a proven error bound."""
+    if out is not None:
+        check_format(out, (".npz", ".npy"))
+    limit = parse_size(memory)
+    mdp = parse_target(target, parameters).mdp(
+        gamma=gamma,
+        horizon=horizon,
+        sticky=sticky,
+        random=random,
+        memory=limit,
+        workers=workers,
+        max_states=max_states,
+    )
+    from pharos.solvers import uniform_value, value_iteration
+
+    with progress_line("solving") as report:
+        solution = value_iteration(
+            mdp, tolerance, progress=lambda sweeps, bound: report(f"sweep {sweeps}, error at most {bound:.2g}")
+        )
+        report("value of the uniform policy")
+        uniform = uniform_value(mdp, tolerance)
+    if out is not None:
+        save(out, solution)
+    answer = {
+        "value_at_start": solution.value_at_start,
+        "uniform_value_at_start": uniform.value_at_start,
+        "error_bound": solution.error_bound,
+        "sweeps": solution.sweeps,
+        "seconds": solution.seconds,
+        "gamma": solution.gamma,
+        "horizon": solution.horizon,
+        "sticky": sticky,
+        "random": random,
+        "tolerance": tolerance,
+        "uniform_error_bound": uniform.error_bound,
+        "uniform_seconds": uniform.seconds,
+        "num_states": mdp.num_states,
+        "num_actions": mdp.num_actions,
+        "file": None if out is None else str(out),
+    }
+    if json:
+        print_json(answer)
+        return
+    lasting = "no horizon" if solution.horizon is None else f"horizon {solution.horizon}"
+    facts: list[tuple[str, object]] = [
+        ("optimal value at the start", f"{solution.value_at_start:.8g}"),
+        ("uniform policy at the start", f"{uniform.value_at_start:.8g}"),
+        ("error at most", f"{max(solution.error_bound, uniform.error_bound):.2g}"),
+        ("discount", f"{solution.gamma:g}, {lasting}"),
+        ("chance", describe_chance(sticky, random)),
+        ("states", f"{mdp.num_states:,} x {mdp.num_actions} actions"),
+        ("sweeps", f"{solution.sweeps} in {solution.seconds:.2f} s"),
+    ]
+    if out is not None:
+        facts.append(("written", out))
+    print_facts(" ".join((target, *(parameters or ()))), facts)
+
+
+def describe_chance(sticky: float, random: float) -> str:
+    """Chance in words."""
+    parts = [f"sticky actions {sticky:g}"] * bool(sticky) + [f"random actions {random:g}"] * bool(random)
+    return ", ".join(parts) or "none"
+
+
+def save(path: Path, solution: Any) -> None:
+    """Write the policy (.npy), or values and policy (.npz)."""
+    import numpy as np
+
+    if path.suffix.lower() == ".npy":
+        np.save(path, solution.policy)
+    else:
+        np.savez_compressed(path, v=solution.v, policy=solution.policy)
