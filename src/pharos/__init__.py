@@ -4,11 +4,16 @@ In the order of the data flow: an Environment (`make`) is enumerated into a Stat
 TabularMDP with its rewards (`StateSpace.mdp`), to which chance can be added (`sticky_actions`, `random_actions`), which is
 solved (`value_iteration`, `evaluate_policy`) and measured (`hardness`).
 
-Importing pharos loads nothing heavy: every name below is imported when it is first used.
+Interaction goes another way from the same Environment: `gymnasium.make("pharos/Breakout-v0", observation="simple_image")`.
+
+Importing pharos loads nothing heavy: every name below is imported when it is first used. Gymnasium alone is loaded at once, so
+that its registry knows the environments.
 """
 
 import importlib
 from typing import Any
+
+from pharos import _registration  # noqa: F401  (Gymnasium's registry)
 
 __version__ = "0.1.0"
 
@@ -27,9 +32,21 @@ _HOMES = {
     "Solution": "pharos.solvers",
     "value_iteration": "pharos.solvers",
     "evaluate_policy": "pharos.solvers",
+    "observe": "pharos.observations",
+    "GymEnv": "pharos.gym_env",
     "PharosError": "pharos.errors",
 }
-_PACKAGES = ("environments", "errors", "exporters", "hardness", "importers", "mdp", "solvers", "state_space")
+_PACKAGES = (
+    "environments",
+    "errors",
+    "exporters",
+    "hardness",
+    "importers",
+    "mdp",
+    "observations",
+    "solvers",
+    "state_space",
+)
 
 __all__ = [*_HOMES, *_PACKAGES, "__version__"]
 

@@ -1,0 +1,13 @@
+"""What an agent sees: pure functions of the state with a Gymnasium space, chosen at the moment of interaction.
+
+`observe(env, "vector")` gives one; calling it with states (N, D) gives N observations. Nothing is stored with the states.
+"""
+
+from pharos.observations._observation import FunctionObservation, Observation, add_built_in, names, observe, register
+from pharos.observations._vector import Index, OneHot, Vector
+
+add_built_in("vector", Vector)
+add_built_in("one_hot", OneHot)
+add_built_in("index", Index)
+
+__all__ = ["FunctionObservation", "Index", "Observation", "OneHot", "Vector", "names", "observe", "register"]

@@ -1,0 +1,248 @@
+"""The Gymnasium environment: the conformance tests of Gymnasium, agreement with the tabulated MDP, chance, limits, errors."""
+
+import json
+import subprocess
+import sys
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+import pharos
+from pharos.errors import ParameterError
+from pharos.gym_env import GymEnv, chance_weights
+
+SMALL = {
+    "pharos/SimpleGrid-v0": {"height": 3, "width": 4, "rewards": (((1, 1), 0.1),), "penalties": (((0, 2), -0.5),)},
+    "pharos/FrozenLake-v0": {"size": 4},
+    "pharos/Freeway-v0": {"num_cars": 3, "lane_length": 4, "player_speed": 2},
+    "pharos/Breakout-v0": {"height": 7, "columns": 4},
+}
+
+
+@pytest.mark.parametrize("env_id", SMALL)
+@pytest.mark.parametrize(
+    "options", [{}, {"sticky": 0.25, "previous_action": True}, {"random": 0.3, "remaining_time": True}]
+)
+def test_gymnasiums_checker_finds_nothing_to_say(env_id, options):
+    check_env(gymnasium.make(env_id, **SMALL[env_id], **options).unwrapped, skip_render_check=True)
+
+
+@pytest.fixture(scope="module")
+def breakout(tmp_path_factory):
+    return pharos.build(pharos.make("breakout", height=7, columns=4), tmp_path_factory.mktemp("breakout") / "space")
+
+
+@pytest.fixture(scope="module")
+def freeway(tmp_path_factory):
+    env = pharos.make("freeway", num_cars=3, lane_length=4, player_speed=2, car_speeds=(1, 2, 3))
+    return pharos.build(env, tmp_path_factory.mktemp("freeway") / "space")
+
+
+@pytest.mark.parametrize("name", ["breakout", "freeway"])
+@pytest.mark.parametrize("chance", [{}, {"sticky": 0.3}, {"random": 0.2}, {"sticky": 0.3, "random": 0.2}])
+def test_a_walk_agrees_with_the_table_at_every_step(name, chance, request):
+    space = request.getfixturevalue(name)
+    rewards = space.mdp().rewards
+    env = GymEnv(space.environment, space=space, observation="index", **chance)
+    rng = np.random.default_rng(1)
+    index, info = env.reset(seed=1)
+    for _ in range(2000):
+        previous = index
+        index, reward, terminated, truncated, info = env.step(rng.integers(env.action_space.n))
+        executed = info["executed_action"]
+        assert index == info["index"] == space.successors[previous, executed]
+        assert tuple(info["state"]) == space.state(index)
+        assert reward == rewards[previous, executed]
+        assert terminated == space.is_terminal(index)
+        if terminated or truncated:
+            index, info = env.reset()
+            assert index in space.start_states
+
+
+def executed_counts(env, steps, seed):
+    """How often the executed action was (chosen, previous and not chosen), by previous action; no matter where."""
+    rng = np.random.default_rng(seed)
+    counts = np.zeros((3, 3, 3), np.int64)  # previous, chosen, executed
+    env.reset(seed=seed)
+    previous = None
+    for _ in range(steps):
+        chosen = int(rng.integers(3))
+        _, _, terminated, truncated, info = env.step(chosen)
+        executed = info["executed_action"]
+        if previous is not None:
+            counts[previous, chosen, executed] += 1
+        previous = executed
+        if terminated or truncated:
+            env.reset()
+            previous = None
+    return counts
+
+
+@pytest.mark.parametrize(("sticky", "random"), [(0.25, 0.0), (0.0, 0.4), (0.25, 0.4), (1.0, 0.0), (0.0, 1.0)])
+def test_the_executed_action_has_the_distribution_of_the_tabular_mdp(sticky, random, breakout):
+    from scipy.stats import chi2
+
+    chance = pharos.random_actions(pharos.sticky_actions(breakout.mdp(), sticky), random).chance
+    assert (chance.chosen, chance.previous, chance.uniform) == pytest.approx(chance_weights(sticky, random))
+    counts = executed_counts(GymEnv(breakout.environment, sticky=sticky, random=random), 20_000, seed=3)
+    statistic, freedom = 0.0, 0
+    for previous in range(3):
+        for chosen in range(3):
+            probabilities = np.full(3, chance.uniform / 3)
+            probabilities[chosen] += chance.chosen
+            probabilities[previous] += chance.previous
+            expected = probabilities * counts[previous, chosen].sum()
+            possible = probabilities > 1e-12
+            assert counts[previous, chosen][~possible].sum() == 0
+            statistic += ((counts[previous, chosen] - expected)[possible] ** 2 / expected[possible]).sum()
+            freedom += possible.sum() - 1
+    assert chi2.sf(statistic, max(freedom, 1)) > 1e-3 or statistic == 0
+
+
+def test_the_first_action_of_an_episode_is_executed_under_sticky_actions():
+    env = GymEnv("breakout", sticky=1.0)
+    for seed in range(20):
+        env.reset(seed=seed)
+        assert env.step(2)[-1]["executed_action"] == 2
+        assert env.step(0)[-1]["executed_action"] == 2  # ever since
+    env = GymEnv("breakout", sticky=1.0, initial_previous_action=1)  # as in the Arcade Learning Environment
+    env.reset(seed=0)
+    assert env.step(2)[-1]["executed_action"] == 1
+
+
+def test_the_same_seed_gives_the_same_episode():
+    def episode(seed):
+        env = gymnasium.make("pharos/Freeway-v0", num_cars=4, sticky=0.3, random=0.1)
+        observation, _ = env.reset(seed=seed)
+        actions = np.random.default_rng(0).integers(3, size=100)
+        return [observation.tolist(), *((step[0].tolist(), *step[1:4]) for step in map(env.step, actions))]
+
+    assert episode(5) == episode(5)
+    assert episode(5) != episode(6)
+
+
+def test_an_episode_is_truncated_at_the_time_limit():
+    for limit, expected in ((7, 7), ("default", 1000)):
+        env = GymEnv("freeway", time_limit=limit)
+        env.reset(seed=0)
+        steps = [env.step(0) for _ in range(expected)]
+        assert [truncated for *_, truncated, _ in steps] == [False] * (expected - 1) + [True]
+        assert not any(terminated for _, _, terminated, _, _ in steps)
+    env = GymEnv("freeway", time_limit=None)
+    env.reset(seed=0)
+    assert not any(env.step(0)[3] for _ in range(3000))
+
+
+def test_gymnasiums_max_episode_steps_is_a_limit_too():
+    env = gymnasium.make("pharos/Freeway-v0", max_episode_steps=5)
+    env.reset(seed=0)
+    assert [env.step(0)[3] for _ in range(5)] == [False] * 4 + [True]
+
+
+def test_an_episode_starts_where_the_options_say(breakout):
+    env = GymEnv(breakout.environment, space=breakout, observation="index")
+    terminal = int(np.flatnonzero(breakout.terminal)[0])
+    for i in (5, breakout.num_states // 2, terminal):
+        index, info = env.reset(options={"state": breakout.state(i)})
+        assert index == i == info["index"]
+        assert env.state == breakout.state(i) == tuple(info["state"])
+    _, reward, terminated, _, info = env.step(0)  # after the end nothing changes
+    assert (reward, terminated, tuple(info["state"]), info["index"]) == (0.0, True, breakout.state(terminal), terminal)
+    with pytest.raises(ParameterError, match="ball_row = 7; expected 0 to 6"):
+        env.reset(options={"state": (7, *breakout.state(0)[1:])})
+    with pytest.raises(ParameterError, match="expected 13 integers"):
+        env.reset(options={"state": (1, 2)})
+
+
+def test_what_was_handed_out_is_not_overwritten_and_may_be_changed():
+    env = GymEnv("breakout")
+    observation, info = env.reset(seed=0)
+    kept = observation.copy(), info["state"].copy()
+    info["state"][:] = 0
+    observation[:] = 0
+    first, _, _, _, info = env.step(1)
+    env.reset(seed=0)
+    again, _, _, _, info_again = env.step(1)
+    np.testing.assert_array_equal(first, again)
+    np.testing.assert_array_equal(info["state"], info_again["state"])
+    np.testing.assert_array_equal(env.reset(seed=0)[0], kept[0])
+
+
+def test_the_previous_action_and_the_remaining_time_are_appended_to_a_vector():
+    env = GymEnv("breakout", sticky=0.5, previous_action=True, remaining_time=True, time_limit=10)
+    observation, _ = env.reset(seed=0)
+    size = len(env.environment.components)
+    assert observation.shape == env.observation_space.shape == (size + 3 + 1,)
+    np.testing.assert_array_equal(observation[size:], [0, 0, 0, 1])
+    for k in range(1, 11):
+        observation, _, _, truncated, info = env.step(k % 3)
+        expected = np.zeros(3)
+        expected[info["executed_action"]] = 1
+        np.testing.assert_allclose(observation[size:], [*expected, 1 - k / 10], atol=1e-6)
+    assert truncated
+    with pytest.raises(ParameterError, match="without a time limit"):
+        GymEnv("breakout", remaining_time=True, time_limit=None)
+
+
+def test_the_previous_action_and_the_remaining_time_stand_beside_other_observations():
+    env = GymEnv("breakout", observation="one_hot", previous_action=True, remaining_time=True, time_limit=4)
+    observation, _ = env.reset(seed=0)
+    assert observation["previous_action"] == 3 and observation["remaining_time"] == [1.0]
+    observation, _, _, _, info = env.step(2)
+    assert observation["previous_action"] == info["executed_action"] == 2
+    assert observation["remaining_time"] == [0.75]
+    assert env.observation_space.contains(observation)
+    check_env(GymEnv("breakout", observation="one_hot", previous_action=True, sticky=0.25), skip_render_check=True)
+
+
+def test_a_spec_survives_the_way_through_json():
+    env = gymnasium.make("pharos/SimpleGrid-v0", height=5, rewards="2,2:0.1", observation="one_hot", sticky=0.25)
+    again = gymnasium.make(gymnasium.envs.registration.EnvSpec.from_json(env.spec.to_json()))
+    assert again.unwrapped.environment == env.unwrapped.environment
+    assert again.observation_space == env.observation_space
+    assert json.loads(env.spec.to_json())["kwargs"]["sticky"] == 0.25
+
+
+def test_any_named_instance_can_be_made_through_gymnasium():
+    env = gymnasium.make("pharos/Environment-v0", environment="breakout/12x10x1")
+    assert env.unwrapped.environment == pharos.make("breakout/12x10x1")
+
+
+@pytest.mark.parametrize("env_id", ["pharos/Breakout-v0", "pharos:pharos/Breakout-v0"])
+def test_gymnasium_finds_the_environments_in_a_fresh_process(env_id):
+    heavy = "'numba', 'scipy', 'pandas', 'matplotlib', 'torch', 'stable_baselines3', 'pygame'"
+    start = "" if ":" in env_id else "import pharos"
+    check = f"assert not [name for name in ({heavy},) if name in sys.modules]"
+    code = f"import sys, gymnasium\n{start}\n{check}\nprint(gymnasium.make({env_id!r}, height=9).reset(seed=0)[1]['state'][0])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["3"]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"sticky": 1.5}, "sticky is 1.5; expected a probability"),
+        ({"random": "often"}, "random is 'often'; expected a probability"),
+        ({"time_limit": 0}, "time_limit is 0; expected a number of steps"),
+        ({"initial_previous_action": 3}, "initial_previous_action is 3; expected None or an action from 0 to 2"),
+        ({"heigth": 12}, "did you mean 'height'"),
+        ({"render_mode": "html"}, "render_mode is 'html'; expected None or one of"),
+        ({"observation": "vektor"}, "did you mean 'vector'"),
+    ],
+)
+def test_wrong_options_are_named(options, message):
+    with pytest.raises(ParameterError, match=message):
+        GymEnv("breakout", **options)
+
+
+def test_wrong_use_is_named():
+    env = GymEnv("breakout")
+    with pytest.raises(gymnasium.error.ResetNeeded, match=r"call reset\(\) before"):
+        env.step(0)
+    env.reset(seed=0)
+    with pytest.raises(ParameterError, match="action 3; expected 0 to 2"):
+        env.step(3)
+    with pytest.raises(ParameterError, match="action -1; expected 0 to 2"):
+        env.step(-1)

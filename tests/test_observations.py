@@ -1,0 +1,119 @@
+"""Observations: pure functions of the state, batched, with their spaces; user-defined ones are checked."""
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import pharos
+from pharos import observations
+from pharos.errors import ParameterError, UnknownName
+
+SMALL = {
+    "simple_grid": {"height": 3, "width": 4, "rewards": (((1, 1), 0.1),), "penalties": (((0, 2), -0.5),)},
+    "frozen_lake": {"size": 4},
+    "freeway": {"num_cars": 3, "lane_length": 4, "player_speed": 2},
+    "breakout": {"height": 7, "columns": 4},
+}
+
+
+def random_states(env, number, seed=0):
+    components = env.components
+    rng = np.random.default_rng(seed)
+    return components.low + rng.integers(0, components.size, (number, len(components)))
+
+
+@pytest.fixture(params=SMALL, scope="module")
+def env(request):
+    return pharos.make(request.param, **SMALL[request.param])
+
+
+def test_a_vector_is_the_state_normalized_by_its_ranges(env):
+    states = random_states(env, 200)
+    vector = observations.observe(env, "vector")
+    found = vector(states)
+    components = env.components
+    expected = (states - components.low) / np.maximum(components.size - 1, 1)
+    assert found.dtype == np.float32
+    np.testing.assert_allclose(found, expected, rtol=1e-6, atol=0)
+    assert vector.names == components.names
+    assert all(vector.space.contains(row) for row in found)
+    np.testing.assert_array_equal(vector.one(states[7]), found[7])
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+@settings(max_examples=20, deadline=None)
+def test_different_states_have_different_vectors_and_one_hots(seed):
+    env = pharos.make("breakout", height=7, columns=4)
+    states = np.unique(random_states(env, 300, seed), axis=0)
+    for name in ("vector", "one_hot"):
+        assert len(np.unique(observations.observe(env, name)(states), axis=0)) == len(states)
+
+
+def test_a_one_hot_has_one_one_for_each_component(env):
+    states = random_states(env, 50)
+    one_hot = observations.observe(env, "one_hot")
+    found = one_hot(states)
+    assert (found.sum(axis=1) == len(env.components)).all()
+    marked = [one_hot.names[i] for i in np.flatnonzero(found[3])]
+    assert marked == [f"{name}={value}" for name, value in zip(env.components.names, states[3], strict=True)]
+
+
+def test_an_index_is_the_number_of_the_state_in_its_space(tmp_path):
+    env = pharos.make("breakout", height=7, columns=4)
+    space = pharos.build(env, tmp_path / "space")
+    index = observations.observe(env, "index", state_space=space)
+    some = np.arange(0, space.num_states, 97)
+    np.testing.assert_array_equal(index(space.states(some)), some)
+    assert index.space == spaces.Discrete(space.num_states)
+    with pytest.raises(ParameterError, match=r"needs the built state space: space=pharos\.build"):
+        observations.observe(env, "index")
+    with pytest.raises(ParameterError, match="belongs to Breakout"):
+        observations.observe(pharos.make("breakout", height=8, columns=4), "index", state_space=space)
+
+
+def ball(env, states):
+    return states[:, :2] / [env.height, env.columns]
+
+
+def test_a_users_function_of_states_is_an_observation():
+    env = pharos.make("breakout")
+    seen = observations.observe(env, (ball, spaces.Box(0, 1, (2,), np.float32)))
+    states = random_states(env, 10)
+    np.testing.assert_allclose(seen(states), ball(env, states), rtol=1e-6)
+    assert seen(states).dtype == np.float32
+    assert seen.name == "ball"
+
+
+def test_a_registered_function_is_known_by_its_name():
+    observations.register("ball", ball, lambda env: spaces.Box(0, 1, (2,), np.float32))
+    assert "ball" in observations.names()
+    assert observations.observe(pharos.make("breakout"), "ball").name == "ball"
+    with pytest.raises(ParameterError, match="'vector' is built in"):
+        observations.register("vector", ball, None)
+
+
+@pytest.mark.parametrize(
+    ("function", "space", "message"),
+    [
+        (ball, spaces.Box(0, 1, (3,), np.float32), r"has shape \(1, 2\) for 1 states; expected \(1, 3\)"),
+        (ball, spaces.Box(0, 255, (2,), np.uint8), r"has dtype float64; expected uint8.*astype"),
+        (lambda env, states: states[:, :1] + 9.0, spaces.Box(0, 1, (1,)), "which is not in its space"),
+        (ball, spaces.Text(4), "expected a Box, Discrete"),
+        (ball, "image", "expected a Box, Discrete"),
+    ],
+)
+def test_a_users_function_that_does_not_keep_its_space_is_refused(function, space, message):
+    with pytest.raises(ParameterError, match=message):
+        observations.observe(pharos.make("breakout"), (function, space))
+
+
+def test_unknown_names_and_options_suggest_the_nearest():
+    env = pharos.make("breakout")
+    with pytest.raises(UnknownName, match="did you mean 'vector'"):
+        observations.observe(env, "vectr")
+    with pytest.raises(UnknownName, match="unknown option of observation 'vector' 'gray'"):
+        observations.observe(env, "vector", gray=True)
+    with pytest.raises(ParameterError, match="expected one of vector"):
+        observations.observe(env, 7)
