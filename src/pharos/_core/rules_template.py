@@ -75,6 +75,7 @@ def explore(parameters, layout, states, successors, terminal, table, base, last,
     first, count = progress[FIRST], progress[COUNT]
     level_end, depth = progress[LEVEL_END], progress[DEPTH]
     while first < count and first < last and count + BATCH * NUM_ACTIONS <= room:
+        progress[FIRST], progress[COUNT] = first, count  # where to look, should a rule fail
         n = min(BATCH, count - first, last - first)
         for i in range(n):
             j = i * NUM_ACTIONS
@@ -129,6 +130,7 @@ def expand_and_find(parameters, layout, states, start, stop, base, keys, found, 
     slots = np.empty(BATCH * NUM_ACTIONS, np.int64)
     capacity = table.shape[0]
     for batch in range(start, stop, BATCH):
+        progress[FIRST] = batch
         n = min(BATCH, stop - batch)
         first = (batch - base) * NUM_ACTIONS
         for i in range(n):
@@ -141,7 +143,6 @@ def expand_and_find(parameters, layout, states, start, stop, base, keys, found, 
                     slots[j + a] = slot_of(hash_of(keys, first + j + a), capacity)
                     prefetch(table, slots[j + a])
         if progress[FAULT]:
-            progress[FIRST] = batch
             return
         for j in range(n * NUM_ACTIONS):
             if slots[j] >= 0 and table[slots[j]] >= 0:

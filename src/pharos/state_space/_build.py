@@ -18,14 +18,16 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
 from pharos import paths
+from pharos._core.fingerprint import fingerprint_of_rules
 from pharos.environment import Environment, start_distribution
 from pharos.errors import DiskFull, ParameterError, RuleError, StateSpaceMismatch, StateSpaceTooLarge
 from pharos.state_space._files import GrowingFile, lock, write_manifest
+from pharos.state_space._interpreted import interpreted_successors
 from pharos.state_space._packing import layout_of, pack, unpack
 from pharos.state_space._store import (
     FORMAT_VERSION,
@@ -36,6 +38,7 @@ from pharos.state_space._store import (
     WIDE_SUCCESSORS,
     StateSpace,
     check_lengths,
+    check_rules,
     identity_of,
     load,
     read_manifest,
@@ -80,8 +83,8 @@ def build(
 
     Args:
         env: the environment.
-        folder: where to write; None for the user's cache, keyed by environment, parameters and version of the rules. A
-            folder that holds the finished state space is loaded; one that holds part of it is resumed, with the same result.
+        folder: where to write; None for the user's cache, keyed by environment, parameters and rules. A folder that holds
+            the finished state space is loaded; one that holds part of it is resumed, with the same result.
         max_states: StateSpaceTooLarge when there are more.
 
         Cost only (the files are the same, byte for byte):
@@ -93,8 +96,9 @@ def build(
         The StateSpace, whose files are in `folder`.
     Raises:
         StateSpaceTooLarge, DiskFull: what was found is kept; the same command resumes.
-        StateSpaceMismatch: the folder holds another environment. StateSpaceLocked: somebody else is building there.
-        StateSpaceCorrupted: files were changed. RuleError: a rule left the declared ranges, in the state that is named.
+        StateSpaceMismatch: the folder holds another environment, or other rules. StateSpaceLocked: somebody else is
+        building there. StateSpaceCorrupted: files were changed. RuleError: a rule failed or left the declared ranges, in the
+        state that is named. ParameterError: the folder cannot be used.
     Cost: see docs/performance.md; 40 to 110 ns a state, 8 W + 8 to 16 bytes of memory a state (W words of 64 bits).
     Source: the pharos paper, appendix A, Algorithm 1 (whose successors are stored under the wrong index there).
     """
@@ -103,13 +107,11 @@ def build(
     if memory is not None and memory < 1 << 24:
         raise ParameterError(f"memory is {memory} bytes; expected at least 16 MiB")
     identity = identity_of(env)
-    path = Path(folder) if folder is not None else cached_folder(identity)
+    path = Path(folder) if folder is not None else cached_folder(env)
     manifest = _manifest_of(env, path, identity)
     if manifest is not None and manifest["complete"]:
         _check_size(env, manifest["num_states"], 0, max_states)
-        space = load(path)
-        space.environment = env
-        return space
+        return load(path, environment=env)
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -118,21 +120,21 @@ def build(
         manifest = _manifest_of(env, path, identity)  # it may have grown while we waited
         if manifest is None or not manifest["complete"]:
             _Builder(env, path, identity, max_states, memory, workers, report, checkpoint_seconds).run(manifest)
-    space = load(path, verify=False)
-    space.environment = env
-    return space
+    return load(path, verify=False, environment=env)
 
 
-def cached_folder(identity: dict[str, Any]) -> Path:
-    """The folder of a state space in the user's cache."""
-    digest = hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()[:16]
-    return paths.cache_directory() / "spaces" / f"{identity['environment']}-{digest}"
+def cached_folder(env: Environment) -> Path:
+    """The folder of the state space of `env` in the user's cache: named by content, so edited rules get another one."""
+    rules = fingerprint_of_rules(env, ("transition", "is_terminal"))
+    content = json.dumps([identity_of(env), rules, FORMAT_VERSION], sort_keys=True)
+    digest = hashlib.sha256(content.encode()).hexdigest()[:16]
+    return paths.cache_directory() / "spaces" / f"{env.name}-{digest}"
 
 
 def _manifest_of(env: Environment, path: Path, identity: dict[str, Any]) -> dict[str, Any] | None:
     manifest = read_manifest(path)
     if manifest is None:
-        if path.exists() and any(item.name not in OUR_FILES for item in path.iterdir()):
+        if path.is_dir() and any(item.name not in OUR_FILES for item in path.iterdir()):
             raise ParameterError(f"{path}: is not empty and holds no state space; choose another folder")
         return None
     for key, expected in identity.items():
@@ -202,6 +204,7 @@ class _Builder:
         finally:
             for file in self.files.values():
                 file.close()
+            del self.states, self.table  # also where a traceback keeps this builder alive
         self.report(self._progress(finished=True))
 
     def _open(self, manifest: dict[str, Any] | None) -> None:
@@ -225,6 +228,11 @@ class _Builder:
             self.terminals = manifest["num_terminal_states"]
             stored = np.memmap(self.path / STATES, "<u8", "r", shape=(self.count, self.layout.num_words))
             self.states[: self.count] = stored
+            if self.first:
+                shape = (self.first, self.env.num_actions)
+                successors = np.memmap(self.path / self.successors_name, self.index_dtype, "r", shape=shape)
+                bits = np.memmap(self.path / TERMINAL, "|u1", "r")
+                check_rules(self.path, self.env, self.layout, stored, successors, bits)
         self.appended = self.count  # states handed over to the files
         self.written = self._written(self._counts())
 
@@ -272,21 +280,26 @@ class _Builder:
         progress = np.array([self.first, self.count, self.level_end, self.depth, 0, 0], np.int64)
         # look at the width and the limit again after a while
         stop = min(last, max(self.first + 2048, self.count)) if self.workers > 1 else last
-        self.rules.kernels.explore(
-            self.rules.parameters,
-            self.layout.tables,
-            self.states,
-            successors,
-            terminal,
-            self.table,
-            base,
-            stop,
-            self._room(),
-            progress,
-        )
+        failure: Exception | None = None
+        try:
+            self.rules.kernels.explore(
+                self.rules.parameters,
+                self.layout.tables,
+                self.states,
+                successors,
+                terminal,
+                self.table,
+                base,
+                stop,
+                self._room(),
+                progress,
+            )
+        except Exception as error:  # of the rules, such as a division by zero
+            failure = error
+        if failure or progress[4]:
+            first, count = int(progress[0]), int(progress[1])
+            self._blame_rules(first, min(first + 16, count), failure)
         self._take(progress)
-        if progress[4]:
-            self._raise_fault(self.first, min(self.first + 16, self.count))
 
     def _expand_wide(self, pool, successors, terminal, base, stop) -> None:
         first, num_actions = self.first, self.env.num_actions
@@ -313,9 +326,10 @@ class _Builder:
                 faults[i],
             )
 
-        list(pool.map(share, range(self.workers)))
-        if any(fault[4] for fault in faults):
-            self._raise_fault(first, stop)
+        failures = [future.exception() for future in [pool.submit(share, i) for i in range(self.workers)]]
+        for fault, failure in zip(faults, failures, strict=True):
+            if failure or fault[4]:
+                self._blame_rules(int(fault[0]), min(int(fault[0]) + 16, stop), failure)
         from pharos._core.hash_table import insert_missing
 
         progress = np.zeros(6, np.int64)
@@ -340,11 +354,7 @@ class _Builder:
         num_actions = self.env.num_actions
         stop = min(stop, self.first + min(4096, (self._room() - self.count) // num_actions))
         rows = unpack(self.layout, self.states[self.first : stop]).tolist()
-        following = np.empty((len(rows) * num_actions, len(self.layout.word)), np.int64)
-        _interpreted_successors(self.env, rows, following, terminal[self.first - base :])
-        outside = (following < self.layout.low) | (following >= self.layout.low + self.layout.size)
-        if outside.any():
-            self._raise_fault(self.first, stop)
+        following, terminal[self.first - base : stop - base] = interpreted_successors(self.env, rows)
         keys = pack(self.layout, following)
         found = np.empty(len(keys), np.int64)
         find(self.table, self.states, keys, found)
@@ -360,27 +370,15 @@ class _Builder:
     def _take(self, progress: np.ndarray) -> None:
         self.first, self.count, self.level_end, self.depth = (int(value) for value in progress[:4])
 
-    def _raise_fault(self, start: int, stop: int) -> None:
-        """A rule left the declared ranges somewhere in [start, stop): find where, by running it interpreted."""
-        components = self.env.components
-        for state in unpack(self.layout, self.states[start:stop]).tolist():
-            if self.env.is_terminal(tuple(state)):
-                continue
-            for action, name in enumerate(self.env.actions):
-                try:
-                    out = self.env.next_state(state, action)
-                except IndexError as error:
-                    raise RuleError(f"{self.env}: action {name!r} in state {tuple(state)} fails: {error}") from error
-                for i, value in enumerate(out):
-                    if not components.low[i] <= value <= components.high[i]:
-                        raise RuleError(
-                            f"{self.env}: action {name!r} in state {tuple(state)} leads to {components.names[i]} = {value}; "
-                            f"declared: {components.low[i]} to {components.high[i]}"
-                        )
+    def _blame_rules(self, start: int, stop: int, failure: BaseException | None = None) -> NoReturn:
+        """Compiled rules failed or left the declared ranges in [start, stop): name the first state where they do interpreted."""
+        rows = unpack(self.layout, self.states[start:stop]).tolist()
+        interpreted_successors(self.env, rows)
         raise RuleError(
-            f"{self.env}: compiled rules read or wrote a component that does not exist, in one of the states {start} to "
-            f"{stop - 1}; run pharos.check_environment to find it"
-        )
+            f"{self.env}: compiled rules {f'raise {failure!r}' if failure else 'read or write outside of the declared ranges'} "
+            f"in one of the states from {tuple(rows[0])} to {tuple(rows[-1])}, interpreted they do not; "
+            f"run pharos.check_environment to find out why"
+        ) from failure
 
     # Room ----------------------------------------------------------------------------------------------------------------
 
@@ -489,26 +487,6 @@ class _Builder:
         return BuildProgress(self.count, self.first, self.depth, time.perf_counter() - self.began, finished)
 
 
-def _interpreted_successors(env: Environment, rows: list, following: np.ndarray, terminal: np.ndarray) -> None:
-    """following[i * A + a] = successor of rows[i] by a, called in Python; terminal states lead to themselves."""
-    num_actions = env.num_actions
-    transition, is_terminal = env.transition, env.is_terminal
-    out: list = []
-    for i, row in enumerate(rows):
-        state = tuple(row)
-        ended = bool(is_terminal(state))
-        terminal[i] = ended
-        for action in range(num_actions):
-            successor = row.copy()
-            if not ended:
-                transition(state, action, successor)
-            out.append(successor)
-    try:  # small non-negative integers, the usual case, go through bytes ten times as fast
-        following[:] = np.frombuffer(b"".join(map(bytes, out)), np.uint8).reshape(following.shape)
-    except (ValueError, TypeError):
-        following[:] = np.array(out, np.int64)
-
-
 def _slots_of(keys: np.ndarray, capacity: int) -> np.ndarray:
     from pharos._core.hash_table import slots_of
 
@@ -531,7 +509,8 @@ def _huge_pages(length: int, dtype: np.dtype) -> np.ndarray:
     """An array of zeros in huge pages, where the system has them."""
     if not hasattr(mmap, "MAP_PRIVATE"):
         return np.zeros(min(length, 1 << 28), dtype)
-    flags = mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS | getattr(mmap, "MAP_NORESERVE", 0)
+    no_reserve = 0x4000 if sys.platform == "linux" else 0  # MAP_NORESERVE, which Python names from 3.13 on
+    flags = mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS | no_reserve
     memory = mmap.mmap(-1, length * dtype.itemsize, flags=flags)
     if hasattr(mmap, "MADV_HUGEPAGE"):
         with contextlib.suppress(OSError):

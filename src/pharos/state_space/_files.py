@@ -30,7 +30,11 @@ class GrowingFile:
         except OSError as error:
             raise cannot_write(path, error) from error
         if committed:
-            self._take_over(committed)
+            try:
+                self._take_over(committed)
+            except BaseException:
+                self.close()
+                raise
 
     def _take_over(self, committed: dict[str, Any]) -> None:
         """Cut what was written after the last checkpoint; verify what was committed."""

@@ -47,11 +47,13 @@ def rewards_of_space(space: "StateSpace", rewards: Any = None, *, workers: int |
     for start, block in _blocks(space, env, workers):
         if not np.isfinite(block).all():
             s, a = map(int, np.argwhere(~np.isfinite(block))[0])
-            raise RuleError(
-                f"{env}: reward of action {env.actions[a]!r} in state {space.state(start + s)} is {block[s, a]}; expected a finite number"
-            )
+            raise _refused(space, env, start + s, a, f"is {block[s, a]}; expected a finite number")
         collector.add(start, block)
     return collector.finish()
+
+
+def _refused(space: "StateSpace", env: Environment, s: int, a: int, why: str) -> RuleError:
+    return RuleError(f"{env}: reward of action {env.actions[a]!r} in state {space.state(s)} {why}")
 
 
 def _blocks(space: "StateSpace", env: Environment, workers: int | None):
@@ -61,28 +63,23 @@ def _blocks(space: "StateSpace", env: Environment, workers: int | None):
     starts = range(0, space.num_states, _ROWS)
     rules = compiled_rules(env, space.layout.num_words, ["rewards_of"])
     states, successors, terminal = space.packed_states, space.successors, space.terminal
+    if rules is None:
+        yield from ((start, _interpreted_rewards(space, env, start)) for start in starts)
+        return
 
     def compiled(start: int) -> np.ndarray:
-        assert rules is not None
         stop = min(start + _ROWS, space.num_states)
         out = np.empty((stop - start, space.num_actions))
-        rules.kernels.rewards_of(rules.parameters, space.layout.tables, states, successors, terminal, start, stop, out)
+        try:
+            rules.kernels.rewards_of(
+                rules.parameters, space.layout.tables, states, successors, terminal, start, stop, out
+            )
+        except Exception as error:  # of the rule, such as a division by zero: name the state
+            out = _interpreted_rewards(space, env, start)
+            if np.isfinite(out).all():
+                raise RuleError(f"{env}: compiled, reward raises {error!r}; interpreted it does not") from error
         return out
 
-    def interpreted(start: int) -> np.ndarray:
-        stop = min(start + _ROWS, space.num_states)
-        out = np.zeros((stop - start, space.num_actions))
-        rows = space.states(slice(start, stop)).tolist()
-        for a in range(space.num_actions):
-            following = space.states(successors[start:stop, a]).tolist()
-            for i, (state, next_state) in enumerate(zip(rows, following, strict=True)):
-                if not terminal[start + i]:
-                    out[i, a] = env.reward(state, a, next_state)
-        return out
-
-    if rules is None:
-        yield from ((start, interpreted(start)) for start in starts)
-        return
     with ThreadPoolExecutor(usable_workers(workers)) as pool:
         window = 2 * usable_workers(workers)
         pending = [pool.submit(compiled, start) for start in starts[:window]]
@@ -91,6 +88,23 @@ def _blocks(space: "StateSpace", env: Environment, workers: int | None):
             if i + window < len(starts):
                 pending[i % window] = pool.submit(compiled, starts[i + window])
             yield start, block
+
+
+def _interpreted_rewards(space: "StateSpace", env: Environment, start: int) -> np.ndarray:
+    """Rewards of the states from `start` on, the rule called in Python."""
+    stop = min(start + _ROWS, space.num_states)
+    out = np.zeros((stop - start, space.num_actions))
+    rows = list(map(tuple, space.states(slice(start, stop)).tolist()))
+    going = np.flatnonzero(~space.terminal[start:stop]).tolist()
+    with np.errstate(all="ignore"):  # what is not finite is reported
+        for a in range(space.num_actions):
+            following = list(map(tuple, space.states(space.successors[start:stop, a]).tolist()))
+            for i in going:
+                try:
+                    out[i, a] = env.reward(rows[i], a, following[i])
+                except Exception as error:
+                    raise _refused(space, env, start + i, a, f"raises {error!r}") from error
+    return out
 
 
 def _with_reward(env: Environment, reward: Callable) -> Environment:

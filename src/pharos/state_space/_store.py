@@ -69,10 +69,14 @@ class StateSpace:
         return self._map(name, self.manifest["arrays"][name]["dtype"], (self.num_states, self.num_actions))
 
     @cached_property
+    def terminal_bits(self) -> np.ndarray:
+        """(ceil(S / 8),) uint8, read-only memory map: state i is terminal where bit i % 8 of byte i // 8 is set."""
+        return self._map(TERMINAL, "|u1", (-(-self.num_states // 8),))
+
+    @cached_property
     def terminal(self) -> np.ndarray:
         """(S,) bool, in memory."""
-        bits = self._map(TERMINAL, "|u1", (-(-self.num_states // 8),))
-        terminal = np.unpackbits(bits, count=self.num_states, bitorder="little").view(np.bool_)
+        terminal = np.unpackbits(self.terminal_bits, count=self.num_states, bitorder="little").view(np.bool_)
         terminal.flags.writeable = False
         return terminal
 
@@ -106,11 +110,11 @@ class StateSpace:
     def is_terminal(self, i: int) -> bool:
         """Whether state number i is terminal."""
         self._check_index(i)
-        return bool(self._map(TERMINAL, "|u1", (-(-self.num_states // 8),))[i // 8] >> (i % 8) & 1)
+        return bool(self.terminal_bits[i // 8] >> (i % 8) & 1)
 
     def index(self, state: Sequence[int]) -> int:
         """The number of a state; ParameterError where it is not reachable. The first call indexes all states, in O(S)."""
-        return int(self.indices(np.array([state]))[0])
+        return int(self.indices(np.array([tuple(state)]))[0])
 
     def indices(self, states: np.ndarray) -> np.ndarray:
         """(N, D) integers -> (N,) int64, the numbers of these states; ParameterError where one is not reachable."""
@@ -121,6 +125,8 @@ class StateSpace:
             raise ParameterError(
                 f"{self}: a state has {len(self.component_names)} components; found an array of shape {states.shape}"
             )
+        if states.dtype.kind not in "iub":
+            raise ParameterError(f"{self}: a state consists of integers; found {states.dtype}")
         out = np.empty(len(states), np.int64)
         inside = (states >= self.layout.low) & (states < self.layout.low + self.layout.size)
         keys = pack(self.layout, np.where(inside, states, self.layout.low))
@@ -178,15 +184,16 @@ class StateSpace:
         return f"StateSpace({what}, num_states={self.num_states})"
 
 
-def load(folder: str | os.PathLike, *, verify: bool = True) -> StateSpace:
+def load(folder: str | os.PathLike, *, verify: bool = True, environment: Environment | None = None) -> StateSpace:
     """Open a state space that `build` wrote.
 
     Args:
         folder: where it is.
         verify: compare every file with its checksums (one read of the files, several GB/s); False trusts their lengths.
+        environment: whose state space it is; None for what the manifest says, where pharos knows its class.
     Raises:
         StateSpaceError: there is no state space; StateSpaceIncomplete: its build did not finish; StateSpaceCorrupted: a file
-        is missing, truncated or changed.
+        is missing, truncated or changed; StateSpaceMismatch: the rules of the environment are not those it was built with.
     """
     folder = Path(folder)
     manifest = read_manifest(folder)
@@ -199,9 +206,11 @@ def load(folder: str | os.PathLike, *, verify: bool = True) -> StateSpace:
             f"{folder}: the build stopped at {manifest['num_states']} states; the same build command resumes it"
         )
     check_lengths(folder, manifest)
-    space = StateSpace(folder, manifest, _environment_of(folder, manifest))
+    space = StateSpace(folder, manifest, environment or _environment_of(folder, manifest))
     if verify:
         space.verify()
+    if space.environment is not None:
+        check_rules(folder, space.environment, space.layout, space.packed_states, space.successors, space.terminal_bits)
     return space
 
 
@@ -209,7 +218,7 @@ def read_manifest(folder: Path) -> dict[str, Any] | None:
     """The manifest of a folder, None where there is none; StateSpaceCorrupted where it is nonsense."""
     try:
         text = (folder / MANIFEST).read_text()
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         return None
     except (OSError, UnicodeDecodeError) as error:
         raise StateSpaceCorrupted(f"{folder / MANIFEST}: cannot be read: {error}") from None
@@ -251,6 +260,22 @@ def check_lengths(folder: Path, manifest: dict[str, Any]) -> None:
             )
 
 
+def check_rules(
+    folder: Path, env: Environment, layout: Layout, states: np.ndarray, successors: np.ndarray, bits: np.ndarray
+) -> None:
+    """StateSpaceMismatch where the rules of `env` disagree with stored transitions, in 64 states spread over the file."""
+    for i in np.unique(np.linspace(0, len(successors) - 1, 64).astype(np.int64)):
+        state = tuple(unpack(layout, states[i : i + 1])[0].tolist())
+        stored = [tuple(row) for row in unpack(layout, states[successors[i]]).tolist()]
+        ended = bool(env.is_terminal(state))
+        found = [state if ended else env.next_state(state, action) for action in range(env.num_actions)]
+        if stored != found or ended != bool(bits[i // 8] >> (i % 8) & 1):
+            raise StateSpaceMismatch(
+                f"{folder}: was built with other rules: from state {state} they lead to {stored}, those of this {env.name} to "
+                f"{found}; build in another folder, and raise `version` when you change rules"
+            )
+
+
 def identity_of(env: Environment) -> dict[str, Any]:
     """What makes a state space the state space of `env`: kept in the manifest and hashed into the cache's folder names."""
     layout = layout_of(env.components)
@@ -280,7 +305,12 @@ def _environment_of(folder: Path, manifest: dict[str, Any]) -> Environment | Non
     cls = classes().get(manifest["environment"])
     if cls is None:
         return None
-    env = cls(**{name: _tuples(value) for name, value in manifest["parameters"].items()})
+    try:
+        env = cls(**{name: _tuples(value) for name, value in manifest["parameters"].items()})
+    except (TypeError, ParameterError) as error:
+        raise StateSpaceMismatch(
+            f"{folder}: its parameters are not those of this pharos' {manifest['environment']}: {error}; build again"
+        ) from error
     found = identity_of(env)
     for key in ("rules_version", "parameters", "actions", "layout", "start"):
         if found[key] != manifest[key]:
