@@ -1,8 +1,8 @@
 """Pictures of states: for people (`human`, `text`), and a place where observations add theirs.
 
 Everything is made from what an environment declares: `draw` says what is where (one plane of cells for each layer) and
-`layers` say how each looks. A class of environments may have a ground of its own (`GROUNDS`); things whose layer has no
-sprite are drawn by the name of the layer (`SHAPES`), otherwise as a tile.
+`layers` say how each looks. A class of environments may have a ground of its own (`GROUNDS`), and layers shapes of their own
+(`SHAPES`); otherwise a layer without sprite is drawn as blocks.
 """
 
 import os
@@ -73,7 +73,7 @@ def human(env: Environment, state: Sequence[int], *, cell: int | None = None) ->
     GROUNDS.get(env.name, _plain_ground)(canvas, court, cell)
     for plane, (name, layer) in zip(planes, env.layers.items(), strict=True):
         for row, column in np.argwhere(plane):
-            tile = _tile(name, layer, int(plane[row, column]), cell)
+            tile = _tile(env.name, name, layer, int(plane[row, column]), cell)
             place = court[row * cell : (row + 1) * cell, column * cell : (column + 1) * cell]
             place += (tile[..., :3] - place) * tile[..., 3:]
     return np.rint(canvas).astype(np.uint8)
@@ -135,7 +135,7 @@ def image(picture: np.ndarray, caption: str = "") -> "Image":
     drawn = Image.fromarray(picture)
     if not caption:
         return drawn
-    size = max(11, min(20, drawn.width // 22))
+    size = max(12, min(20, drawn.width // 22))
     font = ImageFont.load_default(size)
     framed = Image.new("RGB", (drawn.width, drawn.height + 2 * size), NIGHT)
     framed.paste(drawn, (0, 0))
@@ -266,15 +266,15 @@ GROUNDS: dict[str, Ground] = {
 
 
 @cache
-def _tile(name: str, layer: Layer, value: int, cell: int) -> np.ndarray:
-    """How the thing number `value` of a layer looks."""
-    color = _of_value(layer.color, value, np.ndim(layer.color) == 2)
-    sprite = layer.sprite
-    if sprite is not None:
-        rows = _of_value(sprite, value, not isinstance(sprite[0], str))
-        return _sprite(rows, color, cell)
-    shape = SHAPES.get(name, _block)
-    return shape(np.array(color, np.float64), cell)
+def _tile(class_name: str, name: str, layer: Layer, value: int, cell: int) -> np.ndarray:
+    """How the thing number `value` of a layer looks: a shape for this class, the sprite, a shape for any class, a block."""
+    color = np.array(_of_value(layer.color, value, np.ndim(layer.color) == 2), np.float64)
+    glyph = _of_value(layer.glyph, value, True)
+    shape = SHAPES.get(f"{class_name}.{name}")
+    if shape is None and layer.sprite is not None:
+        rows = _of_value(layer.sprite, value, not isinstance(layer.sprite[0], str))
+        return _sprite(rows, _of_value(layer.color, value, np.ndim(layer.color) == 2), cell)
+    return (shape or SHAPES.get(name, _block))(color, cell, glyph)
 
 
 def _of_value(given: Any, value: int, several: bool) -> Any:
@@ -302,7 +302,7 @@ def shade(color: Color, letter: str) -> Color:
     return red, green, blue
 
 
-def _block(color: np.ndarray, cell: int) -> np.ndarray:
+def _block(color: np.ndarray, cell: int, glyph: str) -> np.ndarray:
     """A tile with a light upper and a dark lower edge and a hair of ground around it."""
     tile = np.empty((cell, cell, 4))
     tile[..., :3], tile[..., 3] = color, 1.0
@@ -314,7 +314,7 @@ def _block(color: np.ndarray, cell: int) -> np.ndarray:
     return tile
 
 
-def _disc(color: np.ndarray, cell: int) -> np.ndarray:
+def _disc(color: np.ndarray, cell: int, glyph: str) -> np.ndarray:
     """A ball with a highlight and a thin dark rim."""
     distance = _distance(cell, 0.5, 0.5)
     light = np.clip(1 - _distance(cell, 0.38, 0.34) / 0.5, 0, 1)[..., None]
@@ -323,7 +323,7 @@ def _disc(color: np.ndarray, cell: int) -> np.ndarray:
     return np.concatenate((body, _cover(distance, 0.40, cell)[..., None]), axis=2)
 
 
-def _pit(color: np.ndarray, cell: int) -> np.ndarray:
+def _pit(color: np.ndarray, cell: int, glyph: str) -> np.ndarray:
     """A hole: dark water that is deeper in the middle, with a bright rim of broken ice."""
     distance = _distance(cell, 0.5, 0.5)
     deep = np.clip(1 - distance / 0.42, 0, 1)[..., None]
@@ -332,7 +332,7 @@ def _pit(color: np.ndarray, cell: int) -> np.ndarray:
     return np.concatenate((water, _cover(distance, 0.42, cell)[..., None]), axis=2)
 
 
-def _flag(color: np.ndarray, cell: int) -> np.ndarray:
+def _flag(color: np.ndarray, cell: int, glyph: str) -> np.ndarray:
     """A goal: a golden cell with a flag on it."""
     y, x = _grid(cell)
     tile = np.empty((cell, cell, 4))
@@ -365,6 +365,51 @@ def _cover(distance: np.ndarray, radius: float, cell: int) -> np.ndarray:
     return np.clip((radius - distance) * cell + 0.5, 0, 1)
 
 
-Shape = Callable[[np.ndarray, int], np.ndarray]
-SHAPES: dict[str, Shape] = {"ball": _disc, "agent": _disc, "holes": _pit, "goal": _flag}
-"""Name of a layer without sprite -> function (colour, pixels of a cell) -> (cell, cell, 4)."""
+def _bar(color: np.ndarray, cell: int, glyph: str) -> np.ndarray:
+    """A slab in the upper half of the cell; neighbours join."""
+    tile = np.zeros((cell, cell, 4))
+    height, edge = max(3, cell * 7 // 16), max(1, cell // 12)
+    tile[:height, :, :3], tile[:height, :, 3] = color, 1.0
+    tile[:edge, :, :3] = _mixed(color, 255, 0.4)
+    tile[height - edge : height, :, :3] = _mixed(color, 0, 0.35)
+    return tile
+
+
+def _car(color: np.ndarray, cell: int, glyph: str) -> np.ndarray:
+    """A car from above, with its lights on; it goes left where its glyph is "<"."""
+    fine = 4
+    y, x = _grid(fine * cell)
+    if glyph == "<":
+        x = 1 - x
+    canvas = np.zeros((*x.shape, 4))
+
+    def box(x0: float, x1: float, half: float, round_off: float, paint: Any) -> None:
+        dx = np.maximum(np.maximum(x0 + round_off - x, x - x1 + round_off), 0)
+        dy = np.maximum(abs(y - 0.5) - half + round_off, 0)
+        canvas[np.hypot(dx, dy) <= round_off] = (*np.broadcast_to(paint, 3), 1.0)
+
+    for start in (0.16, 0.66):  # wheels
+        box(start, start + 0.18, 0.34, 0.03, 14.0)
+    box(0.04, 0.96, 0.28, 0.10, _mixed(color, 0, 0.35))  # rim
+    box(0.06, 0.94, 0.25, 0.09, color)
+    box(0.22, 0.72, 0.21, 0.06, (34, 40, 52))  # windows
+    box(0.31, 0.58, 0.19, 0.04, _mixed(color, 255, 0.22))  # roof
+    for sign in (-1, 1):  # headlights, brake lights
+        canvas[(x > 0.89) & (x < 0.95) & (abs(y - 0.5 - 0.16 * sign) < 0.05), :3] = (255, 246, 190)
+        canvas[(x > 0.05) & (x < 0.09) & (abs(y - 0.5 - 0.17 * sign) < 0.05), :3] = (230, 30, 30)
+    parts = canvas.reshape(cell, fine, cell, fine, 4)
+    cover = parts[..., 3].mean(axis=(1, 3))
+    body = (parts[..., :3] * parts[..., 3:]).sum(axis=(1, 3)) / np.maximum(cover[..., None] * fine**2, 1e-9)
+    return np.concatenate((body, cover[..., None]), axis=2)
+
+
+Shape = Callable[[np.ndarray, int, str], np.ndarray]
+SHAPES: dict[str, Shape] = {
+    "ball": _disc,
+    "agent": _disc,
+    "holes": _pit,
+    "goal": _flag,
+    "paddle": _bar,
+    "freeway.cars": _car,
+}
+"""Name of a layer without sprite, or "class.layer" -> function (colour, pixels of a cell, glyph) -> (cell, cell, 4)."""

@@ -1,0 +1,194 @@
+"""Pictures of states: every environment can be drawn, and what is drawn is where the planes say."""
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from pharos import Environment, Layer, make
+from pharos.environments import text_drawing
+from pharos.errors import ParameterError, UnknownName
+from pharos.rendering import (
+    RENDERERS,
+    colored_text,
+    episode,
+    human,
+    image,
+    planes_of,
+    render,
+    save_gif,
+    save_png,
+    shade,
+    text,
+)
+
+ENVIRONMENTS = ["simple_grid/6x6-decoy", "frozen_lake/8x8", "freeway/16x7-speed2", "breakout/12x8x3"]
+
+
+def start_of(env):
+    return tuple(env.initial_states()[0][0])
+
+
+def cells_of(picture, cell):
+    """(rows, columns, cell, cell, 3): a picture without its margin, cut into cells."""
+    margin = cell // 2
+    court = picture[margin:-margin, margin:-margin]
+    rows, columns = court.shape[0] // cell, court.shape[1] // cell
+    return court.reshape(rows, cell, columns, cell, 3).swapaxes(1, 2)
+
+
+@pytest.mark.parametrize("name", ENVIRONMENTS)
+def test_every_environment_can_be_drawn_in_every_state_of_an_episode(name):
+    env = make(name)
+    rng = np.random.default_rng(0)
+    for state, _, _ in episode(env, lambda _: rng.integers(env.num_actions), start_of(env), steps=30):
+        picture = human(env, state)
+        rows, columns = env.grid()
+        assert picture.dtype == np.uint8
+        assert picture.shape[0] <= 720 and picture.shape[1] <= 960
+        assert picture.shape[0] * (columns + 1) == picture.shape[1] * (rows + 1)
+
+
+@pytest.mark.parametrize("name", ENVIRONMENTS)
+def test_only_the_cells_whose_planes_differ_look_different(name):
+    env = make(name)
+    rng = np.random.default_rng(1)
+    states = [state for state, _, _ in episode(env, lambda _: rng.integers(env.num_actions), start_of(env), steps=40)]
+    for before, after in itertools.pairwise(states):
+        differs = (planes_of(env, before) != planes_of(env, after)).any(axis=0)
+        drawn = cells_of(human(env, before, cell=16), 16) != cells_of(human(env, after, cell=16), 16)
+        np.testing.assert_array_equal(drawn.any(axis=(2, 3, 4)), differs)
+
+
+def test_the_ball_is_white_and_the_bricks_are_red():
+    env = make("breakout", height=8, columns=6)
+    cells = cells_of(human(env, start_of(env), cell=32), 32)
+    assert (cells[3, 2, 16, 16] > 220).all()
+    red, green, blue = cells[1, 0, 16, 16].tolist()
+    assert red > 2 * green and red > 2 * blue
+    assert (cells[5, 0] < 40).all()
+
+
+def test_cars_look_where_they_go():
+    env = make("freeway", num_cars=2, lane_length=3)
+    cells = cells_of(human(env, start_of(env), cell=64), 64)
+    right, left = cells[1, 0].astype(int), cells[2, 0].astype(int)
+    yellow = (255, 246, 190)
+    assert (right[:, 32:] == yellow).all(axis=2).any() and not (right[:, :32] == yellow).all(axis=2).any()
+    assert (left[:, :32] == yellow).all(axis=2).any() and not (left[:, 32:] == yellow).all(axis=2).any()
+
+
+def test_text_is_the_drawing_of_the_environment():
+    env = make("frozen_lake")
+    assert text(env, (0, 0)) == text_drawing(env, (0, 0)) == "A...\n.O.O\n...O\nO..G"
+    assert colored_text(env, (0, 0)).plain.replace(" ", "") == text(env, (0, 0))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lamp(Environment):
+    """A switch: on, dim or off."""
+
+    name = "lamp"
+    actions = ("press",)
+    layers = {
+        "lamp": Layer((".", "*"), ((90, 80, 10), (250, 240, 90)), (("#.", ".#"), ("15", "9."))),
+        "frame": Layer("+", (0, 0, 255)),
+    }
+
+    def variables(self):
+        return {"light": range(3)}
+
+    def initial_state(self):
+        return (0,)
+
+    def transition(self, state, action, out):
+        out[0] = (state[0] + 1) % 3
+
+    def reward(self, state, action, next_state):
+        return 0.5
+
+    def grid(self):
+        return 1, 2
+
+    def draw(self, state, planes):
+        planes[0, 0, 0] = state[0]
+        planes[1, 0, 1] = 1
+
+
+def test_a_sprite_for_each_value_and_shades_from_light_to_dark():
+    dim, bright = (cells_of(human(Lamp(), (light,), cell=8), 8)[0, 0] for light in (1, 2))
+    assert dim[0, 0].tolist() == dim[7, 7].tolist() == [90, 80, 10]
+    assert dim[0, 7].tolist() == dim[7, 0].tolist() != [90, 80, 10]  # the ground shows through
+    assert bright[0, 7].tolist() == [250, 240, 90]
+    assert bright[0, 0].sum() > bright[0, 7].sum() > bright[7, 0].sum()
+    assert shade((100, 100, 100), "#") == shade((100, 100, 100), "5") == (100, 100, 100)
+    assert shade((100, 100, 100), "1") == (224, 224, 224)
+    assert shade((100, 100, 100), "9") == (20, 20, 20)
+
+
+def test_an_episode_ends_with_the_state_it_reaches():
+    assert episode(Lamp(), lambda _: 0, (0,), steps=2) == [((0,), 0, 0.5), ((1,), 0, 0.5), ((2,), -1, 0.0)]
+    lake = make("frozen_lake")
+    fell = episode(lake, lambda state: 2 if state == (0, 0) else 1, (0, 0), steps=50)
+    assert [state for state, _, _ in fell] == [(0, 0), (0, 1), (1, 1)]
+
+
+def test_observations_can_be_plugged_in(monkeypatch):
+    monkeypatch.setitem(RENDERERS, "dot", lambda env, state: np.full((2, 3), 7, np.uint8))
+    picture = render(Lamp(), (0,), "dot")
+    assert picture.shape == (2, 3, 3) and (picture == 7).all()
+
+
+def test_what_cannot_be_drawn_is_said():
+    with pytest.raises(UnknownName, match="did you mean 'human'"):
+        render(Lamp(), (0,), "humen")
+    with pytest.raises(ParameterError, match="light = 3; expected 0 to 2"):
+        human(Lamp(), (3,))
+    with pytest.raises(ParameterError, match="2 components; expected 1"):
+        human(Lamp(), (0, 0))
+    with pytest.raises(ParameterError, match=r"must define grid\(\)"):
+        human(Blind(), (0,))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Blind(Environment):
+    """An environment that nobody has drawn."""
+
+    name = "blind"
+    actions = ("wait",)
+
+    def variables(self):
+        return {"x": range(1)}
+
+
+def test_png_holds_the_picture_and_a_caption_below(tmp_path):
+    picture = human(make("simple_grid"), (1, 2))
+    with Image.open(save_png(tmp_path / "a.png", picture)) as read:
+        np.testing.assert_array_equal(np.asarray(read), picture)
+    with Image.open(save_png(tmp_path / "b.png", picture, caption="step 3")) as read:
+        written = np.asarray(read)
+    np.testing.assert_array_equal(written[: len(picture)], picture)
+    assert written[len(picture) :].max() > 200
+    assert image(picture).size == (picture.shape[1], picture.shape[0])
+
+
+def test_small_pictures_are_enlarged_by_a_whole_factor(tmp_path):
+    small = np.arange(18, dtype=np.uint8).reshape(2, 3, 3)
+    with Image.open(save_png(tmp_path / "a.png", small, at_least=10)) as read:
+        np.testing.assert_array_equal(np.asarray(read), small.repeat(4, axis=0).repeat(4, axis=1))
+
+
+def test_gif_has_the_frames_their_time_and_their_colours(tmp_path):
+    env = make("frozen_lake")
+    states = [(0, 0), (1, 0), (2, 0), (2, 1)]
+    pictures = [human(env, state) for state in states]
+    with Image.open(save_gif(tmp_path / "a.gif", pictures, frames_per_second=10)) as read:
+        assert read.n_frames == 4
+        assert read.info["loop"] == 0
+        for number, picture in enumerate(pictures):
+            read.seek(number)
+            assert read.info["duration"] == (1100 if number == 3 else 100)
+            off = np.abs(np.asarray(read.convert("RGB")).astype(int) - picture).max(axis=2)
+            assert (off > 24).mean() < 0.01  # a palette of 256 colours
