@@ -80,7 +80,7 @@ def main() -> None:
         )
 
     def in_pharos(start, stop):
-        bellman.optimal_block(next_states, table, palette, 0.99, 0.0, 1.0, v, out, start, stop)
+        bellman.optimal_block(next_states, table, palette, 0.99, 0.0, 1.0, v, out, (0,) * mdp.num_actions, start, stop)
 
     for threads in (1, THREADS):
         found = {}

@@ -114,8 +114,8 @@ class _Backup:
             return change
         arguments = (mdp.next_states, table.table, table.palette, mdp.gamma)
         if mdp.is_sticky:
-            return bellman.sticky_policy_sweep(*arguments, self.weights, self.policy, self.x, False)
-        return bellman.policy_sweep(*arguments, self.policy, self.x, False)
+            return bellman.sticky_policy_sweep(*arguments, self.weights, self.policy, self.x)
+        return bellman.policy_sweep(*arguments, self.policy, self.x)
 
     def backup(self, x: np.ndarray) -> np.ndarray:
         """The backup of x, not in place; NumPy on whole arrays."""

@@ -11,6 +11,8 @@ already new, so it is within gamma max(|x_old - x*|, |x_new - x*|) + e of x*. Wi
 
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import numpy as np
 
@@ -125,6 +127,8 @@ class _Sweeper:
         shape = (mdp.num_states + 1, mdp.num_actions) if mdp.is_sticky else (mdp.num_states + 1,)
         self.x = np.zeros(shape)
         self.weights = (mdp.chance.chosen, mdp.chance.previous, mdp.chance.uniform)
+        self.actions = (0,) * mdp.num_actions
+        self.tables = (mdp.next_states, mdp.reward_table.table, mdp.reward_table.palette)
 
     def sweep(self) -> float:
         """In place, from the last state to the first; the largest change."""
@@ -136,40 +140,27 @@ class _Sweeper:
             change = float(np.abs(new - self.x).max())
             self.x = new
             return change
-        rewards = mdp.reward_table
+        table, weight = self.tables, chance.uniform
         if mdp.is_sticky:
-            return bellman.sticky_sweep(
-                mdp.next_states, rewards.table, rewards.palette, mdp.gamma, self.weights, self.sign, self.x, False
-            )
-        return bellman.optimal_sweep(
-            mdp.next_states, rewards.table, rewards.palette, mdp.gamma, chance.uniform, self.sign, self.x, False
-        )
+            return bellman.sticky_sweep(*table, mdp.gamma, self.weights, self.sign, self.x, self.actions)
+        return bellman.optimal_sweep(*table, mdp.gamma, weight, self.sign, self.x, self.actions)
 
     def backup(self, x: np.ndarray) -> np.ndarray:
-        """The backup of x, not in place."""
+        """The backup of x, not in place; threads share it."""
         from pharos._core import bellman
 
-        mdp, rewards = self.mdp, self.mdp.reward_table
-        out = np.zeros_like(x)
+        mdp = self.mdp
+        out = np.empty_like(x)
+        out[-1] = 0
         if mdp.transitions is not None:
             return self._general_backup(x, out)
-        if mdp.is_sticky:
-            bellman.sticky_block(
-                mdp.next_states, rewards.table, rewards.palette, mdp.gamma, self.weights, self.sign, x, out
-            )
-        else:
-            bellman.optimal_block(
-                mdp.next_states,
-                rewards.table,
-                rewards.palette,
-                mdp.gamma,
-                mdp.chance.uniform,
-                self.sign,
-                x,
-                out,
-                0,
-                mdp.num_states,
-            )
+        kernel: Any = bellman.sticky_block if mdp.is_sticky else bellman.optimal_block
+        weights = self.weights if mdp.is_sticky else mdp.chance.uniform
+
+        def block(start: int, stop: int) -> None:
+            kernel(*self.tables, mdp.gamma, weights, self.sign, x, out, self.actions, start, stop)
+
+        shared(block, mdp.num_states)
         return out
 
     def _general_backup(self, x: np.ndarray, out: np.ndarray) -> np.ndarray:
@@ -215,6 +206,18 @@ def _backward_induction(sweeper: _Sweeper, horizon: int, kind: str, keep_all: bo
         _v_next=None if mdp.is_sticky else previous[:-1],
         all_steps=None if steps is None else np.stack(steps),
     )
+
+
+def shared(block: Callable[[int, int], None], num_states: int) -> None:
+    """block(start, stop) over all states, on all processors where there are enough states to share."""
+    from pharos._core.compiling import usable_workers
+
+    workers = usable_workers(None) if num_states >= 1 << 16 else 1
+    if workers == 1:
+        return block(0, num_states)
+    cuts = [num_states * i // workers for i in range(workers + 1)]
+    with ThreadPoolExecutor(workers) as pool:
+        list(pool.map(block, cuts[:-1], cuts[1:]))
 
 
 def check_tolerance(tolerance: float) -> None:
