@@ -17,6 +17,7 @@ from pharos.cli.common import (
     TargetArgument,
     Workers,
     check_format,
+    describe_chance,
     parse_size,
     parse_target,
     print_facts,
@@ -99,12 +100,6 @@ def solve(
     if out is not None:
         facts.append(("written", out))
     print_facts(" ".join((target, *(parameters or ()))), facts)
-
-
-def describe_chance(sticky: float, random: float) -> str:
-    """Chance in words."""
-    parts = [f"sticky actions {sticky:g}"] * bool(sticky) + [f"random actions {random:g}"] * bool(random)
-    return ", ".join(parts) or "none"
 
 
 def save(path: Path, solution: Any) -> None:

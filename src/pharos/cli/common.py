@@ -32,6 +32,7 @@ Parameters = Annotated[
     list[str] | None,
     typer.Argument(metavar="[NAME=VALUE]...", help="Parameters of the environment.", show_default=False),
 ]
+Tolerance = Annotated[float, typer.Option("--tolerance", help="Largest error of a value, in units of return.")]
 Memory = Annotated[
     str | None, typer.Option("--memory", metavar="SIZE", help="Memory to use at most, such as 2GiB or 500MB.")
 ]
@@ -269,6 +270,12 @@ def print_facts(title: str, facts: Sequence[tuple[str, object]]) -> None:
     to = console()
     to.print(f"[bold]{escape(title)}[/bold]", soft_wrap=True)
     to.print(table)
+
+
+def describe_chance(sticky: float, random: float) -> str:
+    """Chance in words."""
+    parts = [f"sticky actions {sticky:g}"] * bool(sticky) + [f"random actions {random:g}"] * bool(random)
+    return ", ".join(parts) or "none"
 
 
 def size_text(count: float) -> str:

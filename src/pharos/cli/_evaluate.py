@@ -1,0 +1,128 @@
+"""pharos evaluate: the exact value of a policy, between those of the best and the worst."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from pharos.cli.common import (
+    Gamma,
+    Horizon,
+    Json,
+    MaxStates,
+    Memory,
+    Parameters,
+    Random,
+    Sticky,
+    TargetArgument,
+    Tolerance,
+    Workers,
+    describe_chance,
+    parse_size,
+    parse_target,
+    print_facts,
+    print_json,
+    progress_line,
+)
+from pharos.errors import FileFormatError, ParameterError, UnknownName
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from pharos.mdp import TabularMDP
+
+POLICIES = ("optimal", "uniform", "worst")
+
+
+def evaluate(
+    target: TargetArgument,
+    parameters: Parameters = None,
+    policy: Annotated[
+        str, typer.Option("--policy", help="optimal, uniform, worst, or FILE.npy: actions (S,), probabilities (S, A).")
+    ] = "uniform",
+    gamma: Gamma = None,
+    horizon: Horizon = None,
+    sticky: Sticky = 0.0,
+    random: Random = 0.0,
+    tolerance: Tolerance = 1e-6,
+    memory: Memory = None,
+    workers: Workers = None,
+    max_states: MaxStates = None,
+    json: Json = False,
+) -> None:
+    """Evaluate a policy exactly, and say where it stands: regret 0 is optimal, 1 is as bad as playing at random."""
+    limit = parse_size(memory)
+    given = None if policy in POLICIES else read_policy(policy)
+    mdp = parse_target(target, parameters).mdp(
+        gamma=gamma, horizon=horizon, sticky=sticky, random=random, memory=limit, workers=workers, max_states=max_states
+    )
+    with progress_line("evaluating"):
+        values = _values(mdp, policy, given, tolerance)
+    best, uniform, worst = (values[name].value_at_start for name in POLICIES)
+    solution = values["given"]
+    value = solution.value_at_start
+    spread = best - uniform
+    answer = {
+        "policy": policy,
+        "value_at_start": value,
+        "error_bound": solution.error_bound,
+        "regret": best - value,
+        "normalized_regret": (best - value) / spread if spread > 4 * tolerance else None,
+        "optimal_value_at_start": best,
+        "uniform_value_at_start": uniform,
+        "worst_value_at_start": worst,
+        "seconds": sum(each.seconds for each in values.values()),
+        "gamma": mdp.gamma,
+        "horizon": mdp.horizon,
+        "sticky": sticky,
+        "random": random,
+    }
+    if json:
+        print_json(answer)
+        return
+    relative = answer["normalized_regret"]
+    print_facts(
+        f"{policy} policy on {' '.join((target, *(parameters or ())))}",
+        [
+            ("value at the start", f"{value:.8g}"),
+            ("regret", f"{answer['regret']:.8g}"),
+            ("normalized regret", "-" if relative is None else f"{relative:.6g}  (0: optimal, 1: uniform)"),
+            ("optimal, uniform, worst", f"{best:.8g}, {uniform:.8g}, {worst:.8g}"),
+            ("error at most", f"{max(each.error_bound for each in values.values()):.2g}"),
+            ("discount", f"{mdp.gamma:g}, {'no horizon' if mdp.horizon is None else f'horizon {mdp.horizon}'}"),
+            ("chance", describe_chance(sticky, random)),
+        ],
+    )
+
+
+def _values(mdp: "TabularMDP", policy: str, given: "np.ndarray | None", tolerance: float) -> dict[str, Any]:
+    from pharos.solvers import evaluate_policy, uniform_value, value_iteration, worst_value
+
+    values: dict[str, Any] = {} if given is None else {"given": evaluate_policy(mdp, given, tolerance)}
+    values["optimal"] = value_iteration(mdp, tolerance)
+    values["uniform"] = uniform_value(mdp, tolerance)
+    values["worst"] = worst_value(mdp, tolerance)
+    values.setdefault("given", values.get(policy))
+    return values
+
+
+def read_policy(name: str) -> "np.ndarray":
+    """The policy in a file: .npy, or `policy` of .npz.
+
+    Raises:
+        UnknownName: neither a policy nor a file. FileFormatError: the file holds no such array.
+    """
+    import numpy as np
+
+    path = Path(name).expanduser()
+    if path.suffix.lower() not in (".npy", ".npz"):
+        raise UnknownName("policy", name, [*POLICIES, "FILE.npy"])
+    if not path.is_file():
+        raise ParameterError(f"--policy {name}: no such file")
+    try:
+        if path.suffix.lower() == ".npy":
+            return np.load(path, allow_pickle=False)
+        with np.load(path, allow_pickle=False) as arrays:
+            return arrays["policy"]
+    except (ValueError, KeyError, EOFError) as error:
+        raise FileFormatError(f"{path}: {error}; expected an array of actions (S,) or probabilities (S, A)") from error
