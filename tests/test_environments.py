@@ -483,7 +483,7 @@ def test_built_in_classes_have_a_path_too():
 
 
 def test_listing_environments_loads_nothing_heavy():
-    heavy = "{'numba', 'scipy', 'pandas', 'matplotlib', 'torch', 'gymnasium'}"
+    heavy = "{'numba', 'scipy', 'pandas', 'matplotlib', 'torch'}"
     code = f"import sys, pharos; pharos.list_environments(); pharos.make('freeway'); print({heavy} & set(sys.modules))"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip() == "set()"
 

@@ -160,10 +160,15 @@ class Environment:
         for variable, declared in self.variables().items():
             start = len(names)
             for index, values in _flattened(declared):
-                if not isinstance(values, range) or values.step != 1 or len(values) == 0:
+                if not isinstance(values, range) or values.step != 1 or not values:
                     raise ParameterError(
                         f"{self}: variable {variable!r} is declared as {values!r}; expected a non-empty range with step 1, "
                         f"or a nested sequence of such ranges"
+                    )
+                if values.start < -(2**63) or values.stop > 2**63 or values.stop - values.start >= 2**63:
+                    raise ParameterError(
+                        f"{self}: variable {variable!r} is declared as {values!r}; "
+                        f"expected integers of 64 bits, and at most 2^63 - 1 values"
                     )
                 names.append(variable + (f"[{','.join(map(str, index))}]" if index else ""))
                 ranges.append(values)
@@ -171,7 +176,7 @@ class Environment:
         if not names:
             raise ParameterError(f"{self}: variables() declares nothing; a state needs at least one variable")
         low = np.array([values.start for values in ranges], np.int64)
-        size = np.array([len(values) for values in ranges], np.int64)
+        size = np.array([values.stop - values.start for values in ranges], np.int64)
         low.flags.writeable = size.flags.writeable = False
         return Components(tuple(names), slices, low, size)
 
@@ -195,6 +200,11 @@ def start_distribution(env: Environment) -> tuple[list[State], np.ndarray]:
         if values.shape != (len(components),):
             raise ParameterError(
                 f"{env}: start state {tuple(state)} has {values.size} components; expected {len(components)}"
+            )
+        if values.dtype.kind not in "iub":
+            i = next(i for i, value in enumerate(state) if not isinstance(value, int | np.integer))
+            raise ParameterError(
+                f"{env}: start state {tuple(state)} has {components.names[i]} = {state[i]!r}; expected an integer"
             )
         outside = np.flatnonzero((values < components.low) | (values > components.high))
         if outside.size:
