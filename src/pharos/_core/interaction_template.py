@@ -37,3 +37,61 @@ def step_one(parameters, ranges, scale, state, action, following, vector):
 def is_terminal_one(parameters, state):
     """Whether `state` is terminal."""
     return bool(is_terminal(Parameters(*parameters), state))
+
+
+@njit(cache=CACHE, nogil=True)
+def draw_simple(parameters, states, first, last, planes, shades, covering, out):
+    """out[n, l] = shades[l, value of layer l], each cell enlarged to a square, for states first .. last - 1.
+
+    planes (L, rows, columns) uint8 is room to draw; shades (L, 256) uint8; out (N, L or 1, rows k, columns k) uint8, zero.
+    With `covering`, all layers go to one plane and later ones cover earlier ones.
+    """
+    self = Parameters(*parameters)
+    layers, rows, columns = planes.shape
+    size = out.shape[2] // rows
+    for n in range(first, last):
+        planes[:] = 0
+        draw(self, states[n], planes)
+        for layer in range(layers):
+            plane = 0 if covering else layer
+            for row in range(rows):
+                for column in range(columns):
+                    shade = shades[layer, planes[layer, row, column]]
+                    if shade > 0:
+                        for y in range(row * size, (row + 1) * size):
+                            for x in range(column * size, (column + 1) * size):
+                                out[n, plane, y, x] = shade
+
+
+@njit(cache=CACHE, nogil=True)
+def draw_complex(parameters, states, first, last, planes, picture, top, left, sprite, place, color, keep, out):
+    """Lay the sprites of states first .. last - 1 on the ground, later layers over earlier ones.
+
+    picture (height, width, C) uint8: the ground; top (rows + 1,), left (columns + 1,): edges of the cells in pixels.
+    sprite (L, 256): number of the sprite of a value of a layer, -1 for none; place (sprites, heights, widths): where its pixels
+    for a cell of this height and width begin in color (P, C) uint8, premultiplied, and keep (P,) uint16: how much of the ground
+    stays, of 256.
+    """
+    self = Parameters(*parameters)
+    layers, rows, columns = planes.shape
+    channels = picture.shape[2]
+    for n in range(first, last):
+        planes[:] = 0
+        draw(self, states[n], planes)
+        out[n] = picture
+        for layer in range(layers):
+            for row in range(rows):
+                for column in range(columns):
+                    value = planes[layer, row, column]
+                    if value == 0 or sprite[layer, value] < 0:
+                        continue
+                    height = top[row + 1] - top[row]
+                    width = left[column + 1] - left[column]
+                    pixel = place[sprite[layer, value], height, width]
+                    for y in range(top[row], top[row + 1]):
+                        for x in range(left[column], left[column + 1]):
+                            stays = keep[pixel]
+                            for channel in range(channels):
+                                ground = int64(out[n, y, x, channel]) * stays >> 8
+                                out[n, y, x, channel] = color[pixel, channel] + ground
+                            pixel += 1

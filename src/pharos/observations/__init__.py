@@ -3,11 +3,26 @@
 `observe(env, "vector")` gives one; calling it with states (N, D) gives N observations. Nothing is stored with the states.
 """
 
+from pharos.observations._complex_image import ComplexImage
 from pharos.observations._observation import FunctionObservation, Observation, add_built_in, names, observe, register
+from pharos.observations._simple_image import SimpleImage
 from pharos.observations._vector import Index, OneHot, Vector
 
 add_built_in("vector", Vector)
+add_built_in("simple_image", SimpleImage)
+add_built_in("complex_image", ComplexImage)
 add_built_in("one_hot", OneHot)
 add_built_in("index", Index)
 
-__all__ = ["FunctionObservation", "Index", "Observation", "OneHot", "Vector", "names", "observe", "register"]
+__all__ = [
+    "ComplexImage",
+    "FunctionObservation",
+    "Index",
+    "Observation",
+    "OneHot",
+    "SimpleImage",
+    "Vector",
+    "names",
+    "observe",
+    "register",
+]
