@@ -95,6 +95,13 @@ def _conventions(mdp: TabularMDP, restart: bool) -> dict[str, Any]:
     }
 
 
+def _kernels() -> Any:
+    """The compiled searches, loaded when the first one is made."""
+    from pharos._core import graph
+
+    return graph
+
+
 class Graph:
     """The graph of a deterministic MDP, with restart edges and the implicit end as `pharos._core.graph` describes them.
 
@@ -134,26 +141,22 @@ class Graph:
     def backward(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """(first, previous, restarting): the reversed graph, made when it is first needed."""
         if self._reversed is None:
-            from pharos._core.graph import reversed_graph
-
             restarting = np.empty(0, self.dtype)
             if self.start >= 0:
                 ending = np.flatnonzero(self.ends)
                 restarting = np.append(ending, [len(self.next_states)] * self.has_end).astype(self.dtype)
-            self._reversed = (*reversed_graph(self.next_states, self.ends, self.num_nodes), restarting)
+            self._reversed = (*_kernels().reversed_graph(self.next_states, self.ends, self.num_nodes), restarting)
         return self._reversed
 
     def search_forward(self, source: int, distance: np.ndarray) -> tuple[int, int, int]:
         """distance[v] = d(source, v); (nodes found, largest distance, sum of distances)."""
-        from pharos._core.graph import search_forward
-
-        return search_forward(self.next_states, self.ends, self.start, source, distance, self.queue)
+        kernels = _kernels()
+        return kernels.search_forward(self.next_states, self.ends, self.start, source, distance, self.queue)
 
     def search_backward(self, source: int, distance: np.ndarray) -> tuple[int, int, int]:
         """distance[v] = d(v, source); (nodes found, largest distance, sum of distances)."""
-        from pharos._core.graph import search_backward
-
-        return search_backward(*self.backward, self.start, source, distance, self.queue)
+        kernels = _kernels()
+        return kernels.search_backward(*self.backward, self.start, source, distance, self.queue)
 
 
 def _leads_to_end(table: np.ndarray, terminal: np.ndarray) -> bool:
@@ -233,14 +236,13 @@ class _Sweep:
 
     def _pivot(self, p: int) -> bool:
         """Search from p in both directions; False where p does not reach everything, or is not reached by everything."""
-        from pharos._core.graph import bound_eccentricities
-
+        kernels = _kernels()
         found, out_pivot, _ = self.graph.search_forward(p, self.away)
         reached, in_pivot, _ = self.graph.search_backward(p, self.to)
         self.spending.searches += 2
         if found < self.graph.num_nodes or reached < self.graph.num_nodes:
             return False
-        bound_eccentricities(
+        kernels.bound_eccentricities(
             self.away, self.to, out_pivot, in_pivot, self.out_lower, self.out_upper, self.in_lower, self.in_upper
         )
         self._settle_out(p, out_pivot)
@@ -248,18 +250,16 @@ class _Sweep:
         return True
 
     def _search_out(self, v: int) -> None:
-        from pharos._core.graph import raise_lower
-
+        kernels = _kernels()
         _, largest, _ = self.graph.search_forward(v, self.away)
-        raise_lower(self.away, self.in_lower)
+        kernels.raise_lower(self.away, self.in_lower)
         self._settle_out(v, largest)
         self.spending.searches += 1
 
     def _search_in(self, v: int) -> None:
-        from pharos._core.graph import raise_lower
-
+        kernels = _kernels()
         _, largest, _ = self.graph.search_backward(v, self.to)
-        raise_lower(self.to, self.out_lower)
+        kernels.raise_lower(self.to, self.out_lower)
         self._settle_in(v, largest)
         self.spending.searches += 1
 
@@ -272,9 +272,8 @@ class _Sweep:
         self.best = max(self.best, int(value))
 
     def _open(self) -> tuple[int, tuple[int, int, int, int, int]]:
-        from pharos._core.graph import open_eccentricities
-
-        counts = open_eccentricities(self.out_lower, self.out_upper, self.in_lower, self.in_upper, self.best)
+        kernels = _kernels()
+        counts = kernels.open_eccentricities(self.out_lower, self.out_upper, self.in_lower, self.in_upper, self.best)
         return min(counts[0], counts[1]), counts
 
     def _upper(self) -> int:
@@ -318,11 +317,10 @@ class _Sweep:
 
     def _search_many(self, outward: bool, words: int) -> int:
         """The exact eccentricities of the open nodes with the largest upper bounds; table entries read, times words."""
-        from pharos._core.graph import search_backward_from_many, search_forward_from_many
-
+        kernels = _kernels()
         graph = self.graph
         upper, lower = (self.out_upper, self.out_lower) if outward else (self.in_upper, self.in_lower)
-        nodes = np.flatnonzero(upper > self.best)
+        nodes = np.flatnonzero(np.greater(upper, self.best))
         limit = int(min(64 * words, max(1, self.spending.budget.searches - self.spending.searches)))
         if len(nodes) > limit:
             nodes = np.sort(nodes[np.argsort(-upper[nodes].astype(np.int64), kind="stable")[:limit]])
@@ -332,11 +330,13 @@ class _Sweep:
         bits = [np.zeros((graph.num_nodes, words), np.uint64) for _ in range(3)]
         scratch = (graph.queue, np.empty_like(graph.queue))
         if outward:
-            _, reads = search_forward_from_many(
+            _, reads = kernels.search_forward_from_many(
                 graph.next_states, graph.ends, graph.start, sources, *bits, *scratch, largest
             )
         else:
-            _, reads = search_backward_from_many(*graph.backward, graph.start, sources, *bits, *scratch, largest)
+            _, reads = kernels.search_backward_from_many(
+                *graph.backward, graph.start, sources, *bits, *scratch, largest
+            )
         upper[nodes] = lower[nodes] = largest
         self.best = max(self.best, int(largest.max()))
         self.spending.searches += len(sources)
@@ -361,12 +361,11 @@ class _Sweep:
 
         The sets are found for one layer at a time, a bit for each of its nodes; this pays where layers are narrow.
         """
-        from pharos._core.graph import last_gap, period
-
+        kernels = _kernels()
         graph = self.graph
         if graph.num_nodes < 64:
             return ""
-        cycle = int(period(graph.next_states, graph.ends, graph.start, self.away, graph.has_end))
+        cycle = int(kernels.period(graph.next_states, graph.ends, graph.start, self.away, graph.has_end))
         if cycle < 8:
             return ""
         layer = self.away % cycle
@@ -380,7 +379,9 @@ class _Sweep:
         position[order] = np.arange(graph.num_nodes) - np.repeat(layer_first[:-1], widths)
         scratch = [np.empty((widest, -(-widest // 64)), np.uint64) for _ in range(2)]
         max_reads = 200 * graph.num_nodes * graph.next_states.shape[1] + 10**8
-        gap, _ = last_gap(graph.next_states, graph.ends, graph.start, order, layer_first, position, *scratch, max_reads)
+        gap, _ = kernels.last_gap(
+            graph.next_states, graph.ends, graph.start, order, layer_first, position, *scratch, max_reads
+        )
         if gap == -2:
             return f"all cycles have multiples of {cycle} steps, but some state needs more to reach its whole layer"
         if gap == -3:
@@ -391,8 +392,7 @@ class _Sweep:
 
 def _infinite_diameter(graph: Graph, spending: Spending, conventions: dict[str, Any]) -> Interval:
     """D of a graph that is not strongly connected: infinite; with the count of unreachable pairs and the finite part."""
-    from pharos._core.graph import search_forward_from_many
-
+    kernels = _kernels()
     size = graph.num_nodes
     words = 8 if 24 * 8 * size <= _BATCH_MEMORY else 1
     bits = [np.zeros((size, words), np.uint64) for _ in range(3)]
@@ -402,7 +402,7 @@ def _infinite_diameter(graph: Graph, spending: Spending, conventions: dict[str, 
         sources = np.arange(done, min(done + 64 * words, size), dtype=graph.dtype)
         bits[0][:] = 0
         largest = np.empty(len(sources), np.int64)
-        pairs, _ = search_forward_from_many(
+        pairs, _ = kernels.search_forward_from_many(
             graph.next_states, graph.ends, graph.start, sources, *bits, *scratch, largest
         )
         reached += int(pairs)
