@@ -397,3 +397,20 @@ def last_gap(next_states, ends, start, order, layer_first, position, current, co
         bound = k
         gap = max(gap, k - 1)
     return gap, reads
+
+
+@njit(cache=True, nogil=True)
+def mark_reachable(next_states, ends, reached, queue, tail):
+    """reached[v] = True for all that can be reached; `queue` holds `tail` nodes that are marked already."""
+    head = 0
+    while head < tail:
+        u = queue[head]
+        head += 1
+        if ends[u]:
+            continue
+        for a in range(next_states.shape[1]):
+            v = next_states[u, a]
+            if v >= 0 and not reached[v]:
+                reached[v] = True
+                queue[tail] = v
+                tail += 1
