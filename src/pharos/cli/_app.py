@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from pharos.cli import _build, _cache, _evaluate, _list, _play, _render, _solve
+from pharos.cli import _build, _cache, _evaluate, _hardness, _list, _play, _render, _solve
 from pharos.cli.common import complain
 from pharos.errors import ParameterError, PharosError
 
@@ -97,6 +97,7 @@ def _options(
 app.command("list")(_list.list_)
 app.command("build")(_build.build)
 app.command("solve")(_solve.solve)
+app.command("hardness")(_hardness.hardness)
 app.command("evaluate")(_evaluate.evaluate)
 app.command("render")(_render.render)
 app.command("play")(_play.play)

@@ -267,7 +267,8 @@ def _steps(mdp: TabularMDP, solution: Solution) -> Iterator[tuple[np.ndarray, tu
         solution = value_iteration(mdp, horizon=horizon, keep_all=True)
     all_steps = solution.all_steps
     assert all_steps is not None
-    reached, first = _starts(mdp), _starts(mdp) & mdp.is_sticky
+    reached = _starts(mdp)
+    first = reached if mdp.is_sticky else np.zeros_like(reached)
     later = np.zeros(mdp.num_states, np.int64) if mdp.is_sticky else reached.astype(np.int64)
     for step in range(1, horizon + 1):
         to_go = horizon - step + 1
@@ -275,7 +276,7 @@ def _steps(mdp: TabularMDP, solution: Solution) -> Iterator[tuple[np.ndarray, tu
         yield q, (later, first)
         arrived = _arrivals(mdp, reached)
         first = np.zeros_like(first)
-        reached = arrived.any(axis=1)
+        reached = np.asarray(arrived.any(axis=1))
         later = arrived.sum(axis=1) if mdp.is_sticky else reached.astype(np.int64)
 
 

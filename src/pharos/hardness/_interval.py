@@ -87,6 +87,10 @@ class Budget:
                     f"budget of {value!r} {name}; expected a number of at least 0 (math.inf: no limit)"
                 )
 
+    def exceeds(self, other: "Budget") -> bool:
+        """Whether it allows for more than `other` in any way."""
+        return self.seconds > other.seconds or self.searches > other.searches
+
     @staticmethod
     def of(budget: "Budget | float | None") -> "Budget":
         """`budget`, where a number stands for seconds and None for the default of 300 seconds."""

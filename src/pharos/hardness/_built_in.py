@@ -1,0 +1,57 @@
+"""The measures that pharos registers, in the order of a report."""
+
+from typing import Any
+
+from pharos.hardness._diameter import diameter, start_eccentricity
+from pharos.hardness._registry import Problem, register
+
+
+def _diameter(problem: Problem) -> Any:
+    return diameter(problem.mdp, restart=problem.restart, budget=problem.budget, progress=problem.squeezing("diameter"))
+
+
+register(
+    "diameter",
+    _diameter,
+    definition="max over s != s' of min over policies of E[steps from s to s']",
+    source="Jaksch, Ortner and Auer (2010), definition 1; the pharos paper, equation 1",
+    complexity="visitation",
+    version=1,
+    depends="structure",
+)
+register(
+    "start_eccentricity",
+    lambda problem: start_eccentricity(problem.mdp, restart=problem.restart),
+    definition="max over s' of min over policies of E[steps from the start to s']",
+    source="the pharos paper, equation 1, read literally",
+    complexity="visitation",
+    version=1,
+    depends="structure",
+)
+register(
+    "sum_of_reciprocal_gaps",
+    lambda problem: problem.gaps.sum_of_reciprocals,
+    definition="sum of 1 / (V*(s) - Q*(s, a)) over reachable s and actions that are not optimal",
+    source="Simchowitz and Jamieson (2019); the pharos paper, equation 2",
+    complexity="estimation",
+    version=1,
+    depends="values",
+)
+register(
+    "sum_of_reciprocal_gaps_regularized",
+    lambda problem: problem.gaps.regularized,
+    definition="sum of 1 / (V*(s) - Q*(s, a) + 0.1) over all s and a",
+    source="Conserva and Rauber (2022), as in Colosseum",
+    complexity="estimation",
+    version=1,
+    depends="values",
+)
+register(
+    "minimal_gap",
+    lambda problem: problem.gaps.minimal,
+    definition="the smallest V*(s) - Q*(s, a) > 0 over reachable s",
+    source="Simchowitz and Jamieson (2019)",
+    complexity="estimation",
+    version=1,
+    depends="values",
+)

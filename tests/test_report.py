@@ -1,0 +1,174 @@
+"""The report: names, conventions, what is kept and when it is computed anew; and `pharos hardness`."""
+
+import json
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import pharos
+from pharos import hardness
+from pharos.cli._app import app
+from pharos.errors import ParameterError, UndefinedMeasure, UnknownName
+from pharos.hardness import _registry
+from pharos.mdp import TabularMDP
+
+MEASURES = {
+    "diameter",
+    "start_eccentricity",
+    "sum_of_reciprocal_gaps",
+    "sum_of_reciprocal_gaps_regularized",
+    "minimal_gap",
+}
+
+
+@pytest.fixture(autouse=True)
+def own_cache(monkeypatch, tmp_path):
+    monkeypatch.setenv("PHAROS_CACHE_DIR", str(tmp_path))
+    monkeypatch.setattr(_registry, "_MEASURES", dict(_registry._MEASURES))
+
+
+def corridor(length=5):
+    """Right pays at the end; left goes back."""
+    states = np.arange(length)
+    return TabularMDP.from_arrays(
+        np.stack([np.maximum(states - 1, 0), np.append(states[1:], -1)], axis=1),
+        np.stack([np.zeros(length), (states == length - 1) * 1.0], axis=1),
+        gamma=0.9,
+    )
+
+
+def grid():
+    return pharos.build(pharos.make("simple_grid", height=3, width=4)).mdp()
+
+
+def test_a_report_holds_the_values_of_the_functions():
+    mdp = corridor()
+    report = hardness.report(mdp)
+    solution = pharos.value_iteration(mdp, 1e-9)
+    assert set(report.results) >= MEASURES
+    assert report["diameter"].value["upper"] == hardness.diameter(mdp).upper == 5
+    assert report["start_eccentricity"].value == 5
+    assert report["sum_of_reciprocal_gaps"].value == hardness.sum_of_reciprocal_gaps(mdp, solution)
+    assert report["minimal_gap"].value == hardness.minimal_gap(mdp, solution)
+    assert report.conventions["gamma"] == 0.9
+    assert report.conventions["error_bound"] <= 1e-9
+    assert all(name in str(report) for name in MEASURES)
+
+
+def test_a_report_is_plain_json_even_where_a_value_is_infinite():
+    stuck = TabularMDP.from_arrays([[0, 1], [1, 1]], [[0.0, 0.0], [0.0, 0.0]])
+    report = hardness.report(stuck)
+    answer = json.loads(json.dumps(report.to_dict(), allow_nan=False))
+    assert set(answer["infinite"]) >= {"diameter", "minimal_gap"}
+    assert answer["measures"]["minimal_gap"] is None
+    assert answer["measures"]["diameter"]["unreachable_pairs"] == 1
+
+
+def test_measures_are_chosen_by_name():
+    assert list(hardness.report(corridor(), "minimal_gap, diameter").results) == ["minimal_gap", "diameter"]
+    assert list(hardness.report(corridor(), ["diameter"]).results) == ["diameter"]
+    with pytest.raises(UnknownName, match="did you mean 'diameter'"):
+        hardness.report(corridor(), "diametre")
+    with pytest.raises(ParameterError, match="at least one"):
+        hardness.report(corridor(), [])
+
+
+def test_a_users_measure_is_one_line():
+    hardness.register("density", lambda p: float((p.mdp.rewards != 0).mean()), definition="share of paying transitions")
+    report = hardness.report(corridor())
+    assert report["density"].value == 0.1
+    assert report["density"].definition == "share of paying transitions"
+    with pytest.raises(ParameterError, match="measure of pharos"):
+        hardness.register("diameter", lambda p: 0.0, definition="mine")
+    with pytest.raises(ParameterError, match="letters, digits"):
+        hardness.register("my measure", lambda p: 0.0, definition="mine")
+
+
+def test_an_undefined_measure_says_why_and_the_others_are_there():
+    def never(problem):
+        raise UndefinedMeasure("never is defined for nothing: give up")
+
+    hardness.register("never", never, definition="nothing")
+    report = hardness.report(corridor(), "never,diameter")
+    assert report["never"].value is None
+    assert report.to_dict()["undefined"] == {"never": "never is defined for nothing: give up"}
+    assert report["diameter"].value["exact"]
+    assert "--" in report.to_latex()
+
+
+def test_results_are_kept_beside_the_space_with_what_they_depend_on():
+    mdp = grid()
+    first = hardness.report(mdp)
+    assert not any(result.kept for result in first.results.values())
+    again = hardness.report(grid())
+    assert {name for name, result in again.results.items() if result.kept} >= MEASURES
+    assert {n: r.value for n, r in again.results.items() if r.kept} == {
+        n: r.value for n, r in first.results.items() if again[n].kept
+    }
+    other = hardness.report(mdp.with_gamma(0.5))
+    assert other["diameter"].kept
+    assert not other["minimal_gap"].kept
+    assert not hardness.report(mdp.with_rewards(mdp.rewards * 2))["minimal_gap"].kept
+    assert not hardness.report(pharos.sticky_actions(mdp, 0.25), "minimal_gap")["minimal_gap"].kept
+    assert not hardness.report(mdp, "diameter", restart=False)["diameter"].kept
+    assert not hardness.report(mdp, "diameter", keep=False)["diameter"].kept
+
+
+def test_an_interval_is_computed_anew_with_a_larger_budget():
+    mdp = grid()
+
+    def squeezed(problem):
+        spent = problem.budget.seconds
+        return hardness.Interval(0.0, 100 / spent, exact=False)
+
+    hardness.register("squeezed", squeezed, definition="", version=1)
+    assert hardness.report(mdp, "squeezed", budget=10)["squeezed"].value["upper"] == 10
+    assert hardness.report(mdp, "squeezed", budget=5)["squeezed"].kept
+    assert hardness.report(mdp, "squeezed", budget=20)["squeezed"].value["upper"] == 5
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", '{"format": 1, "results": 3}', '{"format": 2}'])
+def test_a_spoilt_file_of_kept_results_is_replaced(text):
+    mdp = grid()
+    kept = mdp.folder / "hardness.json"
+    expected = hardness.report(mdp)["minimal_gap"].value
+    kept.write_text(text)
+    assert hardness.report(mdp)["minimal_gap"].value == expected
+    assert hardness.report(mdp)["minimal_gap"].kept
+
+
+def test_a_horizon_must_be_a_number_of_steps():
+    for horizon in (0, -1, 2.5, True):
+        with pytest.raises(ParameterError, match="whole number of steps"):
+            hardness.report(corridor(), horizon=horizon)
+
+
+def run(*words):
+    return CliRunner().invoke(app, ["hardness", *words])
+
+
+def test_the_command_answers_with_the_keys_of_its_contract():
+    answer = json.loads(run("simple_grid", "height=3", "width=4", "--json").stdout)
+    assert {"measures", "conventions", "seconds"} <= set(answer)
+    assert set(answer["measures"]) >= MEASURES
+    assert {"lower", "upper", "exact"} <= set(answer["measures"]["diameter"])
+    mdp = grid()
+    assert answer["measures"]["minimal_gap"] == pytest.approx(hardness.minimal_gap(mdp))
+    assert answer["conventions"]["gamma"] == 0.99
+
+
+def test_the_command_prints_a_table_with_sources_or_latex():
+    table = run("simple_grid", "--definitions")
+    assert table.exit_code == 0
+    assert "Simchowitz" in table.stdout
+    assert "16 states x 4 actions" in table.stdout
+    latex = run("simple_grid", "--latex").stdout
+    assert latex.startswith(r"\begin{tabular}")
+    assert "start eccentricity & 6" in latex
+
+
+def test_the_command_refuses_unknown_measures_before_it_builds():
+    result = run("breakout", "--measures", "diametr")
+    assert result.exit_code == 2
+    assert result.stdout == ""
