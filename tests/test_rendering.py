@@ -141,6 +141,26 @@ def test_observations_can_be_plugged_in(monkeypatch):
     assert picture.shape == (2, 3, 3) and (picture == 7).all()
 
 
+@pytest.mark.parametrize("name", ["freeway", "breakout"])
+def test_images_that_agents_see_are_drawn_for_people(name):
+    env = make(name)
+    state = env.initial_states()[0][0]
+    rows, columns = env.grid()
+    planes = render(env, state, "simple_image")
+    assert planes.shape == (rows, len(env.layers) * (columns + 1) - 1, 3)
+    for number, plane in enumerate(planes_of(env, state)):
+        left = number * (columns + 1)
+        assert ((planes[:, left : left + columns, 0] > 0) == (plane > 0)).all()
+    assert render(env, state, "complex_image").shape == (84, 84, 3)
+    assert render(env, state, "complex_image", size=(60, 90), grey=True).shape == (60, 90, 3)
+    with pytest.raises(ParameterError, match="no image"):
+        render(env, state, "vector")
+    with pytest.raises(UnknownName, match="option of observation"):
+        render(env, state, "complex_image", colour=1)
+    with pytest.raises(ParameterError, match="takes no options"):
+        render(env, state, "human", size=3)
+
+
 def test_what_cannot_be_drawn_is_said():
     with pytest.raises(UnknownName, match="did you mean 'human'"):
         render(Lamp(), (0,), "humen")

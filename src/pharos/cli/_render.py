@@ -14,6 +14,7 @@ from pharos.cli.common import (
     check_format,
     complain,
     describe,
+    parse_parameters,
     parse_target,
     parse_value,
     print_json,
@@ -24,15 +25,19 @@ if TYPE_CHECKING:
     from pharos.environment import Environment, State
 
 POLICIES = ("auto", "optimal", "uniform")
-AUTOMATIC_STATES = 2_000_000  # "auto" solves what is not larger
+AUTOMATIC_STATES = 20_000_000  # "auto" solves what is not larger
 
 
 def render(
     target: TargetArgument,
     parameters: Parameters = None,
     observation: Annotated[
-        str, typer.Option("--observation", help="How to draw: human, text, or an observation.")
+        str, typer.Option("--observation", help="How to draw: human, text, simple_image, complex_image, or your own.")
     ] = "human",
+    option: Annotated[
+        list[str] | None,
+        typer.Option("--option", metavar="NAME=VALUE", help="Option of the observation, such as size=natural."),
+    ] = None,
     out: Annotated[
         Path | None, typer.Option("--out", help="FILE.png, FILE.gif or FILE.txt; the terminal when not given.")
     ] = None,
@@ -53,8 +58,9 @@ def render(
 
     goal = parse_target(target, parameters)
     suffix = check_format(out, (".png", ".gif", ".txt")) if out else ""
-    if observation != "text" and observation not in rendering.RENDERERS:
-        raise UnknownName("observation to render", observation, [*rendering.RENDERERS, "text"])
+    options = parse_parameters(option)
+    if observation != "text" and observation not in (known := rendering.renderers()):
+        raise UnknownName("observation to render", observation, [*known, "text"])
     if policy not in POLICIES:
         raise UnknownName("policy", policy, POLICIES)
     env = environment_of(goal)
@@ -73,11 +79,11 @@ def render(
         out.write_text("\n\n".join(frames) + "\n")
     elif out is not None and suffix == ".gif":
         shown = played if len(played) > 1 else [played[0]]
-        pictures = [rendering.render(env, each, observation) for each, _, _ in shown]
+        pictures = [rendering.render(env, each, observation, **options) for each, _, _ in shown]
         captions = _captions(env, shown) if observation == "human" else ()
         rendering.save_gif(out, pictures, captions=captions, frames_per_second=fps, at_least=_at_least(observation))
     elif out is not None:
-        rendering.save_png(out, rendering.render(env, last, observation), at_least=_at_least(observation))
+        rendering.save_png(out, rendering.render(env, last, observation, **options), at_least=_at_least(observation))
     if json:
         print_json(
             {
