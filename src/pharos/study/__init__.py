@@ -2,11 +2,14 @@
 
 from pharos.study._paper import paper_regressions, paper_returns
 from pharos.study._regression import Fit, aggregate_r_squared, fit, fit_models, leave_one_class_out_r_squared
+from pharos.study._specification import Run, Specification, presets, run_id, specification
 from pharos.study._statistics import Estimate, interquartile_mean, stratified_interval
 
 __all__ = [
     "Estimate",
     "Fit",
+    "Run",
+    "Specification",
     "aggregate_r_squared",
     "fit",
     "fit_models",
@@ -14,5 +17,8 @@ __all__ = [
     "leave_one_class_out_r_squared",
     "paper_regressions",
     "paper_returns",
+    "presets",
+    "run_id",
+    "specification",
     "stratified_interval",
 ]

@@ -1,0 +1,135 @@
+"""A specification: what it expands to, and what it says of mistakes."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+import xxhash
+
+from pharos.errors import ParameterError, UnknownName
+from pharos.study import Specification, presets, run_id, specification
+from pharos.study._specification import parse
+
+LAKES = """\
+name: lakes
+steps: 1000
+evaluations: 10
+seeds: 2
+hyperparameters:
+  patient: {learning_rate: 1e-4}
+blocks:
+  - environments: [frozen_lake/4x4, {name: frozen_lake, parameters: {size: 6, seed: 1}}]
+    chance: [plain, {sticky: 0.25}, {random: 0.1}]
+    observations: [vector, {name: simple_image, options: {channels: first}}]
+    agents: [dqn, ppo, q_learning]
+    hyperparameters: {dqn: patient, ppo: {n_steps: 256}}
+"""
+
+
+def test_a_block_is_the_product_of_its_lists_and_tabular_agents_run_once_whatever_the_observations():
+    runs = parse(LAKES).runs
+    deep = [run for run in runs if run.config["agent"] != "q_learning"]
+    tabular = [run for run in runs if run.config["agent"] == "q_learning"]
+    assert len(deep) == 2 * 3 * 2 * 2 * 2
+    assert len(tabular) == 2 * 3 * 2
+    assert {run.config["observation"] for run in tabular} == {"index"}
+    assert len({run.id for run in runs}) == len(runs)
+    assert {run.chance for run in runs} == {"plain", "sticky 0.25", "random 0.1"}
+    assert {run.instance for run in runs} == {"frozen_lake/4x4", "frozen_lake(size=6, seed=1)"}
+
+
+def test_hyperparameters_come_by_reference_or_in_place_and_scientific_notation_is_a_number():
+    by_agent = {run.config["agent"]: run.config["hyperparameters"] for run in parse(LAKES).runs}
+    assert by_agent == {"dqn": {"learning_rate": 0.0001}, "ppo": {"n_steps": 256}, "q_learning": {}}
+
+
+def test_the_id_of_a_run_is_the_xxh3_hash_of_its_sorted_json():
+    run = parse(LAKES).runs[0]
+    text = json.dumps(run.config, sort_keys=True, separators=(",", ":"))
+    assert run.id == xxhash.xxh3_64(text.encode()).hexdigest()
+    assert run_id(dict(reversed(run.config.items()))) == run.id
+
+
+def test_ids_are_the_same_in_another_process_with_another_hash_seed():
+    code = "from pharos.study import specification; print(*[run.id for run in specification('quick').runs])"
+    found = subprocess.run(
+        [sys.executable, "-c", code], env={"PYTHONHASHSEED": "7"}, capture_output=True, text=True, check=True
+    )
+    assert found.stdout.split() == [run.id for run in specification("quick").runs]
+
+
+def test_the_same_run_in_two_blocks_or_under_two_names_is_one_run():
+    twice = parse(
+        "name: twice\nseeds: [3]\nblocks:\n"
+        "  - {environments: [frozen_lake/4x4], agents: [dqn]}\n"
+        "  - {environments: [{name: frozen_lake, parameters: {size: 4}}], agents: [dqn, ppo]}\n"
+    )
+    assert [run.config["agent"] for run in twice.runs] == ["dqn", "ppo"]
+
+
+def test_a_block_may_say_otherwise_than_the_whole():
+    study = parse(
+        "name: a\nsteps: 100\ngamma: 0.9\nblocks:\n"
+        "  - {environments: [frozen_lake], agents: [dqn], seeds: [7, 9], steps: 60, evaluations: 3, gamma: 1, horizon: 5}\n"
+        "  - {environments: [frozen_lake], agents: [dqn], seeds: 1}\n"
+    )
+    first, second, third = (run.config for run in study.runs)
+    assert (first["seed"], second["seed"], third["seed"]) == (7, 9, 0)
+    assert (first["steps"], first["evaluation_interval"], first["gamma"], first["horizon"]) == (60, 20, 1, 5)
+    assert (third["steps"], third["evaluation_interval"], third["gamma"], third["horizon"]) == (100, 1, 0.9, None)
+
+
+@pytest.mark.parametrize(
+    ("line", "wrong", "expected"),
+    [
+        (2, "stepz: 1000", "specification:2: unknown key 'stepz'; did you mean 'steps'?"),
+        (2, "steps: many", "specification:2: steps: found 'many'; expected: a valid integer"),
+        (4, "seeds: 0", "specification:4: seeds: found 0; expected how many, at least 1, or a list of seeds"),
+        (8, "  - environments: [frozen_lake/5x5]", "unknown environment 'frozen_lake/5x5'; did you mean 'frozen_lake/"),
+        (8, "  - environments: [{name: frozen_lake, parameters: {sise: 8}}]", "specification:8: unknown parameter of frozen_lake 'sise'; did you mean 'size'?"),
+        (9, "    chance: [plain, {stiky: 0.25}]", "specification:9: unknown key 'stiky'; did you mean 'sticky'?"),
+        (9, "    chance: [plian]", "specification:9: unknown chance 'plian'; did you mean 'plain'?"),
+        (9, "    chance: [{random: 1.5}]", "specification:9: random: found 1.5; expected: less than or equal to 1"),
+        (10, "    observations: [vectr]", "specification:10: unknown observation 'vectr'; did you mean 'vector'?"),
+        (11, "    agents: [dqn, ppo, qlearning]", "specification:11: unknown agent 'qlearning'; did you mean 'q_learning'?"),
+        (11, "    agents: []", "specification:11: agents: found []"),
+        (12, "    hyperparameters: {dqn: patent}", "specification:12: unknown set of hyperparameters 'patent'; did you mean 'patient'?"),
+        (12, "    hyperparameters: {a2c: patient}", "specification:12: unknown agent of this block 'a2c'"),
+        (12, "    agents: [dqn]", "specification:12: the key 'agents' stands there twice (line 11)"),
+        (12, "    hyperparameters: [", "specification:13"),
+        (1, "blocks: 3\nname: a", "specification:8: the key 'blocks' stands there twice (line 1)"),
+    ],
+)  # fmt: skip
+def test_a_mistake_is_told_with_its_line_and_the_nearest_name(line, wrong, expected):
+    lines = LAKES.splitlines()
+    lines[line - 1] = wrong
+    with pytest.raises(ParameterError) as caught:
+        parse("\n".join(lines) + "\n")
+    assert expected in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("text", ["", "- a\n", "name: a\n", "blocks: []\nname: a\n", "a"])
+def test_what_is_no_study_is_refused(text):
+    with pytest.raises(ParameterError, match="specification"):
+        parse(text)
+
+
+def test_a_mapping_is_read_as_well_and_a_missing_file_suggests_a_preset():
+    study = specification({"name": "a", "blocks": [{"environments": ["frozen_lake"], "agents": ["dqn"]}]})
+    assert isinstance(study, Specification) and len(study.runs) == 5
+    with pytest.raises(ParameterError, match=r"specification\.blocks\.0\.agents\.0: unknown agent"):
+        specification({"name": "a", "blocks": [{"environments": ["frozen_lake"], "agents": ["dqm"]}]})
+    with pytest.raises(UnknownName, match="did you mean 'quick'"):
+        specification("quik")
+
+
+def test_the_presets_are_those_of_the_paper():
+    assert presets() == ["paper", "quick", "small"]
+    assert len(specification("small").runs) == 8 * 3 * 5 * (2 * 2 + 1)
+    paper = specification("paper").runs
+    assert len(paper) == 28 * 3 * 5 * (2 * 2 + 1)
+    assert {run.config["steps"] for run in paper if run.config["environment"] in ("freeway", "breakout")} == {600_000}
+    assert {run.config["steps"] for run in paper if run.config["environment"] == "frozen_lake"} == {50_000}
+    assert len({run.instance for run in paper}) == 28
