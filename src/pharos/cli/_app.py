@@ -10,7 +10,7 @@ from typer.core import TyperGroup
 
 from pharos.cli import _build, _cache, _evaluate, _hardness, _list, _play, _render, _solve, _study
 from pharos.cli.common import complain
-from pharos.errors import ParameterError, PharosError
+from pharos.errors import DivergenceError, ParameterError, PharosError
 
 EXIT_FAILED, EXIT_USAGE, EXIT_INTERRUPTED = 1, 2, 130
 
@@ -40,7 +40,7 @@ def _exit_code(error: Exception) -> int | None:
     if isinstance(error, BrokenPipeError):  # the reader had enough, as in `pharos list | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return EXIT_FAILED
-    if isinstance(error, ParameterError):
+    if isinstance(error, ParameterError | DivergenceError):
         complain(error)
         return EXIT_USAGE
     if isinstance(error, PharosError):

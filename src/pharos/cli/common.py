@@ -192,7 +192,7 @@ def parse_target(text: str, words: Iterable[str] | None = None) -> Target:
                 f"leave out {', '.join(f'{name}=...' for name in parameters)}"
             )
         return Target(text, path=path)
-    if ":" not in text and (path.suffix or text.startswith((".", "~", os.sep))):
+    if ":" not in text and (path.suffix or text.startswith((".", "~", os.sep)) or text.endswith(os.sep)):
         raise ParameterError(f"{text}: no such folder or file")
     return Target(text, environment=make(text, **parameters))
 
