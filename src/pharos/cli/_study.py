@@ -1,15 +1,25 @@
 """pharos study: a grid of training runs from a YAML file: show it, run it, see how far it is, report on it."""
 
+import contextlib
+import sys
+import time
 from collections import Counter
-from typing import Annotated
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Annotated, Any
 
 import typer
 
-from pharos.cli.common import Json, console, print_json
+from pharos.cli.common import Json, complain, console, print_json
 
 app = typer.Typer(help="Run a grid of training runs, and make the paper's figures and tables of it.")
 
 SpecArgument = Annotated[str, typer.Argument(metavar="SPEC", help="A YAML file, or a preset: quick, small, paper.")]
+Out = Annotated[
+    Path | None, typer.Option("--out", metavar="DIR", help="Where results are; studies/NAME when not given.")
+]
+EXIT_FAILED = 1
+LINE_SECONDS = 30.0
 
 
 @app.command("show")
@@ -46,6 +56,89 @@ def show(spec: SpecArgument, json: Json = False) -> None:
     to.print(f"[bold]{escape(study.name)}[/bold]  {escape(study.description)}", soft_wrap=True)
     to.print(table)
     to.print(f"{len(runs):,} runs, {sum(_steps(runs)):,} steps", style="dim")
+
+
+@app.command("run")
+def run(
+    spec: SpecArgument,
+    out: Out = None,
+    shard: Annotated[
+        str | None, typer.Option("--shard", metavar="I/N", help="Only the I-th of N parts, such as 1/8.")
+    ] = None,
+    retry_failed: Annotated[bool, typer.Option("--retry-failed", help="Execute failed runs again.")] = False,
+    timeout: Annotated[
+        float | None, typer.Option("--timeout", min=0, help="Seconds after which a run is ended, and failed.")
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option("--workers", min=1, help="Processes; as many as processors when not given.")
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Execute the runs that are missing. Interrupt it at any time: the same command goes on from there."""
+    from pharos import study
+
+    specification = study.specification(spec)
+    with _progress() as progress:
+        end = study.run(
+            specification,
+            out,
+            shard=shard,
+            retry_failed=retry_failed,
+            timeout=timeout,
+            workers=workers,
+            progress=progress,
+        )
+    _answer(end, json)
+    if end.failed:
+        raise typer.Exit(EXIT_FAILED)
+
+
+@app.command("status")
+def status(spec: SpecArgument, out: Out = None, json: Json = False) -> None:
+    """How many runs are finished, running, missing and failed, and why."""
+    from pharos import study
+
+    _answer(study.status(study.specification(spec), out), json)
+
+
+def _answer(status: Any, json: bool) -> None:
+    if json:
+        print_json(status.to_dict())
+        return
+    print(status)
+    if status.missing:
+        print(f"{status.missing} runs missing; `pharos study run` goes on from there")
+    for error, count in Counter(status.errors.values()).most_common(5):
+        complain(f"{count} x {error}")
+    if status.errors:
+        complain(f"logs: {status.folder}/runs/{next(iter(status.errors))}/log.txt; repeat with --retry-failed")
+
+
+@contextlib.contextmanager
+def _progress() -> Iterator[Callable[[Any], None]]:
+    """A bar on a terminal; elsewhere a line on standard error now and then."""
+    if not sys.stderr.isatty():
+        told = time.monotonic()
+
+        def say(status: Any) -> None:
+            nonlocal told
+            if time.monotonic() - told > LINE_SECONDS:
+                told = time.monotonic()
+                complain(status)
+
+        yield say
+        return
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    with Progress(
+        BarColumn(), TextColumn("{task.description}"), TimeElapsedColumn(), console=console(stderr=True)
+    ) as bar:
+        task = bar.add_task("", total=None)
+
+        def show(status: Any) -> None:
+            bar.update(task, total=status.total, completed=status.finished + status.failed, description=str(status))
+
+        yield show
 
 
 def _steps(runs) -> list[int]:

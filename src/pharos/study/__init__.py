@@ -1,5 +1,6 @@
 """From hardness and regret to the paper's models, figures and tables."""
 
+from pharos.study._execution import Status, run, status
 from pharos.study._paper import paper_regressions, paper_returns
 from pharos.study._regression import Fit, aggregate_r_squared, fit, fit_models, leave_one_class_out_r_squared
 from pharos.study._specification import Run, Specification, presets, run_id, specification
@@ -10,6 +11,7 @@ __all__ = [
     "Fit",
     "Run",
     "Specification",
+    "Status",
     "aggregate_r_squared",
     "fit",
     "fit_models",
@@ -18,7 +20,9 @@ __all__ = [
     "paper_regressions",
     "paper_returns",
     "presets",
+    "run",
     "run_id",
     "specification",
+    "status",
     "stratified_interval",
 ]

@@ -1,0 +1,78 @@
+"""A runner that learns nothing: its curves are formulas of the config, so that a study over it takes no time.
+
+The value approaches the optimal one exponentially, more slowly in large instances, from images and under chance. Every finished
+execution leaves a line in the file PHAROS_FAKE_LOG; PHAROS_FAKE_SECONDS makes it last.
+"""
+
+import json
+import math
+import os
+import time
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from pharos.study import run_id
+
+SIZES = {"simple_grid": 16, "frozen_lake": 30, "freeway": 400, "breakout": 900}
+SLOWNESS = {"vector": 1.0, "simple_image": 1.7, "index": 0.5}
+
+
+def train(config, folder):
+    """Write run.json and curve.parquet; fails where the hyperparameter `fail` says so."""
+    time.sleep(float(os.environ.get("PHAROS_FAKE_SECONDS", "0")))
+    hyperparameters = config["hyperparameters"]
+    if hyperparameters.get("fail") == "always" or config["seed"] == hyperparameters.get("fail_seed"):
+        raise ValueError("this seed\nfails on purpose")
+    id = run_id(config)
+    rng = np.random.default_rng(int(id, 16))
+    interval = config["evaluation_interval"]
+    steps = np.arange(interval, config["steps"] + 1, interval)
+    size = SIZES[config["environment"]] * np.prod(
+        [v for v in config["parameters"].values() if isinstance(v, int)] or [1]
+    )
+    pace = 20 * math.sqrt(size) * SLOWNESS[config["observation"]] * (1 + 3 * sum(config["chance"].values()))
+    pace *= {"ppo": 1.4}.get(config["agent"], 1.0) * math.exp(0.1 * rng.normal())
+    optimal, uniform = 1.0, 0.1
+    value = optimal - (optimal - uniform) * np.exp(-steps / pace)
+    regret = np.cumsum((optimal - value) * interval)
+    normalized = np.cumsum((optimal - value) / (optimal - uniform)) / np.arange(1, len(steps) + 1)
+    curve = pd.DataFrame(
+        {
+            "step": steps,
+            "episodes": steps // 10,
+            "value": value,
+            "expected_regret": optimal - value,
+            "cumulative_expected_regret": regret,
+            "normalized_regret": normalized,
+            "mean_return": value,
+            "realised_regret": optimal - value,
+            "cumulative_realised_regret": regret,
+            "exact": True,
+            "seconds": 0.0,
+        }
+    )
+    curve.to_parquet(folder / "curve.parquet")
+    result = {
+        "value_optimal": optimal,
+        "value_uniform": uniform,
+        "value_worst": 0.0,
+        "final_value": value[-1],
+        "final_regret": optimal - value[-1],
+        "cumulative_regret": regret[-1],
+        "normalized_regret": normalized[-1],
+        "mean_return": float(value.mean()),
+        "episodes": int(steps[-1] // 10),
+    }
+    record = {"format": 1, "id": id, "config": dict(config), "versions": {}, "status": "finished", "error": None}
+    record |= {"seconds": 0.5, "result": {name: float(number) for name, number in result.items()}}
+    if log := os.environ.get("PHAROS_FAKE_LOG"):
+        with open(log, "a") as file:
+            file.write(f"{id}\n")
+    (folder / "run.json").write_text(json.dumps(record))
+
+
+def results(folder):
+    """The result of every run in a study's folder, by id."""
+    return {file.parent.name: json.loads(file.read_text()) for file in Path(folder).glob("runs/*/run.json")}

@@ -1,0 +1,227 @@
+"""Executing a study: what is missing runs, failures stay alone, and kill -9 at any moment loses and repeats nothing."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+import fake_training
+from pharos import study
+from pharos.errors import ParameterError
+from pharos.study._execution import shard_of
+
+TESTS = Path(__file__).parent
+
+
+def specification(name="fake", seeds=3, **block):
+    block = {"environments": ["frozen_lake/4x4"], "agents": ["dqn", "q_learning"], "seeds": seeds} | block
+    return study.specification({"name": name, "steps": 100, "evaluations": 10, "blocks": [block]})
+
+
+@pytest.fixture
+def log(tmp_path, monkeypatch):
+    """Which runs were finished, one line each time."""
+    path = tmp_path / "log"
+    path.touch()
+    monkeypatch.setenv("PHAROS_FAKE_LOG", str(path))
+    return path
+
+
+def test_every_run_is_executed_once_and_a_second_command_finds_nothing_to_do(tmp_path, log):
+    spec = specification()
+    end = study.run(spec, tmp_path / "out", runner=fake_training.train, workers=2)
+    assert (end.total, end.finished, end.failed, end.missing) == (6, 6, 0, 0)
+    again = study.run(spec, tmp_path / "out", runner=fake_training.train, workers=2)
+    assert again.finished == 6
+    assert sorted(log.read_text().split()) == sorted(run.id for run in spec.runs)
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["runs", "status.json", "study.yaml"]
+    assert study.status(spec, tmp_path / "out").finished == 6
+    assert json.loads((tmp_path / "out" / "status.json").read_text())["finished"] == 6
+
+
+def test_the_folder_of_a_study_is_a_specification_of_the_same_runs(tmp_path):
+    spec = specification(chance=["plain", {"sticky": 0.25}])
+    study.run(spec, tmp_path, runner=fake_training.train, workers=2)
+    assert [run.id for run in study.specification(tmp_path).runs] == [run.id for run in spec.runs]
+    with pytest.raises(ParameterError, match="holds the study 'fake', not 'other'"):
+        study.run(specification("other"), tmp_path, runner=fake_training.train)
+
+
+def test_a_run_that_fails_fails_alone_says_why_and_is_repeated_only_on_request(tmp_path, log):
+    spec = specification(agents=["dqn"], hyperparameters={"dqn": {"fail_seed": 1}})
+    end = study.run(spec, tmp_path / "out", runner=fake_training.train, workers=2)
+    assert (end.finished, end.failed) == (2, 1)
+    (failed,) = end.errors
+    assert end.errors[failed] == "ValueError: this seed fails on purpose"
+    assert "Traceback" in (tmp_path / "out" / "runs" / failed / "log.txt").read_text()
+    assert study.run(spec, tmp_path / "out", runner=fake_training.train).failed == 1
+    assert study.run(spec, tmp_path / "out", runner=fake_training.train, retry_failed=True).failed == 1
+    assert len(log.read_text().split()) == 2
+
+
+def test_failed_runs_that_are_repeated_with_success_replace_the_failure(tmp_path):
+    spec = specification(agents=["dqn"], seeds=2)
+    assert study.run(spec, tmp_path, runner=raise_always, workers=2).failed == 2
+    assert study.run(spec, tmp_path, runner=fake_training.train, workers=2).failed == 2
+    end = study.run(spec, tmp_path, runner=fake_training.train, workers=2, retry_failed=True)
+    assert (end.finished, end.failed) == (2, 0)
+
+
+def raise_always(config, folder):
+    raise RuntimeError("no")
+
+
+def write_nothing(config, folder):
+    """A runner that returns without results."""
+
+
+def never_end(config, folder):
+    time.sleep(60)
+
+
+def kill_itself(config, folder):
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_a_runner_that_writes_nothing_has_failed(tmp_path):
+    end = study.run(specification(agents=["dqn"], seeds=1), tmp_path, runner=write_nothing)
+    assert "without a finished run.json" in next(iter(end.errors.values()))
+
+
+def test_a_run_that_takes_too_long_is_ended(tmp_path):
+    end = study.run(specification(agents=["dqn"], seeds=1), tmp_path, runner=never_end, timeout=0.5)
+    assert list(end.errors.values()) == ["took longer than 0.5 s"]
+
+
+def test_a_process_that_dies_three_times_has_failed(tmp_path):
+    end = study.run(specification(agents=["dqn"], seeds=1), tmp_path, runner=kill_itself)
+    assert "ended by signal 9, 3 times" in next(iter(end.errors.values()))
+
+
+def test_shards_are_disjoint_and_together_all(tmp_path):
+    runs = specification(seeds=10).runs
+    parts = [shard_of(runs, f"{i}/3") for i in (1, 2, 3)]
+    assert sorted(run.id for part in parts for run in part) == sorted(run.id for run in runs)
+    assert max(map(len, parts)) - min(map(len, parts)) <= 1
+    for wrong in ("0/3", "4/3", "1", "a/b"):
+        with pytest.raises(ParameterError, match="expected i/n"):
+            shard_of(runs, wrong)
+
+
+def test_shards_share_a_folder(tmp_path, log):
+    spec = specification()
+    for i in (1, 2):
+        study.run(spec, tmp_path / "out", runner=fake_training.train, shard=f"{i}/2", workers=2)
+        assert study.status(spec, tmp_path / "out").finished == 3 * i
+    assert len(log.read_text().split()) == 6
+    assert len(list((tmp_path / "out").glob("status-*-of-2.json"))) == 2
+
+
+def test_progress_tells_how_long_it_will_take(tmp_path):
+    told = []
+    study.run(specification(), tmp_path, runner=fake_training.train, workers=1, progress=told.append)
+    assert told[-1].finished == 6 and told[-1].remaining == 0
+    assert any(now.remaining for now in told)
+    assert str(told[-1]) == "fake: 6 of 6 runs finished"
+
+
+def test_instances_are_prepared_once_each_before_the_runs_and_a_failure_there_stops_nothing(tmp_path, log):
+    spec = specification(agents=["dqn"], seeds=2, environments=["frozen_lake/4x4", "frozen_lake/8x8"])
+    end = study.run(spec, tmp_path / "out", runner=fake_training.train, prepare=prepare, workers=2)
+    assert end.finished == 4
+    lines = log.read_text().split()
+    assert lines[:2] == ["prepared-4", "prepared-8"]
+    assert sorted(lines[2:]) == sorted(run.id for run in spec.runs)
+
+
+def prepare(config):
+    with open(os.environ["PHAROS_FAKE_LOG"], "a") as file:
+        file.write(f"prepared-{config['parameters']['size']}\n")
+    raise RuntimeError("no matter")
+
+
+# kill -9 ----------------------------------------------------------------------------------------------------------------
+
+RUNNER = """
+import sys, fake_training
+from pharos import study
+if __name__ == "__main__":
+    study.run(study.specification(sys.argv[1]), sys.argv[2], runner=fake_training.train, workers=2)
+"""
+
+
+def start_runner(tmp_path, log):
+    environment = {**os.environ, "PYTHONPATH": str(TESTS), "PHAROS_FAKE_LOG": str(log), "PHAROS_FAKE_SECONDS": "0.2"}
+    arguments = [sys.executable, "-c", RUNNER, str(tmp_path / "fake.yaml"), str(tmp_path / "out")]
+    return subprocess.Popen(arguments, env=environment)
+
+
+def wait_for(condition, seconds=60):
+    end = time.monotonic() + seconds
+    while not (value := condition()):
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.01)
+    return value
+
+
+def workers_of(folder):
+    """Living processes that hold the lock of a run, by what they wrote into it."""
+    found = []
+    for lock in Path(folder).glob("locks/*/lock"):
+        words = lock.read_text().split()
+        if len(words) == 2 and Path(f"/proc/{words[1]}").exists():
+            found.append(int(words[1]))
+    return found
+
+
+def test_killing_runner_and_workers_loses_and_repeats_nothing(tmp_path, log):
+    spec = specification(seeds=8)
+    undisturbed = study.run(spec, tmp_path / "undisturbed", runner=fake_training.train, workers=2)
+    assert undisturbed.finished == 16
+    log.write_text("")
+    (tmp_path / "fake.yaml").write_text(Path(tmp_path, "undisturbed", "study.yaml").read_text())
+    out = tmp_path / "out"
+
+    for killed in (1, 2):
+        runner = start_runner(tmp_path, log)
+        target = len(log.read_text().split()) + 2
+        wait_for(lambda target=target: len(log.read_text().split()) >= target)
+        os.kill(wait_for(lambda: workers_of(out))[0], signal.SIGKILL)
+        wait_for(lambda target=target: len(log.read_text().split()) >= target + 2)
+        orphans = wait_for(lambda: workers_of(out))
+        runner.kill()
+        assert runner.wait() == -signal.SIGKILL
+        wait_for(lambda orphans=orphans: not any(Path(f"/proc/{pid}").exists() for pid in orphans))
+        assert len(fake_training.results(out)) < 16, f"kill {killed} came too late"
+
+    assert start_runner(tmp_path, log).wait(60) == 0
+    assert fake_training.results(out) == fake_training.results(tmp_path / "undisturbed")
+    assert set(Counter(log.read_text().split()).values()) == {1}
+    assert not (out / "partial").exists()
+
+
+def test_two_runners_on_one_folder_share_the_work(tmp_path, log):
+    spec = specification(seeds=4)
+    study.run(spec, tmp_path / "undisturbed", runner=fake_training.train, workers=2)
+    log.write_text("")
+    (tmp_path / "fake.yaml").write_text(Path(tmp_path, "undisturbed", "study.yaml").read_text())
+    both = [start_runner(tmp_path, log) for _ in range(2)]
+    assert [runner.wait(60) for runner in both] == [0, 0]
+    assert fake_training.results(tmp_path / "out") == fake_training.results(tmp_path / "undisturbed")
+    assert set(Counter(log.read_text().split()).values()) == {1}
+
+
+def test_a_result_that_was_complete_when_its_process_was_killed_is_kept(tmp_path, log):
+    spec = specification(agents=["dqn"], seeds=1)
+    id = spec.runs[0].id
+    (tmp_path / "partial" / id).mkdir(parents=True)
+    fake_training.train(spec.runs[0].config, tmp_path / "partial" / id)
+    study.run(spec, tmp_path, runner=raise_always)
+    assert study.status(spec, tmp_path).finished == 1
+    assert log.read_text().split() == [id]
