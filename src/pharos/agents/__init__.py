@@ -1,0 +1,5 @@
+"""Agents: tabular Q-learning, and algorithms of Stable-Baselines3. `pharos.experiments.train` trains them on a task."""
+
+from pharos.agents._q_learning import QLearning
+
+__all__ = ["QLearning"]

@@ -1,0 +1,5 @@
+"""Experiments: an agent trained on a task, its policies evaluated exactly, and the result written down."""
+
+from pharos.experiments._task import Task
+
+__all__ = ["Task"]
