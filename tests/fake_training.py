@@ -30,7 +30,7 @@ def train(config, folder):
     interval = config["evaluation_interval"]
     steps = np.arange(interval, config["steps"] + 1, interval)
     size = SIZES[config["environment"]] * np.prod(
-        [v for v in config["parameters"].values() if isinstance(v, int)] or [1]
+        [v for v in config["parameters"].values() if isinstance(v, int) and v > 0] or [1]
     )
     pace = 20 * math.sqrt(size) * SLOWNESS[config["observation"]] * (1 + 3 * sum(config["chance"].values()))
     pace *= {"ppo": 1.4}.get(config["agent"], 1.0) * math.exp(0.1 * rng.normal())

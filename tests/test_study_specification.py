@@ -77,7 +77,7 @@ def test_a_block_may_say_otherwise_than_the_whole():
     first, second, third = (run.config for run in study.runs)
     assert (first["seed"], second["seed"], third["seed"]) == (7, 9, 0)
     assert (first["steps"], first["evaluation_interval"], first["gamma"], first["horizon"]) == (60, 20, 1, 5)
-    assert (third["steps"], third["evaluation_interval"], third["gamma"], third["horizon"]) == (100, 1, 0.9, None)
+    assert (third["steps"], third["evaluation_interval"], third["gamma"], third["horizon"]) == (100, 1, 0.9, 100)
 
 
 @pytest.mark.parametrize(
@@ -88,6 +88,10 @@ def test_a_block_may_say_otherwise_than_the_whole():
         (4, "seeds: 0", "specification:4: seeds: found 0; expected how many, at least 1, or a list of seeds"),
         (8, "  - environments: [frozen_lake/5x5]", "unknown environment 'frozen_lake/5x5'; did you mean 'frozen_lake/"),
         (8, "  - environments: [{name: frozen_lake, parameters: {sise: 8}}]", "specification:8: unknown parameter of frozen_lake 'sise'; did you mean 'size'?"),
+        (3, "gamma: 2", "specification:3: gamma: found 2; expected: less than or equal to 1"),
+        (3, "horizon: 0", "specification:3: horizon: found 0; expected a number of steps, limit (the environment's), or none"),
+        (3, "horizon: none", "specification:8: gamma is 1 and horizon is none, so values may be infinite"),
+        (3, "hardness: {measures: [diametr]}", "unknown measure of hardness 'diametr'; did you mean 'diameter'?"),
         (9, "    chance: [plain, {stiky: 0.25}]", "specification:9: unknown key 'stiky'; did you mean 'sticky'?"),
         (9, "    chance: [plian]", "specification:9: unknown chance 'plian'; did you mean 'plain'?"),
         (9, "    chance: [{random: 1.5}]", "specification:9: random: found 1.5; expected: less than or equal to 1"),

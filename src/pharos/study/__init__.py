@@ -1,22 +1,45 @@
 """From hardness and regret to the paper's models, figures and tables."""
 
+from pharos.study._analysis import (
+    Comparison,
+    Models,
+    agreement,
+    compare,
+    intervals,
+    mean_curve,
+    models,
+    paper_agreement,
+)
 from pharos.study._execution import Status, run, status
 from pharos.study._paper import paper_regressions, paper_returns
 from pharos.study._regression import Fit, aggregate_r_squared, fit, fit_models, leave_one_class_out_r_squared
 from pharos.study._specification import Run, Specification, presets, run_id, specification
 from pharos.study._statistics import Estimate, interquartile_mean, stratified_interval
+from pharos.study._table import cells, curves, hardness_table, paper_instance, table
 
 __all__ = [
+    "Comparison",
     "Estimate",
     "Fit",
+    "Models",
     "Run",
     "Specification",
     "Status",
     "aggregate_r_squared",
+    "agreement",
+    "cells",
+    "compare",
+    "curves",
     "fit",
     "fit_models",
+    "hardness_table",
     "interquartile_mean",
+    "intervals",
     "leave_one_class_out_r_squared",
+    "mean_curve",
+    "models",
+    "paper_agreement",
+    "paper_instance",
     "paper_regressions",
     "paper_returns",
     "presets",
@@ -25,4 +48,5 @@ __all__ = [
     "specification",
     "status",
     "stratified_interval",
+    "table",
 ]

@@ -86,7 +86,7 @@ def study_folder(study: Specification, folder: str | os.PathLike | None = None) 
 
 def train(config: Mapping[str, Any], folder: Path) -> None:
     """The runner of studies: trains as `config` says and writes run.json and curve.parquet into `folder`."""
-    from pharos.experiments import train_config
+    from pharos.experiments import train_config  # type: ignore[attr-defined]
 
     train_config(config, folder)
 

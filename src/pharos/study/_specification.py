@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from pharos.errors import MissingExtra, ParameterError, UnknownName
+from pharos.study._regression import MEASURES
 
 try:
     import yaml
@@ -146,23 +147,31 @@ class ObservationEntry(_Part):
 
 
 class Hardness(_Part):
-    """Which measures of hardness are taken, and how long each may take for one instance, in seconds."""
+    """Which measures of hardness are taken, with which discount, and how many seconds each may take for one instance."""
 
-    measures: list[str] = ["effective_horizon", "sum_of_reciprocal_gaps", "diameter"]
+    gamma: float = Field(default=0.99, ge=0, le=1)
+    measures: list[str] = Field(default_factory=lambda: [name for name in MEASURES if name in registered()])
     budget: float = Field(default=60.0, gt=0)
 
     @field_validator("measures")
     @classmethod
     def _known(cls, measures: list[str]) -> list[str]:
-        from pharos.hardness._registry import chosen
-
-        chosen(measures)
+        for measure in measures:
+            if measure not in registered():
+                raise UnknownName("measure of hardness", measure, registered())
         return measures
+
+
+def _horizon(value: Any) -> Any:
+    if value in ("limit", "none") or (isinstance(value, int) and not isinstance(value, bool) and value >= 1):
+        return value
+    raise ParameterError(f"horizon: found {value!r}; expected a number of steps, limit (the environment's), or none")
 
 
 Seeds = Annotated[list[Annotated[int, Field(ge=0)]], BeforeValidator(_seeds), Field(min_length=1)]
 Steps = Annotated[int, Field(ge=1)]
 Gamma = Annotated[float, Field(ge=0, le=1)]
+Horizon = Annotated[Any, BeforeValidator(_horizon)]
 
 
 class Block(_Part):
@@ -178,7 +187,7 @@ class Block(_Part):
     steps: Steps | None = None
     evaluations: Steps | None = None
     gamma: Gamma | None = None
-    horizon: Steps | None = None
+    horizon: Horizon | None = None
     hyperparameters: dict[str, str | dict[str, Any]] = {}
 
 
@@ -191,10 +200,10 @@ class Specification(_Part):
     seeds: Seeds = list(range(5))
     steps: Steps = 50_000
     evaluations: Steps = 100
-    gamma: Gamma = 0.99
-    horizon: Steps | None = None
+    gamma: Gamma = 1.0
+    horizon: Horizon = "limit"
     hyperparameters: dict[str, dict[str, Any]] = {}
-    hardness: Hardness = Hardness()
+    hardness: Hardness = Field(default_factory=Hardness)
 
     @cached_property
     def runs(self) -> tuple[Run, ...]:
@@ -209,6 +218,7 @@ class Specification(_Part):
         steps = block.steps or self.steps
         evaluations = block.evaluations or self.evaluations
         gamma = self.gamma if block.gamma is None else block.gamma
+        horizon = self.horizon if block.horizon is None else block.horizon
         for environment in block.environments:
             for chance in block.chance:
                 for agent in block.agents:
@@ -229,7 +239,7 @@ class Specification(_Part):
                                     "steps": steps,
                                     "seed": seed,
                                     "gamma": gamma,
-                                    "horizon": block.horizon or self.horizon,
+                                    "horizon": steps_of(horizon, environment.instance),
                                     "evaluation_interval": max(1, steps // evaluations),
                                 },
                                 environment.label,
@@ -258,6 +268,20 @@ def agents() -> tuple[str, ...]:
 def tabular_agents() -> tuple[str, ...]:
     """Those agents that see the index of the state."""
     return ("q_learning",)
+
+
+def steps_of(horizon: int | str, environment: Any) -> int | None:
+    """The number of steps of an episode in values and returns; None for discounted values without a limit."""
+    if horizon == "none":
+        return None
+    return int(environment.max_episode_steps) if horizon == "limit" else int(horizon)
+
+
+def registered() -> list[str]:
+    """The names of the measures of hardness."""
+    from pharos.hardness import measures
+
+    return list(measures())
 
 
 # Reading ----------------------------------------------------------------------------------------------------------------
@@ -335,6 +359,9 @@ def _wrong(found: Specification) -> Iterator[tuple[Loc, str]]:
                 _ = entry.instance
             except ParameterError as error:
                 yield ("blocks", i, "environments", j), str(error)
+        gamma = found.gamma if block.gamma is None else block.gamma
+        if (block.horizon or found.horizon) == "none" and gamma == 1:
+            yield ("blocks", i), "gamma is 1 and horizon is none, so values may be infinite; expected a gamma below 1"
         for j, agent in enumerate(block.agents):
             if agent not in agents():
                 yield ("blocks", i, "agents", j), str(UnknownName("agent", agent, agents()))

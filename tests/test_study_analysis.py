@@ -1,0 +1,234 @@
+"""From result files to tables, models and comparisons, over runs whose results are formulas."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import fake_training
+from pharos import study
+from pharos.errors import ParameterError
+from pharos.study import _worker
+from pharos.study._table import _last_return, _number
+
+SPECIFICATION = {
+    "name": "formulas",
+    "steps": 1000,
+    "evaluations": 20,
+    "seeds": 3,
+    "hardness": {"measures": ["sum_of_reciprocal_gaps", "diameter"], "budget": 5},
+    "blocks": [
+        {
+            "environments": [
+                *(f"simple_grid/{size}x{size}-{kind}" for size in (4, 6) for kind in ("plain", "decoy")),
+                "frozen_lake/4x4",
+                "frozen_lake/8x8",
+                {"name": "frozen_lake", "parameters": {"size": 5, "seed": 0}},
+                {"name": "frozen_lake", "parameters": {"size": 6, "seed": 0}},
+            ],
+            "observations": ["vector", "simple_image"],
+            "agents": ["dqn", "ppo", "q_learning"],
+        }
+    ],
+}
+
+
+@pytest.fixture(scope="module")
+def done(tmp_path_factory):
+    """(specification, folder) of a study whose runs are over."""
+    folder = tmp_path_factory.mktemp("study")
+    found = study.specification(SPECIFICATION)
+    for run in found.runs:
+        assert _worker.attempt(fake_training.train, run.config, run.id, folder) == "finished"
+    return found, folder
+
+
+@pytest.fixture(scope="module")
+def rows(done):
+    return study.table(*done)
+
+
+@pytest.fixture(scope="module")
+def measured(done):
+    return study.hardness_table(*done)
+
+
+@pytest.fixture(scope="module")
+def cells(rows, measured):
+    return study.cells(rows, measured)
+
+
+def test_there_is_a_row_for_each_finished_run_with_the_numbers_of_its_file(done, rows):
+    found, folder = done
+    assert sorted(rows["id"]) == sorted(run.id for run in found.runs)
+    results = fake_training.results(folder)
+    for row in rows.to_dict("records")[::7]:
+        assert row["cumulative_regret"] == results[row["id"]]["result"]["cumulative_regret"]
+        assert row["seed"] == results[row["id"]]["config"]["seed"]
+
+
+def test_a_study_without_results_says_what_to_do(done, tmp_path):
+    with pytest.raises(ParameterError, match="no run of 'formulas' is finished; execute `pharos study run`"):
+        study.table(done[0], tmp_path)
+
+
+def test_runs_that_are_missing_or_failed_are_no_rows(tmp_path):
+    spec = study.specification(SPECIFICATION)
+    first, second = spec.runs[:2]
+    _worker.attempt(fake_training.train, first.config, first.id, tmp_path)
+    (tmp_path / "partial" / second.id).mkdir(parents=True)
+    _worker.write_failure(tmp_path / "partial" / second.id, second.config, second.id, "no", 1.0)
+    _worker.publish(tmp_path / "partial" / second.id, tmp_path, second.id)
+    assert list(study.table(spec, tmp_path)["id"]) == [first.id]
+
+
+def test_curves_hold_every_evaluation_of_every_run(done):
+    points = study.curves(*done)
+    assert len(points) == len(done[0].runs) * 20
+    one = points[points["id"] == done[0].runs[5].id]
+    assert list(one["step"]) == list(range(50, 1001, 50))
+    assert (one["cumulative_expected_regret"].diff().dropna() >= 0).all()
+
+
+def test_a_cell_is_the_mean_over_seeds(rows, cells):
+    assert len(cells) == 8 * (2 * 2 + 1) and set(cells["seeds"]) == {3}
+    cell = cells.iloc[17]
+    same = rows[(rows[study._table.CELL] == cell[study._table.CELL]).all(axis=1)]
+    assert len(same) == 3
+    assert cell["cumulative_regret"] == pytest.approx(same["cumulative_regret"].mean())
+    assert cell["return_deviation"] == pytest.approx(np.std(same["return"]))
+
+
+def test_hardness_is_that_of_the_report_and_kept_in_the_folder(done, measured, cells):
+    from pharos import hardness, make
+
+    mdp = study._table.build_mdp("frozen_lake", {"size": 8}, {"sticky": 0.0, "random": 0.0}, 0.99)
+    report = hardness.report(mdp, ["diameter", "sum_of_reciprocal_gaps"], horizon=make("frozen_lake").max_episode_steps)
+    row = measured[measured["instance"] == "frozen_lake/8x8"].iloc[0]
+    assert row["diameter"] == report["diameter"].value["lower"]
+    assert row["sum_of_reciprocal_gaps"] == pytest.approx(report["sum_of_reciprocal_gaps"].value)
+    assert row["num_states"] == 64 and row["notes"] == ""
+    assert len(list(done[1].glob("hardness/*.json"))) == 8
+    assert set(cells.loc[cells["instance"] == "frozen_lake/8x8", "diameter"]) == {row["diameter"]}
+
+
+def test_an_interval_enters_as_its_geometric_mean_and_only_if_it_has_an_upper_end():
+    assert _number({"lower": 4.0, "upper": 9.0, "exact": False}, False)["value"] == 6
+    assert _number({"lower": 7.0, "upper": 7.0, "exact": True}, True)["value"] == 7
+    assert "only a lower bound of 4" in _number({"lower": 4.0, "upper": None, "exact": False}, False)["why"]
+    assert _number(float("inf"), True) == {"value": None, "why": "it is infinite"}
+    assert _number({"value": 3.5, "k_min": 2}, True)["value"] == 3.5
+
+
+def test_the_return_is_the_mean_over_episodes_that_ended_in_the_last_tenth():
+    curve = pd.DataFrame({"episodes": np.arange(20) ** 2, "mean_return": np.arange(20.0)})
+    weights = np.diff(np.arange(20) ** 2)[-2:]
+    assert _last_return(curve) == pytest.approx((18 * weights[0] + 19 * weights[1]) / weights.sum())
+    curve.loc[18:, "mean_return"] = np.nan  # no episode ended there: the last ones that did
+    curve.loc[18:, "episodes"] = 17**2
+    assert np.isfinite(_last_return(curve))
+    assert np.isnan(_last_return(curve.assign(mean_return=np.nan)))
+
+
+def test_every_model_with_enough_rows_is_fitted_and_the_others_are_named(cells):
+    found = study.models(cells, measures=["sum_of_reciprocal_gaps", "diameter"])
+    assert [(fit.model, fit.subset) for fit in found.fits] == [
+        ("single", "all"),
+        ("representation", "simple_image"),
+        ("representation", "vector"),
+        ("class", "frozen_lake"),
+        ("class", "simple_grid"),
+    ]
+    assert found.get("single", "all").num_rows == 16
+    assert found.class_r_squared > 0.5 and found.leave_one_class_out is not None
+    few = study.models(
+        cells[cells["instance"].isin(["frozen_lake/4x4", "simple_grid/4x4-plain"])],
+        measures=["sum_of_reciprocal_gaps", "diameter"],
+    )
+    assert any("the class model of frozen_lake has 2 rows; needs at least" in note for note in few.notes)
+
+
+def test_measures_that_are_unknown_are_left_out_and_named(cells):
+    found = study.models(cells.assign(diameter=np.nan), measures=["effective_horizon", "diameter"])
+    assert "effective_horizon is known for no instance: the models leave it out" in found.notes
+    assert "diameter is known for no instance: the models leave it out" in found.notes
+    some = cells.copy()
+    some.loc[some["instance"] == "frozen_lake/4x4", "diameter"] = np.nan
+    found = study.models(some, measures=["sum_of_reciprocal_gaps", "diameter"])
+    assert "2 of 16 cells have no positive diameter: left out" in found.notes
+
+
+def test_the_models_without_rows_are_a_note():
+    empty = pd.DataFrame({"agent": ["ppo"], "observation": ["vector"], "cumulative_regret": [1.0]})
+    assert study.models(empty).notes[-1] == "no cell of dqn has all measures: there are no models"
+
+
+def test_agents_whose_returns_are_linear_in_each_other_agree_perfectly(cells):
+    made = cells.copy()
+    made["return"] = np.where(
+        made["agent"] == "dqn", 2 * made["sum_of_reciprocal_gaps"] + 1, made["sum_of_reciprocal_gaps"]
+    )
+    r, n = study.agreement(made, "return")
+    assert r == pytest.approx(1) and n == 16
+    assert study.agreement(cells[cells["agent"] == "dqn"], "return") is None
+
+
+def test_the_correlation_of_the_returns_that_the_paper_prints_is_069():
+    assert study.paper_agreement() == pytest.approx(0.685, abs=0.001)
+
+
+def test_intervals_hold_their_value_and_there_is_one_for_each_class_agent_and_observation(rows):
+    found = study.intervals(rows, resamples=100)
+    assert len(found) == 2 * 5
+    assert ((found["lower"] <= found["iqm"]) & (found["iqm"] <= found["upper"])).all()
+
+
+def test_a_mean_curve_weighs_tasks_alike_and_equal_runs_leave_no_doubt():
+    same = np.tile(np.arange(4.0), (5, 1))
+    mean, lower, upper = study.mean_curve([same, np.zeros((2, 4))])
+    assert (mean == np.arange(4) / 2).all() and np.allclose(lower, mean) and np.allclose(upper, mean)
+    rng = np.random.default_rng(0)
+    mean, lower, upper = study.mean_curve([rng.normal(size=(40, 1))], resamples=4000)
+    assert (upper - lower)[0] == pytest.approx(2 * 1.96 / np.sqrt(40), rel=0.25)
+
+
+def test_ours_stands_beside_each_number_of_the_paper_that_the_study_has(done, cells):
+    found = study.compare(cells, done[0].runs, [study.models(cells, measures=["sum_of_reciprocal_gaps", "diameter"])])
+    returns = found.returns
+    assert len(returns) == len(study.paper_returns())
+    known = returns[returns["ours"].notna()]
+    assert set(zip(known["environment"], known["instance"], strict=True)) == {
+        *(("simple_grid", i) for i in (1, 2, 3, 4)),
+        *(("frozen_lake", i) for i in (1, 2)),
+    }
+    assert set(known["randomization"]) == {"none"} and len(known) == 6 * 4
+    line = known[(known["environment"] == "simple_grid") & (known["instance"] == 1)]
+    line = line[(line["agent"] == "DQN") & (line["observation"] == "image")].iloc[0]
+    cell = cells[(cells["instance"] == "simple_grid/4x4-decoy") & (cells["agent"] == "dqn")]
+    assert line["ours"] == cell[cell["observation"] == "simple_image"]["return"].item()
+    assert line["difference"] == line["ours"] - 0.10
+    fits = found.regressions.set_index(["model", "subset"])
+    assert fits.loc[("single (Eq. 7)", "all"), "paper"] == 0.09
+    assert np.isfinite(fits.loc[("class", "frozen_lake"), "ours_cumulative"])
+    assert np.isnan(fits.loc[("class", "freeway"), "ours_cumulative"])
+    assert fits.loc[("agents", "correlation of DQN and PPO performance"), "paper"] == 0.81
+
+
+def test_instances_are_those_blocks_of_the_papers_tables_that_print_their_parameters():
+    from pharos import make
+    from pharos.environments import named_instances
+
+    printed = study.paper_returns().drop_duplicates(["environment", "instance"])
+    by_number = {
+        (environment, study.paper_instance(environment, make(name).parameters)): make(name).parameters
+        for name, (environment, _) in named_instances().items()
+    }
+    for row in printed.itertuples():
+        words = dict(part.split("=") for part in row.parameters_as_printed.replace(",", ";").split(";"))
+        words = {name.strip(): int(value) for name, value in words.items()}
+        ours = by_number[row.environment, row.instance]
+        if row.environment == "frozen_lake":
+            assert ours["size"] == words["height"] == words["width"]
+            continue
+        renamed = {"lane length": "lane_length", "n cars": "num_cars", "player speed": "player_speed"}
+        renamed["extra paddle width"] = "extra_paddle_width"
+        assert {renamed.get(name, name): value for name, value in words.items()}.items() <= ours.items()
