@@ -119,3 +119,13 @@ class Task:
         from pharos.solvers import worst_value
 
         return worst_value(self.mdp)
+
+    @cached_property
+    def return_range(self) -> tuple[float, float]:
+        """The lowest and the highest return that an episode can have, whatever is executed."""
+        from pharos.solvers import value_iteration, worst_value
+
+        plain = self.space.mdp(gamma=self.gamma).with_horizon(self.horizon)  # type: ignore[arg-type]
+        low, high = worst_value(plain), value_iteration(plain)
+        starts = plain.start_states
+        return float(low.v[starts].min() - low.error_bound), float(high.v[starts].max() + high.error_bound)
