@@ -10,11 +10,13 @@ from typing import Annotated, Any
 
 import typer
 
-from pharos.cli.common import Json, complain, console, print_json
+from pharos.cli.common import Json, complain, console, print_json, progress_line
 
 app = typer.Typer(help="Run a grid of training runs, and make the paper's figures and tables of it.")
 
-SpecArgument = Annotated[str, typer.Argument(metavar="SPEC", help="A YAML file, or a preset: quick, small, paper.")]
+SpecArgument = Annotated[
+    str, typer.Argument(metavar="SPEC", help="A YAML file, a study's folder, or a preset: quick, small, paper.")
+]
 Out = Annotated[
     Path | None, typer.Option("--out", metavar="DIR", help="Where results are; studies/NAME when not given.")
 ]
@@ -81,7 +83,7 @@ def run(
     with _progress() as progress:
         end = study.run(
             specification,
-            out,
+            _folder(spec, out),
             shard=shard,
             retry_failed=retry_failed,
             timeout=timeout,
@@ -98,7 +100,35 @@ def status(spec: SpecArgument, out: Out = None, json: Json = False) -> None:
     """How many runs are finished, running, missing and failed, and why."""
     from pharos import study
 
-    _answer(study.status(study.specification(spec), out), json)
+    _answer(study.status(study.specification(spec), _folder(spec, out)), json)
+
+
+@app.command("report")
+def report(
+    spec: SpecArgument,
+    out: Out = None,
+    to: Annotated[
+        Path | None, typer.Option("--to", metavar="DIR", help="Where to write; DIR/report of the study when not given.")
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Make the figures and tables of the finished runs: one HTML file, PNG, PDF, CSV and LaTeX."""
+    from pharos import study
+
+    with progress_line("report") as tell:
+        written = study.report(study.specification(spec), _folder(spec, out), out=to, progress=tell)
+    if json:
+        files = {"figures": list(map(str, written.figures)), "tables": list(map(str, written.tables))}
+        print_json({"html": str(written.html), **files, "notes": written.notes})
+        return
+    for note in written.notes:
+        complain(note)
+    print(written.html)
+
+
+def _folder(spec: str, out: Path | None) -> Path | None:
+    """The folder of the results: as given, or that of a SPEC which is such a folder."""
+    return Path(spec) if out is None and Path(spec).is_dir() else out
 
 
 def _answer(status: Any, json: bool) -> None:

@@ -13,6 +13,7 @@ from pharos.study._analysis import (
 from pharos.study._execution import Status, run, status
 from pharos.study._paper import paper_regressions, paper_returns
 from pharos.study._regression import Fit, aggregate_r_squared, fit, fit_models, leave_one_class_out_r_squared
+from pharos.study._report import StudyReport, report
 from pharos.study._specification import Run, Specification, presets, run_id, specification
 from pharos.study._statistics import Estimate, interquartile_mean, stratified_interval
 from pharos.study._table import cells, curves, hardness_table, paper_instance, table
@@ -25,6 +26,7 @@ __all__ = [
     "Run",
     "Specification",
     "Status",
+    "StudyReport",
     "aggregate_r_squared",
     "agreement",
     "cells",
@@ -43,6 +45,7 @@ __all__ = [
     "paper_regressions",
     "paper_returns",
     "presets",
+    "report",
     "run",
     "run_id",
     "specification",
