@@ -10,7 +10,8 @@ from typing import Annotated, Any
 
 import typer
 
-from pharos.cli.common import Json, complain, console, print_json, progress_line
+from pharos.cli.common import Json, complain, console, parse_parameters, print_json, progress_line
+from pharos.errors import UnknownName
 
 app = typer.Typer(help="Run a grid of training runs, and make the paper's figures and tables of it.")
 
@@ -74,25 +75,64 @@ def run(
     workers: Annotated[
         int | None, typer.Option("--workers", min=1, help="Processes; as many as processors when not given.")
     ] = None,
+    on: Annotated[str, typer.Option("--on", metavar="local|slurm|ray", help="Where the runs are executed.")] = "local",
+    shards: Annotated[
+        int | None, typer.Option("--shards", min=1, help="With --on slurm: jobs of the array; 8 when not given.")
+    ] = None,
+    slurm: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--slurm", metavar="NAME=VALUE", help="With --on slurm: timeout_min=600, slurm_partition=cpu, ..."
+        ),
+    ] = None,
+    address: Annotated[
+        str | None, typer.Option("--address", help="With --on ray: of the cluster; one is started when not given.")
+    ] = None,
     json: Json = False,
 ) -> None:
     """Execute the runs that are missing. Interrupt it at any time: the same command goes on from there."""
     from pharos import study
 
-    specification = study.specification(spec)
-    with _progress() as progress:
-        end = study.run(
+    if on not in ("local", "slurm", "ray"):
+        raise UnknownName("place to run on", on, ("local", "slurm", "ray"))
+    specification, folder = study.specification(spec), _folder(spec, out)
+    if on == "slurm":
+        jobs = study.submit(
             specification,
-            _folder(spec, out),
-            shard=shard,
+            folder,
+            shards=shards or 8,
+            parameters=parse_parameters(slurm),
             retry_failed=retry_failed,
             timeout=timeout,
-            workers=workers,
-            progress=progress,
+            workers=workers or 1,
         )
+        _print_jobs([str(job.job_id) for job in jobs], json)
+        return
+    with _progress() as progress:
+        if on == "ray":
+            end = study.run_on_ray(
+                specification, folder, address=address, shard=shard, retry_failed=retry_failed, progress=progress
+            )
+        else:
+            end = study.run(
+                specification,
+                folder,
+                shard=shard,
+                retry_failed=retry_failed,
+                timeout=timeout,
+                workers=workers,
+                progress=progress,
+            )
     _answer(end, json)
     if end.failed:
         raise typer.Exit(EXIT_FAILED)
+
+
+def _print_jobs(jobs: list[str], json: bool) -> None:
+    if json:
+        print_json({"jobs": jobs})
+    else:
+        print(f"submitted {len(jobs)} jobs: {', '.join(jobs)}; `pharos study status` says how far they are")
 
 
 @app.command("status")

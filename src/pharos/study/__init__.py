@@ -10,6 +10,7 @@ from pharos.study._analysis import (
     models,
     paper_agreement,
 )
+from pharos.study._clusters import run_on_ray, submit
 from pharos.study._execution import Status, run, status
 from pharos.study._paper import paper_regressions, paper_returns
 from pharos.study._regression import Fit, aggregate_r_squared, fit, fit_models, leave_one_class_out_r_squared
@@ -48,8 +49,10 @@ __all__ = [
     "report",
     "run",
     "run_id",
+    "run_on_ray",
     "specification",
     "status",
     "stratified_interval",
+    "submit",
     "table",
 ]

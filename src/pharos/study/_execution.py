@@ -234,7 +234,7 @@ class _Execution:
         self.kills: dict[str, int] = defaultdict(int)
         self.seconds_per_step: dict[tuple, tuple[float, int]] = {}
         for run in runs:
-            if not self._note(run, retry_failed):
+            if not self.note(run, retry_failed):
                 self.pending.append((0.0, run))
 
     def prepare(self, prepare: Callable[[Mapping[str, Any]], Any]) -> None:
@@ -256,7 +256,7 @@ class _Execution:
             try:
                 while done < len(todo):
                     run = todo[done]
-                    self._report(f"preparing {run.instance}, {run.chance} ({len(instances) - len(todo) + done + 1} of {len(instances)})")  # fmt: skip
+                    self.report(f"preparing {run.instance}, {run.chance} ({len(instances) - len(todo) + done + 1} of {len(instances)})")  # fmt: skip
                     if receiver.poll(STATUS_SECONDS):
                         receiver.recv()
                         done += 1
@@ -276,17 +276,17 @@ class _Execution:
             while self.pending or self.running:
                 self._start(context)
                 self._await()
-                self._report()
+                self.report()
         except BaseException:
             for process, _, _ in self.running.values():
                 process.terminate()
             for process, _, _ in self.running.values():
                 process.join(10)
             self.running.clear()
-            self._report(final=True)
+            self.report(final=True)
             raise
         _clear(self.folder, self.runs)
-        return self._report(final=True)
+        return self.report(final=True)
 
     def _start(self, context: Any) -> None:
         for _ in range(len(self.pending)):
@@ -296,7 +296,7 @@ class _Execution:
             if due > time.monotonic():
                 self.pending.append((due, run))
                 continue
-            if self._note(run, run.id in self.again):
+            if self.note(run, run.id in self.again):
                 continue
             again = run.id in self.again
             arguments = (self.runner, dict(run.config), run.id, self.folder.absolute(), again, dict(os.environ))
@@ -316,7 +316,7 @@ class _Execution:
             process.close()
             if code == _worker.EXIT_BUSY:
                 self.pending.append((time.monotonic() + BUSY_SECONDS, run))
-            elif not self._note(run, code != 0 and run.id in self.again):
+            elif not self.note(run, code != 0 and run.id in self.again):
                 self._killed(run, code)
         if self.timeout is not None:
             for process, run, started in self.running.values():
@@ -339,9 +339,9 @@ class _Execution:
         partial.mkdir(parents=True, exist_ok=True)
         _worker.write_failure(partial, run.config, run.id, error, 0.0)
         _worker.publish(partial, self.folder, run.id)
-        self._note(run, False)
+        self.note(run, False)
 
-    def _note(self, run: Run, again: bool) -> bool:
+    def note(self, run: Run, again: bool = False) -> bool:
         """Read the run's result, if it is over; False where it has to be executed."""
         record = _worker.read_record(self.folder / "runs" / run.id)
         if record is None or (record["status"] != "finished" and again):
@@ -369,7 +369,7 @@ class _Execution:
             seconds += max(0.0, needed - (time.monotonic() - started))
         return seconds / self.workers
 
-    def _report(self, preparing: str = "", *, final: bool = False) -> Status:
+    def report(self, preparing: str = "", *, final: bool = False) -> Status:
         now = Status(
             self.study.name,
             str(self.folder),

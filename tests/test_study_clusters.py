@@ -1,0 +1,99 @@
+"""A study on other engines ends with the same files as on this machine."""
+
+import os
+import sys
+from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+import fake_training
+from pharos import study
+from pharos.errors import MissingExtra, ParameterError
+
+SPECIFICATION = study.specification(
+    {
+        "name": "fake",
+        "steps": 100,
+        "evaluations": 10,
+        "seeds": 4,
+        "blocks": [{"environments": ["frozen_lake"], "agents": ["dqn", "q_learning"]}],
+    }
+)
+
+
+@pytest.fixture
+def undisturbed(tmp_path):
+    """The results of the study on this machine."""
+    study.run(SPECIFICATION, tmp_path / "here", runner=fake_training.train, workers=2)
+    return fake_training.results(tmp_path / "here")
+
+
+def test_submitted_jobs_execute_their_shards(tmp_path, undisturbed, monkeypatch):
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))
+    parameters = {"timeout_min": 2}
+    jobs = study.submit(
+        SPECIFICATION, tmp_path / "there", shards=2, cluster="local", parameters=parameters, runner=fake_training.train
+    )
+    assert [job.result()["finished"] for job in jobs] == [4, 4]
+    assert fake_training.results(tmp_path / "there") == undisturbed
+
+
+def test_where_there_is_no_slurm_submitting_says_so(tmp_path, monkeypatch):
+    monkeypatch.setenv("PATH", "")
+    with pytest.raises(ParameterError, match="cannot submit to slurm"):
+        study.submit(SPECIFICATION, tmp_path, shards=2)
+    with pytest.raises(ParameterError, match="expected slurm or local"):
+        study.submit(SPECIFICATION, tmp_path, shards=2, cluster="cloud")
+
+
+class RayDouble(SimpleNamespace):
+    """What pharos uses of Ray, executed at once in this process; `dies` are runs whose process is lost."""
+
+    def __init__(self, dies=()):
+        super().__init__(started=False, ended=False, waits=0, dies=set(dies))
+
+    def is_initialized(self):
+        return self.started
+
+    def init(self, **options):
+        self.started = True
+
+    def shutdown(self):
+        self.ended = True
+
+    def remote(self, **options):
+        assert options == {"num_cpus": 1, "max_retries": 2}
+        return lambda function: SimpleNamespace(remote=lambda *arguments: partial(function, *arguments))
+
+    def wait(self, references, num_returns, timeout):
+        self.waits += 1
+        return references[:num_returns], references[num_returns:]
+
+    def get(self, reference):
+        if reference.args[2] in self.dies:
+            raise RuntimeError("the worker died")
+        return reference()
+
+
+def test_on_ray_every_run_is_one_task_and_lost_ones_have_failed(tmp_path, undisturbed, monkeypatch):
+    lost = SPECIFICATION.runs[3].id
+    double = RayDouble(dies=[lost])
+    monkeypatch.setitem(sys.modules, "ray", double)
+    end = study.run_on_ray(SPECIFICATION, tmp_path / "ray", runner=fake_training.train)
+    assert (end.finished, end.failed) == (7, 1)
+    assert end.errors == {lost: "RuntimeError: the worker died"}
+    assert double.ended and double.waits == 8
+    double.dies.clear()
+    assert (
+        study.run_on_ray(SPECIFICATION, tmp_path / "ray", runner=fake_training.train, retry_failed=True).finished == 8
+    )
+    assert fake_training.results(tmp_path / "ray") == undisturbed
+
+
+def test_without_ray_the_message_names_the_extra(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(MissingExtra, match=r"pip install 'pharos\[ray\]'"):
+        study.run_on_ray(SPECIFICATION, tmp_path)
+    assert not os.listdir(tmp_path)
