@@ -1,6 +1,17 @@
 """Experiments: an agent trained on a task, its policies evaluated exactly, and the result written down."""
 
 from pharos.experiments._evaluation import Evaluation, evaluate_agent
+from pharos.experiments._results import read_curve, read_record
 from pharos.experiments._task import Task
+from pharos.experiments._train import TrainingResult, train, train_config
 
-__all__ = ["Evaluation", "Task", "evaluate_agent"]
+__all__ = [
+    "Evaluation",
+    "Task",
+    "TrainingResult",
+    "evaluate_agent",
+    "read_curve",
+    "read_record",
+    "train",
+    "train_config",
+]

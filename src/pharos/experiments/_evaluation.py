@@ -192,7 +192,7 @@ def _sub_mdp(task: Task, asked: _Asked) -> tuple[TabularMDP, np.ndarray]:
         table = mdp.next_states[states].astype(np.int64)
         arrived = table * asked.width + (np.arange(mdp.num_actions) if asked.by_pairs else 0)
         following = np.where(table >= 0, asked.position[arrived], -1)
-        policy = asked.probabilities
+        policy = asked.probabilities  # type: ignore[assignment]
         starts = asked.position[_start_rows(task, asked)]
     initial = np.zeros(states.size)
     np.add.at(initial, starts, mdp.start_probabilities)

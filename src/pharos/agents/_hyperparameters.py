@@ -1,0 +1,45 @@
+"""Hyperparameters of every agent, class of environments and observation: hyperparameters.yaml, in RL Zoo's convention."""
+
+from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from pharos.errors import MissingExtra, ParameterError
+
+TABLE = Path(__file__).with_name("hyperparameters.yaml")
+
+
+def hyperparameters(
+    agent: str, environment: str, observation: str, given: Mapping[str, Any] | None = None, *, table: Path | None = None
+) -> dict[str, Any]:
+    """Return the hyperparameters of an agent for a class of environments and an observation.
+
+    Args:
+        given: go before those of the table.
+        table: another YAML of the same form, such as one that `pharos tune` wrote.
+    Raises:
+        ParameterError: the table has another form. MissingExtra: PyYAML is not installed.
+    """
+    entries = _read(table or TABLE).get(agent, {})
+    classes = entries.get(environment, {})
+    result: dict[str, Any] = {}
+    for part in (entries.get("default"), classes.get("default"), classes.get(observation), given):
+        result.update(part or {})
+    return result
+
+
+@cache
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        import yaml
+    except ImportError as error:
+        raise MissingExtra("reading hyperparameters", "pyyaml", "agents") from error
+    try:
+        table = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, yaml.YAMLError) as error:
+        raise ParameterError(f"{path}: cannot be read: {error}") from error
+    levels = [table, *(table.values() if isinstance(table, dict) else [])]
+    if not all(isinstance(level, dict) for level in levels):
+        raise ParameterError(f"{path}: expected agent, then class, then observation, each with names and values")
+    return table

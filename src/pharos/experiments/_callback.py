@@ -1,0 +1,52 @@
+"""A callback of Stable-Baselines3 that stops at chosen steps, and counts the returns of finished episodes."""
+
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback
+
+
+class AtPoints(BaseCallback):
+    """Calls at_point(steps, episodes, sum of returns) when the number of steps passes each of `points`.
+
+    Args:
+        gamma: discount of returns.
+        finished: episodes and sum of returns before.
+    """
+
+    def __init__(self, points: list[int], at_point: Any, gamma: float, finished: tuple[int, float]):
+        super().__init__()
+        self.points, self.at_point, self.gamma = list(points), at_point, gamma
+        self.episodes, self.returns = finished
+        self._owner: Any = None
+
+    def counted_by(self, owner: Any) -> None:
+        """Keep owner.finished at (episodes, sum of returns)."""
+        self._owner = owner
+
+    def _on_training_start(self) -> None:
+        self._running = np.zeros(self.training_env.num_envs)
+        self._discount = np.ones(self.training_env.num_envs)
+
+    def _on_step(self) -> bool:
+        dones = self.locals["dones"]
+        self._running += self._discount * self.locals["rewards"]
+        self._discount *= self.gamma
+        for i in np.flatnonzero(dones):
+            self.episodes += 1
+            self.returns += float(self._running[i])
+            self._running[i], self._discount[i] = 0.0, 1.0
+        self._owner.finished = (self.episodes, self.returns)
+        if self.points and self.num_timesteps >= self.points[0] and len(self.points) > 1:
+            self._call()
+        return True
+
+    def at_the_end(self) -> None:
+        """The last point, after the last update."""
+        if self.points:
+            self._call()
+
+    def _call(self) -> None:
+        steps = max(point for point in self.points if point <= self.num_timesteps)
+        self.points = [point for point in self.points if point > self.num_timesteps]
+        self.at_point(steps, self.episodes, self.returns)

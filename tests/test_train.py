@@ -1,0 +1,195 @@
+"""Training runs: what is written, what a kill loses, that seeds decide everything, and that regret is what it is defined to be."""
+
+import json
+import multiprocessing
+import os
+import signal
+import time
+
+import numpy as np
+import pytest
+
+import pharos
+from pharos.errors import FileFormatError, ParameterError, UnknownName
+from pharos.experiments import _train, read_curve, read_record, train, train_config
+from pharos.experiments._results import COLUMNS
+
+SMALL = {"learning_starts": 50, "buffer_size": 1000, "target_update_interval": 50}
+
+
+@pytest.fixture(autouse=True)
+def always_checkpoint(monkeypatch):
+    monkeypatch.setattr(_train, "CHECKPOINT_SECONDS", 0.0)
+
+
+def short(agent, out=None, steps=400, seed=1, progress=None, **options):
+    hyperparameters = SMALL if agent == "dqn" else {"n_steps": 16} if agent == "ppo" else {}
+    return train(
+        agent,
+        "simple_grid/4x4-plain",
+        steps=steps,
+        seed=seed,
+        out=out,
+        evaluation_interval=100,
+        hyperparameters=hyperparameters,
+        progress=progress,
+        **options,
+    )
+
+
+@pytest.mark.parametrize("agent", ["q_learning", "dqn", "ppo"])
+def test_a_run_writes_its_record_and_its_curve(agent, tmp_path):
+    result = short(agent, tmp_path / "run", observation="vector", sticky=0.25)
+    record, curve = read_record(tmp_path / "run"), read_curve(tmp_path / "run")
+    assert record["status"] == "finished"
+    assert record["config"]["chance"] == {"sticky": 0.25, "random": 0.0}
+    assert record["result"]["episodes"] == result.result["episodes"] == curve["episodes"].iloc[-1]
+    assert list(curve.columns) == list(COLUMNS)
+    assert curve["step"].tolist() == [0, 100, 200, 300, 400]
+    assert not (tmp_path / "run" / "checkpoint").exists()
+    assert not any(path.suffix in (".pkl", ".zip") for path in (tmp_path / "run").rglob("*"))
+
+
+@pytest.mark.parametrize("agent", ["q_learning", "dqn", "ppo"])
+def test_the_same_seed_gives_the_same_file_and_another_seed_another(agent, tmp_path):
+    for name, seed in (("a", 1), ("b", 1), ("c", 2)):
+        short(agent, tmp_path / name, seed=seed, observation="simple_image")
+    files = [(tmp_path / name / "curve.parquet").read_bytes() for name in "abc"]
+    assert files[0] == files[1]
+    assert files[0] != files[2]
+
+
+def test_regret_is_what_it_is_defined_to_be():
+    result = train("q_learning", "frozen_lake/4x4", steps=2000, evaluation_interval=250, random=0.1)
+    curve, best, uniform = result.curve, result.result["value_optimal"], result.result["value_uniform"]
+    cumulative = 0.0
+    for before, row in zip([None, *curve], curve, strict=False):
+        assert row["expected_regret"] == pytest.approx(best - row["value"])
+        assert row["normalized_regret"] == pytest.approx((best - row["value"]) / (best - uniform))
+        if before is not None:
+            finished = row["episodes"] - before["episodes"]
+            cumulative += finished * before["expected_regret"]
+            assert row["realised_regret"] == pytest.approx(best - row["mean_return"])
+        assert row["cumulative_expected_regret"] == pytest.approx(cumulative)
+    total = result.result["mean_return"] * result.result["episodes"]
+    assert curve[-1]["cumulative_realised_regret"] == pytest.approx(result.result["episodes"] * best - total)
+    assert result.result["normalized_regret"] == pytest.approx(
+        cumulative / (result.result["episodes"] * (best - uniform))
+    )
+
+
+def test_the_values_are_those_of_the_task_by_other_means():
+    result = train("q_learning", "frozen_lake/4x4", steps=500, gamma=0.9, horizon=None)
+    mdp = pharos.build(pharos.make("frozen_lake/4x4")).mdp(gamma=0.9)
+    assert result.result["value_optimal"] == pytest.approx(0.9**5, abs=1e-6)
+    policy = result.agent.policy_table()
+    assert result.result["final_value"] == pytest.approx(pharos.evaluate_policy(mdp, policy).value_at_start, abs=1e-6)
+
+
+class Killed(BaseException):
+    pass
+
+
+def kill_at(step):
+    def progress(done, *_):
+        if done >= step:
+            raise Killed
+
+    return progress
+
+
+@pytest.mark.parametrize("agent", ["q_learning", "dqn", "ppo"])
+def test_a_run_that_died_goes_on_from_its_last_checkpoint(agent, tmp_path):
+    with pytest.raises(Killed):
+        short(agent, tmp_path / "run", progress=kill_at(300))
+    assert read_record(tmp_path / "run")["status"] == "running"
+    steps = []
+    result = short(agent, tmp_path / "run", progress=lambda done, *_: steps.append(done))
+    assert steps == [300, 400]
+    assert [row["step"] for row in result.curve] == [0, 100, 200, 300, 400]
+    if agent == "q_learning":
+        short(agent, tmp_path / "whole")
+        assert (tmp_path / "run" / "curve.parquet").read_bytes() == (tmp_path / "whole" / "curve.parquet").read_bytes()
+
+
+def _long_run(folder):
+    train("q_learning", "frozen_lake/8x8", steps=40_000_000, evaluation_interval=100_000, out=folder)
+
+
+def test_a_killed_process_loses_no_more_than_an_interval(tmp_path):
+    folder = tmp_path / "run"
+    process = multiprocessing.get_context("spawn").Process(target=_long_run, args=(folder,))
+    process.start()
+    deadline = time.monotonic() + 60
+    while not (folder / "checkpoint" / "curve.json").exists() and time.monotonic() < deadline:
+        time.sleep(0.01)
+    os.kill(process.pid, signal.SIGKILL)
+    process.join()
+    places = [folder / name / "curve.json" for name in ("checkpoint", "checkpoint.old")]  # one of them, at any moment
+    kept = json.loads(next(place for place in places if place.exists()).read_text())
+    steps = []
+
+    def progress(done, *_):
+        steps.append(done)
+        raise Killed
+
+    with pytest.raises(Killed):
+        train(
+            "q_learning",
+            "frozen_lake/8x8",
+            steps=40_000_000,
+            evaluation_interval=100_000,
+            out=folder,
+            progress=progress,
+        )
+    assert steps == [kept["rows"][-1]["step"] + 100_000]
+
+
+def test_a_finished_run_is_returned_and_another_refused(tmp_path):
+    first = short("q_learning", tmp_path / "run")
+    again = short("q_learning", tmp_path / "run", progress=kill_at(0))
+    assert again.result == first.result
+    assert again.agent is None
+    with pytest.raises(ParameterError, match="another seed; choose another folder"):
+        short("q_learning", tmp_path / "run", seed=5)
+
+
+def test_a_configuration_repeats_a_run(tmp_path):
+    short("q_learning", tmp_path / "a", random=0.1)
+    train_config(read_record(tmp_path / "a")["config"], tmp_path / "b")
+    assert (tmp_path / "a" / "curve.parquet").read_bytes() == (tmp_path / "b" / "curve.parquet").read_bytes()
+
+
+def test_the_policy_of_a_tabular_agent_is_kept_as_an_array(tmp_path):
+    result = short("q_learning", tmp_path / "run", steps=5000)
+    policy = np.load(tmp_path / "run" / "policy.npy", allow_pickle=False)
+    assert (policy == result.agent.policy_table()).all()
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"agent": "dqm"}, UnknownName, "did you mean 'dqn'"),
+        ({"agent": "stable_baselines3:DQM"}, UnknownName, "did you mean"),
+        ({"agent": "dqn", "observation": "vectro"}, UnknownName, "did you mean 'vector'"),
+        ({"agent": "dqn", "hyperparameters": {"learning_rat": 1}}, ParameterError, "learning_rat"),
+        ({"agent": "q_learning", "steps": 0}, ParameterError, "steps is 0"),
+        ({"agent": "q_learning", "evaluation_interval": -1}, ParameterError, "evaluation_interval is -1"),
+        ({"agent": "q_learning", "horizon": None}, ParameterError, "give a horizon"),
+    ],
+)
+def test_what_is_wrong_is_said_before_anything_is_learnt(options, error, message):
+    agent = options.pop("agent")
+    with pytest.raises(error, match=message):
+        train(agent, "simple_grid/4x4-plain", **{"steps": 100, **options})
+
+
+def test_a_folder_that_is_no_run_is_said_to_be_none(tmp_path):
+    with pytest.raises(FileFormatError, match="expected the folder of a run"):
+        read_record(tmp_path)
+    (tmp_path / "run.json").write_text("{")
+    with pytest.raises(FileFormatError, match="is no JSON"):
+        read_record(tmp_path)
+    (tmp_path / "curve.parquet").write_bytes(b"PAR1")
+    with pytest.raises(FileFormatError, match="cannot be read"):
+        read_curve(tmp_path)
