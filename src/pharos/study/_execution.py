@@ -18,7 +18,7 @@ from multiprocessing import connection
 from pathlib import Path
 from typing import Any
 
-from pharos.errors import ParameterError
+from pharos.errors import ParameterError, StateSpaceLocked
 from pharos.study import _worker
 from pharos.study._specification import Run, Specification, specification
 
@@ -86,9 +86,26 @@ def study_folder(study: Specification, folder: str | os.PathLike | None = None) 
 
 def train(config: Mapping[str, Any], folder: Path) -> None:
     """The runner of studies: trains as `config` says and writes run.json and curve.parquet into `folder`."""
-    from pharos.experiments import train_config  # type: ignore[attr-defined]
+    from pharos.experiments import train_config
 
     train_config(config, folder)
+
+
+def prepare_instance(config: Mapping[str, Any]) -> None:
+    """Build the state space of a run into the cache, and compile what solving it needs."""
+    from pharos.environment import make
+    from pharos.experiments import Task
+
+    parameters = {name: tuple_of(value) for name, value in config["parameters"].items()}
+    chance = {"sticky": config["chance"]["sticky"], "random": config["chance"]["random"]}
+    task = Task(make(config["environment"], **parameters), **chance, gamma=config["gamma"], horizon=config["horizon"])
+    for solution in (task.optimal, task.uniform, task.worst):
+        del solution
+
+
+def tuple_of(value: Any) -> Any:
+    """Lists as tuples, all the way down."""
+    return tuple(tuple_of(item) for item in value) if isinstance(value, list) else value
 
 
 def shard_of(runs: Sequence[Run], shard: str | tuple[int, int] | None) -> tuple[Run, ...]:
@@ -127,7 +144,8 @@ def run(
         workers: processes; None for as many as there are processors.
         progress: called with a Status every now and then.
         runner: `runner(config, folder)`, a function of a module, which writes run.json and curve.parquet.
-        prepare: called with one config of each instance, in a process of its own, before the runs; None: nothing.
+        prepare: called with one config of each instance, in a process of its own, before the runs; None: builds state spaces
+            for the usual runner, and does nothing for another.
     Returns:
         The Status at the end. Failed runs do not stop the others.
     Raises:
@@ -141,6 +159,8 @@ def run(
     claim(study, place)
     name = "status.json" if shard is None else f"status-{str(shard).replace('/', '-of-')}.json"
     execution = _Execution(study, place, runs, retry_failed, timeout, workers or processors(), progress, runner, name)
+    if prepare is None and runner is train:
+        prepare = prepare_instance
     if prepare is not None:
         execution.prepare(prepare)
     return execution.run()
@@ -406,8 +426,18 @@ def _prepare_all(
     _worker.end_with_parent()
     for config in configs:
         with contextlib.suppress(Exception):  # the runs of this instance will fail with the same error, and say so
-            prepare(config)
+            _unless_locked(prepare, config)
         sender.send(True)
+
+
+def _unless_locked(prepare: Callable[[Mapping[str, Any]], Any], config: Mapping[str, Any]) -> None:
+    """Prepare an instance; where another process is building it, wait for that one."""
+    while True:
+        try:
+            prepare(config)
+            return
+        except StateSpaceLocked:
+            time.sleep(STATUS_SECONDS)
 
 
 def _clear(folder: Path, runs: Iterable[Run]) -> None:

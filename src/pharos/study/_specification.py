@@ -261,8 +261,8 @@ _PARTS: dict[Loc, type[BaseModel]] = {
 
 
 def agents() -> tuple[str, ...]:
-    """The names of the agents."""
-    return ("dqn", "ppo", "q_learning")
+    """The names of the agents; besides, `module:Class` is an algorithm for Stable-Baselines3."""
+    return ("q_learning", "dqn", "ppo", "a2c")
 
 
 def tabular_agents() -> tuple[str, ...]:
@@ -363,7 +363,7 @@ def _wrong(found: Specification) -> Iterator[tuple[Loc, str]]:
         if (block.horizon or found.horizon) == "none" and gamma == 1:
             yield ("blocks", i), "gamma is 1 and horizon is none, so values may be infinite; expected a gamma below 1"
         for j, agent in enumerate(block.agents):
-            if agent not in agents():
+            if agent not in agents() and ":" not in agent:
                 yield ("blocks", i, "agents", j), str(UnknownName("agent", agent, agents()))
         for agent, given in block.hyperparameters.items():
             loc = ("blocks", i, "hyperparameters", agent)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pharos.errors import ParameterError, PharosError, UnknownName
+from pharos.errors import ParameterError, UnknownName
 from pharos.study import _worker
 from pharos.study._execution import study_folder, write_atomically
 from pharos.study._specification import Run, Specification, specification
@@ -47,7 +47,8 @@ def table(source: Source, folder: str | os.PathLike | None = None) -> "pd.DataFr
         if record is None or record["status"] != "finished":
             continue
         described = {"id": run.id, **_described(run), "seconds": record["seconds"]}
-        rows.append(described | record["result"] | {"return": _last_return(read_curve(place, run.id))})
+        result = {name: value for name, value in record["result"].items() if not isinstance(value, dict)}
+        rows.append(described | result | {"return": _last_return(read_curve(place, run.id))})
     if not rows:
         raise ParameterError(f"{place}: no run of {study.name!r} is finished; execute `pharos study run` first")
     return pd.DataFrame(rows)
@@ -181,32 +182,34 @@ def _measured(study: Specification, place: Path, config: Mapping[str, Any]) -> d
         kept = json.loads(file.read_text(encoding="utf-8"))
     missing = [name for name in study.hardness.measures if name not in kept["measures"]]
     if missing:
-        kept = _measure(study, config, missing, kept)
+        kept, found = _measure(study, config, missing, kept)
         file.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(file, json.dumps(kept, indent=1) + "\n")
+        return found
     return kept
 
 
 def _measure(
     study: Specification, config: Mapping[str, Any], names: Sequence[str], kept: dict[str, Any]
-) -> dict[str, Any]:
-    """Add the measures to what is kept: value, lower, upper, exact; or why there is none."""
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """What is kept with the measures added (value, lower, upper, exact; or why there is none); the same with those that failed."""
     from pharos.environment import make
     from pharos.hardness import report
 
     environment = make(config["environment"], **_arguments(config["parameters"]))
     mdp = build_mdp(config["environment"], config["parameters"], config["chance"], study.hardness.gamma)
     steps = config["horizon"] or environment.max_episode_steps
-    measures = dict(kept["measures"])
+    measures, failed = dict(kept["measures"]), {}
     for name in names:
         try:
             result = report(mdp, [name], horizon=steps, budget=study.hardness.budget)[name]
             measures[name] = {"why": result.undefined} if result.undefined else _number(result.value, result.exact)
         except UnknownName as error:
             raise ParameterError(f"study {study.name!r}: {error}") from error
-        except PharosError as error:
-            measures[name] = {"why": str(error)}
-    return {**kept, "measures": measures, "num_states": mdp.num_states}
+        except Exception as error:  # whatever it is, a report without this measure is better than none
+            failed[name] = {"why": _worker.describe(error)}
+    kept = {**kept, "measures": measures, "num_states": mdp.num_states}
+    return kept, {**kept, "measures": {**measures, **failed}}
 
 
 def build_mdp(
