@@ -34,16 +34,20 @@ _HOMES = {
     "evaluate_policy": "pharos.solvers",
     "observe": "pharos.observations",
     "GymEnv": "pharos.gym_env",
+    "train": "pharos.experiments",
     "PharosError": "pharos.errors",
 }
 _PACKAGES = (
+    "agents",
     "environments",
     "errors",
+    "experiments",
     "exporters",
     "hardness",
     "importers",
     "mdp",
     "observations",
+    "plots",
     "solvers",
     "state_space",
 )

@@ -1,0 +1,155 @@
+"""pharos train: an agent learns, and its policy's exact regret is measured as it does."""
+
+import math
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from pharos.cli.common import (
+    Json,
+    Parameters,
+    Random,
+    Sticky,
+    TargetArgument,
+    console,
+    describe_chance,
+    parse_environment,
+    parse_parameters,
+    print_facts,
+    print_json,
+)
+
+
+def train(
+    target: TargetArgument,
+    parameters: Parameters = None,
+    agent: Annotated[
+        str, typer.Option("--agent", help="q_learning, dqn, ppo, a2c, or module:Class for Stable-Baselines3.")
+    ] = "q_learning",
+    observation: Annotated[
+        str, typer.Option("--observation", help="vector, simple_image, complex_image, one_hot, index, or your own.")
+    ] = "vector",
+    option: Annotated[
+        list[str] | None,
+        typer.Option("--option", metavar="NAME=VALUE", help="Option of the observation, such as size=natural."),
+    ] = None,
+    steps: Annotated[int, typer.Option("--steps", min=1, help="Steps to learn from.")] = 50_000,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Decides everything random.")] = 0,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Folder for results; an unfinished run there is resumed.")
+    ] = None,
+    hyperparameter: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="NAME=VALUE", help="Hyperparameter of the agent, such as learning_rate=0.001."),
+    ] = None,
+    interval: Annotated[
+        int | None, typer.Option("--interval", min=1, help="Steps between evaluations; a hundredth when not given.")
+    ] = None,
+    sticky: Sticky = 0.0,
+    random: Random = 0.0,
+    gamma: Annotated[
+        float | None,
+        typer.Option("--gamma", min=0, max=1, help="Discount of values and returns; 1 when not given, with a horizon."),
+    ] = None,
+    horizon: Annotated[
+        int | None,
+        typer.Option("--horizon", min=1, help="Steps of an episode; the environment's time limit when not given."),
+    ] = None,
+    endless: Annotated[
+        bool, typer.Option("--no-horizon", help="Discounted values without a horizon, at --gamma (0.99).")
+    ] = False,
+    tensorboard: Annotated[bool, typer.Option("--tensorboard", help="Write TensorBoard logs into --out.")] = False,
+    json: Json = False,
+) -> None:
+    """Train an agent and measure the exact regret of its policy on the way."""
+    env = parse_environment(target, parameters)
+    from pharos.experiments import train as learn
+
+    with _bar(steps) as tell:
+        result = learn(
+            agent,
+            env,
+            steps=steps,
+            observation=observation,
+            observation_options=parse_parameters(option),
+            sticky=sticky,
+            random=random,
+            gamma=gamma if gamma is not None else 0.99 if endless else 1.0,
+            horizon=None if endless else horizon or "default",
+            seed=seed,
+            evaluation_interval=interval,
+            hyperparameters=parse_parameters(hyperparameter),
+            out=out,
+            tensorboard=tensorboard,
+            progress=tell,
+        )
+    picture = _plot(out)
+    found = result.result
+    if json:
+        print_json({**found, "config": result.config, "seconds": result.seconds, "folder": out, "plot": picture})
+        return
+    regret = found["normalized_regret"]
+    facts: list[tuple[str, object]] = [
+        (
+            "final value",
+            f"{found['final_value']:.6g}  (optimal {found['value_optimal']:.6g}, uniform {found['value_uniform']:.6g})",
+        ),
+        ("final regret", f"{found['final_regret']:.6g}"),
+        (
+            "cumulative regret",
+            f"{found['cumulative_regret']:.6g} of the learnt policies, "
+            f"{found['cumulative_realised_regret']:.6g} as played",
+        ),
+        (
+            "normalized regret",
+            "-" if regret is None or math.isnan(regret) else f"{regret:.4g}  (0: optimal, 1: uniform)",
+        ),
+        ("mean return", f"{found['mean_return']:.6g} over {found['episodes']:,} episodes"),
+        ("values", "exact" if found["exact"] else "some are estimates, see exact in curve.parquet"),
+        ("chance", describe_chance(sticky, random)),
+        ("seconds", f"{result.seconds:.1f} ({steps / result.seconds:,.0f} steps/s, evaluation included)"),
+    ]
+    if out is not None:
+        facts += [("results", out), *([("plot", picture)] if picture else [])]
+    print_facts(f"{agent} on {' '.join((target, *(parameters or ())))}, {result.config['observation']}", facts)
+
+
+def _plot(out: Path | None) -> Path | None:
+    """The regret curve beside the results, where matplotlib is installed."""
+    if out is None:
+        return None
+    try:
+        from pharos import plots
+
+        return plots.save(plots.regret([out]), out / "regret.png")
+    except ImportError:
+        return None
+
+
+class _bar:
+    """A progress bar on a terminal, with the value of the policy; nothing elsewhere."""
+
+    def __init__(self, steps: int):
+        self.steps = steps
+
+    def __enter__(self) -> Any:
+        screen = console(stderr=True)
+        if not screen.is_terminal:
+            return None
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+        columns = (BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[text]}"), TimeRemainingColumn())
+        self.progress = Progress(*columns, console=screen, transient=True)
+        self.progress.start()
+        task = self.progress.add_task("training", total=self.steps, text="")
+
+        def tell(done: int, steps: int, row: Any) -> None:
+            text = f"value {row['value']:.4g}, regret {row['expected_regret']:.4g}, {row['episodes']:,} episodes"
+            self.progress.update(task, completed=done, text=text)
+
+        return tell
+
+    def __exit__(self, *_: Any) -> None:
+        if hasattr(self, "progress"):
+            self.progress.stop()

@@ -1,0 +1,68 @@
+"""How the plots look, and how they are written."""
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pharos.errors import MissingExtra, ParameterError
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+INK, GRID = "#3b4048", "#e3e5e8"
+RULES: dict[str, Any] = {
+    "font.size": 9,
+    "axes.titlesize": 10,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "axes.edgecolor": INK,
+    "axes.labelcolor": INK,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": GRID,
+    "grid.linewidth": 0.8,
+    "xtick.color": INK,
+    "ytick.color": INK,
+    "legend.frameon": False,
+    "lines.linewidth": 1.8,
+    "figure.constrained_layout.use": True,
+    "savefig.dpi": 160,
+}
+
+
+def figure(rows: int = 1, columns: int = 1, size: tuple[float, float] = (5.0, 3.4)) -> tuple["Figure", Any]:
+    """A figure in the style of pharos, without a window, and its axes (rows, columns)."""
+    try:
+        import matplotlib as mpl
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise MissingExtra("plotting", "matplotlib", "study") from error
+    with mpl.rc_context(RULES):
+        made = Figure(figsize=(size[0] * columns, size[1] * rows), layout="constrained")
+        return made, made.subplots(rows, columns, squeeze=False)
+
+
+def save(figure: "Figure", path: str | os.PathLike) -> Path:
+    """Write a figure as PNG, PDF or SVG, by the ending of the name.
+
+    Raises:
+        ParameterError: another ending, or no such folder.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in (".png", ".pdf", ".svg"):
+        raise ParameterError(f"{path}: expected a name that ends in .png, .pdf or .svg")
+    if not path.parent.is_dir():
+        raise ParameterError(f"{path.parent}: no such folder")
+    figure.savefig(path, dpi=160)
+    return path
+
+
+def thousands(value: float, _: Any = None) -> str:
+    """12000 -> 12k, 3000000 -> 3M: for axes of steps."""
+    for size, letter in ((1e6, "M"), (1e3, "k")):
+        if abs(value) >= size:
+            return f"{value / size:g}{letter}"
+    return f"{value:g}"

@@ -1,0 +1,39 @@
+"""pharos train: answers, files, and what bad input gets."""
+
+import json
+
+from typer.testing import CliRunner
+
+from pharos.cli import app
+from pharos.experiments import read_record
+
+
+def run(*words):
+    return CliRunner().invoke(app, ["train", *map(str, words)])
+
+
+def test_train_answers_in_json_and_writes_a_plot(tmp_path):
+    out = tmp_path / "run"
+    done = run(
+        "simple_grid", "height=3", "--steps", 3000, "--out", out, "--set", "initial_q=2.0", "--json", "--sticky", 0.1
+    )
+    answer = json.loads(done.stdout)
+    assert answer["config"]["agent"] == "q_learning"
+    assert answer["config"]["hyperparameters"] == {"initial_q": 2.0}
+    assert answer["value_optimal"] >= answer["final_value"]
+    assert answer["conventions"]["gamma"] == 1.0
+    assert (out / "regret.png").stat().st_size > 5000
+    assert read_record(out)["status"] == "finished"
+
+
+def test_train_prints_a_table_for_people():
+    done = run("frozen_lake/4x4", "--steps", 2000, "--no-horizon")
+    assert done.exit_code == 0
+    assert "final regret" in done.stdout
+    assert "q_learning on frozen_lake/4x4" in done.stdout
+
+
+def test_wrong_words_are_usage_errors(tmp_path):
+    assert run("simple_grid", "--agent", "dqm").exit_code == 2
+    assert run("simple_grid", "--set", "learning_rate").exit_code == 2
+    assert run("simple_grid", "--steps", 0).exit_code == 2
