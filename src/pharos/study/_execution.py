@@ -19,8 +19,9 @@ from pathlib import Path
 from typing import Any
 
 from pharos.errors import ParameterError, StateSpaceLocked
-from pharos.study import _worker
+from pharos.study import _values, _worker
 from pharos.study._specification import Run, Specification, specification
+from pharos.study._worker import write_atomically
 
 ATTEMPTS = 3
 STATUS_SECONDS = 2.0
@@ -87,25 +88,19 @@ def study_folder(study: Specification, folder: str | os.PathLike | None = None) 
 def train(config: Mapping[str, Any], folder: Path) -> None:
     """The runner of studies: trains as `config` says and writes run.json and curve.parquet into `folder`."""
     from pharos.experiments import train_config
+    from pharos.experiments._train import _run
 
-    train_config(config, folder)
+    known = _values.kept(config)
+    if known is None:
+        train_config(config, folder)
+    else:
+        _run(dict(config), _values.with_values(_values.task_of(config), known), folder, False, None)
 
 
 def prepare_instance(config: Mapping[str, Any]) -> None:
-    """Build the state space of a run into the cache, and compile what solving it needs."""
-    from pharos.environment import make
-    from pharos.experiments import Task
-
-    parameters = {name: tuple_of(value) for name, value in config["parameters"].items()}
-    chance = {"sticky": config["chance"]["sticky"], "random": config["chance"]["random"]}
-    task = Task(make(config["environment"], **parameters), **chance, gamma=config["gamma"], horizon=config["horizon"])
-    for solution in (task.optimal, task.uniform, task.worst):
-        del solution
-
-
-def tuple_of(value: Any) -> Any:
-    """Lists as tuples, all the way down."""
-    return tuple(tuple_of(item) for item in value) if isinstance(value, list) else value
+    """Build the state space of a run into the cache, and keep the values of its task at the start."""
+    _values.task_of(config).space.num_states  # noqa: B018
+    _values.solve(config)
 
 
 def shard_of(runs: Sequence[Run], shard: str | tuple[int, int] | None) -> tuple[Run, ...]:
@@ -212,13 +207,6 @@ def claim(study: Specification, folder: Path) -> None:
 
     text = yaml.safe_dump(study.model_dump(mode="json", exclude_unset=True), sort_keys=False, width=120)
     write_atomically(file, text)
-
-
-def write_atomically(file: Path, text: str) -> None:
-    """Replace a file in one step."""
-    temporary = file.with_name(f".{file.name}.{os.getpid()}")
-    temporary.write_text(text, encoding="utf-8")
-    os.replace(temporary, file)
 
 
 def processors() -> int:

@@ -17,10 +17,11 @@ import numpy as np
 
 from pharos.study import _analysis, _figures, _table
 from pharos.study._analysis import REGRETS, Comparison, Models
-from pharos.study._execution import Status, status, write_atomically
+from pharos.study._execution import Status, status
 from pharos.study._latex import returns_table, tables_of
 from pharos.study._regression import MEASURES, Fit
 from pharos.study._specification import Specification
+from pharos.study._worker import write_atomically
 
 if TYPE_CHECKING:
     import pandas as pd

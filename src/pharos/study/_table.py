@@ -14,8 +14,10 @@ import numpy as np
 
 from pharos.errors import ParameterError, UnknownName
 from pharos.study import _worker
-from pharos.study._execution import study_folder, write_atomically
+from pharos.study._execution import study_folder
 from pharos.study._specification import Run, Specification, specification
+from pharos.study._values import tuple_of
+from pharos.study._worker import write_atomically
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -227,7 +229,7 @@ def build_mdp(
 
 
 def _arguments(parameters: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: _tuples(value) for name, value in parameters.items()}
+    return {name: tuple_of(value) for name, value in parameters.items()}
 
 
 def _number(value: Any, exact: bool) -> dict[str, Any]:
@@ -251,10 +253,6 @@ def _number(value: Any, exact: bool) -> dict[str, Any]:
     elif found["value"] is None:
         found.setdefault("why", "it is infinite or undefined")
     return found
-
-
-def _tuples(value: Any) -> Any:
-    return tuple(_tuples(item) for item in value) if isinstance(value, list) else value
 
 
 # The paper's instances --------------------------------------------------------------------------------------------------

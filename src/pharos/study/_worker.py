@@ -112,6 +112,13 @@ def publish(partial: Path, folder: Path, id: str) -> None:
     _sync(runs)
 
 
+def write_atomically(file: Path, text: str) -> None:
+    """Replace a file in one step."""
+    temporary = file.with_name(f".{file.name}.{os.getpid()}")
+    temporary.write_text(text, encoding="utf-8")
+    os.replace(temporary, file)
+
+
 def _is_complete(partial: Path) -> bool:
     try:
         record = read_record(partial)
