@@ -146,6 +146,24 @@ def prepare(config):
     raise RuntimeError("no matter")
 
 
+def die_once(config, folder):
+    """Killed at the first attempt, after it left a note; tells at the next whether it found the note."""
+    note = folder / "note"
+    if not (folder.parent.parent / "died").exists():
+        note.touch()
+        (folder.parent.parent / "died").touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    fake_training.train(config, folder)
+    (folder / f"found-{note.exists()}").touch()
+
+
+@pytest.mark.parametrize("resume", [False, True])
+def test_a_killed_run_starts_anew_unless_it_is_to_be_resumed(tmp_path, resume):
+    spec = specification(agents=["dqn"], seeds=1)
+    assert study.run(spec, tmp_path, runner=die_once, resume=resume).finished == 1
+    assert (tmp_path / "runs" / spec.runs[0].id / f"found-{resume}").exists()
+
+
 # kill -9 ----------------------------------------------------------------------------------------------------------------
 
 RUNNER = """

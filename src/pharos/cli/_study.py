@@ -69,6 +69,10 @@ def run(
         str | None, typer.Option("--shard", metavar="I/N", help="Only the I-th of N parts, such as 1/8.")
     ] = None,
     retry_failed: Annotated[bool, typer.Option("--retry-failed", help="Execute failed runs again.")] = False,
+    resume: Annotated[
+        bool,
+        typer.Option("--resume", help="Killed runs go on from their last checkpoint; their results may then differ."),
+    ] = False,
     timeout: Annotated[
         float | None, typer.Option("--timeout", min=0, help="Seconds after which a run is ended, and failed.")
     ] = None,
@@ -103,6 +107,7 @@ def run(
             shards=shards or 8,
             parameters=parse_parameters(slurm),
             retry_failed=retry_failed,
+            resume=resume,
             timeout=timeout,
             workers=workers or 1,
         )
@@ -111,7 +116,13 @@ def run(
     with _progress() as progress:
         if on == "ray":
             end = study.run_on_ray(
-                specification, folder, address=address, shard=shard, retry_failed=retry_failed, progress=progress
+                specification,
+                folder,
+                address=address,
+                shard=shard,
+                retry_failed=retry_failed,
+                resume=resume,
+                progress=progress,
             )
         else:
             end = study.run(
@@ -119,6 +130,7 @@ def run(
                 folder,
                 shard=shard,
                 retry_failed=retry_failed,
+                resume=resume,
                 timeout=timeout,
                 workers=workers,
                 progress=progress,

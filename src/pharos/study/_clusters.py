@@ -35,6 +35,7 @@ def submit(
     cluster: str = "slurm",
     parameters: Mapping[str, Any] | None = None,
     retry_failed: bool = False,
+    resume: bool = False,
     timeout: float | None = None,
     workers: int = 1,
     runner: _worker.Runner = train,
@@ -67,18 +68,13 @@ def submit(
         raise ParameterError(f"cannot submit to {cluster}: {error}") from error
     options = {"cpus_per_task": workers, "timeout_min": 24 * 60, "name": f"pharos-{study.name}"}
     executor.update_parameters(**{**options, **(parameters or {})})
+    how = {"retry_failed": retry_failed, "resume": resume, "timeout": timeout, "workers": workers, "runner": runner}
     with executor.batch():
-        return [
-            executor.submit(run_shard, str(place), f"{part}/{shards}", retry_failed, timeout, workers, runner)
-            for part in range(1, shards + 1)
-        ]
+        return [executor.submit(run_shard, str(place), f"{part}/{shards}", how) for part in range(1, shards + 1)]
 
 
-def run_shard(
-    folder: str, shard: str, retry_failed: bool, timeout: float | None, workers: int, runner: _worker.Runner
-) -> dict[str, Any]:
+def run_shard(folder: str, shard: str, options: dict[str, Any]) -> dict[str, Any]:
     """What a job does: its part of the study whose specification stands in the folder."""
-    options: dict[str, Any] = {"retry_failed": retry_failed, "timeout": timeout, "workers": workers, "runner": runner}
     return run(folder, folder, shard=shard, **options).to_dict()
 
 
@@ -89,6 +85,7 @@ def run_on_ray(
     address: str | None = None,
     shard: str | None = None,
     retry_failed: bool = False,
+    resume: bool = False,
     progress: Callable[[Status], None] | None = None,
     runner: _worker.Runner = train,
 ) -> Status:
@@ -108,7 +105,16 @@ def run_on_ray(
     place = study_folder(study, folder).absolute()
     claim(study, place)
     execution = _Execution(
-        study, place, shard_of(study.runs, shard), retry_failed, None, processors(), progress, runner, "status.json"
+        study,
+        place,
+        shard_of(study.runs, shard),
+        "status.json",
+        retry_failed,
+        resume,
+        None,
+        processors(),
+        progress,
+        runner,
     )
     ours = not ray.is_initialized()
     if ours:
@@ -121,9 +127,9 @@ def run_on_ray(
             ray.shutdown()
 
 
-def _attempt(runner: _worker.Runner, config: Mapping[str, Any], id: str, folder: str, again: bool) -> str:
+def _attempt(runner: _worker.Runner, config: Mapping[str, Any], id: str, folder: str, again: bool, resume: bool) -> str:
     _worker.use_one_thread()
-    while (end := _worker.attempt(runner, config, id, Path(folder), again=again)) == _worker.BUSY:
+    while (end := _worker.attempt(runner, config, id, Path(folder), again=again, resume=resume)) == _worker.BUSY:
         time.sleep(STATUS_SECONDS)
     return end
 
@@ -133,7 +139,8 @@ def _follow(ray: Any, remote: Any, execution: _Execution) -> Status:
     started: dict[Any, Run] = {}
     while execution.pending:
         _, run = execution.pending.popleft()
-        arguments = (execution.runner, dict(run.config), run.id, str(execution.folder), run.id in execution.again)
+        how = (run.id in execution.again, execution.resume)
+        arguments = (execution.runner, dict(run.config), run.id, str(execution.folder), *how)
         started[remote.remote(*arguments)] = run
     while started:
         for reference in ray.wait(list(started), num_returns=1, timeout=STATUS_SECONDS)[0]:

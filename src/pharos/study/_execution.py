@@ -122,6 +122,7 @@ def run(
     *,
     shard: str | tuple[int, int] | None = None,
     retry_failed: bool = False,
+    resume: bool = False,
     timeout: float | None = None,
     workers: int | None = None,
     progress: Callable[[Status], None] | None = None,
@@ -135,6 +136,8 @@ def run(
         folder: of the results; None for studies/NAME.
         shard: `i/n`: only the i-th of n parts, for n machines that share the folder.
         retry_failed: execute failed runs again.
+        resume: let runs that were killed go on from their last checkpoint, for long runs on machines that come and go. A deep
+            agent then ends elsewhere than without the interruption; else killed runs start anew, and results never depend on it.
         timeout: seconds after which a run is ended, and failed.
         workers: processes; None for as many as there are processors.
         progress: called with a Status every now and then.
@@ -153,7 +156,9 @@ def run(
         raise ParameterError(f"workers is {workers}; expected at least 1")
     claim(study, place)
     name = "status.json" if shard is None else f"status-{str(shard).replace('/', '-of-')}.json"
-    execution = _Execution(study, place, runs, retry_failed, timeout, workers or processors(), progress, runner, name)
+    execution = _Execution(
+        study, place, runs, name, retry_failed, resume, timeout, workers or processors(), progress, runner
+    )
     if prepare is None and runner is train:
         prepare = prepare_instance
     if prepare is not None:
@@ -222,15 +227,16 @@ class _Execution:
         study: Specification,
         folder: Path,
         runs: Sequence[Run],
+        status_name: str,
         retry_failed: bool,
+        resume: bool,
         timeout: float | None,
         workers: int,
         progress: Callable[[Status], None] | None,
         runner: _worker.Runner,
-        status_name: str,
     ):
         self.study, self.folder, self.runs, self.workers = study, folder, runs, workers
-        self.timeout, self.runner, self.tell = timeout, runner, progress
+        self.timeout, self.runner, self.tell, self.resume = timeout, runner, progress, resume
         self.status_file = folder / status_name
         self.began = time.monotonic()
         self.told = -1e9
@@ -307,7 +313,8 @@ class _Execution:
             if self.note(run, run.id in self.again):
                 continue
             again = run.id in self.again
-            arguments = (self.runner, dict(run.config), run.id, self.folder.absolute(), again, dict(os.environ))
+            where = (run.id, self.folder.absolute(), again, self.resume)
+            arguments = (self.runner, dict(run.config), *where, dict(os.environ))
             process = context.Process(target=_worker.main, args=arguments, name=run.id)
             process.start()
             self.running[process.sentinel] = (process, run, time.monotonic())

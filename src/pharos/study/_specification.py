@@ -235,7 +235,9 @@ class Specification(_Part):
                                     "observation": observation.name,
                                     "observation_options": dict(observation.options),
                                     "agent": agent,
-                                    "hyperparameters": self._hyperparameters(block, agent),
+                                    "hyperparameters": self._hyperparameters(
+                                        block, agent, environment.instance.name, observation.name
+                                    ),
                                     "steps": steps,
                                     "seed": seed,
                                     "gamma": gamma,
@@ -245,9 +247,13 @@ class Specification(_Part):
                                 environment.label,
                             )
 
-    def _hyperparameters(self, block: Block, agent: str) -> dict[str, Any]:
+    def _hyperparameters(self, block: Block, agent: str, environment: str, observation: str) -> dict[str, Any]:
+        """All of them, those of the library's table included: when that changes, these are other runs."""
+        from pharos.agents._hyperparameters import hyperparameters
+
         given = block.hyperparameters.get(agent, {})
-        return dict(self.hyperparameters[given] if isinstance(given, str) else given)
+        own = self.hyperparameters[given] if isinstance(given, str) else given
+        return hyperparameters(agent, environment, observation, own)
 
 
 _PARTS: dict[Loc, type[BaseModel]] = {

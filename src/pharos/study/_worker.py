@@ -4,7 +4,8 @@
     DIR/runs/ID/      when it is over, moved there in one step: run.json (finished or failed), curve.parquet, log.txt
     DIR/locks/ID/     held by the process that runs it
 
-A process that is killed leaves a folder in `partial`, which the next attempt throws away, unless its result is complete.
+A process that is killed leaves a folder in `partial`, which the next attempt throws away, unless its result is complete, or
+unless it is to be resumed: then the runner finds there what it wrote before.
 """
 
 import contextlib
@@ -44,29 +45,32 @@ def read_record(folder: Path) -> dict[str, Any] | None:
         return None
 
 
-def attempt(runner: Runner, config: Mapping[str, Any], id: str, folder: Path, *, again: bool = False) -> str:
+def attempt(
+    runner: Runner, config: Mapping[str, Any], id: str, folder: Path, *, again: bool = False, resume: bool = False
+) -> str:
     """Execute one run unless it is finished already; FINISHED, FAILED or BUSY (another process is at it).
 
-    A run that raises is FAILED: its error stands in run.json and its log; `again` repeats such runs.
+    A run that raises is FAILED: its error stands in run.json and its log; `again` repeats such runs. With `resume` the runner
+    gets what an attempt that was killed left behind, else an empty folder.
     """
     holder = folder / "locks" / id
     holder.mkdir(parents=True, exist_ok=True)
     try:
         with lock(holder):
-            return _attempt(runner, config, id, folder, again)
+            return _attempt(runner, config, id, folder, again, resume)
     except StateSpaceLocked:
         return BUSY
 
 
-def _attempt(runner: Runner, config: Mapping[str, Any], id: str, folder: Path, again: bool) -> str:
+def _attempt(runner: Runner, config: Mapping[str, Any], id: str, folder: Path, again: bool, resume: bool) -> str:
     done = read_status(folder, id)
     if done == FINISHED or (done == FAILED and not again):
         return done
     partial = folder / "partial" / id
     if not _is_complete(partial):
-        if partial.exists():
+        if partial.exists() and not resume:
             shutil.rmtree(partial)
-        partial.mkdir(parents=True)
+        partial.mkdir(parents=True, exist_ok=True)
         began = time.perf_counter()
         with _log(partial / "log.txt"):
             try:
@@ -141,7 +145,7 @@ def _log(path: Path):
     sys.stdout.flush()
     sys.stderr.flush()
     saved = os.dup(1), os.dup(2)
-    with open(path, "wb") as file:
+    with open(path, "ab") as file:
         os.dup2(file.fileno(), 1)
         os.dup2(file.fileno(), 2)
         try:
@@ -167,6 +171,7 @@ def main(
     id: str,
     folder: Path,
     again: bool,
+    resume: bool,
     environment: Mapping[str, str],
 ) -> None:
     """The body of a worker process: ends with the process that started it, leaves interrupts to it, uses one thread.
@@ -178,7 +183,7 @@ def main(
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     end_with_parent()
     use_one_thread()
-    if attempt(runner, config, id, folder, again=again) == BUSY:
+    if attempt(runner, config, id, folder, again=again, resume=resume) == BUSY:
         sys.exit(EXIT_BUSY)
 
 
