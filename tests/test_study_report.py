@@ -106,7 +106,7 @@ def test_every_section_is_there_and_every_link_leads_to_one(written):
 
 def test_failed_and_missing_runs_and_models_without_rows_are_told(written):
     page = written[1].html.read_text()
-    assert "28 of 30 runs are finished, 1 failed" in page and "1 runs are missing" in page
+    assert "28 of 30 runs are finished, 1 failed" in page and "1 run missing" in page
     assert "ValueError: &lt;no&gt;" in page
     assert any("the class model of frozen_lake has 2 rows; needs at least" in note for note in written[1].notes)
 

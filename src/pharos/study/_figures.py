@@ -118,7 +118,11 @@ def fitted_against_actual(fits: Sequence[Fit], regret: str) -> "Figure":
     """A panel for each fit: what the model gives against what was measured; a perfect model is the dotted diagonal."""
     figure, axes = _panels(len(fits), 3.1, 3.0)
     for axis, fit in zip(axes, fits, strict=False):
-        axis.scatter(fit.actual, fit.fitted, s=22, color="#0072B2", alpha=0.75, lw=0)
+        names = list(dict.fromkeys(fit.classes)) or [""]
+        for name in names:
+            points = np.array([other == name for other in fit.classes] or [True] * len(fit.actual))
+            color = class_color(name, names)
+            axis.scatter(fit.actual[points], fit.fitted[points], s=22, color=color, alpha=0.8, lw=0, label=title(name))
         both = np.concatenate((fit.actual, fit.fitted))
         low, high = both.min(), both.max()
         axis.plot([low, high], [low, high], ":", color="#888888", lw=1.2)
@@ -128,6 +132,8 @@ def fitted_against_actual(fits: Sequence[Fit], regret: str) -> "Figure":
         axis.yaxis.set_major_formatter(_thousands)
     for axis in axes[:: max(1, _columns(len(fits)))]:
         axis.set_ylabel(f"fitted {regret}")
+    if len({name for fit in fits for name in fit.classes}) > 1:
+        _legend(figure, axes)
     return figure
 
 
@@ -146,8 +152,8 @@ def agents_against_each_other(cells: "pd.DataFrame", value: str, agents: tuple[s
         axis.scatter(
             part[agents[0]], part[agents[1]], s=28, color=color, alpha=0.8, lw=0, label=title(str(environment))
         )
-    axis.set_xlabel(f"{value.replace('_', ' ')} of {NAMES.get(agents[0], agents[0])}")
-    axis.set_ylabel(f"{value.replace('_', ' ')} of {NAMES.get(agents[1], agents[1])}")
+    axis.set_xlabel(f"{REGRETS.get(value, value)} of {NAMES.get(agents[0], agents[0])}")
+    axis.set_ylabel(f"{REGRETS.get(value, value)} of {NAMES.get(agents[1], agents[1])}")
     axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
     return figure
 

@@ -30,7 +30,7 @@ class Fit:
         coefficients: one row a predictor: estimate, standard error, p-value, lower and upper end of its 95 % interval.
         dropped: predictors left out because they are constant or a linear combination of the others.
         condition_number: of the standardised predictors.
-        fitted, actual: one entry a row; influence: Cook's distances.
+        fitted, actual: one entry a row; influence: Cook's distances; classes: of environments.
     """
 
     model: str
@@ -46,6 +46,7 @@ class Fit:
     fitted: np.ndarray
     actual: np.ndarray
     influence: np.ndarray
+    classes: tuple[str, ...] = ()
 
 
 def fit_models(data: "pd.DataFrame", *, measures: Sequence[str] = MEASURES) -> list[Fit]:
@@ -94,6 +95,7 @@ def fit(rows: "pd.DataFrame", model: str, subset: str, predictors: Sequence[str]
         fitted=np.asarray(result.fittedvalues),
         actual=actual,
         influence=np.asarray(influence.cooks_distance[0]),
+        classes=tuple(map(str, rows["environment"])) if "environment" in rows else (),
     )
 
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from pharos.study import _analysis, _figures, _table
 from pharos.study._analysis import REGRETS, Comparison, Models
-from pharos.study._execution import Status, status
+from pharos.study._execution import Status, duration, status
 from pharos.study._latex import returns_table, tables_of
 from pharos.study._regression import MEASURES, Fit
 from pharos.study._specification import Specification
@@ -209,9 +209,10 @@ def _summary(
     lines = [
         f"{now.finished:,} of {now.total:,} runs are finished"
         + (f", {now.failed} failed" if now.failed else "")
-        + f": {rows['instance'].nunique()} instances of {rows['environment'].nunique()} classes, "
-        f"{rows['chance'].nunique()} kinds of chance, {rows['agent'].nunique()} agents, {rows['seed'].nunique()} seeds, "
-        f"{int(rows['steps'].sum()):,} steps in {rows['seconds'].sum() / 3600:.1f} hours of one processor."
+        + f": {_many(rows['instance'].nunique(), 'instance')} of {_many(rows['environment'].nunique(), 'class', 'classes')}, "
+        f"{_many(rows['chance'].nunique(), 'kind')} of chance, {_many(rows['agent'].nunique(), 'agent')}, "
+        f"{_many(rows['seed'].nunique(), 'seed')}; {int(rows['steps'].sum()):,} steps, which took one processor "
+        f"{duration(rows['seconds'].sum())}."
     ]
     main = found[0].get("single", "all")
     if main is not None:
@@ -222,7 +223,7 @@ def _summary(
     known = int(comparison.returns["ours"].notna().sum())
     lines.append(f"{known} of the {len(comparison.returns)} returns that the paper prints have their counterpart here.")
     if now.missing:
-        lines.append(f"<b>{now.missing} runs are missing: every number below is of the runs that are there.</b>")
+        lines.append(f"<b>{_many(now.missing, 'run')} missing: every number below is of the runs that are there.</b>")
     text = "".join(f"<p>{line}</p>" for line in lines)
     if now.errors:
         counted = Counter(now.errors.values())
@@ -230,6 +231,10 @@ def _summary(
             "<p>Failed:</p><ul>" + "".join(f"<li>{count} × {_text(e)}</li>" for e, count in counted.items()) + "</ul>"
         )
     return text
+
+
+def _many(count: int, one: str, several: str | None = None) -> str:
+    return f"{count:,} {one if count == 1 else several or one + 's'}"
 
 
 def _regret(estimates: "pd.DataFrame", figures: Figures) -> str:
@@ -245,7 +250,7 @@ def _regret(estimates: "pd.DataFrame", figures: Figures) -> str:
     columns = ["environment", "agent", "observation", "tasks", "runs", "iqm", "interval"]
     return text + _html_table(
         shown[columns],
-        "Interquartile mean of the normalised regret (0: optimal from the first step on; 1: as bad as acting at random) and its "
+        "Interquartile mean of the normalised regret (0: optimal from the first episode on; 1: as bad as acting at random) and its "
         "95 % stratified bootstrap interval. With few seeds such intervals are too narrow.",
     )
 
@@ -343,7 +348,7 @@ def _agreement(cells: "pd.DataFrame", comparison: Comparison, figures: Figures) 
     for value in ("return", "normalized_regret", "cumulative_regret"):
         found = _analysis.agreement(cells, value)
         if found is not None:
-            lines.append(f"<li>{value.replace('_', ' ')}: r = {found[0]:.2f} over {found[1]} cells</li>")
+            lines.append(f"<li>{REGRETS.get(value, value)}: r = {found[0]:.2f} over {found[1]} cells</li>")
     if not lines:
         return "<p>The study has fewer than three cells that both DQN and PPO have.</p>"
     return (
@@ -446,6 +451,7 @@ def _data(png: bytes) -> str:
 
 def _html_table(data: "pd.DataFrame", caption: str = "", *, digits: int = 3) -> str:
     numeric = [column for column in data.columns if data[column].dtype.kind in "fiu"]
+    whole = [column for column in numeric if _is_whole(data[column].to_numpy(float))]
     head = "".join(
         f'<th class="{"n" if column in numeric else "t"}">{_text(str(column).replace("_", " "))}</th>'
         for column in data.columns
@@ -455,13 +461,18 @@ def _html_table(data: "pd.DataFrame", caption: str = "", *, digits: int = 3) -> 
         entries = zip(data.columns, line, strict=True)
         body.append(
             "".join(
-                f'<td class="{"n" if column in numeric else "t"}">{_cell(value, digits)}</td>'
+                f'<td class="{"n" if column in numeric else "t"}">{_cell(value, 0 if column in whole else digits)}</td>'
                 for column, value in entries
             )
         )
     lines = "".join(f"<tr>{line}</tr>" for line in body)
     said = f"<caption>{_text(caption)}</caption>" if caption else ""
     return f'<div class="scroll"><table>{said}<thead><tr>{head}</tr></thead><tbody>{lines}</tbody></table></div>'
+
+
+def _is_whole(values: np.ndarray) -> bool:
+    known = values[np.isfinite(values)]
+    return bool((known == np.round(known)).all())
 
 
 def _cell(value: Any, digits: int) -> str:
@@ -476,7 +487,7 @@ def _cell(value: Any, digits: int) -> str:
 
 def number(value: float, digits: int = 3) -> str:
     """A number for people: digits after the point, thousands separated, small and huge ones with a power of ten."""
-    if value != 0 and not 10.0**-digits <= abs(value) < 1e7:
+    if digits > 0 and value != 0 and not 10.0**-digits <= abs(value) < 1e7:
         return f"{value:.{max(1, digits - 1)}e}"
     if abs(value) >= 1000:
         return f"{value:,.0f}"
