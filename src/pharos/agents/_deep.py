@@ -72,7 +72,7 @@ def make_model(
     }
     many = hasattr(env.observation_space, "spaces")
     try:
-        return algorithm(name)(
+        model = algorithm(name)(
             hyperparameters.get("policy", "MultiInputPolicy" if many else "MlpPolicy"),
             env,
             seed=seed,
@@ -83,6 +83,11 @@ def make_model(
         )
     except (TypeError, AssertionError) as error:
         raise ParameterError(f"agent {name!r} cannot be made: {error}") from error
+    if tensorboard is None and not options.get("verbose"):
+        from stable_baselines3.common.logger import Logger
+
+        model.set_logger(Logger(folder=None, output_formats=[]))  # else a folder is left among the temporary files
+    return model
 
 
 class DeepPolicy:

@@ -1,4 +1,8 @@
-"""A callback of Stable-Baselines3 that stops at chosen steps, and counts the returns of finished episodes."""
+"""A callback of Stable-Baselines3 that stops at chosen steps, and counts the returns of finished episodes.
+
+Algorithms that learn from whole rollouts, such as PPO, take the steps of their last rollout although fewer are left; episodes that
+end after the last point are not counted.
+"""
 
 from typing import Any
 
@@ -7,7 +11,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 
 class AtPoints(BaseCallback):
-    """Calls at_point(steps, episodes, sum of returns) when the number of steps passes each of `points`.
+    """Calls at_point(steps, episodes, sum of returns) when the number of steps passes each of `points`, and logs what it returns.
 
     Args:
         gamma: discount of returns.
@@ -16,7 +20,7 @@ class AtPoints(BaseCallback):
 
     def __init__(self, points: list[int], at_point: Any, gamma: float, finished: tuple[int, float]):
         super().__init__()
-        self.points, self.at_point, self.gamma = list(points), at_point, gamma
+        self.points, self.at_point, self.gamma, self.last = list(points), at_point, gamma, points[-1]
         self.episodes, self.returns = finished
         self._owner: Any = None
 
@@ -29,6 +33,8 @@ class AtPoints(BaseCallback):
         self._discount = np.ones(self.training_env.num_envs)
 
     def _on_step(self) -> bool:
+        if self.num_timesteps > self.last:
+            return True
         dones = self.locals["dones"]
         self._running += self._discount * self.locals["rewards"]
         self._discount *= self.gamma
@@ -49,4 +55,8 @@ class AtPoints(BaseCallback):
     def _call(self) -> None:
         steps = max(point for point in self.points if point <= self.num_timesteps)
         self.points = [point for point in self.points if point > self.num_timesteps]
-        self.at_point(steps, self.episodes, self.returns)
+        row = self.at_point(steps, self.episodes, self.returns)
+        for name in ("value", "expected_regret", "mean_return"):
+            self.logger.record(f"pharos/{name}", row[name])
+        if steps == self.last:
+            self.logger.dump(self.num_timesteps)

@@ -1,7 +1,8 @@
 """What learns in a run: the table of Q-learning, or a model of Stable-Baselines3; each can be stored and goes on from there."""
 
+import contextlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ from pharos.agents import QLearning
 from pharos.errors import FileFormatError
 from pharos.experiments._task import Task
 
-AtPoint = Callable[[int, int, float], None]
+AtPoint = Callable[[int, int, float], dict[str, Any]]
 
 
 class Tabular:
@@ -32,7 +33,7 @@ class Tabular:
 
     def load(self, folder: Path) -> None:
         """From plain arrays."""
-        with np.load(folder / "q_learning.npz", allow_pickle=False) as stored:
+        with _said_to_be_damaged(folder), np.load(folder / "q_learning.npz", allow_pickle=False) as stored:
             self.agent.restore({name: stored[name] for name in stored.files})
 
 
@@ -78,22 +79,30 @@ class Deep:
         import torch
 
         model = self.model
-        try:
+        with _said_to_be_damaged(folder):
             model.set_parameters(torch.load(folder / "parameters.pt", weights_only=True), device="cpu")
             stored = json.loads((folder / "model.json").read_text())
-        except Exception as error:  # torch has many
-            raise FileFormatError(
-                f"{folder}: cannot be resumed from: {error}; delete the folder to start anew"
-            ) from error
-        for name, value in stored["counters"].items():
-            if name in _COUNTERS:
-                setattr(model, name, value)
-        self.finished = (stored["counters"]["episodes"], stored["returns"])
-        buffer = getattr(model, "replay_buffer", None)
-        if buffer is not None and (folder / "replay.npz").exists():
-            with np.load(folder / "replay.npz", allow_pickle=False) as arrays:
-                _restore_buffer(buffer, arrays)
+            for name, value in stored["counters"].items():
+                if name in _COUNTERS:
+                    setattr(model, name, value)
+            self.finished = (stored["counters"]["episodes"], stored["returns"])
+            buffer = getattr(model, "replay_buffer", None)
+            if buffer is not None and (folder / "replay.npz").exists():
+                with np.load(folder / "replay.npz", allow_pickle=False) as arrays:
+                    _restore_buffer(buffer, arrays)
         model.set_random_seed(model.seed + model.num_timesteps)
+
+
+@contextlib.contextmanager
+def _said_to_be_damaged(folder: Path) -> Iterator[None]:
+    """Whatever goes wrong in reading a checkpoint, as one line that names its folder."""
+    try:
+        yield
+    except Exception as error:  # torch and NumPy have many
+        first = str(error).split(". ")[0].splitlines()  # torch goes on with advice that is not ours
+        raise FileFormatError(
+            f"{folder}: cannot be resumed from: {first[0] if first else type(error).__name__}; delete the folder to start anew"
+        ) from error
 
 
 _COUNTERS = ("num_timesteps", "_n_updates", "_n_calls", "_episode_num")

@@ -146,8 +146,8 @@ class Learner(Protocol):
 
     agent: Any
 
-    def learn(self, points: list[int], at_point: Callable[[int, int, float], None]) -> None:
-        """Learn until the last of `points`; at each call at_point(steps, finished episodes, sum of their returns)."""
+    def learn(self, points: list[int], at_point: Callable[[int, int, float], dict[str, Any]]) -> None:
+        """Learn until the last of `points`; at each call at_point(steps, finished episodes, sum of their returns) -> row."""
 
     def save(self, folder: Path) -> None:
         """Write what `load` needs."""
@@ -245,15 +245,22 @@ def _run(
     start = curve.rows[-1]["step"]
     points = [point for point in [*range(interval, steps, interval), steps] if point > start]
 
-    def at_point(step: int, episodes: int, returns: float) -> None:
+    def at_point(step: int, episodes: int, returns: float) -> dict[str, Any]:
         row = curve.add(step, episodes, returns, learner.agent)
         if progress is not None:
             progress(step, steps, row)
         if checkpoint is not None and step < steps:
             checkpoint.save(learner, curve.rows, spent + time.perf_counter() - began)
+        return row
 
     if points:
-        learner.learn(points, at_point)
+        try:
+            learner.learn(points, at_point)
+        except Exception as error:
+            if folder is not None:
+                said = f"{type(error).__name__}: {' '.join(str(error).split())}"
+                _results.write_record(folder, {**record, "status": "failed", "error": said})
+            raise
     seconds = spent + time.perf_counter() - began
     result = curve.result()
     if folder is not None:
