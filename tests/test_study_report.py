@@ -12,6 +12,7 @@ import fake_training
 from pharos import study
 from pharos.study import _worker
 from pharos.study._execution import claim
+from pharos.study._figures import _tasks
 from pharos.study._latex import escape
 from pharos.study._report import number
 
@@ -137,6 +138,25 @@ def test_a_report_made_again_is_the_same_but_for_its_date(written):
     again = study.report(written[0]).html.read_text()
     date = re.compile(r"\d{4}-\d{2}-\d{2} \d{2}:\d{2}")
     assert date.sub("", again) == date.sub("", page)
+
+
+def test_runs_of_different_length_or_without_regret_leave_a_report(tmp_path):
+    block = {"environments": ["frozen_lake/4x4"], "agents": ["q_learning"], "observations": ["vector"]}
+    hardness = {"measures": ["diameter"]}
+    blocks = [{**block, "seeds": [0, 1], "steps": 100}, {**block, "seeds": [2], "steps": 70}]
+    spec = study.specification({"name": "odd", "evaluations": 5, "hardness": hardness, "blocks": blocks})
+    for run in spec.runs:
+        _worker.attempt(fake_training.train, run.config, run.id, tmp_path)
+        file = tmp_path / "runs" / run.id / "run.json"
+        record = json.loads(file.read_text())
+        record["result"]["normalized_regret"] = None  # as pharos writes what is not a number
+        file.write_text(json.dumps(record))
+    steps, tasks = _tasks(study.curves(spec, tmp_path))
+    assert list(steps) == [20, 40, 60, 80, 100] and [task.shape for task in tasks] == [(2, 5)]
+    report = study.report(spec, tmp_path)
+    page = report.html.read_text()
+    assert "no cells of DQN with both" in page and "fewer than three cells that both DQN and PPO" in page
+    assert report.notes[-1] == "no cell of dqn has all measures: there are no models"
 
 
 def test_numbers_are_short():

@@ -111,14 +111,18 @@ def intervals(rows: "pd.DataFrame", *, resamples: int = 1000) -> "pd.DataFrame":
 
     found = []
     for key, part in rows.groupby(["environment", "agent", "observation"], sort=True):
-        tasks = [
-            task["normalized_regret"].to_numpy(float) for _, task in part.groupby(["instance", "chance"], sort=True)
-        ]
+        defined = part[
+            np.isfinite(part["normalized_regret"].to_numpy(float))
+        ]  # else random play is optimal, or no episode ended
+        if len(defined) == 0:
+            continue
+        tasks = [task["normalized_regret"].to_numpy(float) for _, task in defined.groupby(["instance", "chance"])]
         estimate = stratified_interval(tasks, resamples=resamples)
         line = dict(zip(("environment", "agent", "observation"), key, strict=True))
-        line |= {"tasks": len(tasks), "runs": len(part)}
+        line |= {"tasks": len(tasks), "runs": len(defined)}
         found.append(line | {"iqm": estimate.value, "lower": estimate.lower, "upper": estimate.upper})
-    return pd.DataFrame(found)
+    columns = ["environment", "agent", "observation", "tasks", "runs", "iqm", "lower", "upper"]
+    return pd.DataFrame(found, columns=columns)
 
 
 def mean_curve(

@@ -81,9 +81,15 @@ def regret_curves(points: "pd.DataFrame", *, by: str = "environment") -> "Figure
 
 
 def _tasks(lines: "pd.DataFrame") -> tuple[np.ndarray, list[np.ndarray]]:
-    """The steps that all runs share, and for each task the cumulative regret (runs, T) there."""
+    """Steps, and for each task the cumulative regret (runs, T) there, of the runs that were evaluated at the same steps.
+
+    Where blocks of a study differ in steps, those are the steps that most runs have.
+    """
     by_run = lines.pivot_table(index=["instance", "chance", "id"], columns="step", values="cumulative_expected_regret")
-    by_run = by_run.dropna(axis=1)
+    present = by_run.notna()
+    kinds = present.apply(lambda row: row.to_numpy().tobytes(), axis=1)
+    same = kinds == kinds.mode().iloc[0]
+    by_run = by_run.loc[same, present[same].all()]
     tasks = [group.to_numpy() for _, group in by_run.groupby(level=["instance", "chance"], sort=True)]
     return by_run.columns.to_numpy(), tasks
 

@@ -49,7 +49,11 @@ def table(source: Source, folder: str | os.PathLike | None = None) -> "pd.DataFr
         if record is None or record["status"] != "finished":
             continue
         described = {"id": run.id, **_described(run), "seconds": record["seconds"]}
-        result = {name: value for name, value in record["result"].items() if not isinstance(value, dict)}
+        result = {
+            name: float("nan") if value is None else value
+            for name, value in record["result"].items()
+            if not isinstance(value, dict)
+        }
         rows.append(described | result | {"return": _last_return(read_curve(place, run.id))})
     if not rows:
         raise ParameterError(f"{place}: no run of {study.name!r} is finished; execute `pharos study run` first")
