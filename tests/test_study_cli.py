@@ -1,0 +1,76 @@
+"""pharos study from the command line: what it prints, what it leaves, and its exit codes."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+SPECIFICATION = """\
+name: lake
+steps: 200
+evaluations: 4
+seeds: 2
+blocks:
+  - environments: [frozen_lake/4x4]
+    agents: [q_learning]
+"""
+
+
+def pharos(*arguments, cwd):
+    command = [sys.executable, "-m", "pharos", "study", *arguments]
+    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=300)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A folder with lake.yaml, and where that has been run."""
+    place = tmp_path_factory.mktemp("cli")
+    (place / "lake.yaml").write_text(SPECIFICATION)
+    done = pharos("run", "lake.yaml", "--json", "--workers", "1", cwd=place)
+    assert done.returncode == 0, done.stderr
+    answer = json.loads(done.stdout)
+    assert (answer["total"], answer["finished"], answer["failed"], answer["missing"]) == (2, 2, 0, 0)
+    return place
+
+
+def test_results_are_in_studies_name_and_the_folder_stands_for_the_study(folder):
+    assert len(list((folder / "studies" / "lake" / "runs").glob("*/run.json"))) == 2
+    for what in ("lake.yaml", "studies/lake"):
+        done = pharos("status", what, cwd=folder)
+        assert (done.returncode, done.stdout) == (0, "lake: 2 of 2 runs finished\n")
+
+
+def test_show_counts_the_runs(folder):
+    answer = json.loads(pharos("show", "lake.yaml", "--json", cwd=folder).stdout)
+    assert answer["num_runs"] == 2 and answer["steps"] == 400
+    assert "2 runs, 400 steps" in pharos("show", "lake.yaml", cwd=folder).stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("run", "lak.yaml"), "pharos: unknown study (no such file, and no such preset) 'lak.yaml'"),
+        (
+            ("run", "lake.yaml", "--shard", "3/2"),
+            "pharos: shard is '3/2'; expected i/n with i from 1 to n, such as 1/8",
+        ),
+        (("run", "lake.yaml", "--on", "moon"), "pharos: unknown place to run on 'moon'; known: local, ray, slurm"),
+        (("report", "lake.yaml", "--out", "nowhere"), "no run of 'lake' is finished; execute `pharos study run` first"),
+    ],
+)
+def test_wrong_usage_is_one_line_and_exit_code_2(folder, arguments, message):
+    done = pharos(*arguments, cwd=folder)
+    assert done.returncode == 2 and done.stdout == ""
+    assert message in done.stderr and done.stderr.count("\n") == 1
+
+
+def test_a_study_with_failed_runs_ends_with_exit_code_1_and_says_where_to_look(folder):
+    wrong = SPECIFICATION.replace("name: lake", "name: wrong").replace(
+        "[q_learning]", "[q_learning]\n    hyperparameters: {q_learning: {learning_rat: 0.5}}"
+    )
+    (folder / "wrong.yaml").write_text(wrong)
+    done = pharos("run", "wrong.yaml", cwd=folder)
+    assert done.returncode == 1
+    assert done.stdout == "wrong: 0 of 2 runs finished, 2 failed\n"
+    assert "2 x " in done.stderr and "learning_rat" in done.stderr and "--retry-failed" in done.stderr
