@@ -1,5 +1,6 @@
 """Agents: tabular Q-learning, and algorithms of Stable-Baselines3. `pharos.experiments.train` trains them on a task."""
 
+from pharos.agents._hyperparameters import hyperparameters
 from pharos.agents._q_learning import QLearning
 
-__all__ = ["QLearning"]
+__all__ = ["QLearning", "hyperparameters"]

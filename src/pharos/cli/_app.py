@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from pharos.cli import _build, _cache, _evaluate, _hardness, _list, _play, _render, _solve, _study, _train
+from pharos.cli import _build, _cache, _evaluate, _hardness, _list, _play, _render, _solve, _study, _train, _tune
 from pharos.cli.common import complain
 from pharos.errors import DivergenceError, ParameterError, PharosError
 
@@ -102,6 +102,7 @@ app.command("evaluate")(_evaluate.evaluate)
 app.command("render")(_render.render)
 app.command("play")(_play.play)
 app.command("train")(_train.train)
+app.command("tune")(_tune.tune)
 app.add_typer(_study.app, name="study")
 app.add_typer(_cache.app, name="cache")
 

@@ -43,6 +43,12 @@ def train(
         list[str] | None,
         typer.Option("--set", metavar="NAME=VALUE", help="Hyperparameter of the agent, such as learning_rate=0.001."),
     ] = None,
+    table: Annotated[
+        Path | None,
+        typer.Option(
+            "--hyperparameters", metavar="FILE", help="YAML of hyperparameters, such as `pharos tune` writes."
+        ),
+    ] = None,
     interval: Annotated[
         int | None, typer.Option("--interval", min=1, help="Steps between evaluations; a hundredth when not given.")
     ] = None,
@@ -64,7 +70,13 @@ def train(
 ) -> None:
     """Train an agent and measure the exact regret of its policy on the way."""
     env = parse_environment(target, parameters)
+    from pharos.agents import hyperparameters as hyperparameters_of
     from pharos.experiments import train as learn
+
+    given = parse_parameters(hyperparameter)
+    if table is not None:
+        seen = "index" if agent == "q_learning" else observation
+        given = hyperparameters_of(agent, env.name, seen, given, table=table)
 
     with _bar(steps) as tell:
         result = learn(
@@ -79,7 +91,7 @@ def train(
             horizon=None if endless else horizon or "default",
             seed=seed,
             evaluation_interval=interval,
-            hyperparameters=parse_parameters(hyperparameter),
+            hyperparameters=given,
             out=out,
             tensorboard=tensorboard,
             progress=tell,

@@ -4,14 +4,18 @@ from pharos.experiments._evaluation import Evaluation, evaluate_agent
 from pharos.experiments._results import read_curve, read_record
 from pharos.experiments._task import Task
 from pharos.experiments._train import TrainingResult, train, train_config
+from pharos.experiments._tuning import SPACES, TuningResult, tune
 
 __all__ = [
+    "SPACES",
     "Evaluation",
     "Task",
     "TrainingResult",
+    "TuningResult",
     "evaluate_agent",
     "read_curve",
     "read_record",
     "train",
     "train_config",
+    "tune",
 ]

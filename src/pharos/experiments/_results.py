@@ -54,7 +54,7 @@ def versions() -> dict[str, str]:
 
 def write_record(folder: Path, record: Mapping[str, Any]) -> None:
     """run.json, replaced in one step; numbers that JSON cannot say are null."""
-    _replace(folder / "run.json", (json.dumps(_finite(record), indent=1, allow_nan=False) + "\n").encode())
+    replace_file(folder / "run.json", (as_json(record) + "\n").encode())
 
 
 def write_curve(folder: Path, rows: Sequence[Mapping[str, Any]]) -> None:
@@ -68,7 +68,7 @@ def write_curve(folder: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     columns = [pa.array([row[name] for row in rows], schema.field(name).type) for name in COLUMNS]
     sink = pa.BufferOutputStream()
     pq.write_table(pa.Table.from_arrays(columns, schema=schema), sink, compression="zstd")
-    _replace(folder / "curve.parquet", sink.getvalue().to_pybytes())
+    replace_file(folder / "curve.parquet", sink.getvalue().to_pybytes())
 
 
 def read_record(folder: str | os.PathLike) -> dict[str, Any]:
@@ -110,7 +110,13 @@ def read_curve(folder: str | os.PathLike) -> "pd.DataFrame":
     return curve
 
 
-def _replace(path: Path, data: bytes) -> None:
+def as_json(record: Mapping[str, Any]) -> str:
+    """Text in JSON; numbers that it cannot say are null."""
+    return json.dumps(_finite(record), indent=1, allow_nan=False)
+
+
+def replace_file(path: Path, data: bytes) -> None:
+    """Write a file whole, on disk before it has its name."""
     partial = path.with_name(f"{path.name}.{os.getpid()}")
     with open(partial, "wb") as file:
         file.write(data)
@@ -137,4 +143,4 @@ def write_policy(folder: Path, policy: Any) -> None:
 
     sink = io.BytesIO()
     np.save(sink, policy, allow_pickle=False)
-    _replace(folder / "policy.npy", sink.getvalue())
+    replace_file(folder / "policy.npy", sink.getvalue())

@@ -63,7 +63,7 @@ def train(
     horizon: int | str | None = "default",
     seed: int = 0,
     evaluation_interval: int | None = None,
-    hyperparameters: Mapping[str, Any] | None = None,
+    hyperparameters: Mapping[str, Any] | str | os.PathLike | None = None,
     out: str | os.PathLike | None = None,
     tensorboard: bool = False,
     progress: Progress | None = None,
@@ -79,7 +79,7 @@ def train(
         sticky, random: chance.
         gamma, horizon: setting of values and returns, see `Task`; the agent's own discount is a hyperparameter.
         evaluation_interval: steps between evaluations; None: a hundredth of `steps`.
-        hyperparameters: go before those of agents/hyperparameters.yaml.
+        hyperparameters: go before those of agents/hyperparameters.yaml; or a YAML file of the same form, such as one that `tune` wrote.
         out: folder of the run; None: nothing is written. A finished run there is returned, an unfinished one resumed.
         tensorboard: write TensorBoard's logs into `out`/tensorboard (algorithms of Stable-Baselines3).
         progress: called after each evaluation with steps done, steps in all, and the row of the curve.
@@ -98,22 +98,52 @@ def train(
         gamma=gamma,
         horizon=horizon,
     )
-    interval = evaluation_interval or max(1, steps // 100)
+    return train_on(
+        given,
+        agent,
+        steps=steps,
+        seed=seed,
+        evaluation_interval=evaluation_interval,
+        hyperparameters=hyperparameters,
+        out=out,
+        tensorboard=tensorboard,
+        progress=progress,
+    )
+
+
+def train_on(
+    task: Task,
+    agent: str,
+    *,
+    steps: int,
+    seed: int = 0,
+    evaluation_interval: int | None = None,
+    hyperparameters: Mapping[str, Any] | str | os.PathLike | None = None,
+    out: str | os.PathLike | None = None,
+    tensorboard: bool = False,
+    progress: Progress | None = None,
+) -> TrainingResult:
+    """As `train`, on a task, which is built and solved once for all runs on it."""
+    env = task.env
+    if hyperparameters is None or isinstance(hyperparameters, Mapping):
+        given = dict(hyperparameters or {})
+    else:
+        given = hyperparameters_of(agent, env.name, str(task.observation), table=Path(hyperparameters))
     config = {
         "environment": env.name,
         "parameters": json.loads(json.dumps(env.parameters)),
-        "chance": {"sticky": sticky, "random": random},
-        "observation": given.observation,
-        "observation_options": dict(given.observation_options),
+        "chance": {"sticky": task.sticky, "random": task.random},
+        "observation": task.observation,
+        "observation_options": dict(task.observation_options),
         "agent": agent,
-        "hyperparameters": dict(hyperparameters or {}),
+        "hyperparameters": given,
         "steps": steps,
         "seed": seed,
-        "gamma": gamma,
-        "horizon": given.horizon,
-        "evaluation_interval": interval,
+        "gamma": task.gamma,
+        "horizon": task.horizon,
+        "evaluation_interval": evaluation_interval or max(1, steps // 100),
     }
-    return _run(config, given, None if out is None else Path(out), tensorboard, progress)
+    return _run(config, task, None if out is None else Path(out), tensorboard, progress)
 
 
 def train_config(

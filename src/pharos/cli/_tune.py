@@ -1,0 +1,133 @@
+"""pharos tune: a search for hyperparameters."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from pharos.cli.common import Json, Random, Sticky, console, parse_environment, parse_value, print_facts, print_json
+from pharos.errors import ParameterError
+
+
+def tune(
+    targets: Annotated[
+        list[str],
+        typer.Argument(metavar="TARGET...", help="Instances of one class, such as frozen_lake/4x4 frozen_lake/8x8."),
+    ],
+    agent: Annotated[str, typer.Option("--agent", help="As for `pharos train`.")] = "dqn",
+    observation: Annotated[str, typer.Option("--observation", help="As for `pharos train`.")] = "vector",
+    steps: Annotated[int, typer.Option("--steps", min=1, help="Steps of every run.")] = 50_000,
+    trials: Annotated[int, typer.Option("--trials", min=1, help="Trials in all, earlier ones in --out included.")] = 50,
+    seeds: Annotated[
+        str, typer.Option("--seeds", metavar="S,...", help="Of the runs of a trial; not those of your experiment.")
+    ] = "1000,1001",
+    search: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--search",
+            metavar="NAME=CHOICES",
+            help="Search this instead of the agent's own space: learning_rate=log,0.0001,0.01, gamma=linear,0.9,1, "
+            "batch_size=32,64. Can be given several times.",
+        ),
+    ] = None,
+    search_seed: Annotated[int, typer.Option("--search-seed", min=0, help="Of the search.")] = 0,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Folder for the YAML and the record; a search there goes on.")
+    ] = None,
+    sticky: Sticky = 0.0,
+    random: Random = 0.0,
+    json: Json = False,
+) -> None:
+    """Search hyperparameters of an agent for one class of environments."""
+    instances = [parse_environment(target) for target in targets]
+    from pharos.experiments import tune as find
+
+    with _bar(trials) as tell:
+        result = find(
+            agent,
+            instances,
+            steps=steps,
+            trials=trials,
+            observation=observation,
+            seeds=_seeds(seeds),
+            sticky=sticky,
+            random=random,
+            space=_space(search),
+            search_seed=search_seed,
+            out=out,
+            progress=tell,
+        )
+    if json:
+        print_json(
+            {
+                "agent": result.agent,
+                "environment": result.environment,
+                "observation": result.observation,
+                "score": result.score,
+                "first_score": result.first_score,
+                "hyperparameters": result.hyperparameters,
+                "trials": result.trials,
+                "folder": out,
+            }
+        )
+        return
+    count = {
+        word: sum(trial["status"] == word for trial in result.trials) for word in ("finished", "given up", "failed")
+    }
+    first = "-" if result.first_score is None else f"{result.first_score:.4g}"
+    facts: list[tuple[str, object]] = [
+        ("score", f"{result.score:.4g}  (mean normalized regret; with the table's hyperparameters {first})"),
+        ("trials", ", ".join(f"{number} {word}" for word, number in count.items() if number)),
+        *result.hyperparameters.items(),
+    ]
+    if out is not None:
+        facts += [("use it", f"pharos train ... --hyperparameters {out / 'hyperparameters.yaml'}")]
+    print_facts(f"{agent} on {result.environment}, {result.observation}", facts)
+
+
+def _seeds(text: str) -> list[int]:
+    try:
+        return [int(word) for word in text.split(",")]
+    except ValueError:
+        raise ParameterError(f"--seeds {text!r}; expected whole numbers, such as 1000,1001") from None
+
+
+def _space(words: list[str] | None) -> dict[str, tuple[Any, ...]] | None:
+    """`["batch_size=32,64"]` -> `{"batch_size": ("one of", 32, 64)}`; None where nothing is said."""
+    if not words:
+        return None
+    space = {}
+    for word in words:
+        name, sign, text = word.partition("=")
+        if not sign or not text:
+            raise ParameterError(f"--search {word!r}; expected name=choices, such as batch_size=32,64")
+        choices = tuple(parse_value(part) for part in text.split(","))
+        space[name] = choices if choices[0] in ("log", "linear") else ("one of", *choices)
+    return space
+
+
+class _bar:
+    """A progress bar on a terminal, with the best score so far; nothing elsewhere."""
+
+    def __init__(self, trials: int):
+        self.trials = trials
+
+    def __enter__(self) -> Any:
+        screen = console(stderr=True)
+        if not screen.is_terminal:
+            return None
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+        columns = (BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[text]}"), TimeRemainingColumn())
+        self.progress = Progress(*columns, console=screen, transient=True)
+        self.progress.start()
+        task = self.progress.add_task("tuning", total=self.trials, text="")
+
+        def tell(done: int, _trials: int, best: float) -> None:
+            self.progress.update(task, completed=done, text=f"best {best:.4g}")
+
+        return tell
+
+    def __exit__(self, *_: Any) -> None:
+        if hasattr(self, "progress"):
+            self.progress.stop()

@@ -1,0 +1,118 @@
+"""Searching hyperparameters: what a score is, what is written, that a search goes on, and what bad input gets."""
+
+import json
+
+import pytest
+import yaml
+from typer.testing import CliRunner
+
+from pharos.agents import hyperparameters
+from pharos.cli import app
+from pharos.errors import ParameterError
+from pharos.experiments import SPACES, read_record, train, tune
+
+LAKE = "frozen_lake/4x4"
+ONE = {"learning_rate": ("log", 0.001, 1.0)}
+
+
+def search(trials, out=None, **options):
+    return tune("q_learning", LAKE, steps=2000, trials=trials, seeds=[7, 8], out=out, **options)
+
+
+def test_the_score_is_the_mean_normalized_regret_of_runs_that_anyone_can_repeat():
+    result = search(1)
+    runs = [train("q_learning", LAKE, steps=2000, seed=seed, evaluation_interval=100) for seed in (7, 8)]
+    rows = [row["normalized_regret"] for run in runs for row in run.curve[1:]]
+    assert result.score == result.first_score == pytest.approx(sum(rows) / len(rows))
+    assert result.hyperparameters == hyperparameters("q_learning", "frozen_lake", "index")
+
+
+def test_the_best_is_never_worse_than_what_the_table_said():
+    result = search(8, space=ONE)
+    scores = [trial["score"] for trial in result.trials if trial["status"] == "finished"]
+    assert result.score == min(scores) <= result.first_score
+    assert 0.001 <= result.hyperparameters["learning_rate"] <= 1.0
+    assert search(8, space=ONE).hyperparameters == result.hyperparameters  # the same search seed
+    assert search(8, space=ONE, search_seed=5).trials[1] != result.trials[1]
+
+
+def test_a_search_goes_on_and_writes_what_train_reads(tmp_path):
+    search(2, tmp_path / "found")
+    result = search(4, tmp_path / "found")
+    assert len(result.trials) == 4
+    record = json.loads((tmp_path / "found" / "tuning.json").read_text())
+    assert record["best"]["hyperparameters"] == result.hyperparameters
+    assert [trial["number"] for trial in record["trials"]] == [0, 1, 2, 3]
+    table = tmp_path / "found" / "hyperparameters.yaml"
+    assert yaml.safe_load(table.read_text()) == {"q_learning": {"frozen_lake": {"index": result.hyperparameters}}}
+    run = train("q_learning", LAKE, steps=100, hyperparameters=table)
+    assert run.config["hyperparameters"] == result.hyperparameters
+    with pytest.raises(ParameterError, match="holds a search with another steps"):
+        tune("q_learning", LAKE, steps=3000, trials=4, seeds=[7, 8], out=tmp_path / "found")
+
+
+def test_algorithms_of_stable_baselines3_are_searched_too():
+    few = {"learning_rate": ("log", 1e-4, 1e-3), "batch_size": ("one of", 16, 32)}
+    result = tune("dqn", "simple_grid/4x4-plain", steps=200, trials=2, seeds=[3], space=few)
+    assert result.trials[1]["hyperparameters"]["batch_size"] in (16, 32)
+
+
+@pytest.mark.parametrize("agent", SPACES)
+def test_every_space_holds_hyperparameters_that_the_agent_has(agent):
+    from pharos.agents._deep import algorithm
+    from pharos.agents._q_learning import DEFAULTS
+
+    if agent == "q_learning":
+        assert set(SPACES[agent]) <= set(DEFAULTS)
+    else:
+        assert set(SPACES[agent]) <= set(algorithm(agent).__init__.__annotations__)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"agent": "stable_baselines3:TD3"}, "has no space to search"),
+        ({"environments": ["simple_grid/4x4-plain", LAKE]}, "of the classes frozen_lake, simple_grid"),
+        ({"space": {"gamma": ("linear", 1.0, 0.5)}}, "gamma is .* expected"),
+        ({"space": {"learning_rate": ("log", 0.0, 0.5)}}, "learning_rate is .* expected"),
+        ({"seeds": []}, "0 seeds"),
+        ({"trials": 0}, "0 trials"),
+    ],
+)
+def test_a_search_that_cannot_be_done_is_refused(change, message):
+    options = {"agent": "q_learning", "environments": LAKE, "steps": 100, "trials": 1, **change}
+    with pytest.raises(ParameterError, match=message):
+        tune(options.pop("agent"), options.pop("environments"), **options)
+
+
+def run(*words):
+    return CliRunner().invoke(app, [*map(str, words)])
+
+
+def test_the_command_answers_in_json_and_train_takes_its_file(tmp_path):
+    options = (
+        "--agent",
+        "q_learning",
+        "--steps",
+        1000,
+        "--trials",
+        2,
+        "--seeds",
+        "4",
+        "--search",
+        "learning_rate=0.5,0.7",
+    )
+    done = run("tune", LAKE, "frozen_lake/8x8", *options, "--out", tmp_path / "t", "--json")
+    answer = json.loads(done.stdout)
+    assert answer["hyperparameters"]["learning_rate"] in (0.5, 0.7)
+    table = ("--hyperparameters", tmp_path / "t" / "hyperparameters.yaml", "--set", "gamma=0.9")
+    assert run("train", LAKE, "--steps", 100, "--out", tmp_path / "r", *table).exit_code == 0
+    used = read_record(tmp_path / "r")["hyperparameters"]
+    assert used == {**answer["hyperparameters"], "gamma": 0.9}
+
+
+def test_the_command_prints_a_table_and_refuses_wrong_words():
+    options = ("--agent", "q_learning", "--steps", 500)
+    assert "mean normalized regret" in run("tune", LAKE, *options, "--trials", 1).stdout
+    assert run("tune", LAKE, *options, "--seeds", "one").exit_code == 2
+    assert run("tune", LAKE, *options, "--search", "gamma").exit_code == 2
