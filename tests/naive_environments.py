@@ -109,6 +109,8 @@ class Breakout:
             self._come_back()
         elif ahead[0] == self.height - 1 and (self.height - 1, column) in self.paddle():
             down, right = -1, -right
+            inside = 0 <= column + right < self.columns
+            self.ball = (row, column + right if inside else column)
             self._come_back()
         else:
             self.ball = ahead

@@ -94,7 +94,7 @@ def test_load_gives_back_what_build_gave(breakout):
     loaded = pharos.load(breakout.folder)
     assert loaded.environment == breakout.environment
     assert loaded.parameters == breakout.environment.parameters
-    assert (loaded.num_states, loaded.num_actions, loaded.depth) == (5708, 3, breakout.depth)
+    assert (loaded.num_states, loaded.num_actions, loaded.depth) == (4620, 3, breakout.depth)
     assert (loaded.successors == breakout.successors).all()
     assert (loaded.states() == breakout.states()).all()
 
@@ -113,10 +113,10 @@ def test_index_is_the_inverse_of_state(breakout):
         assert breakout.is_terminal(i) is bool(breakout.environment.is_terminal(state))
 
 
-@pytest.mark.parametrize("i", (-1, 5708))
+@pytest.mark.parametrize("i", (-1, 4620))
 def test_there_is_no_state_beyond_the_last(breakout, i):
     for method in (breakout.state, breakout.is_terminal):
-        with pytest.raises(ParameterError, match=r"does not exist; expected 0 to 5707"):
+        with pytest.raises(ParameterError, match=r"does not exist; expected 0 to 4619"):
             method(i)
 
 
@@ -160,7 +160,7 @@ def test_without_a_folder_the_users_cache_is_used(tmp_path, monkeypatch):
 def test_a_callback_hears_of_the_end(folder):
     heard = []
     build(pharos.make("breakout", height=6, columns=4), folder, progress=heard.append)
-    assert (heard[-1].num_states, heard[-1].num_expanded, heard[-1].depth) == (5708, 5708, 83)
+    assert (heard[-1].num_states, heard[-1].num_expanded, heard[-1].depth) == (4620, 4620, 93)
     assert [done.finished for done in heard] == [False] * (len(heard) - 1) + [True]
 
 
@@ -479,14 +479,14 @@ def test_rewards_are_replaced_without_a_new_build(breakout, monkeypatch):
     top = breakout.states(breakout.successors.ravel())[:, 0].reshape(mdp.rewards.shape) == 0
     assert (mdp.rewards[going] == np.array([0, 2.5, 0]) + top[going]).all()
     assert (mdp.rewards[breakout.terminal] == 0).all()
-    array = np.random.default_rng(0).normal(size=(5708, 3))
+    array = np.random.default_rng(0).normal(size=(4620, 3))
     assert (breakout.mdp(rewards=array).rewards[going] == array[going]).all()
     assert breakout.mdp().rewards.sum() == pharos.load(breakout.folder).mdp().rewards.sum()
 
 
 def test_rewards_of_the_wrong_shape_are_refused(breakout):
-    with pytest.raises(ParameterError, match=r"rewards have shape \(5708,\); expected \(5708, 3\)"):
-        breakout.mdp(rewards=np.zeros(5708))
+    with pytest.raises(ParameterError, match=r"rewards have shape \(4620,\); expected \(4620, 3\)"):
+        breakout.mdp(rewards=np.zeros(4620))
     with pytest.raises(ParameterError, match=r"takes \(self, state, action, next_state\); found \(state, action\)"):
         breakout.mdp(rewards=lambda state, action: 0.0)
 

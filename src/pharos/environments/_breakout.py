@@ -18,8 +18,8 @@ class Breakout(Environment):
              brick breaks it, stays in its cell for that step and turns back vertically. The paddle lies in the bottom
              row and moves first, by at most one cell. A ball is hit by the paddle in the row above it: when the paddle
              lies ahead of the ball, the ball bounces, one column on in its row, and goes up onwards; when the paddle
-             lies straight below the ball but not ahead, its edge turns the ball back where it came from. So the
-             player steers by where the paddle is hit, whatever its width.
+             lies straight below the ball but not ahead, its edge turns the ball back, one column towards where it
+             came from. So the player steers by where the paddle is hit, whatever its width, and can reach every brick.
     State    (ball row, ball column, ball goes right, ball goes down, leftmost cell of the paddle, bricks row by row).
     Start    ball below the middle of the bricks, going down to the right; paddle in the middle; all bricks there.
     Actions  left, stay, right.
@@ -46,7 +46,7 @@ class Breakout(Environment):
 
     name = "breakout"
     actions = ("left", "stay", "right")
-    version = 1
+    version = 2
     max_episode_steps = 1000
     layers = {
         "bricks": Layer("#", (200, 72, 72)),
@@ -111,7 +111,7 @@ class Breakout(Environment):
             elif paddle <= column < paddle + self.paddle_width:
                 right = 1 - right
                 down = 0
-                ahead_column = column
+                ahead_column = min(max(column + 2 * right - 1, 0), self.columns - 1)
             if down == 0:
                 ahead_row = row
                 if self.respawn and no_brick_is_left(self.num_bricks, state):
