@@ -396,9 +396,8 @@ def _wide_returns(part: "pd.DataFrame") -> "pd.DataFrame":
 
 
 def _beside(comparison: Comparison) -> str:
-    shown = comparison.regressions.drop(columns=["r_squared"]).rename(
-        columns={"significant_predictors_as_printed": "significant in the paper"}
-    )
+    shown = comparison.regressions.drop(columns=["r_squared", "significant_predictors_as_printed"])
+    shown = shown.rename(columns={name: name.replace("_", ", ") for name in shown.columns})
     text = _html_table(shown, "R² and correlation: printed, ours, and the difference, for both kinds of regret.")
     known = comparison.returns[comparison.returns["ours"].notna()]
     if len(known) == 0:
@@ -451,6 +450,7 @@ def _data(png: bytes) -> str:
 
 def _html_table(data: "pd.DataFrame", caption: str = "", *, digits: int = 3) -> str:
     numeric = [column for column in data.columns if data[column].dtype.kind in "fiu"]
+    short = [column for column in data.columns if data[column].astype(str).str.len().max() <= 30]
     whole = [column for column in numeric if _is_whole(data[column].to_numpy(float))]
     head = "".join(
         f'<th class="{"n" if column in numeric else "t"}">{_text(str(column).replace("_", " "))}</th>'
@@ -461,7 +461,7 @@ def _html_table(data: "pd.DataFrame", caption: str = "", *, digits: int = 3) -> 
         entries = zip(data.columns, line, strict=True)
         body.append(
             "".join(
-                f'<td class="{"n" if column in numeric else "t"}">{_cell(value, 0 if column in whole else digits)}</td>'
+                f'<td class="{"n" if column in numeric else "s" if column in short else "t"}">{_cell(value, 0 if column in whole else digits)}</td>'
                 for column, value in entries
             )
         )
