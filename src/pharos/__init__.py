@@ -50,6 +50,7 @@ _PACKAGES = (
     "plots",
     "solvers",
     "state_space",
+    "study",
 )
 
 __all__ = [*_HOMES, *_PACKAGES, "__version__"]
