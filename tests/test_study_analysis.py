@@ -8,7 +8,7 @@ import fake_training
 from pharos import study
 from pharos.errors import ParameterError
 from pharos.study import _worker
-from pharos.study._table import _last_return, _number
+from pharos.study._table import _chosen, _last_return, _number
 
 SPECIFICATION = {
     "name": "formulas",
@@ -117,6 +117,31 @@ def test_an_interval_enters_as_its_geometric_mean_and_only_if_it_has_an_upper_en
     assert "only a lower bound of 4" in _number({"lower": 4.0, "upper": None, "exact": False}, False)["why"]
     assert _number(float("inf"), True) == {"value": None, "why": "it is infinite"}
     assert _number({"value": 3.5, "k_min": 2}, True)["value"] == 3.5
+
+
+def test_a_measure_that_does_not_exist_under_chance_is_that_without_and_noted():
+    own = {"num_states": 16, "measures": {"a": {"why": "no chance, please"}, "b": {"value": 2.0, "exact": True}}}
+    plain = {"num_states": 16, "measures": {"a": {"value": 3.0, "exact": True}, "b": {"value": 1.0, "exact": True}}}
+    row = _chosen(["a", "b", "c"], own, plain)
+    assert (row["a"], row["b"]) == (3.0, 2.0) and np.isnan(row["c"])
+    assert row["notes"] == "a: without chance, because no chance, please; c: none, because it is undefined"
+    interval = {"value": 6.0, "lower": 4.0, "upper": 9.0, "exact": False}
+    row = _chosen(["a"], {"num_states": 16, "measures": {"a": interval}}, plain)
+    assert row["a"] == 6 and row["notes"] == "a: geometric mean of the proven interval 4 to 9"
+
+
+def test_a_measure_that_fails_is_noted_and_tried_again_next_time(tmp_path, monkeypatch):
+    block = {"environments": ["frozen_lake/4x4"], "agents": ["q_learning"], "seeds": 1}
+    spec = study.specification({"name": "a", "hardness": {"measures": ["diameter"]}, "blocks": [block]})
+
+    def fails(*_, **__):
+        raise ZeroDivisionError("a bug")
+
+    with monkeypatch.context() as patched:
+        patched.setattr("pharos.hardness.report", fails)
+        found = study.hardness_table(spec, tmp_path)
+    assert found["notes"].item() == "diameter: none, because ZeroDivisionError: a bug"
+    assert study.hardness_table(spec, tmp_path)["diameter"].item() == 7
 
 
 def test_the_return_is_the_mean_over_episodes_that_ended_in_the_last_tenth():

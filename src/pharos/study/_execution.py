@@ -289,8 +289,8 @@ class _Execution:
         try:
             while self.pending or self.running:
                 self._start(context)
-                self._await()
                 self.report()
+                self._await()
         except BaseException:
             for process, _, _ in self.running.values():
                 process.terminate()
