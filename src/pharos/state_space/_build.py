@@ -154,6 +154,10 @@ def _short(value: Any) -> str:
 
 def _check_size(env: Environment, count: int, left: int, max_states: int | None) -> None:
     if max_states is not None and count > max_states:
+        if left == 0:
+            raise StateSpaceTooLarge(
+                f"{env} has {count} states, more than max_states={max_states}; raise it or choose a smaller instance"
+            )
         raise StateSpaceTooLarge(
             f"{env} passed max_states={max_states}, {left} left to expand; raise it or choose a smaller instance"
         )
@@ -350,12 +354,16 @@ class _Builder:
     def _expand_interpreted(self, successors, terminal, base, stop) -> None:
         """The same with rules that Numba cannot compile: Python calls them, arrays do the rest."""
         from pharos._core.hash_table import find, insert_missing
+        from pharos._core.packing import pack_rows, unpack_rows
 
+        layout = self.layout
         num_actions = self.env.num_actions
         stop = min(stop, self.first + min(4096, (self._room() - self.count) // num_actions))
-        rows = unpack(self.layout, self.states[self.first : stop]).tolist()
-        following, terminal[self.first - base : stop - base] = interpreted_successors(self.env, rows)
-        keys = pack(self.layout, following)
+        states = np.empty((stop - self.first, len(layout.word)), np.int64)
+        unpack_rows(layout.word, layout.shift, layout.mask, layout.low, self.states[self.first : stop], states)
+        following, terminal[self.first - base : stop - base] = interpreted_successors(self.env, states.tolist())
+        keys = np.zeros((len(following), layout.num_words), np.uint64)
+        pack_rows(layout.word, layout.shift, layout.low, following, keys)
         found = np.empty(len(keys), np.int64)
         find(self.table, self.states, keys, found)
         slots = np.flatnonzero(found < 0)

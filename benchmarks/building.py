@@ -1,0 +1,185 @@
+"""How fast is a state space built? Beside the paper's own method, and a program written by hand in C, all in one run.
+
+    python benchmarks/building.py [--quick]
+
+Prints states/s (files written, medians after a first run), and ratios: to Algorithm 1 in plain Python with RocksDB (the paper's
+method, on the first states of the same rules), to C with the same rules (the counts must agree), and for rules that are
+interpreted. Memory is the growth of the resident set of a process of its own.
+"""
+
+import importlib.util
+import inspect
+import json
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+import warnings
+from collections import deque
+from pathlib import Path
+
+import pharos
+
+HERE = Path(__file__).parent
+REPEATS = 3 if "--quick" in sys.argv else 5
+PYTHON_STATES = 60_000
+# instance -> options of the C program, and the logarithm of its table's size
+GAMES = {
+    "breakout/12x8x1": (["-DBREAKOUT", "-DHEIGHT=12", "-DCOLUMNS=8", "-DROWS=2", "-DEXTRA=0"], 23),
+    "breakout/12x10x1": (["-DBREAKOUT", "-DHEIGHT=12", "-DCOLUMNS=10", "-DROWS=2", "-DEXTRA=0"], 26),
+    "freeway/16x7-speed1": (["-DFREEWAY", "-DCARS=16", "-DLENGTH=7", "-DSPEED=1"], 21),
+    "freeway/25x13-speed2": (["-DFREEWAY", "-DCARS=25", "-DLENGTH=13", "-DSPEED=2"], 23),
+}
+
+
+def paper(env, folder, limit):
+    """Algorithm 1 with RocksDB for the visited set and flat files for the rest, on `limit` states; states/s."""
+    import numpy as np
+    from rocksdict import Options, Rdict
+
+    options = Options(raw_mode=True)
+    options.create_if_missing(True)
+    visited = Rdict(str(folder / "visited"), options=options)
+    successors = np.memmap(folder / "successors", np.int32, "w+", shape=(limit * 2, env.num_actions))
+    began = time.perf_counter()
+    start = tuple(env.initial_state())
+    visited[bytes(start)] = (0).to_bytes(4, "little")
+    queue, count, expanded = deque([(0, start)]), 1, 0
+    while queue and expanded < limit:
+        number, state = queue.popleft()
+        expanded += 1
+        ended = env.is_terminal(state)
+        for action in range(env.num_actions):
+            following = state if ended else env.next_state(state, action)
+            key = bytes(following)
+            found = visited.get(key)
+            if found is None:
+                visited[key] = count.to_bytes(4, "little")
+                queue.append((count, following))
+                successors[number, action] = count
+                count += 1
+            else:
+                successors[number, action] = int.from_bytes(found, "little")
+    seconds = time.perf_counter() - began
+    visited.close()
+    return expanded / seconds
+
+
+def by_hand(options, log2, folder):
+    """(states, median states/s) of the C program."""
+    program = folder / "build"
+    source = HERE / "c" / "build.c"
+    subprocess.run(["gcc", "-O3", "-march=native", *options, str(source), "-o", str(program)], check=True)
+    rates = []
+    for _ in range(REPEATS + 1):
+        printed = subprocess.run(
+            [str(program), str(log2), str(folder)], check=True, capture_output=True, text=True
+        ).stdout
+        states, _, _, seconds = printed.split()
+        rates.append(int(states) / float(seconds))
+    return int(states), statistics.median(rates[1:])
+
+
+def own(env):
+    """(states, median states/s) of pharos, files included."""
+    rates = []
+    for _ in range(REPEATS + 1):
+        with tempfile.TemporaryDirectory() as folder:
+            began = time.perf_counter()
+            space = pharos.build(env, Path(folder) / "space")
+            rates.append(space.num_states / (time.perf_counter() - began))
+    return space.num_states, statistics.median(rates[1:])
+
+
+MEMORY = """
+import json, sys, tempfile, pharos
+from pathlib import Path
+
+def status(name):
+    return int(next(line for line in open("/proc/self/status") if line.startswith(name)).split()[1]) * 1024
+
+env = pharos.make(sys.argv[1])
+with tempfile.TemporaryDirectory() as folder:
+    kinds = {"breakout": {"height": 6, "columns": 3}, "freeway": {"num_cars": 2, "lane_length": 3}}
+    pharos.build(pharos.make(env.name, **kinds[env.name]), Path(folder) / "warm")
+    open("/proc/self/clear_refs", "w").write("5")  # the peak starts again from what is resident now
+    before = status("VmRSS")
+    states = pharos.build(env, Path(folder) / "space").num_states
+print(json.dumps({"bytes": status("VmHWM") - before, "states": states}))
+"""
+
+
+def memory(name):
+    """Bytes a state by which the peak resident set grows."""
+    found = json.loads(
+        subprocess.run([sys.executable, "-c", MEMORY, name], check=True, capture_output=True, text=True).stdout
+    )
+    return found["bytes"] / found["states"]
+
+
+OPAQUE = "        id(self)  # Numba knows no id()\n"
+
+
+def opaque_class(env):
+    """The class with the same rules, of which one calls what Numba cannot compile."""
+    cls = type(env)
+    source = inspect.getsource(sys.modules[cls.__module__])
+    head = "    def transition(self, state, action, out):\n"
+    assert source.count(head) == 1
+    source = source.replace(head, head + OPAQUE).replace(f'name = "{env.name}"', f'name = "opaque_{env.name}"')
+    name = f"opaque_{env.name}"
+    path = Path(tempfile.mkdtemp()) / f"{name}.py"
+    path.write_text(source)
+    spec = importlib.util.spec_from_file_location(name, path)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    spec.loader.exec_module(module)
+    return getattr(module, cls.__name__)
+
+
+def interpreted(env):
+    """(states, states/s of pharos, of the paper's method) with rules that Numba cannot compile; medians after a first run."""
+    options = (
+        {"height": 12, "columns": 6} if env.name == "breakout" else {"num_cars": 8, "car_speeds": (1, 2, 3, 4, 5, 7)}
+    )
+    slow, rates, references = opaque_class(env)(**options), [], []
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # that they are interpreted
+        for _ in range(4):
+            with tempfile.TemporaryDirectory() as folder:
+                began = time.perf_counter()
+                space = pharos.build(slow, Path(folder) / "space")
+                rates.append(space.num_states / (time.perf_counter() - began))
+            with tempfile.TemporaryDirectory() as folder:
+                references.append(paper(slow, Path(folder), min(PYTHON_STATES, space.num_states)))
+    return space.num_states, statistics.median(rates[1:]), statistics.median(references[1:])
+
+
+def main() -> None:
+    """Measure and print."""
+    for name, (options, log2) in GAMES.items():
+        env = pharos.make(name)
+        with tempfile.TemporaryDirectory() as folder:
+            c_states, c_rate = by_hand(options, log2, Path(folder))
+        states, rate = own(env)
+        assert states == c_states, f"{name}: {states} states, {c_states} in C"
+        with tempfile.TemporaryDirectory() as folder:
+            python_rate = paper(env, Path(folder), PYTHON_STATES)
+        print(
+            f"{name}: {states:,} states; pharos {rate / 1e6:.2f} M states/s, C {c_rate / 1e6:.2f} M, "
+            f"paper's method {python_rate / 1e3:.1f} k; ratio to the paper's method {rate / python_rate:.0f}, "
+            f"time relative to C {c_rate / rate:.2f}, {memory(name):.1f} bytes of memory a state",
+            flush=True,
+        )
+    for name in ("breakout", "freeway"):
+        states, rate, reference = interpreted(pharos.make(name))
+        print(
+            f"{name}, interpreted rules: {states:,} states; {rate / 1e3:.0f} k states/s, paper's method on the same instance "
+            f"{reference / 1e3:.1f} k; ratio {rate / reference:.1f}",
+            flush=True,
+        )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,20 @@
+"""Packing states into words and back, compiled: a few states at a time, where NumPy would take a call for each component."""
+
+import numpy as np
+from numba import njit
+
+
+@njit(cache=True, nogil=True)
+def pack_rows(word, shift, low, states, packed):
+    """packed (N, W) uint64 |= states (N, D) int64, component i in bits from shift[i] of word[i]. `packed` is zero before."""
+    for n in range(len(states)):
+        for i in range(len(word)):
+            packed[n, word[i]] |= np.uint64(states[n, i] - low[i]) << shift[i]
+
+
+@njit(cache=True, nogil=True)
+def unpack_rows(word, shift, mask, low, packed, states):
+    """The other way round."""
+    for n in range(len(packed)):
+        for i in range(len(word)):
+            states[n, i] = np.int64((packed[n, word[i]] >> shift[i]) & mask[i]) + low[i]
