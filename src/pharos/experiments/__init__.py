@@ -1,6 +1,7 @@
 """Experiments: an agent trained on a task, its policies evaluated exactly, and the result written down."""
 
 from pharos.experiments._evaluation import Evaluation, evaluate_agent
+from pharos.experiments._regret import ReferenceValues, RegretCurve, cumulative_expected_regret, regret
 from pharos.experiments._results import read_curve, read_record
 from pharos.experiments._task import Task
 from pharos.experiments._train import TrainingResult, train, train_config
@@ -9,12 +10,16 @@ from pharos.experiments._tuning import SPACES, TuningResult, tune
 __all__ = [
     "SPACES",
     "Evaluation",
+    "ReferenceValues",
+    "RegretCurve",
     "Task",
     "TrainingResult",
     "TuningResult",
+    "cumulative_expected_regret",
     "evaluate_agent",
     "read_curve",
     "read_record",
+    "regret",
     "train",
     "train_config",
     "tune",

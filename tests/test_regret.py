@@ -1,0 +1,181 @@
+"""Regret: never negative, a sum over episodes, and normalised so that the optimal policy is 0 and the reference policy 1."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import pharos
+from pharos.errors import FileFormatError, ParameterError
+from pharos.experiments import (
+    ReferenceValues,
+    RegretCurve,
+    Task,
+    cumulative_expected_regret,
+    evaluate_agent,
+    regret,
+    train,
+)
+from pharos.mdp import TabularMDP
+from pharos.solvers import uniform_value, value_iteration, worst_value
+from strategies import deterministic_mdps
+
+CHANCE = [{}, {"random": 0.2}, {"sticky": 0.25}]
+
+
+def values_of(mdp):
+    found = [solve(mdp) for solve in (value_iteration, uniform_value, worst_value)]
+    errors = max(solution.error_bound for solution in found)
+    return ReferenceValues(*(solution.value_at_start for solution in found), error_bound=errors)
+
+
+@st.composite
+def runs(draw):
+    """(episodes finished before each evaluation, expected regret there)."""
+    between = draw(st.lists(st.integers(0, 50), min_size=1, max_size=12))
+    lost = draw(st.lists(st.floats(0, 10), min_size=len(between), max_size=len(between)))
+    return np.cumsum(between) - between[0], np.array(lost)
+
+
+@settings(max_examples=80, deadline=None)
+@given(deterministic_mdps(), st.integers(0, 2**31), st.booleans())
+def test_no_policy_has_a_regret_below_zero_or_above_that_of_the_worst(mdp, seed, sharp):
+    rng = np.random.default_rng(seed)
+    shape = (mdp.num_states, mdp.num_actions)
+    policy = rng.integers(mdp.num_actions, size=shape[0]) if sharp else rng.dirichlet(np.ones(shape[1]), shape[0])
+    solution, values = pharos.evaluate_policy(mdp, policy), values_of(mdp)
+    lost = regret(solution.value_at_start, values)
+    error = solution.error_bound + values.error_bound
+    assert -error <= lost <= values.optimal - values.worst + error
+
+
+@settings(max_examples=80, deadline=None)
+@given(deterministic_mdps())
+def test_the_references_are_at_zero_and_one_or_nowhere(mdp):
+    values = values_of(mdp)
+    for reference in ("uniform", "worst"):
+        ends = regret([values.optimal, getattr(values, reference)], values, normalized_by=reference)
+        if math.isnan(values.spread(reference)):
+            assert values.optimal - getattr(values, reference) <= 2e-6
+            assert np.isnan(ends).all()
+        else:
+            assert ends.tolist() == [0.0, 1.0]
+
+
+@settings(max_examples=80, deadline=None)
+@given(deterministic_mdps(ends=False), st.sampled_from([0.5, 2.0, 30.0]), st.sampled_from([-3.0, 0.0, 7.0]))
+def test_normalised_regret_does_not_change_with_the_unit_or_the_zero_of_rewards(mdp, unit, zero):
+    never = np.zeros(mdp.num_states, bool)  # no state ends the episode, so that `zero` is paid on every step
+    plain = TabularMDP.from_arrays(mdp.next_states, mdp.rewards, gamma=0.9, terminal=never)
+    other = TabularMDP.from_arrays(mdp.next_states, unit * mdp.rewards + zero, gamma=0.9, terminal=never)
+    policy = np.zeros(mdp.num_states, np.int64)
+    answers = []
+    for each in (plain, other):
+        found = [solve(each, 1e-9).value_at_start for solve in (value_iteration, uniform_value, worst_value)]
+        value = pharos.evaluate_policy(each, policy, 1e-9).value_at_start
+        answers.append(regret(value, ReferenceValues(*found, error_bound=1e-7), normalized_by="worst"))
+    assert answers[0] == pytest.approx(answers[1], abs=1e-4, nan_ok=True)
+
+
+@given(runs(), st.data())
+def test_the_regret_of_a_run_is_that_of_its_two_parts(run, data):
+    episodes, lost = run
+    cut = data.draw(st.integers(0, len(episodes) - 1))
+    whole = cumulative_expected_regret(episodes, lost)
+    head = cumulative_expected_regret(episodes[: cut + 1], lost[: cut + 1])
+    tail = cumulative_expected_regret(episodes[cut:], lost[cut:])
+    np.testing.assert_allclose(whole[: cut + 1], head, atol=1e-9)
+    np.testing.assert_allclose(whole[cut:], head[-1] + tail, atol=1e-9)
+
+
+@given(runs())
+def test_every_episode_counts_with_the_policy_that_was_evaluated_before_it(run):
+    episodes, lost = run
+    expected = [lost[np.flatnonzero(episodes <= k)[-1]] for k in range(episodes[-1])]
+    sums = np.concatenate([[0.0], np.cumsum(expected)])
+    np.testing.assert_allclose(cumulative_expected_regret(episodes, lost), sums[episodes], atol=1e-9)
+
+
+def test_more_evaluations_of_the_same_policies_change_nothing():
+    coarse = cumulative_expected_regret([0, 10, 30], [1.0, 0.5, 0.0])
+    fine = cumulative_expected_regret([0, 4, 10, 20, 30], [1.0, 1.0, 0.5, 0.5, 0.0])
+    assert coarse.tolist() == [0.0, 10.0, 20.0]
+    assert fine[[0, 2, 4]].tolist() == coarse.tolist()
+
+
+@pytest.mark.parametrize("chance", CHANCE)
+def test_the_uniform_policy_loses_one_an_episode_and_the_optimal_one_nothing(chance):
+    task = Task.of("frozen_lake/4x4", **chance)
+    values = ReferenceValues.of(task)
+    uniform = evaluate_agent(np.full((task.mdp.num_states, 4), 0.25), task).value
+    assert regret(uniform, values, normalized_by="uniform") == pytest.approx(1)
+    assert regret(task.optimal.value_at_start, values) == 0
+    curve = RegretCurve(np.array([0, 50, 100]), np.array([0, 5, 12]), np.full(3, uniform), np.zeros(3), values)
+    np.testing.assert_allclose(curve.normalized(curve.cumulative_expected), [np.nan, 1, 1])
+    still = RegretCurve(curve.steps, curve.episodes, np.full(3, values.optimal), curve.returns, values)
+    np.testing.assert_allclose(still.normalized(still.cumulative_expected), [np.nan, 0, 0])
+
+
+def test_regret_cannot_be_normalised_where_every_policy_is_optimal():
+    mdp = TabularMDP.from_arrays([[1, 1], [-1, -1]], [[1.0, 1.0], [0.0, 0.0]])
+    values = values_of(mdp)
+    assert regret(values.uniform, values) == 0
+    assert math.isnan(regret(values.uniform, values, normalized_by="uniform"))
+    curve = RegretCurve(np.arange(2), np.arange(2), np.ones(2), np.zeros(2), values)
+    assert np.isnan(curve.normalized(curve.cumulative_expected)).all()
+
+
+@pytest.fixture(scope="module")
+def run_folder(tmp_path_factory):
+    out = tmp_path_factory.mktemp("run") / "0"
+    return train("q_learning", "frozen_lake/4x4", steps=3000, evaluation_interval=250, random=0.1, out=out)
+
+
+def test_the_curve_of_a_run_says_what_its_file_says(run_folder):
+    curve, rows = RegretCurve.read(run_folder.folder), run_folder.curve
+    for found, name in (
+        (curve.expected, "expected_regret"),
+        (curve.cumulative_expected, "cumulative_expected_regret"),
+        (curve.cumulative_realised, "cumulative_realised_regret"),
+        (regret(curve.policy_values, curve.values, normalized_by="uniform"), "normalized_regret"),
+    ):
+        np.testing.assert_allclose(found, [row[name] for row in rows], atol=1e-9)
+    assert curve.normalized(curve.cumulative_expected)[-1] == pytest.approx(run_folder.result["normalized_regret"])
+    realised = curve.normalized(curve.cumulative_realised)[-1]
+    assert realised == pytest.approx(run_folder.result["normalized_realised_regret"])
+    worst = curve.normalized(curve.cumulative_expected, "worst")[-1]
+    lost = run_folder.result["value_optimal"] - run_folder.result["value_worst"]
+    assert worst == pytest.approx(run_folder.result["cumulative_regret"] / (rows[-1]["episodes"] * lost))
+
+
+@pytest.mark.parametrize("chance", CHANCE)
+def test_in_expectation_an_episode_loses_what_its_policy_loses(chance):
+    """Uniformly random episodes in the environment, counted one by one, against the exact value."""
+    task = Task.of("frozen_lake/4x4", **chance)
+    values, env = ReferenceValues.of(task), pharos.GymEnv(task.env, **task.interaction)
+    rng, lost = np.random.default_rng(1), []
+    env.reset(seed=1)
+    for _ in range(3000):
+        env.reset()
+        over, gained = False, 0.0
+        while not over:
+            _, reward, terminated, truncated, _ = env.step(int(rng.integers(4)))
+            gained, over = gained + reward, terminated or truncated
+        lost.append(regret(gained, values))
+    deviation = np.std(lost) / math.sqrt(len(lost))
+    assert np.mean(lost) == pytest.approx(regret(values.uniform, values), abs=4 * deviation)
+
+
+def test_mistakes_are_named(tmp_path):
+    values = ReferenceValues(1.0, 0.0)
+    with pytest.raises(ParameterError, match="expected 'uniform' or 'worst'"):
+        regret(0.5, values, normalized_by="human")
+    assert math.isnan(regret(0.5, values, normalized_by="worst"))  # its value is not known
+    with pytest.raises(ParameterError, match="fall from 5 to 3 at evaluation 2"):
+        cumulative_expected_regret([0, 5, 3], [1, 1, 1])
+    with pytest.raises(ParameterError, match="one of each"):
+        cumulative_expected_regret([0, 5], [1, 1, 1])
+    with pytest.raises(FileFormatError, match="no such file"):
+        RegretCurve.read(tmp_path)
