@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import pharos
-from pharos.errors import ParameterError
+from pharos.errors import DivergenceError, ParameterError
 from pharos.experiments import Task, evaluate_agent
 
 CHANCE = [{}, {"random": 0.2}, {"sticky": 0.25}, {"sticky": 0.25, "random": 0.2}]
@@ -86,6 +86,114 @@ def test_the_optimal_policy_has_the_optimal_value_and_reaches_few_states():
     found = evaluate_agent(lambda seen: np.array([actions[row.tobytes()] for row in seen]), task)
     assert found.value == pytest.approx(task.optimal.value_at_start, abs=1e-6)
     assert found.states == 14
+
+
+@pytest.mark.parametrize("chance", CHANCE)
+@pytest.mark.parametrize("setting", [{"horizon": 6}, {"gamma": 0.9, "horizon": None}])
+@pytest.mark.parametrize("sharp", [True, False])
+@pytest.mark.parametrize("sees_previous", [True, False])
+def test_policies_that_see_observations_have_the_values_of_their_table_wherever_they_get(
+    chance, setting, sharp, sees_previous
+):
+    task = Task.of("frozen_lake/4x4", **chance, **setting)
+    sees_previous = sees_previous and task.mdp.is_sticky
+    policy, states = linear(task, 3, sharp), task.space.states()
+    if sees_previous:
+        observation = pharos.observe(task.env, "vector")(states)
+        previous = np.concatenate([np.eye(4), np.zeros((1, 4))])
+        seen = [np.hstack([np.tile(observation[s], (5, 1)), previous]).astype(np.float32) for s in range(len(states))]
+        table = np.stack([policy(each) for each in seen])
+        found = pharos.evaluate_policy(task.mdp, policy, 1e-9, observation="vector", previous_action=True)
+    else:
+        table = table_of(task, policy)
+        found = pharos.evaluate_policy(task.mdp, policy, 1e-9, observation="vector")
+    expected = pharos.evaluate_policy(task.mdp, table, 1e-9)
+    assert found.value_at_start == pytest.approx(expected.value_at_start, abs=1e-7)
+    assert found.v.shape == expected.v.shape
+    for mine, whole in ((found.v, expected.v), (found.q, expected.q)):
+        known = ~np.isnan(mine)
+        np.testing.assert_allclose(mine[known], whole[known], atol=1e-7)
+    if task.mdp.is_sticky:
+        assert np.isnan(found.v).any()  # the start after some action
+    else:
+        assert found.v[task.mdp.start_states] == pytest.approx(found.value_at_start)
+    assert 1 <= found.states_reached <= len(states)
+
+
+def test_a_policy_is_asked_only_where_it_gets():
+    space = pharos.build(pharos.make("breakout", height=8, columns=4))
+    mdp, asked = space.mdp(gamma=0.9), []
+
+    def policy(observations):
+        asked.extend(row.tobytes() for row in observations)
+        return np.ones(len(observations), np.int64)
+
+    found = pharos.evaluate_policy(mdp, policy, observation="vector")
+    expected = pharos.evaluate_policy(mdp, np.ones(mdp.num_states, np.int64))
+    assert found.value_at_start == pytest.approx(expected.value_at_start, abs=1e-6)
+    assert len(asked) == len(set(asked)) == found.states_reached < mdp.num_states / 10
+
+
+def test_a_short_horizon_is_no_longer_asked_about():
+    task = Task.of("simple_grid/8x8-plain", horizon=3)
+    found = evaluate_agent(lambda seen: np.full((len(seen), 4), 0.25), task)
+    assert found.states == 6  # at most two steps from the corner
+    assert found.value == pytest.approx(task.uniform.value_at_start)
+
+
+@pytest.mark.parametrize("name", ["dqn", "ppo"])
+@pytest.mark.parametrize("observation", ["vector", "simple_image"])
+def test_models_of_stable_baselines_are_policies(name, observation):
+    from pharos.agents._deep import make_model
+    from pharos.experiments._learners import vector_environment
+
+    task = Task.of("frozen_lake/4x4", random=0.1, observation=observation)
+    model = make_model(name, vector_environment(task, 1, 0), {}, seed=0)
+    found = pharos.evaluate_policy(task.mdp, model, observation=observation)
+    assert found.value_at_start == pytest.approx(evaluate_agent(model, task).value, abs=2e-6)
+    greedy = evaluate_agent(model, task, deterministic=True).value
+    observed = task.space.states()
+    seen = pharos.observe(task.env, observation)(observed)
+    if name == "dqn":
+        assert greedy == pytest.approx(found.value_at_start, abs=2e-6)
+    else:
+        assert greedy != pytest.approx(found.value_at_start, abs=1e-6)
+    actions = np.array([int(model.predict(_as_trained(model, each), deterministic=True)[0]) for each in seen])
+    assert greedy == pytest.approx(pharos.evaluate_policy(task.mdp, actions).value_at_start, abs=2e-6)
+    other = "vector" if observation == "simple_image" else "one_hot"
+    with pytest.raises(ParameterError, match="name the observation it was trained on"):
+        pharos.evaluate_policy(task.mdp, model, observation=other)
+
+
+def _as_trained(model, observation):
+    moved = observation.ndim == 3 and observation.shape != model.observation_space.shape
+    return observation.transpose(2, 0, 1) if moved else observation
+
+
+def test_what_cannot_be_observed_is_refused():
+    mdp = pharos.build(pharos.make("frozen_lake/4x4")).mdp(gamma=0.9)
+    policy = linear(Task.of("frozen_lake/4x4"), 0, True)
+    given = pharos.TabularMDP.from_arrays([[0, -1]], [[0.0, 1.0]])
+    with pytest.raises(ParameterError, match="nothing to observe"):
+        pharos.evaluate_policy(given, policy, observation="vector")
+    with pytest.raises(ParameterError, match="its values belong to no state"):
+        pharos.evaluate_policy(mdp, policy, observation="vector", previous_action=True)
+    with pytest.raises(ParameterError, match="name the observation"):
+        pharos.evaluate_policy(mdp, np.zeros(mdp.num_states, int), deterministic=True)
+    with pytest.raises(DivergenceError, match="gamma is 1"):
+        pharos.evaluate_policy(mdp.with_gamma(1.0), policy, observation="vector")
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 10**6))
+def test_the_most_probable_action_of_a_table_is_that_of_its_rows(seed):
+    task = Task.of("frozen_lake/4x4")
+    table = np.random.default_rng(seed).dirichlet(np.ones(4), task.mdp.num_states)
+    greedy = evaluate_agent(table.argmax(axis=1), task)
+    assert evaluate_agent(table, task, deterministic=True).value == greedy.value
+    indices = Task.of("frozen_lake/4x4", observation="index")
+    found = evaluate_agent(lambda seen: table[seen], indices, deterministic=True)
+    assert found.value == pytest.approx(greedy.value)
 
 
 def test_tables_are_agents_too():

@@ -5,15 +5,17 @@ and beyond a limit the value is estimated from simulated episodes instead, and t
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from pharos.errors import ParameterError
+from pharos.errors import DivergenceError, ParameterError
 from pharos.experiments._task import Task
 from pharos.mdp import TabularMDP
+from pharos.solvers import Solution
 
 BATCH = 4096  # observations that a policy is asked about at once
 RISK = 0.01  # that an estimate's interval misses the value
@@ -40,7 +42,13 @@ class Evaluation:
 
 
 def evaluate_agent(
-    agent: Any, task: Task, *, max_states: int = 100_000, episodes: int = 2_000, seed: int = 0
+    agent: Any,
+    task: Task,
+    *,
+    deterministic: bool = False,
+    max_states: int = 100_000,
+    episodes: int = 2_000,
+    seed: int = 0,
 ) -> Evaluation:
     """Return the value of an agent's current policy on a task.
 
@@ -48,6 +56,7 @@ def evaluate_agent(
         agent: has `policy_table()` (S,), (S, A) or as `pharos.evaluate_policy` takes it; or `action_probabilities(observations)`
             -> (N, A); or is a model of Stable-Baselines3; or an array like the table; or a function of observations that returns
             (N, A) probabilities or (N,) actions.
+        deterministic: whether the most probable action is taken (the first among equals) instead of one at random.
         max_states: how many states (pairs, where previous actions matter) the policy may reach for an exact value.
         episodes, seed: of the estimate beyond that.
     Raises:
@@ -61,15 +70,140 @@ def evaluate_agent(
     if hasattr(agent, "policy_table"):
         agent = agent.policy_table()
     if isinstance(agent, np.ndarray):
-        solution = evaluate_policy(task.mdp, agent)
+        sharp = deterministic and agent.dtype.kind == "f"
+        solution = evaluate_policy(task.mdp, agent.argmax(axis=-1) if sharp else agent)
         return Evaluation(solution.value_at_start, True, solution.error_bound, task.mdp.num_states)
-    asked = _Asked(_policy_of(agent), task)
-    if _reach(task, asked, max_states):
+    asked = _Asked(agent, task, deterministic)
+    if _reach(task, asked, max_states, task.mdp.horizon):
         sub, policy = _sub_mdp(task, asked)
         solution = evaluate_policy(sub, policy)
         return Evaluation(solution.value_at_start, True, solution.error_bound, len(asked.rows))
     value, width = _estimate(task, asked, episodes, np.random.default_rng(seed))
     return Evaluation(value, False, width, len(asked.rows), episodes)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class ReachedSolution(Solution):
+    """Values of a policy where it gets from the start, in the numbering of the whole MDP; NaN elsewhere.
+
+    Attributes:
+        start: value of an episode's first state.
+        states_reached: number of states in which the policy was asked.
+    """
+
+    start: float = math.nan
+    states_reached: int = 0
+
+    @property
+    def value_at_start(self) -> float:
+        """The expected value of an episode's first state."""
+        return self.start
+
+    @cached_property
+    def v(self) -> np.ndarray:
+        """(S,) values; (S, A) under sticky actions; NaN where the policy does not get."""
+        if self._v is not None:
+            return self._v
+        assert self._q is not None and self._policy is not None
+        chance, q = self.mdp.chance, self._q
+        policy = self._policy[:, None] if self._policy.ndim == 2 else self._policy[:, : q.shape[1]]
+        known = np.where(np.isnan(q), 0.0, q)  # times a probability of 0
+        choice = np.where(np.isnan(policy), np.nan, policy * known[:, None]).sum(axis=2)
+        return chance.previous * q + chance.chosen * choice + chance.uniform * known.mean(axis=1, keepdims=True)
+
+
+def evaluate_observing(
+    mdp: TabularMDP,
+    policy: Any,
+    tolerance: float = 1e-6,
+    *,
+    observation: Any = "vector",
+    observation_options: Mapping[str, Any] | None = None,
+    previous_action: bool = False,
+    deterministic: bool = False,
+) -> ReachedSolution:
+    """What `pharos.evaluate_policy` does for policies that see observations; `evaluate_agent` also gives estimates.
+
+    Raises:
+        ParameterError: the MDP was not made from a state space of an environment, the policy is none for its observations, or
+            it sees the previous action where actions are not sticky, so that values do not belong to states.
+        DivergenceError: gamma is 1 and there is no horizon.
+    """
+    from pharos.solvers import evaluate_policy
+    from pharos.state_space import load
+
+    if mdp.horizon is None and mdp.gamma == 1.0:
+        raise DivergenceError(
+            f"{mdp}: gamma is 1 and there is no horizon, so the value may be infinite; give one, or gamma < 1"
+        )
+    if previous_action and not mdp.is_sticky:
+        raise ParameterError(
+            "the policy sees the previous action, so its values belong to no state; use experiments.evaluate_agent"
+        )
+    space = None if mdp.folder is None else load(mdp.folder, verify=False)
+    if space is None or space.environment is None:
+        raise ParameterError(
+            f"{mdp}: is not of a state space whose environment is known, so there is nothing to observe; give the policy as a table"
+        )
+    options = dict(observation_options or {})
+    task = Task(
+        space.environment,
+        observation=observation,
+        observation_options=options,
+        previous_action=previous_action,
+        gamma=mdp.gamma,
+        horizon=mdp.horizon,
+    )
+    task.__dict__.update(mdp=mdp, space=space)  # its cached properties
+    asked = _Asked(policy, task, deterministic)
+    _reach(task, asked, None, None)
+    sub, chosen = _sub_mdp(task, asked)
+    found = evaluate_policy(sub, chosen, tolerance)
+    states = np.unique(asked.rows // asked.width)
+    v = q = before = None
+    if mdp.is_sticky:
+        q = _scattered(found.q, states, mdp.num_states)
+        q[states] = np.where(_executed_where_reached(task, asked, states), q[states], np.nan)
+        known = np.full((mdp.num_states, asked.width, mdp.num_actions), np.nan)
+        known[asked.rows // asked.width, asked.rows % asked.width] = asked.probabilities
+    else:
+        v, known = _scattered(found.v, asked.rows, mdp.num_states), None
+        before = None if found._v_next is None else _scattered(found._v_next, asked.rows, mdp.num_states)
+        known = _scattered(asked.probabilities, asked.rows, mdp.num_states)
+    if before is not None and v is not None:
+        before[np.asarray(mdp.terminal)] = 0.0
+    if v is not None:
+        v[np.asarray(mdp.terminal)] = 0.0
+    return ReachedSolution(
+        mdp,
+        found.error_bound,
+        found.sweeps,
+        found.seconds,
+        mdp.gamma,
+        mdp.horizon,
+        "policy",
+        v,
+        q,
+        _v_next=before,
+        _policy=known,
+        start=found.value_at_start,
+        states_reached=len(states),
+    )
+
+
+def _scattered(values: np.ndarray, rows: np.ndarray, count: int) -> np.ndarray:
+    out = np.full((count, *values.shape[1:]), np.nan)
+    out[rows] = values
+    return out
+
+
+def _executed_where_reached(task: Task, asked: "_Asked", states: np.ndarray) -> np.ndarray:
+    """(N, A) bool: whether what follows on executing an action in `states` is the end, or a pair that the policy reaches."""
+    mdp = task.mdp
+    assert mdp.next_states is not None
+    table = mdp.next_states[states].astype(np.int64)
+    ended = (table < 0) | np.asarray(mdp.terminal)[table]
+    return ended | (asked.index(table * asked.width + np.arange(mdp.num_actions)) >= 0)
 
 
 def _policy_of(agent: Any) -> Callable[[Any], Any]:
@@ -89,16 +223,18 @@ def _policy_of(agent: Any) -> Callable[[Any], Any]:
 class _Asked:
     """What a policy answered so far, by row: a state s, or s (A + 1) + b where the previous action b matters (A: none)."""
 
-    def __init__(self, policy: Callable[[Any], Any], task: Task):
+    def __init__(self, agent: Any, task: Task, deterministic: bool = False):
         from pharos.observations import observe
         from pharos.observations._context import ObservationInContext
 
         mdp = task.mdp
-        self.policy, self.task = policy, task
+        self.policy, self.task, self.deterministic = _policy_of(agent), task, deterministic
         self.num_actions = mdp.num_actions
         self.by_pairs = mdp.is_sticky or task.previous_action
         self.width = mdp.num_actions + 1 if self.by_pairs else 1
-        self.position = np.full(mdp.num_states * self.width, -1, np.int32)
+        self._place = np.zeros(
+            mdp.num_states * self.width, np.int32
+        )  # index + 1; memory is taken where something is written
         self.rows = np.empty(0, np.int64)
         self.probabilities = np.empty((0, mdp.num_actions))
         options = dict(task.observation_options)
@@ -106,16 +242,21 @@ class _Asked:
         self.observe = ObservationInContext(
             observation, previous_action=task.previous_action, remaining_time=False, limit=task.time_limit
         )
+        _check_observation(agent, self.observe.space, task.observation)
+
+    def index(self, rows: np.ndarray) -> np.ndarray:
+        """Where each row stands in `rows` and `probabilities`; -1 where it was not asked about."""
+        return self._place[rows] - 1
 
     def of(self, rows: np.ndarray) -> np.ndarray:
         """(N, A) probabilities of distinct or repeated rows; the policy is asked about new ones only."""
-        unknown = np.unique(rows[self.position[rows] < 0])
+        unknown = np.unique(rows[self._place[rows] == 0])
         if unknown.size:
-            self.position[unknown] = np.arange(len(self.rows), len(self.rows) + unknown.size)
+            self._place[unknown] = np.arange(len(self.rows), len(self.rows) + unknown.size) + 1
             self.rows = np.concatenate([self.rows, unknown])
             answers = [self._ask(unknown[i : i + BATCH]) for i in range(0, unknown.size, BATCH)]
             self.probabilities = np.concatenate([self.probabilities, *answers])
-        return self.probabilities[self.position[rows]]
+        return self.probabilities[self.index(rows)]
 
     def _ask(self, rows: np.ndarray) -> np.ndarray:
         states, previous = np.divmod(rows, self.width)
@@ -137,22 +278,38 @@ class _Asked:
         total = answer.sum(axis=1, keepdims=True)
         if not np.allclose(total, 1, atol=1e-4):
             raise ParameterError(f"the policy's probabilities sum to {total.min():g}; expected 1")
+        if self.deterministic:
+            return np.eye(self.num_actions)[answer.argmax(axis=1)]
         return answer / total
+
+
+def _check_observation(agent: Any, given: Any, name: Any) -> None:
+    """ParameterError where a model was trained on observations of another shape."""
+    model = getattr(agent, "model", agent)
+    expected = getattr(getattr(model, "observation_space", None), "shape", None)
+    shape = given.shape
+    if expected is None or shape is None or expected in (shape, shape[2:] + shape[:2]):
+        return
+    raise ParameterError(
+        f"the model was trained on observations of shape {expected}; {name!r} gives {shape}: name the observation it was trained on"
+    )
 
 
 def _start_rows(task: Task, asked: _Asked) -> np.ndarray:
     return task.mdp.start_states * asked.width + (asked.num_actions if asked.by_pairs else 0)
 
 
-def _reach(task: Task, asked: _Asked, max_rows: int) -> bool:
-    """Ask the policy in all rows that it reaches, level by level; False where they are more than `max_rows`."""
+def _reach(task: Task, asked: _Asked, max_rows: int | None, steps: int | None) -> bool:
+    """Ask the policy in all rows that it reaches (within `steps`), level by level; False where they are more than `max_rows`."""
     mdp, chance = task.mdp, task.mdp.chance
     table, actions = mdp.next_states, np.arange(mdp.num_actions)
     assert table is not None
     frontier = np.unique(_start_rows(task, asked))
-    while frontier.size:
+    level = 0
+    while frontier.size and (steps is None or level < steps):
+        level += 1
         probabilities = asked.of(frontier)
-        if len(asked.rows) > max_rows:
+        if max_rows is not None and len(asked.rows) > max_rows:
             return False
         states, previous = np.divmod(frontier, asked.width)
         executed = (probabilities > 0) & (chance.chosen > 0)
@@ -169,7 +326,7 @@ def _reach(task: Task, asked: _Asked, max_rows: int) -> bool:
         live = (following >= 0) & ~np.asarray(mdp.terminal)[following]
         rows = following[live] * asked.width + (what[live] if asked.by_pairs else 0)
         rows = np.unique(rows)
-        frontier = rows[asked.position[rows] < 0]
+        frontier = rows[asked.index(rows) < 0]
     return True
 
 
@@ -191,9 +348,9 @@ def _sub_mdp(task: Task, asked: _Asked) -> tuple[TabularMDP, np.ndarray]:
         states = asked.rows // asked.width
         table = mdp.next_states[states].astype(np.int64)
         arrived = table * asked.width + (np.arange(mdp.num_actions) if asked.by_pairs else 0)
-        following = np.where(table >= 0, asked.position[arrived], -1)
+        following = np.where(table >= 0, asked.index(arrived), -1)
         policy = asked.probabilities  # type: ignore[assignment]
-        starts = asked.position[_start_rows(task, asked)]
+        starts = asked.index(_start_rows(task, asked))
     initial = np.zeros(states.size)
     np.add.at(initial, starts, mdp.start_probabilities)
     sub = TabularMDP.from_arrays(
