@@ -166,6 +166,12 @@ def test_the_policy_of_a_tabular_agent_is_kept_as_an_array(tmp_path):
     assert (policy == result.agent.policy_table()).all()
 
 
+def test_an_algorithm_can_be_named_by_its_path():
+    result = train("stable_baselines3:A2C", "simple_grid/4x4-plain", steps=50, evaluation_interval=25)
+    assert [row["step"] for row in result.curve] == [0, 25, 50]
+    assert result.curve[0]["value"] > result.result["value_worst"]  # a distribution, not one action
+
+
 @pytest.mark.parametrize(
     ("options", "error", "message"),
     [
@@ -176,6 +182,7 @@ def test_the_policy_of_a_tabular_agent_is_kept_as_an_array(tmp_path):
         ({"agent": "q_learning", "steps": 0}, ParameterError, "steps is 0"),
         ({"agent": "q_learning", "evaluation_interval": -1}, ParameterError, "evaluation_interval is -1"),
         ({"agent": "q_learning", "horizon": None}, ParameterError, "give a horizon"),
+        ({"agent": "dqn", "tensorboard": True}, ParameterError, "no folder for results"),
     ],
 )
 def test_what_is_wrong_is_said_before_anything_is_learnt(options, error, message):

@@ -251,6 +251,11 @@ def _run(
     for name, value in (("steps", steps), ("evaluation_interval", interval)):
         if isinstance(value, bool) or not isinstance(value, int) or value < 1:
             raise ParameterError(f"{name} is {value!r}; expected a whole number of at least 1")
+    if tensorboard and (folder is None or config["agent"] == "q_learning"):
+        raise ParameterError(
+            f"TensorBoard's logs were asked for, with {config['agent']} and {'a' if folder else 'no'} folder for results; "
+            f"expected an algorithm of Stable-Baselines3 and a folder (out)"
+        )
     id, began = _results.identifier(config), time.perf_counter()
     record: dict[str, Any] = {"format": _results.FORMAT, "id": id, "config": config, "versions": _results.versions()}
     spent = 0.0
