@@ -122,3 +122,9 @@ def test_the_configuration_in_a_record_is_plain_json(tmp_path):
     assert record["config"]["parameters"]["rewards"] == [[[2, 2], 0.1]]
     assert record["hyperparameters"]["gamma"] == 0.9
     assert np.isfinite(record["seconds"])
+
+
+def test_the_page_about_agents_defines_every_column_and_every_key():
+    page = (Path(__file__).parents[1] / "docs" / "agents.md").read_text()
+    result = train("q_learning", "simple_grid/4x4-plain", steps=10).result
+    assert [name for name in (*_results.COLUMNS, *result) if f"`{name}`" not in page] == []
