@@ -1,12 +1,18 @@
 """Plots: what is drawn is what the results say."""
 
+import matplotlib
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from matplotlib.figure import Figure
+from matplotlib.text import Annotation
+from PIL import Image
 
 import pharos
 from pharos import hardness, plots
 from pharos.errors import FileFormatError, ParameterError
-from pharos.experiments import read_curve, train
+from pharos.experiments import Task, read_curve, train
 
 
 @pytest.fixture(scope="module")
@@ -54,10 +60,90 @@ def test_a_value_map_shows_values_in_their_cells_and_arrows_of_optimal_actions()
     solution = pharos.value_iteration(space.mdp(gamma=0.5))
     axis = plots.value_map(space, solution, title="grid").axes[0]
     shown = axis.get_images()[0].get_array()
-    np.testing.assert_allclose(shown, [[0.25, 0.5, 1.0], [0.5, 1.0, 0.0]])
-    arrows = {(tuple(text.xy), tuple(text.xyann)) for text in axis.texts}
+    np.testing.assert_allclose(shown.filled(np.nan), [[0.25, 0.5, 1.0], [0.5, 1.0, np.nan]])  # the goal has no colour
+    arrows = {(tuple(text.xy), tuple(text.xyann)) for text in axis.texts if isinstance(text, Annotation)}
     starts = [start for _, start in arrows]
+    assert [text.get_text() for text in axis.texts if not isinstance(text, Annotation)] == ["1"]
     assert sorted(starts) == [(0, 0), (0, 0), (0, 1), (1, 0), (1, 0), (1, 1), (2, 0)]
+
+
+def test_a_given_policy_has_arrows_as_long_as_its_probabilities():
+    space = pharos.build(pharos.make("simple_grid", height=2, width=2))
+    policy = np.tile([0.0, 0.75, 0.25, 0.0], (4, 1))  # up, right, down, left
+    axis = plots.value_map(space, pharos.evaluate_policy(space.mdp(gamma=0.5), policy)).axes[0]
+    lengths = {tuple(np.subtract(t.xy, t.xyann).round(6).tolist()) for t in axis.texts if isinstance(t, Annotation)}
+    assert lengths == {(0.295, 0.0), (0.0, 0.165)}  # 0.1 + 0.26 times the probability
+    uniform = plots.value_map(space, pharos.evaluate_policy(space.mdp(gamma=0.5), np.full((4, 4), 0.25))).axes[0]
+    assert not any(isinstance(text, Annotation) for text in uniform.texts)
+    assert len(uniform.get_lines()) == 3  # a dot in each cell where the episode goes on
+
+
+def test_plots_can_stand_beside_each_other(folders):
+    figure = Figure()
+    axes = figure.subplots(1, 4)
+    space = pharos.build(pharos.make("simple_grid"))
+    assert plots.regret(folders[:1], axes=axes[:2]) is figure
+    assert plots.growth({"grid": space}, axes=axes[2]) is figure
+    assert plots.value_map(space, pharos.value_iteration(space.mdp()), axes=axes[3]) is figure
+    assert lines(axes[0]) and lines(axes[2]) and axes[3].get_images()
+
+
+def test_drawing_leaves_the_settings_of_matplotlib_alone(folders):
+    before = dict(matplotlib.rcParams)
+    plots.regret(folders)
+    assert dict(matplotlib.rcParams) == before
+
+
+def test_regret_that_cannot_be_normalised_is_drawn_in_units_of_return(tmp_path):
+    run = train("q_learning", "simple_grid", height=1, width=2, horizon=1, steps=200, out=tmp_path / "run")
+    left, _ = plots.regret([run.folder]).axes
+    assert left.get_ylabel() == "normalized regret"
+    curve = read_curve(run.folder)
+    curve["normalized_regret"] = np.nan  # as where playing at random is optimal
+    curve.to_parquet(run.folder / "curve.parquet")
+    left, _ = plots.regret([run.folder]).axes
+    assert left.get_ylabel() == "expected regret"
+    np.testing.assert_allclose(lines(left)["q_learning"].get_ydata(), curve["expected_regret"])
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(1, 5), st.integers(2, 5))
+def test_a_grid_grows_by_its_diagonals(height, width):
+    space = pharos.build(pharos.make("simple_grid", height=height, width=width))
+    counts = plots.states_by_depth(space)
+    diagonals = [sum(row + column == d for row in range(height) for column in range(width)) for d in range(20)]
+    assert counts.tolist() == [count for count in diagonals if count]
+    assert counts.sum() == space.num_states and len(counts) == space.depth + 1
+
+
+def test_growth_shows_the_states_at_each_distance():
+    space = pharos.build(pharos.make("frozen_lake/8x8"))
+    axis = plots.growth({"lake": space}).axes[0]
+    drawn = lines(axis)["lake: 64 states"]
+    assert drawn.get_ydata().tolist() == plots.states_by_depth(space).tolist()
+    with pytest.raises(ParameterError, match="at least one"):
+        plots.growth({})
+
+
+def test_policies_play_beside_each_other(tmp_path):
+    task = Task.of("frozen_lake/4x4")
+    optimal = pharos.value_iteration(task.space.mdp(gamma=0.9)).policy
+
+    def never(seen):
+        return np.zeros(len(seen), np.int64)
+
+    agents = {"best": optimal, "left": never, "random": np.full((task.mdp.num_states, 4), 0.25)}
+    path = plots.policies(task, agents, tmp_path / "play.gif", steps=9)
+    with Image.open(path) as gif:
+        frames, (width, height) = gif.n_frames, gif.size
+    with Image.open(plots.policies(task, {"best": optimal}, tmp_path / "one.gif", steps=9)) as one:
+        assert one.n_frames == 7  # six steps to the goal
+        assert (one.height, 3 * one.width + 2 * 12) == (height, width)
+    assert 8 <= frames <= 10  # "left" never ends; a GIF merges frames that are alike
+    with pytest.raises(ParameterError, match=r"ends in \.gif"):
+        plots.policies(task, agents, tmp_path / "play.png")
+    with pytest.raises(ParameterError, match="at least one"):
+        plots.policies(task, {}, tmp_path / "play.gif")
 
 
 def test_a_value_map_refuses_what_is_no_grid():

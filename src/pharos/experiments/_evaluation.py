@@ -262,18 +262,22 @@ class _Asked:
         states, previous = np.divmod(rows, self.width)
         previous = np.where(previous == self.num_actions, -1, previous) if self.by_pairs else np.full(len(rows), -1)
         seen = self.observe(self.task.space.states(states), previous, np.zeros(len(rows), np.int64))
+        return self.answer(seen, len(rows))
+
+    def answer(self, seen: Any, count: int = 1) -> np.ndarray:
+        """(N, A) probabilities for a batch of `count` observations; ParameterError where the policy answers otherwise."""
         answer = np.asarray(self.policy(seen))
-        if answer.dtype.kind in "iu" and answer.shape == (len(rows),):
+        if answer.dtype.kind in "iu" and answer.shape == (count,):
             if (answer < 0).any() or (answer >= self.num_actions).any():
                 raise ParameterError(
                     f"the policy chose action {answer.min()} to {answer.max()}; expected 0 to {self.num_actions - 1}"
                 )
             return np.eye(self.num_actions)[answer]
         answer = answer.astype(np.float64)
-        if answer.shape != (len(rows), self.num_actions) or not (answer >= 0).all():
+        if answer.shape != (count, self.num_actions) or not (answer >= 0).all():
             raise ParameterError(
-                f"the policy answered with shape {answer.shape} for {len(rows)} observations; expected "
-                f"({len(rows)}, {self.num_actions}) probabilities, or ({len(rows)},) actions"
+                f"the policy answered with shape {answer.shape} for {count} observations; expected "
+                f"({count}, {self.num_actions}) probabilities, or ({count},) actions"
             )
         total = answer.sum(axis=1, keepdims=True)
         if not np.allclose(total, 1, atol=1e-4):

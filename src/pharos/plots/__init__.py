@@ -1,11 +1,14 @@
-"""Plots: regret as it grows, values and policies over a grid, instances in the plane of hardness.
+"""Plots: regret as it grows, values and policies over a grid, policies at play, instances in the plane of hardness.
 
-Each function returns a matplotlib Figure; `save` writes it. Colours are told apart by colour-blind people (Okabe and Ito, 2008).
+Each function draws on the matplotlib axes given, or on a new figure, and returns the Figure; `save` writes it. Colours are told
+apart by colour-blind people (Okabe and Ito, 2008). Nothing opens a window or changes matplotlib's settings.
 """
 
 from pharos.plots._grid import value_map
+from pharos.plots._growth import growth, states_by_depth
 from pharos.plots._plane import hardness_plane
+from pharos.plots._policies import policies
 from pharos.plots._regret import regret
 from pharos.plots._style import save
 
-__all__ = ["hardness_plane", "regret", "save", "value_map"]
+__all__ = ["growth", "hardness_plane", "policies", "regret", "save", "states_by_depth", "value_map"]

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from pharos.errors import ParameterError
-from pharos.plots._style import COLORS, figure
+from pharos.plots._style import COLORS, single, styled
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -14,24 +14,26 @@ if TYPE_CHECKING:
 MARKERS = "os^Dv<>P*X"
 
 
+@styled
 def hardness_plane(
     reports: Mapping[str, "Report"],
     *,
     visitation: str = "diameter",
     estimation: str = "sum_of_reciprocal_gaps",
+    axes: Any = None,
 ) -> "Figure":
     """Draw instances by two measures on logarithmic axes; a diameter that is an interval is drawn as a bar.
 
     Args:
         reports: name of an instance, such as "breakout/12x8x1", to its report. One colour for each class before the slash.
         visitation, estimation: names of measures in the reports.
+        axes: where to draw; None for a new figure.
     Raises:
         ParameterError: no reports, or a report lacks a measure or has no finite value for it.
     """
     if not reports:
         raise ParameterError("no reports to draw; give at least one")
-    drawn, axes = figure(1, 1, (6.0, 4.4))
-    axis = axes[0, 0]
+    drawn, axis = single(axes, (6.0, 4.4))
     classes = list(dict.fromkeys(name.split("/")[0] for name in reports))
     for name, report in reports.items():
         number = classes.index(name.split("/")[0])

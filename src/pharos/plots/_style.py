@@ -1,13 +1,18 @@
 """How the plots look, and how they are written."""
 
+import functools
 import os
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
 from pharos.errors import MissingExtra, ParameterError
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+P = ParamSpec("P")
+T = TypeVar("T")
 
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 INK, GRID = "#3b4048", "#e3e5e8"
@@ -33,16 +38,35 @@ RULES: Any = {
 }
 
 
+def styled(draw: Callable[P, T]) -> Callable[P, T]:
+    """A function that draws in the style of pharos, whatever matplotlib is set to."""
+
+    @functools.wraps(draw)
+    def drawing(*arguments: P.args, **options: P.kwargs) -> T:
+        try:
+            import matplotlib as mpl
+        except ImportError as error:
+            raise MissingExtra("plotting", "matplotlib", "study") from error
+        with mpl.rc_context(RULES):
+            return draw(*arguments, **options)
+
+    return drawing
+
+
 def figure(rows: int = 1, columns: int = 1, size: tuple[float, float] = (5.0, 3.4)) -> tuple["Figure", Any]:
-    """A figure in the style of pharos, without a window, and its axes (rows, columns)."""
-    try:
-        import matplotlib as mpl
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise MissingExtra("plotting", "matplotlib", "study") from error
-    with mpl.rc_context(RULES):
-        made = Figure(figsize=(size[0] * columns, size[1] * rows), layout="constrained")
-        return made, made.subplots(rows, columns, squeeze=False)
+    """A figure without a window, and its axes (rows, columns), each of `size` inches."""
+    from matplotlib.figure import Figure
+
+    made = Figure(figsize=(size[0] * columns, size[1] * rows), layout="constrained")
+    return made, made.subplots(rows, columns, squeeze=False)
+
+
+def single(axes: Any, size: tuple[float, float]) -> tuple["Figure", Any]:
+    """The figure and the axes to draw on: those given, or new ones of `size` inches."""
+    if axes is not None:
+        return axes.figure, axes
+    made, several = figure(1, 1, size)
+    return made, several[0, 0]
 
 
 def save(figure: "Figure", path: str | os.PathLike) -> Path:
