@@ -21,7 +21,7 @@ register(
 )
 register(
     "start_eccentricity",
-    lambda problem: start_eccentricity(problem.mdp, restart=problem.restart),
+    lambda problem: start_eccentricity(problem.mdp, restart=problem.restart, budget=problem.budget),
     definition="max over s' of min over policies of E[steps from the start to s']",
     source="the pharos paper, equation 1, read literally",
     complexity="visitation",

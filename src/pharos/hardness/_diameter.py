@@ -63,7 +63,9 @@ def diameter(
     return _Sweep(graph, spending, _conventions(mdp, restart)).interval()
 
 
-def start_eccentricity(mdp: TabularMDP, *, restart: bool = True, tolerance: float = 1e-6) -> float:
+def start_eccentricity(
+    mdp: TabularMDP, *, restart: bool = True, tolerance: float = 1e-6, budget: Budget | float | None = None
+) -> float:
     """Return the largest least expected number of steps from the start to a state: the literal reading of the paper's (1).
 
         max over s' of min over policies of E[steps from a start state to s'], the start drawn from the start distribution
@@ -71,9 +73,12 @@ def start_eccentricity(mdp: TabularMDP, *, restart: bool = True, tolerance: floa
     Args:
         restart: as in `diameter`; without chance and with one start state it makes no difference.
         tolerance: relative accuracy under chance; a deterministic MDP with one start state is exact.
+        budget: under chance, seconds (300 by default), or a `Budget`.
     Returns:
         Steps; infinite where some state cannot be reached from the start. Under chance the upper bound, proven to lie within
         `tolerance`.
+    Raises:
+        UndefinedMeasure: under chance, out of reach of the budget.
     Cost: one search; under chance one stochastic shortest path problem for each target that bounds do not rule out.
     Source: the pharos paper, equation 1.
     """
@@ -81,7 +86,7 @@ def start_eccentricity(mdp: TabularMDP, *, restart: bool = True, tolerance: floa
     if graph is None:
         from pharos.hardness._stochastic_diameter import stochastic_start_eccentricity
 
-        return stochastic_start_eccentricity(mdp, restart, tolerance)
+        return stochastic_start_eccentricity(mdp, restart, tolerance, Budget.of(budget))
     distance = np.empty(graph.num_nodes, np.int32)
     found, largest, _ = graph.search_forward(graph.pivot, distance)
     return float(largest) if found == graph.num_nodes else math.inf

@@ -1,0 +1,75 @@
+"""Least expected hitting times by value iteration on explicit matrices: the slow twin of pharos.hardness._stochastic_diameter."""
+
+import math
+
+import numpy as np
+
+from naive_mdp import augmented
+
+FAR = 1e12  # stands for infinity inside of the iteration
+
+
+def hitting_times(mdp, restart):
+    """(times (N, S + 1): from node n to state e, column S the end; reachable nodes; state of each node; starts (N,))."""
+    P, _, start = augmented(mdp)
+    num_states, width = mdp.num_states, mdp.num_actions + 1
+    size = len(P)
+    state = np.append(np.repeat(np.arange(num_states), width), num_states)
+    over = np.append(np.repeat(mdp.terminal, width), True)
+    for n in np.flatnonzero(over):
+        P[n] = start if restart else np.eye(size)[n]
+    reached = start > 0
+    while True:
+        more = reached | (P[reached].sum(axis=(0, 1)) > 0)
+        if (more == reached).all():
+            break
+        reached = more
+    times = np.empty((size, num_states + 1))
+    for target in range(num_states + 1):
+        goal = state == target
+        sure, change = goal.astype(float), 1.0  # largest probability of ever arriving
+        while change > 1e-13:
+            new = np.where(goal, 1.0, (P @ sure).max(axis=1))
+            change, sure = np.abs(new - sure).max(), new
+        lost = sure < 1 - 1e-9
+        j, change = np.where(lost, FAR, 0.0), 1.0
+        while change > 1e-12 * max(1.0, j[~lost].max(initial=0.0)):
+            new = np.where(goal, 0.0, np.where(lost, FAR, 1 + (P @ j).min(axis=1)))
+            change, j = np.abs(new - j).max(), new
+        times[:, target] = np.where(lost, math.inf, j)
+    return times, reached, state, start
+
+
+def nodes_that_count(mdp, reached, state):
+    """Nodes that the maximum runs over: one a state without sticky actions, else the reachable pairs and starts."""
+    width = mdp.num_actions + 1
+    ends = any_end(mdp)
+    if mdp.is_sticky:
+        return np.flatnonzero(reached & ((state < mdp.num_states) | ends))
+    first = np.arange(mdp.num_states) * width  # the previous action does not matter: take any node
+    return np.append(first, len(state) - 1) if ends else first
+
+
+def any_end(mdp):
+    """Whether a state that is not terminal leads to the implicit end."""
+    if mdp.transitions is None:
+        return bool((mdp.next_states[~mdp.terminal] < 0).any())
+    live = np.repeat(~mdp.terminal, mdp.num_actions)
+    return bool((1 - np.asarray(mdp.transitions.sum(axis=1)).ravel()[live] > 1e-12).any())
+
+
+def diameter(mdp, restart):
+    """(largest hitting time between different states, or inf; largest finite one)."""
+    times, reached, state, _ = hitting_times(mdp, restart)
+    nodes = nodes_that_count(mdp, reached, state)
+    targets = range(mdp.num_states + any_end(mdp))
+    found = [times[n, e] for n in nodes for e in targets if state[n] != e]
+    return max(found, default=0.0), max((t for t in found if math.isfinite(t)), default=0.0)
+
+
+def start_eccentricity(mdp, restart):
+    """The largest expected time from the start to a state."""
+    times, _, state, start = hitting_times(mdp, restart)
+    targets = range(mdp.num_states + any_end(mdp))
+    first = start > 0
+    return max(float(times[first, e] @ start[first]) for e in targets)
