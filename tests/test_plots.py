@@ -13,6 +13,8 @@ import pharos
 from pharos import hardness, plots
 from pharos.errors import FileFormatError, ParameterError
 from pharos.experiments import Task, read_curve, train
+from pharos.plots._plane import _label
+from pharos.plots._style import thousands
 
 
 @pytest.fixture(scope="module")
@@ -116,11 +118,11 @@ def test_a_grid_grows_by_its_diagonals(height, width):
     assert counts.sum() == space.num_states and len(counts) == space.depth + 1
 
 
-def test_growth_shows_the_states_at_each_distance():
+def test_growth_shows_the_states_within_each_distance():
     space = pharos.build(pharos.make("frozen_lake/8x8"))
     axis = plots.growth({"lake": space}).axes[0]
     drawn = lines(axis)["lake: 64 states"]
-    assert drawn.get_ydata().tolist() == plots.states_by_depth(space).tolist()
+    assert drawn.get_ydata().tolist() == plots.states_by_depth(space).cumsum().tolist()
     with pytest.raises(ParameterError, match="at least one"):
         plots.growth({})
 
@@ -166,6 +168,26 @@ def test_the_plane_places_instances_by_their_measures():
         plots.hardness_plane(reports, visitation="depth")
     with pytest.raises(ParameterError, match="at least one"):
         plots.hardness_plane({})
+
+
+@given(st.lists(st.floats(1, 1e6), min_size=2, max_size=8))
+@settings(max_examples=20, deadline=None)
+def test_names_in_the_plane_are_each_drawn_once(values):
+    axis = Figure().subplots()
+    axis.set(xscale="log", yscale="log", xlim=(0.5, 2e6), ylim=(0.5, 2e6))
+    points = {f"x/{i}": (value, value) for i, value in enumerate(values)}
+    _label(axis, points)
+    assert {text.get_text(): text.xy for text in axis.texts} == {str(i): (v, v) for i, v in enumerate(values)}
+    first, second = axis.texts[:2]
+    if values[0] == values[1]:  # of two in one place, the names do not cover each other
+        assert (first.xyann, first.get_ha()) != (second.xyann, second.get_ha())
+
+
+@pytest.mark.parametrize(
+    ("value", "text"), [(0.5, "0.5"), (500, "500"), (12_000, "12k"), (3e6, "3M"), (2e10, "2e10"), (0, "0")]
+)
+def test_large_numbers_on_axes_are_short(value, text):
+    assert thousands(value) == text
 
 
 @pytest.mark.parametrize("ending", [".png", ".pdf", ".svg"])

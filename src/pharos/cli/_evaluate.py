@@ -27,9 +27,10 @@ from pharos.cli.common import (
 from pharos.errors import FileFormatError, ParameterError, UnknownName
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from pharos.mdp import TabularMDP
+    from pharos.solvers import Solution
+
+    Given = tuple[Any, dict[str, Any]]
 
 POLICIES = ("optimal", "uniform", "worst")
 
@@ -38,7 +39,11 @@ def evaluate(
     target: TargetArgument,
     parameters: Parameters = None,
     policy: Annotated[
-        str, typer.Option("--policy", help="optimal, uniform, worst, or FILE.npy: actions (S,), probabilities (S, A).")
+        str,
+        typer.Option(
+            "--policy",
+            help="optimal, uniform, worst; FILE.npy: actions (S,), probabilities (S, A); or the folder of a finished run.",
+        ),
     ] = "uniform",
     gamma: Gamma = None,
     horizon: Horizon = None,
@@ -68,6 +73,7 @@ def evaluate(
         "error_bound": solution.error_bound,
         "regret": best - value,
         "normalized_regret": (best - value) / spread if spread > 4 * tolerance else None,
+        "regret_relative_to_worst": (best - value) / (best - worst) if best - worst > 4 * tolerance else None,
         "optimal_value_at_start": best,
         "uniform_value_at_start": uniform,
         "worst_value_at_start": worst,
@@ -80,13 +86,14 @@ def evaluate(
     if json:
         print_json(answer)
         return
-    relative = answer["normalized_regret"]
+    relative, against_worst = answer["normalized_regret"], answer["regret_relative_to_worst"]
     print_facts(
         f"{policy} policy on {' '.join((target, *(parameters or ())))}",
         [
             ("value at the start", f"{value:.8g}"),
             ("regret", f"{answer['regret']:.8g}"),
             ("normalized regret", "-" if relative is None else f"{relative:.6g}  (0: optimal, 1: uniform)"),
+            ("relative to worst", "-" if against_worst is None else f"{against_worst:.6g}  (0: optimal, 1: worst)"),
             ("optimal, uniform, worst", f"{best:.8g}, {uniform:.8g}, {worst:.8g}"),
             ("error at most", f"{max(each.error_bound for each in values.values()):.2g}"),
             ("discount", f"{mdp.gamma:g}, {'no horizon' if mdp.horizon is None else f'horizon {mdp.horizon}'}"),
@@ -95,34 +102,48 @@ def evaluate(
     )
 
 
-def _values(mdp: "TabularMDP", policy: str, given: "np.ndarray | None", tolerance: float) -> dict[str, Any]:
-    from pharos.solvers import evaluate_policy, uniform_value, value_iteration, worst_value
-
-    values: dict[str, Any] = {} if given is None else {"given": evaluate_policy(mdp, given, tolerance)}
-    values["optimal"] = value_iteration(mdp, tolerance)
-    values["uniform"] = uniform_value(mdp, tolerance)
-    values["worst"] = worst_value(mdp, tolerance)
+def _values(mdp: "TabularMDP", policy: str, given: "Given | None", tolerance: float) -> dict[str, Any]:
+    values: dict[str, Any] = {} if given is None else {"given": solution_of(mdp, policy, given, tolerance)}
+    values |= {name: solution_of(mdp, name, None, tolerance) for name in POLICIES}
     values.setdefault("given", values.get(policy))
     return values
 
 
-def read_policy(name: str) -> "np.ndarray":
-    """The policy in a file: .npy, or `policy` of .npz.
+def solution_of(mdp: "TabularMDP", policy: str, given: "Given | None", tolerance: float) -> "Solution":
+    """The values of a policy: one of POLICIES, or what `read_policy` gave."""
+    from pharos.solvers import evaluate_policy, uniform_value, value_iteration, worst_value
 
+    if given is not None:
+        return evaluate_policy(mdp, given[0], tolerance, **given[1])
+    return {"optimal": value_iteration, "uniform": uniform_value, "worst": worst_value}[policy](mdp, tolerance)
+
+
+def read_policy(name: str) -> "Given":
+    """The policy in a file: .npy, or `policy` of .npz; or what a finished run has learnt, in the folder of the run.
+
+    Returns:
+        The policy, and how `pharos.evaluate_policy` is to take it.
     Raises:
-        UnknownName: neither a policy nor a file. FileFormatError: the file holds no such array.
+        UnknownName: neither a policy nor a file. FileFormatError: the file holds no such array, or the folder no such run.
     """
     import numpy as np
 
     path = Path(name).expanduser()
+    if path.is_dir():
+        from pharos.experiments import load_agent
+
+        task, agent = load_agent(path)
+        if isinstance(agent, np.ndarray):
+            return agent, {}
+        return agent, {"observation": task.observation, "observation_options": task.observation_options}
     if path.suffix.lower() not in (".npy", ".npz"):
-        raise UnknownName("policy", name, [*POLICIES, "FILE.npy"])
+        raise UnknownName("policy", name, [*POLICIES, "FILE.npy", "RUN_DIR"])
     if not path.is_file():
         raise ParameterError(f"--policy {name}: no such file")
     try:
         if path.suffix.lower() == ".npy":
-            return np.load(path, allow_pickle=False)
+            return np.load(path, allow_pickle=False), {}
         with np.load(path, allow_pickle=False) as arrays:
-            return arrays["policy"]
+            return arrays["policy"], {}
     except (ValueError, KeyError, EOFError) as error:
         raise FileFormatError(f"{path}: {error}; expected an array of actions (S,) or probabilities (S, A)") from error

@@ -1,6 +1,7 @@
 """Experiments: an agent trained on a task, its policies evaluated exactly, and the result written down."""
 
 from pharos.experiments._evaluation import Evaluation, evaluate_agent
+from pharos.experiments._loading import load_agent
 from pharos.experiments._regret import ReferenceValues, RegretCurve, cumulative_expected_regret, regret
 from pharos.experiments._results import read_curve, read_record
 from pharos.experiments._task import Task
@@ -17,6 +18,7 @@ __all__ = [
     "TuningResult",
     "cumulative_expected_regret",
     "evaluate_agent",
+    "load_agent",
     "read_curve",
     "read_record",
     "regret",

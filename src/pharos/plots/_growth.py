@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pharos.errors import ParameterError
-from pharos.plots._style import COLORS, single, styled
+from pharos.plots._style import COLORS, plain_log, single, styled
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -33,7 +33,7 @@ def states_by_depth(space: "StateSpace") -> np.ndarray:
 
 @styled
 def growth(spaces: Mapping[str, "StateSpace"], *, axes: Any = None) -> "Figure":
-    """Draw the number of states at each distance from the start, a line for each space; the number of states in the legend.
+    """Draw how many states are within so many steps from the start, a line for each space, on logarithmic axes.
 
     Args:
         spaces: label -> state space.
@@ -45,9 +45,12 @@ def growth(spaces: Mapping[str, "StateSpace"], *, axes: Any = None) -> "Figure":
         raise ParameterError("no state spaces to draw; give at least one")
     drawn, axis = single(axes, (5.6, 3.6))
     for number, (label, space) in enumerate(spaces.items()):
-        counts, color = states_by_depth(space), COLORS[number % len(COLORS)]
-        axis.plot(np.arange(len(counts)), counts, color=color, label=f"{label}: {space.num_states:,} states")
-        axis.fill_between(np.arange(len(counts)), counts, 0.5, color=color, alpha=0.08, linewidth=0)
-    axis.set(yscale="log", xlabel="steps from the start", ylabel="states", ylim=(0.7, None))
+        within, color = states_by_depth(space).cumsum(), COLORS[number % len(COLORS)]
+        distance = np.arange(1, len(within) + 1)
+        axis.plot(distance, within, color=color, label=f"{label}: {space.num_states:,} states")
+        axis.plot(distance[-1:], within[-1:], "o", color=color, markersize=5)
+    axis.set(xscale="log", yscale="log", xlabel="steps from the start + 1", ylabel="states")
+    for side in (axis.xaxis, axis.yaxis):
+        plain_log(side)
     axis.legend()
     return drawn

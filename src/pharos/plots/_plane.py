@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from pharos.errors import ParameterError
-from pharos.plots._style import COLORS, single, styled
+from pharos.plots._style import COLORS, plain_log, single, styled
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -35,6 +35,7 @@ def hardness_plane(
         raise ParameterError("no reports to draw; give at least one")
     drawn, axis = single(axes, (6.0, 4.4))
     classes = list(dict.fromkeys(name.split("/")[0] for name in reports))
+    points: dict[str, tuple[float, float]] = {}
     for name, report in reports.items():
         number = classes.index(name.split("/")[0])
         low, high = _range(name, report, visitation)
@@ -42,16 +43,49 @@ def hardness_plane(
         color, marker = COLORS[number % len(COLORS)], MARKERS[number % len(MARKERS)]
         axis.plot([low, high], [gaps, gaps], color=color, linewidth=2)
         axis.plot((low * high) ** 0.5, gaps, marker, color=color, markersize=6, markeredgecolor="white")
-        short = name.split("/", 1)[-1]
-        axis.annotate(short, ((low * high) ** 0.5, gaps), (5, 4), textcoords="offset points", fontsize=7)
+        points[name] = ((low * high) ** 0.5, gaps)
     for number, cls in enumerate(classes):
         axis.plot(
             [], [], MARKERS[number % len(MARKERS)], color=COLORS[number % len(COLORS)], label=cls.replace("_", " ")
         )
     axis.set(xscale="log", yscale="log", xlabel=visitation.replace("_", " "), ylabel=estimation.replace("_", " "))
     axis.margins(0.12)
-    axis.legend()
+    for side in (axis.xaxis, axis.yaxis):
+        plain_log(side)
+    axis.legend(loc="upper left")
+    _label(axis, points)
     return drawn
+
+
+def _label(axis: Any, points: Mapping[str, tuple[float, float]]) -> None:
+    """Names beside their points, on the side and at the height where the fewest others are in the way."""
+    scale = 72 / axis.figure.dpi
+    at = {name: scale * axis.transData.transform(point) for name, point in points.items()}
+    taken = [(x - 4, y - 4, x + 4, y + 4) for x, y in at.values()]
+    for name, (x, y) in at.items():
+        short = name.split("/", 1)[-1]
+        width, height = 4.2 * len(short), 8.0
+        boxes = {}
+        for dy in (-3.0, 5.0, -11.0, 13.0, -19.0):
+            for right in (True, False):
+                left = x + 6 if right else x - 6 - width
+                boxes[right, dy] = (left, y + dy, left + width, y + dy + height)
+        right, dy = min(boxes, key=lambda place: sum(_overlap(boxes[place], other) for other in taken))
+        taken.append(boxes[right, dy])
+        axis.annotate(
+            short,
+            points[name],
+            (6 if right else -6, dy),
+            textcoords="offset points",
+            ha="left" if right else "right",
+            fontsize=7,
+        )
+
+
+def _overlap(one: tuple[float, ...], other: tuple[float, ...]) -> float:
+    across = min(one[2], other[2]) - max(one[0], other[0])
+    along = min(one[3], other[3]) - max(one[1], other[1])
+    return max(0.0, across) * max(0.0, along)
 
 
 def _range(name: str, report: "Report", measure: str) -> tuple[float, float]:

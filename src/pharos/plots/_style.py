@@ -86,7 +86,19 @@ def save(figure: "Figure", path: str | os.PathLike) -> Path:
 
 def thousands(value: float, _: Any = None) -> str:
     """12000 -> 12k, 3000000 -> 3M: for axes of steps."""
+    if abs(value) >= 1e9:
+        return f"{value:.0e}".replace("e+0", "e").replace("e+", "e")
     for size, letter in ((1e6, "M"), (1e3, "k")):
         if abs(value) >= size:
             return f"{value / size:g}{letter}"
     return f"{value:g}"
+
+
+def plain_log(side: Any) -> None:
+    """Ticks of a logarithmic axis as numbers, with 2 and 5 between powers of ten where there are few of these."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    low, high = side.get_view_interval()
+    side.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < 200 * low else (1.0,)))
+    side.set_major_formatter(FuncFormatter(thousands))
+    side.set_minor_formatter(NullFormatter())
