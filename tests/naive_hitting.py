@@ -69,7 +69,7 @@ def diameter(mdp, restart):
 
 def start_eccentricity(mdp, restart):
     """The largest expected time from the start to a state."""
-    times, _, state, start = hitting_times(mdp, restart)
+    times, _, _, start = hitting_times(mdp, restart)
     targets = range(mdp.num_states + any_end(mdp))
     first = start > 0
     return max(float(times[first, e] @ start[first]) for e in targets)

@@ -1,11 +1,12 @@
 """How hard an MDP is to learn: how long it takes to get around, to tell actions apart, and to look ahead.
 
 Visitation complexity: `diameter`, `start_eccentricity`. Estimation complexity: `gaps`, `sum_of_reciprocal_gaps`, `minimal_gap`.
-All of them: `report`; one of your own: `register`.
+Planning: `effective_horizon`. All of them: `report`; one of your own: `register`.
 """
 
 from pharos.hardness import _built_in  # noqa: F401  (registers the measures; the order of a report)
 from pharos.hardness._diameter import diameter, start_eccentricity
+from pharos.hardness._effective_horizon import EffectiveHorizon, effective_horizon
 from pharos.hardness._gaps import Gaps, gaps, minimal_gap, sum_of_reciprocal_gaps
 from pharos.hardness._interval import Budget, Interval, Progress
 from pharos.hardness._registry import Measure, Problem, measures, register
@@ -13,6 +14,7 @@ from pharos.hardness._report import Report, Result, report
 
 __all__ = [
     "Budget",
+    "EffectiveHorizon",
     "Gaps",
     "Interval",
     "Measure",
@@ -21,6 +23,7 @@ __all__ = [
     "Report",
     "Result",
     "diameter",
+    "effective_horizon",
     "gaps",
     "measures",
     "minimal_gap",

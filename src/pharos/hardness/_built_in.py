@@ -3,6 +3,7 @@
 from typing import Any
 
 from pharos.hardness._diameter import diameter, start_eccentricity
+from pharos.hardness._effective_horizon import effective_horizon
 from pharos.hardness._registry import Problem, register
 
 
@@ -54,4 +55,13 @@ register(
     complexity="estimation",
     version=1,
     depends="values",
+)
+register(
+    "effective_horizon",
+    lambda problem: effective_horizon(problem.mdp, horizon=problem.episode("effective_horizon")),
+    definition="min over k of k + log_A m_k: m_k samples of k steps followed by random play tell optimal actions apart",
+    source="Laidlaw, Russell and Dragan (2023), theorem 5.4",
+    complexity="planning",
+    version=1,
+    depends="episodes",
 )

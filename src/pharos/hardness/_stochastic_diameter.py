@@ -42,12 +42,14 @@ class Choices:
     Attributes:
         matrix: (N A, N) CSR, probabilities.
         underlying: (N,) the state of each node; S for the implicit end.
+        previous: (N,) the previously executed action, A for none; -1 where it does not matter.
         starts: [(node, probability)] of the first step.
         num_actions: A.
     """
 
     matrix: Any
     underlying: np.ndarray
+    previous: np.ndarray
     starts: list[tuple[int, float]]
     num_actions: int
     num_targets: int
@@ -121,7 +123,7 @@ def choices_of(mdp: TabularMDP, restart: bool) -> Choices:
     matrix = matrix + _restarts(owner, live, starts, num_actions, nodes, restart)
     matrix = sparse.csr_matrix(matrix)
     matrix.sum_duplicates()
-    choices = Choices(matrix, owner, starts, num_actions, size)
+    choices = Choices(matrix, owner, previous, starts, num_actions, size)
     return _reachable(choices) if mdp.is_sticky else choices
 
 
@@ -193,7 +195,9 @@ def _reachable(choices: Choices) -> Choices:
     rows = (nodes[:, None] * choices.num_actions + np.arange(choices.num_actions)).ravel()
     matrix = sparse.csr_matrix(choices.matrix[rows][:, nodes])
     starts = [(int(place[node]), p) for node, p in choices.starts]
-    return Choices(matrix, choices.underlying[nodes], starts, choices.num_actions, choices.num_targets)
+    return Choices(
+        matrix, choices.underlying[nodes], choices.previous[nodes], starts, choices.num_actions, choices.num_targets
+    )
 
 
 # Targets ----------------------------------------------------------------------------------------------------------------
@@ -391,9 +395,9 @@ def stochastic_start_eccentricity(
         j, count, lost = targets.open(target)
         if lost is not None and lost[nodes].any():
             return math.inf
-        low, high, _ = targets.sweep(j, count, SWEEPS, 0.0)
+        _, high, _ = targets.sweep(j, count, SWEEPS, 0.0)
         if float(weights @ j[nodes]) * high <= best:
             continue
-        low, high, _ = targets.solve(j, count, tolerance, 0.0, spending)
+        _, high, _ = targets.solve(j, count, tolerance, 0.0, spending)
         best = max(best, float(weights @ j[nodes]) * high)
     return best

@@ -1,0 +1,133 @@
+"""The effective horizon: published analyses, its definition by brute force, and theory."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import pharos
+from naive_horizon import analysis
+from pharos import hardness
+from pharos.errors import ParameterError, UndefinedMeasure
+from pharos.mdp import TabularMDP, random_actions, sticky_actions
+from strategies import deterministic_mdps, general_mdps
+
+BRIDGE = Path(__file__).parent / "data" / "bridge"
+
+
+def key_corridor():
+    with np.load(BRIDGE / "key-corridor-s3r1.npz", allow_pickle=False) as arrays:
+        return TabularMDP.from_arrays(arrays["transitions"], arrays["rewards"], gamma=1.0, horizon=100)
+
+
+def published(name):
+    return json.loads((BRIDGE / f"key-corridor-s3r1{name}.json").read_text())
+
+
+def test_the_published_analysis_of_key_corridor_is_reproduced():
+    found, expected = hardness.effective_horizon(key_corridor()), published("_analyzed")
+    results = expected["effective_horizon_results"]
+    assert found.k_min == expected["min_k"]
+    assert found.effective_planning_window == expected["epw"]
+    assert found.value == pytest.approx(expected["effective_horizon"], rel=1e-12)
+    assert found.ks == results["ks"]
+    assert found.ms == results["ms"]
+    assert found.vars == pytest.approx(results["vars"], rel=1e-8)
+    assert found.gaps == pytest.approx([math.inf if gap is None else gap for gap in results["gaps"]], rel=1e-8)
+    assert found.random_return == pytest.approx(0.0032357130, abs=5e-11)
+    assert (found.optimal_return, found.worst_return) == (1.0, 0.0)
+
+
+def test_the_published_analysis_with_sticky_actions_is_reproduced():
+    found = hardness.effective_horizon(sticky_actions(key_corridor(), 0.25))
+    expected = published("_analyzed_sticky_0.25")
+    assert found.num_states == expected["num_states"]
+    assert found.k_min == expected["min_k"]
+    assert found.effective_planning_window == expected["epw"]
+    assert found.greedy_returns == pytest.approx(expected["greedy_returns"], rel=1e-8)
+    assert found.optimal_return == pytest.approx(expected["optimal_return"], rel=1e-12)
+    assert found.random_return == pytest.approx(expected["random_return"], rel=1e-8)
+    assert found.worst_return == expected["worst_return"]
+
+
+# Rewards that floats hold exactly, so that ties are ties in whatever order sums are taken.
+exact = st.sampled_from([-1.0, 0.0, 0.5, 1.0])
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.one_of(
+        deterministic_mdps(max_states=4, max_actions=2, rewards=exact), general_mdps(max_states=3, max_actions=2)
+    ),
+    st.sampled_from([{}, {"sticky": 0.25}, {"random": 0.5}, {"sticky": 0.25, "random": 0.5}]),
+    st.integers(1, 5),
+)
+def test_it_is_what_its_definition_says(mdp, chance, steps):
+    mdp = random_actions(sticky_actions(mdp, chance.get("sticky", 0.0)), chance.get("random", 0.0))
+    found = hardness.effective_horizon(mdp, horizon=steps)
+    k_min, window, value, lists = analysis(mdp, steps)
+    assert 1 <= found.k_min <= steps
+    if mdp.transitions is None:  # else sums of thirds: which ties are exact depends on their order
+        assert (found.k_min, found.effective_planning_window) == (k_min, window)
+        assert found.ks == [k for k, _ in lists]
+        assert found.ms == pytest.approx([m for _, m in lists], rel=1e-5)
+        assert found.value == pytest.approx(value, rel=1e-5)
+
+
+def lock(length):
+    """A combination lock: action 0 goes on, action 1 goes back to the start; the end pays 1."""
+    states = np.arange(length)
+    return TabularMDP.from_arrays(
+        np.stack([np.append(states[1:], -1), np.zeros(length, int)], axis=1),
+        np.stack([(states == length - 1) * 1.0, np.zeros(length)], axis=1),
+        gamma=1.0,
+    )
+
+
+def test_a_longer_combination_lock_needs_a_longer_look():
+    values = [hardness.effective_horizon(lock(length), horizon=length).value for length in (2, 3, 5, 7, 9)]
+    assert values == sorted(values)
+    assert values[0] < values[-1]
+
+
+def test_a_game_of_one_step_needs_one_look():
+    bandit = TabularMDP.from_arrays([[-1, -1]], [[1.0, 0.0]], gamma=1.0)
+    found = hardness.effective_horizon(bandit, horizon=1)
+    assert (found.value, found.k_min, found.effective_planning_window) == (1.0, 1, 1)
+
+
+def test_greedy_returns_lie_between_worst_and_best_and_reach_it_from_k_min_on():
+    for chance in (0.0, 0.2):
+        mdp = random_actions(pharos.build(pharos.make("frozen_lake/4x4")).mdp(gamma=1.0), chance)
+        found = hardness.effective_horizon(mdp, horizon=30)
+        for k, value in enumerate(found.greedy_returns, start=1):
+            assert found.worst_return - 1e-12 <= value <= found.optimal_return + 1e-12
+            if k >= found.k_min:
+                assert value == pytest.approx(found.optimal_return, abs=1e-3)
+
+
+def test_returns_are_those_of_the_solvers():
+    mdp = sticky_actions(pharos.build(pharos.make("frozen_lake/4x4")).mdp(gamma=1.0), 0.25).with_horizon(20)
+    found = hardness.effective_horizon(mdp)
+    assert found.optimal_return == pytest.approx(pharos.value_iteration(mdp).value_at_start, rel=1e-12)
+
+
+def test_it_needs_a_horizon_and_room():
+    mdp = pharos.build(pharos.make("frozen_lake/4x4")).mdp()
+    with pytest.raises(UndefinedMeasure, match="give a horizon"):
+        hardness.effective_horizon(mdp)
+    with pytest.raises(ParameterError, match="whole number of steps"):
+        hardness.effective_horizon(mdp, horizon=0)
+    with pytest.raises(UndefinedMeasure, match="GiB"):
+        hardness.effective_horizon(mdp, horizon=10_000_000)
+
+
+def test_a_report_with_a_horizon_has_it_and_one_without_says_what_is_missing():
+    mdp = pharos.build(pharos.make("frozen_lake/4x4")).mdp()
+    report = hardness.report(mdp, "effective_horizon", horizon=20, keep=False)
+    assert report["effective_horizon"].value["k_min"] >= 1
+    assert "give a horizon" in hardness.report(mdp, "effective_horizon", keep=False)["effective_horizon"].undefined
