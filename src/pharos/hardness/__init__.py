@@ -1,19 +1,22 @@
 """How hard an MDP is to learn: how long it takes to get around, to tell actions apart, and to look ahead.
 
-Visitation complexity: `diameter`, `start_eccentricity`. Estimation complexity: `gaps`, `sum_of_reciprocal_gaps`, `minimal_gap`.
-Planning: `effective_horizon`. All of them: `report`; one of your own: `register`.
+Visitation complexity: `diameter`, `start_eccentricity`, `covering`. Estimation complexity: `gaps`, `sum_of_reciprocal_gaps`, `minimal_gap`,
+`environmental_value_norm`. Planning: `effective_horizon`. All of them: `report`; one of your own: `register`.
 """
 
 from pharos.hardness import _built_in  # noqa: F401  (registers the measures; the order of a report)
+from pharos.hardness._covering import Covering, covering
 from pharos.hardness._diameter import diameter, start_eccentricity
 from pharos.hardness._effective_horizon import EffectiveHorizon, effective_horizon
 from pharos.hardness._gaps import Gaps, gaps, minimal_gap, sum_of_reciprocal_gaps
 from pharos.hardness._interval import Budget, Interval, Progress
 from pharos.hardness._registry import Measure, Problem, measures, register
 from pharos.hardness._report import Report, Result, report
+from pharos.hardness._value_norm import environmental_value_norm
 
 __all__ = [
     "Budget",
+    "Covering",
     "EffectiveHorizon",
     "Gaps",
     "Interval",
@@ -22,8 +25,10 @@ __all__ = [
     "Progress",
     "Report",
     "Result",
+    "covering",
     "diameter",
     "effective_horizon",
+    "environmental_value_norm",
     "gaps",
     "measures",
     "minimal_gap",

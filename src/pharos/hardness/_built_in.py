@@ -2,9 +2,11 @@
 
 from typing import Any
 
+from pharos.hardness._covering import covering
 from pharos.hardness._diameter import diameter, start_eccentricity
 from pharos.hardness._effective_horizon import effective_horizon
 from pharos.hardness._registry import Problem, register
+from pharos.hardness._value_norm import environmental_value_norm
 
 
 def _diameter(problem: Problem) -> Any:
@@ -57,11 +59,29 @@ register(
     depends="values",
 )
 register(
+    "environmental_value_norm",
+    lambda problem: environmental_value_norm(problem.mdp, problem.solution),
+    definition="max over s, a of the standard deviation of V*(s') under p(. | s, a)",
+    source="Maillard, Mann and Mannor (2014), definition 1",
+    complexity="estimation",
+    version=1,
+    depends="values",
+)
+register(
     "effective_horizon",
     lambda problem: effective_horizon(problem.mdp, horizon=problem.episode("effective_horizon")),
     definition="min over k of k + log_A m_k: m_k samples of k steps followed by random play tell optimal actions apart",
     source="Laidlaw, Russell and Dragan (2023), theorem 5.4",
     complexity="planning",
+    version=1,
+    depends="episodes",
+)
+register(
+    "covering",
+    lambda problem: covering(problem.mdp, horizon=problem.episode("covering")),
+    definition="min over s, a of max over t of mu_t(s, a) under uniform play; length <= ln(2 S A) / omega",
+    source="Laidlaw, Russell and Dragan (2023); Even-Dar and Mansour (2003)",
+    complexity="visitation",
     version=1,
     depends="episodes",
 )

@@ -1,0 +1,109 @@
+"""The environmental value norm and covering: explicit matrices, published values, theory."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import pharos
+from naive_mdp import augmented, optimal_values
+from pharos import hardness
+from pharos.errors import ParameterError, UndefinedMeasure
+from pharos.mdp import TabularMDP, random_actions
+from strategies import deterministic_mdps, small_mdps
+from test_effective_horizon import key_corridor
+
+ANALYZED = Path(__file__).parent / "data" / "bridge" / "key-corridor-s3r1_analyzed.json"
+
+
+def reached(P, start):
+    """Nodes that can be met, by whatever is chosen."""
+    met = start > 0
+    while True:
+        more = met | (P[met].sum(axis=(0, 1)) > 0)
+        if (more == met).all():
+            return met
+        met = more
+
+
+@settings(max_examples=150, deadline=None)
+@given(small_mdps())
+def test_the_norm_is_that_of_the_explicit_matrices(mdp):
+    P, R, start = augmented(mdp)
+    v = optimal_values(P, R, mdp.gamma)
+    over = np.append(np.repeat(mdp.terminal, mdp.num_actions + 1), True)
+    met = reached(P, start) & ~over
+    if mdp.is_sticky and mdp.chance.chosen + mdp.chance.uniform == 0:
+        return  # pairs count as reachable by whatever is executed, although nothing can be chosen after the first step
+    mean = P @ v
+    variance = np.maximum((P * (v[None, None, :] - mean[:, :, None]) ** 2).sum(axis=2), 0)
+    expected = math.sqrt(variance[met].max(initial=0.0))
+    assert hardness.environmental_value_norm(mdp) == pytest.approx(expected, rel=1e-5, abs=2e-6)
+
+
+@settings(max_examples=30, deadline=None)
+@given(deterministic_mdps())
+def test_the_norm_of_a_deterministic_mdp_is_zero(mdp):
+    assert hardness.environmental_value_norm(mdp) == 0.0
+
+
+def test_the_norm_of_a_coin_is_its_deviation():
+    """One action leads to a state worth 1 with probability 0.3, else to the end: sqrt(0.3 x 0.7)."""
+    matrix = np.zeros((2, 1, 2))
+    matrix[0, 0, 1] = 0.3
+    mdp = TabularMDP.from_matrices(matrix, np.array([[0.0], [1.0]]), gamma=0.5)
+    assert hardness.environmental_value_norm(mdp) == pytest.approx(math.sqrt(0.21))
+
+
+@settings(max_examples=100, deadline=None)
+@given(small_mdps(), st.integers(1, 6))
+def test_covering_is_that_of_the_explicit_matrices(mdp, steps):
+    P, _, start = augmented(mdp)
+    width = mdp.num_actions + 1
+    over = np.append(np.repeat(mdp.terminal, width), True)
+    for n in np.flatnonzero(over):
+        P[n] = np.eye(len(P))[n]
+    now, seen = start.copy(), []
+    for _ in range(steps):
+        seen.append(now)
+        now = np.einsum("i,iaj->j", now, P) / mdp.num_actions
+    seen = np.array(seen)
+    if not mdp.is_sticky:  # the previous action does not matter
+        seen = np.column_stack([seen[:, :-1].reshape(steps, -1, width).sum(axis=2), seen[:, -1]])
+        over = np.append(mdp.terminal, True)
+    met = (seen.sum(axis=0) > 0) & ~over
+    if not met.any():
+        with pytest.raises(UndefinedMeasure, match="every start state is terminal"):
+            hardness.covering(mdp, horizon=steps)
+        return
+    found = hardness.covering(mdp, horizon=steps)
+    assert found.omega_max == pytest.approx(seen.max(axis=0)[met].min() / mdp.num_actions)
+    assert found.omega_sum == pytest.approx(seen.sum(axis=0)[met].min() / mdp.num_actions)
+    assert found.num_states == met.sum()
+    assert found.length_bound == pytest.approx(math.log(2 * met.sum() * mdp.num_actions) / found.omega_max)
+
+
+def test_the_published_occupancies_of_key_corridor_are_reproduced():
+    expected = json.loads(ANALYZED.read_text())["min_occupancy_results"]
+    found = hardness.covering(key_corridor())
+    assert found.omega_max == pytest.approx(expected["min_state_action_occupancy"], rel=1e-8)
+    assert found.omega_sum == pytest.approx(expected["min_sum_state_action_occupancy"], rel=1e-8)
+
+
+def test_chance_cannot_make_random_play_different():
+    """Uniform play stays uniform when a uniform action is executed instead."""
+    mdp = pharos.build(pharos.make("frozen_lake/4x4")).mdp()
+    plain, random = (hardness.covering(each, horizon=30) for each in (mdp, random_actions(mdp, 0.3)))
+    assert random.omega_max == pytest.approx(plain.omega_max)
+
+
+def test_covering_needs_a_horizon():
+    mdp = pharos.build(pharos.make("frozen_lake/4x4")).mdp()
+    with pytest.raises(UndefinedMeasure, match="give a horizon"):
+        hardness.covering(mdp)
+    with pytest.raises(ParameterError, match="whole number"):
+        hardness.covering(mdp, horizon=-3)
