@@ -142,6 +142,8 @@ def test_policies_play_beside_each_other(tmp_path):
         assert one.n_frames == 7  # six steps to the goal
         assert (one.height, 3 * one.width + 2 * 12) == (height, width)
     assert 8 <= frames <= 10  # "left" never ends; a GIF merges frames that are alike
+    with pytest.raises(ParameterError, match=r"expected \(16,\) actions or \(16, 4\) probabilities"):
+        plots.policies(task, {"of pairs": np.zeros((16, 5), int)}, tmp_path / "play.gif")
     with pytest.raises(ParameterError, match=r"ends in \.gif"):
         plots.policies(task, agents, tmp_path / "play.png")
     with pytest.raises(ParameterError, match="at least one"):

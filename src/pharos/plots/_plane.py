@@ -49,7 +49,7 @@ def hardness_plane(
             [], [], MARKERS[number % len(MARKERS)], color=COLORS[number % len(COLORS)], label=cls.replace("_", " ")
         )
     axis.set(xscale="log", yscale="log", xlabel=visitation.replace("_", " "), ylabel=estimation.replace("_", " "))
-    axis.margins(0.12)
+    axis.margins(0.18)
     for side in (axis.xaxis, axis.yaxis):
         plain_log(side)
     axis.legend(loc="upper left")
@@ -59,18 +59,26 @@ def hardness_plane(
 
 def _label(axis: Any, points: Mapping[str, tuple[float, float]]) -> None:
     """Names beside their points, on the side and at the height where the fewest others are in the way."""
+    axis.figure.draw_without_rendering()  # the layout decides where points are
     scale = 72 / axis.figure.dpi
     at = {name: scale * axis.transData.transform(point) for name, point in points.items()}
+    left, low, right_end, high = (scale * edge for edge in axis.bbox.extents)
+    far = 1e4
     taken = [(x - 4, y - 4, x + 4, y + 4) for x, y in at.values()]
+    taken += [(left - far, -far, left, far), (right_end, -far, right_end + far, far)]  # outside
+    taken += [(-far, low - far, far, low), (-far, high, far, high + far)]
     for name, (x, y) in at.items():
         short = name.split("/", 1)[-1]
         width, height = 4.2 * len(short), 8.0
         boxes = {}
         for dy in (-3.0, 5.0, -11.0, 13.0, -19.0):
             for right in (True, False):
-                left = x + 6 if right else x - 6 - width
-                boxes[right, dy] = (left, y + dy, left + width, y + dy + height)
-        right, dy = min(boxes, key=lambda place: sum(_overlap(boxes[place], other) for other in taken))
+                edge = x + 6 if right else x - 6 - width
+                boxes[right, dy] = (edge, y + dy, edge + width, y + dy + height)
+        cost = {
+            place: sum(_overlap(box, other) for other in taken) + 2 * abs(place[1] + 3) for place, box in boxes.items()
+        }
+        right, dy = min(cost, key=cost.__getitem__)
         taken.append(boxes[right, dy])
         axis.annotate(
             short,

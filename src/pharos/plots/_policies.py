@@ -96,8 +96,11 @@ def _chooser(task: "Task", agent: Any, rng: np.random.Generator) -> Callable[[An
     if hasattr(agent, "policy_table"):
         agent = agent.policy_table()
     if isinstance(agent, np.ndarray):
-        if agent.ndim > 2:
-            raise ParameterError(f"the policy has shape {agent.shape}; expected (S,) actions or (S, A) probabilities")
+        if agent.shape[1:] not in ((), (task.env.num_actions,)) or len(agent) != task.space.num_states:
+            raise ParameterError(
+                f"the policy has shape {agent.shape}; expected ({task.space.num_states},) actions or "
+                f"({task.space.num_states}, {task.env.num_actions}) probabilities"
+            )
         asked = None
     else:
         asked = _Asked(agent, task)
