@@ -8,7 +8,22 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from pharos.cli import _build, _cache, _evaluate, _hardness, _list, _play, _plot, _render, _solve, _study, _train, _tune
+from pharos.cli import (
+    _build,
+    _cache,
+    _evaluate,
+    _export,
+    _hardness,
+    _import,
+    _list,
+    _play,
+    _plot,
+    _render,
+    _solve,
+    _study,
+    _train,
+    _tune,
+)
 from pharos.cli.common import complain
 from pharos.errors import DivergenceError, ParameterError, PharosError
 
@@ -105,6 +120,8 @@ app.command("train")(_train.train)
 app.command("tune")(_tune.tune)
 app.add_typer(_plot.app, name="plot")
 app.add_typer(_study.app, name="study")
+app.command("export")(_export.export)
+app.add_typer(_import.app, name="import")
 app.add_typer(_cache.app, name="cache")
 
 

@@ -67,9 +67,11 @@ def hardness(
         from pharos.hardness._registry import chosen
 
         chosen(measures)  # an unknown name is told before anything is built
-    mdp = parse_target(target, parameters).mdp(
-        gamma=0.99 if gamma is None else gamma,
-        horizon=horizon if gamma == 1 else None,
+    goal = parse_target(target, parameters)
+    own = goal.is_imported  # an imported MDP has a discount and a horizon of its own
+    mdp = goal.mdp(
+        gamma=0.99 if gamma is None and not own else gamma,
+        horizon=horizon if gamma == 1 or own else None,
         sticky=sticky,
         random=random,
         memory=limit,

@@ -152,6 +152,11 @@ class Target:
         """The tabular MDP, with chance; `gamma` None stands for 0.99, or 1 with a horizon. `building` as for `space`."""
         from pharos.mdp import random_actions, sticky_actions
 
+        if self.is_imported:
+            mdp = self._imported(horizon)
+            mdp = mdp if gamma is None else mdp.with_gamma(gamma)
+            mdp = sticky_actions(mdp, sticky) if sticky else mdp
+            return random_actions(mdp, random) if random else mdp
         space = self.space(**building)
         if space.environment is None:
             raise ParameterError(
@@ -162,6 +167,22 @@ class Target:
         if sticky:
             mdp = sticky_actions(mdp, sticky)
         return random_actions(mdp, random) if random else mdp
+
+    @property
+    def is_imported(self) -> bool:
+        """Whether it is an imported MDP: a file, or a folder that `pharos import` wrote. It has a gamma and a horizon of its own."""
+        from pharos.importers._folder import is_folder
+
+        return self.path is not None and (self.path.is_file() or is_folder(self.path))
+
+    def _imported(self, horizon: int | None) -> "TabularMDP":
+        from pharos import importers
+
+        assert self.path is not None
+        if self.path.is_dir():
+            mdp = importers.load(self.path)
+            return mdp if horizon is None else mdp.with_horizon(horizon)
+        return importers.bridge(self.path, horizon)
 
 
 def discount(gamma: float | None, horizon: int | None) -> float:

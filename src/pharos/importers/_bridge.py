@@ -1,0 +1,103 @@
+"""Tabular MDPs of the BRIDGE dataset (Laidlaw, Russell and Dragan 2023): `consolidated.npz` and the like."""
+
+import os
+import re
+import zipfile
+from pathlib import Path
+
+import numpy as np
+
+from pharos.errors import FileFormatError, ParameterError
+from pharos.mdp import TabularMDP
+
+MINIGRID_STEPS = 100
+
+
+def bridge(path: str | os.PathLike, horizon: int | None = None) -> TabularMDP:
+    """Return the MDP of a BRIDGE file: undiscounted, T steps, starting in row 0, -1 ending the episode.
+
+    Args:
+        path: npz with `transitions` (S, A) integers and `rewards` (S, A); other members are not read.
+        horizon: T; None: what the name says: `<rom>_<T>_fs<k>` for Atari and Procgen, 100 for MiniGrid.
+    Raises:
+        FileFormatError: no npz, a member is missing, pickled, of the wrong shape, or holds an index or reward out of range.
+        ParameterError: no horizon can be told, or the one given contradicts the name.
+    Source: BRIDGE, https://doi.org/10.5281/zenodo.10966777, its data card; horizons are load-bearing: states first met at depth T are
+        coded as terminal.
+    """
+    path = Path(path)
+    arrays = _members(path, ("transitions", "rewards"))
+    transitions, rewards = arrays["transitions"], arrays["rewards"]
+    if transitions.ndim != 2 or transitions.dtype.kind not in "iu" or not transitions.size:
+        raise FileFormatError(
+            f"{path}: transitions have shape {transitions.shape} and type {transitions.dtype}; expected integers (states, actions)"
+        )
+    if rewards.shape != transitions.shape or rewards.dtype.kind not in "iuf":
+        raise FileFormatError(
+            f"{path}: rewards have shape {rewards.shape} and type {rewards.dtype}; expected numbers of shape {transitions.shape}"
+        )
+    steps = _horizon(path, horizon)
+    try:
+        return TabularMDP.from_arrays(transitions, rewards.astype(np.float64), gamma=1.0, horizon=steps)
+    except ParameterError as error:
+        raise FileFormatError(f"{path}: {error}") from None
+
+
+def bridge_screens(path: str | os.PathLike) -> np.ndarray:
+    """Return the screen of each state, (S, H, W, 3) uint8, where the file has screens.
+
+    Raises:
+        FileFormatError: it has none, or they do not fit.
+    """
+    path = Path(path)
+    arrays = _members(path, ("transitions", "screens", "screen_mapping"))
+    screens, mapping = arrays["screens"], arrays["screen_mapping"]
+    if screens.ndim != 4 or screens.dtype != np.uint8 or mapping.shape != (len(arrays["transitions"]),):
+        raise FileFormatError(
+            f"{path}: screens have shape {screens.shape}, screen_mapping {mapping.shape}; expected (screens, height, width, 3) uint8 "
+            f"and one number a state"
+        )
+    if mapping.dtype.kind not in "iu" or (mapping < 0).any() or (mapping >= len(screens)).any():
+        raise FileFormatError(
+            f"{path}: screen_mapping names a screen that is not there; expected 0 to {len(screens) - 1}"
+        )
+    return screens[mapping]
+
+
+def _members(path: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:
+    try:
+        with open(path, "rb") as file, np.load(file, allow_pickle=False) as stored:
+            missing = [name for name in names if name not in stored.files]
+            if missing:
+                raise FileFormatError(
+                    f"{path}: lacks {', '.join(missing)}; found {', '.join(stored.files) or 'nothing'}: expected a file of BRIDGE"
+                )
+            return {name: stored[name] for name in names}
+    except FileNotFoundError:
+        raise ParameterError(f"{path}: no such file") from None
+    except (OSError, ValueError, EOFError, AttributeError, zipfile.BadZipFile) as error:
+        raise FileFormatError(f"{path}: cannot be read as npz without unpickling: {error}") from None
+
+
+def _horizon(path: Path, given: int | None) -> int:
+    named = horizon_of_name(path)
+    if given is not None and (isinstance(given, bool) or not isinstance(given, int | np.integer) or given < 1):
+        raise ParameterError(f"horizon is {given!r}; expected a whole number of steps, at least 1")
+    if named is None and given is None:
+        raise ParameterError(
+            f"{path}: its name does not tell the horizon; give one (`--horizon T`), as its values depend on it"
+        )
+    if named is not None and given is not None and named != given:
+        raise ParameterError(f"{path}: horizon {given} contradicts its name, which says {named}; leave it out")
+    return int(named if given is None else given)  # type: ignore[arg-type]
+
+
+def horizon_of_name(path: Path) -> int | None:
+    """T from the name of a file or its folder: `freeway_10_fs30`, or MiniGrid."""
+    for name in (path.stem, path.resolve().parent.name):
+        found = re.search(r"_(\d+)_fs\d+", name)
+        if found:
+            return int(found[1])
+        if "minigrid" in name.lower():
+            return MINIGRID_STEPS
+    return None
