@@ -1,5 +1,7 @@
 """What an agent has learnt is evaluated exactly on the states that it reaches; estimates agree within their confidence."""
 
+import math
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -139,6 +141,18 @@ def test_a_short_horizon_is_no_longer_asked_about():
     found = evaluate_agent(lambda seen: np.full((len(seen), 4), 0.25), task)
     assert found.states == 6  # at most two steps from the corner
     assert found.value == pytest.approx(task.uniform.value_at_start)
+
+
+@pytest.mark.parametrize("chance", [{}, {"random": 0.1}, {"sticky": 0.25}])
+@pytest.mark.parametrize("gamma", [0.0, 0.1, 0.5])
+def test_steps_that_no_longer_matter_are_not_asked_about(chance, gamma):
+    length = math.ceil(math.log(1e-10) / math.log(gamma)) + 20 if gamma else 20
+    task = Task.of("simple_grid", {"height": 1, "width": length}, gamma=gamma, horizon=None, **chance)
+    found = evaluate_agent(lambda seen: np.full(len(seen), task.env.actions.index("right")), task)
+    exact = pharos.evaluate_policy(task.mdp, np.full(length, task.env.actions.index("right")), 1e-12)
+    assert found.exact
+    assert abs(found.value - exact.value_at_start) <= found.error_bound + exact.error_bound
+    assert found.states < (length - 10) * (4 if chance.get("sticky") else 1)
 
 
 @pytest.mark.parametrize("name", ["dqn", "ppo"])

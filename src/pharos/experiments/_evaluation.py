@@ -18,6 +18,7 @@ from pharos.mdp import TabularMDP
 from pharos.solvers import Solution
 
 BATCH = 4096  # observations that a policy is asked about at once
+TAIL = 1e-9  # of a discounted value, left out where the policy takes as long to get there
 RISK = 0.01  # that an estimate's interval misses the value
 
 
@@ -74,10 +75,11 @@ def evaluate_agent(
         solution = evaluate_policy(task.mdp, agent.argmax(axis=-1) if sharp else agent)
         return Evaluation(solution.value_at_start, True, solution.error_bound, task.mdp.num_states)
     asked = _Asked(agent, task, deterministic)
-    if _reach(task, asked, max_states, task.mdp.horizon):
+    steps, error = _steps_that_matter(task.mdp)
+    if _reach(task, asked, max_states, steps):
         sub, policy = _sub_mdp(task, asked)
         solution = evaluate_policy(sub, policy)
-        return Evaluation(solution.value_at_start, True, solution.error_bound, len(asked.rows))
+        return Evaluation(solution.value_at_start, True, solution.error_bound + error, len(asked.rows))
     value, width = _estimate(task, asked, episodes, np.random.default_rng(seed))
     return Evaluation(value, False, width, len(asked.rows), episodes)
 
@@ -235,14 +237,24 @@ class _Asked:
         self._place = np.zeros(
             mdp.num_states * self.width, np.int32
         )  # index + 1; memory is taken where something is written
-        self.rows = np.empty(0, np.int64)
-        self.probabilities = np.empty((0, mdp.num_actions))
+        self._count = 0  # of what is filled in the two arrays that follow, which double when they are full
+        self._rows, self._answers = np.empty(64, np.int64), np.empty((64, mdp.num_actions))
         options = dict(task.observation_options)
         observation = observe(task.env, task.observation, state_space=task.space, **options)
         self.observe = ObservationInContext(
             observation, previous_action=task.previous_action, remaining_time=False, limit=task.time_limit
         )
         _check_observation(agent, self.observe.space, task.observation)
+
+    @property
+    def rows(self) -> np.ndarray:
+        """(N,) the rows that the policy was asked about."""
+        return self._rows[: self._count]
+
+    @property
+    def probabilities(self) -> np.ndarray:
+        """(N, A) what it answered."""
+        return self._answers[: self._count]
 
     def index(self, rows: np.ndarray) -> np.ndarray:
         """Where each row stands in `rows` and `probabilities`; -1 where it was not asked about."""
@@ -252,10 +264,17 @@ class _Asked:
         """(N, A) probabilities of distinct or repeated rows; the policy is asked about new ones only."""
         unknown = np.unique(rows[self._place[rows] == 0])
         if unknown.size:
-            self._place[unknown] = np.arange(len(self.rows), len(self.rows) + unknown.size) + 1
-            self.rows = np.concatenate([self.rows, unknown])
-            answers = [self._ask(unknown[i : i + BATCH]) for i in range(0, unknown.size, BATCH)]
-            self.probabilities = np.concatenate([self.probabilities, *answers])
+            count = self._count + unknown.size
+            if count > len(self._rows):
+                more = max(count, 2 * len(self._rows)) - len(self._rows)
+                self._rows = np.concatenate([self._rows, np.empty(more, np.int64)])
+                self._answers = np.concatenate([self._answers, np.empty((more, self.num_actions))])
+            for start in range(0, unknown.size, BATCH):
+                block = unknown[start : start + BATCH]
+                place = slice(self._count + start, self._count + start + len(block))
+                self._rows[place], self._answers[place] = block, self._ask(block)
+            self._place[unknown] = np.arange(self._count, count) + 1
+            self._count = count
         return self.probabilities[self.index(rows)]
 
     def _ask(self, rows: np.ndarray) -> np.ndarray:
@@ -297,6 +316,20 @@ def _check_observation(agent: Any, given: Any, name: Any) -> None:
     raise ParameterError(
         f"the model was trained on observations of shape {expected}; {name!r} gives {shape}: name the observation it was trained on"
     )
+
+
+def _steps_that_matter(mdp: TabularMDP) -> tuple[int, float]:
+    """The number of steps after which nothing changes the value at the start by more than a bound, and the bound.
+
+    Without a horizon 2 gamma^n max |r| / (1 - gamma), below TAIL; what a policy would do later is not asked.
+    """
+    if mdp.horizon is not None:
+        return mdp.horizon, 0.0
+    largest = 2 * max(abs(mdp.reward_table.lowest), abs(mdp.reward_table.highest)) / (1 - mdp.gamma)
+    if largest <= TAIL or mdp.gamma == 0.0:
+        return 1, largest * mdp.gamma
+    steps = max(1, math.ceil(math.log(TAIL / largest) / math.log(mdp.gamma)))
+    return steps, largest * mdp.gamma**steps
 
 
 def _start_rows(task: Task, asked: _Asked) -> np.ndarray:
