@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 import pharos
 from pharos.errors import DivergenceError, ParameterError
-from pharos.experiments import Task, evaluate_agent
+from pharos.experiments import Task, evaluate_agent, train
 
 CHANCE = [{}, {"random": 0.2}, {"sticky": 0.25}, {"sticky": 0.25, "random": 0.2}]
 
@@ -63,6 +63,18 @@ def test_estimates_agree_with_exact_values_within_their_confidence(chance, sharp
         assert not estimate.exact and estimate.episodes == 400
         outside += abs(estimate.value - exact.value) > estimate.error_bound + 1e-9
     assert outside == 0  # 20 intervals that hold with 99 % each, and are wider than needed
+
+
+@pytest.mark.parametrize("name", ["simple_grid/4x4-decoy", "frozen_lake/8x8"])
+@pytest.mark.parametrize("setting", [{"horizon": 7}, {"gamma": 0.9, "horizon": None}, {"gamma": 0.0, "horizon": None}])
+@pytest.mark.parametrize("chance", CHANCE)
+def test_estimates_agree_in_every_setting(name, setting, chance):
+    task = Task.of(name, **setting, **chance)
+    for seed in range(5):
+        policy = linear(task, seed, sharp=False)
+        exact = evaluate_agent(policy, task)
+        estimate = evaluate_agent(policy, task, max_states=0, episodes=1000, seed=seed)
+        assert abs(estimate.value - exact.value) <= estimate.error_bound + exact.error_bound
 
 
 @pytest.mark.parametrize("chance", CHANCE)
@@ -208,6 +220,13 @@ def test_the_most_probable_action_of_a_table_is_that_of_its_rows(seed):
     indices = Task.of("frozen_lake/4x4", observation="index")
     found = evaluate_agent(lambda seen: table[seen], indices, deterministic=True)
     assert found.value == pytest.approx(greedy.value)
+
+
+def test_a_q_learner_is_a_policy():
+    learner = train("q_learning", "frozen_lake/4x4", steps=2000).agent
+    mdp = pharos.build(pharos.make("frozen_lake/4x4")).mdp(gamma=0.9)
+    found = pharos.evaluate_policy(mdp, learner)
+    np.testing.assert_array_equal(found.v, pharos.evaluate_policy(mdp, learner.policy_table()).v)
 
 
 def test_tables_are_agents_too():
