@@ -8,9 +8,10 @@ import time
 from pathlib import Path
 
 FOLDER = Path("quickstart")
-INSTANCE = "breakout height=12 columns=10"
+STUDY = "scripts/quickstart.yaml"
+INSTANCE = "breakout height=12 columns=8"
 STEPS = (
-    ("Enumerate the reachable states of a Breakout of 12 x 10 cells, as a tabular MDP on disk.", f"build {INSTANCE}"),
+    ("Enumerate the reachable states of a Breakout of 12 x 8 cells, as a tabular MDP on disk.", f"build {INSTANCE}"),
     ("Measure how hard it is; all values are exact, or proven intervals.", f"hardness {INSTANCE}"),
     (
         "Solve it, and draw 200 steps of the optimal policy.",
@@ -19,6 +20,18 @@ STEPS = (
     (
         "Draw what an agent sees when it is given an Atari-like image.",
         f"render {INSTANCE} --observation complex_image --steps 60 --out {FOLDER}/breakout-complex.png",
+    ),
+    (
+        "Train tabular Q-learning on a lake with random actions, and measure the exact regret of what it has learnt.",
+        f"train frozen_lake/8x8 --agent q_learning --random 0.1 --steps 300000 --out {FOLDER}/q-learning",
+    ),
+    (
+        "Run a small study: DQN and Q-learning on three instances, two kinds of chance, two observations, two seeds.",
+        f"study run {STUDY} --out {FOLDER}/study",
+    ),
+    (
+        "Read it: hardness joined to regret, linear models, each number beside the paper's.",
+        f"study report {STUDY} --out {FOLDER}/study",
     ),
 )
 
@@ -31,8 +44,9 @@ def main() -> None:
         print(f"\n# {what}\n$ pharos {command}", flush=True)
         subprocess.run([sys.executable, "-m", "pharos", *shlex.split(command)], check=True, env=os.environ)
     print(
-        f"\nDone in {time.perf_counter() - began:.0f} s; pictures are in {FOLDER}/. Ask for another instance by its parameters,\n"
-        f"`.venv/bin/pharos hardness breakout height=14 columns=8 brick_rows=3`, or by its name in `.venv/bin/pharos list`."
+        f"\nDone in {time.perf_counter() - began:.0f} s; pictures, {FOLDER}/q-learning/regret.png and the study's report are in {FOLDER}/.\n"
+        f"Ask for another instance by its parameters, `.venv/bin/pharos hardness breakout height=12 columns=10`, or by its name in\n"
+        f"`.venv/bin/pharos list`; for a larger study, `.venv/bin/pharos study run quick`."
     )
 
 
