@@ -34,6 +34,7 @@ _HOMES = {
     "evaluate_policy": "pharos.solvers",
     "observe": "pharos.observations",
     "GymEnv": "pharos.gym_env",
+    "make_vec": "pharos.vector_env",
     "train": "pharos.experiments",
     "PharosError": "pharos.errors",
 }

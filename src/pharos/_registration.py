@@ -22,6 +22,7 @@ for _name, _environment in {**CLASSES, "Environment": None}.items():
     register(
         id=f"pharos/{_name}-{VERSION}",
         entry_point="pharos.gym_env:GymEnv",
+        vector_entry_point="pharos.vector_env:VectorEnv",
         kwargs=_kwargs,
         order_enforce=False,  # the environment says itself when reset() is missing, and checks its actions:
         disable_env_checker=True,  # wrappers that do it again cost more than the step

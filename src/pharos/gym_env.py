@@ -132,7 +132,7 @@ class GymEnv(gymnasium.Env):
 
     Actions are 0 .. A-1, named by `action_names`. `info` has "state" (D,) int64, "executed_action" (-1 after reset), and
     "index" where a state space was given. `reset(options={"state": ...})` starts in any state. Chance draws one number from
-    `np_random` a step, so the vector environment repeats the same episodes from the same seeds.
+    `np_random` a step.
 
     Args:
         environment: a name that `pharos.make` knows, or an Environment.
@@ -290,6 +290,7 @@ class _CompiledRules:
         rules = InteractionRules(env)
         self.parameters = rules.parameters
         self.step_one = rules.kernels.step_one
+        self.step_many = rules.kernels.step_many
         self.is_terminal_one = rules.kernels.is_terminal_one
 
 

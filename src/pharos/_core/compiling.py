@@ -28,7 +28,7 @@ from pharos.errors import ParameterError
 RULES = ("transition", "is_terminal", "reward", "draw")
 _HERE = Path(__file__).parent
 _TEMPLATE = _HERE / "rules_template.py"
-_MACHINERY = (Path(__file__), _HERE / "packed.py", _HERE / "hash_table.py")
+_MACHINERY = (Path(__file__), _HERE / "packed.py", _HERE / "hash_table.py", _HERE / "stepping.py")
 
 
 class CompiledRules:

@@ -8,7 +8,10 @@ what the rules see as `self`; NUM_ACTIONS; CACHE, whether compiled code is kept 
 `ranges` (2, D) int64: lowest and highest value of each component.
 """
 
+import numpy as np
 from numba import int64, njit
+
+from pharos._core.stepping import SAME_STEP, drawn_start, executed_action
 
 
 @njit(forceinline=True)
@@ -31,6 +34,49 @@ def step_one(parameters, ranges, scale, state, action, following, vector):
         for i in range(len(state)):
             vector[i] = (following[i] - ranges[0, i]) * scale[i]
     return value, code
+
+
+@njit(cache=CACHE, nogil=True)
+def step_many(parameters, ranges, scale, chance, limit, mode, first_previous, starts, cumulative, rng, actions,
+              states, previous, elapsed, ended, rewards, terminated, truncated, executed, final, vector, first, last):  # fmt: skip
+    """One step of environments first .. last - 1; return -1, or i * D + c where component c of environment i left its range.
+
+    An environment that has `ended` is reset instead (the mode DISABLED never comes here with one); in the mode SAME_STEP it is
+    reset at once, and `final` gets its last state. starts (K, D), cumulative (K,): the start distribution; rng (N,) uint64;
+    states, final (N, D); vector (N, D) float32 as in `step_one`, (0, D) where it is not wanted; the others (N,).
+    """
+    self = Parameters(*parameters)
+    length = states.shape[1]
+    following = np.empty(length, np.int64)
+    for i in range(first, last):
+        rewards[i], terminated[i], truncated[i], executed[i] = 0.0, False, False, -1
+        restart = ended[i]
+        if not restart:
+            action = executed_action(actions[i], previous[i], chance, NUM_ACTIONS, rng, i)
+            value, code = advance(self, ranges, states[i], action, following)
+            if code > 1:
+                executed[i] = action
+                return i * length + code - 2
+            rewards[i] = value
+            previous[i] = executed[i] = action
+            elapsed[i] += 1
+            terminated[i] = code == 1
+            truncated[i] = elapsed[i] >= limit
+            ended[i] = terminated[i] or truncated[i]
+            restart = mode == SAME_STEP and ended[i]
+            for c in range(length):
+                states[i, c] = following[c]
+                if restart:
+                    final[i, c] = following[c]
+        if restart:
+            k = drawn_start(cumulative, rng, i)
+            for c in range(length):
+                states[i, c] = starts[k, c]
+            previous[i], elapsed[i], ended[i] = first_previous, 0, False
+        if len(vector) > 0:
+            for c in range(length):
+                vector[i, c] = (states[i, c] - ranges[0, c]) * scale[c]
+    return -1
 
 
 @njit(cache=CACHE, nogil=True)
