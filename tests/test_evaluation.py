@@ -254,3 +254,22 @@ def test_a_task_needs_a_horizon_or_a_discount():
     with pytest.raises(ParameterError, match="give a horizon"):
         Task.of("frozen_lake/4x4", horizon=None)
     assert Task.of("frozen_lake/4x4").horizon == 100
+
+
+@pytest.mark.parametrize("chance", CHANCE)
+@pytest.mark.parametrize("sharp", [True, False])
+def test_tables_of_large_spaces_are_looked_up_where_they_are_reached(chance, sharp):
+    task = Task.of("frozen_lake/8x8", **chance)
+    table = table_of(task, linear(task, 5, sharp))
+    whole = evaluate_agent(table, task)
+    parts = evaluate_agent(table, task, max_states=task.mdp.num_states - 1)
+    assert whole.states == task.mdp.num_states
+    assert parts.value == pytest.approx(whole.value, abs=1e-9) or not parts.exact
+    if not chance:
+        assert parts.exact and parts.states < whole.states
+    if task.mdp.is_sticky:
+        triple = np.repeat(np.atleast_2d(table if table.ndim == 2 else np.eye(4)[table])[:, None], 5, axis=1)
+        pairs = evaluate_agent(triple, task, max_states=63)
+        assert pairs.value == pytest.approx(whole.value, abs=max(1e-9, pairs.error_bound))
+    with pytest.raises(ParameterError, match="the policy has shape"):
+        evaluate_agent(np.zeros((3, 3), int), task, max_states=10)

@@ -71,10 +71,13 @@ def evaluate_agent(
     if hasattr(agent, "policy_table"):
         agent = agent.policy_table()
     if isinstance(agent, np.ndarray):
-        sharp = deterministic and agent.dtype.kind == "f"
-        solution = evaluate_policy(task.mdp, agent.argmax(axis=-1) if sharp else agent)
-        return Evaluation(solution.value_at_start, True, solution.error_bound, task.mdp.num_states)
-    asked = _Asked(agent, task, deterministic)
+        table = agent.argmax(axis=-1) if deterministic and agent.dtype.kind == "f" else agent
+        if task.mdp.num_states <= max_states:
+            solution = evaluate_policy(task.mdp, table)
+            return Evaluation(solution.value_at_start, True, solution.error_bound, task.mdp.num_states)
+        asked: _Asked = _AskedTable(table, task)
+    else:
+        asked = _Asked(agent, task, deterministic)
     steps, error = _steps_that_matter(task.mdp)
     if _reach(task, asked, max_states, steps):
         sub, policy = _sub_mdp(task, asked)
@@ -229,9 +232,18 @@ class _Asked:
         from pharos.observations import observe
         from pharos.observations._context import ObservationInContext
 
+        self._start(task)
+        self.policy, self.deterministic = _policy_of(agent), deterministic
+        options = dict(task.observation_options)
+        observation = observe(task.env, task.observation, state_space=task.space, **options)
+        self.observe = ObservationInContext(
+            observation, previous_action=task.previous_action, remaining_time=False, limit=task.time_limit
+        )
+        _check_observation(agent, self.observe.space, task.observation)
+
+    def _start(self, task: Task) -> None:
         mdp = task.mdp
-        self.policy, self.task, self.deterministic = _policy_of(agent), task, deterministic
-        self.num_actions = mdp.num_actions
+        self.task, self.num_actions = task, mdp.num_actions
         self.by_pairs = mdp.is_sticky or task.previous_action
         self.width = mdp.num_actions + 1 if self.by_pairs else 1
         self._place = np.zeros(
@@ -239,12 +251,6 @@ class _Asked:
         )  # index + 1; memory is taken where something is written
         self._count = 0  # of what is filled in the two arrays that follow, which double when they are full
         self._rows, self._answers = np.empty(64, np.int64), np.empty((64, mdp.num_actions))
-        options = dict(task.observation_options)
-        observation = observe(task.env, task.observation, state_space=task.space, **options)
-        self.observe = ObservationInContext(
-            observation, previous_action=task.previous_action, remaining_time=False, limit=task.time_limit
-        )
-        _check_observation(agent, self.observe.space, task.observation)
 
     @property
     def rows(self) -> np.ndarray:
@@ -304,6 +310,28 @@ class _Asked:
         if self.deterministic:
             return np.eye(self.num_actions)[answer.argmax(axis=1)]
         return answer / total
+
+
+class _AskedTable(_Asked):
+    """The same for a table: (S,) actions, (S, A) probabilities, or for each previous action, as `pharos.evaluate_policy` takes it."""
+
+    def __init__(self, table: np.ndarray, task: Task):
+        self._start(task)
+        states, actions = task.mdp.num_states, task.mdp.num_actions
+        shapes = [(states,), (states, actions)]
+        if self.by_pairs:
+            shapes += [(states, actions + 1), (states, actions + 1, actions)]
+        if table.shape not in shapes or (table.ndim == 2 and self.by_pairs and table.dtype.kind in "iu") != (
+            table.shape == (states, actions + 1)
+        ):
+            raise ParameterError(f"the policy has shape {table.shape}; expected one of {', '.join(map(str, shapes))}")
+        self.table = table
+
+    def _ask(self, rows: np.ndarray) -> np.ndarray:
+        states, previous = np.divmod(rows, self.width)
+        by_previous = self.table.ndim == 3 or self.table.shape == (self.task.mdp.num_states, self.num_actions + 1)
+        found = self.table[states, previous] if by_previous else self.table[states]
+        return np.eye(self.num_actions)[found] if found.ndim == 1 else np.asarray(found, np.float64)
 
 
 def _check_observation(agent: Any, given: Any, name: Any) -> None:
