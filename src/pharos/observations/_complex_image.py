@@ -115,7 +115,7 @@ def _sprite_tables(
         count = num_values(layer)
         sprite[number, 1:] = len(images) + count - 1
         sprite[number, 1 : 1 + count] = len(images) + np.arange(count)
-        images += [_sprite_image(name, layer, value, scenery) for value in range(1, count + 1)]
+        images += [_sprite_image(env.name, name, layer, value, scenery) for value in range(1, count + 1)]
     place = np.zeros((max(1, len(images)), heights.max() + 1, widths.max() + 1), np.int64)
     pixels: list[np.ndarray] = []
     used = 0
@@ -130,7 +130,7 @@ def _sprite_tables(
     return sprite, place, table[:, :3], keep
 
 
-def _sprite_image(name: str, layer: Layer, value: int, scenery: Scenery) -> np.ndarray:
+def _sprite_image(class_name: str, name: str, layer: Layer, value: int, scenery: Scenery) -> np.ndarray:
     """(h, w, 4): colour 0 .. 255 times cover, and cover 0 .. 1."""
     from pharos.rendering import SHAPES, _block, _of_value, shade
 
@@ -140,8 +140,9 @@ def _sprite_image(name: str, layer: Layer, value: int, scenery: Scenery) -> np.n
     if rows is not None and not isinstance(rows[0], str):
         rows = _of_value(rows, value, True)
     if rows is None:
-        shape: Any = SHAPES.get(name, _block)
-        image = shape(np.array(color, np.float64), 4 * scenery.cell[0]).copy()
+        shape: Any = SHAPES.get(f"{class_name}.{name}") or SHAPES.get(name, _block)
+        glyph = _of_value(layer.glyph, value, isinstance(layer.glyph, tuple))
+        image = shape(np.array(color, np.float64), 4 * scenery.cell[0], glyph).copy()
     else:
         image = np.zeros((len(rows), max(map(len, rows)), 4))
         for y, row in enumerate(rows):

@@ -1,0 +1,121 @@
+"""Simple and complex images: compiled frames against their interpreted twins, spaces, layers that show, options, errors."""
+
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+import pharos
+from pharos.errors import ParameterError
+from pharos.gym_env import GymEnv
+from pharos.observations import observe
+
+SMALL = {
+    "simple_grid": {"height": 4, "width": 5, "rewards": (((1, 1), 0.1),), "penalties": (((0, 2), -0.5),)},
+    "frozen_lake": {"size": 4},
+    "freeway": {"num_cars": 6, "lane_length": 8, "player_speed": 2},
+    "breakout": {"height": 9, "columns": 6},
+}
+OPTIONS = [
+    ("simple_image", {}),
+    ("simple_image", {"scale": 5}),
+    ("simple_image", {"grey": True}),
+    ("complex_image", {}),
+    ("complex_image", {"size": "natural"}),
+    ("complex_image", {"size": (61, 97), "channels_first": True}),
+    ("complex_image", {"grey": True}),
+]
+
+
+@pytest.fixture(params=SMALL, scope="module")
+def env(request):
+    return pharos.make(request.param, **SMALL[request.param])
+
+
+def random_states(env, number, seed=0):
+    components = env.components
+    rng = np.random.default_rng(seed)
+    return components.low + rng.integers(0, components.size, (number, len(components)))
+
+
+@pytest.mark.parametrize(("name", "options"), OPTIONS)
+def test_compiled_frames_are_the_interpreted_ones(env, name, options):
+    states = random_states(env, 150)
+    compiled, interpreted = observe(env, name, **options), observe(env, name, **options)
+    interpreted._drawing._compiled = interpreted._drawing._interpret
+    found = compiled(states)
+    np.testing.assert_array_equal(found, interpreted(states))
+    np.testing.assert_array_equal(compiled.one(states[9]), found[9])
+    assert found.dtype == compiled.space.dtype == np.uint8
+    assert found.shape == (150, *compiled.space.shape)
+    assert all(compiled.space.contains(frame) for frame in found)
+
+
+def test_a_simple_image_has_a_plane_for_each_layer(env):
+    image = (
+        observe(env, "simple_image", scale=1) if min(env.grid()) >= len(env.layers) else observe(env, "simple_image")
+    )
+    scale = image.space.shape[1] // env.grid()[0]
+    assert image.space.shape == (len(env.layers), *(scale * n for n in env.grid()))
+    for state in random_states(env, 40):
+        planes = np.zeros((len(env.layers), *env.grid()), np.uint8)
+        env.draw(tuple(state.tolist()), planes)
+        np.testing.assert_array_equal(image.one(state)[:, ::scale, ::scale] > 0, planes > 0)
+
+
+def test_channels_come_first_or_last_and_colour_becomes_luminance(env):
+    states = random_states(env, 20)
+    last, first = observe(env, "complex_image"), observe(env, "complex_image", channels_first=True)
+    grey = observe(env, "complex_image", grey=True)
+    assert (last.space.shape, first.space.shape, grey.space.shape) == ((84, 84, 3), (3, 84, 84), (84, 84, 1))
+    np.testing.assert_array_equal(last(states).transpose(0, 3, 1, 2), first(states))
+    luminance = last(states).astype(float) @ [0.299, 0.587, 0.114]
+    assert np.abs(luminance - grey(states)[..., 0]).max() <= 2 * len(env.layers)
+
+
+@pytest.mark.parametrize("name", ["simple_image", "complex_image"])
+def test_different_pictures_for_different_drawings(env, name):
+    states = random_states(env, 60, seed=3)
+    drawings = np.zeros((60, len(env.layers), *env.grid()), np.uint8)
+    for state, planes in zip(states, drawings, strict=True):
+        env.draw(tuple(state.tolist()), planes)
+    frames = observe(env, name, **({"size": "natural"} if name == "complex_image" else {}))(states)
+    visible = [i for i, layer in enumerate(env.layers) if (name, layer) != ("complex_image", "kerb")]
+    covered = drawings[:, visible]
+    for i in range(1, 60):
+        if (frames[i] == frames[0]).all():
+            top = [shown(d) for d in (covered[i], covered[0])]
+            np.testing.assert_array_equal(*top)
+
+
+def shown(planes):
+    """What covers each cell: the number of the uppermost layer and its value."""
+    out = np.zeros(planes.shape[1:], int)
+    for layer, plane in enumerate(planes):
+        out[plane > 0] = 1000 * (layer + 1) + plane[plane > 0].astype(int)
+    return out
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(("name", "options"), OPTIONS[:4])
+def test_the_checkers_of_gymnasium_and_stable_baselines_pass(env, name, options):
+    from stable_baselines3.common.env_checker import check_env as sb3_check
+
+    check_env(GymEnv(env, observation=name, observation_options=options), skip_render_check=True)
+    if name == "complex_image":  # smaller ones are for other networks than NatureCNN, which Stable-Baselines3 warns of
+        sb3_check(GymEnv(env, observation=name, observation_options=options))
+
+
+@pytest.mark.parametrize("observation", ["vector", "one_hot"])
+def test_stable_baselines_accepts_what_is_no_image(env, observation):
+    from stable_baselines3.common.env_checker import check_env as sb3_check
+
+    sb3_check(GymEnv(env, observation=observation))
+
+
+def test_wrong_options_are_refused_in_one_line(env):
+    with pytest.raises(ParameterError, match="scale is 0; expected an integer of at least 1"):
+        observe(env, "simple_image", scale=0)
+    with pytest.raises(ParameterError, match="size is 84; expected 'natural' or"):
+        observe(env, "complex_image", size=84)
+    with pytest.raises(ParameterError, match="leave less than one"):
+        observe(env, "complex_image", size=(2, 2))
