@@ -114,7 +114,7 @@ def draw_complex(parameters, states, first, last, planes, picture, top, left, sp
     """Lay the sprites of states first .. last - 1 on the ground, later layers over earlier ones.
 
     picture (height, width, C) uint8: the ground; top (rows + 1,), left (columns + 1,): edges of the cells in pixels.
-    sprite (L, 256): number of the sprite of a value of a layer, -1 for none; place (sprites, heights, widths): where its pixels
+    sprite (L, rows, 256): number of the sprite of a value of a layer in a row, -1 for none; place (sprites, heights, widths): where its pixels
     for a cell of this height and width begin in color (P, C) uint8, premultiplied, and keep (P,) uint16: how much of the ground
     stays, of 256.
     """
@@ -129,11 +129,11 @@ def draw_complex(parameters, states, first, last, planes, picture, top, left, sp
             for row in range(rows):
                 for column in range(columns):
                     value = planes[layer, row, column]
-                    if value == 0 or sprite[layer, value] < 0:
+                    if value == 0 or sprite[layer, row, value] < 0:
                         continue
                     height = top[row + 1] - top[row]
                     width = left[column + 1] - left[column]
-                    pixel = place[sprite[layer, value], height, width]
+                    pixel = place[sprite[layer, row, value], height, width]
                     for y in range(top[row], top[row + 1]):
                         for x in range(left[column], left[column + 1]):
                             stays = keep[pixel]

@@ -1,5 +1,6 @@
 """Complex images: sprites on a ground, like the screen of an Atari game."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -107,15 +108,22 @@ def _sprite_tables(
     env: Environment, scenery: Scenery, heights: np.ndarray, widths: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """sprite, place, color and keep, as `draw_complex` takes them; color still (P, 3) float64."""
-    sprite = np.full((len(env.layers), 256), -1, np.int64)
+    rows = len(heights)
+    sprite = np.full((len(env.layers), rows, 256), -1, np.int64)
     images: list[np.ndarray] = []
     for number, (name, layer) in enumerate(env.layers.items()):
         if name in scenery.sprites and scenery.sprites[name] is None:
             continue
         count = num_values(layer)
-        sprite[number, 1:] = len(images) + count - 1
-        sprite[number, 1 : 1 + count] = len(images) + np.arange(count)
-        images += [_sprite_image(env.name, name, layer, value, scenery) for value in range(1, count + 1)]
+        by_row = scenery.row_colors.get(name)
+        looks = [layer] if by_row is None else [replace(layer, color=color) for color in by_row]
+        for row in range(rows):
+            first = len(images) + count * (row % len(looks))
+            sprite[number, row, 1:] = first + count - 1
+            sprite[number, row, 1 : 1 + count] = first + np.arange(count)
+        images += [
+            _sprite_image(env.name, name, look, value, scenery) for look in looks for value in range(1, count + 1)
+        ]
     place = np.zeros((max(1, len(images)), heights.max() + 1, widths.max() + 1), np.int64)
     pixels: list[np.ndarray] = []
     used = 0
@@ -158,7 +166,7 @@ def _compose(planes, picture, top, left, sprite, place, color, keep, out) -> Non
     out[:] = picture
     for layer, plane in enumerate(planes):
         for row, column in np.argwhere(plane):
-            number = sprite[layer, plane[row, column]]
+            number = sprite[layer, row, plane[row, column]]
             if number < 0:
                 continue
             height, width = top[row + 1] - top[row], left[column + 1] - left[column]

@@ -24,12 +24,14 @@ class Scenery:
         margin: (top, right, bottom, left) around the cells.
         ground: function(picture (H, W, 3) float64, cell, margin) that paints what lies below all layers.
         sprites: name of a layer -> sprite in place of its own (see Layer.sprite), or None: the layer is not drawn.
+        row_colors: name of a layer -> colours of rows 0, 1, ... of the grid, again from the first after the last.
     """
 
     cell: tuple[int, int]
     margin: tuple[int, int, int, int]
     ground: Callable[[np.ndarray, "Scenery"], None]
     sprites: Mapping[str, Sprite] = field(default_factory=dict)
+    row_colors: Mapping[str, tuple[tuple[int, int, int], ...]] = field(default_factory=dict)
 
 
 def scenery_of(env: Environment) -> Scenery:
@@ -113,6 +115,14 @@ def _freeway(env: Environment) -> Scenery:
 # Breakout ----------------------------------------------------------------------------------------------------------------
 
 WALL = (142, 142, 142)
+ROWS = (
+    (66, 72, 200),
+    (200, 72, 72),
+    (198, 108, 58),
+    (180, 122, 48),
+    (162, 162, 42),
+    (72, 160, 72),
+)  # bricks begin in row 1
 BRICK = ("#" * 16,) * 11 + ("." * 16,)
 PADDLE = ("." * 16,) * 2 + ("#" * 16,) * 5 + ("." * 16,) * 5
 BALL = ("." * 16,) * 3 + ("." * 6 + "#" * 4 + "." * 6,) * 6 + ("." * 16,) * 3
@@ -130,6 +140,7 @@ def _breakout(env: Environment) -> Scenery:
         margin=(16, 8, 4, 8),
         ground=ground,
         sprites={"bricks": BRICK, "paddle": PADDLE, "ball": BALL},
+        row_colors={"bricks": ROWS},
     )
 
 
