@@ -154,6 +154,8 @@ def test_build_answers_with_the_keys_of_its_contract(answer, tmp_path):
     assert built["parameters"]["width"] == 5
     assert built["folder"] == str(tmp_path / "grid")
     assert built["bytes_on_disk"] == sum(file.stat().st_size for file in (tmp_path / "grid").iterdir())
+    again = answer("build", "simple_grid", "height=3", "width=5", "--out", tmp_path / "grid")
+    assert (built["found"], again["found"]) == (False, True)
 
 
 def test_a_built_folder_is_a_target(answer, tmp_path):

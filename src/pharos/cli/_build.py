@@ -35,9 +35,11 @@ def build(
 ) -> None:
     """Enumerate every state that can be reached, and its transitions, onto disk. The same command resumes."""
     from pharos import state_space
+    from pharos.state_space._build import cached_folder
 
     env = parse_environment(environment, parameters)
     limit = parse_size(memory)
+    found = _is_there(out or cached_folder(env))
     began = time.perf_counter()
     space = state_space.build(env, out, memory=limit, workers=workers, max_states=max_states)
     seconds = time.perf_counter() - began
@@ -54,6 +56,7 @@ def build(
         "peak_memory_bytes": peak,
         "bytes_on_disk": bytes_on_disk,
         "folder": str(space.folder),
+        "found": found,
     }
     if json:
         print_json(answer)
@@ -64,9 +67,17 @@ def build(
             ("states", f"{space.num_states:,} ({space.num_terminal_states:,} terminal)"),
             ("actions", f"{space.num_actions} ({', '.join(env.actions)})"),
             ("depth", f"{space.depth:,}"),
-            ("seconds", f"{seconds:.2f} ({rate:,.0f} states/s)"),
+            ("seconds", f"{seconds:.2f} (it was there already)" if found else f"{seconds:.2f} ({rate:,.0f} states/s)"),
             ("peak memory", size_text(peak)),
             ("on disk", size_text(bytes_on_disk)),
             ("folder", space.folder),
         ],
     )
+
+
+def _is_there(folder: Path) -> bool:
+    """Whether the finished state space lies there already."""
+    from pharos.state_space._store import read_manifest
+
+    manifest = read_manifest(folder)
+    return manifest is not None and bool(manifest["complete"])
