@@ -109,17 +109,10 @@ _COUNTERS = ("num_timesteps", "_n_updates", "_n_calls", "_episode_num")
 
 
 def vector_environment(task: Task, num_envs: int, seed: int) -> Any:
-    """The environment of a task for Stable-Baselines3."""
-    from stable_baselines3.common.vec_env import DummyVecEnv
+    """The environment of a task for Stable-Baselines3, all copies advanced by one compiled call."""
+    from pharos.sb3_env import make_sb3_vec
 
-    from pharos.gym_env import GymEnv
-
-    def make_one() -> Any:
-        return GymEnv(task.env, **task.interaction)
-
-    env = DummyVecEnv([make_one] * num_envs)
-    env.seed(seed)
-    return env
+    return make_sb3_vec(task.env, num_envs, seed=seed, **task.interaction)
 
 
 def _buffer_arrays(buffer: Any) -> dict[str, np.ndarray]:

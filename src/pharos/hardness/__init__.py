@@ -5,6 +5,7 @@ Visitation complexity: `diameter`, `start_eccentricity`, `covering`. Estimation 
 """
 
 from pharos.hardness import _built_in  # noqa: F401  (registers the measures; the order of a report)
+from pharos.hardness._colosseum import colosseum_diameter
 from pharos.hardness._covering import Covering, covering
 from pharos.hardness._diameter import diameter, start_eccentricity
 from pharos.hardness._effective_horizon import EffectiveHorizon, effective_horizon
@@ -25,6 +26,7 @@ __all__ = [
     "Progress",
     "Report",
     "Result",
+    "colosseum_diameter",
     "covering",
     "diameter",
     "effective_horizon",

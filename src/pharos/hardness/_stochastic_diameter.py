@@ -398,6 +398,11 @@ def stochastic_start_eccentricity(
         _, high, _ = targets.sweep(j, count, SWEEPS, 0.0)
         if float(weights @ j[nodes]) * high <= best:
             continue
-        _, high, _ = targets.solve(j, count, tolerance, 0.0, spending)
+        low, high, _ = targets.solve(j, count, tolerance, 0.0, spending)
+        if not _met(low, high, tolerance):
+            raise UndefinedMeasure(
+                f"start_eccentricity: the budget ended within a target, at {float(weights @ j[nodes]) * low:.6g} or more; "
+                f"a larger budget would define it"
+            )
         best = max(best, float(weights @ j[nodes]) * high)
     return best
