@@ -309,15 +309,15 @@ def stochastic_diameter(mdp: TabularMDP, restart: bool, tolerance: float, spendi
     targets = _Targets(choices)
     number = choices.num_targets
     lower = finite = 0.0
-    highest, unreachable, settled = 0.0, 0, 0
-    order = _by_promise(targets, spending)
-    for target in order:
+    highest = 0.0
+    met = np.diff(targets.edges) > 0
+    settled = int(np.count_nonzero(~met))  # states that cannot be reached at all
+    unreachable = settled * (number - 1)
+    for target in _by_promise(targets, spending):
+        if not met[target]:
+            continue
         if spending.is_over:
             break
-        if not targets.nodes_of(target).size:  # cannot be reached at all
-            unreachable += number - 1
-            settled += 1
-            continue
         j, count, lost = targets.open(target)
         if lost is not None and lost.any():
             unreachable += np.unique(choices.underlying[lost]).size
