@@ -1,0 +1,98 @@
+"""Makes docs/gallery.md and its pictures: every class, several instances, what people and agents see, and an optimal policy at play.
+
+python scripts/gallery.py
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+import pharos
+from pharos import rendering
+
+DOCS = Path(__file__).parents[1] / "docs"
+FOLDER = DOCS / "gallery"
+INSTANCES = {
+    "simple_grid": (("simple_grid/6x6-decoy", 0), ("simple_grid/8x8-plain", 5)),
+    "frozen_lake": (("frozen_lake/4x4", 2), ("frozen_lake/8x8", 6)),
+    "freeway": (("freeway/16x7-speed1", 12), ("freeway/20x11-speed1", 12)),
+    "breakout": (("breakout/12x8x1", 60), ("breakout/16x8x3", 60)),
+}
+PLAYED = {
+    "simple_grid": "simple_grid/6x6-decoy",
+    "frozen_lake": "frozen_lake/8x8",
+    "freeway": "freeway/16x7-speed1",
+    "breakout": "breakout/12x8x3",
+}
+FRAMES = 90
+
+
+def optimal(name):
+    """(environment, policy): of the discounted problem, so that it does not loiter."""
+    env = pharos.make(name)
+    space = pharos.build(env)
+    policy = pharos.value_iteration(space.mdp(gamma=0.99)).policy
+    return env, lambda state: int(policy[space.index(state)])
+
+
+def enlarged(picture, height):
+    """A small picture enlarged by a whole factor to about `height` pixels."""
+    factor = max(1, round(height / len(picture)))
+    return picture.repeat(factor, axis=0).repeat(factor, axis=1)
+
+
+def beside(pictures, gap=12, height=260):
+    """Pictures beside each other on white, tops aligned."""
+    pictures = [enlarged(picture, height) for picture in pictures]
+    rows = max(map(len, pictures))
+    parts = []
+    for picture in pictures:
+        framed = np.full((rows, picture.shape[1] + gap, 3), 255, np.uint8)
+        framed[: len(picture), : picture.shape[1]] = picture
+        parts.append(framed)
+    return np.concatenate(parts, axis=1)[:, :-gap]
+
+
+def shown(env, state):
+    """Human drawing, complex image at its natural size and at 84 x 84, simple image."""
+    return beside(
+        [
+            rendering.render(env, state),
+            rendering.render(env, state, "complex_image", size="natural"),
+            rendering.render(env, state, "complex_image"),
+            rendering.render(env, state, "simple_image"),
+        ]
+    )
+
+
+def main() -> None:
+    """Write everything anew."""
+    FOLDER.mkdir(exist_ok=True)
+    lines = [
+        "# Gallery",
+        "",
+        "Made by `python scripts/gallery.py`. In each row, from the left: the drawing for people, the complex image at its natural size",
+        "and at 84 x 84 pixels, and the planes of the simple image.",
+        "",
+    ]
+    for cls, instances in INSTANCES.items():
+        lines += [f"## {cls}", "", " ".join(pharos.make(cls).__doc__.split("\n")[0].split()), ""]
+        for name, steps in instances:
+            env, policy = optimal(name)
+            state = rendering.episode(env, policy, env.initial_states()[0][0], steps=steps)[-1][0]
+            file = FOLDER / f"{name.replace('/', '-')}.png"
+            rendering.save_png(file, shown(env, state))
+            space = pharos.build(env)
+            lines += [f"`{name}`, {space.num_states:,} states, after {steps} steps of the optimal policy:", ""]
+            lines += [f"![{name}](gallery/{file.name})", ""]
+        env, policy = optimal(PLAYED[cls])
+        played = rendering.episode(env, policy, env.initial_states()[0][0], steps=FRAMES)
+        pictures = [rendering.render(env, state, "complex_image", size="natural") for state, _, _ in played]
+        file = FOLDER / f"{PLAYED[cls].replace('/', '-')}.gif"
+        rendering.save_gif(file, pictures, frames_per_second=12, at_least=160)
+        lines += [f"The optimal policy of `{PLAYED[cls]}`:", "", f"![{PLAYED[cls]}](gallery/{file.name})", ""]
+    (DOCS / "gallery.md").write_text("\n".join(lines))
+
+
+if __name__ == "__main__":
+    main()
