@@ -40,6 +40,7 @@ _HOMES = {
 }
 _PACKAGES = (
     "agents",
+    "bisimulation",
     "environments",
     "errors",
     "experiments",

@@ -1,0 +1,111 @@
+"""Bisimulation: the coarsest partition by brute force, values that are kept, published minimal MDPs."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import pharos
+from pharos import importers
+from pharos.bisimulation import minimize
+from pharos.errors import ParameterError
+from pharos.mdp import TabularMDP, random_actions, sticky_actions
+from strategies import deterministic_mdps, general_mdps, probabilities
+
+BRIDGE = Path(__file__).parent / "data" / "bridge"
+
+
+def bisimilar(mdp):
+    """(S + 1, S + 1) bool by a greatest fixed point over all pairs; the last state is the implicit end."""
+    size, end = mdp.num_states + 1, mdp.num_states
+    table = np.vstack([np.where(mdp.next_states < 0, end, mdp.next_states), np.full((1, mdp.num_actions), end)])
+    rewards = np.vstack([mdp.rewards, np.full((1, mdp.num_actions), np.inf)])
+    same = (rewards[:, None] == rewards[None]).all(axis=2)
+    over = np.append(mdp.terminal, True)
+    same &= over[:, None] == over[None]
+    while True:
+        new = same.copy()
+        for s in range(size):
+            for t in range(size):
+                new[s, t] &= all(same[table[s, a], table[t, a]] for a in range(mdp.num_actions))
+        if (new == same).all():
+            return same
+        same = new
+
+
+@settings(max_examples=150, deadline=None)
+@given(deterministic_mdps(max_states=7, max_actions=2))
+def test_classes_are_those_of_the_greatest_bisimulation(mdp):
+    classes = minimize(mdp).classes
+    assert ((classes[:, None] == classes[None]) == bisimilar(mdp)[:-1, :-1]).all()
+
+
+@settings(max_examples=80, deadline=None)
+@given(deterministic_mdps(max_states=7, max_actions=2), probabilities, probabilities)
+def test_values_are_kept_under_every_chance(mdp, sticky, random):
+    mdp = random_actions(sticky_actions(mdp, sticky), random)
+    found = minimize(mdp)
+    whole, merged = (pharos.value_iteration(each, 1e-9) for each in (mdp, found.mdp))
+    np.testing.assert_allclose(merged.v[found.classes], whole.v, atol=1e-6)
+    assert merged.value_at_start == pytest.approx(whole.value_at_start, abs=1e-6)
+    assert found.mdp.chance == mdp.chance
+
+
+@settings(max_examples=50, deadline=None)
+@given(deterministic_mdps(max_states=7, max_actions=2))
+def test_a_minimal_mdp_stays_as_it_is(mdp):
+    smaller = minimize(mdp)
+    assert minimize(smaller.mdp).num_classes == smaller.num_classes
+    assert (np.diff(smaller.representatives) > 0).all()
+
+
+@settings(max_examples=50, deadline=None)
+@given(deterministic_mdps(max_states=6, max_actions=2), st.data())
+def test_states_that_look_different_stay_apart(mdp, data):
+    looks = np.array(data.draw(st.lists(st.integers(0, 2), min_size=mdp.num_states, max_size=mdp.num_states)))
+    found = minimize(mdp, looks)
+    for each in range(found.num_classes):
+        assert len(set(looks[found.classes == each])) == 1
+    assert found.num_classes >= minimize(mdp).num_classes
+    assert minimize(mdp, np.arange(mdp.num_states)).num_classes == mdp.num_states
+
+
+def test_copies_of_a_state_are_merged():
+    """A corridor in which every cell is there twice."""
+    length = 6
+    cells = np.arange(length)
+    onwards = np.append(cells[1:], -1)
+    table = np.concatenate([np.stack([onwards, cells], axis=1), np.stack([onwards, cells], axis=1)])
+    rewards = np.zeros((2 * length, 2))
+    rewards[[length - 1, 2 * length - 1], 0] = 1
+    found = minimize(TabularMDP.from_arrays(table, rewards))
+    assert found.num_classes == length
+    assert (found.classes == np.tile(cells, 2)).all()
+
+
+@pytest.mark.parametrize("name", ["key-corridor-s3r1", "empty-16x16-distance-shaped"])
+def test_what_bridge_has_consolidated_is_minimal_or_tells_screens_apart(name):
+    mdp = importers.bridge(BRIDGE / f"{name}.npz", horizon=100)
+    found = minimize(mdp)
+    one, other = (pharos.value_iteration(each).value_at_start for each in (mdp, found.mdp))
+    assert one == pytest.approx(other, abs=1e-12)
+    try:
+        screens = importers.bridge_screens(BRIDGE / f"{name}.npz")
+    except pharos.errors.FileFormatError:
+        return
+    assert minimize(mdp, screens).num_classes >= found.num_classes
+
+
+@given(general_mdps())
+@settings(max_examples=5, deadline=None)
+def test_general_mdps_are_refused(mdp):
+    with pytest.raises(ParameterError, match="no table of next states"):
+        minimize(mdp)
+
+
+def test_observations_must_be_one_a_state():
+    mdp = pharos.build(pharos.make("frozen_lake/4x4")).mdp()
+    with pytest.raises(ParameterError, match="one for each state"):
+        minimize(mdp, np.zeros(3))
