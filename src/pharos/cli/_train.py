@@ -1,6 +1,7 @@
 """pharos train: an agent learns, and its policy's exact regret is measured as it does."""
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,12 +13,12 @@ from pharos.cli.common import (
     Random,
     Sticky,
     TargetArgument,
-    console,
     describe_chance,
     parse_environment,
     parse_parameters,
     print_facts,
     print_json,
+    progress_bar,
 )
 
 
@@ -78,7 +79,7 @@ def train(
         seen = "index" if agent == "q_learning" else observation
         given = hyperparameters_of(agent, env.name, seen, given, table=table)
 
-    with _bar(steps) as tell:
+    with progress_bar("training", steps) as show:
         result = learn(
             agent,
             env,
@@ -94,7 +95,7 @@ def train(
             hyperparameters=given,
             out=out,
             tensorboard=tensorboard,
-            progress=tell,
+            progress=_telling(show),
         )
     picture = _plot(out)
     found = result.result
@@ -139,29 +140,12 @@ def _plot(out: Path | None) -> Path | None:
         return None
 
 
-class _bar:
-    """A progress bar on a terminal, with the value of the policy; nothing elsewhere."""
+def _telling(show: Callable[[int, str], None] | None) -> Callable[[int, int, Any], None] | None:
+    """What `train` calls after each evaluation: the value of the policy, beside the bar."""
+    if show is None:
+        return None
 
-    def __init__(self, steps: int):
-        self.steps = steps
+    def tell(done: int, _steps: int, row: Any) -> None:
+        show(done, f"value {row['value']:.4g}, regret {row['expected_regret']:.4g}, {row['episodes']:,} episodes")
 
-    def __enter__(self) -> Any:
-        screen = console(stderr=True)
-        if not screen.is_terminal:
-            return None
-        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-        columns = (BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[text]}"), TimeRemainingColumn())
-        self.progress = Progress(*columns, console=screen, transient=True)
-        self.progress.start()
-        task = self.progress.add_task("training", total=self.steps, text="")
-
-        def tell(done: int, steps: int, row: Any) -> None:
-            text = f"value {row['value']:.4g}, regret {row['expected_regret']:.4g}, {row['episodes']:,} episodes"
-            self.progress.update(task, completed=done, text=text)
-
-        return tell
-
-    def __exit__(self, *_: Any) -> None:
-        if hasattr(self, "progress"):
-            self.progress.stop()
+    return tell

@@ -1,11 +1,21 @@
 """pharos tune: a search for hyperparameters."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from pharos.cli.common import Json, Random, Sticky, console, parse_environment, parse_value, print_facts, print_json
+from pharos.cli.common import (
+    Json,
+    Random,
+    Sticky,
+    parse_environment,
+    parse_value,
+    print_facts,
+    print_json,
+    progress_bar,
+)
 from pharos.errors import ParameterError
 
 
@@ -42,7 +52,7 @@ def tune(
     instances = [parse_environment(target) for target in targets]
     from pharos.experiments import tune as find
 
-    with _bar(trials) as tell:
+    with progress_bar("tuning", trials) as show:
         result = find(
             agent,
             instances,
@@ -55,7 +65,7 @@ def tune(
             space=_space(search),
             search_seed=search_seed,
             out=out,
-            progress=tell,
+            progress=_telling(show),
         )
     if json:
         print_json(
@@ -106,28 +116,6 @@ def _space(words: list[str] | None) -> dict[str, tuple[Any, ...]] | None:
     return space
 
 
-class _bar:
-    """A progress bar on a terminal, with the best score so far; nothing elsewhere."""
-
-    def __init__(self, trials: int):
-        self.trials = trials
-
-    def __enter__(self) -> Any:
-        screen = console(stderr=True)
-        if not screen.is_terminal:
-            return None
-        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-        columns = (BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[text]}"), TimeRemainingColumn())
-        self.progress = Progress(*columns, console=screen, transient=True)
-        self.progress.start()
-        task = self.progress.add_task("tuning", total=self.trials, text="")
-
-        def tell(done: int, _trials: int, best: float) -> None:
-            self.progress.update(task, completed=done, text=f"best {best:.4g}")
-
-        return tell
-
-    def __exit__(self, *_: Any) -> None:
-        if hasattr(self, "progress"):
-            self.progress.stop()
+def _telling(show: Callable[[int, str], None] | None) -> Callable[[int, int, float], None] | None:
+    """What `tune` calls after each trial: the best score so far, beside the bar."""
+    return None if show is None else lambda done, _trials, best: show(done, f"best {best:.4g}")

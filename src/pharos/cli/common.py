@@ -278,6 +278,21 @@ def progress_line(what: str) -> Iterator[Callable[[str], None]]:
         yield lambda text: bar.update(task, text=text)
 
 
+@contextlib.contextmanager
+def progress_bar(what: str, total: int) -> Iterator[Callable[[int, str], None] | None]:
+    """A bar on standard error, on a terminal: call it with how much is done and a text. None elsewhere."""
+    screen = console(stderr=True)
+    if not screen.is_terminal:
+        yield None
+        return
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[text]}"), TimeRemainingColumn())
+    with Progress(*columns, console=screen, transient=True) as bar:
+        task = bar.add_task(what, total=total, text="")
+        yield lambda done, text: bar.update(task, completed=done, text=text)
+
+
 def print_facts(title: str, facts: Sequence[tuple[str, object]]) -> None:
     """A table of two columns: what, and how much."""
     from rich.markup import escape
