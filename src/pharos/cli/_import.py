@@ -1,11 +1,14 @@
 """pharos import: MDPs from elsewhere, as folders that every command takes."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from pharos.cli.common import Json, print_facts, print_json
+
+if TYPE_CHECKING:
+    from pharos.mdp import TabularMDP
 
 app = typer.Typer(help="Bring an MDP from elsewhere into a folder.", no_args_is_help=True)
 
@@ -24,27 +27,37 @@ def bridge(
 
     mdp = importers.bridge(file, horizon)
     importers.save(mdp, out, source=f"BRIDGE: {file.name}")
-    answer = {
-        "num_states": mdp.num_states,
-        "num_actions": mdp.num_actions,
-        "num_terminal_states": int(mdp.terminal.sum()),
-        "horizon": mdp.horizon,
-        "gamma": mdp.gamma,
-        "folder": out,
-    }
+    _tell(file.name, mdp, out, json)
+
+
+@app.command("minigrid")
+def minigrid(
+    name: Annotated[str, typer.Argument(help="Such as MiniGrid-KeyCorridorS3R1-v0.")],
+    out: Annotated[Path, typer.Option("--out", help="Folder for the MDP.")],
+    seed: Annotated[int, typer.Option("--seed", help="Of the layout.")] = 0,
+    horizon: Annotated[int, typer.Option("--horizon", min=1, help="Steps of an episode.")] = 100,
+    json: Json = False,
+) -> None:
+    """Enumerate an environment of MiniGrid, by playing it from every state."""
+    from pharos import importers
+
+    mdp = importers.minigrid(name, seed=seed, horizon=horizon)
+    importers.save(mdp, out, source=f"{name}, seed {seed}")
+    _tell(name, mdp, out, json)
+
+
+def _tell(name: str, mdp: "TabularMDP", out: Path, json: bool) -> None:
     if json:
-        print_json(answer)
+        print_json(
+            {
+                "num_states": mdp.num_states,
+                "num_actions": mdp.num_actions,
+                "num_terminal_states": int(mdp.terminal.sum()),
+                "horizon": mdp.horizon,
+                "gamma": mdp.gamma,
+                "folder": out,
+            }
+        )
         return
-    print_facts(
-        file.name,
-        [
-            ("states", f"{mdp.num_states:,} x {mdp.num_actions} actions"),
-            ("horizon", mdp.horizon),
-            ("folder", out),
-        ],
-    )
-
-
-@app.callback()
-def _several() -> None:
-    """Keep `bridge` a word of its own, as more will follow."""
+    size = f"{mdp.num_states:,} x {mdp.num_actions} actions"
+    print_facts(name, [("states", size), ("horizon", mdp.horizon), ("folder", out)])

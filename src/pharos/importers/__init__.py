@@ -1,4 +1,4 @@
-"""MDPs from elsewhere: BRIDGE's files, any `P` table of Gymnasium, transition matrices; and folders that keep them.
+"""MDPs from elsewhere: BRIDGE's files, any `P` table of Gymnasium, transition matrices, MiniGrid; and folders that keep them.
 
 Nothing here unpickles: files hold plain arrays and JSON, or are refused.
 """
@@ -6,5 +6,6 @@ Nothing here unpickles: files hold plain arrays and JSON, or are refused.
 from pharos.importers._bridge import bridge, bridge_screens
 from pharos.importers._folder import load, save
 from pharos.importers._gymnasium import gymnasium, matrices
+from pharos.importers._minigrid import minigrid, minigrid_grids
 
-__all__ = ["bridge", "bridge_screens", "gymnasium", "load", "matrices", "save"]
+__all__ = ["bridge", "bridge_screens", "gymnasium", "load", "matrices", "minigrid", "minigrid_grids", "save"]
