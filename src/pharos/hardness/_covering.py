@@ -5,9 +5,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from scipy import sparse
 
 from pharos.errors import ParameterError, UndefinedMeasure
+from pharos.hardness._occupancy import Walk
 from pharos.mdp import TabularMDP
 
 
@@ -54,7 +54,8 @@ def covering(mdp: TabularMDP, *, horizon: int | None = None) -> Covering:
         horizon: T; None: that of the MDP.
     Raises:
         UndefinedMeasure: there is no horizon.
-    Cost: T products of a sparse matrix and a vector.
+    Cost: O(S A) for each of the T steps, and O(S) memory, under sticky actions O(S A). 200 steps on the 2.4 million
+        states of `breakout/12x8x1` take 1.4 s.
     Source: Laidlaw, Russell and Dragan (2023), section 3 and appendix; the bound: Even-Dar and Mansour (2003).
     """
     steps = mdp.horizon if horizon is None else horizon
@@ -62,34 +63,26 @@ def covering(mdp: TabularMDP, *, horizon: int | None = None) -> Covering:
         raise UndefinedMeasure("covering is defined for episodes of T steps: give a horizon")
     if isinstance(steps, bool) or not isinstance(steps, int | np.integer) or steps < 1:
         raise ParameterError(f"horizon is {steps!r}; expected a whole number of steps, at least 1")
-    largest, total, counted = _occupied(mdp, int(steps))
-    met = counted & (total > 0)
-    states = int(met.sum())
+    largest, total = _occupied(mdp, int(steps))
+    states = len(total)
     if not states:
         raise UndefinedMeasure("covering: every start state is terminal, so that nothing is played")
-    omega_max = float(largest[met].min()) / mdp.num_actions
-    omega_sum = float(total[met].min()) / mdp.num_actions
+    omega_max = float(largest.min()) / mdp.num_actions
+    omega_sum = float(total.min()) / mdp.num_actions
     length = math.log(2 * states * mdp.num_actions) / omega_max
     return Covering(omega_max, omega_sum, length, states, {"horizon": int(steps), "exploration": "uniform"})
 
 
-def _occupied(mdp: TabularMDP, steps: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(max over t, sum over t) of the probability of each node under uniform play; and which nodes are states that play goes on in."""
-    from pharos.hardness._stochastic_diameter import choices_of
-
-    choices = choices_of(mdp, restart=False)
-    size, actions = len(choices.underlying), mdp.num_actions
-    merge = sparse.csr_matrix(
-        (np.full(size * actions, 1 / actions), (np.repeat(np.arange(size), actions), np.arange(size * actions)))
-    )
-    onwards = sparse.csr_matrix((merge @ choices.matrix).T)
-    now = np.zeros(size)
-    for node, p in choices.starts:
-        now[node] += p
-    largest, total = now.copy(), now.copy()
-    for _ in range(steps - 1):
-        now = onwards @ now
-        np.maximum(largest, now, out=largest)
-        total += now
-    ended = np.append(np.asarray(mdp.terminal), True)[np.minimum(choices.underlying, mdp.num_states)]
-    return largest, total, ~ended
+def _occupied(mdp: TabularMDP, steps: int) -> tuple[np.ndarray, np.ndarray]:
+    """(max over t, sum over t) of the probability of each node that is met under uniform play and not terminal, one entry a node."""
+    walk = Walk(mdp, None, steps)
+    largest, total = np.zeros((mdp.num_states, walk.width)), np.zeros((mdp.num_states, walk.width))
+    alone = np.zeros((0, 1))  # under sticky actions a start has no previous action: nodes of their own
+    for now, _ in walk.distributions():
+        if now.first and mdp.is_sticky:
+            alone = now.mass[walk.live]
+            continue
+        np.maximum(largest, now.mass, out=largest)
+        total += now.mass
+    most, often = (np.append(each[walk.live], alone) for each in (largest, total))
+    return most[often > 0], often[often > 0]

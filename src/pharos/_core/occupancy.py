@@ -1,0 +1,66 @@
+"""Distributions of states, pushed one step forward over a table of next states.
+
+next_states (S, A), -1 where the episode ends; live (S,) bool: states that play goes on in; now, after (S, W) float64: the
+distribution over states, W = 1, or over pairs (state, previously executed action), W = A, where `previous` > 0; policy (S, B, A)
+probabilities, B = 1 or, for policies that look at the previous action, A; weights: (chosen, previous, uniform).
+"""
+
+from numba import njit
+
+
+@njit(forceinline=True)
+def _executed(policy, weights, now, s, a, mass):
+    """Probability of being in s and executing a."""
+    chosen, previous, uniform = weights
+    if policy.shape[1] == 1:
+        p = mass * policy[s, 0, a]
+    else:
+        p = 0.0
+        for b in range(now.shape[1]):
+            p += now[s, b] * policy[s, b, a]
+    p = chosen * p + uniform * mass / policy.shape[2]
+    if previous > 0.0:
+        p += previous * now[s, a]
+    return p
+
+
+@njit(cache=True, nogil=True)
+def push(next_states, live, policy, weights, now, after):
+    """after = the distribution one step later, without what has ended. Returns what goes on: the sum over live states."""
+    after[:] = 0.0
+    sticky = weights[1] > 0.0
+    for s in range(len(next_states)):
+        if not live[s]:
+            continue
+        mass = 0.0
+        for b in range(now.shape[1]):
+            mass += now[s, b]
+        if mass == 0.0:
+            continue
+        for a in range(next_states.shape[1]):
+            t = next_states[s, a]
+            if t >= 0:
+                after[t, a if sticky else 0] += _executed(policy, weights, now, s, a, mass)
+    total = 0.0
+    for s in range(len(next_states)):
+        if live[s]:
+            for b in range(after.shape[1]):
+                total += after[s, b]
+    return total
+
+
+@njit(cache=True, nogil=True)
+def record(live, policy, weights, now, scale, total, largest):
+    """total[s, a] += scale p, largest[s, a] = max(largest[s, a], p), p the probability of s and a by `weights`."""
+    for s in range(len(total)):
+        if not live[s]:
+            continue
+        mass = 0.0
+        for b in range(now.shape[1]):
+            mass += now[s, b]
+        if mass == 0.0:
+            continue
+        for a in range(total.shape[1]):
+            p = _executed(policy, weights, now, s, a, mass)
+            total[s, a] += scale * p
+            largest[s, a] = max(largest[s, a], p)
