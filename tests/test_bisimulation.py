@@ -98,11 +98,61 @@ def test_what_bridge_has_consolidated_is_minimal_or_tells_screens_apart(name):
     assert minimize(mdp, screens).num_classes >= found.num_classes
 
 
+def bisimilar_general(mdp):
+    """(S, S) bool by a greatest fixed point: the probabilities of reaching each class of the relation are equal."""
+    matrix = mdp.transitions.toarray().reshape(mdp.num_states, mdp.num_actions, mdp.num_states)
+    same = (mdp.rewards[:, None] == mdp.rewards[None]).all(axis=2)
+    same &= mdp.terminal[:, None] == mdp.terminal[None]
+    while True:
+        groups = np.unique(same, axis=0).astype(float)  # rows of an equivalence are its classes
+        reached = np.einsum("sat,ct->sac", matrix, groups)
+        new = same & (np.abs(reached[:, None] - reached[None]) < 1e-9).all(axis=(2, 3))
+        if (new == same).all():
+            return same
+        same = new
+
+
+@settings(max_examples=100, deadline=None)
 @given(general_mdps())
-@settings(max_examples=5, deadline=None)
-def test_general_mdps_are_refused(mdp):
-    with pytest.raises(ParameterError, match="no table of next states"):
-        minimize(mdp)
+def test_classes_of_general_mdps_are_those_of_the_greatest_bisimulation(mdp):
+    classes = minimize(mdp).classes
+    assert ((classes[:, None] == classes[None]) == bisimilar_general(mdp)).all()
+
+
+@settings(max_examples=80, deadline=None)
+@given(general_mdps(), probabilities, probabilities, st.data())
+def test_values_of_general_mdps_are_kept_when_states_are_doubled(mdp, sticky, random, data):
+    """Each state twice, and each transition spread over both copies."""
+    size, actions = mdp.num_states, mdp.num_actions
+    share = data.draw(st.sampled_from([0.0, 0.3, 0.5]))
+    plain = mdp.transitions.toarray().reshape(size, actions, size)
+    doubled = np.tile(np.concatenate([share * plain, (1 - share) * plain], axis=2), (2, 1, 1))
+    twice = TabularMDP.from_matrices(doubled, np.tile(mdp.rewards, (2, 1)), gamma=mdp.gamma)
+    one, other = (random_actions(sticky_actions(each, sticky), random) for each in (mdp, twice))
+    found = minimize(other)
+    assert found.num_classes == minimize(one).num_classes
+    whole, merged = (pharos.value_iteration(each, 1e-9) for each in (other, found.mdp))
+    np.testing.assert_allclose(merged.v[found.classes], whole.v, atol=1e-6)
+    assert merged.value_at_start == pytest.approx(whole.value_at_start, abs=1e-6)
+
+
+def rounds_of_all(mdp):
+    """Refinement in which every state is asked in every round."""
+    classes = np.unique(np.column_stack([mdp.terminal, mdp.rewards + 0.0]), axis=0, return_inverse=True)[1].ravel()
+    while True:
+        following = np.where(mdp.next_states >= 0, classes[mdp.next_states], -1)
+        new = np.unique(np.column_stack([classes, following]), axis=0, return_inverse=True)[1].ravel()
+        if new.max() == classes.max():
+            return new
+        classes = new
+
+
+@pytest.mark.parametrize("name", ["freeway/20x5-speed1", "frozen_lake/8x8", "simple_grid"])
+def test_classes_of_games_are_those_of_refinement_in_full(name):
+    mdp = pharos.build(pharos.make(name)).mdp()
+    found, expected = minimize(mdp).classes, rounds_of_all(mdp)
+    pairs = np.unique(np.column_stack([found, expected]), axis=0)
+    assert len(pairs) == found.max() + 1 == expected.max() + 1
 
 
 def test_observations_must_be_one_a_state():
