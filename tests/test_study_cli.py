@@ -1,6 +1,7 @@
 """pharos study from the command line: what it prints, what it leaves, and its exit codes."""
 
 import json
+import os
 import subprocess
 import sys
 
@@ -19,7 +20,9 @@ blocks:
 
 def pharos(*arguments, cwd):
     command = [sys.executable, "-m", "pharos", "study", *arguments]
-    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=300)
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(cwd / "numba")}  # nothing is compiled yet, as after an installation
+    environment.pop("NUMBA_NUM_THREADS", None)
+    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=300, env=environment)
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,9 @@ import importlib
 import os
 import warnings
 
-for _name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
+from pharos.study._worker import THREAD_VARIABLES
+
+for _name in THREAD_VARIABLES:
     os.environ.setdefault(_name, "1")
 
 

@@ -27,6 +27,7 @@ from pharos.state_space._files import lock
 FINISHED, FAILED, BUSY = "finished", "failed", "busy"
 EXIT_BUSY = 75
 PARENT_GONE = 76
+THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
 
 Runner = Callable[[Mapping[str, Any], Path], Any]
 
@@ -178,8 +179,9 @@ def main(
 
     `environment` holds the variables of that process now, which may not be those of when workers began to be forked.
     """
+    threads = {name: os.environ[name] for name in THREAD_VARIABLES if name in os.environ}  # Numba refuses that they change
     os.environ.clear()
-    os.environ.update(environment)
+    os.environ.update({**environment, **threads})
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     end_with_parent()
     use_one_thread()
