@@ -20,7 +20,10 @@ blocks:
 
 def pharos(*arguments, cwd):
     command = [sys.executable, "-m", "pharos", "study", *arguments]
-    environment = {**os.environ, "NUMBA_CACHE_DIR": str(cwd / "numba")}  # nothing is compiled yet, as after an installation
+    environment = {
+        **os.environ,
+        "NUMBA_CACHE_DIR": str(cwd / "numba"),
+    }  # nothing is compiled yet, as after an installation
     environment.pop("NUMBA_NUM_THREADS", None)
     return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=300, env=environment)
 

@@ -10,9 +10,12 @@ from pharos.hardness._covering import Covering, covering
 from pharos.hardness._diameter import diameter, start_eccentricity
 from pharos.hardness._effective_horizon import EffectiveHorizon, effective_horizon
 from pharos.hardness._gaps import Gaps, gaps, minimal_gap, sum_of_reciprocal_gaps
+from pharos.hardness._gorp import GorpBound, GorpRuns, gorp_bound, run_gorp
 from pharos.hardness._interval import Budget, Interval, Progress
+from pharos.hardness._occupancy import Occupancy, occupancy
 from pharos.hardness._registry import Measure, Problem, measures, register
 from pharos.hardness._report import Report, Result, report
+from pharos.hardness._return_distribution import ReturnDistribution, return_distribution
 from pharos.hardness._value_norm import environmental_value_norm
 
 __all__ = [
@@ -20,22 +23,30 @@ __all__ = [
     "Covering",
     "EffectiveHorizon",
     "Gaps",
+    "GorpBound",
+    "GorpRuns",
     "Interval",
     "Measure",
+    "Occupancy",
     "Problem",
     "Progress",
     "Report",
     "Result",
+    "ReturnDistribution",
     "colosseum_diameter",
     "covering",
     "diameter",
     "effective_horizon",
     "environmental_value_norm",
     "gaps",
+    "gorp_bound",
     "measures",
     "minimal_gap",
+    "occupancy",
     "register",
     "report",
+    "return_distribution",
+    "run_gorp",
     "start_eccentricity",
     "sum_of_reciprocal_gaps",
 ]

@@ -91,14 +91,10 @@ def effective_horizon(mdp: TabularMDP, *, horizon: int | None = None) -> Effecti
     Source: Laidlaw, Russell and Dragan (2023), "Bridging RL theory and practice with the effective horizon", theorem 5.4 and
         appendix C; sticky actions: Laidlaw et al. (2024).
     """
-    steps = mdp.horizon if horizon is None else horizon
-    if steps is None:
-        raise UndefinedMeasure("effective_horizon is defined for episodes of T steps: give a horizon")
-    if isinstance(steps, bool) or not isinstance(steps, int | np.integer) or steps < 1:
-        raise ParameterError(f"horizon is {steps!r}; expected a whole number of steps, at least 1")
-    tree = _Steps(mdp, int(steps))
-    k_min = _first_greedy(tree, tree.explored, int(steps))
-    window = _first_greedy(tree, np.broadcast_to(tree.rewards, tree.explored.shape), int(steps))
+    steps = steps_of("effective_horizon", mdp, horizon)
+    tree = _Steps(mdp, steps)
+    k_min = _first_greedy(tree, tree.explored, steps)
+    window = _first_greedy(tree, np.broadcast_to(tree.rewards, tree.explored.shape), steps)
     bound = _simple_bound(tree)
     greedy = [_greedy_return(tree, k) for k in range(1, 6)]
     return EffectiveHorizon(
@@ -109,13 +105,23 @@ def effective_horizon(mdp: TabularMDP, *, horizon: int | None = None) -> Effecti
         worst_return=tree.at_start(tree.worst.min(axis=2)[0]),
         num_states=tree.num_visitable,
         conventions={
-            "horizon": int(steps),
+            "horizon": steps,
             "gamma": 1.0,
             "exploration": "uniform",
             "tie_tolerance": TIE,
             "states": "pairs (state, previously executed action)" if mdp.is_sticky else "states",
         },
     )
+
+
+def steps_of(name: str, mdp: TabularMDP, horizon: int | None) -> int:
+    """T: what was given, else the horizon of the MDP."""
+    steps = mdp.horizon if horizon is None else horizon
+    if steps is None:
+        raise UndefinedMeasure(f"{name} is defined for episodes of T steps: give a horizon")
+    if isinstance(steps, bool) or not isinstance(steps, int | np.integer) or steps < 1:
+        raise ParameterError(f"horizon is {steps!r}; expected a whole number of steps, at least 1")
+    return int(steps)
 
 
 class _Steps:
@@ -140,7 +146,7 @@ class _Steps:
             )
         choices = choices_of(mdp, restart=False)
         self.matrix, self.num_actions, self.steps = choices.matrix, mdp.num_actions, steps
-        self.num_nodes = len(choices.underlying)
+        self.underlying, self.num_nodes = choices.underlying, len(choices.underlying)
         self.starts = choices.starts
         self.rewards = _expected_rewards(mdp, choices)
         self.table = _single_outcomes(self.matrix, self.num_nodes, self.num_actions)

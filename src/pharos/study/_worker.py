@@ -179,7 +179,9 @@ def main(
 
     `environment` holds the variables of that process now, which may not be those of when workers began to be forked.
     """
-    threads = {name: os.environ[name] for name in THREAD_VARIABLES if name in os.environ}  # Numba refuses that they change
+    threads = {
+        name: os.environ[name] for name in THREAD_VARIABLES if name in os.environ
+    }  # Numba refuses that they change
     os.environ.clear()
     os.environ.update({**environment, **threads})
     signal.signal(signal.SIGINT, signal.SIG_IGN)
