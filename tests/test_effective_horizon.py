@@ -13,6 +13,8 @@ import pharos
 from naive_horizon import analysis
 from pharos import hardness
 from pharos.errors import ParameterError, UndefinedMeasure
+from pharos.hardness._effective_horizon import TIE, _compiled, _Steps, _vectorized
+from pharos.hardness._large_horizon import LargeHorizon
 from pharos.mdp import TabularMDP, random_actions, sticky_actions
 from strategies import deterministic_mdps, general_mdps
 
@@ -78,6 +80,31 @@ def test_it_is_what_its_definition_says(mdp, chance, steps):
         assert found.value == pytest.approx(value, rel=1e-5)
 
 
+@settings(max_examples=150, deadline=None)
+@given(deterministic_mdps(max_states=6, max_actions=3), st.integers(1, 7))
+def test_the_compiled_analysis_is_the_other_one(mdp, steps):
+    one = _vectorized(_Steps(mdp, steps))
+    other = _compiled(LargeHorizon(mdp, steps, TIE))
+    assert one.keys() == other.keys()
+    for name in one:
+        assert one[name] == pytest.approx(other[name], rel=1e-12, abs=1e-12), name
+
+
+def test_the_compiled_analysis_of_key_corridor_is_the_published_one():
+    found = _compiled(LargeHorizon(key_corridor(), 100, TIE))
+    expected = published("_analyzed")
+    assert (found["k_min"], found["effective_planning_window"]) == (expected["min_k"], expected["epw"])
+    assert found["ms"] == expected["effective_horizon_results"]["ms"]
+    assert found["value"] == pytest.approx(expected["effective_horizon"], rel=1e-12)
+
+
+def test_larger_games_are_analysed_by_the_compiled_one(monkeypatch):
+    mdp = pharos.build(pharos.make("frozen_lake/8x8")).mdp(gamma=1.0)
+    expected = hardness.effective_horizon(mdp, horizon=30)
+    monkeypatch.setattr("pharos.hardness._effective_horizon.COMPILED", 0)
+    assert hardness.effective_horizon(mdp, horizon=30) == expected
+
+
 def lock(length):
     """A combination lock: action 0 goes on, action 1 goes back to the start; the end pays 1."""
     states = np.arange(length)
@@ -123,7 +150,7 @@ def test_it_needs_a_horizon_and_room():
     with pytest.raises(ParameterError, match="whole number of steps"):
         hardness.effective_horizon(mdp, horizon=0)
     with pytest.raises(UndefinedMeasure, match="GiB"):
-        hardness.effective_horizon(mdp, horizon=10_000_000)
+        hardness.effective_horizon(mdp, horizon=10**12)
 
 
 def test_a_report_with_a_horizon_has_it_and_one_without_says_what_is_missing():

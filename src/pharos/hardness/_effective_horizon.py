@@ -16,6 +16,8 @@ from pharos.mdp import TabularMDP
 
 TIE = 1e-4  # an action is optimal if its value is within this of the best
 MEMORY = 8 * 2**30
+COMPILED = 2**26  # bytes of the table of all steps from which on it is not written out
+GREEDY_RETURNS = 5
 
 
 @dataclass(frozen=True)
@@ -73,7 +75,7 @@ class EffectiveHorizon:
         return f"{self.value:.6g} (k_min {self.k_min}, window {self.effective_planning_window})"
 
 
-def effective_horizon(mdp: TabularMDP, *, horizon: int | None = None) -> EffectiveHorizon:
+def effective_horizon(mdp: TabularMDP, *, horizon: int | None = None, tight: int = 0) -> EffectiveHorizon:
     """Return the effective horizon of an MDP, and what it is made of.
 
         Q^1 = Q of the uniform policy,  Q^{k+1}_t(s, a) = r(s, a) + E max_b Q^k_{t+1}(s', b),  Q^k_T = r
@@ -85,33 +87,81 @@ def effective_horizon(mdp: TabularMDP, *, horizon: int | None = None) -> Effecti
 
     Args:
         horizon: T; None: that of the MDP.
+        tight: the largest k for which the tight bound of `gorp_bound` is computed as well; 0: none.
     Raises:
-        UndefinedMeasure: there is no horizon, or the table of all steps does not fit into 8 GiB.
-    Cost: a pass over T x nodes x A for every k that is tried; memory 40 bytes for each of them.
+        UndefinedMeasure: there is no horizon, or the table of all steps does not fit into memory: 8 GiB under chance, else 60 % of
+            that of the machine.
+    Cost: a pass over T x nodes x A for every k that is tried. Memory 40 bytes for each of them under chance; 17 bytes for each of
+        T x S without.
     Source: Laidlaw, Russell and Dragan (2023), "Bridging RL theory and practice with the effective horizon", theorem 5.4 and
         appendix C; sticky actions: Laidlaw et al. (2024).
     """
     steps = steps_of("effective_horizon", mdp, horizon)
-    tree = _Steps(mdp, steps)
-    k_min = _first_greedy(tree, tree.explored, steps)
-    window = _first_greedy(tree, np.broadcast_to(tree.rewards, tree.explored.shape), steps)
+    from pharos.hardness import _large_horizon
+
+    compiled = _large_horizon.applies(mdp) and 40 * steps * mdp.num_states * mdp.num_actions > COMPILED
+    parts = _compiled(_large_horizon.LargeHorizon(mdp, steps, TIE)) if compiled else _vectorized(_Steps(mdp, steps))
+    bound = gorp_value(mdp, steps, tight) if tight else None
+    conventions = {
+        "horizon": steps,
+        "gamma": 1.0,
+        "exploration": "uniform",
+        "tie_tolerance": TIE,
+        "states": "pairs (state, previously executed action)" if mdp.is_sticky else "states",
+    }
+    return EffectiveHorizon(**parts, tight=bound, conventions=conventions)
+
+
+def gorp_value(mdp: TabularMDP, steps: int, max_k: int) -> float:
+    """The tight bound, with BRIDGE's methods."""
+    from pharos.hardness._gorp import gorp_bound
+
+    return gorp_bound(mdp, horizon=steps, max_k=max_k).value
+
+
+def _vectorized(tree: "_Steps") -> dict[str, Any]:
+    steps = tree.steps
     bound = _simple_bound(tree)
-    greedy = [_greedy_return(tree, k) for k in range(1, 6)]
-    return EffectiveHorizon(
-        *(bound[0], k_min, window, *bound[1:]),
-        greedy_returns=greedy,
-        optimal_return=tree.at_start(tree.best.max(axis=2)[0]),
-        random_return=tree.at_start(tree.explored_value[0]),
-        worst_return=tree.at_start(tree.worst.min(axis=2)[0]),
-        num_states=tree.num_visitable,
-        conventions={
-            "horizon": steps,
-            "gamma": 1.0,
-            "exploration": "uniform",
-            "tie_tolerance": TIE,
-            "states": "pairs (state, previously executed action)" if mdp.is_sticky else "states",
-        },
-    )
+    return {
+        **dict(zip(("value", "ks", "ms", "gaps", "vars"), bound, strict=True)),
+        "k_min": _first_greedy(tree, tree.explored, steps),
+        "effective_planning_window": _first_greedy(tree, np.broadcast_to(tree.rewards, tree.explored.shape), steps),
+        "greedy_returns": [_greedy_return(tree, k) for k in range(1, GREEDY_RETURNS + 1)],
+        "optimal_return": tree.at_start(tree.best.max(axis=2)[0]),
+        "random_return": tree.at_start(tree.explored_value[0]),
+        "worst_return": tree.at_start(tree.worst.min(axis=2)[0]),
+        "num_states": tree.num_visitable,
+    }
+
+
+def _compiled(table: Any) -> dict[str, Any]:
+    """The same, for each k in turn."""
+    steps, best = table.steps, float(table.steps)
+    found: list[tuple[int, int, float, float]] = []
+    greedy: list[float] = []
+    k_min, k = 0, 1
+    while k < best or k <= GREEDY_RETURNS or not k_min:
+        if k < best and (needed := table.samples(k)) is not None:
+            found.append((k, *needed))
+            best = min(best, k + (math.log(needed[0]) / math.log(table.num_actions) if table.num_actions > 1 else 0.0))
+        if not k_min and (table.is_greedy_optimal() or k == steps):
+            k_min = k
+        if k <= GREEDY_RETURNS:
+            greedy.append(table.greedy_return())
+        table.advance()
+        k += 1
+    table.look_at_rewards()
+    window = 1
+    while not table.is_greedy_optimal() and window < steps:
+        table.advance(spread=False)
+        window += 1
+    ks, ms, gaps, variances = (list(each) for each in zip(*found, strict=True)) if found else ([], [], [], [])
+    optimal, random, worst = table.returns
+    return {
+        **{"value": best, "ks": ks, "ms": ms, "gaps": gaps, "vars": variances, "k_min": k_min},
+        **{"effective_planning_window": window, "greedy_returns": greedy, "num_states": table.num_visitable},
+        **{"optimal_return": optimal, "random_return": random, "worst_return": worst},
+    }
 
 
 def steps_of(name: str, mdp: TabularMDP, horizon: int | None) -> int:

@@ -1,0 +1,135 @@
+"""Passes over all states at one step of an episode, for the effective horizon of deterministic MDPs.
+
+next_states (S, A), -1 where the episode ends; rewards (S, A) float64. An episode that has ended is worth 0.
+"""
+
+import math
+
+import numpy as np
+from numba import njit, prange
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def values(next_states, rewards, tie, best, worst, explored, best_now, worst_now, explored_now, optimal, variance):
+    """One step backwards: the values of optimal, worst and uniform play, and what the simple bound needs of them.
+
+    best, worst, explored (S,): of the step after; *_now (S,): of this step. optimal (S,) unsigned: bit a where Q*(s, a) is within
+    `tie` of the best. variance (S,): max over a of (Q^e - Q^w) (Q* - Q^w).
+    """
+    num_actions = next_states.shape[1]
+    for s in prange(len(next_states)):
+        high, low, total = -math.inf, math.inf, 0.0
+        spread = 0.0
+        for a in range(num_actions):
+            t, r = next_states[s, a], rewards[s, a]
+            b = r + (best[t] if t >= 0 else 0.0)
+            w = r + (worst[t] if t >= 0 else 0.0)
+            e = r + (explored[t] if t >= 0 else 0.0)
+            high, low = max(high, b), min(low, w)
+            total = e if a == 0 else total + e
+            product = (e - w) * (b - w)
+            if a == 0 or product > spread:
+                spread = product
+        mask = np.uint64(0)
+        for a in range(num_actions):
+            t = next_states[s, a]
+            if rewards[s, a] + (best[t] if t >= 0 else 0.0) >= high - tie:
+                mask |= np.uint64(1) << np.uint64(a)
+        best_now[s], worst_now[s] = high, low
+        explored_now[s] = min(max(total / num_actions, low), high)
+        optimal[s] = mask
+        variance[s] = spread
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def lookahead(next_states, rewards, after, now):
+    """now (S,) = max over a of r(s, a) + after(next state)."""
+    for s in prange(len(next_states)):
+        high = -math.inf
+        for a in range(next_states.shape[1]):
+            t = next_states[s, a]
+            high = max(high, rewards[s, a] + (after[t] if t >= 0 else 0.0))
+        now[s] = high
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def largest(next_states, after, now):
+    """now (S,) = max over a of after(next state), at least 0."""
+    for s in prange(len(next_states)):
+        high = 0.0
+        for a in range(next_states.shape[1]):
+            t = next_states[s, a]
+            if t >= 0:
+                high = max(high, after[t])
+        now[s] = high
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def greedy_return(next_states, rewards, after, followed, now):
+    """now (S,) = min over the actions greedy in r + after(next state) of r + followed(next state)."""
+    for s in prange(len(next_states)):
+        high, low = -math.inf, math.inf
+        for a in range(next_states.shape[1]):
+            t, r = next_states[s, a], rewards[s, a]
+            q = r + (after[t] if t >= 0 else 0.0)
+            if q >= high:
+                value = r + (followed[t] if t >= 0 else 0.0)
+                low = min(low, value) if q == high else value
+                high = q
+        now[s] = low
+
+
+@njit(cache=True, nogil=True)
+def walk(next_states, rewards, after, optimal, variance, log, near, nodes, n, following, seen, most):
+    """Go one step on from nodes[:n] along greedy actions (`near` False), or along those better than all that are not optimal.
+
+    after (S,): Q(s, a) = r(s, a) + after(next state). seen (S,) bool, all False before and after. most (3,): 16 variance log / gap^2
+    of the node that has the largest, the first among equals, and its gap and variance.
+    Returns how many states `following` holds; -1 where an action that is not optimal may be taken.
+    """
+    num_actions = next_states.shape[1]
+    count, at, fails = 0, -1, False
+    most[:] = 0.0
+    for i in range(n):
+        s = nodes[i]
+        top, second = -math.inf, -math.inf
+        for a in range(num_actions):
+            t = next_states[s, a]
+            q = rewards[s, a] + (after[t] if t >= 0 else 0.0)
+            top = max(top, q)
+            if not (optimal[s] >> a) & 1:
+                second = max(second, q)
+        if second == top:
+            fails = True
+            break
+        gap = top - second
+        needed = 0.0 if second == -math.inf else 16 * variance[s] / gap**2 * log
+        if at < 0 or needed > most[0] or (needed == most[0] and s < at):
+            most[0], most[1], most[2] = needed, gap, variance[s]
+            at = s
+        for a in range(num_actions):
+            t = next_states[s, a]
+            if t < 0 or seen[t]:
+                continue
+            q = rewards[s, a] + after[t]
+            if q > second if near else q == top:
+                seen[t] = True
+                following[count] = t
+                count += 1
+    for j in range(count):
+        seen[following[j]] = False
+    return -1 if fails else count
+
+
+@njit(cache=True, nogil=True)
+def onwards(next_states, nodes, n, following, seen):
+    """States that nodes[:n] lead to and that were not seen before; returns how many. seen (S,) bool."""
+    count = 0
+    for i in range(n):
+        for a in range(next_states.shape[1]):
+            t = next_states[nodes[i], a]
+            if t >= 0 and not seen[t]:
+                seen[t] = True
+                following[count] = t
+                count += 1
+    return count
