@@ -27,7 +27,10 @@ def hardness(
     target: TargetArgument,
     parameters: Parameters = None,
     measures: Annotated[
-        str | None, typer.Option("--measures", metavar="A,B", help="Names of measures; all when not given.")
+        str | None,
+        typer.Option(
+            "--measures", metavar="A,B", help="Names of measures, or all; those that are quick when not given."
+        ),
     ] = None,
     gamma: Annotated[
         float | None,

@@ -5,6 +5,7 @@ Visitation complexity: `diameter`, `start_eccentricity`, `covering`. Estimation 
 """
 
 from pharos.hardness import _built_in  # noqa: F401  (registers the measures; the order of a report)
+from pharos.hardness._action_gap import ActionGapRegularity, action_gap_regularity
 from pharos.hardness._colosseum import colosseum_diameter
 from pharos.hardness._covering import Covering, covering
 from pharos.hardness._diameter import diameter, start_eccentricity
@@ -12,6 +13,8 @@ from pharos.hardness._effective_horizon import EffectiveHorizon, effective_horiz
 from pharos.hardness._gaps import Gaps, gaps, minimal_gap, sum_of_reciprocal_gaps
 from pharos.hardness._gorp import GorpBound, GorpRuns, gorp_bound, run_gorp
 from pharos.hardness._interval import Budget, Interval, Progress
+from pharos.hardness._mismatch import distribution_mismatch
+from pharos.hardness._mixing_time import MixingTime, mixing_time
 from pharos.hardness._occupancy import Occupancy, occupancy
 from pharos.hardness._registry import Measure, Problem, measures, register
 from pharos.hardness._report import Report, Result, report
@@ -19,6 +22,7 @@ from pharos.hardness._return_distribution import ReturnDistribution, return_dist
 from pharos.hardness._value_norm import environmental_value_norm
 
 __all__ = [
+    "ActionGapRegularity",
     "Budget",
     "Covering",
     "EffectiveHorizon",
@@ -27,21 +31,25 @@ __all__ = [
     "GorpRuns",
     "Interval",
     "Measure",
+    "MixingTime",
     "Occupancy",
     "Problem",
     "Progress",
     "Report",
     "Result",
     "ReturnDistribution",
+    "action_gap_regularity",
     "colosseum_diameter",
     "covering",
     "diameter",
+    "distribution_mismatch",
     "effective_horizon",
     "environmental_value_norm",
     "gaps",
     "gorp_bound",
     "measures",
     "minimal_gap",
+    "mixing_time",
     "occupancy",
     "register",
     "report",

@@ -2,9 +2,13 @@
 
 from typing import Any
 
+from pharos.hardness._action_gap import action_gap_regularity
 from pharos.hardness._covering import covering
 from pharos.hardness._diameter import diameter, start_eccentricity
 from pharos.hardness._effective_horizon import effective_horizon
+from pharos.hardness._gorp import gorp_bound
+from pharos.hardness._mismatch import distribution_mismatch
+from pharos.hardness._mixing_time import mixing_time
 from pharos.hardness._registry import Problem, register
 from pharos.hardness._value_norm import environmental_value_norm
 
@@ -84,4 +88,44 @@ register(
     complexity="visitation",
     version=1,
     depends="episodes",
+)
+register(
+    "action_gap_regularity",
+    lambda problem: action_gap_regularity(problem.mdp, problem.solution),
+    definition="smallest c with P(0 < V*(s) - best Q*(s, a) that is not optimal <= t) <= c t for all t, s uniform",
+    source="Farahmand (2011), assumption A1",
+    complexity="estimation",
+    version=1,
+    depends="values",
+    on_request=True,
+)
+register(
+    "distribution_mismatch",
+    lambda problem: distribution_mismatch(problem.mdp, solution=problem.solution),
+    definition="max over s of d*(s) / d(s), discounted visits of the optimal and of the uniform policy",
+    source="Kakade and Langford (2002); Agarwal et al. (2021), section 4.2",
+    complexity="visitation",
+    version=1,
+    depends="values",
+    on_request=True,
+)
+register(
+    "mixing_time",
+    lambda problem: mixing_time(problem.mdp, restart=problem.restart),
+    definition="min t with max over s of the total variation of P^t(s, .) to the stationary distribution <= 1/4; uniform play",
+    source="Kearns and Singh (2002); Levin, Peres and Wilmer (2009), section 4.5",
+    complexity="visitation",
+    version=1,
+    depends="structure",
+    on_request=True,
+)
+register(
+    "tight_effective_horizon",
+    lambda problem: gorp_bound(problem.mdp, horizon=problem.episode("tight_effective_horizon")),
+    definition="1 + log_A m, m samples with which greedy over random policy fails with probability <= 1/2",
+    source="Laidlaw, Russell and Dragan (2023), appendix C",
+    complexity="planning",
+    version=1,
+    depends="episodes",
+    on_request=True,
 )

@@ -87,14 +87,9 @@ def gaps(mdp: TabularMDP, solution: Solution | None = None, *, tie_tolerance: fl
     Source: Simchowitz and Jamieson (2019), "Non-asymptotic gap-dependent regret bounds for tabular MDPs", section 2; the
         pharos paper, equation 2; regularized: Colosseum (Conserva and Rauber, 2022).
     """
-    solution = _checked(mdp, solution)
+    solution = checked(mdp, solution)
+    tolerance = _tolerance(solution, tie_tolerance)
     error = 2 * solution.error_bound
-    tolerance = max(1e-9, 1.25 * error) if tie_tolerance is None else tie_tolerance
-    if not (isinstance(tolerance, int | float | np.floating) and math.isfinite(tolerance) and tolerance > error):
-        raise PrecisionError(
-            f"tie_tolerance is {tolerance!r}; expected more than twice the error bound of the solution, {error:.3g}: "
-            f"raise it, or solve with a smaller tolerance"
-        )
     total = low = high = regularized = 0.0
     minimal, count, ties = math.inf, 0, 0
     histogram: dict[int, int] = {}
@@ -125,8 +120,8 @@ def gaps(mdp: TabularMDP, solution: Solution | None = None, *, tie_tolerance: fl
         ties,
         np.array([histogram.get(bin_, 0) for bin_ in range(first, last + 1)], np.int64),
         10.0 ** (np.arange(first, last + 2) / 4),
-        float(tolerance),
-        _conventions(mdp, solution, float(tolerance)),
+        tolerance,
+        _conventions(mdp, solution, tolerance),
     )
 
 
@@ -147,7 +142,33 @@ def minimal_gap(mdp: TabularMDP, solution: Solution | None = None, *, tie_tolera
     return gaps(mdp, solution, tie_tolerance=tie_tolerance).minimal
 
 
-def _checked(mdp: TabularMDP, solution: Solution | None) -> Solution:
+def gaps_of_states(
+    mdp: TabularMDP, solution: Solution | None, tie_tolerance: float | None
+) -> tuple[Iterator[tuple[np.ndarray, np.ndarray]], float, dict[str, Any]]:
+    """(blocks of (gap (N, A), weight (N,): how often each row counts, 0 for none), tie tolerance, conventions)."""
+    solution = checked(mdp, solution)
+    tolerance = _tolerance(solution, tie_tolerance)
+    blocks = ((gap, counted * weight) for gap, weight, counted in _weighted_gaps(mdp, solution))
+    return blocks, tolerance, _conventions(mdp, solution, tolerance)
+
+
+def _tolerance(solution: Solution, tie_tolerance: float | None) -> float:
+    error = 2 * solution.error_bound
+    tolerance = max(1e-9, 1.25 * error) if tie_tolerance is None else tie_tolerance
+    if not (isinstance(tolerance, int | float | np.floating) and math.isfinite(tolerance) and tolerance > error):
+        raise PrecisionError(
+            f"tie_tolerance is {tolerance!r}; expected more than twice the error bound of the solution, {error:.3g}: "
+            f"raise it, or solve with a smaller tolerance"
+        )
+    return float(tolerance)
+
+
+def checked(mdp: TabularMDP, solution: Solution | None) -> Solution:
+    """The optimal solution of `mdp` that was given, or a new one.
+
+    Raises:
+        ParameterError: it is of another kind or MDP.
+    """
     if solution is None:
         return value_iteration(mdp, 1e-9)
     shape = (mdp.num_states, mdp.num_actions)

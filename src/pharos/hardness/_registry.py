@@ -97,6 +97,7 @@ class Measure:
         version: goes up when the function's results change, so that kept ones are not used; None: never keep results.
         depends: on what results depend, beside the transitions, chance and start: "structure" (nothing else), "values" (rewards,
             gamma), "episodes" (rewards, horizon), "all".
+        on_request: only part of a report where it is named, or where all are asked for.
     """
 
     name: str
@@ -106,6 +107,7 @@ class Measure:
     complexity: str = "other"
     version: int | None = None
     depends: str = "all"
+    on_request: bool = False
 
 
 _MEASURES: dict[str, Measure] = {}
@@ -120,6 +122,7 @@ def register(
     complexity: str = "other",
     version: int | None = None,
     depends: str = "all",
+    on_request: bool = False,
 ) -> Measure:
     """Make a measure part of every report: `register("density", lambda p: (p.mdp.rewards != 0).mean(), definition="...")`.
 
@@ -128,7 +131,7 @@ def register(
             `to_dict()`.
         definition, source: printed beside the value.
         version: give one to keep results beside the state space, and raise it when the function changes.
-        depends: see `Measure`.
+        depends, on_request: see `Measure`.
     Raises:
         ParameterError: the name is no identifier, or taken by a measure of pharos.
     """
@@ -138,7 +141,7 @@ def register(
         )
     if name in _MEASURES and _MEASURES[name].source != "the user" and source == "the user":
         raise ParameterError(f"{name!r} is a measure of pharos; choose another name")
-    _MEASURES[name] = Measure(name, function, definition, source, complexity, version, depends)
+    _MEASURES[name] = Measure(name, function, definition, source, complexity, version, depends, on_request)
     return _MEASURES[name]
 
 
@@ -148,12 +151,14 @@ def measures() -> dict[str, Measure]:
 
 
 def chosen(names: Any) -> list[Measure]:
-    """The measures of these names; all where None.
+    """The measures of these names; None: all but those on request; "all": these as well.
 
     Raises:
         UnknownName: there is no such measure; the nearest is suggested.
     """
     if names is None:
+        return [measure for measure in _MEASURES.values() if not measure.on_request]
+    if names == "all":
         return list(_MEASURES.values())
     if isinstance(names, str):
         names = names.split(",")

@@ -113,7 +113,8 @@ def report(
     """Measure how hard an MDP is.
 
     Args:
-        measures: names, as a sequence or with commas; None: all that are registered.
+        measures: names, as a sequence or with commas; None: all that are registered but for those that are slow and come on
+            request; "all": these as well.
         horizon: number of steps T for measures of episodes; None: that of the MDP, if any. Values and gaps have the gamma and
             the horizon of the MDP itself.
         tolerance: largest error of the optimal values, in units of return.

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pharos.hardness._gaps import _BLOCK, _arrivals, _checked, reachable
+from pharos.hardness._gaps import _BLOCK, _arrivals, checked, reachable
 from pharos.mdp import TabularMDP
 from pharos.solvers import Solution
 
@@ -22,7 +22,7 @@ def environmental_value_norm(mdp: TabularMDP, solution: Solution | None = None) 
     Cost: one pass over the table; 20 to 100 ns a state.
     Source: Maillard, Mann and Mannor (2014), definition 1. (Colosseum centres with the expectation of another state: a slip.)
     """
-    solution = _checked(mdp, solution)
+    solution = checked(mdp, solution)
     if mdp.is_deterministic:
         return 0.0
     live = np.flatnonzero(reachable(mdp) & ~np.asarray(mdp.terminal))
