@@ -19,6 +19,7 @@ from pharos.hardness._occupancy import Occupancy, occupancy
 from pharos.hardness._registry import Measure, Problem, measures, register
 from pharos.hardness._report import Report, Result, report
 from pharos.hardness._return_distribution import ReturnDistribution, return_distribution
+from pharos.hardness._stationary_horizon import StationaryHorizon, stationary_effective_horizon
 from pharos.hardness._value_norm import environmental_value_norm
 
 __all__ = [
@@ -38,6 +39,7 @@ __all__ = [
     "Report",
     "Result",
     "ReturnDistribution",
+    "StationaryHorizon",
     "action_gap_regularity",
     "colosseum_diameter",
     "covering",
@@ -56,5 +58,6 @@ __all__ = [
     "return_distribution",
     "run_gorp",
     "start_eccentricity",
+    "stationary_effective_horizon",
     "sum_of_reciprocal_gaps",
 ]

@@ -10,6 +10,7 @@ from pharos.hardness._gorp import gorp_bound
 from pharos.hardness._mismatch import distribution_mismatch
 from pharos.hardness._mixing_time import mixing_time
 from pharos.hardness._registry import Problem, register
+from pharos.hardness._stationary_horizon import stationary_effective_horizon
 from pharos.hardness._value_norm import environmental_value_norm
 
 
@@ -127,5 +128,20 @@ register(
     complexity="planning",
     version=1,
     depends="episodes",
+    on_request=True,
+)
+register(
+    "stationary_effective_horizon",
+    lambda problem: stationary_effective_horizon(
+        problem.mdp,
+        problem.solution if problem.mdp.horizon is None else None,
+        steps=problem.horizon,
+        progress=lambda line: problem.report("stationary_effective_horizon", line),
+    ),
+    definition="the effective horizon with one discounted value a state in place of one for each step",
+    source="pharos; after Laidlaw, Russell and Dragan (2023), theorem 5.4",
+    complexity="planning",
+    version=1,
+    depends="all",
     on_request=True,
 )

@@ -1,0 +1,256 @@
+"""The effective horizon of discounted MDPs without time: one value a state, so that it is within reach of millions of states.
+
+pharos's own variant of Laidlaw, Russell and Dragan's (2023) measure; `effective_horizon` is theirs.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from pharos.errors import ParameterError, PrecisionError, UndefinedMeasure
+from pharos.hardness._effective_horizon import _expected_rewards, _single_outcomes
+from pharos.mdp import TabularMDP
+from pharos.solvers import Solution, uniform_value, value_iteration, worst_value
+
+
+@dataclass(frozen=True)
+class StationaryHorizon:
+    """How far ahead one must look in a discounted MDP.
+
+    Attributes:
+        value: min over k of k + log_A m_k, at most `steps`.
+        k_min: smallest k for which acting greedily in Q^k is optimal, Q^1 being the value of uniform play; `steps` where none is.
+        effective_planning_window: the same from Q^1 = r.
+        ks, ms, gaps, vars: for each k that was tried and does not fail: k, the samples m_k, and gap and variance bound where m_k is
+            attained.
+        conventions: gamma, steps, tie tolerance, slack of comparisons.
+    """
+
+    value: float
+    k_min: int
+    effective_planning_window: int
+    ks: list[int]
+    ms: list[int]
+    gaps: list[float]
+    vars: list[float]
+    conventions: dict[str, Any] = field(default_factory=dict)
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able; infinite gaps are None."""
+        return {
+            "value": self.value,
+            "k_min": self.k_min,
+            "effective_planning_window": self.effective_planning_window,
+            "ks": self.ks,
+            "ms": self.ms,
+            "gaps": [gap if math.isfinite(gap) else None for gap in self.gaps],
+            "vars": self.vars,
+            **self.conventions,
+        }
+
+    def __str__(self) -> str:
+        return f"{self.value:.6g} (k_min {self.k_min}, window {self.effective_planning_window})"
+
+
+def stationary_effective_horizon(
+    mdp: TabularMDP,
+    solution: Solution | None = None,
+    *,
+    steps: int | None = None,
+    tie_tolerance: float | None = None,
+    tolerance: float = 1e-9,
+    progress: Callable[[str], None] | None = None,
+) -> StationaryHorizon:
+    """Return the stationary effective horizon of a discounted MDP, under every kind of chance.
+
+        Q^1 = Q of the uniform policy,  Q^{k+1}(s, a) = r(s, a) + gamma E max_b Q^k(s', b)
+        var^1 = (Q^e - Q^w)(Q* - Q^w),  var^{k+1}(s, a) = gamma^2 max over s', b of var^k(s', b)
+        m_k = max over states met of max(1, ceil(16 max_a var^k / gap_k^2 ln(2 T A^k))),  H = min_k k + log_A m_k
+
+    As `effective_horizon`, but for values that do not depend on the step: in place of T steps there are states, and T, the time
+    limit, only counts the decisions. Where an MDP ends by itself within T steps, each state at one depth, both are the same for
+    gamma = 1.
+
+    Args:
+        solution: the optimal solution of `mdp`; None: solved here.
+        steps: T; None: the MDP's horizon, else ceil(1 / (1 - gamma)).
+        tie_tolerance: an action is optimal if its value is within it of the best; None: 2.5 times the largest error of the values,
+            at least 1e-9.
+        tolerance: largest error of the values; a larger one is used where floats cannot reach it.
+        progress: called with a line on how far it is.
+    Raises:
+        UndefinedMeasure: gamma is 1.
+        ParameterError: an option is wrong, or `solution` is not of this MDP. PrecisionError: tie_tolerance is not above twice the error.
+    Exactness: Q^k is known up to an error; what differs by less than `slack`, four times that, counts as equal, which makes k fail
+        rather than pass.
+    Cost: three solutions, then a backup and a walk over the states met for each k. breakout/12x8x1 (2.4 million states) takes about
+        a minute.
+    Source: pharos; after Laidlaw, Russell and Dragan (2023), theorem 5.4.
+    """
+    if mdp.gamma == 1.0:
+        raise UndefinedMeasure(
+            "stationary_effective_horizon is defined for gamma < 1; see effective_horizon for episodes"
+        )
+    limit = steps if steps is not None else mdp.horizon or math.ceil(1 / (1 - mdp.gamma))
+    if isinstance(limit, bool) or not isinstance(limit, int | np.integer) or limit < 1:
+        raise ParameterError(f"steps is {limit!r}; expected a whole number of steps, at least 1")
+    endless = mdp if mdp.horizon is None else mdp.with_horizon(None)
+    tell = progress or (lambda line: None)
+    nodes = _Nodes(endless, solution, tolerance, tell)
+    floor = 2 * nodes.error
+    tie = max(1e-9, 1.25 * floor) if tie_tolerance is None else float(tie_tolerance)
+    if not tie > floor:
+        raise PrecisionError(
+            f"tie_tolerance is {tie_tolerance!r}; expected more than twice the error of the values, {floor:.3g}: raise it, or "
+            f"solve with a smaller tolerance"
+        )
+    slack = max(1e-12, 2 * floor)
+    optimal = nodes.best >= nodes.best.max(axis=1, keepdims=True) - tie
+    k_min = window = 0
+    found: list[tuple[int, int, float, float]] = []
+    best, k = float(limit), 1
+    values, spread = nodes.explored, (nodes.explored - nodes.worst) * (nodes.best - nodes.worst)
+    log_actions = math.log(mdp.num_actions)
+    while k < best or not k_min:
+        tell(f"k = {k}, bound {best:.4g}")
+        if k < best and (
+            needed := _samples(nodes, values, spread, optimal, slack, math.log(2 * limit) + k * log_actions)
+        ):
+            found.append((k, *needed))
+            best = min(best, k + (math.log(needed[0]) / log_actions if mdp.num_actions > 1 else 0.0))
+        if not k_min and (k >= limit or _is_greedy_optimal(nodes, values, optimal, slack)):
+            k_min = k
+        values = nodes.backup(values.max(axis=1))
+        spread = mdp.gamma**2 * nodes.following_max(spread.max(axis=1))
+        k += 1
+    values, window = nodes.rewards, 1
+    while window < limit and not _is_greedy_optimal(nodes, values, optimal, slack):
+        tell(f"window {window}")
+        values = nodes.backup(values.max(axis=1))
+        window += 1
+    ks, ms, gaps, variances = (list(each) for each in zip(*found, strict=True)) if found else ([], [], [], [])
+    conventions = {
+        "gamma": mdp.gamma,
+        "steps": int(limit),
+        "exploration": "uniform",
+        "tie_tolerance": tie,
+        "slack": slack,
+        "states": "pairs (state, previously executed action)" if mdp.is_sticky else "states",
+    }
+    return StationaryHorizon(best, k_min, window, ks, ms, gaps, variances, conventions)
+
+
+class _Nodes:
+    """Values of optimal, worst and uniform play on the nodes that can be met: states, or pairs with the previous action.
+
+    Attributes:
+        rewards, best, worst, explored: (N, A) of choosing an action. error: the largest error of any of them.
+    """
+
+    def __init__(self, mdp: TabularMDP, solution: Solution | None, tolerance: float, tell: Callable[[str], None]):
+        from pharos.hardness._gaps import checked
+        from pharos.hardness._stochastic_diameter import _reachable, choices_of
+
+        choices = _reachable(choices_of(mdp, restart=False))
+        self.gamma, self.num_actions = mdp.gamma, mdp.num_actions
+        self.num_nodes = len(choices.underlying)
+        self.matrix = choices.matrix
+        self.starts = np.array(sorted(node for node, _ in choices.starts))
+        self.rewards = _expected_rewards(mdp, choices)
+        self.table = _single_outcomes(self.matrix, self.num_nodes, self.num_actions)
+        tell("values of optimal play")
+        best = checked(mdp, solution) if solution is not None else _solved(value_iteration, mdp, tolerance)
+        tell("values of the worst play")
+        worst = _solved(worst_value, mdp, tolerance)
+        tell("values of uniform play")
+        explored = _solved(uniform_value, mdp, tolerance)
+        self.error = mdp.gamma * max(best.error_bound, worst.error_bound, explored.error_bound)
+        self.best, self.worst, self.explored = (
+            self.backup(_on_nodes(each, choices, mdp)) for each in (best, worst, explored)
+        )
+
+    def backup(self, value: np.ndarray) -> np.ndarray:
+        """(N, A): r + gamma E value(next)."""
+        if self.table is not None:
+            return self.rewards + self.gamma * value[self.table]
+        return self.rewards + self.gamma * (self.matrix @ value).reshape(self.num_nodes, self.num_actions)
+
+    def following_max(self, values: np.ndarray) -> np.ndarray:
+        """(N, A): the largest of values (N,) >= 0 over the nodes that an action may lead to."""
+        if self.table is not None:
+            return values[self.table]
+        return np.maximum.reduceat(values[self.matrix.indices], self.matrix.indptr[:-1]).reshape(self.rewards.shape)
+
+    def closure(self, actions: Callable[[np.ndarray], np.ndarray | None]) -> np.ndarray | None:
+        """The nodes met from the start by the actions (n, A) bool that are named for nodes (n,); None where it says None."""
+        met = np.zeros(self.num_nodes, np.bool_)
+        met[self.starts] = True
+        nodes = self.starts
+        while nodes.size:
+            allowed = actions(nodes)
+            if allowed is None:
+                return None
+            rows, chosen = np.nonzero(allowed)
+            if self.table is not None:
+                following = self.table[nodes[rows], chosen]
+            else:
+                following = self.matrix[nodes[rows] * self.num_actions + chosen].indices
+            nodes = np.unique(following[~met[following]])
+            met[nodes] = True
+        return np.flatnonzero(met)
+
+
+def _solved(solver: Callable[..., Solution], mdp: TabularMDP, tolerance: float) -> Solution:
+    while True:
+        try:
+            return solver(mdp, tolerance)
+        except PrecisionError:
+            if tolerance > 1:
+                raise
+            tolerance *= 10
+
+
+def _on_nodes(solution: Solution, choices: Any, mdp: TabularMDP) -> np.ndarray:
+    """(N,): V of the nodes; 0 at the end. Of starts without a previous action any number, as nothing leads there."""
+    inside = choices.underlying < mdp.num_states
+    v = solution.v
+    if v.ndim == 2:
+        found = v[np.where(inside, choices.underlying, 0), np.clip(choices.previous, 0, mdp.num_actions - 1)]
+    else:
+        found = v[np.where(inside, choices.underlying, 0)]
+    return np.where(inside, found, 0.0)
+
+
+def _is_greedy_optimal(nodes: _Nodes, values: np.ndarray, optimal: np.ndarray, slack: float) -> bool:
+    def greedy(n: np.ndarray) -> np.ndarray | None:
+        taken = values[n] >= values[n].max(axis=1, keepdims=True) - slack
+        return None if (taken & ~optimal[n]).any() else taken
+
+    return nodes.closure(greedy) is not None
+
+
+def _samples(
+    nodes: _Nodes, values: np.ndarray, spread: np.ndarray, optimal: np.ndarray, slack: float, log: float
+) -> tuple[int, float, float] | None:
+    """(m_k, gap, variance where it is attained); None where k fails."""
+
+    def second(n: np.ndarray) -> np.ndarray:
+        return np.where(optimal[n], -math.inf, values[n]).max(axis=1)
+
+    def better(n: np.ndarray) -> np.ndarray | None:
+        others = second(n)
+        if (values[n].max(axis=1) - others <= slack).any():
+            return None
+        return optimal[n] & (values[n] > others[:, None] - slack)
+
+    met = nodes.closure(better)
+    if met is None:
+        return None
+    gap, largest = values[met].max(axis=1) - second(met), spread[met].max(axis=1)
+    with np.errstate(invalid="ignore"):
+        needed = np.where(np.isinf(gap), 0.0, 16 * largest / gap**2 * log)
+    i = int(needed.argmax())
+    return max(1, math.ceil(needed[i])), float(gap[i]), float(largest[i])
