@@ -1,6 +1,7 @@
 """A study on other engines ends with the same files as on this machine."""
 
 import os
+import shutil
 import sys
 from functools import partial
 from pathlib import Path
@@ -11,6 +12,7 @@ import pytest
 import fake_training
 from pharos import study
 from pharos.errors import MissingExtra, ParameterError
+from pharos.study._execution import shard_of
 
 SPECIFICATION = study.specification(
     {
@@ -37,6 +39,13 @@ def test_submitted_jobs_execute_their_shards(tmp_path, undisturbed, monkeypatch)
         SPECIFICATION, tmp_path / "there", shards=2, cluster="local", parameters=parameters, runner=fake_training.train
     )
     assert [job.result()["finished"] for job in jobs] == [4, 4]
+    assert fake_training.results(tmp_path / "there") == undisturbed
+    again = {"shards": 2, "cluster": "local", "parameters": parameters, "runner": fake_training.train}
+    assert study.submit(SPECIFICATION, tmp_path / "there", **again) == []
+    one = shard_of(SPECIFICATION.runs, "2/2")[0].id
+    shutil.rmtree(tmp_path / "there" / "runs" / one)
+    (job,) = study.submit(SPECIFICATION, tmp_path / "there", **again)
+    assert job.result()["finished"] == 4
     assert fake_training.results(tmp_path / "there") == undisturbed
 
 

@@ -143,6 +143,8 @@ def run(
 def _print_jobs(jobs: list[str], json: bool) -> None:
     if json:
         print_json({"jobs": jobs})
+    elif not jobs:
+        print("nothing is missing; `pharos study report` shows the results")
     else:
         print(f"submitted {len(jobs)} jobs: {', '.join(jobs)}; `pharos study status` says how far they are")
 

@@ -6,7 +6,7 @@ killed, repeated, or followed by another.
 
 import os
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -47,7 +47,8 @@ def submit(
         cluster: "slurm"; or "local": all jobs at once on this machine, to try it.
         parameters: of submitit's executor, such as {"timeout_min": 600, "slurm_partition": "cpu", "slurm_array_parallelism": 50}.
     Returns:
-        submitit's jobs: `job.job_id`, `job.result()` waits. Their logs are in the folder `jobs`.
+        submitit's jobs, one for each part in which runs are missing: `job.job_id`, `job.result()` waits. Their logs are in the
+        folder `jobs`.
     Raises:
         MissingExtra: submitit is not installed. ParameterError: there is no such cluster, or an option is wrong.
     """
@@ -69,8 +70,17 @@ def submit(
     options = {"cpus_per_task": workers, "timeout_min": 24 * 60, "name": f"pharos-{study.name}"}
     executor.update_parameters(**{**options, **(parameters or {})})
     how = {"retry_failed": retry_failed, "resume": resume, "timeout": timeout, "workers": workers, "runner": runner}
+    parts = [f"{part}/{shards}" for part in range(1, shards + 1)]
+    parts = [part for part in parts if _has_work(shard_of(study.runs, part), place, retry_failed)]
+    if not parts:
+        return []
     with executor.batch():
-        return [executor.submit(run_shard, str(place), f"{part}/{shards}", how) for part in range(1, shards + 1)]
+        return [executor.submit(run_shard, str(place), part, how) for part in parts]
+
+
+def _has_work(runs: Iterable[Run], place: Path, retry_failed: bool) -> bool:
+    over = ("finished",) if retry_failed else ("finished", "failed")
+    return any(_worker.read_status(place, run.id) not in over for run in runs)
 
 
 def run_shard(folder: str, shard: str, options: dict[str, Any]) -> dict[str, Any]:
