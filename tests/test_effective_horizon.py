@@ -21,17 +21,26 @@ from strategies import deterministic_mdps, general_mdps
 BRIDGE = Path(__file__).parent / "data" / "bridge"
 
 
+PUBLISHED = [("key-corridor-s3r1", 100), ("freeway_10_fs30", 10), ("maze_easy_l0_30_fs1", 30)]
+
+
 def key_corridor():
-    with np.load(BRIDGE / "key-corridor-s3r1.npz", allow_pickle=False) as arrays:
-        return TabularMDP.from_arrays(arrays["transitions"], arrays["rewards"], gamma=1.0, horizon=100)
+    return bridge_mdp("key-corridor-s3r1", 100)
 
 
-def published(name):
-    return json.loads((BRIDGE / f"key-corridor-s3r1{name}.json").read_text())
+def bridge_mdp(name, horizon):
+    with np.load(BRIDGE / f"{name}.npz", allow_pickle=False) as arrays:
+        return TabularMDP.from_arrays(arrays["transitions"], arrays["rewards"], gamma=1.0, horizon=horizon)
 
 
-def test_the_published_analysis_of_key_corridor_is_reproduced():
-    found, expected = hardness.effective_horizon(key_corridor()), published("_analyzed")
+def published(analysis, name="key-corridor-s3r1"):
+    return json.loads((BRIDGE / f"{name}{analysis}.json").read_text())
+
+
+@pytest.mark.parametrize("name, horizon", PUBLISHED)
+def test_published_analyses_are_reproduced(name, horizon):
+    mdp = bridge_mdp(name, horizon)
+    found, expected = hardness.effective_horizon(mdp), published("_analyzed", name)
     results = expected["effective_horizon_results"]
     assert found.k_min == expected["min_k"]
     assert found.effective_planning_window == expected["epw"]
@@ -40,13 +49,21 @@ def test_the_published_analysis_of_key_corridor_is_reproduced():
     assert found.ms == results["ms"]
     assert found.vars == pytest.approx(results["vars"], rel=1e-8)
     assert found.gaps == pytest.approx([math.inf if gap is None else gap for gap in results["gaps"]], rel=1e-8)
+    omega, occupancies = hardness.covering(mdp), expected["min_occupancy_results"]
+    assert omega.omega_max == pytest.approx(occupancies["min_state_action_occupancy"], rel=1e-6)
+    assert omega.omega_sum == pytest.approx(occupancies["min_sum_state_action_occupancy"], rel=1e-6)
+
+
+def test_returns_of_key_corridor_are_the_published_ones():
+    found = hardness.effective_horizon(key_corridor())
     assert found.random_return == pytest.approx(0.0032357130, abs=5e-11)
     assert (found.optimal_return, found.worst_return) == (1.0, 0.0)
 
 
-def test_the_published_analysis_with_sticky_actions_is_reproduced():
-    found = hardness.effective_horizon(sticky_actions(key_corridor(), 0.25))
-    expected = published("_analyzed_sticky_0.25")
+@pytest.mark.parametrize("name, horizon", PUBLISHED)
+def test_published_analyses_with_sticky_actions_are_reproduced(name, horizon):
+    found = hardness.effective_horizon(sticky_actions(bridge_mdp(name, horizon), 0.25))
+    expected = published("_analyzed_sticky_0.25", name)
     assert found.num_states == expected["num_states"]
     assert found.k_min == expected["min_k"]
     assert found.effective_planning_window == expected["epw"]

@@ -34,6 +34,14 @@ def test_the_published_bound_of_key_corridor_is_reproduced(corridor):
     assert not found.proven
 
 
+@pytest.mark.parametrize("name, horizon", [("freeway_10_fs30", 10), ("maze_easy_l0_30_fs1", 30)])
+def test_the_published_bounds_of_other_games_are_reproduced(name, horizon):
+    published = json.loads((DATA / f"{name}_gorp_bounds.json").read_text())["k_results"]
+    found = hardness.gorp_bound(importers.bridge(DATA / f"{name}.npz", horizon=horizon), max_k=len(published))
+    for k, value in zip(found.ks, found.values, strict=True):
+        assert value == pytest.approx(published[str(k)]["effective_horizon"], rel=1e-12)
+
+
 def test_exact_probabilities_give_a_smaller_bound_that_is_proven(corridor):
     found = hardness.gorp_bound(corridor, methods=("exact", "bennett"))
     assert found.proven and found.ms == [50]

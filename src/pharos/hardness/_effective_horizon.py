@@ -33,8 +33,8 @@ class EffectiveHorizon:
         tight: a tighter bound by GORP's failure probability, where it was asked for; else None.
         greedy_returns: J_k for k = 1, ..., 5: return of the policy greedy in Q^k, ties broken adversarially.
         optimal_return, random_return, worst_return: from the start.
-        num_states: number of states that can be met at some step; under sticky actions of pairs (state, previously executed
-            action), the implicit end with every action among them.
+        num_states: number of states that can be met at some step; under sticky actions, as BRIDGE counts, of pairs (state,
+            previously executed action), the implicit end with every action among them, and a start with the first action.
         conventions: horizon, exploration, chance, tie tolerance.
     """
 
@@ -219,14 +219,18 @@ class _Steps:
         self.first[[node for node, _ in self.starts]] = True
         everything = np.ones((self.num_nodes, self.num_actions), np.bool_)
         visitable, reached = self.first.copy(), self.first
+        inside, ended = choices.underlying < mdp.num_states, False
         for _ in range(steps - 1):
+            ended |= bool((reached & ~inside).any())
             reached = self.following(reached, everything)
             visitable |= reached
-        inside = choices.underlying < mdp.num_states
-        if mdp.is_sticky:  # as BRIDGE counts: pairs, and the end with every previous action, as it leads to itself
-            ended = bool((visitable & ~inside).any())
-            self.num_visitable = int((visitable & inside & (choices.previous < mdp.num_actions)).sum())
-            self.num_visitable += ended * mdp.num_actions
+        if mdp.is_sticky:  # as BRIDGE counts
+            pairs = {
+                (int(s), 0) for s in choices.underlying[self.first]
+            }  # a start stands for itself with the first action
+            met = visitable & (inside | (not ended)) & (choices.previous < mdp.num_actions)
+            pairs |= set(zip(choices.underlying[met].tolist(), choices.previous[met].tolist(), strict=True))
+            self.num_visitable = len(pairs) + ended * mdp.num_actions  # an end leads to itself, by every action
         else:
             self.num_visitable = int((visitable & inside).sum())
 
