@@ -1,5 +1,6 @@
 """The Gymnasium environment: the conformance tests of Gymnasium, agreement with the tabulated MDP, chance, limits, errors."""
 
+import itertools
 import json
 import subprocess
 import sys
@@ -10,8 +11,9 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import pharos
-from pharos.errors import ParameterError
+from pharos.errors import MissingExtra, ParameterError
 from pharos.gym_env import GymEnv, chance_weights
+from pharos.rendering import human
 
 SMALL = {
     "pharos/SimpleGrid-v0": {"height": 3, "width": 4, "rewards": (((1, 1), 0.1),), "penalties": (((0, 2), -0.5),)},
@@ -27,6 +29,47 @@ SMALL = {
 )
 def test_gymnasiums_checker_finds_nothing_to_say(env_id, options):
     check_env(gymnasium.make(env_id, **SMALL[env_id], **options).unwrapped, skip_render_check=True)
+
+
+@pytest.mark.parametrize("env_id", SMALL)
+def test_gymnasiums_checker_finds_nothing_to_say_about_rendering(env_id, monkeypatch):
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    check_env(gymnasium.make(env_id, **SMALL[env_id]).unwrapped)
+
+
+@pytest.mark.parametrize("env_id", SMALL)
+def test_the_picture_is_the_one_for_people(env_id):
+    env = gymnasium.make(env_id, render_mode="rgb_array", **SMALL[env_id])
+    env.reset(seed=0)
+    frames = gymnasium.wrappers.RenderCollection(env)
+    frames.reset(seed=0)
+    for _ in range(5):
+        frames.step(env.action_space.sample())
+    pictures = frames.render()
+    assert len(pictures) == 6
+    assert (pictures[-1] == human(env.unwrapped.environment, env.unwrapped.state)).all()
+    assert any((one != other).any() for one, other in itertools.pairwise(pictures))
+
+
+def test_a_window_shows_each_state_and_closes(monkeypatch):
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    import pygame
+
+    env = GymEnv("frozen_lake", size=4, render_mode="human")
+    env.reset(seed=0)
+    for action in (1, 1, 2):
+        env.step(action)
+        shown = pygame.surfarray.array3d(pygame.display.get_surface()).swapaxes(0, 1)
+        assert (shown == human(env.environment, env.state)).all()
+        assert env.render() is None
+    env.close()
+    assert not pygame.display.get_init()
+
+
+def test_without_pygame_the_message_names_the_extra(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pygame", None)
+    with pytest.raises(MissingExtra, match=r"pharos\[play\]"):
+        GymEnv("frozen_lake", size=4, render_mode="human")
 
 
 @pytest.fixture(scope="module")

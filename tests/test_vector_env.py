@@ -250,3 +250,17 @@ def test_stable_baselines_trains_on_it(observation):
 def test_a_discrete_observation_keeps_its_space(breakout):
     vec = make_vec(breakout.environment, 3, observation="index", space=breakout)
     assert vec.single_observation_space == spaces.Discrete(breakout.num_states)
+
+
+def test_a_vector_environment_draws_each_of_its_environments():
+    from pharos.rendering import human
+
+    envs = gymnasium.make_vec("pharos/FrozenLake-v0", num_envs=3, size=4, render_mode="rgb_array")
+    envs.reset(seed=0)
+    envs.step(np.array([0, 1, 2]))
+    pictures, states = envs.render(), envs.unwrapped.states
+    assert len(pictures) == 3
+    for picture, state in zip(pictures, states, strict=True):
+        assert (picture == human(envs.unwrapped.environment, state.tolist())).all()
+    with pytest.raises(ParameterError, match="render_mode is 'human'"):
+        pharos.make_vec("frozen_lake", 2, size=4, render_mode="human")

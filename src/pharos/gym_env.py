@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium
 import numpy as np
 
+from pharos._window import Window
 from pharos.environment import Environment, make, start_distribution
 from pharos.errors import ParameterError, RuleError
 from pharos.observations import Index, observe
@@ -136,13 +137,14 @@ class GymEnv(gymnasium.Env):
 
     Args:
         environment: a name that `pharos.make` knows, or an Environment.
-        render_mode: None or "ansi".
+        render_mode: None; "ansi", text; "rgb_array", the picture for people, (H, W, 3) uint8; or "human", a window with that picture,
+            drawn anew at each step, 15 a second at most (needs `pip install 'pharos[play]'`).
         options: see `Interaction`, and the parameters of the environment, such as `height=12`.
     Raises:
-        ParameterError: an option or parameter is wrong.
+        ParameterError: an option or parameter is wrong. MissingExtra: render_mode is "human" and pygame is not installed.
     """
 
-    metadata: dict[str, Any] = {"render_modes": ["ansi"], "render_fps": 15}
+    metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array", "ansi"], "render_fps": 15}
 
     def __init__(self, environment: Environment | str, *, render_mode: str | None = None, **options: Any):
         interaction, parameters = split_options(options)
@@ -152,6 +154,9 @@ class GymEnv(gymnasium.Env):
                 f"render_mode is {render_mode!r}; expected None or one of {', '.join(self.metadata['render_modes'])}"
             )
         self.render_mode = render_mode
+        self._window: Window | None = None
+        if render_mode == "human":
+            self._window = Window(str(simulator.env), self.metadata["render_fps"])
         self.observation_space = simulator.context.space
         self.action_space = gymnasium.spaces.Discrete(simulator.env.num_actions)
         self.action_names = simulator.env.actions
@@ -197,6 +202,8 @@ class GymEnv(gymnasium.Env):
         self._elapsed = 0
         if simulator.state_space is not None:
             self._index = int(simulator.state_space.indices(self._state[None])[0])
+        if self._window is not None:
+            self.render()
         return self._observation(), self._info(self._state)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
@@ -223,6 +230,8 @@ class GymEnv(gymnasium.Env):
         if self._successors is not None:
             info["index"] = self._index = int(self._successors[self._index, chosen])
         observation = vector if self._vector_length else self._observation()
+        if self._window is not None:
+            self.render()
         return observation, reward, self._terminated, self._elapsed >= self._limit, info
 
     def _step_after_the_end(self) -> tuple[Any, float, bool, bool, dict[str, Any]]:
@@ -232,12 +241,25 @@ class GymEnv(gymnasium.Env):
         return self._observation(), 0.0, True, self._elapsed >= self._limit, info
 
     def render(self) -> Any:
-        """The current state in the render mode: "ansi", text."""
+        """The current state in the render mode: text, a picture, or None where there is a window."""
         if self.render_mode is None:
             return None
-        from pharos.environments import text_drawing
+        if self.render_mode == "ansi":
+            from pharos.environments import text_drawing
 
-        return text_drawing(self.environment, self.state)
+            return text_drawing(self.environment, self.state)
+        from pharos.rendering import human
+
+        picture = human(self.environment, self.state)
+        if self._window is None:
+            return picture
+        self._window.show(picture)
+        return None
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        if self._window is not None:
+            self._window.close()
 
     def _info(self, state: np.ndarray) -> dict[str, Any]:
         info: dict[str, Any] = {"state": state.copy(), "executed_action": NO_ACTION}

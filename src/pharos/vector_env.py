@@ -38,6 +38,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
             `options={"reset_mask": mask}`.
         seed: of the first reset, where that is given none.
         max_episode_steps: another name of `time_limit`, as `gymnasium.make_vec` calls it.
+        render_mode: None; or "rgb_array": `render()` returns a picture of each environment.
         options: see `Interaction`, and the parameters of the environment, such as `height=12`.
     Raises:
         ParameterError: an option or parameter is wrong.
@@ -53,6 +54,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         seed: int | None = None,
         max_episode_steps: int | None = None,
+        render_mode: str | None = None,
         **options: Any,
     ):
         if max_episode_steps is not None:
@@ -63,8 +65,10 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         self._mode = _MODES.index(_checked_mode(autoreset_mode))
         self.simulator = simulator = Simulator(environment, interaction, parameters)
         self.num_envs = int(num_envs)
-        self.metadata = {"autoreset_mode": _MODES[self._mode], "render_modes": []}
-        self.render_mode = None
+        self.metadata = {"autoreset_mode": _MODES[self._mode], "render_modes": ["rgb_array"], "render_fps": 15}
+        if render_mode not in (None, "rgb_array"):
+            raise ParameterError(f"render_mode is {render_mode!r}; expected None or 'rgb_array'")
+        self.render_mode = render_mode
         self.single_observation_space = simulator.context.space
         self.single_action_space = gymnasium.spaces.Discrete(simulator.env.num_actions)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
@@ -89,6 +93,16 @@ class VectorEnv(gymnasium.vector.VectorEnv):
     def states(self) -> np.ndarray:
         """(N, D) int64, the current states."""
         return self._walk.states(slice(None))
+
+    def render(self) -> tuple[np.ndarray, ...] | None:
+        """The picture for people of each environment, (H, W, 3) uint8, where render_mode is "rgb_array"; else None."""
+        if self.render_mode is None:
+            return None
+        if self._rng is None:
+            raise gymnasium.error.ResetNeeded(f"{self.environment}: call reset() before render()")
+        from pharos.rendering import human
+
+        return tuple(human(self.environment, state.tolist()) for state in self.states)
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
