@@ -44,8 +44,10 @@ def small():
     )
     for methods in (hardness.gorp_bound.__kwdefaults__["methods"], ("exact", "bennett")):
         _, found = timed(
-            f"KeyCorridor, tight bound by {', '.join(methods)}", lambda: hardness.gorp_bound(mdp, methods=methods), 60
-        )  # noqa: B023
+            f"KeyCorridor, tight bound by {', '.join(methods)}",
+            lambda methods=methods: hardness.gorp_bound(mdp, methods=methods),
+            60,
+        )
         print(f"  {found}")
     lake = pharos.build(pharos.make("frozen_lake", size=40, seed=0)).mdp(gamma=1.0)
     slow, _ = timed(f"lake of {lake.num_states} states, T = 200, vectorized", lambda: _vectorized(_Steps(lake, 200)))

@@ -96,17 +96,30 @@ def draw_simple(parameters, states, first, last, planes, shades, covering, out):
     layers, rows, columns = planes.shape
     size = out.shape[2] // rows
     for n in range(first, last):
+        if size == 1 and not covering:
+            image = out[n]
+            draw(self, states[n], image)
+            for layer in range(layers):
+                plane = image[layer].reshape(rows * columns)
+                only = shades[layer, 1]
+                if only == shades[layer, 255]:  # one kind of thing: no table, so that the loop is vectorized
+                    for i in range(rows * columns):
+                        plane[i] = only if plane[i] != 0 else 0
+                else:
+                    for i in range(rows * columns):
+                        plane[i] = shades[layer, plane[i]]
+            continue
         planes[:] = 0
         draw(self, states[n], planes)
         for layer in range(layers):
-            plane = 0 if covering else layer
+            target = 0 if covering else layer
             for row in range(rows):
                 for column in range(columns):
                     shade = shades[layer, planes[layer, row, column]]
                     if shade > 0:
                         for y in range(row * size, (row + 1) * size):
                             for x in range(column * size, (column + 1) * size):
-                                out[n, plane, y, x] = shade
+                                out[n, target, y, x] = shade
 
 
 @njit(cache=CACHE, nogil=True)

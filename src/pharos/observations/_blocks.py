@@ -10,10 +10,13 @@ _pool: tuple[int, ThreadPoolExecutor] | None = None  # of this process: threads 
 
 def in_blocks(run: Callable[[int, int], None], number: int, block: int) -> None:
     """run(first, last) over 0 .. number - 1; on all processors where there are at least two blocks."""
+    if number < 2 * block:
+        run(0, number)
+        return
     from pharos._core.compiling import usable_workers
 
     workers = usable_workers(None)
-    if number < 2 * block or workers < 2:
+    if workers < 2:
         run(0, number)
         return
     parts = min(4 * workers, number // block)

@@ -34,7 +34,7 @@ class ComplexImage(Observation):
 
         self.name = "complex_image"
         self.env = env
-        self._drawing = Drawing(env, "draw_complex", _compose)
+        self._drawing = Drawing(env, "draw_complex", _compose, block=64)
         self._channels_first = bool(channels_first)
         scenery = scenery_of(env)
         natural = _natural_size(scenery, self._drawing.rows, self._drawing.columns)

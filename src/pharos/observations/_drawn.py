@@ -9,8 +9,6 @@ from pharos.environment import Environment, Layer
 from pharos.errors import ParameterError
 from pharos.observations._blocks import in_blocks
 
-BLOCK = 64  # frames that are worth a thread's while
-
 
 def num_values(layer: Layer) -> int:
     """How many values a plane of this layer may have besides 0."""
@@ -23,13 +21,13 @@ class Drawing:
     """Runs a drawing kernel of `interaction_template.py` on batches of states; a twin in Python where Numba cannot compile it.
 
     Attributes:
-        env: the environment; rows, columns: of its grid.
+        env: the environment; rows, columns: of its grid. `block` frames are worth a thread's while.
     Raises:
         ParameterError: the environment declares no grid, no layers or no draw().
     """
 
-    def __init__(self, env: Environment, kernel: str, interpreted: Callable[..., None]):
-        self.env = env
+    def __init__(self, env: Environment, kernel: str, interpreted: Callable[..., None], block: int):
+        self.env, self._block = env, block
         try:
             self.rows, self.columns = env.grid()
             planes = np.zeros((len(env.layers), self.rows, self.columns), np.uint8)
@@ -38,6 +36,7 @@ class Drawing:
             raise ParameterError(f"{env}: cannot be drawn: {error}") from None
         if not env.layers:
             raise ParameterError(f"{env}: cannot be drawn: it declares no layers")
+        self._shape = planes.shape
         self._kernel = kernel
         self._interpreted = interpreted
         self._compiled: Any = None
@@ -47,11 +46,19 @@ class Drawing:
         if self._compiled is None:
             self._compiled = self._function(states, out, tables)
         in_blocks(
-            lambda first, last: self._compiled(states, first, last, self._planes(), *tables, out), len(states), BLOCK
+            lambda first, last: self._compiled(states, first, last, self._planes(), *tables, out),
+            len(states),
+            self._block,
         )
 
+    def one(self, state: np.ndarray, out: np.ndarray, *tables: Any) -> None:
+        """Draw one state (D,) into out (1, ...); as the call for many, without its cost."""
+        if self._compiled is None:
+            self._compiled = self._function(state[None], out, tables)
+        self._compiled(state[None], 0, 1, self._planes(), *tables, out)
+
     def _planes(self) -> np.ndarray:
-        return np.zeros((len(self.env.layers), self.rows, self.columns), np.uint8)
+        return np.empty(self._shape, np.uint8)  # zeroed by the kernel
 
     def _function(self, states: np.ndarray, out: np.ndarray, tables: tuple[Any, ...]) -> Callable[..., None]:
         from pharos._core.compiling import InteractionRules, _first_lines, _warn_once

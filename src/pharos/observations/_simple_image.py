@@ -29,7 +29,7 @@ class SimpleImage(Observation):
 
         self.name = "simple_image"
         self.env = env
-        self._drawing = Drawing(env, "draw_simple", _paint)
+        self._drawing = Drawing(env, "draw_simple", _paint, block=512)
         self._covering = bool(grey)
         rows, columns = self._drawing.rows, self._drawing.columns
         planes = 1 if grey else len(env.layers)
@@ -44,12 +44,18 @@ class SimpleImage(Observation):
                 f"use scale={-(-planes // min(rows, columns))} or grey=True"
             )
         self.space = Box(0, 255, (planes, rows * scale, columns * scale), np.uint8)
+        self._one = (1, planes, rows * scale, columns * scale)
         self._shades = _shades(env, self._covering)
 
     def __call__(self, states: np.ndarray) -> np.ndarray:
         out = np.zeros((len(states), *self.space.shape), np.uint8)  # type: ignore[misc]
         self._drawing(states, out, self._shades, self._covering)
         return out
+
+    def one(self, state: np.ndarray) -> np.ndarray:
+        out = np.zeros(self._one, np.uint8)
+        self._drawing.one(state, out, self._shades, self._covering)
+        return out[0]
 
 
 def _shades(env: Environment, covering: bool) -> np.ndarray:
