@@ -224,7 +224,7 @@ _CALLS = {"explore": _call_explore, "rewards_of": _call_rewards_of}
 
 
 def _empty_layout() -> tuple[np.ndarray, ...]:
-    return tuple(np.zeros(1, dtype) for dtype in (np.uint64, np.uint64, np.uint64, np.int64, np.int64))
+    return (np.zeros((1, 4), np.int64),)
 
 
 def _warn_once(cls: type, kernel: str, error: str) -> None:

@@ -30,6 +30,36 @@ def prefetch(typing_context, array, index):
     return types.void(array, types.int64), codegen
 
 
+def _entry(context, builder, array_type, array, index):
+    array = context.make_array(array_type)(context, builder, array)
+    return builder.gep(array.data, [index])
+
+
+@intrinsic
+def seen(typing_context, table, slot):
+    """table[slot], which another thread may be writing; what it wrote before is seen as well (an acquiring load)."""
+
+    def codegen(context, builder, sig, args):
+        place = _entry(context, builder, sig.args[0], *args)
+        value = builder.load_atomic(place, "acquire", sig.args[0].dtype.bitwidth // 8)
+        return context.cast(builder, value, sig.args[0].dtype, types.int64)
+
+    return types.int64(table, types.int64), codegen
+
+
+@intrinsic
+def publish(typing_context, table, slot, index):
+    """table[slot] = index, after everything written before (a releasing store), for threads that read it by `seen`."""
+
+    def codegen(context, builder, sig, args):
+        place = _entry(context, builder, sig.args[0], *args[:2])
+        value = context.cast(builder, args[2], types.int64, sig.args[0].dtype)
+        builder.store_atomic(value, place, "release", sig.args[0].dtype.bitwidth // 8)
+        return context.get_dummy_value()
+
+    return types.void(table, types.int64, types.int64), codegen
+
+
 @njit(forceinline=True)
 def mixed(h):
     """A 64-bit mixer (two rounds of multiply and xor-shift): every input bit reaches the high bits of the result."""
@@ -124,7 +154,7 @@ def insert_missing(table, states, keys, found, successors, first, count, level_e
                     index = count
                     for k in range(words):
                         states[count, k] = keys[j, k]
-                    table[slot] = count
+                    publish(table, slot, count)
                     count += 1
                     break
                 equal = True

@@ -16,55 +16,82 @@ from numba.core import cgutils
 from numba.extending import intrinsic, models, overload, register_model
 
 _WORD = ir.IntType(64)
-_U64_ARRAY = types.Array(types.uint64, 1, "C")
-_I64_ARRAY = types.Array(types.int64, 1, "C")
+_REGISTER_WORDS = 8  # views on more words than this are in memory
+_OFFSET, _MASK, _LOW, _SIZE = range(4)  # columns of the layout's table
 
 
 class PackedView(types.Type):
-    """Numba type of the view: pointers to the words, to the tables of the layout, and to the fault."""
+    """Numba type of the view on `num_words` words: where they are, the layout's table, and the fault.
 
-    def __init__(self):
-        super().__init__(name="pharos.PackedView")
+    Words that are only read are an array on the stack. Words that are written one after the other are a vector, kept in a
+    register: through memory each write would wait for the one before it.
+    """
+
+    def __init__(self, num_words: int, writable: bool):
+        self.num_words, self.writable = num_words, writable
+        self.in_register = writable and num_words <= _REGISTER_WORDS
+        super().__init__(name=f"pharos.PackedView({num_words}, {writable})")
+
+    @property
+    def words_type(self) -> ir.Type:
+        """The type of all words together, on the stack."""
+        return ir.VectorType(_WORD, self.num_words) if self.in_register else ir.ArrayType(_WORD, self.num_words)
 
 
-PACKED_VIEW = PackedView()
+class _WordsPointer(types.Type):
+    def __init__(self, view_type: PackedView):
+        self.view_type = view_type
+        super().__init__(name=f"{view_type.name}.words")
+
+
+@register_model(_WordsPointer)
+class _WordsPointerModel(models.PrimitiveModel):
+    def __init__(self, manager, pointer_type):
+        super().__init__(manager, pointer_type, pointer_type.view_type.words_type.as_pointer())
 
 
 @register_model(PackedView)
 class _PackedViewModel(models.StructModel):
     def __init__(self, manager, view_type):
         pointer = types.CPointer(types.uint64)
-        names = ("words", "fault", "word", "shift", "mask", "low", "size")
-        members = [*((name, pointer) for name in names), ("length", types.uint64)]
-        super().__init__(manager, view_type, members)
+        words = ("words", _WordsPointer(view_type))
+        super().__init__(manager, view_type, [words, ("fault", pointer), ("fields", pointer), ("length", types.uint64)])
 
 
-@intrinsic
-def packed_view(typing_context, words, word, shift, mask, low, size):
-    """A view on len(words) words of this stack frame, with the layout's tables, each (D,) of 64 bits."""
-    count = len(words)
-    signature = PACKED_VIEW(words, word, shift, mask, low, size)
-
+def _new_view(view_type, words, fields):
     def codegen(context, builder, sig, args):
-        view = cgutils.create_struct_proxy(PACKED_VIEW)(context, builder)
-        words = cgutils.alloca_once(builder, ir.ArrayType(_WORD, count))
-        view.words = builder.bitcast(words, _WORD.as_pointer())
+        view = cgutils.create_struct_proxy(view_type)(context, builder)
+        view.words = cgutils.alloca_once(builder, view_type.words_type)
         view.fault = cgutils.alloca_once(builder, _WORD)
         builder.store(ir.Constant(_WORD, 0), view.fault)
-        for name, array_type, value in zip(
-            ("word", "shift", "mask", "low", "size"), sig.args[1:], args[1:], strict=True
-        ):
-            array = context.make_array(array_type)(context, builder, value)
-            setattr(view, name, builder.bitcast(array.data, _WORD.as_pointer()))
         array = context.make_array(sig.args[1])(context, builder, args[1])
+        view.fields = builder.bitcast(array.data, _WORD.as_pointer())
         view.length = cgutils.unpack_tuple(builder, array.shape)[0]
         return view._getvalue()
 
-    return signature, codegen
+    return view_type(words, fields), codegen
 
 
-def _view(context, builder, value):
-    return cgutils.create_struct_proxy(PACKED_VIEW)(context, builder, value)
+@intrinsic
+def packed_view(typing_context, words, fields):
+    """A view on len(words) words of this stack frame, with the layout's table (D, 4) int64."""
+    return _new_view(PackedView(len(words), True), words, fields)
+
+
+@intrinsic
+def read_only_view(typing_context, words, fields):
+    """The same for a state whose components are only read."""
+    return _new_view(PackedView(len(words), False), words, fields)
+
+
+def _view(context, builder, sig, args):
+    return cgutils.create_struct_proxy(sig.args[0])(context, builder, args[0])
+
+
+def _load_word(builder, view, view_type, k):
+    if view_type.in_register:
+        return builder.extract_element(builder.load(view.words), k)
+    return builder.load(builder.gep(view.words, [ir.Constant(_WORD, 0), k]))
 
 
 @intrinsic
@@ -72,7 +99,11 @@ def set_word(typing_context, view, k, value):
     """Set word k of the view."""
 
     def codegen(context, builder, sig, args):
-        builder.store(args[2], builder.gep(_view(context, builder, args[0]).words, [args[1]]))
+        view = _view(context, builder, sig, args)
+        if sig.args[0].in_register:
+            builder.store(builder.insert_element(builder.load(view.words), args[2], args[1]), view.words)
+        else:
+            builder.store(args[2], builder.gep(view.words, [ir.Constant(_WORD, 0), args[1]]))
         return context.get_dummy_value()
 
     return types.void(view, types.int64, types.uint64), codegen
@@ -83,7 +114,7 @@ def get_word(typing_context, view, k):
     """Word k of the view."""
 
     def codegen(context, builder, sig, args):
-        return builder.load(builder.gep(_view(context, builder, args[0]).words, [args[1]]))
+        return _load_word(builder, _view(context, builder, sig, args), sig.args[0], args[1])
 
     return types.uint64(view, types.int64), codegen
 
@@ -93,7 +124,7 @@ def fault(typing_context, view):
     """0, or 1 + the component that was read or written outside its declared range (1 + D: no such component)."""
 
     def codegen(context, builder, sig, args):
-        return builder.load(_view(context, builder, args[0]).fault)
+        return builder.load(_view(context, builder, sig, args).fault)
 
     return types.int64(view), codegen
 
@@ -103,7 +134,7 @@ def clear_fault(typing_context, view):
     """Forget the fault."""
 
     def codegen(context, builder, sig, args):
-        builder.store(ir.Constant(_WORD, 0), _view(context, builder, args[0]).fault)
+        builder.store(ir.Constant(_WORD, 0), _view(context, builder, sig, args).fault)
         return context.get_dummy_value()
 
     return types.void(view), codegen
@@ -111,30 +142,44 @@ def clear_fault(typing_context, view):
 
 def _checked_component(builder, view, index):
     """`index` as in Python (negative from the end); where there is no such component, component 0 and a fault."""
-    negative = builder.icmp_signed("<", index, ir.Constant(_WORD, 0))
-    index = builder.select(negative, builder.add(index, view.length), index)
-    inside = builder.icmp_unsigned("<", index, view.length)
-    _note_fault(builder, view, builder.not_(inside), view.length)
-    return builder.select(inside, index, ir.Constant(_WORD, 0))
+    checked = cgutils.alloca_once_value(builder, index)
+    with builder.if_then(builder.icmp_unsigned(">=", index, view.length), likely=False):
+        wrapped = builder.add(index, view.length)
+        is_negative = builder.icmp_signed("<", index, ir.Constant(_WORD, 0))
+        inside = builder.and_(is_negative, builder.icmp_unsigned("<", wrapped, view.length))
+        builder.store(builder.select(inside, wrapped, ir.Constant(_WORD, 0)), checked)
+        with builder.if_then(builder.not_(inside)):
+            _note_fault(builder, view, view.length)
+    return builder.load(checked)
 
 
-def _note_fault(builder, view, is_fault, component):
-    found = builder.add(component, ir.Constant(_WORD, 1))
-    builder.store(builder.select(is_fault, found, builder.load(view.fault)), view.fault)
+def _note_fault(builder, view, component):
+    builder.store(builder.add(component, ir.Constant(_WORD, 1)), view.fault)
 
 
-def _field(builder, view, index):
-    """Pointer to the word of a component, its shift, mask and lowest value."""
-    table = [builder.load(builder.gep(column, [index])) for column in (view.word, view.shift, view.mask, view.low)]
-    return builder.gep(view.words, [table[0]]), *table[1:]
+def _column(builder, view, index, column):
+    """One entry of the layout's row of a component."""
+    place = builder.add(builder.shl(index, ir.Constant(_WORD, 2)), ir.Constant(_WORD, column))
+    return builder.load(builder.gep(view.fields, [place]))
+
+
+def _place(builder, view, view_type, index):
+    """The word of a component and its shift there."""
+    offset = _column(builder, view, index, _OFFSET)
+    if view_type.num_words == 1:
+        return ir.Constant(_WORD, 0), offset
+    return builder.lshr(offset, ir.Constant(_WORD, 6)), builder.and_(offset, ir.Constant(_WORD, 63))
 
 
 @intrinsic
 def _get_component(typing_context, view, index):
     def codegen(context, builder, sig, args):
-        view = _view(context, builder, args[0])
-        word, shift, mask, low = _field(builder, view, _checked_component(builder, view, args[1]))
-        return builder.add(low, builder.and_(builder.lshr(builder.load(word), shift), mask))
+        view = _view(context, builder, sig, args)
+        index = _checked_component(builder, view, args[1])
+        word, shift = _place(builder, view, sig.args[0], index)
+        field = builder.lshr(_load_word(builder, view, sig.args[0], word), shift)
+        field = builder.and_(field, _column(builder, view, index, _MASK))
+        return builder.add(_column(builder, view, index, _LOW), field)
 
     return types.int64(view, types.int64), codegen
 
@@ -142,18 +187,36 @@ def _get_component(typing_context, view, index):
 @intrinsic
 def _set_component(typing_context, view, index, value):
     def codegen(context, builder, sig, args):
-        view = _view(context, builder, args[0])
+        view = _view(context, builder, sig, args)
         index = _checked_component(builder, view, args[1])
-        word, shift, mask, low = _field(builder, view, index)
-        offset = builder.sub(args[2], low)
-        inside = builder.icmp_unsigned("<", offset, builder.load(builder.gep(view.size, [index])))
-        _note_fault(builder, view, builder.not_(inside), index)
-        field = builder.shl(builder.and_(offset, mask), shift)
-        others = builder.and_(builder.load(word), builder.not_(builder.shl(mask, shift)))
-        builder.store(builder.or_(others, field), word)
+        word, shift = _place(builder, view, sig.args[0], index)
+        mask = _column(builder, view, index, _MASK)
+        offset = builder.sub(args[2], _column(builder, view, index, _LOW))
+        inside = builder.icmp_unsigned("<", offset, _column(builder, view, index, _SIZE))
+        with builder.if_then(builder.not_(inside), likely=False):
+            _note_fault(builder, view, index)
+        field, mask = builder.shl(builder.and_(offset, mask), shift), builder.shl(mask, shift)
+        place = view.words
+        if sig.args[0].in_register:
+            field, mask = (_in_lane(builder, sig.args[0].num_words, word, bits) for bits in (field, mask))
+        else:
+            place = builder.gep(view.words, [ir.Constant(_WORD, 0), word])
+        builder.store(builder.or_(builder.and_(builder.load(place), builder.not_(mask)), field), place)
         return context.get_dummy_value()
 
     return types.void(view, types.int64, types.int64), codegen
+
+
+def _in_lane(builder, num_words, word, bits):
+    """A vector with `bits` in lane `word`, elsewhere 0."""
+    vector = ir.VectorType(_WORD, num_words)
+    first, zero = ir.Constant(ir.IntType(32), 0), ir.Constant(vector, [0] * num_words)
+    everywhere = ir.Constant(ir.VectorType(ir.IntType(32), num_words), [0] * num_words)
+    word, bits = (
+        builder.shuffle_vector(builder.insert_element(zero, value, first), zero, everywhere) for value in (word, bits)
+    )
+    lanes = ir.Constant(vector, list(range(num_words)))
+    return builder.select(builder.icmp_unsigned("==", word, lanes), bits, zero)
 
 
 @overload(operator.getitem)
@@ -164,14 +227,14 @@ def _getitem(view, index):
 
 @overload(operator.setitem)
 def _setitem(view, index, value):
-    if isinstance(view, PackedView) and isinstance(index, types.Integer | types.Boolean):
+    if isinstance(view, PackedView) and view.writable and isinstance(index, types.Integer | types.Boolean):
         return lambda view, index, value: _set_component(view, int64(index), int64(value))
 
 
 @intrinsic
 def _length(typing_context, view):
     def codegen(context, builder, sig, args):
-        return _view(context, builder, args[0]).length
+        return _view(context, builder, sig, args).length
 
     return types.int64(view), codegen
 

@@ -5,17 +5,17 @@
 Names that the template gets from there: the rules `transition`, `is_terminal`, `reward`, `draw`; `Parameters`, a namedtuple,
 what the rules see as `self`; the constants NUM_WORDS, NUM_ACTIONS and WORDS, a tuple of NUM_WORDS zeros; CACHE, whether
 compiled code is kept on disk.
-`layout` stands for five (D,) tables (word, shift, mask, low, size): where component i of a state sits.
+`layout` is a tuple of one table (D, 4): where component i of a state sits (state_space/_packing.py).
 """
 
 import numpy as np
 from numba import int64, njit
 
-from pharos._core.hash_table import mixed, prefetch, slot_of
-from pharos._core.packed import fault, get_word, packed_view, set_word
+from pharos._core.hash_table import mixed, prefetch, seen, slot_of
+from pharos._core.packed import fault, get_word, packed_view, read_only_view, set_word
 
 BATCH = 16  # states expanded before their successors are looked up: enough look-ups to hide the memory's latency
-FIRST, COUNT, LEVEL_END, DEPTH, FAULT, FAULT_ACTION = range(6)  # fields of `progress`
+FIRST, COUNT, LEVEL_END, DEPTH, FAULT = range(5)  # fields of `progress`
 
 
 @njit(forceinline=True)
@@ -40,22 +40,42 @@ def same(keys, j, states, index):
     return True
 
 
-@njit(forceinline=True)
-def expand(self, state, out, states, index, keys, j, progress):
-    """Write the packed successors of states[index] to keys[j : j + A]; return whether it is terminal."""
-    load(state, states, index)
-    ended = is_terminal(self, state)
-    if not ended:
-        for a in range(NUM_ACTIONS):
-            load(out, states, index)
-            transition(self, state, a, out)
+@njit(nogil=True)
+def expand(parameters, layout, states, first, n, keys, slots, terminal, row, table, progress):
+    """Successors of states [first, first + n): packed words to keys, slots from which to search to slots, -1 if terminal.
+
+    keys (n * A, W), slots (n * A,); terminal[row + i] gets whether state first + i is terminal. The slots are prefetched.
+    """
+    self = Parameters(*parameters)
+    state = read_only_view(WORDS, *layout)
+    out = packed_view(WORDS, *layout)
+    capacity = table.shape[0]
+    progress[FIRST] = first  # where to look, should a rule fail
+    for i in range(n):
+        load(state, states, first + i)
+        ended = is_terminal(self, state)
+        terminal[row + i] = ended
+        for j in range(i * NUM_ACTIONS, (i + 1) * NUM_ACTIONS):
+            if ended:
+                slots[j] = -1
+                continue
+            load(out, states, first + i)
+            transition(self, state, j - i * NUM_ACTIONS, out)
             for k in range(NUM_WORDS):
-                keys[j + a, k] = get_word(out, k)
-            if fault(out) and not progress[FAULT]:
-                progress[FAULT], progress[FAULT_ACTION] = fault(out), a
-    if fault(state) and not progress[FAULT]:
-        progress[FAULT], progress[FAULT_ACTION] = fault(state), -1
-    return ended
+                keys[j, k] = get_word(out, k)
+            slots[j] = slot_of(hash_of(keys, j), capacity)
+            prefetch(table, slots[j])
+    progress[FAULT] = max(fault(state), fault(out))
+
+
+@njit(forceinline=True)
+def prefetch_states(table, states, slots, n):
+    """Fetch the states that sit in the slots, which will be compared soon."""
+    for j in range(n * NUM_ACTIONS):
+        if slots[j] >= 0:
+            index = seen(table, slots[j])
+            if index >= 0:
+                prefetch(states, index)
 
 
 @njit(cache=CACHE, nogil=True)
@@ -65,54 +85,53 @@ def explore(parameters, layout, states, successors, terminal, table, base, last,
     states (capacity, W) uint64: found so far, in the order of discovery: progress[COUNT] of them.
     successors (rows, A), terminal (rows,) uint8: row i belongs to state base + i.
     table (slots,): index of a state, or -1; its place follows from the hash of the state.
+    While one batch is looked up, the next one is expanded already where it is known: memory has that long to answer.
     """
-    self = Parameters(*parameters)
-    state = packed_view(WORDS, *layout)
-    out = packed_view(WORDS, *layout)
-    keys = np.empty((BATCH * NUM_ACTIONS, NUM_WORDS), np.uint64)
-    slots = np.empty(BATCH * NUM_ACTIONS, np.int64)
+    keys = np.empty((2, BATCH * NUM_ACTIONS, NUM_WORDS), np.uint64)
+    slots = np.empty((2, BATCH * NUM_ACTIONS), np.int64)
     capacity = table.shape[0]
     first, count = progress[FIRST], progress[COUNT]
     level_end, depth = progress[LEVEL_END], progress[DEPTH]
-    while first < count and first < last and count + BATCH * NUM_ACTIONS <= room:
-        progress[FIRST], progress[COUNT] = first, count  # where to look, should a rule fail
-        n = min(BATCH, count - first, last - first)
-        for i in range(n):
-            j = i * NUM_ACTIONS
-            ended = expand(self, state, out, states, first + i, keys, j, progress)
-            terminal[first + i - base] = ended
-            for a in range(NUM_ACTIONS):
-                slots[j + a] = -1
-                if not ended:
-                    slots[j + a] = slot_of(hash_of(keys, j + a), capacity)
-                    prefetch(table, slots[j + a])
-        if progress[FAULT]:
+    waiting, buffer = 0, 0  # states [first, first + waiting) are expanded, in the other buffer
+    while True:
+        n = 0
+        if count + 2 * BATCH * NUM_ACTIONS <= room:
+            n = max(0, min(BATCH, count - first - waiting, last - first - waiting))
+        if n == 0 and waiting == 0:
             break
-        for j in range(n * NUM_ACTIONS):
-            if slots[j] >= 0 and table[slots[j]] >= 0:
-                prefetch(states, int64(table[slots[j]]))
-        for i in range(n):
+        if n > 0:
+            progress[COUNT] = count
+            ahead = first + waiting
+            expand(
+                parameters, layout, states, ahead, n, keys[buffer], slots[buffer], terminal, ahead - base, table, progress
+            )
+            if progress[FAULT]:
+                return
+        buffer = 1 - buffer
+        for i in range(waiting):
             for a in range(NUM_ACTIONS):
                 j = i * NUM_ACTIONS + a
-                slot = slots[j]
+                slot = slots[buffer, j]
                 found = first + i
                 while slot >= 0:
                     found = int64(table[slot])
                     if found < 0:
                         found = count
                         for k in range(NUM_WORDS):
-                            states[count, k] = keys[j, k]
+                            states[count, k] = keys[buffer, j, k]
                         table[slot] = count
                         count += 1
                         break
-                    if same(keys, j, states, found):
+                    if same(keys[buffer], j, states, found):
                         break
                     slot = slot + 1 if slot + 1 < capacity else 0
                 successors[first + i - base, a] = found
             if first + i + 1 == level_end:
                 level_end = count
                 depth += 1
-        first += n
+        first += waiting
+        prefetch_states(table, states, slots[1 - buffer], n)
+        waiting = n
     progress[FIRST], progress[COUNT] = first, count
     progress[LEVEL_END], progress[DEPTH] = level_end, depth
 
@@ -122,36 +141,27 @@ def expand_and_find(parameters, layout, states, start, stop, base, keys, found, 
     """The part of a wide frontier that threads share: successors of states [start, stop), and those already known.
 
     keys ((rows * A), W) gets the successors' words; found (rows * A,) their indices, or -1 - slot where one is not known yet;
-    row i belongs to state base + i. The table is only read.
+    row i belongs to state base + i. The table is only read; another thread may insert meanwhile: what it inserts is found or
+    not found, and the one that numbers the states searches on from the slot.
     """
-    self = Parameters(*parameters)
-    state = packed_view(WORDS, *layout)
-    out = packed_view(WORDS, *layout)
-    slots = np.empty(BATCH * NUM_ACTIONS, np.int64)
+    slots = np.empty((2, BATCH * NUM_ACTIONS), np.int64)
     capacity = table.shape[0]
-    for batch in range(start, stop, BATCH):
-        progress[FIRST] = batch
-        n = min(BATCH, stop - batch)
-        first = (batch - base) * NUM_ACTIONS
-        for i in range(n):
-            j = i * NUM_ACTIONS
-            ended = expand(self, state, out, states, batch + i, keys, first + j, progress)
-            terminal[batch + i - base] = ended
-            for a in range(NUM_ACTIONS):
-                slots[j + a] = -1
-                if not ended:
-                    slots[j + a] = slot_of(hash_of(keys, first + j + a), capacity)
-                    prefetch(table, slots[j + a])
-        if progress[FAULT]:
-            return
-        for j in range(n * NUM_ACTIONS):
-            if slots[j] >= 0 and table[slots[j]] >= 0:
-                prefetch(states, int64(table[slots[j]]))
-        for j in range(n * NUM_ACTIONS):
-            slot = slots[j]
-            index = batch + j // NUM_ACTIONS
+    waiting, buffer = 0, 0
+    for batch in range(start, stop + BATCH, BATCH):
+        n = max(0, min(BATCH, stop - batch))
+        if n > 0:
+            part = keys[(batch - base) * NUM_ACTIONS : (batch - base + n) * NUM_ACTIONS]
+            expand(parameters, layout, states, batch, n, part, slots[buffer], terminal, batch - base, table, progress)
+            if progress[FAULT]:
+                return
+        buffer = 1 - buffer
+        before = batch - BATCH
+        first = (before - base) * NUM_ACTIONS
+        for j in range(waiting * NUM_ACTIONS):
+            slot = slots[buffer, j]
+            index = before + j // NUM_ACTIONS
             while slot >= 0:
-                index = int64(table[slot])
+                index = seen(table, slot)
                 if index < 0:
                     index = -1 - slot
                     break
@@ -159,14 +169,16 @@ def expand_and_find(parameters, layout, states, start, stop, base, keys, found, 
                     break
                 slot = slot + 1 if slot + 1 < capacity else 0
             found[first + j] = index
+        prefetch_states(table, states, slots[1 - buffer], n)
+        waiting = n
 
 
 @njit(cache=CACHE, nogil=True)
 def rewards_of(parameters, layout, states, successors, terminal, start, stop, out):
     """out[i, a] = reward of the stored transition of state start + i; 0 in terminal states. Returns whether all are finite."""
     self = Parameters(*parameters)
-    state = packed_view(WORDS, *layout)
-    following = packed_view(WORDS, *layout)
+    state = read_only_view(WORDS, *layout)
+    following = read_only_view(WORDS, *layout)
     finite = True
     for s in range(start, stop):
         load(state, states, s)

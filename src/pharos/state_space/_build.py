@@ -182,7 +182,7 @@ class _Builder:
         self.depth = -1  # levels finished, the start states' own level not counted
         self.terminals = 0
         self.index_dtype: np.dtype = np.dtype("<i4")
-        self.margin = 16 * env.num_actions + len(self.start_states)
+        self.margin = 32 * env.num_actions + len(self.start_states)
 
     def run(self, manifest: dict[str, Any] | None) -> None:
         self.began = self.last_checkpoint = time.perf_counter()

@@ -5,6 +5,7 @@ the order of declaration; one that would straddle two words starts the next word
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -23,10 +24,12 @@ class Layout:
     size: np.ndarray
     num_words: int
 
-    @property
+    @cached_property
     def tables(self) -> tuple[np.ndarray, ...]:
-        """The five tables, in the order in which compiled code takes them."""
-        return self.word, self.shift, self.mask, self.low, self.size
+        """The layout as compiled code takes it: one table (D, 4) int64 of 64 * word + shift, mask, low, size."""
+        offset = (self.word << np.uint64(6)) + self.shift
+        columns = (offset.astype(np.int64), self.mask.astype(np.int64), self.low, self.size)
+        return (np.stack(columns, axis=1),)
 
 
 def layout_of(components: Components) -> Layout:
