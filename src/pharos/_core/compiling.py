@@ -207,7 +207,7 @@ def _call_explore(compiled: CompiledRules) -> None:
     table, layout = np.full(1 << 16, -1, np.int32), _empty_layout()
     rows = (np.empty((1, compiled.kernels.NUM_ACTIONS), np.int32), np.empty(1, np.uint8))
     states = np.empty((1, compiled.kernels.NUM_WORDS), np.uint64)
-    compiled.kernels.explore(compiled.parameters, layout, states, *rows, table, 0, 0, 0, np.zeros(6, np.int64))
+    compiled.kernels.explore(compiled.parameters, layout, states, *rows, table, 0, 0, 0, np.zeros(5, np.int64))
 
 
 def _call_rewards_of(compiled: CompiledRules) -> None:

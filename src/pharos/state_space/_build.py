@@ -49,6 +49,7 @@ OUR_FILES = (STATES, SUCCESSORS, WIDE_SUCCESSORS, TERMINAL, MANIFEST + ".tmp", "
 CHUNK = (
     1 << 16
 )  # states expanded between two looks at the clock; a multiple of 8, so that terminal bits fill whole bytes
+PIECES = 4  # of a chunk: threads expand one while the one before is numbered
 WIDE = 1 << 13  # a frontier of this many states is worth sharing between threads
 CHECKPOINT_SECONDS = 15.0
 LOAD = 0.5  # the table grows beyond this share of used slots
@@ -163,6 +164,19 @@ def _check_size(env: Environment, count: int, left: int, max_states: int | None)
         )
 
 
+class _Piece:
+    """A piece of a wide frontier: what threads write, for the one that numbers the states."""
+
+    def __init__(self, num_actions: int, num_words: int):
+        rows = -(-CHUNK // PIECES)
+        self.keys = np.empty((rows * num_actions, num_words), np.uint64)
+        self.found = np.empty(rows * num_actions, np.int64)
+        self.terminal = np.empty(rows, np.uint8)
+        self.first = self.stop = 0
+        self.faults: list[np.ndarray] = []
+        self.futures: list[Future] = []
+
+
 class _Builder:
     """One run of the build: memory, files and the loop."""
 
@@ -182,6 +196,9 @@ class _Builder:
         self.depth = -1  # levels finished, the start states' own level not counted
         self.terminals = 0
         self.index_dtype: np.dtype = np.dtype("<i4")
+        self.ahead: _Piece | None = None  # expanded by threads, not numbered yet
+        self.spare: list[_Piece] = []
+        self.blocks: list[tuple[np.ndarray, np.ndarray]] = []  # rows of successors and terminal bits, used in turn
         self.margin = 32 * env.num_actions + len(self.start_states)
 
     def run(self, manifest: dict[str, Any] | None) -> None:
@@ -263,15 +280,14 @@ class _Builder:
             self._widen_indices()
         base = self.first
         last = base + CHUNK
-        successors = np.empty((CHUNK, self.env.num_actions), self.index_dtype)
-        terminal = np.zeros(CHUNK, np.uint8)
+        successors, terminal = self._block()
         while self.first < min(last, self.count):
-            if self.count + self.margin > self._room():
+            if self.ahead is None and self.count + self.margin > self._room():
                 self._make_room()
             if self.rules is None:
                 self._expand_interpreted(successors, terminal, base, min(last, self.count))
-            elif self.workers > 1 and min(last, self.count) - self.first >= WIDE:
-                self._expand_wide(pool, successors, terminal, base, min(last, self.count))
+            elif self.ahead or (self.workers > 1 and min(last, self.count) - self.first >= WIDE):
+                self._expand_wide(pool, successors, terminal, base)
             else:
                 self._expand_narrow(successors, terminal, base, last)
             _check_size(self.env, self.count, self.count - self.first, self.max_states)
@@ -280,8 +296,17 @@ class _Builder:
         self._append(self.states[self.appended : self.count], successors[:rows], terminal[:rows])
         self.report(self._progress())
 
+    def _block(self) -> tuple[np.ndarray, np.ndarray]:
+        """Room for the rows of a chunk; _append lets two chunks wait, so the third one back is written."""
+        if len(self.blocks) == 3 and self.blocks[0][0].dtype == self.index_dtype:
+            self.blocks.append(self.blocks.pop(0))
+        else:
+            rows = np.empty((CHUNK, self.env.num_actions), self.index_dtype)
+            self.blocks = [*self.blocks, (rows, np.empty(CHUNK, np.uint8))][-3:]
+        return self.blocks[-1]
+
     def _expand_narrow(self, successors, terminal, base, last) -> None:
-        progress = np.array([self.first, self.count, self.level_end, self.depth, 0, 0], np.int64)
+        progress = np.array([self.first, self.count, self.level_end, self.depth, 0], np.int64)
         # look at the width and the limit again after a while
         stop = min(last, max(self.first + 2048, self.count)) if self.workers > 1 else last
         failure: Exception | None = None
@@ -305,51 +330,71 @@ class _Builder:
             self._blame_rules(first, min(first + 16, count), failure)
         self._take(progress)
 
-    def _expand_wide(self, pool, successors, terminal, base, stop) -> None:
-        first, num_actions = self.first, self.env.num_actions
-        room = (self._room() - self.count) // num_actions
-        stop = min(stop, first + room)
-        rows = stop - first
-        keys = np.empty((rows * num_actions, self.layout.num_words), np.uint64)
-        found = np.empty(rows * num_actions, np.int64)
-        faults = [np.zeros(6, np.int64) for _ in range(self.workers)]
-        cuts = [first + rows * i // self.workers for i in range(self.workers + 1)]
+    def _expand_wide(self, pool, successors, terminal, base) -> None:
+        """Number the successors of the piece that threads have expanded, while they expand the next one."""
+        from pharos._core.hash_table import insert_missing
 
-        def share(i: int) -> None:
-            self.rules.kernels.expand_and_find(
+        piece = self.ahead or self._expand_ahead(pool, self.first, self.first - base)
+        assert piece is not None
+        self.ahead = None
+        wait(piece.futures)
+        for future, fault in zip(piece.futures, piece.faults, strict=True):
+            failure = future.exception()
+            if failure or fault[4]:
+                self._blame_rules(int(fault[0]), min(int(fault[0]) + 16, piece.stop), failure)
+        rows, num_actions = piece.stop - piece.first, self.env.num_actions
+        row = piece.first - base
+        reserved = rows * num_actions
+        if self.count - piece.stop >= WIDE:
+            self.ahead = self._expand_ahead(pool, piece.stop, (row + rows) % CHUNK, reserved)
+        progress = np.zeros(5, np.int64)
+        insert_missing(
+            self.table,
+            self.states,
+            piece.keys,
+            piece.found,
+            successors[row : row + rows],
+            piece.first,
+            self.count,
+            self.level_end,
+            self.depth,
+            progress,
+        )
+        terminal[row : row + rows] = piece.terminal[:rows]
+        self.spare.append(piece)
+        self._take(progress)
+
+    def _expand_ahead(self, pool, first: int, row: int, reserved: int = 0) -> "_Piece | None":
+        """Let threads expand a piece of the frontier, from state `first`, in row `row` of its chunk.
+
+        None where the table has no room left beside `reserved` other states: it grows while nobody reads it.
+        """
+        room = (self._room() - self.count - reserved) // self.env.num_actions
+        rows = min(-(-CHUNK // PIECES), CHUNK - row, self.count - first, room)
+        if rows < 1:
+            return None
+        piece = self.spare.pop() if self.spare else _Piece(self.env.num_actions, self.layout.num_words)
+        cuts = [first + rows * i // self.workers for i in range(self.workers + 1)]
+        piece.first, piece.stop = first, first + rows
+        piece.faults = [np.zeros(5, np.int64) for _ in range(self.workers)]
+        piece.futures = [
+            pool.submit(
+                self.rules.kernels.expand_and_find,
                 self.rules.parameters,
                 self.layout.tables,
                 self.states,
                 cuts[i],
                 cuts[i + 1],
                 first,
-                keys,
-                found,
-                terminal[first - base :],
+                piece.keys,
+                piece.found,
+                piece.terminal,
                 self.table,
-                faults[i],
+                piece.faults[i],
             )
-
-        failures = [future.exception() for future in [pool.submit(share, i) for i in range(self.workers)]]
-        for fault, failure in zip(faults, failures, strict=True):
-            if failure or fault[4]:
-                self._blame_rules(int(fault[0]), min(int(fault[0]) + 16, stop), failure)
-        from pharos._core.hash_table import insert_missing
-
-        progress = np.zeros(6, np.int64)
-        insert_missing(
-            self.table,
-            self.states,
-            keys,
-            found,
-            successors[first - base : first - base + rows],
-            first,
-            self.count,
-            self.level_end,
-            self.depth,
-            progress,
-        )
-        self._take(progress)
+            for i in range(self.workers)
+        ]
+        return piece
 
     def _expand_interpreted(self, successors, terminal, base, stop) -> None:
         """The same with rules that Numba cannot compile: Python calls them, arrays do the rest."""
@@ -368,7 +413,7 @@ class _Builder:
         find(self.table, self.states, keys, found)
         slots = np.flatnonzero(found < 0)
         found[slots] = -1 - _slots_of(keys[slots], len(self.table))
-        progress = np.zeros(6, np.int64)
+        progress = np.zeros(5, np.int64)
         part = successors[self.first - base : stop - base]
         insert_missing(
             self.table, self.states, keys, found, part, self.first, self.count, self.level_end, self.depth, progress
