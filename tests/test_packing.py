@@ -1,12 +1,14 @@
 """Integer vectors <-> packed states: the layout of docs/format.md, its twin in Python integers, and the compiled view."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numba import njit
 
-from pharos._core.hash_table import fill, find, mixed, slot_of
+from pharos._core.hash_table import fill, fill_more, fill_range, find, mixed, slot_of
 from pharos._core.packed import clear_fault, fault, get_word, packed_view, set_word
 from pharos.environment import Components
 from pharos.errors import ParameterError
@@ -184,6 +186,38 @@ def test_a_full_table_wraps_around():
     out = np.empty(len(keys), np.int64)
     find(table, keys, keys, out)
     assert (out == np.arange(len(keys))).all()
+
+
+@pytest.mark.parametrize("parts", (1, 2, 3, 64))
+@pytest.mark.parametrize("count", (1000, 40_000, 65_000))
+def test_a_table_filled_part_by_part_holds_every_state_once(parts, count):
+    keys = np.random.default_rng(count).permutation(80_000).astype(np.uint64)[:, None]
+    states, others = keys[:count], keys[count:]
+    table = np.full(1 << 16, -1, np.int32)
+    cuts = [(1 << 16) * i // parts for i in range(parts + 1)]
+    left = []
+    for low, high in pairwise(cuts):
+        left_over = np.empty(1 << 16, np.int64)
+        over = fill_range(table, states, count, low, high, left_over)
+        assert set(table[low:high][table[low:high] >= 0].tolist()).isdisjoint(left_over[:over].tolist())
+        left.append(left_over[:over])
+    assert parts == 1 or count < 65_000 or sum(map(len, left)) > 0  # a full part has no room for all of its states
+    for indices in left:
+        fill_more(table, states, indices)
+    assert sorted(table[table >= 0].tolist()) == list(range(count))
+    out = np.empty(len(keys), np.int64)
+    find(table, states, keys, out)
+    assert out.tolist() == [*range(count), *[-1] * len(others)]
+
+
+def test_states_beyond_the_room_for_what_is_left_over_are_counted():
+    states = np.arange(65_000, dtype=np.uint64)[:, None]
+    table, few = np.full(1 << 16, -1, np.int32), np.empty(3, np.int64)
+    left = fill_range(table, states, len(states), 0, 1 << 12, few)
+    assert left > len(few)
+    assert (table[: 1 << 12] >= 0).sum() + left == fill_range(
+        np.full(1 << 16, 0, np.int32), states, len(states), 0, 1 << 12, np.empty(0, np.int64)
+    )
 
 
 def test_a_range_that_is_too_large_is_refused():

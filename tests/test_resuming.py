@@ -61,6 +61,16 @@ def test_files_do_not_depend_on_threads_or_blocks(env, workers, chunk, wide, tmp
     assert_same_files(tmp_path / "space", undisturbed[env.name])
 
 
+@pytest.mark.parametrize("room", (1 << 16, 0))
+def test_a_table_that_threads_fill_together_gives_the_same_files(room, tmp_path, undisturbed, monkeypatch):
+    monkeypatch.setattr(building, "PARALLEL_FILL", 0)
+    monkeypatch.setattr(building, "LEFT_OVER", room)
+    with pytest.raises(StateSpaceTooLarge):
+        build(BREAKOUT, tmp_path / "space", workers=2, max_states=20_000)
+    build(BREAKOUT, tmp_path / "space", workers=3)
+    assert_same_files(tmp_path / "space", undisturbed["breakout"])
+
+
 def in_a_child(work, *args) -> multiprocessing.Process:
     """Run `work` in a forked process and return it; forked, so that nothing is imported or compiled again."""
     process = fork.Process(target=work, args=args)

@@ -102,6 +102,51 @@ def fill(table, states, count):
 
 
 @njit(cache=True, nogil=True)
+def fill_range(table, states, count, low, high, left_over):
+    """The same for the states whose slots are in [low, high), so that threads can fill disjoint ranges of one table.
+
+    Returns the number of states that found no free slot before `high`, and puts their indices into left_over, as many as fit.
+    """
+    capacity = table.shape[0]
+    slots = np.empty(2 * _BATCH, np.int64)
+    indices = np.empty(2 * _BATCH, np.int64)
+    n, over = 0, 0
+    for first in range(0, count, _BATCH):
+        stop = min(first + _BATCH, count)
+        for i in range(first, stop):
+            slots[n] = slot_of(_hash_of(states, i), capacity)
+            indices[n] = i
+            n += low <= slots[n] < high
+        if n < _BATCH and stop < count:
+            continue
+        for i in range(n):
+            prefetch(table, slots[i])
+        for i in range(n):
+            slot = slots[i]
+            while slot < high and table[slot] >= 0:
+                slot += 1
+            if slot < high:
+                table[slot] = indices[i]
+            else:
+                if over < len(left_over):
+                    left_over[over] = indices[i]
+                over += 1
+        n = 0
+    return over
+
+
+@njit(cache=True, nogil=True)
+def fill_more(table, states, indices):
+    """Put some more states into a table."""
+    capacity = table.shape[0]
+    for index in indices:
+        slot = slot_of(_hash_of(states, index), capacity)
+        while table[slot] >= 0:
+            slot = slot + 1 if slot + 1 < capacity else 0
+        table[slot] = index
+
+
+@njit(cache=True, nogil=True)
 def find(table, states, keys, out):
     """out[j] = index of keys[j] among the states, or -1. keys (N, W) uint64."""
     capacity = table.shape[0]

@@ -103,7 +103,17 @@ def explore(parameters, layout, states, successors, terminal, table, base, last,
             progress[COUNT] = count
             ahead = first + waiting
             expand(
-                parameters, layout, states, ahead, n, keys[buffer], slots[buffer], terminal, ahead - base, table, progress
+                parameters,
+                layout,
+                states,
+                ahead,
+                n,
+                keys[buffer],
+                slots[buffer],
+                terminal,
+                ahead - base,
+                table,
+                progress,
             )
             if progress[FAULT]:
                 return

@@ -52,6 +52,8 @@ CHUNK = (
 PIECES = 4  # of a chunk: threads expand one while the one before is numbered
 WIDE = 1 << 13  # a frontier of this many states is worth sharing between threads
 CHECKPOINT_SECONDS = 15.0
+PARALLEL_FILL = 1 << 16  # states that are worth sharing between threads when the table grows
+LEFT_OVER = 1 << 12  # states that may pass the end of a part of the table, which are a handful
 LOAD = 0.5  # the table grows beyond this share of used slots
 INT32_STATES = 2**31 - 1
 
@@ -205,13 +207,14 @@ class _Builder:
         self.began = self.last_checkpoint = time.perf_counter()
         self.states = _reserved_states(self.layout.num_words)
         self.table = np.empty(0, self.index_dtype)
+        self.table_space = _reserved_table()
         self.files: dict[str, GrowingFile] = {}
         self.writes: list[Future] = []
         self.written: dict[str, Any] | None = None
         try:
             self._open(manifest)
             with ThreadPoolExecutor(self.workers) as pool, ThreadPoolExecutor(1) as self.writer:
-                self._grow_table(self.count)
+                self._grow_table(pool, self.count)
                 while self.first < self.count:
                     self._expand_chunk(pool)
                     if time.perf_counter() - self.last_checkpoint >= self.checkpoint_seconds:
@@ -225,7 +228,7 @@ class _Builder:
         finally:
             for file in self.files.values():
                 file.close()
-            del self.states, self.table  # also where a traceback keeps this builder alive
+            del self.states, self.table, self.table_space  # also where a traceback keeps this builder alive
         self.report(self._progress(finished=True))
 
     def _open(self, manifest: dict[str, Any] | None) -> None:
@@ -277,13 +280,13 @@ class _Builder:
     def _expand_chunk(self, pool: ThreadPoolExecutor) -> None:
         """Expand up to CHUNK states, then append their rows to the files."""
         if self.index_dtype.itemsize == 4 and self.count + CHUNK * self.env.num_actions + self.margin > INT32_STATES:
-            self._widen_indices()
+            self._widen_indices(pool)
         base = self.first
         last = base + CHUNK
         successors, terminal = self._block()
         while self.first < min(last, self.count):
             if self.ahead is None and self.count + self.margin > self._room():
-                self._make_room()
+                self._make_room(pool)
             if self.rules is None:
                 self._expand_interpreted(successors, terminal, base, min(last, self.count))
             elif self.ahead or (self.workers > 1 and min(last, self.count) - self.first >= WIDE):
@@ -439,26 +442,44 @@ class _Builder:
         """States that table and array of states can hold."""
         return min(int(len(self.table) * LOAD), len(self.states))
 
-    def _make_room(self) -> None:
+    def _make_room(self, pool: ThreadPoolExecutor) -> None:
         if self.count + self.margin > len(self.states):
             raise MemoryError(
                 f"{self.env}: no address space for more than {len(self.states)} states; set a larger ulimit -v"
             )
-        self._grow_table(self.count)
+        self._grow_table(pool, self.count)
 
-    def _grow_table(self, count: int) -> None:
+    def _grow_table(self, pool: ThreadPoolExecutor, count: int) -> None:
         """A table with room for about twice as many states, filled from the array of states."""
-        from pharos._core.hash_table import fill
+        from pharos._core.hash_table import fill, fill_more, fill_range
 
         slots = 1 << 16
         while slots * LOAD < 1.4 * count + self.margin:
             slots *= 2
         needed = slots * self.index_dtype.itemsize + int(slots * LOAD) * self.layout.num_words * 8
         self._check_memory(count, needed)
-        self.table = np.empty(0, self.index_dtype)  # free the old one first
-        self.table = _huge_pages(slots, self.index_dtype)
-        self.table.fill(-1)
-        fill(self.table, self.states, count)
+        self.table = np.empty(0, self.index_dtype)  # free the old one first, where it cannot grow in its place
+        if self.table_space.nbytes < slots * self.index_dtype.itemsize:
+            self.table_space = _huge_pages(slots, self.index_dtype)
+        self.table = self.table_space.view(self.index_dtype)[:slots]
+        if self.workers == 1 or count < PARALLEL_FILL:
+            self.table.fill(-1)
+            fill(self.table, self.states, count)
+            return
+        cuts = [slots * i // self.workers for i in range(self.workers + 1)]
+        left_over = np.empty((self.workers, LEFT_OVER), np.int64)
+
+        def fill_part(i: int) -> int:
+            self.table[cuts[i] : cuts[i + 1]].fill(-1)
+            return fill_range(self.table, self.states, count, cuts[i], cuts[i + 1], left_over[i])
+
+        left = [*pool.map(fill_part, range(self.workers))]
+        if max(left) > left_over.shape[1]:  # only where a bad hash crowds the end of a part
+            self.table.fill(-1)
+            fill(self.table, self.states, count)
+            return
+        for i, over in enumerate(left):
+            fill_more(self.table, self.states, left_over[i, :over])
 
     def _check_memory(self, count: int, needed: int) -> None:
         available = self.memory if self.memory is not None else _available_memory()
@@ -471,7 +492,7 @@ class _Builder:
 
     # Files ---------------------------------------------------------------------------------------------------------------
 
-    def _widen_indices(self) -> None:
+    def _widen_indices(self, pool: ThreadPoolExecutor) -> None:
         """From int32 to int64 indices: a new file of successors and a new table; the old file goes once this is committed."""
         self._finish_writes()
         old = self.files[self.successors_name]
@@ -487,7 +508,7 @@ class _Builder:
         del self.files[SUCCESSORS]
         old.close()
         old.path.unlink()
-        self._grow_table(self.count)
+        self._grow_table(pool, self.count)
 
     def _append(self, states: np.ndarray, successors: np.ndarray, terminal: np.ndarray) -> None:
         """Append in the background, while the next chunk is expanded; at most two chunks wait.
@@ -556,6 +577,14 @@ def _reserved_states(num_words: int) -> np.ndarray:
         except (OSError, ValueError):
             continue
     raise MemoryError("no address space for 2^26 states; set a larger ulimit -v")
+
+
+def _reserved_table() -> np.ndarray:
+    """Address space in which the table grows; an empty array where there is none."""
+    for size in (1 << 35, 1 << 33, 1 << 31):
+        with contextlib.suppress(OSError, ValueError):
+            return _huge_pages(size, np.dtype("|u1"))
+    return np.empty(0, np.uint8)
 
 
 def _huge_pages(length: int, dtype: np.dtype) -> np.ndarray:
