@@ -1,5 +1,6 @@
 """The files of a state space do not depend on threads, blocks, or on how often the build was killed, stopped or refused."""
 
+import errno
 import multiprocessing
 import os
 import resource
@@ -14,6 +15,7 @@ import pytest
 import pharos
 from pharos.errors import DiskFull, StateSpaceIncomplete, StateSpaceLocked, StateSpaceTooLarge
 from pharos.state_space import _build as building
+from pharos.state_space import _files as writing
 from table_worlds import TableWorld
 
 BREAKOUT = pharos.make("breakout", height=7, columns=5)  # 27,692 states; a frontier of hundreds
@@ -304,6 +306,98 @@ def test_a_full_disk_loses_nothing(limit, tmp_path, undisturbed, small_blocks):
     manifest = building.read_manifest(folder)
     if limit >= 20_000:
         assert 12 * (manifest["num_expanded"] + 2 * 512) > limit  # all that fitted, but for the blocks under way
+    build(BREAKOUT, folder)
+    assert_same_files(folder, undisturbed["breakout"])
+
+
+class FullDisk:
+    """A disk that has no room from the n-th call of one kind on: a write to a file, an fsync, a rename, or making a file.
+
+    Half of the write that fails is on the disk. `freed_at_once`: the next call has room again.
+    """
+
+    def __init__(self, monkeypatch, kind: str, call: int, freed_at_once: bool):
+        self.kind, self.call, self.freed_at_once = kind, call, freed_at_once
+        self.calls = 0
+        real_open, real_fsync, real_replace = open, os.fsync, os.replace
+
+        def opened(path, *args, **options):
+            name = Path(path).name
+            if name not in ("lock", "meminfo"):
+                self.count("open")
+            file = real_open(path, *args, **options)
+            return _FileOnFullDisk(file, name, self) if name == self.kind else file
+
+        def fsync(*args):
+            self.count("fsync")
+            real_fsync(*args)
+
+        def replace(*args):
+            self.count("rename")
+            real_replace(*args)
+
+        monkeypatch.setattr(writing, "open", opened, raising=False)
+        monkeypatch.setattr(os, "fsync", fsync)
+        monkeypatch.setattr(os, "replace", replace)
+
+    def count(self, kind: str) -> None:
+        if kind == self.kind:
+            self.calls += 1
+            if self.calls == self.call or (self.calls > self.call and not self.freed_at_once):
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+class _FileOnFullDisk:
+    def __init__(self, file, name: str, disk: FullDisk):
+        self.file, self.name, self.disk = file, name, disk
+
+    def write(self, data):
+        try:
+            self.disk.count(self.name)
+        except OSError:
+            self.file.write(data[: len(data) // 2])
+            raise
+        return self.file.write(data)
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.file.close()
+
+    def __getattr__(self, name):
+        return getattr(self.file, name)
+
+
+@pytest.mark.parametrize("freed_at_once", (False, True))
+@pytest.mark.parametrize("call", (1, 2, 7, 23))
+@pytest.mark.parametrize(
+    "kind", ("states.bin", "successors.bin", "terminal.bin", "manifest.json.tmp", "open", "fsync", "rename")
+)
+def test_a_disk_that_is_full_at_any_point_loses_nothing(
+    kind, call, freed_at_once, tmp_path, undisturbed, small_blocks, monkeypatch
+):
+    folder = tmp_path / "space"
+    committed = []
+
+    def note(_):  # what a checkpoint has promised so far
+        committed.append((building.read_manifest(folder) or {"num_expanded": 0})["num_expanded"])
+
+    with monkeypatch.context() as patch:
+        disk = FullDisk(patch, kind, call, freed_at_once)
+        with pytest.raises(
+            DiskFull, match=r"cannot write \(No space left on device; \d+ MiB free\).*same command resumes"
+        ):
+            build(BREAKOUT, folder, checkpoint_seconds=0.0, progress=note)
+        assert disk.calls >= call
+    kept = (building.read_manifest(folder) or {"num_expanded": 0})["num_expanded"]
+    assert kept >= max(committed, default=0)
+    if not freed_at_once and kind != "open":
+        with pytest.MonkeyPatch.context() as patch:  # the disk is still full: the same error, and still nothing is lost
+            FullDisk(patch, kind, 1, False)
+            with pytest.raises(DiskFull):
+                build(BREAKOUT, folder, checkpoint_seconds=0.0)
+        assert (building.read_manifest(folder) or {"num_expanded": 0})["num_expanded"] >= kept
     build(BREAKOUT, folder)
     assert_same_files(folder, undisturbed["breakout"])
 
