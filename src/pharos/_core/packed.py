@@ -177,9 +177,8 @@ def _get_component(typing_context, view, index):
         view = _view(context, builder, sig, args)
         index = _checked_component(builder, view, args[1])
         word, shift = _place(builder, view, sig.args[0], index)
-        field = builder.lshr(_load_word(builder, view, sig.args[0], word), shift)
-        field = builder.and_(field, _column(builder, view, index, _MASK))
-        return builder.add(_column(builder, view, index, _LOW), field)
+        field = builder.and_(_load_word(builder, view, sig.args[0], word), _column(builder, view, index, _MASK))
+        return builder.add(_column(builder, view, index, _LOW), builder.lshr(field, shift))
 
     return types.int64(view, types.int64), codegen
 
@@ -193,9 +192,11 @@ def _set_component(typing_context, view, index, value):
         mask = _column(builder, view, index, _MASK)
         offset = builder.sub(args[2], _column(builder, view, index, _LOW))
         inside = builder.icmp_unsigned("<", offset, _column(builder, view, index, _SIZE))
+        harmless = cgutils.alloca_once_value(builder, offset)
         with builder.if_then(builder.not_(inside), likely=False):
             _note_fault(builder, view, index)
-        field, mask = builder.shl(builder.and_(offset, mask), shift), builder.shl(mask, shift)
+            builder.store(ir.Constant(_WORD, 0), harmless)
+        field = builder.shl(builder.load(harmless), shift)
         place = view.words
         if sig.args[0].in_register:
             field, mask = (_in_lane(builder, sig.args[0].num_words, word, bits) for bits in (field, mask))

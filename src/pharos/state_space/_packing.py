@@ -26,9 +26,9 @@ class Layout:
 
     @cached_property
     def tables(self) -> tuple[np.ndarray, ...]:
-        """The layout as compiled code takes it: one table (D, 4) int64 of 64 * word + shift, mask, low, size."""
+        """The layout as compiled code takes it: one table (D, 4) int64 of 64 * word + shift, mask << shift, low, size."""
         offset = (self.word << np.uint64(6)) + self.shift
-        columns = (offset.astype(np.int64), self.mask.astype(np.int64), self.low, self.size)
+        columns = (offset.astype(np.int64), (self.mask << self.shift).astype(np.int64), self.low, self.size)
         return (np.stack(columns, axis=1),)
 
 
