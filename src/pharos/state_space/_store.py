@@ -264,9 +264,11 @@ def check_rules(
     folder: Path, env: Environment, layout: Layout, states: np.ndarray, successors: np.ndarray, bits: np.ndarray
 ) -> None:
     """StateSpaceMismatch where the rules of `env` disagree with stored transitions, in 64 states spread over the file."""
-    for i in np.unique(np.linspace(0, len(successors) - 1, 64).astype(np.int64)):
-        state = tuple(unpack(layout, states[i : i + 1])[0].tolist())
-        stored = [tuple(row) for row in unpack(layout, states[successors[i]]).tolist()]
+    chosen = np.unique(np.linspace(0, len(successors) - 1, 64).astype(np.int64))
+    following = unpack(layout, states[successors[chosen].ravel()]).tolist()
+    for n, (i, row) in enumerate(zip(chosen.tolist(), unpack(layout, states[chosen]).tolist(), strict=True)):
+        state = tuple(row)
+        stored = [tuple(row) for row in following[n * env.num_actions : (n + 1) * env.num_actions]]
         ended = bool(env.is_terminal(state))
         found = [state if ended else env.next_state(state, action) for action in range(env.num_actions)]
         if stored != found or ended != bool(bits[i // 8] >> (i % 8) & 1):
