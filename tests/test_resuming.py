@@ -256,6 +256,24 @@ def test_beyond_32_bit_indices_only_the_width_of_the_successors_changes(widened,
     assert wide.indices(wide.states()).tolist() == list(range(wide.num_states))
 
 
+@pytest.mark.parametrize("limit", (3000, 25_000, 28_000))  # beyond 24,000 the table grows as well
+def test_indices_widen_while_threads_are_a_piece_ahead(limit, tmp_path, undisturbed, monkeypatch):
+    monkeypatch.setattr(building, "CHUNK", 512)
+    monkeypatch.setattr(building, "WIDE", 16)
+    monkeypatch.setattr(building, "INT32_STATES", limit)
+    widen, ahead = building._Builder._widen_indices, []
+
+    def noted(self, pool):
+        ahead.append(self.ahead)
+        widen(self, pool)
+
+    monkeypatch.setattr(building._Builder, "_widen_indices", noted)
+    wide, narrow = build(BREAKOUT, tmp_path / "space", workers=2), pharos.load(undisturbed["breakout"])
+    assert len(ahead) == 1 and ahead[0] is not None
+    assert (wide.successors == narrow.successors).all()
+    assert (wide.packed_states == narrow.packed_states).all()
+
+
 @pytest.mark.parametrize("limit", (1000, 4000, 6000, 20000))
 def test_a_build_that_widens_its_indices_resumes_to_the_same_files(limit, widened, tmp_path, small_blocks, monkeypatch):
     monkeypatch.setattr(building, "INT32_STATES", 5000)

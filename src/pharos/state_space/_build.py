@@ -4,7 +4,7 @@ Breadth-first search: the array of states, in the order of discovery, is the que
 only other memory. Successors and terminal bits are appended to files as the states are expanded. While the frontier is
 wide, threads compute successors and look up those already known, and one thread numbers the new ones in order: so states
 are numbered as one thread would number them. While it is narrow (Freeway: 148 thousand levels of 9 states) one thread does
-everything. docs/decisions/building.md has the measurements.
+everything. docs/decisions has the measurements.
 """
 
 import contextlib
@@ -495,6 +495,9 @@ class _Builder:
     def _widen_indices(self, pool: ThreadPoolExecutor) -> None:
         """From int32 to int64 indices: a new file of successors and a new table; the old file goes once this is committed."""
         self._finish_writes()
+        if self.ahead:  # its slots are those of the old table: it is expanded again
+            wait(self.ahead.futures)
+            self.ahead = None
         old = self.files[self.successors_name]
         wide = GrowingFile(self.path / WIDE_SUCCESSORS)
         for start in range(0, self.first, CHUNK):
