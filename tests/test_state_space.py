@@ -445,6 +445,19 @@ def test_a_rule_that_breaks_the_contract_is_named_with_state_and_action(
         build(env, folder, workers=workers)
 
 
+class WritesToItsState(Walk):
+    def transition(self, state, action, out):
+        state[0] = min(max(state[0] + 2 * action - 1, 0), self.length - 1)
+
+
+def test_a_rule_that_writes_to_the_state_is_neither_compiled_nor_interpreted(folder):
+    with (
+        pytest.warns(RuntimeWarning, match="WritesToItsState: Numba cannot compile its rules"),
+        pytest.raises(RuleError, match=r"in state \(0,\) by action 'left' a rule raises TypeError"),
+    ):
+        build(WritesToItsState(), folder)
+
+
 def test_what_was_found_before_a_rule_failed_is_kept(folder, monkeypatch):
     monkeypatch.setattr(building, "CHUNK", 64)
     with pytest.raises(RuleError):

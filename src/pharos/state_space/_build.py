@@ -2,9 +2,9 @@
 
 Breadth-first search: the array of states, in the order of discovery, is the queue; a table of indices keyed by hash is the
 only other memory. Successors and terminal bits are appended to files as the states are expanded. While the frontier is
-wide, threads compute successors and look up those already known, and one thread numbers the new ones in order: so states
-are numbered as one thread would number them. While it is narrow (Freeway: 148 thousand levels of 9 states) one thread does
-everything. docs/decisions has the measurements.
+wide, threads compute successors and look up those already known, a piece ahead of the one thread that numbers the new
+ones in order: so states are numbered as one thread would number them. While it is narrow (Freeway: 148 thousand levels of
+9 states) one thread does everything. docs/decisions has the measurements.
 """
 
 import contextlib
