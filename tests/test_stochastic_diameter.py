@@ -39,6 +39,16 @@ def test_diameters_are_those_of_the_explicit_matrices(mdp, restart):
         assert found.lower <= expected * (1 + 1e-9) and expected <= found.upper * (1 + 1e-9)
 
 
+@pytest.mark.parametrize("workers", [2, 5])
+def test_results_do_not_depend_on_the_number_of_threads(workers, monkeypatch):
+    mdp = random_actions(pharos.build(pharos.make("frozen_lake/8x8")).mdp(), 0.1)
+    monkeypatch.setattr("pharos.hardness._stochastic_diameter.usable_workers", lambda _: 1)
+    expected = hardness.diameter(mdp)
+    monkeypatch.setattr("pharos.hardness._stochastic_diameter.usable_workers", lambda _: workers)
+    found = hardness.diameter(mdp)
+    assert (found.lower, found.upper, found.searches) == (expected.lower, expected.upper, expected.searches)
+
+
 @settings(max_examples=40, deadline=None)
 @given(chancy_mdps(), st.booleans())
 def test_start_eccentricities_are_those_of_the_explicit_matrices(mdp, restart):

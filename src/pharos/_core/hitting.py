@@ -30,35 +30,40 @@ def backward_order(first, previous, goal, order, distance):
     return tail
 
 
-@njit(forceinline=True)
-def _backup(first, node, weight, num_actions, j, n):
-    best = np.inf
-    for a in range(num_actions):
-        row = n * num_actions + a
-        total = 1.0
-        for i in range(first[row], first[row + 1]):
-            total += weight[i] * j[node[i]]
-        best = min(best, total)
-    return best
-
-
 @njit(cache=True, nogil=True)
-def sweep_in_place(first, node, weight, num_actions, goal, order, count, j):
-    """j(n) = 1 + min_a sum p j, in place in the order given; the largest change. j is 0 at the goal."""
+def sweep_in_place(rows, common, goal, order, count, j):
+    """j(n) = 1 + min_a sum p j, in place in the order given; the largest change. j is 0 at the goal.
+
+    What all actions of a node have in common is in its row of `common`, the rest in `rows` of each action.
+    """
+    first, node, weight = rows
+    always, always_node, always_weight = common
+    num_actions = (len(first) - 1) // len(goal)
     change = 0.0
     for i in range(count):
         n = order[i]
         if goal[n]:
             continue
-        value = _backup(first, node, weight, num_actions, j, n)
-        change = max(change, abs(value - j[n]))
-        j[n] = value
+        best = np.inf
+        for row in range(n * num_actions, (n + 1) * num_actions):
+            total = 0.0
+            for k in range(first[row], first[row + 1]):
+                total += weight[k] * j[node[k]]
+            best = min(best, total)
+        best += 1.0
+        for k in range(always[n], always[n + 1]):
+            best += always_weight[k] * j[always_node[k]]
+        change = max(change, abs(best - j[n]))
+        j[n] = best
     return change
 
 
 @njit(cache=True, nogil=True)
-def residuals(first, node, weight, num_actions, goal, order, count, j, policy):
+def residuals(rows, common, goal, order, count, j, policy):
     """(largest T j - j, largest j - T j, largest j) over nodes that are not the goal; policy[n] = the action that attains T j."""
+    first, node, weight = rows
+    always, always_node, always_weight = common
+    num_actions = (len(first) - 1) // len(goal)
     above, below, largest = 0.0, 0.0, 0.0
     for i in range(count):
         n = order[i]
@@ -67,11 +72,14 @@ def residuals(first, node, weight, num_actions, goal, order, count, j, policy):
         best, choice = np.inf, 0
         for a in range(num_actions):
             row = n * num_actions + a
-            total = 1.0
+            total = 0.0
             for k in range(first[row], first[row + 1]):
                 total += weight[k] * j[node[k]]
             if total < best:
                 best, choice = total, a
+        best += 1.0
+        for k in range(always[n], always[n + 1]):
+            best += always_weight[k] * j[always_node[k]]
         policy[n] = choice
         above = max(above, best - j[n])
         below = max(below, j[n] - best)

@@ -9,14 +9,18 @@ Certificate. For any J >= 0 with T J - J <= above < 1 and J - T J <= below every
 With c = 1 / (1 - above), T(c J) = 1 + c (T J - 1) <= 1 + c (J + above - 1) = c J: the policy that is greedy in c J loses at least
 one expected step a step, so it needs at most c J. With c = 1 / (1 + below), T(c J) >= c J in the same way, and iterating T from
 c J rises to J*. It does not matter where J comes from: sweeps in place from the target outwards, then policies evaluated by a
-sparse linear solve where sweeps are slow. A target whose upper bound falls below the largest proven hitting time is dropped
+sparse linear solve where sweeps are slow. They begin with the distance times what the first target's hitting times are of its
+distances, at their upper end: from above, few sweeps prove that a target is not the one. A target whose upper bound falls below the largest proven hitting time is dropped
 at once.
 
 Nodes. Without sticky actions the states, and the implicit end. Under sticky actions the pairs (state, previously executed
 action) that can be reached, and the start states without a previous action; a target is a state, reached with any previous action.
 """
 
+import itertools
 import math
+from concurrent.futures import ThreadPoolExecutor
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -26,6 +30,7 @@ from scipy import sparse
 from scipy.sparse import csgraph
 from scipy.sparse.linalg import splu
 
+from pharos._core.compiling import usable_workers
 from pharos.errors import UndefinedMeasure
 from pharos.hardness._interval import Budget, Interval, Spending
 from pharos.mdp import TabularMDP
@@ -33,6 +38,7 @@ from pharos.mdp import TabularMDP
 SWEEPS = 40  # before a policy is evaluated by a linear solve
 SOLVABLE = 60_000  # nodes up to which linear solves are tried
 TOP = 1e300
+BATCH = 64  # targets that threads look at with the same largest hitting time known
 
 
 @dataclass
@@ -209,36 +215,47 @@ class _Targets:
     def __init__(self, choices: Choices):
         matrix = choices.matrix
         self.choices = choices
-        self.arrays = (
-            matrix.indptr.astype(np.int64),
-            matrix.indices.astype(np.int64),
-            matrix.data,
-            choices.num_actions,
-        )
+        self.support = (matrix.indptr.astype(np.int64), matrix.indices.astype(np.int64), choices.num_actions)
+        self.arrays = _without_common(matrix, choices.num_actions)
         first, previous = choices.reversed
         self.back = (first.astype(np.int64), previous.astype(np.int64))
-        size = len(choices.underlying)
-        self.order, self.distance = np.empty(size, np.int64), np.empty(size, np.int64)
-        self.policy = np.zeros(size, np.int64)
         self.members = np.argsort(choices.underlying, kind="stable")
         self.edges = np.searchsorted(choices.underlying[self.members], np.arange(choices.num_targets + 1))
-        self.goal = np.zeros(size, np.bool_)
+        self.ratio = 1.0
+        self._make_room()
+
+    def learn_ratio(self, j: np.ndarray) -> None:
+        """Guess the next hitting times from those of the target last opened: a guess somewhat too large is the quickest to be proven."""
+        there = (self.distance > 0) & (j < TOP)
+        if there.any():
+            self.ratio = float(np.quantile(j[there] / self.distance[there], 0.99))
+
+    def _make_room(self) -> None:
+        size = len(self.choices.underlying)
+        self.order, self.distance = np.empty(size, np.int64), np.empty(size, np.int64)
+        self.policy, self.goal = np.zeros(size, np.int64), np.zeros(size, np.bool_)
+
+    def for_another_thread(self) -> "_Targets":
+        """The same problem with room of its own."""
+        other = copy(self)
+        other._make_room()
+        return other
 
     def nodes_of(self, target: int) -> np.ndarray:
         return self.members[self.edges[target] : self.edges[target + 1]]
 
     def open(self, target: int) -> tuple[np.ndarray, int, np.ndarray | None]:
-        """(J, nodes to sweep, nodes that do not surely reach the target, or None): J from the distances, a lower bound."""
+        """(J, nodes to sweep, nodes that do not surely reach the target, or None): J a guess, `ratio` times the distance."""
         from pharos._core import hitting
 
         self.goal[:] = False
         self.goal[self.nodes_of(target)] = True
         count = hitting.backward_order(*self.back, self.goal, self.order, self.distance)
-        j = np.maximum(self.distance, 0).astype(np.float64)
+        j = np.maximum(self.distance, 0) * self.ratio
         if self.choices.is_strongly_connected:
             return j, count, None
         sure, found = np.empty_like(self.goal), np.empty_like(self.goal)
-        hitting.almost_surely(*self.arrays[:2], self.arrays[3], self.goal, sure, found)
+        hitting.almost_surely(*self.support, self.goal, sure, found)
         keep = sure[self.order[:count]]
         kept = self.order[:count][keep]
         self.order[: kept.size] = kept
@@ -296,6 +313,33 @@ class _Targets:
         return full[nodes]
 
 
+def _without_common(matrix: Any, num_actions: int) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
+    """(first, node, weight) of the rows without what all actions of a node have in common, and that: (first, node, weight) of nodes.
+
+    Under random actions each action may be replaced by any other, under sticky ones by the previous: that part is then added up once.
+    """
+    nodes = matrix.shape[0] // num_actions
+    row = np.repeat(np.arange(matrix.shape[0]), np.diff(matrix.indptr))
+    pairs, place, times = np.unique(
+        (row // num_actions) * np.int64(nodes) + matrix.indices, return_inverse=True, return_counts=True
+    )
+    least = np.full(len(pairs), np.inf)
+    np.minimum.at(least, place, matrix.data)
+    least[times < num_actions] = 0.0
+    rest = matrix.data - least[place]
+    kept = rest > 1e-15
+    if kept.sum() + np.count_nonzero(least) >= matrix.nnz:  # nothing gained
+        least[:] = 0.0
+        rest, kept = matrix.data, np.ones(matrix.nnz, np.bool_)
+    shared = least > 0
+    first = np.concatenate([[0], np.cumsum(np.bincount(row[kept], minlength=matrix.shape[0]))])
+    always = np.concatenate([[0], np.cumsum(np.bincount(pairs[shared] // nodes, minlength=nodes))])
+    return (
+        (first.astype(np.int64), matrix.indices[kept].astype(np.int64), rest[kept]),
+        (always.astype(np.int64), (pairs[shared] % nodes).astype(np.int64), least[shared]),
+    )
+
+
 def _met(low: float, high: float, tolerance: float) -> bool:
     """Whether bounds by these factors are within `tolerance` of each other."""
     return math.isfinite(high) and high - low <= tolerance * high
@@ -313,19 +357,28 @@ def stochastic_diameter(mdp: TabularMDP, restart: bool, tolerance: float, spendi
     met = np.diff(targets.edges) > 0
     settled = int(np.count_nonzero(~met))  # states that cannot be reached at all
     unreachable = settled * (number - 1)
-    for target in _by_promise(targets, spending):
-        if not met[target]:
-            continue
-        if spending.is_over:
-            break
-        j, count, lost = targets.open(target)
-        if lost is not None and lost.any():
-            unreachable += np.unique(choices.underlying[lost]).size
-        low, high, largest = targets.solve(j, count, tolerance, finite, spending)
-        spending.searches += 1
-        finite, highest = max(finite, largest * low), max(highest, largest * high)
-        settled += 1
-        spending.report(finite, max(highest, choices.crude_upper if settled < number else 0.0), number - settled)
+    order = [int(target) for target in _by_promise(targets, spending) if met[target]]
+    threads = [targets, *(targets.for_another_thread() for _ in range(usable_workers(None) - 1))]
+    with ThreadPoolExecutor(len(threads)) as pool:
+        at, size = 0, 1  # the first one alone: its hitting times are large, and make a guess for the others
+        while at < len(order) and not spending.is_over:
+            left = spending.budget.searches - spending.searches
+            batch = order[at : at + int(min(size, left))]
+            parts = [batch[i :: len(threads)] for i in range(len(threads))]
+            looks = [
+                pool.submit(_look, own, part, tolerance, finite, spending)
+                for own, part in zip(threads, parts, strict=True)
+                if part
+            ]
+            for low, high, lost in itertools.chain.from_iterable(look.result() for look in looks):
+                finite, highest = max(finite, low), max(highest, high)
+                unreachable += lost
+            spending.searches += len(batch)
+            settled += len(batch)
+            for own in threads:
+                own.ratio = targets.ratio
+            at, size = at + len(batch), min(2 * size, BATCH)
+            spending.report(finite, max(highest, choices.crude_upper if settled < number else 0.0), number - settled)
     done = settled == number
     upper = max(highest, finite) if done else max(highest, choices.crude_upper)
     lower = finite
@@ -350,6 +403,25 @@ def stochastic_diameter(mdp: TabularMDP, restart: bool, tolerance: float, spendi
         note=note,
         seconds=spending.seconds,
     )
+
+
+def _look(
+    targets: _Targets, some: list[int], tolerance: float, enough: float, spending: Spending
+) -> list[tuple[float, float, int]]:
+    """For each target: bounds of the largest hitting time, and how many states do not surely reach it.
+
+    What lies below `enough` is known no better than that; it is the same for all targets of a batch, so that results do not depend on
+    the number of threads.
+    """
+    found = []
+    for target in some:
+        j, count, lost = targets.open(target)
+        missing = 0 if lost is None else np.unique(targets.choices.underlying[lost]).size
+        low, high, largest = targets.solve(j, count, tolerance, enough, spending)
+        found.append((largest * low, largest * high, missing))
+        if enough == 0.0:
+            targets.learn_ratio(j)
+    return found
 
 
 def _by_promise(targets: _Targets, spending: Spending) -> np.ndarray:
