@@ -23,8 +23,8 @@ HEAVY = ("numba", "scipy", "pandas", "matplotlib", "torch", "rich", "typer", "st
 # A file imports, at its top, only what stands before it. Inside of functions `make` and `StateSpace` look ahead.
 ORDER = (
     *("errors", "paths", "environment", "environments", "_core", "state_space", "mdp", "solvers", "hardness"),
-    *("bisimulation", "importers", "exporters", "conformance", "observations", "rendering", "gym_env", "vector_env"),
-    *("sb3_env", "_registration", "agents", "experiments", "plots", "study", "cli", "__main__"),
+    *("bisimulation", "importers", "exporters", "conformance", "observations", "rendering", "_window", "gym_env"),
+    *("vector_env", "sb3_env", "_registration", "agents", "experiments", "plots", "study", "cli", "__main__"),
 )
 
 # These may never meet, not even inside of a function.
