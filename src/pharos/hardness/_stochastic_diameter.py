@@ -366,7 +366,7 @@ def stochastic_diameter(mdp: TabularMDP, restart: bool, tolerance: float, spendi
             batch = order[at : at + int(min(size, left))]
             parts = [batch[i :: len(threads)] for i in range(len(threads))]
             looks = [
-                pool.submit(_look, own, part, tolerance, finite, spending)
+                pool.submit(_look, own, part, tolerance, finite, spending, learn=at == 0)
                 for own, part in zip(threads, parts, strict=True)
                 if part
             ]
@@ -406,7 +406,7 @@ def stochastic_diameter(mdp: TabularMDP, restart: bool, tolerance: float, spendi
 
 
 def _look(
-    targets: _Targets, some: list[int], tolerance: float, enough: float, spending: Spending
+    targets: _Targets, some: list[int], tolerance: float, enough: float, spending: Spending, learn: bool
 ) -> list[tuple[float, float, int]]:
     """For each target: bounds of the largest hitting time, and how many states do not surely reach it.
 
@@ -419,7 +419,7 @@ def _look(
         missing = 0 if lost is None else np.unique(targets.choices.underlying[lost]).size
         low, high, largest = targets.solve(j, count, tolerance, enough, spending)
         found.append((largest * low, largest * high, missing))
-        if enough == 0.0:
+        if learn:
             targets.learn_ratio(j)
     return found
 
