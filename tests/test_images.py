@@ -1,5 +1,7 @@
 """Simple and complex images: compiled frames against their interpreted twins, spaces, layers that show, options, errors."""
 
+import warnings
+
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
@@ -110,6 +112,22 @@ def test_stable_baselines_accepts_what_is_no_image(env, observation):
     from stable_baselines3.common.env_checker import check_env as sb3_check
 
     sb3_check(GymEnv(env, observation=observation))
+
+
+def test_stable_baselines_only_says_that_simple_images_are_small_for_its_own_network(env):
+    from stable_baselines3.common.env_checker import check_env as sb3_check
+
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        sb3_check(GymEnv(env, observation="simple_image"))
+    assert [str(warning.message) for warning in told if "minimal resolution" not in str(warning.message)] == []
+
+
+def test_stable_baselines_accepts_indices(tmp_path):
+    from stable_baselines3.common.env_checker import check_env as sb3_check
+
+    space = pharos.build(pharos.make("frozen_lake/4x4"), tmp_path / "lake")
+    sb3_check(GymEnv("frozen_lake/4x4", observation="index", space=space))
 
 
 def test_wrong_options_are_refused_in_one_line(env):
