@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 import naive_hitting
 import pharos
 from pharos import hardness
+from pharos.hardness._travel import TravelBounds
 from pharos.mdp import TabularMDP, random_actions, sticky_actions
 from strategies import deterministic_mdps, general_mdps
 
@@ -67,6 +68,52 @@ def test_the_interval_holds_the_value_for_every_budget(mdp, searches):
     assert expected <= found.upper * (1 + 1e-9)
     if not found.exact:
         assert "budget" in found.note
+
+
+@settings(max_examples=30, deadline=None)
+@given(chancy_mdps())
+def test_bounds_from_a_hub_hold_for_every_target(mdp):
+    mdp = random_actions(mdp, 0.25)
+    times, reached, state, _ = naive_hitting.hitting_times(mdp, True)
+    nodes = naive_hitting.nodes_that_count(mdp, reached, state)
+    states = np.unique(state[nodes])
+    largest = np.full((mdp.num_states + 1, mdp.num_states + 1), -math.inf)
+    for n in nodes:
+        largest[state[n]] = np.maximum(largest[state[n]], times[n])
+    if not np.isfinite(largest[np.ix_(states, states)]).all():
+        return  # such an MDP is not bounded from hubs
+    bounds = TravelBounds(mdp, True)
+    size = mdp.num_states + naive_hitting.any_end(mdp)
+    for hub in states:
+        found = bounds.times_from(hub, np.maximum(largest[:size, hub], 0.0))
+        assert (found[states] >= largest[hub, states] * (1 - 1e-9)).all()
+
+
+@settings(max_examples=30, deadline=None)
+@given(chancy_mdps())
+def test_spaces_too_large_for_a_look_at_each_target_have_the_same_diameter(mdp):
+    mdp = random_actions(mdp, 0.25)
+    expected, _ = naive_hitting.diameter(mdp, True)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("pharos.hardness._stochastic_diameter.MANY", -1)
+        found = hardness.diameter(mdp)
+    if math.isinf(expected):
+        assert math.isinf(found.lower) and (found.exact or not found.counted)
+    else:
+        assert found.exact and found.upper == pytest.approx(expected, rel=1e-5)
+
+
+@pytest.mark.parametrize("chance", [lambda mdp: random_actions(mdp, 0.1), lambda mdp: sticky_actions(mdp, 0.25)])
+def test_few_targets_settle_a_grid_and_the_interval_squeezes(chance):
+    mdp = chance(pharos.build(pharos.make("simple_grid", height=30, width=30)).mdp())
+    intervals = []
+    found = hardness.diameter(mdp, progress=lambda p: intervals.append((p.lower, p.upper)))
+    assert found.exact and found.searches < 90
+    assert all(low <= found.lower and high >= found.upper * (1 - 1e-9) for low, high in intervals)
+    little = hardness.diameter(mdp, budget=hardness.Budget(searches=3))
+    assert not little.exact and little.upper < 3 * little.lower
+    more = hardness.diameter(mdp, budget=hardness.Budget(searches=25))
+    assert little.lower <= more.lower and more.upper < little.upper
 
 
 def ring(length, lazy):

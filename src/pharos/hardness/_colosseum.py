@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from pharos.errors import ParameterError
-from pharos.hardness._stochastic_diameter import choices_of
+from pharos.hardness._choices import choices_of
 from pharos.mdp import TabularMDP
 
 _BLOCK = 256  # targets at a time

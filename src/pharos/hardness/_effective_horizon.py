@@ -185,7 +185,7 @@ class _Steps:
     """
 
     def __init__(self, mdp: TabularMDP, steps: int):
-        from pharos.hardness._stochastic_diameter import choices_of
+        from pharos.hardness._choices import choices_of
 
         size = (mdp.num_states + 1) * (mdp.num_actions + 1 if mdp.is_sticky else 1)
         needed = 40 * steps * size * mdp.num_actions

@@ -70,13 +70,13 @@ def mixing_time(
     Cost: 2 log2(t_mix) products of N x N matrices.
     Source: Kearns and Singh (2002); Levin, Peres and Wilmer (2009), "Markov chains and mixing times", section 4.5.
     """
-    from pharos.hardness._stochastic_diameter import _reachable, choices_of
+    from pharos.hardness._choices import choices_of, reachable
 
     if isinstance(epsilon, bool) or not isinstance(epsilon, int | float | np.floating) or not 0 < epsilon < 0.5:
         raise ParameterError(f"epsilon is {epsilon!r}; expected a number between 0 and 1/2")
     if mdp.num_states > 100 * MOST_NODES:  # too many to be written out, even if few can be reached
         raise UndefinedMeasure(_too_many(mdp.num_states))
-    choices = _reachable(choices_of(mdp, restart))
+    choices = reachable(choices_of(mdp, restart))
     size = len(choices.underlying)
     if size > MOST_NODES:
         raise UndefinedMeasure(_too_many(size))

@@ -151,10 +151,10 @@ class _Nodes:
     """
 
     def __init__(self, mdp: TabularMDP, solution: Solution | None, tolerance: float, tell: Callable[[str], None]):
+        from pharos.hardness._choices import choices_of, reachable
         from pharos.hardness._gaps import checked
-        from pharos.hardness._stochastic_diameter import _reachable, choices_of
 
-        choices = _reachable(choices_of(mdp, restart=False))
+        choices = reachable(choices_of(mdp, restart=False))
         self.gamma, self.num_actions = mdp.gamma, mdp.num_actions
         self.num_nodes = len(choices.underlying)
         self.matrix = choices.matrix

@@ -9,201 +9,40 @@ Certificate. For any J >= 0 with T J - J <= above < 1 and J - T J <= below every
 With c = 1 / (1 - above), T(c J) = 1 + c (T J - 1) <= 1 + c (J + above - 1) = c J: the policy that is greedy in c J loses at least
 one expected step a step, so it needs at most c J. With c = 1 / (1 + below), T(c J) >= c J in the same way, and iterating T from
 c J rises to J*. It does not matter where J comes from: sweeps in place from the target outwards, then policies evaluated by a
-sparse linear solve where sweeps are slow. They begin with the distance times what the first target's hitting times are of its
+sparse linear solve where sweeps are slow. They begin with the distance times what the hitting times of the farthest target so far are of its
 distances, at their upper end: from above, few sweeps prove that a target is not the one. A target whose upper bound falls below the largest proven hitting time is dropped
 at once.
 
-Nodes. Without sticky actions the states, and the implicit end. Under sticky actions the pairs (state, previously executed
-action) that can be reached, and the start states without a previous action; a target is a state, reached with any previous action.
+Solved targets bound the others (`_travel`), so that there is an interval whenever the budget ends. Where there are so many nodes that a
+look at each target would take longer than that, the target with the largest upper bound is always the next.
 """
 
 import itertools
 import math
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from copy import copy
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
 from scipy import sparse
-from scipy.sparse import csgraph
 from scipy.sparse.linalg import splu
 
 from pharos._core.compiling import usable_workers
 from pharos.errors import UndefinedMeasure
+from pharos.hardness._choices import Choices, choices_of
 from pharos.hardness._interval import Budget, Interval, Spending
+from pharos.hardness._travel import TravelBounds
 from pharos.mdp import TabularMDP
 
 SWEEPS = 40  # before a policy is evaluated by a linear solve
 SOLVABLE = 60_000  # nodes up to which linear solves are tried
 TOP = 1e300
 BATCH = 64  # targets that threads look at with the same largest hitting time known
-
-
-@dataclass
-class Choices:
-    """An MDP with chance written out: N nodes, A choices each.
-
-    Attributes:
-        matrix: (N A, N) CSR, probabilities.
-        underlying: (N,) the state of each node; S for the implicit end.
-        previous: (N,) the previously executed action, A for none; -1 where it does not matter.
-        starts: [(node, probability)] of the first step.
-        num_actions: A.
-    """
-
-    matrix: Any
-    underlying: np.ndarray
-    previous: np.ndarray
-    starts: list[tuple[int, float]]
-    num_actions: int
-    num_targets: int
-
-    @cached_property
-    def reversed(self) -> tuple[np.ndarray, np.ndarray]:
-        """(first, previous) of the graph of all transitions that some choice may take."""
-        size = len(self.underlying)
-        rows = np.repeat(np.arange(size * self.num_actions) // self.num_actions, np.diff(self.matrix.indptr))
-        graph = sparse.csr_matrix((np.ones(len(rows), np.int8), (self.matrix.indices, rows)), shape=(size, size))
-        return graph.indptr, graph.indices
-
-    @cached_property
-    def is_strongly_connected(self) -> bool:
-        """Whether every node can be reached from every other."""
-        first, previous = self.reversed
-        size = len(self.underlying)
-        graph = sparse.csr_matrix((np.ones(len(previous), np.int8), previous, first), shape=(size, size))
-        return csgraph.connected_components(graph, connection="strong", return_labels=False) == 1
-
-    @cached_property
-    def crude_upper(self) -> float:
-        """Proven, and far too large: a shortest path of at most H edges succeeds with probability q^H or more; H / q^H."""
-        if not self.is_strongly_connected:
-            return math.inf
-        size = len(self.underlying)
-        coo = self.matrix.tocoo()
-        best = sparse.coo_matrix((coo.data, (coo.row // self.num_actions, coo.col)), shape=(size, size))
-        order = np.lexsort((-best.data, best.col, best.row))
-        row, col, data = best.row[order], best.col[order], best.data[order]
-        first = np.ones(len(row), np.bool_)
-        first[1:] = (row[1:] != row[:-1]) | (col[1:] != col[:-1])
-        pivot = self.starts[0][0]
-        graph = sparse.csr_matrix((np.ones(int(first.sum())), (row[first], col[first])), shape=(size, size))
-        steps = 0
-        for each in (graph, graph.T.tocsr()):
-            distances = csgraph.dijkstra(each, indices=pivot, unweighted=True)
-            steps += int(distances.max())
-        exponent = -steps * math.log(float(data[first].min()))
-        return steps * math.exp(exponent) if exponent < 690 else math.inf
-
-
-def choices_of(mdp: TabularMDP, restart: bool) -> Choices:
-    """The MDP written out, with the restart convention."""
-    num_states, num_actions = mdp.num_states, mdp.num_actions
-    terminal = np.asarray(mdp.terminal)
-    executed, ends = _executed(mdp, terminal)  # (S A, S + ends): outcome of executing an action in a live state
-    size = num_states + ends
-    states = np.arange(size)
-    live = np.zeros(size, np.bool_)
-    live[:num_states] = ~terminal
-    chance = mdp.chance
-    if mdp.is_sticky:
-        # node s (A + 1) + b, b = A: no previous action
-        width = num_actions + 1
-        nodes = size * width
-        coo = executed.tocoo()
-        arrived = coo.col * width + coo.row % num_actions
-        outcome = sparse.csr_matrix((coo.data, (coo.row, arrived)), shape=(num_states * num_actions, nodes))
-        owner, previous = np.repeat(states, width), np.tile(np.arange(width), size)
-    else:
-        width, nodes = 1, size
-        outcome, owner, previous = executed, states, np.full(size, -1)
-    starts = [
-        (int(s) * width + (num_actions if width > 1 else 0), float(p))
-        for s, p in zip(mdp.start_states, mdp.start_probabilities, strict=True)
-        if p > 0
-    ]
-    weights = _weights(chance, (num_states, num_actions), owner, previous, live[owner])
-    matrix = weights @ outcome
-    matrix = matrix + _restarts(owner, live, starts, num_actions, nodes, restart)
-    matrix = sparse.csr_matrix(matrix)
-    matrix.sum_duplicates()
-    choices = Choices(matrix, owner, previous, starts, num_actions, size)
-    return _reachable(choices) if mdp.is_sticky else choices
-
-
-def _executed(mdp: TabularMDP, terminal: np.ndarray) -> tuple[Any, bool]:
-    """(S A, S + 1 or S) outcomes of executing actions, rows of terminal states empty; whether the end is among them."""
-    num_states, num_actions = mdp.num_states, mdp.num_actions
-    live = np.repeat(~terminal, num_actions)
-    if mdp.transitions is None:
-        assert mdp.next_states is not None
-        column = np.asarray(mdp.next_states).ravel().astype(np.int64)
-        ends = bool((column[live] < 0).any())
-        column = np.where(column < 0, num_states, column)
-        rows = np.flatnonzero(live)
-        data = np.ones(rows.size)
-        shape = (num_states * num_actions, num_states + ends)
-        return sparse.csr_matrix((data, (rows, column[rows])), shape=shape), ends
-    kept = sparse.diags(live.astype(np.float64)) @ mdp.transitions
-    kept.eliminate_zeros()
-    rest = np.where(live, 1 - np.asarray(kept.sum(axis=1)).ravel(), 0.0)
-    rest[rest < 1e-12] = 0.0
-    ends = bool(rest.any())
-    if not ends:
-        return sparse.csr_matrix(kept), False
-    return sparse.csr_matrix(sparse.hstack([kept, sparse.csr_matrix(rest[:, None])])), True
-
-
-def _weights(chance: Any, shape: tuple[int, int], owner: np.ndarray, previous: np.ndarray, live: np.ndarray) -> Any:
-    """(N A, S A): the probability that choosing a in a node executes x in its state; previous (N,), A for none, -1 for any."""
-    num_states, num_actions = shape
-    node = np.flatnonzero(live)
-    n = np.repeat(node, num_actions * num_actions)
-    a = np.tile(np.repeat(np.arange(num_actions), num_actions), node.size)
-    x = np.tile(np.arange(num_actions), node.size * num_actions)
-    first = previous[n] == num_actions
-    data = np.where(first, chance.first_uniform, chance.uniform) / num_actions
-    data = data + (x == a) * np.where(first, chance.first_chosen, chance.chosen) + (x == previous[n]) * chance.previous
-    keep = data > 0
-    rows, columns = (n * num_actions + a)[keep], (owner[n] * num_actions + x)[keep]
-    return sparse.csr_matrix((data[keep], (rows, columns)), shape=(owner.size * num_actions, num_states * num_actions))
-
-
-def _restarts(
-    owner: np.ndarray, live: np.ndarray, starts: list[tuple[int, float]], num_actions: int, nodes: int, restart: bool
-) -> Any:
-    """(N A, N): what terminal states and the end lead to."""
-    ended = np.flatnonzero(~live[owner])
-    if restart:
-        rows = np.repeat((ended[:, None] * num_actions + np.arange(num_actions)).ravel(), len(starts))
-        columns = np.tile([node for node, _ in starts], ended.size * num_actions)
-        data = np.tile([p for _, p in starts], ended.size * num_actions)
-    else:
-        rows = (ended[:, None] * num_actions + np.arange(num_actions)).ravel()
-        columns = np.repeat(ended, num_actions)
-        data = np.ones(rows.size)
-    return sparse.csr_matrix((data, (rows, columns)), shape=(nodes * num_actions, nodes))
-
-
-def _reachable(choices: Choices) -> Choices:
-    """The nodes that can be reached from the start, by whatever is chosen."""
-    first, previous = choices.reversed
-    size = len(choices.underlying)
-    graph = sparse.csr_matrix((np.ones(len(previous), np.int8), previous, first), shape=(size, size)).T.tocsr()
-    kept = np.zeros(size, np.bool_)
-    for node, _ in choices.starts:
-        kept[csgraph.breadth_first_order(graph, node, return_predecessors=False)] = True
-    nodes = np.flatnonzero(kept)
-    place = np.full(size, -1)
-    place[nodes] = np.arange(nodes.size)
-    rows = (nodes[:, None] * choices.num_actions + np.arange(choices.num_actions)).ravel()
-    matrix = sparse.csr_matrix(choices.matrix[rows][:, nodes])
-    starts = [(int(place[node]), p) for node, p in choices.starts]
-    return Choices(
-        matrix, choices.underlying[nodes], choices.previous[nodes], starts, choices.num_actions, choices.num_targets
-    )
+MANY = 10**9  # nodes times targets from which on looking at each target for the most promising takes too long
+TRIAL = 16  # targets after which bounds of others must have closed
+CLOSED = 10  # targets each, or the others are looked at one by one
 
 
 # Targets ----------------------------------------------------------------------------------------------------------------
@@ -224,11 +63,10 @@ class _Targets:
         self.ratio = 1.0
         self._make_room()
 
-    def learn_ratio(self, j: np.ndarray) -> None:
-        """Guess the next hitting times from those of the target last opened: a guess somewhat too large is the quickest to be proven."""
+    def ratio_of(self, j: np.ndarray) -> float:
+        """What the hitting times of the target last opened are of the distances, at their upper end."""
         there = (self.distance > 0) & (j < TOP)
-        if there.any():
-            self.ratio = float(np.quantile(j[there] / self.distance[there], 0.99))
+        return float(np.quantile(j[there] / self.distance[there], 0.99)) if there.any() else 1.0
 
     def _make_room(self) -> None:
         size = len(self.choices.underlying)
@@ -252,7 +90,7 @@ class _Targets:
         self.goal[self.nodes_of(target)] = True
         count = hitting.backward_order(*self.back, self.goal, self.order, self.distance)
         j = np.maximum(self.distance, 0) * self.ratio
-        if self.choices.is_strongly_connected:
+        if self.choices.is_connected:
             return j, count, None
         sure, found = np.empty_like(self.goal), np.empty_like(self.goal)
         hitting.almost_surely(*self.support, self.goal, sure, found)
@@ -269,15 +107,17 @@ class _Targets:
         above, below, largest = hitting.residuals(*self.arrays, self.goal, self.order, count, j, self.policy)
         return 1 / (1 + below), 1 / (1 - above) if above < 1 else math.inf, largest
 
-    def sweep(self, j: np.ndarray, count: int, sweeps: int, enough: float) -> tuple[float, float, float]:
-        """Sweeps in place; ends early where the upper bound is at most `enough`."""
+    def sweep(
+        self, j: np.ndarray, count: int, sweeps: int, enough: float, spending: Spending
+    ) -> tuple[float, float, float]:
+        """Sweeps in place; ends early where the upper bound is at most `enough`, or the budget ends."""
         from pharos._core import hitting
 
         for number in range(sweeps):
             change = hitting.sweep_in_place(*self.arrays, self.goal, self.order, count, j)
             if number % 4 == 3 or change < 1e-13:
                 low, high, largest = self.bounds(j, count)
-                if largest * high <= enough or change < 1e-13:
+                if largest * high <= enough or change < 1e-13 or spending.is_over:
                     return low, high, largest
         return self.bounds(j, count)
 
@@ -285,7 +125,7 @@ class _Targets:
         self, j: np.ndarray, count: int, tolerance: float, enough: float, spending: Spending
     ) -> tuple[float, float, float]:
         """Until the bounds are within `tolerance` of each other, or the upper one is at most `enough`."""
-        low, high, largest = self.sweep(j, count, SWEEPS, enough)
+        low, high, largest = self.sweep(j, count, SWEEPS, enough, spending)
         while not _met(low, high, tolerance) and largest * high > enough and not spending.is_over:
             if count <= SOLVABLE:
                 improved = self._evaluate(count)
@@ -294,7 +134,7 @@ class _Targets:
                     low, high, largest = self.bounds(j, count)
                     if _met(low, high, tolerance) or largest * high <= enough:
                         break
-            low, high, largest = self.sweep(j, count, SWEEPS if count <= SOLVABLE else 8 * SWEEPS, enough)
+            low, high, largest = self.sweep(j, count, SWEEPS if count <= SOLVABLE else 8 * SWEEPS, enough, spending)
         return low, high, largest
 
     def _evaluate(self, count: int) -> np.ndarray | None:
@@ -350,96 +190,180 @@ def stochastic_diameter(mdp: TabularMDP, restart: bool, tolerance: float, spendi
     from pharos.hardness._diameter import _conventions
 
     choices = choices_of(mdp, restart)
-    targets = _Targets(choices)
-    number = choices.num_targets
-    lower = finite = 0.0
-    highest = 0.0
-    met = np.diff(targets.edges) > 0
-    settled = int(np.count_nonzero(~met))  # states that cannot be reached at all
-    unreachable = settled * (number - 1)
-    order = [int(target) for target in _by_promise(targets, spending) if met[target]]
-    threads = [targets, *(targets.for_another_thread() for _ in range(usable_workers(None) - 1))]
-    with ThreadPoolExecutor(len(threads)) as pool:
-        at, size = 0, 1  # the first one alone: its hitting times are large, and make a guess for the others
-        while at < len(order) and not spending.is_over:
-            left = spending.budget.searches - spending.searches
-            batch = order[at : at + int(min(size, left))]
-            parts = [batch[i :: len(threads)] for i in range(len(threads))]
-            looks = [
-                pool.submit(_look, own, part, tolerance, finite, spending, learn=at == 0)
-                for own, part in zip(threads, parts, strict=True)
-                if part
-            ]
-            for low, high, lost in itertools.chain.from_iterable(look.result() for look in looks):
-                finite, highest = max(finite, low), max(highest, high)
-                unreachable += lost
-            spending.searches += len(batch)
-            settled += len(batch)
-            for own in threads:
-                own.ratio = targets.ratio
-            at, size = at + len(batch), min(2 * size, BATCH)
-            spending.report(finite, max(highest, choices.crude_upper if settled < number else 0.0), number - settled)
-    done = settled == number
-    upper = max(highest, finite) if done else max(highest, choices.crude_upper)
-    lower = finite
-    note = "" if done else f"budget spent: {number - settled} of {number} targets were not looked at"
-    if unreachable:
-        lower = upper = math.inf
-    exact = done and (math.isinf(lower) or (math.isfinite(upper) and upper - lower <= 2 * tolerance * upper))
-    if done and not exact:
-        note = "budget spent before the bounds of the last targets met"
-    spending.report(lower, upper, number - settled, now=True)
-    return Interval(
-        lower,
-        upper,
-        exact,
-        unreachable_pairs=int(unreachable),
-        finite_part=finite,
-        counted=done,
-        tolerance=tolerance,
-        searches=spending.searches,
-        method="a stochastic shortest path problem for each target, bounds from residuals",
-        conventions={**_conventions(mdp, restart), "nodes": len(choices.underlying), "sticky_pairs": mdp.is_sticky},
-        note=note,
-        seconds=spending.seconds,
-    )
+    conventions = {**_conventions(mdp, restart), "nodes": len(choices.underlying), "sticky_pairs": mdp.is_sticky}
+    return _Diameter(mdp, restart, choices, tolerance, spending).interval(conventions)
+
+
+class _Diameter:
+    """Bounds of the largest hitting time of every target, tightened until none may exceed the largest that is proven.
+
+    Attributes:
+        upper: (targets,) of the largest hitting time of each; -inf where it is settled.
+        lower: the largest hitting time that is proven, of pairs that are surely connected.
+        settled_upper: the largest upper bound of settled targets.
+    """
+
+    def __init__(self, mdp: TabularMDP, restart: bool, choices: Choices, tolerance: float, spending: Spending):
+        self.mdp, self.restart, self.choices = mdp, restart, choices
+        self.tolerance, self.spending = tolerance, spending
+        self.targets = _Targets(choices)
+        self.threads = [self.targets, *(self.targets.for_another_thread() for _ in range(usable_workers(None) - 1))]
+        met = np.diff(self.targets.edges) > 0
+        self.many = len(choices.underlying) * choices.num_targets > MANY
+        self.upper = np.where(met, math.inf if self.many else choices.crude_upper, -math.inf)
+        self.lower = self.settled_upper = 0.0
+        self.unreachable = int(np.count_nonzero(~met)) * (
+            choices.num_targets - 1
+        )  # states that cannot be reached at all
+        self._travel: TravelBounds | None = None
+
+    def interval(self, conventions: dict[str, Any]) -> Interval:
+        """Look at targets until the bounds meet, or the budget ends."""
+        connected = self.choices.is_connected
+        with ThreadPoolExecutor(len(self.threads)) as pool:
+            if connected:
+                for batch in self._widest():
+                    self._look_at(batch, pool, bounding=True)
+            if not self.many:  # else, where not connected: it is infinite, and that is all that can be said
+                for batch in self._promising():
+                    self._look_at(batch, pool, bounding=False)
+        left = int(np.count_nonzero(self.upper > -math.inf))
+        lower, upper, note = self.lower, self._upper(), ""
+        exact = not left and (math.isfinite(upper) and upper - lower <= 2 * self.tolerance * upper)
+        if left:
+            note = f"budget spent: {left} of {self.choices.num_targets} targets may have a larger hitting time"
+        elif not exact:
+            note = "budget spent before the bounds of the last targets met"
+        if self.unreachable or not connected:
+            lower = upper = math.inf
+            exact = not left
+            note = note if left else ""
+        self.spending.report(lower, upper, left, now=True)
+        return Interval(
+            lower,
+            upper,
+            exact,
+            unreachable_pairs=int(self.unreachable),
+            finite_part=self.lower,
+            counted=not left,
+            tolerance=self.tolerance,
+            searches=self.spending.searches,
+            method="a stochastic shortest path problem for each target, bounds from residuals",
+            conventions=conventions,
+            note=note,
+            seconds=self.spending.seconds,
+        )
+
+    def _upper(self) -> float:
+        return max(self.settled_upper, self.lower, float(self.upper.max()))
+
+    def _promising(self) -> Iterator[list[int]]:
+        """Those that are left, the farthest from some node first; in batches that grow, as the first makes a guess for the others."""
+        order = [int(target) for target in _by_promise(self.targets, self.upper > -math.inf, self.spending)]
+        size = 1
+        while order and not self.spending.is_over:
+            order = [target for target in order if self.upper[target] > -math.inf]
+            left = self.spending.budget.searches - self.spending.searches
+            batch, order = order[: int(min(size, left))], order[int(min(size, left)) :]
+            if batch:
+                yield batch
+            size = min(2 * size, BATCH)
+
+    def _widest(self) -> Iterator[list[int]]:
+        """A start state, then those of the largest upper bounds, two at once; for as long as it pays, or while there are too many for anything else."""
+        batch = [int(self.choices.underlying[self.choices.starts[0][0]])]
+        apart = self.choices.num_targets // 64 + 1
+        while batch and not self.spending.is_over:
+            yield batch
+            searches = self.spending.searches
+            if not self.many and searches >= TRIAL and np.count_nonzero(self.upper == -math.inf) < CLOSED * searches:
+                return
+            widest = int(self.upper.argmax())
+            others = self.upper.copy()
+            others[max(0, widest - apart) : widest + apart] = -math.inf  # neighbours bound each other
+            left = self.spending.budget.searches - self.spending.searches
+            batch = [each for each in (widest, int(others.argmax())) if self.upper[each] > -math.inf]
+            batch = list(dict.fromkeys(batch))[: int(min(2, left))]
+
+    def _look_at(self, batch: list[int], pool: ThreadPoolExecutor, bounding: bool) -> None:
+        threads = self.threads
+        learning = bounding or not self.spending.searches
+        looks = [
+            pool.submit(_look, own, part, self.tolerance, self.lower, self.spending, learning, bounding)
+            for i, own in enumerate(threads)
+            if (part := batch[i :: len(threads)])
+        ]
+        for look in itertools.chain.from_iterable(look.result() for look in looks):
+            if learning and look.low >= self.lower:
+                self.targets.ratio = look.ratio
+            self.lower = max(self.lower, look.low)
+            self.settled_upper = max(self.settled_upper, min(look.high, self.upper[look.target]))
+            self.unreachable += look.unreachable
+            self.upper[look.target] = -math.inf
+            if look.times is not None and math.isfinite(look.high):
+                self._bound_others(look.target, look.times)
+        self.upper[self.upper <= self.lower] = -math.inf
+        self.spending.searches += len(batch)
+        for own in threads:
+            own.ratio = self.targets.ratio
+        self.spending.report(self.lower, self._upper(), int(np.count_nonzero(self.upper > -math.inf)))
+
+    def _bound_others(self, hub: int, times: np.ndarray) -> None:
+        """From the hitting times (nodes,) of a solved target."""
+        if self._travel is None:
+            self._travel = TravelBounds(self.mdp, self.restart)
+        by_state = np.zeros(self.choices.num_targets)
+        np.maximum.at(by_state, self.choices.underlying, times)
+        bound = float(by_state.max()) + self._travel.times_from(hub, by_state)
+        np.minimum(self.upper, bound, out=self.upper)
+
+
+@dataclass
+class _Look:
+    """Bounds of the largest hitting time of a target, how many states do not surely reach it, and upper bounds for all nodes.
+
+    ratio: what its hitting times are of the distances.
+    """
+
+    target: int
+    low: float
+    high: float
+    unreachable: int
+    ratio: float
+    times: np.ndarray | None
 
 
 def _look(
-    targets: _Targets, some: list[int], tolerance: float, enough: float, spending: Spending, learn: bool
-) -> list[tuple[float, float, int]]:
-    """For each target: bounds of the largest hitting time, and how many states do not surely reach it.
-
-    What lies below `enough` is known no better than that; it is the same for all targets of a batch, so that results do not depend on
-    the number of threads.
+    targets: _Targets, some: list[int], tolerance: float, enough: float, spending: Spending, learn: bool, hubs: bool
+) -> list[_Look]:
+    """Each of `some`. What lies below `enough` is known no better than that; it is the same for all targets of a batch, so that
+    results do not depend on the number of threads. With `learn`, the ratio comes along; with `hubs`, upper bounds for all nodes.
     """
     found = []
     for target in some:
         j, count, lost = targets.open(target)
         missing = 0 if lost is None else np.unique(targets.choices.underlying[lost]).size
         low, high, largest = targets.solve(j, count, tolerance, enough, spending)
-        found.append((largest * low, largest * high, missing))
-        if learn:
-            targets.learn_ratio(j)
+        times = j * high if hubs and lost is None and math.isfinite(high) else None
+        ratio = targets.ratio_of(j) if learn else 1.0
+        found.append(_Look(target, largest * low, largest * high, missing, ratio, times))
     return found
 
 
-def _by_promise(targets: _Targets, spending: Spending) -> np.ndarray:
-    """All targets, those first that are farthest from some node: a large hitting time found early lets others be dropped."""
+def _by_promise(targets: _Targets, wanted: np.ndarray, spending: Spending) -> np.ndarray:
+    """The targets wanted, those first that are farthest from some node: a large hitting time found early lets others be dropped."""
     from pharos._core import hitting
 
-    number = targets.choices.num_targets
-    promise = np.zeros(number)
-    if len(targets.choices.underlying) * number > 5e9:  # a look at each would cost more than it saves
-        return np.arange(number)[::-1]
-    for target in range(number):
+    promise = np.zeros(len(wanted))
+    for target in np.flatnonzero(wanted):
         if spending.is_over:
             break
         targets.goal[:] = False
-        targets.goal[targets.nodes_of(target)] = True
+        targets.goal[targets.nodes_of(int(target))] = True
         count = hitting.backward_order(*targets.back, targets.goal, targets.order, targets.distance)
         promise[target] = targets.distance[targets.order[count - 1]] if count else 0
-    return np.argsort(-promise, kind="stable")
+    order = np.argsort(-promise, kind="stable")
+    return order[wanted[order]]
 
 
 def stochastic_start_eccentricity(
@@ -467,7 +391,7 @@ def stochastic_start_eccentricity(
         j, count, lost = targets.open(target)
         if lost is not None and lost[nodes].any():
             return math.inf
-        _, high, _ = targets.sweep(j, count, SWEEPS, 0.0)
+        _, high, _ = targets.sweep(j, count, SWEEPS, 0.0, spending)
         if float(weights @ j[nodes]) * high <= best:
             continue
         low, high, _ = targets.solve(j, count, tolerance, 0.0, spending)

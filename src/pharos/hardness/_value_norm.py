@@ -65,7 +65,7 @@ def _variance(
 
 
 def _general(mdp: TabularMDP, solution: Solution, live: np.ndarray) -> float:
-    from pharos.hardness._stochastic_diameter import choices_of
+    from pharos.hardness._choices import choices_of
 
     choices = choices_of(mdp, restart=False)
     v = np.vstack([solution.v.reshape(mdp.num_states, -1), np.zeros((1, solution.v.size // mdp.num_states))])

@@ -1,0 +1,197 @@
+"""An MDP with chance, written out: nodes, choices and where they may lead.
+
+Nodes. Without sticky actions the states, and the implicit end. Under sticky actions the pairs (state, previously executed
+action) that can be reached, and the start states without a previous action; a target is a state, reached with any previous action.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from scipy import sparse
+from scipy.sparse import csgraph
+
+from pharos.mdp import TabularMDP
+
+
+@dataclass
+class Choices:
+    """An MDP with chance written out: N nodes, A choices each.
+
+    Attributes:
+        matrix: (N A, N) CSR, probabilities.
+        underlying: (N,) the state of each node; S for the implicit end.
+        previous: (N,) the previously executed action, A for none; -1 where it does not matter.
+        starts: [(node, probability)] of the first step.
+        num_actions: A.
+    """
+
+    matrix: Any
+    underlying: np.ndarray
+    previous: np.ndarray
+    starts: list[tuple[int, float]]
+    num_actions: int
+    num_targets: int
+
+    @cached_property
+    def reversed(self) -> tuple[np.ndarray, np.ndarray]:
+        """(first, previous) of the graph of all transitions that some choice may take."""
+        size = len(self.underlying)
+        rows = np.repeat(np.arange(size * self.num_actions) // self.num_actions, np.diff(self.matrix.indptr))
+        graph = sparse.csr_matrix((np.ones(len(rows), np.int8), (self.matrix.indices, rows)), shape=(size, size))
+        return graph.indptr, graph.indices
+
+    @cached_property
+    def home(self) -> int:
+        """A node of the only set of nodes that is never left, where each target has a node in it; else -1.
+
+        So from every node every target can be reached, and surely is, by whoever chooses at random.
+        """
+        first, previous = self.reversed
+        size = len(self.underlying)
+        graph = sparse.csr_matrix((np.ones(len(previous), np.int8), previous, first), shape=(size, size))
+        number, component = csgraph.connected_components(graph, connection="strong")
+        into = np.repeat(np.arange(size), np.diff(first))
+        leaves = component[previous] != component[into]
+        final = np.ones(number, np.bool_)
+        final[component[previous[leaves]]] = False
+        if final.sum() != 1:
+            return -1
+        inside = final[component]
+        met = np.unique(self.underlying)
+        return int(np.flatnonzero(inside)[0]) if np.unique(self.underlying[inside]).size == met.size else -1
+
+    @property
+    def is_connected(self) -> bool:
+        """Whether every target that is met at all can be reached from every node."""
+        return self.home >= 0
+
+    @cached_property
+    def crude_upper(self) -> float:
+        """Proven, and far too large: a shortest path of at most H edges succeeds with probability q^H or more; H / q^H."""
+        if not self.is_connected:
+            return math.inf
+        size = len(self.underlying)
+        coo = self.matrix.tocoo()
+        best = sparse.coo_matrix((coo.data, (coo.row // self.num_actions, coo.col)), shape=(size, size))
+        order = np.lexsort((-best.data, best.col, best.row))
+        row, col, data = best.row[order], best.col[order], best.data[order]
+        first = np.ones(len(row), np.bool_)
+        first[1:] = (row[1:] != row[:-1]) | (col[1:] != col[:-1])
+        graph = sparse.csr_matrix((np.ones(int(first.sum())), (row[first], col[first])), shape=(size, size))
+        steps = 0
+        for each in (graph, graph.T.tocsr()):
+            distances = csgraph.dijkstra(each, indices=self.home, unweighted=True)
+            steps += int(distances[np.isfinite(distances)].max())
+        exponent = -steps * math.log(float(data[first].min()))
+        return steps * math.exp(exponent) if exponent < 690 else math.inf
+
+
+def choices_of(mdp: TabularMDP, restart: bool) -> Choices:
+    """The MDP written out, with the restart convention."""
+    num_states, num_actions = mdp.num_states, mdp.num_actions
+    terminal = np.asarray(mdp.terminal)
+    executed, ends = outcomes_of(mdp, terminal)  # (S A, S + ends): outcome of executing an action in a live state
+    size = num_states + ends
+    states = np.arange(size)
+    live = np.zeros(size, np.bool_)
+    live[:num_states] = ~terminal
+    chance = mdp.chance
+    if mdp.is_sticky:
+        # node s (A + 1) + b, b = A: no previous action
+        width = num_actions + 1
+        nodes = size * width
+        coo = executed.tocoo()
+        arrived = coo.col * width + coo.row % num_actions
+        outcome = sparse.csr_matrix((coo.data, (coo.row, arrived)), shape=(num_states * num_actions, nodes))
+        owner, previous = np.repeat(states, width), np.tile(np.arange(width), size)
+    else:
+        width, nodes = 1, size
+        outcome, owner, previous = executed, states, np.full(size, -1)
+    starts = [
+        (int(s) * width + (num_actions if width > 1 else 0), float(p))
+        for s, p in zip(mdp.start_states, mdp.start_probabilities, strict=True)
+        if p > 0
+    ]
+    weights = _weights(chance, (num_states, num_actions), owner, previous, live[owner])
+    matrix = weights @ outcome
+    matrix = matrix + _restarts(owner, live, starts, num_actions, nodes, restart)
+    matrix = sparse.csr_matrix(matrix)
+    matrix.sum_duplicates()
+    choices = Choices(matrix, owner, previous, starts, num_actions, size)
+    return reachable(choices) if mdp.is_sticky else choices
+
+
+def outcomes_of(mdp: TabularMDP, terminal: np.ndarray) -> tuple[Any, bool]:
+    """(S A, S + 1 or S) outcomes of executing actions, rows of terminal states empty; whether the end is among them."""
+    num_states, num_actions = mdp.num_states, mdp.num_actions
+    live = np.repeat(~terminal, num_actions)
+    if mdp.transitions is None:
+        assert mdp.next_states is not None
+        column = np.asarray(mdp.next_states).ravel().astype(np.int64)
+        ends = bool((column[live] < 0).any())
+        column = np.where(column < 0, num_states, column)
+        rows = np.flatnonzero(live)
+        data = np.ones(rows.size)
+        shape = (num_states * num_actions, num_states + ends)
+        return sparse.csr_matrix((data, (rows, column[rows])), shape=shape), ends
+    kept = sparse.diags(live.astype(np.float64)) @ mdp.transitions
+    kept.eliminate_zeros()
+    rest = np.where(live, 1 - np.asarray(kept.sum(axis=1)).ravel(), 0.0)
+    rest[rest < 1e-12] = 0.0
+    ends = bool(rest.any())
+    if not ends:
+        return sparse.csr_matrix(kept), False
+    return sparse.csr_matrix(sparse.hstack([kept, sparse.csr_matrix(rest[:, None])])), True
+
+
+def _weights(chance: Any, shape: tuple[int, int], owner: np.ndarray, previous: np.ndarray, live: np.ndarray) -> Any:
+    """(N A, S A): the probability that choosing a in a node executes x in its state; previous (N,), A for none, -1 for any."""
+    num_states, num_actions = shape
+    node = np.flatnonzero(live)
+    n = np.repeat(node, num_actions * num_actions)
+    a = np.tile(np.repeat(np.arange(num_actions), num_actions), node.size)
+    x = np.tile(np.arange(num_actions), node.size * num_actions)
+    first = previous[n] == num_actions
+    data = np.where(first, chance.first_uniform, chance.uniform) / num_actions
+    data = data + (x == a) * np.where(first, chance.first_chosen, chance.chosen) + (x == previous[n]) * chance.previous
+    keep = data > 0
+    rows, columns = (n * num_actions + a)[keep], (owner[n] * num_actions + x)[keep]
+    return sparse.csr_matrix((data[keep], (rows, columns)), shape=(owner.size * num_actions, num_states * num_actions))
+
+
+def _restarts(
+    owner: np.ndarray, live: np.ndarray, starts: list[tuple[int, float]], num_actions: int, nodes: int, restart: bool
+) -> Any:
+    """(N A, N): what terminal states and the end lead to."""
+    ended = np.flatnonzero(~live[owner])
+    if restart:
+        rows = np.repeat((ended[:, None] * num_actions + np.arange(num_actions)).ravel(), len(starts))
+        columns = np.tile([node for node, _ in starts], ended.size * num_actions)
+        data = np.tile([p for _, p in starts], ended.size * num_actions)
+    else:
+        rows = (ended[:, None] * num_actions + np.arange(num_actions)).ravel()
+        columns = np.repeat(ended, num_actions)
+        data = np.ones(rows.size)
+    return sparse.csr_matrix((data, (rows, columns)), shape=(nodes * num_actions, nodes))
+
+
+def reachable(choices: Choices) -> Choices:
+    """The nodes that can be reached from the start, by whatever is chosen."""
+    first, previous = choices.reversed
+    size = len(choices.underlying)
+    graph = sparse.csr_matrix((np.ones(len(previous), np.int8), previous, first), shape=(size, size)).T.tocsr()
+    kept = np.zeros(size, np.bool_)
+    for node, _ in choices.starts:
+        kept[csgraph.breadth_first_order(graph, node, return_predecessors=False)] = True
+    nodes = np.flatnonzero(kept)
+    place = np.full(size, -1)
+    place[nodes] = np.arange(nodes.size)
+    rows = (nodes[:, None] * choices.num_actions + np.arange(choices.num_actions)).ravel()
+    matrix = sparse.csr_matrix(choices.matrix[rows][:, nodes])
+    starts = [(int(place[node]), p) for node, p in choices.starts]
+    return Choices(
+        matrix, choices.underlying[nodes], choices.previous[nodes], starts, choices.num_actions, choices.num_targets
+    )
