@@ -86,11 +86,11 @@ class Simulator:
         self.ranges = np.stack([components.low, components.high])
         self.rules = rules_for_interaction(self.env, self.start_states[0])
 
-    def drawn_start(self, rng: np.random.Generator) -> np.ndarray:
-        """(D,) a start state; draws one number where there are several."""
+    def drawn_start(self, rng: np.random.Generator) -> int:
+        """Which of the start states; draws one number where there are several."""
         if len(self.start_states) == 1:
-            return self.start_states[0].copy()
-        return self.start_states[np.searchsorted(self.start_cumulative, rng.random(), side="right")].copy()
+            return 0
+        return int(np.searchsorted(self.start_cumulative, rng.random(), side="right"))
 
     def executed(self, chosen: int, previous: int, u: float) -> int:
         """The executed action, by one uniform number u in [0, 1): chosen, then previous, then uniform."""
@@ -170,10 +170,13 @@ class GymEnv(gymnasium.Env):
         self._ranges, self._num_actions = simulator.ranges, simulator.env.num_actions
         self._limit = simulator.limit if simulator.limit is not None else 1 << 62
         observation: Any = simulator.context.observation
-        self._length = len(simulator.env.components)
         is_vector = simulator.context.is_vector and simulator.context.is_plain
-        self._vector_length = self._length if is_vector else 0  # the compiled step writes the vector as well
+        self._blank = np.zeros(
+            len(simulator.env.components) if is_vector else 0, np.float32
+        )  # the compiled step writes the vector
         self._scale = observation.scale if is_vector else np.zeros(0)
+        self._is_vector = is_vector
+        self._start_vectors = observation(simulator.start_states) if is_vector else np.zeros((0, 0))
         self._has_chance = simulator.has_chance
         self._is_index = simulator.context.is_plain and isinstance(observation, Index)
         self._successors = simulator.state_space.successors if simulator.state_space is not None else None
@@ -195,16 +198,19 @@ class GymEnv(gymnasium.Env):
         if options is not None and options.get("state") is not None:
             self._state = simulator.checked_state(options["state"])
             self._terminated = simulator.rules.is_terminal_one(self._parameters, self._state)
+            vector = None
         else:
-            self._state = simulator.drawn_start(self.np_random)
+            start = simulator.drawn_start(self.np_random)
+            self._state = simulator.start_states[start].copy()
             self._terminated = False
+            vector = self._start_vectors[start].copy() if self._is_vector else None
         self._previous = simulator.first_previous
         self._elapsed = 0
         if simulator.state_space is not None:
             self._index = int(simulator.state_space.indices(self._state[None])[0])
         if self._window is not None:
             self.render()
-        return self._observation(), self._info(self._state)
+        return self._observation() if vector is None else vector, self._info(self._state)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Choose an action. After a terminal state nothing changes and nothing is paid."""
@@ -216,8 +222,8 @@ class GymEnv(gymnasium.Env):
             return self._step_after_the_end()
         if self._has_chance:
             chosen = self.simulator.executed(chosen, self._previous, self.np_random.random())
-        following = np.empty(self._length, np.int64)
-        vector = np.empty(self._vector_length, np.float32)
+        following = state.copy()  # quicker than np.empty
+        vector = self._blank.copy()
         reward, code = self._step_one(self._parameters, self._ranges, self._scale, state, chosen, following, vector)
         if code:
             if code > 1:
@@ -229,7 +235,7 @@ class GymEnv(gymnasium.Env):
         info = {"state": following.copy(), "executed_action": chosen}
         if self._successors is not None:
             info["index"] = self._index = int(self._successors[self._index, chosen])
-        observation = vector if self._vector_length else self._observation()
+        observation = vector if self._is_vector else self._observation()
         if self._window is not None:
             self.render()
         return observation, reward, self._terminated, self._elapsed >= self._limit, info
