@@ -180,6 +180,39 @@ def report(
     print(written.html)
 
 
+@app.command("pack")
+def pack(
+    spec: SpecArgument,
+    to: Annotated[Path, typer.Option("--to", metavar="FILE", help="The Parquet file to write.")],
+    out: Out = None,
+    json: Json = False,
+) -> None:
+    """Put the finished runs into one Parquet file, to keep, publish or carry; without what the agents learnt."""
+    from pharos import study
+
+    number = study.pack(study.specification(spec), _folder(spec, out), file=to)
+    if json:
+        print_json({"file": str(to), "runs": number})
+        return
+    print(f"{to}: {number} runs, {to.stat().st_size:,} bytes")
+
+
+@app.command("unpack")
+def unpack(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="Written by `pharos study pack`.")],
+    out: Out = None,
+    json: Json = False,
+) -> None:
+    """Put packed runs into a study's folder; `pharos study run FOLDER` goes on with those that are missing."""
+    from pharos import study
+
+    folder, number = study.unpack(file, out)
+    if json:
+        print_json({"folder": str(folder), "added": number})
+        return
+    print(f"{folder}: {number} runs added; `pharos study report {folder}` reports on them")
+
+
 def _folder(spec: str, out: Path | None) -> Path | None:
     """The folder of the results: as given, or that of a SPEC which is such a folder."""
     return Path(spec) if out is None and Path(spec).is_dir() else out

@@ -10,6 +10,7 @@ from pharos.study._analysis import (
     models,
     paper_agreement,
 )
+from pharos.study._archive import pack, unpack
 from pharos.study._clusters import run_on_ray, submit
 from pharos.study._execution import Status, run, status
 from pharos.study._paper import paper_regressions, paper_returns
@@ -41,6 +42,7 @@ __all__ = [
     "leave_one_class_out_r_squared",
     "mean_curve",
     "models",
+    "pack",
     "paper_agreement",
     "paper_instance",
     "paper_regressions",
@@ -55,4 +57,5 @@ __all__ = [
     "stratified_interval",
     "submit",
     "table",
+    "unpack",
 ]

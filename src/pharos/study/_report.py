@@ -65,7 +65,7 @@ def report(
     Cost: the measures of hardness, once; then seconds.
     """
     tell = progress or (lambda _: None)
-    study, place = _table._opened(source, folder)
+    study, place = _table.opened(source, folder)
     now = status(study, place)
     tell("reading results")
     rows = _table.table(study, place)

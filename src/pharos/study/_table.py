@@ -42,7 +42,7 @@ def table(source: Source, folder: str | os.PathLike | None = None) -> "pd.DataFr
     """
     import pandas as pd
 
-    study, place = _opened(source, folder)
+    study, place = opened(source, folder)
     rows = []
     for run in study.runs:
         record = _worker.read_record(place / "runs" / run.id)
@@ -64,7 +64,7 @@ def curves(source: Source, folder: str | os.PathLike | None = None) -> "pd.DataF
     """One row an evaluation of a finished run: the columns of curve.parquet, and those that describe the run."""
     import pandas as pd
 
-    study, place = _opened(source, folder)
+    study, place = opened(source, folder)
     parts = []
     for run in study.runs:
         if _worker.read_status(place, run.id) == "finished":
@@ -121,7 +121,7 @@ def _described(run: Run) -> dict[str, Any]:
     }
 
 
-def _opened(source: Source, folder: str | os.PathLike | None) -> tuple[Specification, Path]:
+def opened(source: Source, folder: str | os.PathLike | None) -> tuple[Specification, Path]:
     study = source if isinstance(source, Specification) else specification(source)
     if folder is None and isinstance(source, str | Path) and Path(source).is_dir():
         folder = source
@@ -144,7 +144,7 @@ def hardness_table(
     """
     import pandas as pd
 
-    study, place = _opened(source, folder)
+    study, place = opened(source, folder)
     rows: dict[tuple[str, str], dict[str, Any]] = {}
     for run in study.runs:
         key = (run.instance, run.chance)

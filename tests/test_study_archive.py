@@ -1,0 +1,122 @@
+"""Packed studies: what comes out is what went in, and nothing that was changed on the way gets in."""
+
+import json
+import os
+
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+import fake_training
+from pharos import study
+from pharos.errors import FileFormatError, ParameterError
+
+BLOCK = {
+    "environments": ["frozen_lake/4x4"],
+    "agents": ["dqn", "q_learning"],
+    "chance": ["plain", {"sticky": 0.25}],
+    "seeds": 2,
+}
+SPEC = {"name": "fake", "steps": 100, "evaluations": 10, "blocks": [BLOCK]}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    place = tmp_path_factory.mktemp("study")
+    study.run(SPEC, place, runner=fake_training.train, workers=2)
+    return place
+
+
+@pytest.fixture
+def packed(folder, tmp_path):
+    study.pack(folder, file=tmp_path / "fake.parquet")
+    return tmp_path / "fake.parquet"
+
+
+def changed(packed, **columns):
+    """The packed study with other columns: functions of the lists that are there."""
+    table = pq.read_table(packed)
+    data = table.to_pydict()
+    for name, change in columns.items():
+        data[name] = change(data[name])
+    pq.write_table(pa.table(data, schema=table.schema), packed)
+
+
+def test_unpacked_runs_have_the_same_tables_and_curves(folder, packed, tmp_path):
+    place, added = study.unpack(packed, tmp_path / "other")
+    assert (place, added) == (tmp_path / "other", 8)
+    pd.testing.assert_frame_equal(study.table(place), study.table(folder))
+    pd.testing.assert_frame_equal(study.curves(place), study.curves(folder))
+    assert study.specification(place) == study.specification(folder)
+
+
+def test_what_is_missing_is_run_and_what_is_there_stays(packed, tmp_path, monkeypatch):
+    changed(packed, **{name: lambda values: values[:5] for name in pq.read_schema(packed).names})
+    log = tmp_path / "log"
+    monkeypatch.setenv("PHAROS_FAKE_LOG", str(log))
+    place, _ = study.unpack(packed, tmp_path / "other")
+    before = {path: path.stat().st_mtime_ns for path in place.rglob("run.json")}
+    assert study.run(SPEC, place, runner=fake_training.train, workers=2).finished == 8
+    assert len(log.read_text().split()) == 3
+    assert study.unpack(packed, place)[1] == 0
+    assert all(path.stat().st_mtime_ns == time for path, time in before.items())
+
+
+def test_a_study_without_finished_runs_is_not_packed_and_an_older_file_stays(folder, packed, tmp_path, monkeypatch):
+    with pytest.raises(ParameterError, match="no run of 'fake' is finished"):
+        study.pack(SPEC, tmp_path / "empty", file=packed)
+    old = packed.read_bytes()
+
+    def full(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(pq, "write_table", full)
+    with pytest.raises(OSError, match="No space left"):
+        study.pack(folder, file=packed)
+    assert packed.read_bytes() == old and os.listdir(tmp_path) == [packed.name]
+
+
+def another_seed(records):
+    first = json.loads(records[0])
+    first["config"]["seed"] += 1
+    return [json.dumps(first), *records[1:]]
+
+
+@pytest.mark.parametrize(
+    ("columns", "message"),
+    [
+        ({"record": another_seed}, "is not one of the study, or its configuration was changed"),
+        ({"record": lambda values: ["{", *values[1:]]}, "cannot be read"),
+        ({"record": lambda values: [values[0].replace("finished", "failed"), *values[1:]]}, "expected finished runs"),
+        ({"id": lambda values: ["0" * 16, *values[1:]]}, "is not one of the study"),
+        ({"value": lambda values: [values[0][:-1], *values[1:]]}, "differ in length"),
+        ({"step": lambda values: [None, *values[1:]]}, "have no steps"),
+    ],
+)
+def test_files_that_were_changed_are_refused_before_anything_is_written(packed, tmp_path, columns, message):
+    changed(packed, **columns)
+    with pytest.raises(FileFormatError, match=message):
+        study.unpack(packed, tmp_path / "other")
+    assert not (tmp_path / "other").exists()
+
+
+def test_files_that_are_something_else_are_refused(packed, tmp_path):
+    with pytest.raises(ParameterError, match="no such file"):
+        study.unpack(tmp_path / "none.parquet")
+    table = pq.read_table(packed)
+    packed.write_bytes(packed.read_bytes()[:-100])
+    with pytest.raises(FileFormatError, match="cut short"):
+        study.unpack(packed)
+    pq.write_table(table.replace_schema_metadata({}), packed)
+    with pytest.raises(FileFormatError, match="not a packed study"):
+        study.unpack(packed)
+    pq.write_table(table.replace_schema_metadata({**table.schema.metadata, b"pharos.format": b"9"}), packed)
+    with pytest.raises(FileFormatError, match="format 9"):
+        study.unpack(packed)
+
+
+def test_a_folder_of_another_study_is_not_written_to(packed, tmp_path):
+    study.run(SPEC | {"name": "other"}, tmp_path / "other", runner=fake_training.train, workers=2)
+    with pytest.raises(ParameterError, match="holds the study 'other'"):
+        study.unpack(packed, tmp_path / "other")
