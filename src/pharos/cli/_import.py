@@ -36,13 +36,16 @@ def minigrid(
     out: Annotated[Path, typer.Option("--out", help="Folder for the MDP.")],
     seed: Annotated[int, typer.Option("--seed", help="Of the layout.")] = 0,
     horizon: Annotated[int, typer.Option("--horizon", min=1, help="Steps of an episode.")] = 100,
+    remember_carried: Annotated[
+        bool, typer.Option("--remember-carried", help="Objects know whether they were ever carried, as in BRIDGE.")
+    ] = False,
     json: Json = False,
 ) -> None:
     """Enumerate an environment of MiniGrid, by playing it from every state."""
     from pharos import importers
 
-    mdp = importers.minigrid(name, seed=seed, horizon=horizon)
-    importers.save(mdp, out, source=f"{name}, seed {seed}")
+    mdp = importers.minigrid(name, seed=seed, horizon=horizon, remember_carried=remember_carried)
+    importers.save(mdp, out, source=f"{name}, seed {seed}" + (", objects remember" if remember_carried else ""))
     _tell(name, mdp, out, json)
 
 

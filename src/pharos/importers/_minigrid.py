@@ -41,6 +41,7 @@ def minigrid(
     gamma: float = 1.0,
     horizon: int | None = MINIGRID_STEPS,
     max_states: int = 1_000_000,
+    remember_carried: bool = False,
 ) -> TabularMDP:
     """Return the MDP of a MiniGrid environment, by stepping the environment itself from every state that can be reached.
 
@@ -54,6 +55,8 @@ def minigrid(
         actions: those of the MDP, in their order; None: all of the environment, without `done` where it never does anything.
         gamma, horizon: of the MDP; 100 steps are those of BRIDGE. The environment's own time limit is not taken over.
         max_states: more are an error.
+        remember_carried: each object knows whether it has ever been carried, as in BRIDGE, whose states keep that for rewards of
+            progress; so a key put back where it was is another state, though nothing that can happen from there is different.
     Raises:
         MissingExtra: the package minigrid is not installed.
         ParameterError: there is no such environment, it is none of MiniGrid, or an action is none of its own.
@@ -61,13 +64,18 @@ def minigrid(
         StateSpaceTooLarge: there are more than `max_states` states.
     Cost: 0.1 to 1 ms a transition, by the size of the grid; 1 to 20 kB a state while it runs.
     """
-    driver = _Driver(env, seed)
+    driver = _Driver(env, seed, remember_carried)
     table, rewards = driver.explore(actions, max_states)
     return TabularMDP.from_arrays(table, rewards, gamma=gamma, horizon=horizon)
 
 
 def minigrid_grids(
-    env: Any, *, seed: int = 0, actions: Sequence[int] | None = None, max_states: int = 1_000_000
+    env: Any,
+    *,
+    seed: int = 0,
+    actions: Sequence[int] | None = None,
+    max_states: int = 1_000_000,
+    remember_carried: bool = False,
 ) -> np.ndarray:
     """Return what one sees of each state of `minigrid` with the same arguments, (S, width, height, 3) uint8.
 
@@ -76,7 +84,7 @@ def minigrid_grids(
 
     Args, errors and cost: as of `minigrid`.
     """
-    driver = _Driver(env, seed)
+    driver = _Driver(env, seed, remember_carried)
     driver.explore(actions, max_states)
     return np.stack([driver.seen(state) for state in driver.snapshots])
 
@@ -84,7 +92,7 @@ def minigrid_grids(
 class _Driver:
     """An environment that can be put into any state that it has been in."""
 
-    def __init__(self, env: Any, seed: int):
+    def __init__(self, env: Any, seed: int, remember_carried: bool):
         try:
             import minigrid as package  # registers its environments
             from minigrid.core.world_object import Wall
@@ -105,6 +113,7 @@ class _Driver:
             raise ParameterError(f"{env!r}: is no environment of MiniGrid {package.__version__}")
         self.name = str(env)
         self.wall = Wall
+        self.remember_carried = remember_carried
         self.fixed_types = (gymnasium.spaces.Space, np.random.Generator)
         self.fixed: list[Any] = []
         made.reset(seed=seed)
@@ -159,6 +168,8 @@ class _Driver:
         before = rng.bit_generator.state
         self.env.step_count = 0
         _, reward, terminated, _, _ = self.env.step(action)
+        if self.remember_carried and self.env.carrying is not None:
+            self.env.carrying.has_been_carried = True
         if rng.bit_generator.state != before:
             raise RuleError(
                 f"{self.name}: draws random numbers in state {state} by action {action}; expected one outcome of each action"
