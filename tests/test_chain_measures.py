@@ -11,6 +11,7 @@ import pharos
 from naive_mdp import augmented
 from pharos import hardness
 from pharos.errors import ParameterError, UndefinedMeasure
+from pharos.hardness import _occupancy
 from pharos.mdp import TabularMDP, random_actions, sticky_actions
 from strategies import small_mdps
 
@@ -134,6 +135,33 @@ def test_the_mismatch_contains_the_largest_ratio_of_visits(mdp):
     found = hardness.distribution_mismatch(mdp, solution=solution)
     assert found.lower <= expected * (1 + 1e-6) + 1e-9
     assert found.upper >= expected * (1 - 1e-6) - 1e-9
+
+
+@pytest.mark.parametrize("backwards", [False, True])
+def test_the_mismatch_counts_states_that_are_met_after_all_that_is_worth_a_step(backwards):
+    """A path: one action goes on and pays 1, the other ends. d*(s) / d(s) = 2^s, while gamma^s sinks below any tolerance."""
+    length = 60
+    following = np.full((length, 2), -1)
+    following[:-1, 0] = np.arange(1, length)
+    rewards = np.tile([1.0, 0.0], (length, 1))
+    start = 0
+    if backwards:
+        following = np.where(following < 0, -1, length - 1 - following)[::-1]
+        start = length - 1
+    mdp = TabularMDP.from_arrays(following, rewards, gamma=0.5).with_initial(start)
+    found = hardness.distribution_mismatch(mdp)
+    assert found.lower <= 2.0 ** (length - 1) * (1 + 1e-9) and found.upper >= 2.0 ** (length - 1) * (1 - 1e-9)
+    assert found.lower > 1e4
+
+
+@settings(max_examples=100, deadline=None)
+@given(small_mdps(max_states=6, max_actions=3), st.integers(0, 2**32 - 1))
+def test_support_is_where_the_walk_may_be(mdp, seed):
+    """Without chance each state is met within S steps, under sticky actions each pair within S A."""
+    random = np.random.default_rng(seed)
+    policy = random.integers(mdp.num_actions, size=mdp.num_states)
+    walk = hardness.occupancy(mdp.with_horizon(None), policy, horizon=mdp.num_states * (mdp.num_actions + 1) + 1)
+    assert (_occupancy.support(mdp, policy) == (walk.largest.sum(axis=1) > 0)).all()
 
 
 def test_the_mismatch_of_the_optimal_policy_with_itself_is_one():

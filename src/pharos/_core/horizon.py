@@ -1,4 +1,4 @@
-"""Passes over all states at one step of an episode, for the effective horizon of deterministic MDPs.
+"""Passes over all states at one step, for the effective horizons of deterministic MDPs.
 
 next_states (S, A), -1 where the episode ends; rewards (S, A) float64. An episode that has ended is worth 0.
 """
@@ -42,13 +42,13 @@ def values(next_states, rewards, tie, best, worst, explored, best_now, worst_now
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def lookahead(next_states, rewards, after, now):
-    """now (S,) = max over a of r(s, a) + after(next state)."""
+def lookahead(next_states, rewards, gamma, after, now):
+    """now (S,) = max over a of r(s, a) + gamma after(next state)."""
     for s in prange(len(next_states)):
         high = -math.inf
         for a in range(next_states.shape[1]):
             t = next_states[s, a]
-            high = max(high, rewards[s, a] + (after[t] if t >= 0 else 0.0))
+            high = max(high, rewards[s, a] + (gamma * after[t] if t >= 0 else 0.0))
         now[s] = high
 
 

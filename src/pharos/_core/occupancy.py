@@ -5,6 +5,7 @@ distribution over states, W = 1, or over pairs (state, previously executed actio
 probabilities, B = 1 or, for policies that look at the previous action, A; weights: (chosen, previous, uniform).
 """
 
+import numpy as np
 from numba import njit
 
 
@@ -47,6 +48,64 @@ def push(next_states, live, policy, weights, now, after):
             for b in range(after.shape[1]):
                 total += after[s, b]
     return total
+
+
+@njit(cache=True, nogil=True)
+def settle(next_states, live, policy, weights, gamma, least, waiting, visits):
+    """Count what waits in a state as a visit, and let it go on; from the first state to the last, in place.
+
+    waiting (S, W): discounted mass that has come and has not gone on. visits (S,): sum over t of gamma^t P(s_t = s), as far as it has
+    gone on. Masses below `least` stay. Returns what waits in the end.
+    """
+    num_actions = next_states.shape[1]
+    sticky = weights[1] > 0.0
+    leaving = np.empty(num_actions)
+    for s in range(len(next_states)):
+        mass = 0.0
+        for b in range(waiting.shape[1]):
+            mass += waiting[s, b]
+        if mass < least or not live[s]:
+            continue
+        for a in range(num_actions):
+            leaving[a] = _executed(policy, weights, waiting, s, a, mass)
+        waiting[s] = 0.0
+        visits[s] += mass
+        for a in range(num_actions):
+            t = next_states[s, a]
+            if t >= 0 and live[t]:
+                waiting[t, a if sticky else 0] += gamma * leaving[a]
+    total = 0.0
+    for s in range(len(next_states)):
+        for b in range(waiting.shape[1]):
+            total += waiting[s, b]
+    return total
+
+
+@njit(cache=True, nogil=True)
+def support(next_states, live, policy, weights, met):
+    """Add to met (S, W), 1 where play may be and else 0, whatever may come after."""
+    width = met.shape[1]
+    sticky = weights[1] > 0.0
+    alone = np.zeros_like(met)  # a row is 1 at one place while its node is looked at
+    todo = np.flatnonzero(met.reshape(-1) > 0.0)
+    stack = np.empty(met.size, np.int64)
+    stack[: len(todo)] = todo
+    top = len(todo)
+    while top > 0:
+        top -= 1
+        s, b = divmod(stack[top], width)
+        if not live[s]:
+            continue
+        alone[s, b] = 1.0
+        for a in range(next_states.shape[1]):
+            t = next_states[s, a]
+            if t >= 0 and live[t] and _executed(policy, weights, alone, s, a, 1.0) > 0.0:
+                c = a if sticky else 0
+                if met[t, c] == 0.0:
+                    met[t, c] = 1.0
+                    stack[top] = t * width + c
+                    top += 1
+        alone[s, b] = 0.0
 
 
 @njit(cache=True, nogil=True)

@@ -122,7 +122,7 @@ class LargeHorizon:
         """From k to k + 1."""
         nothing = np.zeros(len(self.next_states))
         for t in range(self.steps):
-            self.kernels.lookahead(self.next_states, self.rewards, self.ahead[t + 1], self.ahead[t])
+            self.kernels.lookahead(self.next_states, self.rewards, 1.0, self.ahead[t + 1], self.ahead[t])
             if spread:
                 after = self.spread[t + 1] if t + 1 < self.steps else nothing
                 self.kernels.largest(self.next_states, after, self.spread[t])

@@ -9,7 +9,7 @@ import numpy as np
 from pharos.errors import UndefinedMeasure
 from pharos.hardness._gaps import checked
 from pharos.hardness._interval import Interval
-from pharos.hardness._occupancy import occupancy
+from pharos.hardness._occupancy import discounted_visits, support
 from pharos.mdp import TabularMDP
 from pharos.solvers import Solution
 
@@ -26,7 +26,7 @@ def distribution_mismatch(
     Args:
         policy: as for `evaluate_policy`; None: uniform.
         solution: the optimal solution of `mdp`; None: solved here to an error of 1e-9.
-        tolerance: of the sums d and d*.
+        tolerance: of the sums of d and of d*.
     Returns:
         An interval: it is wide where d(s) is not much larger than `tolerance`, and infinite at the upper end where it is smaller.
     Raises:
@@ -42,15 +42,15 @@ def distribution_mismatch(
             "distribution_mismatch is defined for discounted MDPs without a horizon: give gamma < 1 and no horizon"
         )
     solution = checked(mdp, solution)
-    best = occupancy(mdp, solution.policy, tolerance=tolerance)
-    other = occupancy(mdp, policy, tolerance=tolerance)
-    there = best.states > 0
+    best, lacking = discounted_visits(mdp, solution.policy, tolerance=tolerance)
+    other, missing = discounted_visits(mdp, policy, tolerance=tolerance)
+    there = support(mdp, solution.policy)
     lower = upper = 0.0
     if there.any():
-        one, two = best.states[there], other.states[there]
-        lower = float((one / (two + other.error_bound)).max())
-        with np.errstate(divide="ignore"):
-            upper = float(((one + best.error_bound) / two).max())
+        one, two = best[there], other[there]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            lower = float(np.nanmax(one / (two + missing), initial=0.0))
+            upper = float(np.nanmax((one + lacking) / two, initial=0.0))
     return Interval(
         lower,
         upper,

@@ -1,5 +1,6 @@
 """Occupancy measures: how often a policy is where, and what it does there. Source: Puterman (1994), section 6.9."""
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
@@ -12,6 +13,7 @@ from pharos.solvers import uniform_policy
 from pharos.solvers._policy_evaluation import _probabilities
 
 _MEMORY = 8 << 30  # bytes that all steps together may take
+_LEAST = 1e-280  # mass that is not worth a step: smaller numbers lose their digits, and take a hundred times longer
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,6 +120,66 @@ def occupancy(
     return Occupancy(total, largest, steps, left, np.stack(kept) if keep_all else None, conventions)
 
 
+def discounted_visits(mdp: TabularMDP, policy: Any = None, *, tolerance: float = 1e-9) -> tuple[np.ndarray, float]:
+    """Return the visits of states without a horizon, from below, and what they may lack together.
+
+        d(s) = sum over t of gamma^t P(s_t = s),   t = 0, 1, ...
+
+    As `occupancy(...).states`, but without `largest`, so that mass may go on many steps in one pass over states in breadth-first
+    order.
+
+    Args:
+        policy, tolerance: as for `occupancy`.
+    Returns:
+        (S,) float64, and the bound; it is above `tolerance` only where all that is left has less than 1e-280 in each state.
+    Raises:
+        UndefinedMeasure: gamma is 1. ParameterError: the policy is wrong.
+    Cost: O(S A) a pass; at most ln(1 / tolerance) / (1 - gamma) passes, in breadth-first order a tenth of them and fewer.
+    """
+    from pharos._core import occupancy as kernels
+
+    walk = Walk(mdp if mdp.horizon is None else mdp.with_horizon(None), policy, None)
+    if mdp.next_states is None:
+        found = occupancy(walk.mdp, policy, tolerance=tolerance)
+        return found.states, found.error_bound
+    visits, waiting = walk.after_the_start()
+    waiting *= mdp.gamma if mdp.is_sticky else 1.0
+    before = math.inf
+    while True:
+        waits = kernels.settle(
+            mdp.next_states, walk.live, walk.policy, walk.weights, mdp.gamma, _LEAST, waiting, visits
+        )
+        left = waits / (1 - mdp.gamma)
+        if left <= tolerance or left >= before:
+            return visits, left
+        before = left
+
+
+def support(mdp: TabularMDP, policy: Any = None) -> np.ndarray:
+    """Return the states that a policy may be in at some step, however rarely: (S,) bool, without terminal ones.
+
+    Args:
+        policy: as for `occupancy`.
+    Raises:
+        ParameterError: the policy is wrong.
+    Cost: O(S A); with transitions as a matrix that for each step to the last state that is met.
+    """
+    from pharos._core import occupancy as kernels
+
+    walk = Walk(mdp, policy, 1)
+    started, met = walk.after_the_start()
+    met = (met > 0).astype(np.float64)
+    if mdp.next_states is not None:
+        kernels.support(mdp.next_states, walk.live, walk.policy, walk.weights, met)
+    else:
+        grows, after = True, np.zeros_like(met)
+        while grows:
+            walk._push(met, False, after)
+            new = (after > 0) & (met == 0)
+            met[new], grows = 1.0, bool(new.any())
+    return walk.live & ((met > 0).any(axis=1) | (started > 0))
+
+
 class Walk:
     """Distributions of a policy's states, one step after the other; pairs (state, previous action) under sticky actions."""
 
@@ -139,6 +201,21 @@ class Walk:
         self.weights = (float(chance.chosen), float(chance.previous), float(chance.uniform))
         self.first_weights = (float(chance.first_chosen), 0.0, float(chance.first_uniform))
         self.width = mdp.num_actions if mdp.is_sticky else 1
+
+    def after_the_start(self) -> tuple[np.ndarray, np.ndarray]:
+        """((S,), (S, W)): under sticky actions where play starts, and where it is a step later; else nothing, and where it starts.
+
+        That is where the rules of later steps hold. Without states where play ends.
+        """
+        start = next(self.distributions())[0].mass
+        started, now = np.zeros(len(start)), np.zeros((len(start), self.width))
+        if self.mdp.is_sticky:
+            started += start[:, 0]
+            self._push(start, True, now)
+        else:
+            now += start
+        started[~self.live] = now[~self.live] = 0.0
+        return started, now
 
     def distributions(self) -> Iterator[tuple["Nodes", float]]:
         """(distribution, probability that play goes on) at t = 0, 1, ...; T of them with a horizon. Overwritten by later ones."""

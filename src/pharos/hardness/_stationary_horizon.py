@@ -6,11 +6,13 @@ pharos's own variant of Laidlaw, Russell and Dragan's (2023) measure; `effective
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from pharos.errors import ParameterError, PrecisionError, UndefinedMeasure
+from pharos.hardness._choices import Choices, choices_of, reachable
 from pharos.hardness._effective_horizon import _expected_rewards, _single_outcomes
 from pharos.mdp import TabularMDP
 from pharos.solvers import Solution, uniform_value, value_iteration, worst_value
@@ -86,8 +88,8 @@ def stationary_effective_horizon(
         ParameterError: an option is wrong, or `solution` is not of this MDP. PrecisionError: tie_tolerance is not above twice the error.
     Exactness: Q^k is known up to an error; what differs by less than `slack`, four times that, counts as equal, which makes k fail
         rather than pass.
-    Cost: three solutions, then a backup and a walk over the states met for each k. breakout/12x8x1 (2.4 million states) takes about
-        a minute.
+    Cost: three solutions, then a backup and a walk over the states met for each k. breakout/12x8x1 (2.4 million states) takes
+        about ten seconds.
     Source: pharos; after Laidlaw, Russell and Dragan (2023), theorem 5.4.
     """
     if mdp.gamma == 1.0:
@@ -112,7 +114,8 @@ def stationary_effective_horizon(
     k_min = window = 0
     found: list[tuple[int, int, float, float]] = []
     best, k = float(limit), 1
-    values, spread = nodes.explored, (nodes.explored - nodes.worst) * (nodes.best - nodes.worst)
+    values: _Known | _Ahead = _Known(nodes.explored)
+    spread = ((nodes.explored - nodes.worst) * (nodes.best - nodes.worst)).max(axis=1)
     log_actions = math.log(mdp.num_actions)
     while k < best or not k_min:
         tell(f"k = {k}, bound {best:.4g}")
@@ -123,13 +126,13 @@ def stationary_effective_horizon(
             best = min(best, k + (math.log(needed[0]) / log_actions if mdp.num_actions > 1 else 0.0))
         if not k_min and (k >= limit or _is_greedy_optimal(nodes, values, optimal, slack)):
             k_min = k
-        values = nodes.backup(values.max(axis=1))
-        spread = mdp.gamma**2 * nodes.following_max(spread.max(axis=1))
+        values = nodes.backup(values.best)
+        spread = mdp.gamma**2 * nodes.following_max(spread)
         k += 1
-    values, window = nodes.rewards, 1
+    values, window = _Known(nodes.rewards), 1
     while window < limit and not _is_greedy_optimal(nodes, values, optimal, slack):
         tell(f"window {window}")
-        values = nodes.backup(values.max(axis=1))
+        values = nodes.backup(values.best)
         window += 1
     ks, ms, gaps, variances = (list(each) for each in zip(*found, strict=True)) if found else ([], [], [], [])
     conventions = {
@@ -143,24 +146,65 @@ def stationary_effective_horizon(
     return StationaryHorizon(best, k_min, window, ks, ms, gaps, variances, conventions)
 
 
+class _Known:
+    """Action values that are kept as a table (N, A)."""
+
+    def __init__(self, table: np.ndarray):
+        self.table = table
+
+    @cached_property
+    def best(self) -> np.ndarray:
+        """(N,): max over a."""
+        return self.table.max(axis=1)
+
+    def at(self, nodes: np.ndarray) -> np.ndarray:
+        """(n, A), of some nodes."""
+        return self.table[nodes]
+
+
+class _Ahead:
+    """Action values r + gamma value(next), where each action leads to one node: worked out only where they are asked for."""
+
+    def __init__(self, nodes: "_Nodes", value: np.ndarray):
+        self.nodes, self.value = nodes, value
+
+    @cached_property
+    def best(self) -> np.ndarray:
+        """(N,): max over a."""
+        from pharos._core import horizon
+
+        found = np.empty(self.nodes.num_nodes)
+        horizon.lookahead(self.nodes.table, self.nodes.rewards, self.nodes.gamma, self.value, found)
+        return found
+
+    def at(self, nodes: np.ndarray) -> np.ndarray:
+        """(n, A), of some nodes."""
+        assert self.nodes.table is not None
+        return self.nodes.rewards[nodes] + self.nodes.gamma * self.value[self.nodes.table[nodes]]
+
+
 class _Nodes:
     """Values of optimal, worst and uniform play on the nodes that can be met: states, or pairs with the previous action.
 
     Attributes:
         rewards, best, worst, explored: (N, A) of choosing an action. error: the largest error of any of them.
+        table: (N, A), the only node that an action leads to, where that is so everywhere; else None, and matrix (N A, N) says.
     """
 
     def __init__(self, mdp: TabularMDP, solution: Solution | None, tolerance: float, tell: Callable[[str], None]):
-        from pharos.hardness._choices import choices_of, reachable
         from pharos.hardness._gaps import checked
 
-        choices = reachable(choices_of(mdp, restart=False))
         self.gamma, self.num_actions = mdp.gamma, mdp.num_actions
+        self.table: np.ndarray | None
+        if mdp.next_states is not None and not mdp.is_sticky and not mdp.is_random:
+            choices, self.table = _states_and_the_end(mdp)
+        else:
+            choices = reachable(choices_of(mdp, restart=False))
+            self.table = _single_outcomes(choices.matrix, len(choices.underlying), mdp.num_actions)
         self.num_nodes = len(choices.underlying)
         self.matrix = choices.matrix
         self.starts = np.array(sorted(node for node, _ in choices.starts))
         self.rewards = _expected_rewards(mdp, choices)
-        self.table = _single_outcomes(self.matrix, self.num_nodes, self.num_actions)
         tell("values of optimal play")
         best = checked(mdp, solution) if solution is not None else _solved(value_iteration, mdp, tolerance)
         tell("values of the worst play")
@@ -168,21 +212,27 @@ class _Nodes:
         tell("values of uniform play")
         explored = _solved(uniform_value, mdp, tolerance)
         self.error = mdp.gamma * max(best.error_bound, worst.error_bound, explored.error_bound)
+        everywhere = np.arange(self.num_nodes)
         self.best, self.worst, self.explored = (
-            self.backup(_on_nodes(each, choices, mdp)) for each in (best, worst, explored)
+            self.backup(_on_nodes(each, choices, mdp)).at(everywhere) for each in (best, worst, explored)
         )
 
-    def backup(self, value: np.ndarray) -> np.ndarray:
-        """(N, A): r + gamma E value(next)."""
+    def backup(self, value: np.ndarray) -> _Known | _Ahead:
+        """r + gamma E value(next)."""
         if self.table is not None:
-            return self.rewards + self.gamma * value[self.table]
-        return self.rewards + self.gamma * (self.matrix @ value).reshape(self.num_nodes, self.num_actions)
+            return _Ahead(self, value)
+        return _Known(self.rewards + self.gamma * (self.matrix @ value).reshape(self.num_nodes, self.num_actions))
 
     def following_max(self, values: np.ndarray) -> np.ndarray:
-        """(N, A): the largest of values (N,) >= 0 over the nodes that an action may lead to."""
+        """(N,): the largest of values (N,) >= 0 over the nodes that some action may lead to."""
         if self.table is not None:
-            return values[self.table]
-        return np.maximum.reduceat(values[self.matrix.indices], self.matrix.indptr[:-1]).reshape(self.rewards.shape)
+            from pharos._core import horizon
+
+            found = np.empty(self.num_nodes)
+            horizon.largest(self.table, values, found)
+            return found
+        each = np.maximum.reduceat(values[self.matrix.indices], self.matrix.indptr[:-1])
+        return each.reshape(self.rewards.shape).max(axis=1)
 
     def closure(self, actions: Callable[[np.ndarray], np.ndarray | None]) -> np.ndarray | None:
         """The nodes met from the start by the actions (n, A) bool that are named for nodes (n,); None where it says None."""
@@ -201,6 +251,19 @@ class _Nodes:
             nodes = np.unique(following[~met[following]])
             met[nodes] = True
         return np.flatnonzero(met)
+
+
+def _states_and_the_end(mdp: TabularMDP) -> tuple[Choices, np.ndarray]:
+    """The states without chance, then the implicit end; and where each action leads. What has ended stays where it is."""
+    assert mdp.next_states is not None
+    size = mdp.num_states
+    table = np.full((size + 1, mdp.num_actions), size, mdp.next_states.dtype)
+    table[:size] = mdp.next_states
+    table[table < 0] = size
+    terminal = np.flatnonzero(mdp.terminal)
+    table[terminal] = terminal[:, None]
+    starts = [(int(s), float(p)) for s, p in zip(mdp.start_states, mdp.start_probabilities, strict=True) if p > 0]
+    return Choices(None, np.arange(size + 1), np.full(size + 1, -1), starts, mdp.num_actions, size + 1), table
 
 
 def _solved(solver: Callable[..., Solution], mdp: TabularMDP, tolerance: float) -> Solution:
@@ -224,32 +287,35 @@ def _on_nodes(solution: Solution, choices: Any, mdp: TabularMDP) -> np.ndarray:
     return np.where(inside, found, 0.0)
 
 
-def _is_greedy_optimal(nodes: _Nodes, values: np.ndarray, optimal: np.ndarray, slack: float) -> bool:
+def _is_greedy_optimal(nodes: _Nodes, values: _Known | _Ahead, optimal: np.ndarray, slack: float) -> bool:
     def greedy(n: np.ndarray) -> np.ndarray | None:
-        taken = values[n] >= values[n].max(axis=1, keepdims=True) - slack
+        q = values.at(n)
+        taken = q >= q.max(axis=1, keepdims=True) - slack
         return None if (taken & ~optimal[n]).any() else taken
 
     return nodes.closure(greedy) is not None
 
 
 def _samples(
-    nodes: _Nodes, values: np.ndarray, spread: np.ndarray, optimal: np.ndarray, slack: float, log: float
+    nodes: _Nodes, values: _Known | _Ahead, spread: np.ndarray, optimal: np.ndarray, slack: float, log: float
 ) -> tuple[int, float, float] | None:
     """(m_k, gap, variance where it is attained); None where k fails."""
 
-    def second(n: np.ndarray) -> np.ndarray:
-        return np.where(optimal[n], -math.inf, values[n]).max(axis=1)
+    def second(n: np.ndarray, q: np.ndarray) -> np.ndarray:
+        return np.where(optimal[n], -math.inf, q).max(axis=1)
 
     def better(n: np.ndarray) -> np.ndarray | None:
-        others = second(n)
-        if (values[n].max(axis=1) - others <= slack).any():
+        q = values.at(n)
+        others = second(n, q)
+        if (q.max(axis=1) - others <= slack).any():
             return None
-        return optimal[n] & (values[n] > others[:, None] - slack)
+        return optimal[n] & (q > others[:, None] - slack)
 
     met = nodes.closure(better)
     if met is None:
         return None
-    gap, largest = values[met].max(axis=1) - second(met), spread[met].max(axis=1)
+    q, largest = values.at(met), spread[met]
+    gap = q.max(axis=1) - second(met, q)
     with np.errstate(invalid="ignore"):
         needed = np.where(np.isinf(gap), 0.0, 16 * largest / gap**2 * log)
     i = int(needed.argmax())
