@@ -7,13 +7,14 @@ import resource
 import signal
 import sys
 import time
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import pharos
-from pharos.errors import DiskFull, StateSpaceIncomplete, StateSpaceLocked, StateSpaceTooLarge
+from pharos.errors import DiskFull, RuleError, StateSpaceIncomplete, StateSpaceLocked, StateSpaceTooLarge
 from pharos.state_space import _build as building
 from pharos.state_space import _files as writing
 from table_worlds import TableWorld
@@ -221,15 +222,120 @@ def test_raising_max_states_goes_on_where_the_build_stopped(tmp_path, undisturbe
         build(BREAKOUT, folder, max_states=33673)
 
 
-def test_more_memory_goes_on_where_the_build_stopped(tmp_path, monkeypatch):
-    env = pharos.make("breakout", height=8, columns=6)  # hundreds of thousands of states: the table grows twice
+# A table on disk ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def little_memory(monkeypatch):
+    """Memory that holds nothing: the table is on disk at once, chunks have 1024 rows, and a part of the table is a few pages."""
+    monkeypatch.setattr(building, "available_memory", lambda: 0)
+    monkeypatch.setattr(building, "LEAST_MEMORY", 1 << 16)
+
+
+@pytest.mark.parametrize("env", (BREAKOUT, NARROW), ids=lambda env: env.name)
+@pytest.mark.parametrize("workers", (1, 2))
+@pytest.mark.parametrize("wide", (8, 1 << 13))
+def test_files_do_not_depend_on_where_the_table_is(
+    env, workers, wide, tmp_path, undisturbed, little_memory, monkeypatch
+):
+    monkeypatch.setattr(building, "WIDE", wide)
+    build(env, tmp_path / "space", workers=workers, checkpoint_seconds=0.01)
+    assert_same_files(tmp_path / "space", undisturbed[env.name])
+
+
+@pytest.mark.parametrize("limit", (1 << 16, 1 << 20, 3 << 20))
+@pytest.mark.parametrize("chunk", (64, 1 << 16))
+def test_the_table_moves_to_disk_in_the_middle_of_a_build(limit, chunk, tmp_path, monkeypatch):
+    env = pharos.make("breakout", height=8, columns=6)  # 142,063 states: the table grows twice
     build(env, tmp_path / "undisturbed")
-    monkeypatch.setattr(building, "_available_memory", lambda: 1 << 20)
-    with pytest.raises(StateSpaceTooLarge, match="give more memory"):
-        build(env, tmp_path / "space")
-    monkeypatch.undo()
-    build(env, tmp_path / "space")
+    monkeypatch.setattr(building, "CHUNK", chunk)
+    monkeypatch.setattr(building, "LEAST_MEMORY", 1 << 16)
+    moved = []
+    spill = building._Builder._spill
+    monkeypatch.setattr(building._Builder, "_spill", lambda self, *args: (moved.append(self.count), spill(self, *args)))
+    build(env, tmp_path / "space", memory=limit)
+    assert len(moved) == 1 and (moved[0] > 1000) == (limit > 1 << 16)
     assert_same_files(tmp_path / "space", tmp_path / "undisturbed")
+
+
+def test_memory_may_come_and_go_between_sessions(tmp_path, undisturbed, monkeypatch):
+    folder = tmp_path / "space"
+    monkeypatch.setattr(building, "LEAST_MEMORY", 1 << 16)
+    for limit, memory in ((3000, 1 << 16), (9000, None), (15_000, 1 << 16), (25_000, 1 << 20), (None, 1 << 16)):
+        if limit:
+            with pytest.raises(StateSpaceTooLarge):
+                build(BREAKOUT, folder, max_states=limit, memory=memory)
+        else:
+            build(BREAKOUT, folder, memory=memory)
+    assert_same_files(folder, undisturbed["breakout"])
+
+
+def test_a_build_on_disk_killed_again_and_again_leaves_no_table_behind(tmp_path, undisturbed, little_memory):
+    folder = tmp_path / "space"
+    rng = np.random.default_rng(0)
+    for _ in range(6):
+        process = in_a_child(_build_slowly, BREAKOUT, folder)
+        process.join(timeout=rng.uniform(0.05, 0.2))
+        os.kill(process.pid, signal.SIGKILL)
+        process.join()
+        assert process.exitcode == -signal.SIGKILL
+        assert set(files_of(folder)) <= {*building.OUR_FILES, "manifest.json"}
+    build(BREAKOUT, folder)
+    assert_same_files(folder, undisturbed["breakout"])
+
+
+def test_indices_widen_while_the_table_is_on_disk(widened, tmp_path, little_memory, monkeypatch):
+    monkeypatch.setattr(building, "INT32_STATES", 5000)
+    build(BREAKOUT, tmp_path / "space")
+    wide, expected = pharos.load(tmp_path / "space"), pharos.load(widened)
+    assert wide.successors.dtype == np.int64
+    assert (wide.successors == expected.successors).all() and (wide.packed_states == expected.packed_states).all()
+
+
+def test_interpreted_rules_are_enumerated_with_the_table_on_disk(tmp_path, undisturbed, little_memory, monkeypatch):
+    monkeypatch.setattr("pharos._core.compiling.compiled_rules", lambda *args: None)
+    build(BREAKOUT, tmp_path / "space")
+    assert_same_files(tmp_path / "space", undisturbed["breakout"])
+
+
+def _build_where_the_table_does_not_fit(env, folder):
+    def refused(descriptor, start, size):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    os.posix_fallocate = refused
+    try:
+        build(env, folder, memory=1 << 20)
+    except DiskFull as error:
+        os._exit(7 if "the table of states: cannot write (No space left" in str(error) else 1)
+    os._exit(0)
+
+
+def test_a_disk_without_room_for_the_table_loses_nothing(tmp_path, monkeypatch):
+    env = pharos.make("breakout", height=8, columns=6)
+    monkeypatch.setattr(building, "LEAST_MEMORY", 1 << 16)
+    monkeypatch.setattr(building, "CHUNK", 512)
+    process = in_a_child(_build_where_the_table_does_not_fit, env, tmp_path / "space")
+    process.join()
+    assert process.exitcode == 7
+    assert building.read_manifest(tmp_path / "space")["num_expanded"] > 0
+    build(env, tmp_path / "space")
+    build(env, tmp_path / "undisturbed")
+    assert_same_files(tmp_path / "space", tmp_path / "undisturbed")
+
+
+def test_a_rule_that_fails_is_blamed_with_the_table_on_disk(tmp_path, little_memory):
+    @dataclass(frozen=True, kw_only=True)
+    class Overflowing(TableWorld):
+        name = "overflowing"
+
+        def transition(self, state, action, out):
+            out[0] = state[0] + 1 if state[0] < 1200 else 10**6
+
+        def is_terminal(self, state):
+            return False
+
+    with pytest.raises(RuleError, match="declared"):
+        build(Overflowing(num_positions=8000), tmp_path / "space")
 
 
 # More than 2^31 states ---------------------------------------------------------------------------------------------------

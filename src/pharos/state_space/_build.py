@@ -1,7 +1,7 @@
 """build: enumerate the reachable states of an environment, onto disk. Algorithm 1 of the paper, compiled.
 
 Breadth-first search: the array of states, in the order of discovery, is the queue; a table of indices keyed by hash is the
-only other memory. Successors and terminal bits are appended to files as the states are expanded. While the frontier is
+only other memory. Where both do not fit, the table goes to disk (_disk_table.py), and states stay in their file. Successors and terminal bits are appended to files as the states are expanded. While the frontier is
 wide, threads compute successors and look up those already known, a piece ahead of the one thread that numbers the new
 ones in order: so states are numbered as one thread would number them. While it is narrow (Freeway: 148 thousand levels of
 9 states) one thread does everything. docs/decisions has the measurements.
@@ -28,6 +28,7 @@ from pharos.environment import Environment, start_distribution
 from pharos.errors import DiskFull, ParameterError, RuleError, StateSpaceMismatch, StateSpaceTooLarge
 from pharos.state_space._files import GrowingFile, lock, write_manifest
 from pharos.state_space._interpreted import interpreted_successors
+from pharos.state_space._memory import available_memory
 from pharos.state_space._packing import layout_of, pack, unpack
 from pharos.state_space._store import (
     FORMAT_VERSION,
@@ -54,19 +55,22 @@ WIDE = 1 << 13  # a frontier of this many states is worth sharing between thread
 CHECKPOINT_SECONDS = 15.0
 PARALLEL_FILL = 1 << 16  # states that are worth sharing between threads when the table grows
 LEFT_OVER = 1 << 12  # states that may pass the end of a part of the table, which are a handful
+LEAST_MEMORY = 1 << 24  # bytes
 LOAD = 0.5  # the table grows beyond this share of used slots
 INT32_STATES = 2**31 - 1
+_NOTHING = np.full(1 << 16, -1, np.int32)  # a table that holds nothing, where the slot of a state is its bucket
 
 
 @dataclass(frozen=True)
 class BuildProgress:
-    """What a progress callback receives: states found and expanded so far, levels finished, seconds."""
+    """What a progress callback receives: states found and expanded so far, levels finished, seconds, where the table is."""
 
     num_states: int
     num_expanded: int
     depth: int
     seconds: float
     finished: bool = False
+    on_disk: bool = False
 
 
 Progress = Callable[[BuildProgress], None]
@@ -91,7 +95,8 @@ def build(
         max_states: StateSpaceTooLarge when there are more.
 
         Cost only (the files are the same, byte for byte):
-        memory: bytes that states and table may take; None for as much as there is.
+        memory: bytes that states and table may take; None for as much as there is. Beyond them the table is on disk, in a file
+            without a name in `folder` of 23 to 46 bytes a state (12 to 23 more for each further word), which is gone in the end.
         workers: threads; None for all processors.
         progress: None for a bar on a terminal; False for silence; or a function that gets a BuildProgress now and then.
         checkpoint_seconds: at most this much work is lost when the process is killed.
@@ -107,7 +112,7 @@ def build(
     """
     if max_states is not None and max_states < 1:
         raise ParameterError(f"max_states is {max_states}; expected at least 1")
-    if memory is not None and memory < 1 << 24:
+    if memory is not None and memory < LEAST_MEMORY:
         raise ParameterError(f"memory is {memory} bytes; expected at least 16 MiB")
     identity = identity_of(env)
     path = Path(folder) if folder is not None else cached_folder(env)
@@ -179,6 +184,37 @@ class _Piece:
         self.futures: list[Future] = []
 
 
+class _Spilled:
+    """The table on disk, and memory for a chunk of the frontier.
+
+    Attributes:
+        rows: of a chunk: as many as half of the memory holds; the table takes a quarter at a time.
+        states: what the chunk found and is not in the file yet. terminal: of its rows. keys, found, order, slots: of its candidates.
+    """
+
+    def __init__(self, path: Path, num_words: int, num_actions: int, memory: int, count: int):
+        from pharos.state_space._disk_table import DiskTable
+
+        candidate = 2 * 8 * num_words + 8 + 8 + 8 + 4  # words here and as a state, found, slots, a successor, order
+        bytes_of_a_row = num_actions * candidate + 8 * num_words + 1
+        self.rows = min(
+            max(memory // 2 // bytes_of_a_row // 1024, 1) * 1024, INT32_STATES // num_actions // 1024 * 1024
+        )
+        candidates = self.rows * num_actions
+        self.states, self.keys = (np.empty((candidates, num_words), np.uint64) for _ in range(2))
+        self.found, self.slots = np.empty(candidates, np.int64), np.empty(candidates, np.int64)
+        self.order = np.empty(candidates, np.int32)
+        self.terminal = np.empty(self.rows, np.uint8)
+        self._successors = np.empty((0, num_actions), np.int32)
+        self.table = DiskTable(path, num_words, memory // 4, 2 * count)
+
+    def successors(self, dtype: np.dtype) -> np.ndarray:
+        """(rows, A), of the chunk."""
+        if len(self._successors) != self.rows or self._successors.dtype != dtype:
+            self._successors = np.empty((self.rows, self._successors.shape[1]), dtype)
+        return self._successors
+
+
 class _Builder:
     """One run of the build: memory, files and the loop."""
 
@@ -202,6 +238,7 @@ class _Builder:
         self.spare: list[_Piece] = []
         self.blocks: list[tuple[np.ndarray, np.ndarray]] = []  # rows of successors and terminal bits, used in turn
         self.margin = 32 * env.num_actions + len(self.start_states)
+        self.disk: _Spilled | None = None  # the table on disk, where memory is not enough
 
     def run(self, manifest: dict[str, Any] | None) -> None:
         self.began = self.last_checkpoint = time.perf_counter()
@@ -214,9 +251,13 @@ class _Builder:
         try:
             self._open(manifest)
             with ThreadPoolExecutor(self.workers) as pool, ThreadPoolExecutor(1) as self.writer:
-                self._grow_table(pool, self.count)
+                if self.disk is None:
+                    self._grow_table(pool, self.count)
                 while self.first < self.count:
-                    self._expand_chunk(pool)
+                    if self.disk is None:
+                        self._expand_chunk(pool)
+                    else:
+                        self._expand_chunk_on_disk(pool, self.disk)
                     if time.perf_counter() - self.last_checkpoint >= self.checkpoint_seconds:
                         self._checkpoint(complete=False)
                 self._checkpoint(complete=True)
@@ -228,6 +269,7 @@ class _Builder:
         finally:
             for file in self.files.values():
                 file.close()
+            self.disk = None
             del self.states, self.table, self.table_space  # also where a traceback keeps this builder alive
         self.report(self._progress(finished=True))
 
@@ -251,7 +293,10 @@ class _Builder:
             self.level_end, self.depth = manifest["level_end"], manifest["depth"]
             self.terminals = manifest["num_terminal_states"]
             stored = np.memmap(self.path / STATES, "<u8", "r", shape=(self.count, self.layout.num_words))
-            self.states[: self.count] = stored
+            if self._fits(self.count):
+                self.states[: self.count] = stored
+            else:
+                self._spill(stored)
             if self.first:
                 shape = (self.first, self.env.num_actions)
                 successors = np.memmap(self.path / self.successors_name, self.index_dtype, "r", shape=shape)
@@ -281,12 +326,17 @@ class _Builder:
         """Expand up to CHUNK states, then append their rows to the files."""
         if self.index_dtype.itemsize == 4 and self.count + CHUNK * self.env.num_actions + self.margin > INT32_STATES:
             self._widen_indices(pool)
+            if self.disk:
+                return
         base = self.first
         last = base + CHUNK
         successors, terminal = self._block()
         while self.first < min(last, self.count):
             if self.ahead is None and self.count + self.margin > self._room():
-                self._make_room(pool)
+                self._grow_table(pool, self.count)
+                if self.disk:
+                    self.first -= (self.first - base) % 8  # what is appended has whole bytes of terminal bits
+                    break
             if self.rules is None:
                 self._expand_interpreted(successors, terminal, base, min(last, self.count))
             elif self.ahead or (self.workers > 1 and min(last, self.count) - self.first >= WIDE):
@@ -298,6 +348,108 @@ class _Builder:
         self.terminals += int(terminal[:rows].sum())
         self._append(self.states[self.appended : self.count], successors[:rows], terminal[:rows])
         self.report(self._progress())
+
+    def _expand_chunk_on_disk(self, pool: ThreadPoolExecutor, disk: "_Spilled") -> None:
+        """The same with the table on disk: successors are looked up in order of the table, many at once, and then numbered."""
+        num_actions = self.env.num_actions
+        if self.index_dtype.itemsize == 4 and self.count + disk.rows * num_actions > INT32_STATES:
+            self._widen_indices(pool)
+        from pharos._core.disk_table import number
+
+        self._finish_writes()
+        if len(self.states):
+            self.states, self.table, self.table_space = (
+                self.states[:0].copy(),
+                self.table[:0].copy(),
+                self.table_space[:0].copy(),
+            )
+            self.blocks, self.spare = [], []
+        base, last = self.first, self.first + disk.rows
+        successors, terminal = disk.successors(self.index_dtype), disk.terminal
+        while self.first < min(last, self.count):
+            first, rows = self.first, min(last, self.count) - self.first
+            size = rows * num_actions
+            keys, found = disk.keys[:size], disk.found[:size]
+            part = slice(first - base, first - base + rows)
+            self._expand_rows(pool, self._rows(first, first + rows), keys, found, terminal[part])
+            disk.table.grow(self.count + size)
+            looked_up = disk.table.look_up(keys, found, first, disk.order, disk.slots)
+            progress = np.zeros(5, np.int64)
+            number(
+                keys,
+                found,
+                successors[part],
+                disk.states,
+                first,
+                self.count,
+                self.appended,
+                self.level_end,
+                self.depth,
+                progress,
+            )
+            disk.table.settle(looked_up, found, disk.order, disk.slots)
+            self._take(progress)
+            _check_size(self.env, self.count, self.count - self.first, self.max_states)
+        rows = self.first - base
+        self.terminals += int(terminal[:rows].sum())
+        self._append(disk.states[: self.count - self.appended], successors[:rows], terminal[:rows])
+        self.report(self._progress())
+
+    def _expand_rows(self, pool, states: np.ndarray, keys: np.ndarray, found: np.ndarray, terminal: np.ndarray) -> None:
+        """Successors of states to keys; to found -1 - bucket, or in terminal states their own row."""
+        rows = len(states)
+        if self.rules is None:
+            from pharos._core.packing import pack_rows, unpack_rows
+
+            layout = self.layout
+            keys[:] = 0
+            for start in range(0, rows, 4096):
+                stop = min(start + 4096, rows)
+                unpacked = np.empty((stop - start, len(layout.word)), np.int64)
+                unpack_rows(layout.word, layout.shift, layout.mask, layout.low, states[start:stop], unpacked)
+                following, terminal[start:stop] = interpreted_successors(self.env, unpacked.tolist())
+                part = slice(start * self.env.num_actions, stop * self.env.num_actions)
+                pack_rows(layout.word, layout.shift, layout.low, following, keys[part])
+            found[:] = -1 - _slots_of(keys, len(_NOTHING))
+            return
+        threads = self.workers if rows >= WIDE else 1
+        cuts = [rows * i // threads for i in range(threads + 1)]
+        faults = [np.zeros(5, np.int64) for _ in range(threads)]
+
+        def expand(i: int) -> None:
+            self.rules.kernels.expand_and_find(
+                self.rules.parameters,
+                self.layout.tables,
+                states,
+                cuts[i],
+                cuts[i + 1],
+                0,
+                keys,
+                found,
+                terminal,
+                _NOTHING,
+                faults[i],
+            )
+
+        for i, future in enumerate([pool.submit(expand, i) for i in range(threads)]):
+            failure = future.exception()
+            if failure or faults[i][4]:
+                at = int(faults[i][0])
+                self._blame_rules(self.first + at, self.first + min(at + 16, rows), failure)
+
+    def _rows(self, start: int, stop: int) -> np.ndarray:
+        """States [start, stop): in memory, or from their file and what is not in it yet."""
+        if self.disk is None:
+            return self.states[start:stop]
+        words, held = self.layout.num_words, self.appended
+        states = np.empty((stop - start, words), np.uint64)
+        in_file = max(0, min(stop, held) - start)
+        if in_file:
+            states[:in_file] = np.fromfile(
+                self.path / STATES, "<u8", in_file * words, offset=8 * words * start
+            ).reshape(-1, words)
+        states[in_file:] = self.disk.states[start + in_file - held : stop - held]
+        return states
 
     def _block(self) -> tuple[np.ndarray, np.ndarray]:
         """Room for the rows of a chunk; _append lets two chunks wait, so the third one back is written."""
@@ -428,7 +580,7 @@ class _Builder:
 
     def _blame_rules(self, start: int, stop: int, failure: BaseException | None = None) -> NoReturn:
         """Compiled rules failed or left the declared ranges in [start, stop): name the first state where they do interpreted."""
-        rows = unpack(self.layout, self.states[start:stop]).tolist()
+        rows = unpack(self.layout, self._rows(start, stop)).tolist()
         interpreted_successors(self.env, rows)
         raise RuleError(
             f"{self.env}: compiled rules {f'raise {failure!r}' if failure else 'read or write outside of the declared ranges'} "
@@ -442,22 +594,29 @@ class _Builder:
         """States that table and array of states can hold."""
         return min(int(len(self.table) * LOAD), len(self.states))
 
-    def _make_room(self, pool: ThreadPoolExecutor) -> None:
-        if self.count + self.margin > len(self.states):
-            raise MemoryError(
-                f"{self.env}: no address space for more than {len(self.states)} states; set a larger ulimit -v"
-            )
-        self._grow_table(pool, self.count)
-
-    def _grow_table(self, pool: ThreadPoolExecutor, count: int) -> None:
-        """A table with room for about twice as many states, filled from the array of states."""
-        from pharos._core.hash_table import fill, fill_more, fill_range
-
+    def _slots_for(self, count: int) -> int:
+        """Slots of a table in memory with room for about twice as many states."""
         slots = 1 << 16
         while slots * LOAD < 1.4 * count + self.margin:
             slots *= 2
+        return slots
+
+    def _fits(self, count: int) -> bool:
+        """Whether memory holds a table with room for about twice as many states, and the states."""
+        if count + self.margin > len(self.states):
+            return False
+        slots = self._slots_for(count)
         needed = slots * self.index_dtype.itemsize + int(slots * LOAD) * self.layout.num_words * 8
-        self._check_memory(count, needed)
+        return needed <= (self.memory if self.memory is not None else available_memory())
+
+    def _grow_table(self, pool: ThreadPoolExecutor, count: int) -> None:
+        """A table with room for about twice as many states, filled from the array of states; on disk where memory is not enough."""
+        from pharos._core.hash_table import fill, fill_more, fill_range
+
+        if not self._fits(count):
+            self._spill()
+            return
+        slots = self._slots_for(count)
         self.table = np.empty(0, self.index_dtype)  # free the old one first, where it cannot grow in its place
         if self.table_space.nbytes < slots * self.index_dtype.itemsize:
             self.table_space = _huge_pages(slots, self.index_dtype)
@@ -481,14 +640,20 @@ class _Builder:
         for i, over in enumerate(left):
             fill_more(self.table, self.states, left_over[i, :over])
 
-    def _check_memory(self, count: int, needed: int) -> None:
-        available = self.memory if self.memory is not None else _available_memory()
-        if needed > available:
-            raise StateSpaceTooLarge(
-                f"{self.env}: {count} states found, {count - self.first} left to expand, and the next "
-                f"{needed / 2**30:.1f} GiB of table and states pass the memory of {available / 2**30:.1f} GiB; "
-                f"what was found is kept: give more memory and the same command resumes, or choose a smaller instance"
-            )
+    def _spill(self, stored: np.ndarray | None = None) -> None:
+        """Go on with the table on disk, filled from the one in memory, or from the states of the last checkpoint."""
+        memory = self.memory
+        if memory is None:
+            memory = max(LEAST_MEMORY, available_memory() // 2)
+        disk = _Spilled(self.path, self.layout.num_words, self.env.num_actions, memory, self.count)
+        if stored is not None:
+            for start in range(0, self.count, disk.rows):
+                disk.table.fill(np.array(stored[start : start + disk.rows], np.uint64), start)
+        elif len(self.table):
+            disk.table.take_over(self.table, self.states)
+        else:
+            disk.table.fill(self.states[: self.count], 0)
+        self.disk = disk
 
     # Files ---------------------------------------------------------------------------------------------------------------
 
@@ -511,7 +676,8 @@ class _Builder:
         del self.files[SUCCESSORS]
         old.close()
         old.path.unlink()
-        self._grow_table(pool, self.count)
+        if self.disk is None:
+            self._grow_table(pool, self.count)
 
     def _append(self, states: np.ndarray, successors: np.ndarray, terminal: np.ndarray) -> None:
         """Append in the background, while the next chunk is expanded; at most two chunks wait.
@@ -561,7 +727,8 @@ class _Builder:
         self.last_checkpoint = time.perf_counter()
 
     def _progress(self, finished: bool = False) -> BuildProgress:
-        return BuildProgress(self.count, self.first, self.depth, time.perf_counter() - self.began, finished)
+        seconds = time.perf_counter() - self.began
+        return BuildProgress(self.count, self.first, self.depth, seconds, finished, self.disk is not None)
 
 
 def _slots_of(keys: np.ndarray, capacity: int) -> np.ndarray:
@@ -603,17 +770,6 @@ def _huge_pages(length: int, dtype: np.dtype) -> np.ndarray:
     return np.frombuffer(memory, dtype)
 
 
-def _available_memory() -> int:
-    """Bytes that this process may still take: free memory of the machine, or of its control group where that is less."""
-    free = 1 << 62
-    with contextlib.suppress(OSError, StopIteration, ValueError), open("/proc/meminfo") as file:
-        free = next(int(line.split()[1]) * 1024 for line in file if line.startswith("MemAvailable"))
-    with contextlib.suppress(OSError, ValueError):
-        limit = int(Path("/sys/fs/cgroup/memory.max").read_text())
-        free = min(free, limit - int(Path("/sys/fs/cgroup/memory.current").read_text()))
-    return free
-
-
 @contextlib.contextmanager
 def _reporter(progress: Progress | bool | None, env: Environment):
     """The function that gets each BuildProgress: the caller's, a bar on a terminal, or nothing."""
@@ -640,7 +796,8 @@ def _reporter(progress: Progress | bool | None, env: Environment):
                 rate = done.num_states / max(done.seconds, 1e-9)
                 bar.update(
                     task,
-                    text=f"{done.num_states:,} states, {left:,} to expand, level {done.depth}, {rate:,.0f} states/s",
+                    text=f"{done.num_states:,} states, {left:,} to expand, level {done.depth}, {rate:,.0f} states/s"
+                    f"{', table on disk' if done.on_disk else ''}",
                 )
 
             yield show
