@@ -46,6 +46,15 @@ def minatar(game, seconds):
     return _rate(step, seconds)
 
 
+def minatar_by_gymnasium(game, seconds):
+    from minatar.gym import register_envs
+
+    name = f"MinAtar/{game.capitalize()}-v1"
+    if name not in gymnasium.registry:
+        register_envs()
+    return steps_per_second_of_one(gymnasium.make(name, sticky_action_prob=0.25), seconds)
+
+
 def gymnax(game, seconds, scanned):
     import gymnax
     import jax
@@ -120,7 +129,13 @@ def main():
         show(f"{game} with images, {NUM_ENVS} environments", rows, peers)
         one = gymnasium.make(f"pharos/{game.capitalize()}-v0", observation="simple_image", sticky=0.25, **parameters)
         rows = [(f"{game}, simple_image", steps_per_second_of_one(one, seconds))]
-        peers = [("MinAtar", minatar(game, seconds))] if there["minatar"] else []
+        rows.append((f"{game}, without Gymnasium's wrappers", steps_per_second_of_one(one.unwrapped, seconds)))
+        peers = []
+        if there["minatar"]:
+            peers = [
+                ("MinAtar by gymnasium.make", minatar_by_gymnasium(game, seconds)),
+                ("MinAtar without Gymnasium", minatar(game, seconds)),
+            ]
         show(f"{game} with images, one environment", rows, peers)
 
 

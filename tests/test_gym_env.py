@@ -13,6 +13,7 @@ from gymnasium.utils.env_checker import check_env
 import pharos
 from pharos.errors import MissingExtra, ParameterError
 from pharos.gym_env import GymEnv, chance_weights
+from pharos.observations import observe
 from pharos.rendering import human
 
 SMALL = {
@@ -40,6 +41,7 @@ def test_gymnasiums_checker_finds_nothing_to_say_about_rendering(env_id, monkeyp
 @pytest.mark.parametrize("env_id", SMALL)
 def test_the_picture_is_the_one_for_people(env_id):
     env = gymnasium.make(env_id, render_mode="rgb_array", **SMALL[env_id])
+    env.action_space.seed(0)
     env.reset(seed=0)
     frames = gymnasium.wrappers.RenderCollection(env)
     frames.reset(seed=0)
@@ -289,3 +291,28 @@ def test_wrong_use_is_named():
         env.step(3)
     with pytest.raises(ParameterError, match="action -1; expected 0 to 2"):
         env.step(-1)
+
+
+@pytest.mark.parametrize(
+    ("observation", "options"),
+    (("vector", {}), ("simple_image", {}), ("simple_image", {"scale": 8}), ("simple_image", {"grey": True})),
+    ids=str,
+)
+@pytest.mark.parametrize("name", ("breakout", "freeway", "frozen_lake", "simple_grid"))
+def test_what_a_step_returns_is_of_its_state_and_stays_so(name, observation, options):
+    """The step draws and writes by itself; nothing that it returned changes later."""
+    env = GymEnv(name, observation=observation, observation_options=options, sticky=0.3, random=0.1)
+    of_state = observe(env.environment, observation, **options)
+    random = np.random.default_rng(0)
+    given, info = env.reset(seed=1)
+    kept = [(given, info["state"], given.copy(), info["state"].copy())]
+    for _ in range(300):
+        given, _, terminated, truncated, info = env.step(int(random.integers(env.action_space.n)))
+        kept.append((given, info["state"], given.copy(), info["state"].copy()))
+        if terminated or truncated:
+            given, info = env.reset()
+            kept.append((given, info["state"], given.copy(), info["state"].copy()))
+    for given, state, given_then, state_then in kept:
+        assert (given == given_then).all() and (state == state_then).all()
+        assert given.dtype == env.observation_space.dtype and (given == of_state.one(state)).all()
+    assert len({state.tobytes() for _, state, _, _ in kept}) > 10

@@ -15,7 +15,7 @@ import numpy as np
 from pharos._window import Window
 from pharos.environment import Environment, make, start_distribution
 from pharos.errors import ParameterError, RuleError
-from pharos.observations import Index, observe
+from pharos.observations import Index, SimpleImage, observe
 from pharos.observations._context import NO_ACTION, ObservationInContext
 
 if TYPE_CHECKING:
@@ -171,13 +171,16 @@ class GymEnv(gymnasium.Env):
         self._limit = simulator.limit if simulator.limit is not None else 1 << 62
         observation: Any = simulator.context.observation
         is_vector = simulator.context.is_vector and simulator.context.is_plain
-        self._blank = np.zeros(
-            len(simulator.env.components) if is_vector else 0, np.float32
-        )  # the compiled step writes the vector
+        self._spare = simulator.start_states[0].copy()  # room for the next state
+        self._blank: np.ndarray = np.zeros(len(simulator.env.components) if is_vector else 0, np.float32)
         self._scale = observation.scale if is_vector else np.zeros(0)
-        self._is_vector = is_vector
-        self._start_vectors = observation(simulator.start_states) if is_vector else np.zeros((0, 0))
-        self._has_chance = simulator.has_chance
+        self._step_and_draw = _step_and_draw(simulator)
+        self._is_written = is_vector or self._step_and_draw is not None  # whether a step writes the observation itself
+        few = self._is_written and len(simulator.start_states) <= 4096
+        self._start_observations = observation(simulator.start_states) if few else None
+        if self._step_and_draw is not None:
+            self._shades, self._blank = observation.shades, np.zeros(observation.space.shape, np.uint8)
+        self._has_chance, self._stays = simulator.has_chance, simulator.chance[0]
         self._is_index = simulator.context.is_plain and isinstance(observation, Index)
         self._successors = simulator.state_space.successors if simulator.state_space is not None else None
 
@@ -198,19 +201,19 @@ class GymEnv(gymnasium.Env):
         if options is not None and options.get("state") is not None:
             self._state = simulator.checked_state(options["state"])
             self._terminated = simulator.rules.is_terminal_one(self._parameters, self._state)
-            vector = None
+            observation = None
         else:
             start = simulator.drawn_start(self.np_random)
             self._state = simulator.start_states[start].copy()
             self._terminated = False
-            vector = self._start_vectors[start].copy() if self._is_vector else None
+            observation = None if self._start_observations is None else self._start_observations[start].copy()
         self._previous = simulator.first_previous
         self._elapsed = 0
         if simulator.state_space is not None:
             self._index = int(simulator.state_space.indices(self._state[None])[0])
         if self._window is not None:
             self.render()
-        return self._observation() if vector is None else vector, self._info(self._state)
+        return self._observation() if observation is None else observation, self._info(self._state)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Choose an action. After a terminal state nothing changes and nothing is paid."""
@@ -220,22 +223,30 @@ class GymEnv(gymnasium.Env):
         state = self._state
         if state is None or self._terminated:
             return self._step_after_the_end()
-        if self._has_chance:
-            chosen = self.simulator.executed(chosen, self._previous, self.np_random.random())
-        following = state.copy()  # quicker than np.empty
-        vector = self._blank.copy()
-        reward, code = self._step_one(self._parameters, self._ranges, self._scale, state, chosen, following, vector)
+        if self._has_chance and (u := self.np_random.random()) >= self._stays:
+            chosen = self.simulator.executed(chosen, self._previous, u)
+        following = self._spare
+        observation: Any = self._blank.copy()
+        if self._step_and_draw is not None:
+            reward, code = self._step_and_draw(
+                self._parameters, self._ranges, state, chosen, following, self._shades, observation
+            )
+        else:
+            reward, code = self._step_one(
+                self._parameters, self._ranges, self._scale, state, chosen, following, observation
+            )
         if code:
             if code > 1:
                 self.simulator.raise_fault(state, chosen, code - 2)
             self._terminated = True
-        self._state = following
+        self._state, self._spare = following, state
         self._previous = chosen
         self._elapsed += 1
         info = {"state": following.copy(), "executed_action": chosen}
         if self._successors is not None:
             info["index"] = self._index = int(self._successors[self._index, chosen])
-        observation = vector if self._is_vector else self._observation()
+        if not self._is_written:
+            observation = self._observation()
         if self._window is not None:
             self.render()
         return observation, reward, self._terminated, self._elapsed >= self._limit, info
@@ -318,6 +329,7 @@ class _CompiledRules:
         rules = InteractionRules(env)
         self.parameters = rules.parameters
         self.step_one = rules.kernels.step_one
+        self.step_and_draw_one = rules.kernels.step_and_draw_one
         self.step_many = rules.kernels.step_many
         self.is_terminal_one = rules.kernels.is_terminal_one
 
@@ -336,6 +348,22 @@ def rules_for_interaction(env: Environment, state: np.ndarray) -> Any:
     except Exception as error:  # Numba raises its own errors, and others from inside of it
         _warn_once(type(env), "step_one", _first_lines(str(error)) or type(error).__name__)
         return _InterpretedRules(env)
+
+
+def _step_and_draw(simulator: Simulator) -> Any:
+    """The compiled step that draws as well, for simple images with a pixel for each cell; else None."""
+    observation = simulator.context.observation
+    if not simulator.context.is_plain or not isinstance(observation, SimpleImage) or not observation.is_flat:
+        return None
+    kernel = getattr(simulator.rules, "step_and_draw_one", None)
+    if kernel is None:
+        return None
+    state, image = simulator.start_states[0], observation.one(simulator.start_states[0])
+    try:
+        kernel(simulator.rules.parameters, simulator.ranges, state, 0, state.copy(), observation.shades, image)
+    except Exception:  # draw() does not compile: the observation says so, when it is asked for
+        return None
+    return kernel
 
 
 # Options -----------------------------------------------------------------------------------------------------------------

@@ -37,6 +37,19 @@ def step_one(parameters, ranges, scale, state, action, following, vector):
 
 
 @njit(cache=CACHE, nogil=True)
+def step_and_draw_one(parameters, ranges, state, action, following, shades, image):
+    """One step: `advance`, and the simple image of the successor, a pixel for each cell, on planes of their own.
+
+    shades (L, 256) uint8 as in `draw_simple`; image (L, rows, columns) uint8, zero.
+    """
+    self = Parameters(*parameters)
+    value, code = advance(self, ranges, state, action, following)
+    if code <= 1:
+        draw_flat(self, following, shades, image)
+    return value, code
+
+
+@njit(cache=CACHE, nogil=True)
 def step_many(parameters, ranges, scale, chance, limit, mode, first_previous, starts, cumulative, rng, actions,
               states, previous, elapsed, ended, rewards, terminated, truncated, executed, final, vector, first, last):  # fmt: skip
     """One step of environments first .. last - 1; return -1, or i * D + c where component c of environment i left its range.
@@ -85,6 +98,22 @@ def is_terminal_one(parameters, state):
     return bool(is_terminal(Parameters(*parameters), state))
 
 
+@njit(forceinline=True)
+def draw_flat(self, state, shades, image):
+    """image[l] = shades[l, value of layer l], a pixel for each cell; image (L, rows, columns) uint8, zero."""
+    draw(self, state, image)
+    layers, rows, columns = image.shape
+    for layer in range(layers):
+        plane = image[layer].reshape(rows * columns)
+        only = shades[layer, 1]
+        if only == shades[layer, 255]:  # one kind of thing: no table, so that the loop is vectorized
+            for i in range(rows * columns):
+                plane[i] = only if plane[i] != 0 else 0
+        else:
+            for i in range(rows * columns):
+                plane[i] = shades[layer, plane[i]]
+
+
 @njit(cache=CACHE, nogil=True)
 def draw_simple(parameters, states, first, last, planes, shades, covering, out):
     """out[n, l] = shades[l, value of layer l], each cell enlarged to a square, for states first .. last - 1.
@@ -97,17 +126,7 @@ def draw_simple(parameters, states, first, last, planes, shades, covering, out):
     size = out.shape[2] // rows
     for n in range(first, last):
         if size == 1 and not covering:
-            image = out[n]
-            draw(self, states[n], image)
-            for layer in range(layers):
-                plane = image[layer].reshape(rows * columns)
-                only = shades[layer, 1]
-                if only == shades[layer, 255]:  # one kind of thing: no table, so that the loop is vectorized
-                    for i in range(rows * columns):
-                        plane[i] = only if plane[i] != 0 else 0
-                else:
-                    for i in range(rows * columns):
-                        plane[i] = shades[layer, plane[i]]
+            draw_flat(self, states[n], shades, out[n])
             continue
         planes[:] = 0
         draw(self, states[n], planes)

@@ -20,6 +20,9 @@ class SimpleImage(Observation):
         grey: one plane (1, rows k, columns k) for all things, each in a shade of its own, later layers over earlier ones.
         scale: k, pixels on each side of a cell. None: 1, or more where there are more planes than rows or columns, because
             Stable-Baselines3 takes the smallest dimension for the channels.
+    Attributes:
+        shades: (L, 256) uint8, the shade of every value on the plane of every layer.
+        is_flat: a pixel is a cell, and each layer has a plane of its own.
     Raises:
         ParameterError: the environment cannot be drawn, or there are more planes than pixels on a side.
     """
@@ -45,16 +48,17 @@ class SimpleImage(Observation):
             )
         self.space = Box(0, 255, (planes, rows * scale, columns * scale), np.uint8)
         self._one = (1, planes, rows * scale, columns * scale)
-        self._shades = _shades(env, self._covering)
+        self.shades = _shades(env, self._covering)
+        self.is_flat = scale == 1 and not grey
 
     def __call__(self, states: np.ndarray) -> np.ndarray:
         out = np.zeros((len(states), *self.space.shape), np.uint8)  # type: ignore[misc]
-        self._drawing(states, out, self._shades, self._covering)
+        self._drawing(states, out, self.shades, self._covering)
         return out
 
     def one(self, state: np.ndarray) -> np.ndarray:
         out = np.zeros(self._one, np.uint8)
-        self._drawing.one(state, out, self._shades, self._covering)
+        self._drawing.one(state, out, self.shades, self._covering)
         return out[0]
 
 
