@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import pharos
+from pharos.environment import Environment
 from pharos.errors import DiskFull, RuleError, StateSpaceIncomplete, StateSpaceLocked, StateSpaceTooLarge
 from pharos.state_space import _build as building
 from pharos.state_space import _files as writing
@@ -336,6 +337,69 @@ def test_a_rule_that_fails_is_blamed_with_the_table_on_disk(tmp_path, little_mem
 
     with pytest.raises(RuleError, match="declared"):
         build(Overflowing(num_positions=8000), tmp_path / "space")
+
+
+# Interpreted rules in several processes ----------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def interpreted(monkeypatch):
+    monkeypatch.setattr("pharos._core.compiling.compiled_rules", lambda *args: None)
+
+
+@pytest.mark.parametrize("env", (BREAKOUT, NARROW), ids=lambda env: env.name)
+@pytest.mark.parametrize("workers", (1, 2, 3))
+def test_files_do_not_depend_on_processes_that_interpret(env, workers, tmp_path, undisturbed, interpreted):
+    build(env, tmp_path / "space", workers=workers)
+    assert_same_files(tmp_path / "space", undisturbed[env.name])
+    for child in multiprocessing.active_children():
+        child.join(5)
+        assert not child.is_alive()
+
+
+def test_processes_that_interpret_may_be_killed(tmp_path, undisturbed, interpreted):
+    killed = []
+
+    def kill(done):
+        if done.num_states > 5000 and not killed:
+            killed.extend(multiprocessing.active_children())
+            for child in killed:
+                os.kill(child.pid, signal.SIGKILL)
+
+    build(BREAKOUT, tmp_path / "space", workers=3, progress=kill, checkpoint_seconds=0.0)
+    assert len(killed) == 2
+    assert_same_files(tmp_path / "space", undisturbed["breakout"])
+
+
+def test_a_rule_that_fails_in_another_process_is_blamed(tmp_path, interpreted):
+    with pytest.raises(RuleError, match=r"action .* in state .* leads to .* declared"):
+        build(Fanning(), tmp_path / "space", workers=2)
+    build(Fanning(fails=False), tmp_path / "fine", workers=2)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fanning(Environment):
+    """Doubles its level's width at each step; the last state of a wide level leaves its range."""
+
+    fails: bool = True
+    name = "fanning"
+    actions = ("left", "right")
+
+    def variables(self):
+        return {"place": range(2**13)}
+
+    def initial_states(self):
+        return [((1,), 1.0)]
+
+    def transition(self, state, action, out):
+        place = 2 * state[0] + action
+        out[0] = place if place < 2**13 else (2**13 if self.fails and place == 2**14 - 1 else 0)
+
+    def is_terminal(self, state):
+        return state[0] == 0
+
+    def reward(self, state, action, next_state):
+        return 0.0
 
 
 # More than 2^31 states ---------------------------------------------------------------------------------------------------

@@ -27,7 +27,7 @@ from pharos._core.fingerprint import fingerprint_of_rules
 from pharos.environment import Environment, start_distribution
 from pharos.errors import DiskFull, ParameterError, RuleError, StateSpaceMismatch, StateSpaceTooLarge
 from pharos.state_space._files import GrowingFile, lock, write_manifest
-from pharos.state_space._interpreted import interpreted_successors
+from pharos.state_space._interpreted import Interpreters, interpreted_successors
 from pharos.state_space._memory import available_memory
 from pharos.state_space._packing import layout_of, pack, unpack
 from pharos.state_space._store import (
@@ -97,7 +97,7 @@ def build(
         Cost only (the files are the same, byte for byte):
         memory: bytes that states and table may take; None for as much as there is. Beyond them the table is on disk, in a file
             without a name in `folder` of 23 to 46 bytes a state (12 to 23 more for each further word), which is gone in the end.
-        workers: threads; None for all processors.
+        workers: threads, or processes where rules are interpreted; None for all processors.
         progress: None for a bar on a terminal; False for silence; or a function that gets a BuildProgress now and then.
         checkpoint_seconds: at most this much work is lost when the process is killed.
     Returns:
@@ -248,6 +248,7 @@ class _Builder:
         self.files: dict[str, GrowingFile] = {}
         self.writes: list[Future] = []
         self.written: dict[str, Any] | None = None
+        self.interpreters = Interpreters(self.env, self.workers if self.rules is None else 1)
         try:
             self._open(manifest)
             with ThreadPoolExecutor(self.workers) as pool, ThreadPoolExecutor(1) as self.writer:
@@ -269,6 +270,7 @@ class _Builder:
         finally:
             for file in self.files.values():
                 file.close()
+            self.interpreters.close()
             self.disk = None
             del self.states, self.table, self.table_space  # also where a traceback keeps this builder alive
         self.report(self._progress(finished=True))
@@ -407,7 +409,7 @@ class _Builder:
                 stop = min(start + 4096, rows)
                 unpacked = np.empty((stop - start, len(layout.word)), np.int64)
                 unpack_rows(layout.word, layout.shift, layout.mask, layout.low, states[start:stop], unpacked)
-                following, terminal[start:stop] = interpreted_successors(self.env, unpacked.tolist())
+                following, terminal[start:stop] = self.interpreters.successors(unpacked)
                 part = slice(start * self.env.num_actions, stop * self.env.num_actions)
                 pack_rows(layout.word, layout.shift, layout.low, following, keys[part])
             found[:] = -1 - _slots_of(keys, len(_NOTHING))
@@ -561,7 +563,7 @@ class _Builder:
         stop = min(stop, self.first + min(4096, (self._room() - self.count) // num_actions))
         states = np.empty((stop - self.first, len(layout.word)), np.int64)
         unpack_rows(layout.word, layout.shift, layout.mask, layout.low, self.states[self.first : stop], states)
-        following, terminal[self.first - base : stop - base] = interpreted_successors(self.env, states.tolist())
+        following, terminal[self.first - base : stop - base] = self.interpreters.successors(states)
         keys = np.zeros((len(following), layout.num_words), np.uint64)
         pack_rows(layout.word, layout.shift, layout.low, following, keys)
         found = np.empty(len(keys), np.int64)
