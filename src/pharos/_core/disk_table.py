@@ -11,7 +11,7 @@ looked up, by bucket, each bucket in the order of candidates.
 import numpy as np
 from numba import int64, njit, uint64
 
-from pharos._core.hash_table import mixed, prefetch, slot_of
+from pharos._core.hash_table import hash_of_row, prefetch, slot_of
 
 BUCKETS = 1 << 16
 _AHEAD = 16
@@ -20,18 +20,10 @@ _NEW = uint64(1 << 63)
 
 
 @njit(forceinline=True)
-def _hash_of(keys, j):
-    h = mixed(keys[j, 0])
-    for k in range(1, keys.shape[1]):
-        h = mixed(h ^ keys[j, k])
-    return h
-
-
-@njit(forceinline=True)
 def _slot_for(entries, keys, j):
     """(slot, its entry): where keys[j] is, or the free slot where it belongs."""
     capacity, words = entries.shape[0], keys.shape[1]
-    slot = slot_of(_hash_of(keys, j), capacity)
+    slot = slot_of(hash_of_row(keys, j), capacity)
     while True:
         entry = entries[slot, words]
         if entry == 0:
@@ -79,7 +71,7 @@ def look_up(entries, keys, order, low, high, found, slots):
     capacity, words = entries.shape[0], keys.shape[1]
     for p in range(low, high):
         if p + _AHEAD < high:
-            prefetch(entries, slot_of(_hash_of(keys, order[p + _AHEAD]), capacity))
+            prefetch(entries, slot_of(hash_of_row(keys, order[p + _AHEAD]), capacity))
         j = order[p]
         slot, entry = _slot_for(entries, keys, j)
         slots[j] = -1

@@ -77,7 +77,8 @@ def slot_of(h, capacity):
 
 
 @njit(forceinline=True)
-def _hash_of(states, i):
+def hash_of_row(states, i):
+    """The hash of states[i], a row of words."""
     h = mixed(states[i, 0])
     for k in range(1, states.shape[1]):
         h = mixed(h ^ states[i, k])
@@ -92,7 +93,7 @@ def fill(table, states, count):
     for first in range(0, count, _BATCH):
         n = min(_BATCH, count - first)
         for i in range(n):
-            slots[i] = slot_of(_hash_of(states, first + i), capacity)
+            slots[i] = slot_of(hash_of_row(states, first + i), capacity)
             prefetch(table, slots[i])
         for i in range(n):
             slot = slots[i]
@@ -114,7 +115,7 @@ def fill_range(table, states, count, low, high, left_over):
     for first in range(0, count, _BATCH):
         stop = min(first + _BATCH, count)
         for i in range(first, stop):
-            slots[n] = slot_of(_hash_of(states, i), capacity)
+            slots[n] = slot_of(hash_of_row(states, i), capacity)
             indices[n] = i
             n += low <= slots[n] < high
         if n < _BATCH and stop < count:
@@ -140,7 +141,7 @@ def fill_more(table, states, indices):
     """Put some more states into a table."""
     capacity = table.shape[0]
     for index in indices:
-        slot = slot_of(_hash_of(states, index), capacity)
+        slot = slot_of(hash_of_row(states, index), capacity)
         while table[slot] >= 0:
             slot = slot + 1 if slot + 1 < capacity else 0
         table[slot] = index
@@ -152,7 +153,7 @@ def find(table, states, keys, out):
     capacity = table.shape[0]
     words = states.shape[1]
     for j in range(len(keys)):
-        slot = slot_of(_hash_of(keys, j), capacity)
+        slot = slot_of(hash_of_row(keys, j), capacity)
         out[j] = -1
         while table[slot] >= 0:
             index = int64(table[slot])
@@ -169,7 +170,7 @@ def find(table, states, keys, out):
 def slots_of(keys, capacity, out):
     """out[j] = the slot from which to search for keys[j]."""
     for j in range(len(keys)):
-        out[j] = slot_of(_hash_of(keys, j), capacity)
+        out[j] = slot_of(hash_of_row(keys, j), capacity)
 
 
 @njit(cache=True, nogil=True)
