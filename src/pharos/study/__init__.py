@@ -13,6 +13,7 @@ from pharos.study._analysis import (
 from pharos.study._archive import pack, unpack
 from pharos.study._clusters import run_on_ray, submit
 from pharos.study._execution import Status, run, status
+from pharos.study._findings import findings
 from pharos.study._paper import paper_regressions, paper_returns
 from pharos.study._regression import Fit, aggregate_r_squared, fit, fit_models, leave_one_class_out_r_squared
 from pharos.study._report import StudyReport, report
@@ -34,6 +35,7 @@ __all__ = [
     "cells",
     "compare",
     "curves",
+    "findings",
     "fit",
     "fit_models",
     "hardness_table",

@@ -6,7 +6,7 @@ columns `environment` (class), `observation`, `regret`, and the measures `effect
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -30,7 +30,8 @@ class Fit:
         coefficients: one row a predictor: estimate, standard error, p-value, lower and upper end of its 95 % interval.
         dropped: predictors left out because they are constant or a linear combination of the others.
         condition_number: of the standardised predictors.
-        fitted, actual: one entry a row; influence: Cook's distances; classes: of environments.
+        fitted, actual: one entry a row; influence: Cook's distances; classes: of environments; tasks: instance and chance.
+        design: (rows, predictors), as they entered.
     """
 
     model: str
@@ -47,6 +48,8 @@ class Fit:
     actual: np.ndarray
     influence: np.ndarray
     classes: tuple[str, ...] = ()
+    tasks: tuple[str, ...] = ()
+    design: np.ndarray = field(default_factory=lambda: np.empty((0, 0)))
 
 
 def fit_models(data: "pd.DataFrame", *, measures: Sequence[str] = MEASURES) -> list[Fit]:
@@ -96,6 +99,10 @@ def fit(rows: "pd.DataFrame", model: str, subset: str, predictors: Sequence[str]
         actual=actual,
         influence=np.asarray(influence.cooks_distance[0]),
         classes=tuple(map(str, rows["environment"])) if "environment" in rows else (),
+        tasks=tuple(map(" ".join, zip(rows["instance"], rows["chance"], strict=True)))
+        if {"instance", "chance"} <= {*rows}
+        else (),
+        design=np.asarray(result.model.exog, np.float64),
     )
 
 

@@ -18,6 +18,7 @@ import numpy as np
 from pharos.study import _analysis, _figures, _table
 from pharos.study._analysis import REGRETS, Comparison, Models
 from pharos.study._execution import Status, duration, status
+from pharos.study._findings import findings
 from pharos.study._latex import returns_table, tables_of
 from pharos.study._regression import MEASURES, Fit
 from pharos.study._specification import Specification
@@ -77,6 +78,7 @@ def report(
     found = [_analysis.models(cells, regret=regret, measures=measures) for regret in REGRETS]
     comparison = _analysis.compare(cells, study.runs, found)
     estimates = _analysis.intervals(rows)
+    said = findings(cells, found[0])
     target = Path(out) if out is not None else place / "report"
     target.mkdir(parents=True, exist_ok=True)
     figures = {}
@@ -85,8 +87,8 @@ def report(
         figures[name] = _figures.save(draw, target / "figures" / name)
     tell("drawing instances")
     pictures = _pictures(study)
-    tables = _write_tables(target / "tables", rows, cells, measured, found, comparison, estimates)
-    page = _page(study, now, rows, cells, measured, found, comparison, estimates, figures, pictures)
+    tables = _write_tables(target / "tables", rows, cells, measured, found, comparison, estimates, said)
+    page = _page(study, now, rows, cells, measured, found, comparison, estimates, said, figures, pictures)
     write_atomically(target / "report.html", page)
     notes = [*dict.fromkeys(note for models in found for note in models.notes)]
     drawn = [
@@ -103,11 +105,12 @@ def _write_tables(
     found: Sequence[Models],
     comparison: Comparison,
     estimates: "pd.DataFrame",
+    said: "pd.DataFrame",
 ) -> list[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     written = []
     tables = {"runs": rows, "cells": cells, "hardness": measured, "paper_returns": comparison.returns}
-    tables |= {"paper_regressions": comparison.regressions, "intervals": estimates}
+    tables |= {"paper_regressions": comparison.regressions, "intervals": estimates, "findings": said}
     for models in found:
         tables[f"coefficients_{models.regret}"] = coefficients(models)
     for name, data in tables.items():
@@ -170,11 +173,13 @@ def _page(
     found: Sequence[Models],
     comparison: Comparison,
     estimates: "pd.DataFrame",
+    said: "pd.DataFrame",
     figures: Figures,
     pictures: Mapping[str, bytes],
 ) -> str:
     sections = {
         "Summary": _summary(study, now, rows, found, comparison),
+        "Findings of the paper": _findings(said),
         "Regret": _regret(estimates, figures),
         "Vector against image": _representations(cells, figures),
         "Hardness and regret": "".join(_models(models, figures) for models in found),
@@ -231,6 +236,18 @@ def _summary(
             "<p>Failed:</p><ul>" + "".join(f"<li>{count} × {_text(e)}</li>" for e, count in counted.items()) + "</ul>"
         )
     return text
+
+
+def _findings(said: "pd.DataFrame") -> str:
+    decided = said[said["verdict"] != "no data"]
+    if len(decided) == 0:
+        return "<p>The study has no data for any of them.</p>"
+    counts = ", ".join(f"{number} {verdict}" for verdict, number in decided["verdict"].value_counts().items())
+    return f"<p>{len(decided)} of {len(said)} can be looked at here: {counts}.</p>" + _html_table(
+        said,
+        "What the paper says in words, and the same from these runs. Undecided: not significant at 0.05; no correction for the number of "
+        "tests. How each is tested: docs/study.md.",
+    )
 
 
 def _many(count: int, one: str, several: str | None = None) -> str:

@@ -1,0 +1,129 @@
+"""The paper's findings, on cells whose truth is known."""
+
+import math
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy import stats
+
+from pharos import study
+
+CLASSES = ("simple_grid", "frozen_lake", "breakout", "freeway")
+MEASURES = ("effective_horizon", "sum_of_reciprocal_gaps", "diameter")
+
+
+def made(image_harder=0.0, slopes=(1.0, 1.0, 1.0, 1.0), image_slope=1.0, noise=0.1, instances=6, seed=0, ppo=0.0):
+    """Cells of DQN (and PPO): regret grows with log diameter by a slope for each class; images cost `image_harder` more."""
+    random = np.random.default_rng(seed)
+    rows = []
+    for environment, slope in zip(CLASSES, slopes, strict=True):
+        for instance in range(instances):
+            for chance in ("plain", "sticky 0.25"):
+                measures = dict(zip(MEASURES, np.exp(random.normal(0, 1, 3)), strict=True))
+                for observation in ("vector", "simple_image"):
+                    is_image = observation == "simple_image"
+                    signal = slope * math.log(measures["diameter"]) * (image_slope if is_image else 1.0)
+                    for agent in ("dqn", "ppo"):
+                        regret = 5 + signal + is_image * image_harder + noise * random.normal()
+                        rows.append(
+                            {
+                                "environment": environment,
+                                "instance": f"{environment}/{instance}",
+                                "chance": chance,
+                                "agent": agent,
+                                "observation": observation,
+                                "cumulative_regret": regret,
+                                "normalized_regret": regret / 10,
+                                "return": -regret + (ppo * random.normal() if agent == "ppo" else 0.0),
+                                **measures,
+                            }
+                        )
+    return pd.DataFrame(rows)
+
+
+def verdicts(cells, **options):
+    found = study.findings(cells, study.models(cells), resamples=200, **options)
+    return {(row.finding, row.of): row for row in found.itertuples()}
+
+
+OBSERVATION = "the harder observation of DQN"
+
+
+@pytest.mark.parametrize(
+    ("shift", "ours", "grids", "games"), ((1, "image", "agrees", "disagrees"), (-1, "vector", "disagrees", "agrees"))
+)
+def test_the_harder_observation_is_found_in_each_class(shift, ours, grids, games):
+    found = verdicts(made(image_harder=shift))
+    for environment in CLASSES:
+        row = found[OBSERVATION, environment]
+        assert row.ours == ours and row.p < 0.001
+        assert row.verdict == (grids if environment in ("simple_grid", "frozen_lake") else games)
+
+
+def test_equal_observations_are_undecided_as_often_as_the_level_says():
+    decided = [
+        row.verdict != "undecided"
+        for seed in range(25)
+        for (finding, _), row in verdicts(made(seed=seed)).items()
+        if finding == OBSERVATION
+    ]
+    assert len(decided) == 100 and sum(decided) <= 14  # 5 expected
+
+
+def test_one_model_that_explains_much_disagrees_with_the_paper():
+    name = ("one model explains next to nothing", "all")
+    assert verdicts(made())[name].verdict == "disagrees"
+    row = verdicts(made(slopes=(0, 0, 0, 0), seed=3))[name]
+    assert row.verdict == "agrees" and row.p > 0.05
+
+
+def test_slopes_of_their_own_are_needed_where_they_differ():
+    by_class, by_representation = (f"models by {model} explain more than one" for model in ("class", "representation"))
+    alike, classes, images = verdicts(made()), verdicts(made(slopes=(1, -1, 2, 0))), verdicts(made(image_slope=-1.0))
+    assert alike[by_class, "all"].verdict == alike[by_representation, "all"].verdict == "undecided"
+    assert classes[by_class, "all"].verdict == "agrees" and classes[by_representation, "all"].verdict == "undecided"
+    assert images[by_representation, "all"].verdict == "agrees"
+
+
+def test_the_test_of_slopes_is_that_of_an_analysis_of_variance():
+    """Against statsmodels' comparison of the nested models, written as one formula each."""
+    import statsmodels.formula.api as smf
+    from statsmodels.stats.anova import anova_lm
+
+    cells = made(slopes=(1, 0.9, 1.1, 1), noise=1.0)
+    rows = cells[cells["agent"] == "dqn"].rename(columns={"cumulative_regret": "regret"})
+    logs = " + ".join(f"np.log({name})" for name in MEASURES)
+    small = smf.ols(f"regret ~ C(observation) + C(environment) + {logs}", rows).fit()
+    large = smf.ols(f"regret ~ C(environment) * (C(observation) + {logs})", rows).fit()
+    expected = anova_lm(small, large)["Pr(>F)"].iloc[1]
+    row = verdicts(cells)["models by class explain more than one", "all"]
+    assert row.p == pytest.approx(expected, rel=1e-6)
+
+
+def test_vectors_that_hardness_explains_better_are_found():
+    name = ("hardness explains vectors better than images", "all")
+    assert verdicts(made(image_slope=0.0, noise=0.3))[name].verdict == "agrees"
+    assert verdicts(made(noise=0.3))[name].verdict == "undecided"
+
+
+def test_agreement_has_fishers_interval():
+    row = verdicts(made(ppo=1.5))["DQN and PPO find the same hard", "all"]
+    cells = made(ppo=1.5)
+    wide = cells.pivot_table(index=["instance", "chance", "observation"], columns="agent", values="return")
+    expected = stats.pearsonr(wide["dqn"], wide["ppo"])
+    low, high = expected.confidence_interval()
+    assert row.evidence == f"{low:.2f} to {high:.2f} (95 %, 96 cells)"
+    assert row.verdict == ("agrees" if low <= 0.81 <= high else "disagrees")
+
+
+def test_what_is_not_there_is_no_data():
+    cells = made()
+    grids = cells[
+        (cells["environment"] == "simple_grid") & (cells["observation"] == "vector") & (cells["agent"] == "dqn")
+    ]
+    found = verdicts(grids)
+    assert found[OBSERVATION, "freeway"].verdict == found[OBSERVATION, "simple_grid"].verdict == "no data"
+    assert found["models by class explain more than one", "all"].verdict == "no data"
+    assert found["DQN and PPO find the same hard", "all"].verdict == "no data"
+    assert len(found) == 9
