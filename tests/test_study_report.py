@@ -90,6 +90,7 @@ def test_every_section_is_there_and_every_link_leads_to_one(written):
     reader = read(page)
     assert reader.headings == [
         "Summary",
+        "Findings of the paper",
         "Regret",
         "Vector against image",
         "Hardness and regret",
