@@ -14,6 +14,7 @@ import pytest
 import fake_training
 from pharos import study
 from pharos.errors import ParameterError
+from pharos.study import _execution, _worker
 from pharos.study._execution import shard_of
 
 TESTS = Path(__file__).parent
@@ -233,6 +234,25 @@ def test_two_runners_on_one_folder_share_the_work(tmp_path, log):
     assert [runner.wait(60) for runner in both] == [0, 0]
     assert fake_training.results(tmp_path / "out") == fake_training.results(tmp_path / "undisturbed")
     assert set(Counter(log.read_text().split()).values()) == {1}
+
+
+def test_what_another_runner_finishes_is_counted_at_once(tmp_path, log, monkeypatch):
+    monkeypatch.setattr(_execution, "OTHERS_SECONDS", 0.0)
+    monkeypatch.setenv("PHAROS_FAKE_SECONDS", "0.2")
+    spec = specification()
+    others, told = spec.runs[-3:], []
+
+    def look(status):
+        told.append((status.finished, len(log.read_text().splitlines()) if log.exists() else 0))
+        if len(told) == 2:
+            for run in others:
+                assert _worker.attempt(fake_training.train, run.config, run.id, tmp_path / "out") == "finished"
+
+    end = study.run(spec, tmp_path / "out", runner=fake_training.train, workers=1, progress=look)
+    assert end.finished == len(spec.runs) and end.missing == 0
+    early = [finished for finished, _ in told[3:6]]
+    assert min(early) >= len(others)
+    assert len(log.read_text().splitlines()) == len(spec.runs)  # each once
 
 
 def test_a_result_that_was_complete_when_its_process_was_killed_is_kept(tmp_path, log):

@@ -26,6 +26,7 @@ from pharos.study._worker import write_atomically
 ATTEMPTS = 3
 STATUS_SECONDS = 2.0
 BUSY_SECONDS = 0.5
+OTHERS_SECONDS = 20.0  # between two looks at what other runners have finished in the same folder
 
 
 @dataclass(frozen=True)
@@ -239,7 +240,7 @@ class _Execution:
         self.timeout, self.runner, self.tell, self.resume = timeout, runner, progress, resume
         self.status_file = folder / status_name
         self.began = time.monotonic()
-        self.told = -1e9
+        self.told, self.looked = -1e9, time.monotonic()
         self.finished: dict[str, float] = {}
         self.errors: dict[str, str] = {}
         self.again: set[str] = set()
@@ -288,6 +289,8 @@ class _Execution:
         context = _context(self.runner is train)
         try:
             while self.pending or self.running:
+                if time.monotonic() - self.looked >= OTHERS_SECONDS:
+                    self._look_around()
                 self._start(context)
                 self.report()
                 self._await()
@@ -301,6 +304,17 @@ class _Execution:
             raise
         _clear(self.folder, self.runs)
         return self.report(final=True)
+
+    def _look_around(self) -> None:
+        """Count what other runners have finished: one listing of the folder."""
+        self.looked = time.monotonic()
+        with contextlib.suppress(OSError):
+            there = set(os.listdir(self.folder / "runs"))
+            self.pending = deque(
+                (due, run)
+                for due, run in self.pending
+                if run.id not in there or run.id in self.again or not self.note(run)
+            )
 
     def _start(self, context: Any) -> None:
         for _ in range(len(self.pending)):
