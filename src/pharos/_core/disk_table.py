@@ -36,6 +36,15 @@ def _slot_for(entries, keys, j):
         slot = slot + 1 if slot + 1 < capacity else 0
 
 
+@njit(forceinline=True)
+def _enter(entries, slot, keys, j, entry):
+    """Put keys[j] into a slot, with what is said of it."""
+    words = keys.shape[1]
+    for k in range(words):
+        entries[slot, k] = keys[j, k]
+    entries[slot, words] = entry
+
+
 @njit(cache=True, nogil=True)
 def sort_by_bucket(found, first, order):
     """Fill order; returns its length. found[j] >= 0, a state in this block that leads to itself, gets its index: first + found[j]."""
@@ -68,7 +77,7 @@ def sort_by_bucket(found, first, order):
 @njit(cache=True, nogil=True)
 def look_up(entries, keys, order, low, high, found, slots):
     """found[j] for candidates order[low:high]: its index; -1 where it is new, slots[j] then being its slot; -2 - i where i is equal."""
-    capacity, words = entries.shape[0], keys.shape[1]
+    capacity = entries.shape[0]
     for p in range(low, high):
         if p + _AHEAD < high:
             prefetch(entries, slot_of(hash_of_row(keys, order[p + _AHEAD]), capacity))
@@ -76,9 +85,7 @@ def look_up(entries, keys, order, low, high, found, slots):
         slot, entry = _slot_for(entries, keys, j)
         slots[j] = -1
         if entry == 0:
-            for k in range(words):
-                entries[slot, k] = keys[j, k]
-            entries[slot, words] = _NEW | uint64(j)
+            _enter(entries, slot, keys, j, _NEW | uint64(j))
             found[j] = -1
             slots[j] = slot
         elif entry & _NEW:
@@ -124,28 +131,22 @@ def settle(entries, order, low, high, found, slots):
 @njit(cache=True, nogil=True)
 def place(entries, keys, order, low, high, first):
     """Put states order[low:high] of keys, not there yet, into the table; state j has index first + j."""
-    words = keys.shape[1]
     for p in range(low, high):
         j = order[p]
         slot, _ = _slot_for(entries, keys, j)
-        for k in range(words):
-            entries[slot, k] = keys[j, k]
-        entries[slot, words] = uint64(first + j + 1)
+        _enter(entries, slot, keys, j, uint64(first + j + 1))
 
 
 @njit(cache=True, nogil=True)
 def place_from_memory(entries, table, states, low, high):
     """Put the states in slots [low, high) of a table in memory (hash_table.py) into an empty table."""
-    words = states.shape[1]
-    for place in range(low, high):
-        if place + _AHEAD < high and table[place + _AHEAD] >= 0:
-            prefetch(states, int64(table[place + _AHEAD]))
-        index = int64(table[place])
+    for i in range(low, high):
+        if i + _AHEAD < high and table[i + _AHEAD] >= 0:
+            prefetch(states, int64(table[i + _AHEAD]))
+        index = int64(table[i])
         if index >= 0:
             slot, _ = _slot_for(entries, states, index)
-            for k in range(words):
-                entries[slot, k] = states[index, k]
-            entries[slot, words] = uint64(index + 1)
+            _enter(entries, slot, states, index, uint64(index + 1))
 
 
 @njit(cache=True, nogil=True)
@@ -153,8 +154,7 @@ def place_again(entries, old, low, high):
     """Put the entries in slots [low, high) of an old table into a larger one."""
     words = old.shape[1] - 1
     keys = old[:, :words]
-    for place in range(low, high):
-        if old[place, words] > 0:
-            slot, _ = _slot_for(entries, keys, place)
-            for k in range(words + 1):
-                entries[slot, k] = old[place, k]
+    for i in range(low, high):
+        if old[i, words] > 0:
+            slot, _ = _slot_for(entries, keys, i)
+            _enter(entries, slot, keys, i, old[i, words])

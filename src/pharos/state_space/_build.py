@@ -55,6 +55,7 @@ WIDE = 1 << 13  # a frontier of this many states is worth sharing between thread
 CHECKPOINT_SECONDS = 15.0
 PARALLEL_FILL = 1 << 16  # states that are worth sharing between threads when the table grows
 LEFT_OVER = 1 << 12  # states that may pass the end of a part of the table, which are a handful
+INTERPRETED = 4096  # states whose successors are Python objects at a time
 LEAST_MEMORY = 1 << 24  # bytes
 LOAD = 0.5  # the table grows beyond this share of used slots
 INT32_STATES = 2**31 - 1
@@ -353,11 +354,11 @@ class _Builder:
 
     def _expand_chunk_on_disk(self, pool: ThreadPoolExecutor, disk: "_Spilled") -> None:
         """The same with the table on disk: successors are looked up in order of the table, many at once, and then numbered."""
+        from pharos._core.disk_table import number
+
         num_actions = self.env.num_actions
         if self.index_dtype.itemsize == 4 and self.count + disk.rows * num_actions > INT32_STATES:
             self._widen_indices(pool)
-        from pharos._core.disk_table import number
-
         self._finish_writes()
         if len(self.states):
             self.states, self.table, self.table_space = (
@@ -401,17 +402,10 @@ class _Builder:
         """Successors of states to keys; to found -1 - bucket, or in terminal states their own row."""
         rows = len(states)
         if self.rules is None:
-            from pharos._core.packing import pack_rows, unpack_rows
-
-            layout = self.layout
-            keys[:] = 0
-            for start in range(0, rows, 4096):
-                stop = min(start + 4096, rows)
-                unpacked = np.empty((stop - start, len(layout.word)), np.int64)
-                unpack_rows(layout.word, layout.shift, layout.mask, layout.low, states[start:stop], unpacked)
-                following, terminal[start:stop] = self.interpreters.successors(unpacked)
+            for start in range(0, rows, INTERPRETED):
+                stop = min(start + INTERPRETED, rows)
                 part = slice(start * self.env.num_actions, stop * self.env.num_actions)
-                pack_rows(layout.word, layout.shift, layout.low, following, keys[part])
+                self._interpret(states[start:stop], keys[part], terminal[start:stop])
             found[:] = -1 - _slots_of(keys, len(_NOTHING))
             return
         threads = self.workers if rows >= WIDE else 1
@@ -556,16 +550,11 @@ class _Builder:
     def _expand_interpreted(self, successors, terminal, base, stop) -> None:
         """The same with rules that Numba cannot compile: Python calls them, arrays do the rest."""
         from pharos._core.hash_table import find, insert_missing
-        from pharos._core.packing import pack_rows, unpack_rows
 
-        layout = self.layout
         num_actions = self.env.num_actions
-        stop = min(stop, self.first + min(4096, (self._room() - self.count) // num_actions))
-        states = np.empty((stop - self.first, len(layout.word)), np.int64)
-        unpack_rows(layout.word, layout.shift, layout.mask, layout.low, self.states[self.first : stop], states)
-        following, terminal[self.first - base : stop - base] = self.interpreters.successors(states)
-        keys = np.zeros((len(following), layout.num_words), np.uint64)
-        pack_rows(layout.word, layout.shift, layout.low, following, keys)
+        stop = min(stop, self.first + min(INTERPRETED, (self._room() - self.count) // num_actions))
+        keys = np.empty(((stop - self.first) * num_actions, self.layout.num_words), np.uint64)
+        self._interpret(self.states[self.first : stop], keys, terminal[self.first - base : stop - base])
         found = np.empty(len(keys), np.int64)
         find(self.table, self.states, keys, found)
         slots = np.flatnonzero(found < 0)
@@ -576,6 +565,17 @@ class _Builder:
             self.table, self.states, keys, found, part, self.first, self.count, self.level_end, self.depth, progress
         )
         self._take(progress)
+
+    def _interpret(self, states: np.ndarray, keys: np.ndarray, terminal: np.ndarray) -> None:
+        """Successors of packed states to keys, packed, by rules in Python; terminal ones lead to themselves."""
+        from pharos._core.packing import pack_rows, unpack_rows
+
+        layout = self.layout
+        unpacked = np.empty((len(states), len(layout.word)), np.int64)
+        unpack_rows(layout.word, layout.shift, layout.mask, layout.low, states, unpacked)
+        following, terminal[:] = self.interpreters.successors(unpacked)
+        keys[:] = 0
+        pack_rows(layout.word, layout.shift, layout.low, following, keys)
 
     def _take(self, progress: np.ndarray) -> None:
         self.first, self.count, self.level_end, self.depth = (int(value) for value in progress[:4])

@@ -12,7 +12,7 @@ import yaml
 
 from pharos.errors import FileFormatError, ParameterError
 from pharos.study import _worker
-from pharos.study._execution import claim
+from pharos.study._execution import claim, study_folder
 from pharos.study._specification import Specification, parse, run_id
 from pharos.study._table import Source, opened
 
@@ -75,7 +75,7 @@ def unpack(file: str | os.PathLike, folder: str | os.PathLike | None = None) -> 
     """
     file = Path(file)
     study, table = _read(file)
-    place = Path("studies", study.name) if folder is None else Path(folder)
+    place = study_folder(study, folder)
     configs = {run.id: run.config for run in study.runs}
     runs = []
     for row in table.to_pylist():
