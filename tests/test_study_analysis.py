@@ -125,9 +125,15 @@ def test_a_measure_that_does_not_exist_under_chance_is_that_without_and_noted():
     row = _chosen(["a", "b", "c"], own, plain)
     assert (row["a"], row["b"]) == (3.0, 2.0) and np.isnan(row["c"])
     assert row["notes"] == "a: without chance, because no chance, please; c: none, because it is undefined"
-    interval = {"value": 6.0, "lower": 4.0, "upper": 9.0, "exact": False}
-    row = _chosen(["a"], {"num_states": 16, "measures": {"a": interval}}, plain)
-    assert row["a"] == 6 and row["notes"] == "a: geometric mean of the proven interval 4 to 9"
+
+
+def test_a_proven_interval_enters_where_it_is_narrow():
+    plain = {"num_states": 16, "measures": {"a": {"value": 3.0, "exact": True}}}
+    narrow, wide = ({"value": 6.0, "lower": low, "upper": 36 / low, "exact": False} for low in (4.5, 4.0))
+    row = _chosen(["a"], {"num_states": 16, "measures": {"a": narrow}}, plain)
+    assert row["a"] == 6 and row["notes"] == "a: geometric mean of the proven interval 4.5 to 8"
+    row = _chosen(["a"], {"num_states": 16, "measures": {"a": wide}}, plain)
+    assert row["a"] == 3 and row["notes"] == "a: without chance, because only 4 to 9 is proven within the budget"
 
 
 def test_a_measure_that_fails_is_noted_and_tried_again_next_time(tmp_path, monkeypatch):

@@ -51,6 +51,16 @@ def test_unpacked_runs_have_the_same_tables_and_curves(folder, packed, tmp_path)
     assert study.specification(place) == study.specification(folder)
 
 
+def test_runs_are_unpacked_into_another_study_that_has_them(folder, packed, tmp_path):
+    other = {**SPEC, "name": "lakes", "blocks": [{**BLOCK, "agents": ["dqn"], "seeds": 3}]}
+    place, added = study.unpack(packed, tmp_path / "other", into=other)
+    assert added == 4 and study.specification(place) == study.specification(other)
+    status = study.status(place)
+    assert (status.finished, status.missing) == (4, 2)
+    theirs = study.table(folder).set_index("id")
+    pd.testing.assert_frame_equal(study.table(place).set_index("id"), theirs[theirs["agent"] == "dqn"])
+
+
 def test_what_is_missing_is_run_and_what_is_there_stays(packed, tmp_path, monkeypatch):
     changed(packed, **{name: lambda values: values[:5] for name in pq.read_schema(packed).names})
     log = tmp_path / "log"

@@ -141,10 +141,31 @@ def test_a_mapping_is_read_as_well_and_a_missing_file_suggests_a_preset():
 
 
 def test_the_presets_are_those_of_the_paper():
-    assert presets() == ["paper", "quick", "small"]
+    assert presets() == ["classes", "paper", "quick", "small"]
     assert len(specification("small").runs) == 8 * 3 * 5 * (2 * 2 + 1)
     paper = specification("paper").runs
     assert len(paper) == 28 * 3 * 5 * (2 * 2 + 1)
     assert {run.config["steps"] for run in paper if run.config["environment"] in ("freeway", "breakout")} == {600_000}
     assert {run.config["steps"] for run in paper if run.config["environment"] == "frozen_lake"} == {50_000}
     assert len({run.instance for run in paper}) == 28
+
+
+def test_all_classes_in_an_afternoon_contain_the_small_study_and_every_instance_of_the_paper():
+    classes, small, paper = (specification(name) for name in ("classes", "small", "paper"))
+    assert {run.id for run in small.runs} < {run.id for run in classes.runs}
+    assert {run.instance for run in classes.runs} == {run.instance for run in paper.runs}
+    large = [run.config for run in classes.runs if run.config["environment"] in ("freeway", "breakout")]
+    assert len(large) == 20 * (2 * 2 + 1) and {config["steps"] for config in large} == {100_000}
+
+
+def test_the_predictors_of_the_models_are_the_papers_three_as_far_as_they_are_measured():
+    def predictors(*measures):
+        block = {"environments": ["frozen_lake"], "agents": ["dqn"]}
+        return specification({"name": "a", "hardness": {"measures": measures}, "blocks": [block]}).hardness.predictors
+
+    three = ["effective_horizon", "sum_of_reciprocal_gaps", "diameter"]
+    assert specification("small").hardness.predictors == three
+    assert predictors("environmental_value_norm", "diameter", "effective_horizon") == ["effective_horizon", "diameter"]
+    assert predictors(*three, "stationary_effective_horizon") == three
+    assert specification("paper").hardness.predictors == ["stationary_effective_horizon", *three[1:]]
+    assert predictors("environmental_value_norm") == ["environmental_value_norm"]

@@ -16,7 +16,8 @@ from pharos.errors import UnknownName
 app = typer.Typer(help="Run a grid of training runs, and make the paper's figures and tables of it.")
 
 SpecArgument = Annotated[
-    str, typer.Argument(metavar="SPEC", help="A YAML file, a study's folder, or a preset: quick, small, paper.")
+    str,
+    typer.Argument(metavar="SPEC", help="A YAML file, a study's folder, or a preset: quick, small, classes, paper."),
 ]
 Out = Annotated[
     Path | None, typer.Option("--out", metavar="DIR", help="Where results are; studies/NAME when not given.")
@@ -99,11 +100,10 @@ def run(
 
     if on not in ("local", "slurm", "ray"):
         raise UnknownName("place to run on", on, ("local", "slurm", "ray"))
-    specification, folder = study.specification(spec), _folder(spec, out)
     if on == "slurm":
         jobs = study.submit(
-            specification,
-            folder,
+            spec,
+            out,
             shards=shards or 8,
             parameters=parse_parameters(slurm),
             retry_failed=retry_failed,
@@ -116,8 +116,8 @@ def run(
     with _progress() as progress:
         if on == "ray":
             end = study.run_on_ray(
-                specification,
-                folder,
+                spec,
+                out,
                 address=address,
                 shard=shard,
                 retry_failed=retry_failed,
@@ -126,8 +126,8 @@ def run(
             )
         else:
             end = study.run(
-                specification,
-                folder,
+                spec,
+                out,
                 shard=shard,
                 retry_failed=retry_failed,
                 resume=resume,
@@ -154,7 +154,7 @@ def status(spec: SpecArgument, out: Out = None, json: Json = False) -> None:
     """How many runs are finished, running, missing and failed, and why."""
     from pharos import study
 
-    _answer(study.status(study.specification(spec), _folder(spec, out)), json)
+    _answer(study.status(spec, out), json)
 
 
 @app.command("report")
@@ -170,7 +170,7 @@ def report(
     from pharos import study
 
     with progress_line("report") as tell:
-        written = study.report(study.specification(spec), _folder(spec, out), out=to, progress=tell)
+        written = study.report(spec, out, out=to, progress=tell)
     if json:
         files = {"figures": list(map(str, written.figures)), "tables": list(map(str, written.tables))}
         print_json({"html": str(written.html), **files, "notes": written.notes})
@@ -190,7 +190,7 @@ def pack(
     """Put the finished runs into one Parquet file, to keep, publish or carry; without what the agents learnt."""
     from pharos import study
 
-    number = study.pack(study.specification(spec), _folder(spec, out), file=to)
+    number = study.pack(spec, out, file=to)
     if json:
         print_json({"file": str(to), "runs": number})
         return
@@ -200,22 +200,21 @@ def pack(
 @app.command("unpack")
 def unpack(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="Written by `pharos study pack`.")],
+    into: Annotated[
+        str | None,
+        typer.Option(metavar="SPEC", help="Another study, which gets those of the runs that it has as well."),
+    ] = None,
     out: Out = None,
     json: Json = False,
 ) -> None:
     """Put packed runs into a study's folder; `pharos study run FOLDER` goes on with those that are missing."""
     from pharos import study
 
-    folder, number = study.unpack(file, out)
+    folder, number = study.unpack(file, out, into=into)
     if json:
         print_json({"folder": str(folder), "added": number})
         return
     print(f"{folder}: {number} runs added; `pharos study report {folder}` reports on them")
-
-
-def _folder(spec: str, out: Path | None) -> Path | None:
-    """The folder of the results: as given, or that of a SPEC which is such a folder."""
-    return Path(spec) if out is None and Path(spec).is_dir() else out
 
 
 def _answer(status: Any, json: bool) -> None:

@@ -12,9 +12,8 @@ import yaml
 
 from pharos.errors import FileFormatError, ParameterError
 from pharos.study import _worker
-from pharos.study._execution import claim, study_folder
-from pharos.study._specification import Specification, parse, run_id
-from pharos.study._table import Source, opened
+from pharos.study._execution import claim, opened
+from pharos.study._specification import Source, Specification, parse, run_id
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -62,12 +61,15 @@ def pack(source: Source, folder: str | os.PathLike | None = None, *, file: str |
     return len(ids)
 
 
-def unpack(file: str | os.PathLike, folder: str | os.PathLike | None = None) -> tuple[Path, int]:
+def unpack(
+    file: str | os.PathLike, folder: str | os.PathLike | None = None, *, into: Source | None = None
+) -> tuple[Path, int]:
     """Put the runs of a packed study into a folder, where `run` goes on with those that are missing and `report` reports on all.
 
     Args:
         file: written by `pack`.
         folder: of the study; studies/NAME in the current directory when not given. Runs that it has stay as they are.
+        into: another study, which gets those of the runs that it has as well; None: the packed one.
     Returns:
         The folder, and how many runs were added.
     Raises:
@@ -75,14 +77,14 @@ def unpack(file: str | os.PathLike, folder: str | os.PathLike | None = None) -> 
     """
     file = Path(file)
     study, table = _read(file)
-    place = study_folder(study, folder)
-    configs = {run.id: run.config for run in study.runs}
+    target, place = opened(study if into is None else into, folder)
+    configs, wanted = {run.id: run.config for run in study.runs}, {run.id for run in target.runs}
     runs = []
     for row in table.to_pylist():
         id, record = row.pop("id"), row.pop("record")
         runs.append((id, _checked(file, id, record, configs), _curve(file, id, row, table.schema)))
-    claim(study, place)
-    added = sum(_write(place, *run) for run in runs)
+    claim(target, place)
+    added = sum(_write(place, *run) for run in runs if run[0] in wanted)
     with contextlib.suppress(OSError):  # others may be at work there
         (place / "partial").rmdir()
     return place, added

@@ -18,17 +18,17 @@ from pharos.study._execution import (
     Status,
     _Execution,
     claim,
+    opened,
     processors,
     run,
     shard_of,
-    study_folder,
     train,
 )
-from pharos.study._specification import Run, Specification, specification
+from pharos.study._specification import Run, Source
 
 
 def submit(
-    source: str | Path | Mapping[str, Any] | Specification,
+    source: Source,
     folder: str | os.PathLike | None = None,
     *,
     shards: int,
@@ -60,8 +60,8 @@ def submit(
         raise ParameterError(f"cluster is {cluster!r}; expected slurm or local")
     if shards < 1:
         raise ParameterError(f"shards is {shards}; expected at least 1")
-    study = source if isinstance(source, Specification) else specification(source)
-    place = study_folder(study, folder).absolute()
+    study, place = opened(source, folder)
+    place = place.absolute()
     claim(study, place)
     try:
         executor = submitit.AutoExecutor(folder=str(place / "jobs"), cluster=cluster)
@@ -89,7 +89,7 @@ def run_shard(folder: str, shard: str, options: dict[str, Any]) -> dict[str, Any
 
 
 def run_on_ray(
-    source: str | Path | Mapping[str, Any] | Specification,
+    source: Source,
     folder: str | os.PathLike | None = None,
     *,
     address: str | None = None,
@@ -111,8 +111,8 @@ def run_on_ray(
         import ray
     except ImportError as error:
         raise MissingExtra("running on Ray", "ray", "ray") from error
-    study = source if isinstance(source, Specification) else specification(source)
-    place = study_folder(study, folder).absolute()
+    study, place = opened(source, folder)
+    place = place.absolute()
     claim(study, place)
     execution = _Execution(
         study,

@@ -20,7 +20,7 @@ from typing import Any
 
 from pharos.errors import ParameterError, StateSpaceLocked
 from pharos.study import _values, _worker
-from pharos.study._specification import Run, Specification, specification
+from pharos.study._specification import Run, Source, Specification, specification
 from pharos.study._worker import write_atomically
 
 ATTEMPTS = 3
@@ -81,9 +81,12 @@ def duration(seconds: float) -> str:
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
 
 
-def study_folder(study: Specification, folder: str | os.PathLike | None = None) -> Path:
-    """Where the results of a study are: `folder`, or studies/NAME in the current directory."""
-    return Path("studies", study.name) if folder is None else Path(folder)
+def opened(source: Source, folder: str | os.PathLike | None = None) -> tuple[Specification, Path]:
+    """A study and where its results are: `folder`, else the source if that is a study's folder, else studies/NAME."""
+    study = specification(source)
+    if folder is None and isinstance(source, str | Path) and Path(source, "study.yaml").is_file():
+        folder = source
+    return study, Path("studies", study.name) if folder is None else Path(folder)
 
 
 def train(config: Mapping[str, Any], folder: Path) -> None:
@@ -118,7 +121,7 @@ def shard_of(runs: Sequence[Run], shard: str | tuple[int, int] | None) -> tuple[
 
 
 def run(
-    source: str | Path | Mapping[str, Any] | Specification,
+    source: Source,
     folder: str | os.PathLike | None = None,
     *,
     shard: str | tuple[int, int] | None = None,
@@ -133,8 +136,8 @@ def run(
     """Execute the runs of a study that are not over, on this machine.
 
     Args:
-        source: YAML file, preset, mapping or Specification.
-        folder: of the results; None for studies/NAME.
+        source: YAML file, preset, mapping, Specification, or the folder of a study.
+        folder: of the results; None for that folder, or studies/NAME.
         shard: `i/n`: only the i-th of n parts, for n machines that share the folder.
         retry_failed: execute failed runs again.
         resume: let runs that were killed go on from their last checkpoint, for long runs on machines that come and go. A deep
@@ -150,8 +153,7 @@ def run(
     Raises:
         ParameterError: the specification or an option is wrong, or the folder holds another study.
     """
-    study = source if isinstance(source, Specification) else specification(source)
-    place = study_folder(study, folder)
+    study, place = opened(source, folder)
     runs = shard_of(study.runs, shard)
     if workers is not None and workers < 1:
         raise ParameterError(f"workers is {workers}; expected at least 1")
@@ -167,10 +169,9 @@ def run(
     return execution.run()
 
 
-def status(source: str | Path | Mapping[str, Any] | Specification, folder: str | os.PathLike | None = None) -> Status:
+def status(source: Source, folder: str | os.PathLike | None = None) -> Status:
     """How far a study is, from its files; `remaining` is what its runners last said."""
-    study = source if isinstance(source, Specification) else specification(source)
-    place = study_folder(study, folder)
+    study, place = opened(source, folder)
     states = {run.id: _worker.read_record(place / "runs" / run.id) for run in study.runs}
     errors = {id: str(record.get("error")) for id, record in states.items() if record and record["status"] == "failed"}
     finished = sum(1 for record in states.values() if record and record["status"] == "finished")

@@ -17,11 +17,11 @@ import numpy as np
 
 from pharos.study import _analysis, _figures, _table
 from pharos.study._analysis import REGRETS, Comparison, Models
-from pharos.study._execution import Status, duration, status
+from pharos.study._execution import Status, duration, opened, status
 from pharos.study._findings import findings
 from pharos.study._latex import returns_table, tables_of
-from pharos.study._regression import MEASURES, Fit
-from pharos.study._specification import Specification
+from pharos.study._regression import Fit
+from pharos.study._specification import Source, Specification
 from pharos.study._worker import write_atomically
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ class StudyReport:
 
 
 def report(
-    source: _table.Source,
+    source: Source,
     folder: str | os.PathLike | None = None,
     *,
     out: str | os.PathLike | None = None,
@@ -66,16 +66,15 @@ def report(
     Cost: the measures of hardness, once; then seconds.
     """
     tell = progress or (lambda _: None)
-    study, place = _table.opened(source, folder)
+    study, place = opened(source, folder)
     now = status(study, place)
     tell("reading results")
     rows = _table.table(study, place)
     points = _table.curves(study, place)
     measured = _table.hardness_table(study, place, progress=tell)
     cells = _table.cells(rows, measured)
-    measures = [name for name in MEASURES if name in study.hardness.measures] or list(study.hardness.measures)
     tell("fitting models")
-    found = [_analysis.models(cells, regret=regret, measures=measures) for regret in REGRETS]
+    found = [_analysis.models(cells, regret=regret, measures=study.hardness.predictors) for regret in REGRETS]
     comparison = _analysis.compare(cells, study.runs, found)
     estimates = _analysis.intervals(rows)
     said = findings(cells, found[0])

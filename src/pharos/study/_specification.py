@@ -161,6 +161,16 @@ class Hardness(_Part):
                 raise UnknownName("measure of hardness", measure, registered())
         return measures
 
+    @property
+    def predictors(self) -> list[str]:
+        """Those measures that explain regret in the linear models: the paper's three, or all where none of them is taken.
+
+        The stationary effective horizon stands for the effective horizon where that is not taken.
+        """
+        stand_in = {"effective_horizon": "stationary_effective_horizon"}
+        taken = [name if name in self.measures else stand_in.get(name) for name in MEASURES]
+        return [name for name in taken if name in self.measures] or list(self.measures)
+
 
 def _horizon(value: Any) -> Any:
     if value in ("limit", "none") or (isinstance(value, int) and not isinstance(value, bool) and value >= 1):
@@ -299,12 +309,18 @@ def presets() -> list[str]:
     return sorted(Path(file.name).stem for file in folder.iterdir() if file.name.endswith(".yaml"))
 
 
-def specification(source: str | Path | Mapping[str, Any]) -> Specification:
-    """The specification in a YAML file, of a preset by its name, or from a mapping.
+Source = str | Path | Mapping[str, Any] | Specification
+"""What is taken for a study: a YAML file, a preset's name, a mapping, a Specification, or the folder of a study."""
+
+
+def specification(source: Source) -> Specification:
+    """The specification in a YAML file or a study's folder, of a preset by its name, or from a mapping.
 
     Raises:
         UnknownName: no such file or preset. ParameterError: something in it is wrong; the message names file, line and key.
     """
+    if isinstance(source, Specification):
+        return source
     if isinstance(source, Mapping):
         return _validated(source, "specification", None)
     if str(source) in presets():

@@ -14,8 +14,8 @@ import numpy as np
 
 from pharos.errors import ParameterError, UnknownName
 from pharos.study import _worker
-from pharos.study._execution import study_folder
-from pharos.study._specification import Run, Specification, specification
+from pharos.study._execution import opened
+from pharos.study._specification import Run, Source, Specification
 from pharos.study._values import tuple_of
 from pharos.study._worker import write_atomically
 
@@ -25,9 +25,8 @@ if TYPE_CHECKING:
     from pharos.mdp import TabularMDP
 
 CELL = ["environment", "instance", "chance", "agent", "observation"]
+WIDEST = 2  # a proven interval enters as one number if its upper end is at most so many times its lower end
 LAST = 0.1  # part of the evaluations at the end over which the return is averaged
-
-Source = str | Path | Mapping[str, Any] | Specification
 
 
 def table(source: Source, folder: str | os.PathLike | None = None) -> "pd.DataFrame":
@@ -121,13 +120,6 @@ def _described(run: Run) -> dict[str, Any]:
     }
 
 
-def opened(source: Source, folder: str | os.PathLike | None) -> tuple[Specification, Path]:
-    study = source if isinstance(source, Specification) else specification(source)
-    if folder is None and isinstance(source, str | Path) and Path(source).is_dir():
-        folder = source
-    return study, study_folder(study, folder)
-
-
 # Hardness ---------------------------------------------------------------------------------------------------------------
 
 
@@ -138,8 +130,9 @@ def hardness_table(
 
     Returns:
         Columns `environment`, `instance`, `chance`; each measure as a number; `num_states`; and `notes`: where a measure is
-        undefined or unknown, where it is the geometric mean of a proven interval, and where it is that of the instance without
-        chance, because the measure does not exist, or cannot be computed within the budget, under this chance.
+        undefined or unknown, where it is the geometric mean of a proven interval (whose ends differ by a factor of at most two),
+        and where it is that of the instance without chance, because the measure does not exist, or cannot be computed within
+        the budget, under this chance.
     Cost: a state space and a report of hardness for each row, each measure at most the budget of the specification.
     """
     import pandas as pd
@@ -164,7 +157,7 @@ def _chosen(names: Sequence[str], own: Mapping[str, Any], plain: Mapping[str, An
     row: dict[str, Any] = {"num_states": own.get("num_states") or plain.get("num_states")}
     notes = []
     for name in names:
-        mine, other = own["measures"].get(name, {}), plain["measures"].get(name, {})
+        mine, other = (_usable(report["measures"].get(name, {})) for report in (own, plain))
         used = mine if mine.get("value") is not None else other
         row[name] = float("nan") if used.get("value") is None else used["value"]
         if used is not mine and used.get("value") is not None:
@@ -174,6 +167,13 @@ def _chosen(names: Sequence[str], own: Mapping[str, Any], plain: Mapping[str, An
         elif not used.get("exact", True):
             notes.append(f"{name}: geometric mean of the proven interval {used['lower']:g} to {used['upper']:g}")
     return {**row, "notes": "; ".join(notes)}
+
+
+def _usable(measure: dict[str, Any]) -> dict[str, Any]:
+    """The measure, or why it says too little: a proven interval that is too wide to be one number."""
+    if measure.get("value") is None or measure.get("exact", True) or measure["upper"] <= WIDEST * measure["lower"]:
+        return measure
+    return {"value": None, "why": f"only {measure['lower']:g} to {measure['upper']:g} is proven within the budget"}
 
 
 def _measured(study: Specification, place: Path, config: Mapping[str, Any]) -> dict[str, Any]:
