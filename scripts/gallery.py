@@ -9,6 +9,7 @@ import numpy as np
 
 import pharos
 from pharos import rendering
+from pharos.observations import observe
 
 DOCS = Path(__file__).parents[1] / "docs"
 FOLDER = DOCS / "gallery"
@@ -25,6 +26,7 @@ PLAYED = {
     "breakout": "breakout/12x8x3",
 }
 FRAMES = 90
+NUMBERS = 8  # of a vector
 
 
 def optimal(name):
@@ -65,6 +67,19 @@ def shown(env, state):
     )
 
 
+def told(env, space, state):
+    """The observations that are numbers, in a sentence."""
+    states = np.array([state])
+    vector, one_hot = observe(env, "vector"), observe(env, "one_hot")
+    parts = [f"`{name}` {value:.2f}" for name, value in zip(vector.names, vector(states)[0], strict=True)]
+    shown = ", ".join(parts[:NUMBERS]) + (", ..." if len(parts) > NUMBERS else "")
+    ones = int(one_hot(states)[0].sum())
+    return (
+        f"`vector`, {len(parts)} numbers: {shown}. `one_hot`: {len(one_hot.names):,} bits, {ones} of them set. "
+        f"`index`: {space.index(state):,}."
+    )
+
+
 def main() -> None:
     """Write everything anew."""
     FOLDER.mkdir(exist_ok=True)
@@ -72,7 +87,8 @@ def main() -> None:
         "# Gallery",
         "",
         "Made by `python scripts/gallery.py`. In each row, from the left: the drawing for people, the complex image at its natural size",
-        "and at 84 x 84 pixels, and the planes of the simple image.",
+        "and at 84 x 84 pixels, and the planes of the simple image; below it, the observations that are numbers. What agents learnt, at play",
+        "beside the optimal policy and a random one: [large-runs.md](large-runs.md).",
         "",
     ]
     for cls, instances in INSTANCES.items():
@@ -84,7 +100,7 @@ def main() -> None:
             rendering.save_png(file, shown(env, state))
             space = pharos.build(env)
             lines += [f"`{name}`, {space.num_states:,} states, after {steps} steps of the optimal policy:", ""]
-            lines += [f"![{name}](gallery/{file.name})", ""]
+            lines += [f"![{name}](gallery/{file.name})", "", told(env, space, state), ""]
         env, policy = optimal(PLAYED[cls])
         played = rendering.episode(env, policy, env.initial_states()[0][0], steps=FRAMES)
         pictures = [rendering.render(env, state, "complex_image", size="natural") for state, _, _ in played]
