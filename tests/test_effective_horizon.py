@@ -175,3 +175,29 @@ def test_a_report_with_a_horizon_has_it_and_one_without_says_what_is_missing():
     report = hardness.report(mdp, "effective_horizon", horizon=20, keep=False)
     assert report["effective_horizon"].value["k_min"] >= 1
     assert "give a horizon" in hardness.report(mdp, "effective_horizon", keep=False)["effective_horizon"].undefined
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.one_of(
+        deterministic_mdps(max_states=6, max_actions=2, rewards=exact), general_mdps(max_states=4, max_actions=2)
+    ),
+    st.sampled_from([{}, {"sticky": 0.25}, {"random": 0.5}]),
+    st.integers(1, 4),
+)
+def test_states_that_no_episode_meets_do_not_matter(mdp, chance, steps):
+    mdp = random_actions(sticky_actions(mdp, chance.get("sticky", 0.0)), chance.get("random", 0.0))
+    whole, part = (_vectorized(_Steps(each, steps)) for each in (mdp, mdp.within(steps)))
+    for name in whole:
+        assert part[name] == pytest.approx(whole[name], rel=1e-9, abs=1e-12), name
+    if not chance and mdp.next_states is not None:
+        whole, part = (_compiled(LargeHorizon(each, steps, TIE)) for each in (mdp, mdp.within(steps)))
+        assert part == whole
+
+
+def test_a_freeway_is_analysed_for_the_states_that_an_episode_meets():
+    mdp = pharos.build(pharos.make("freeway", num_cars=8, lane_length=7)).mdp(gamma=1.0)
+    met = int(mdp.states_within(99).sum())
+    found = hardness.effective_horizon(mdp, horizon=100)
+    assert found.num_states == met < mdp.num_states / 5
+    assert found.optimal_return == pharos.value_iteration(mdp.with_horizon(100)).value_at_start

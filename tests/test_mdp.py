@@ -10,7 +10,8 @@ import pharos
 from pharos.errors import ParameterError
 from pharos.mdp import Rewards, TabularMDP, random_actions, sticky_actions
 from pharos.mdp._rewards import RewardsCollector
-from strategies import deterministic_mdps, probabilities
+from pharos.solvers import uniform_value, value_iteration, worst_value
+from strategies import deterministic_mdps, probabilities, small_mdps
 
 often = settings(max_examples=100, deadline=None)
 
@@ -156,3 +157,36 @@ def test_a_state_space_becomes_an_mdp_with_its_own_or_other_rewards(tmp_path):
     assert own.rewards[goal].max() == 1
     assert (space.mdp(rewards=2 * own.rewards).rewards == 2 * own.rewards).all()
     assert (space.mdp(rewards=lambda self, state, action, next_state: 3.0).rewards[~own.terminal] == 3).all()
+
+
+@often
+@given(small_mdps(), st.integers(1, 6))
+def test_states_that_an_episode_cannot_meet_do_not_matter_to_it(mdp, steps):
+    found = mdp.within(steps)
+    met = {int(s) for s, p in zip(mdp.start_states, mdp.start_probabilities, strict=True) if p > 0}
+    frontier = set(met)
+    for _ in range(steps):
+        frontier = {t for s in frontier for a in range(mdp.num_actions) for t in successors(mdp, s, a)} - met
+        met |= frontier
+    assert set(np.flatnonzero(mdp.states_within(steps))) == met
+    assert found.num_states == len(met | set(mdp.start_states.tolist()))
+    for solve in (value_iteration, uniform_value, worst_value):
+        whole, part = (solve(each.with_gamma(1.0).with_horizon(steps)) for each in (mdp, found))
+        assert part.value_at_start == pytest.approx(whole.value_at_start, abs=1e-12)
+
+
+def successors(mdp, state, action):
+    if mdp.next_states is None:
+        return mdp.transitions[state * mdp.num_actions + action].indices.tolist()
+    following = int(mdp.next_states[state, action])
+    return [following] if following >= 0 else []
+
+
+def test_an_mdp_whose_states_are_all_met_stays_itself_and_a_smaller_one_has_other_numbers():
+    line = TabularMDP.from_arrays([[1], [2], [3], [3]], [[0.0], [0.0], [1.0], [0.0]], initial=1)
+    assert line.with_initial(0).within(3).num_states == 4
+    mdp = line.with_initial(0)
+    assert mdp.within(3) is mdp
+    part = line.within(1)
+    assert part.next_states.tolist() == [[1], [1]] and part.rewards.tolist() == [[0.0], [1.0]] and part.initial == 0
+    assert part.folder is None and not part.terminal.any()

@@ -414,3 +414,17 @@ def mark_reachable(next_states, ends, reached, queue, tail):
                 reached[v] = True
                 queue[tail] = v
                 tail += 1
+
+
+@njit(cache=True, nogil=True)
+def onwards(next_states, nodes, n, following, seen):
+    """States that nodes[:n] lead to and that were not seen before; returns how many. seen (S,) bool."""
+    count = 0
+    for i in range(n):
+        for a in range(next_states.shape[1]):
+            t = next_states[nodes[i], a]
+            if t >= 0 and not seen[t]:
+                seen[t] = True
+                following[count] = t
+                count += 1
+    return count

@@ -119,17 +119,3 @@ def walk(next_states, rewards, after, optimal, variance, log, near, nodes, n, fo
     for j in range(count):
         seen[following[j]] = False
     return -1 if fails else count
-
-
-@njit(cache=True, nogil=True)
-def onwards(next_states, nodes, n, following, seen):
-    """States that nodes[:n] lead to and that were not seen before; returns how many. seen (S,) bool."""
-    count = 0
-    for i in range(n):
-        for a in range(next_states.shape[1]):
-            t = next_states[nodes[i], a]
-            if t >= 0 and not seen[t]:
-                seen[t] = True
-                following[count] = t
-                count += 1
-    return count

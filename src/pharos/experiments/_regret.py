@@ -48,9 +48,7 @@ class ReferenceValues:
     @staticmethod
     def of(task: "Task") -> "ReferenceValues":
         """Those of a task; the space is built and solved where it is not yet."""
-        found = (task.optimal, task.uniform, task.worst)
-        optimal, uniform, worst = (solution.value_at_start for solution in found)
-        return ReferenceValues(optimal, uniform, worst, max(solution.error_bound for solution in found))
+        return task.reference
 
     def spread(self, reference: str = "uniform") -> float:
         """V* - V of the reference policy, "uniform" or "worst"; NaN where it is too small to divide by.

@@ -9,6 +9,7 @@ from pharos.environment import Environment, make
 from pharos.errors import ParameterError
 
 if TYPE_CHECKING:
+    from pharos.experiments._regret import ReferenceValues
     from pharos.mdp import TabularMDP
     from pharos.solvers import Solution
     from pharos.state_space import StateSpace
@@ -121,11 +122,30 @@ class Task:
         return worst_value(self.mdp)
 
     @cached_property
+    def reference(self) -> "ReferenceValues":
+        """What regret is measured against: the values at the start of the optimal, the uniform and the worst policy."""
+        from pharos.experiments._regret import ReferenceValues
+        from pharos.solvers import uniform_value, value_iteration, worst_value
+
+        mdp = self._episodes(self.mdp)
+        found = [solve(mdp) for solve in (value_iteration, uniform_value, worst_value)]
+        error = max(solution.error_bound for solution in found)
+        optimal, uniform, worst = (float(solution.value_at_start) for solution in found)
+        return ReferenceValues(optimal, uniform, worst, error)
+
+    @cached_property
     def return_range(self) -> tuple[float, float]:
         """The lowest and the highest return that an episode can have, whatever is executed."""
         from pharos.solvers import value_iteration, worst_value
 
-        plain = self.space.mdp(gamma=self.gamma).with_horizon(self.horizon)  # type: ignore[arg-type]
+        if not self.sticky and not self.random and len(self.mdp.start_states) == 1:
+            known = self.reference
+            return known.worst - known.error_bound, known.optimal + known.error_bound
+        plain = self._episodes(self.space.mdp(gamma=self.gamma).with_horizon(self.horizon))  # type: ignore[arg-type]
         low, high = worst_value(plain), value_iteration(plain)
         starts = plain.start_states
         return float(low.v[starts].min() - low.error_bound), float(high.v[starts].max() + high.error_bound)
+
+    def _episodes(self, mdp: "TabularMDP") -> "TabularMDP":
+        """Those states that an episode can meet: of a Freeway of a million, some thousand."""
+        return mdp if self.horizon is None else mdp.within(int(self.horizon))

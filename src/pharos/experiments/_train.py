@@ -196,7 +196,7 @@ class _Curve:
     def add(self, step: int, episodes: int, returns: float, agent: Any) -> dict[str, Any]:
         """Evaluate the policy after `step` steps, `episodes` finished episodes and the sum `returns` of their returns."""
         found = evaluate_agent(agent, self.task)
-        best, uniform = self.task.optimal.value_at_start, self.task.uniform.value_at_start
+        best, uniform = self.task.reference.optimal, self.task.reference.uniform
         last = self.rows[-1] if self.rows else None
         finished = episodes - (last["episodes"] if last else 0)
         gained = returns - (last["returns"] if last else 0.0)
@@ -225,12 +225,12 @@ class _Curve:
     def result(self) -> dict[str, Any]:
         """The summary of a finished run."""
         task, last = self.task, self.rows[-1]
-        best, uniform = task.optimal.value_at_start, task.uniform.value_at_start
+        best, uniform = task.reference.optimal, task.reference.uniform
         scale = last["episodes"] * (best - uniform)
         return {
             "value_optimal": best,
             "value_uniform": uniform,
-            "value_worst": task.worst.value_at_start,
+            "value_worst": task.reference.worst,
             "final_value": last["value"],
             "final_regret": last["expected_regret"],
             "cumulative_regret": last["cumulative_expected_regret"],

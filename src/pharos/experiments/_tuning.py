@@ -166,7 +166,7 @@ def tune(
         study.enqueue_trial(first)
 
     for task in tasks:
-        if not task.optimal.value_at_start - task.uniform.value_at_start > 1e-12:
+        if not task.reference.optimal - task.reference.uniform > 1e-12:
             raise ParameterError(
                 f"{task.env}: acting at random is optimal, so regret cannot be normalised; leave it out"
             )

@@ -91,12 +91,13 @@ def effective_horizon(mdp: TabularMDP, *, horizon: int | None = None, tight: int
     Raises:
         UndefinedMeasure: there is no horizon, or the table of all steps does not fit into memory: 8 GiB under chance, else 60 % of
             that of the machine.
-    Cost: a pass over T x nodes x A for every k that is tried. Memory 40 bytes for each of them under chance; 17 bytes for each of
-        T x S without.
+    Cost: a pass over T x nodes x A for every k that is tried, of those that can be met within T steps. Memory 40 bytes for each of them
+        under chance; 17 bytes for each of T x S without.
     Source: Laidlaw, Russell and Dragan (2023), "Bridging RL theory and practice with the effective horizon", theorem 5.4 and
         appendix C; sticky actions: Laidlaw et al. (2024).
     """
     steps = steps_of("effective_horizon", mdp, horizon)
+    mdp = mdp.within(steps)
     from pharos.hardness import _large_horizon
 
     compiled = _large_horizon.applies(mdp) and 40 * steps * mdp.num_states * mdp.num_actions > COMPILED
@@ -191,7 +192,7 @@ class _Steps:
         needed = 40 * steps * size * mdp.num_actions
         if needed > MEMORY:
             raise UndefinedMeasure(
-                f"effective_horizon: {steps} steps of {size} states need {needed / 2**30:.1f} GiB, more than {MEMORY / 2**30:.0f}; "
+                f"effective_horizon: {steps} steps of the {size} nodes that they can meet need {needed / 2**30:.1f} GiB, more than {MEMORY / 2**30:.0f}; "
                 f"a smaller horizon or instance would define it"
             )
         choices = choices_of(mdp, restart=False)

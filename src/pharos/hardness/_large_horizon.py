@@ -40,7 +40,7 @@ class LargeHorizon:
         needed = (16 + bits(0).itemsize) * steps * states
         if needed > (room := _room()):
             raise UndefinedMeasure(
-                f"effective_horizon: {steps} steps of {states} states need {needed / 2**30:.1f} GiB, more than {room / 2**30:.1f}, "
+                f"effective_horizon: {steps} steps of the {states} states that they can meet need {needed / 2**30:.1f} GiB, more than {room / 2**30:.1f}, "
                 f"{_PARTS:.0%} of this machine's memory; a smaller horizon or instance would define it"
             )
         assert mdp.next_states is not None
@@ -63,7 +63,7 @@ class LargeHorizon:
         small = np.int32 if states < 2**31 else np.int64
         self.nodes = (np.empty(states, small), np.empty(states, small))
         self.seen = np.zeros(states, np.bool_)
-        self.num_visitable = self._visitable()
+        self.num_visitable = int(mdp.states_within(steps - 1).sum())
 
     def _at_start(self, values: np.ndarray) -> float:
         return float(sum(p * values[s] for s, p in self.starts))
@@ -72,19 +72,6 @@ class LargeHorizon:
         first = sorted({s for s, _ in self.starts})
         self.nodes[0][: len(first)] = first
         return len(first)
-
-    def _visitable(self) -> int:
-        n = self._begin()
-        self.seen[self.nodes[0][:n]] = True
-        now, following = self.nodes
-        for _ in range(self.steps - 1):
-            n = self.kernels.onwards(self.next_states, now, n, following, self.seen)
-            now, following = following, now
-            if not n:
-                break
-        count = int(self.seen.sum())
-        self.seen[:] = False
-        return count
 
     def samples(self, k: int) -> tuple[int, float, float] | None:
         """(m_k, gap, variance where it is attained); None where k fails."""

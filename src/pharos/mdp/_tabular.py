@@ -247,6 +247,71 @@ class TabularMDP:
         states, probabilities = _start(initial, self.num_states)
         return replace(self, start_states=states, start_probabilities=probabilities)
 
+    def within(self, steps: int) -> "TabularMDP":
+        """The same MDP with only those states that can be met within `steps` steps from a start; they keep their order.
+
+        Whatever episodes of at most `steps` steps from the start tell is the same for both: values there, returns, effective horizon. Of
+        states that take all the steps to reach, only that they exist is right: actions that lead out of the set lead back.
+
+        Returns:
+            This MDP where all of its states are met; else one without a folder, as its states have other numbers.
+        Cost: one look at each transition of the states that are met, and a copy of them.
+        """
+        met = self.states_within(steps)
+        met[self.start_states] = True
+        if met.all():
+            return self
+        kept = np.flatnonzero(met)
+        number = np.full(self.num_states, -1, np.int64)
+        number[kept] = np.arange(len(kept))
+        next_states, transitions = None, None
+        if self.next_states is not None:
+            table = np.asarray(self.next_states[kept])
+            inside = number[table]  # what leads to -1 gets any number here
+            own = np.broadcast_to(np.arange(len(kept))[:, None], table.shape)
+            following = np.where(table < 0, -1, np.where(inside < 0, own, inside))
+            next_states = following.astype(np.int32 if len(kept) < 2**31 else np.int64)
+        else:
+            assert self.transitions is not None
+            rows = (kept[:, None] * self.num_actions + np.arange(self.num_actions)).ravel()
+            transitions = self.transitions[rows][:, kept].tocsr()
+        return replace(
+            self,
+            next_states=next_states,
+            transitions=transitions,
+            reward_table=replace(self.reward_table, table=np.asarray(self.reward_table.table[kept])),
+            terminal=np.asarray(self.terminal[kept]),
+            start_states=number[self.start_states],
+            folder=None,
+        )
+
+    def states_within(self, steps: int) -> np.ndarray:
+        """(S,) bool: the states that can be met within `steps` steps from a start."""
+        met = np.zeros(self.num_states, np.bool_)
+        frontier = np.unique(self.start_states[self.start_probabilities > 0])
+        met[frontier] = True
+        if self.next_states is None:
+            assert self.transitions is not None
+            for _ in range(steps):
+                if not len(frontier):
+                    break
+                rows = (frontier[:, None] * self.num_actions + np.arange(self.num_actions)).ravel()
+                found = np.unique(self.transitions[rows].indices)
+                frontier = found[~met[found]]
+                met[frontier] = True
+            return met
+        from pharos._core.graph import onwards
+
+        now, following = (np.empty(self.num_states, np.int64) for _ in range(2))
+        count = len(frontier)
+        now[:count] = frontier
+        for _ in range(steps):
+            count = onwards(self.next_states, now, count, following, met)
+            if not count:
+                break
+            now, following = following, now
+        return met
+
     def __repr__(self) -> str:
         kind = "general, " if self.transitions is not None else ""
         chance = "" if self.chance == Chance() else f", {self.chance}"

@@ -6,7 +6,7 @@ for each run would take longer than some training.
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,15 +14,6 @@ from pharos.study._worker import write_atomically
 
 if TYPE_CHECKING:
     from pharos.experiments import Task
-
-POLICIES = ("optimal", "uniform", "worst")
-
-
-@dataclass(frozen=True)
-class StartValue:
-    """What is known of a solution: its value at the start."""
-
-    value_at_start: float
 
 
 def task_of(config: Mapping[str, Any]) -> "Task":
@@ -41,20 +32,20 @@ def task_of(config: Mapping[str, Any]) -> "Task":
     )
 
 
-def solve(config: Mapping[str, Any]) -> dict[str, float]:
-    """The values at the start for the task of a run; solved now unless they are kept."""
+def solve(config: Mapping[str, Any]) -> dict[str, Any]:
+    """What a task knows of its values, `reference` and `return_range`; solved now unless they are kept."""
     known = kept(config)
     if known is None:
         task = task_of(config)
-        known = {name: float(getattr(task, name).value_at_start) for name in POLICIES}
+        known = {"reference": asdict(task.reference), "return_range": list(task.return_range)}
         file = _file(config)
         file.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(file, json.dumps({"task": _key(config), "values": known}, indent=1) + "\n")
     return known
 
 
-def kept(config: Mapping[str, Any]) -> dict[str, float] | None:
-    """The values at the start, where they were solved before for these rules."""
+def kept(config: Mapping[str, Any]) -> dict[str, Any] | None:
+    """What `solve` found before for these rules."""
     try:
         said = json.loads(_file(config).read_text(encoding="utf-8"))
     except (FileNotFoundError, ValueError):
@@ -62,9 +53,12 @@ def kept(config: Mapping[str, Any]) -> dict[str, float] | None:
     return said["values"] if said.get("task") == _key(config) else None
 
 
-def with_values(task: "Task", values: Mapping[str, float]) -> "Task":
+def with_values(task: "Task", values: Mapping[str, Any]) -> "Task":
     """The task, which now knows these values instead of solving for them."""
-    task.__dict__.update({name: StartValue(value) for name, value in values.items()})
+    from pharos.experiments import ReferenceValues
+
+    task.__dict__["reference"] = ReferenceValues(**values["reference"])
+    task.__dict__["return_range"] = tuple(values["return_range"])
     return task
 
 
@@ -94,6 +88,7 @@ def _key(config: Mapping[str, Any]) -> dict[str, Any]:
         json.dumps(
             {
                 **setting,
+                "format": 2,
                 "version": env.version,
                 "rules": fingerprint_of_rules(env, ("transition", "is_terminal", "reward")),
                 "start": [[list(map(int, state)) for state in states], probabilities.tolist()],
