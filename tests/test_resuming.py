@@ -344,7 +344,9 @@ def test_a_rule_that_fails_is_blamed_with_the_table_on_disk(tmp_path, little_mem
 
 @pytest.fixture
 def interpreted(monkeypatch):
+    """Rules that are neither compiled nor traced: each state is asked."""
     monkeypatch.setattr("pharos._core.compiling.compiled_rules", lambda *args: None)
+    monkeypatch.setattr("pharos.state_space._traced.TracedRules.successors", lambda self, states: None)
 
 
 @pytest.mark.parametrize("env", (BREAKOUT, NARROW), ids=lambda env: env.name)

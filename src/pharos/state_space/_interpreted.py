@@ -12,6 +12,7 @@ import numpy as np
 
 from pharos.environment import Environment
 from pharos.errors import RuleError
+from pharos.state_space._traced import TracedRules
 
 _MOST_FILES = 1 << 16
 _SHARE = 64  # states that are worth sending to another process
@@ -121,6 +122,7 @@ class Interpreters:
 
     def __init__(self, env: Environment, workers: int):
         self.env = env
+        self._traced = TracedRules(env)
         self._connections: list[Connection] = []
         if not sys.platform.startswith("linux"):
             return
@@ -135,7 +137,10 @@ class Interpreters:
             self._connections.append(ours)
 
     def successors(self, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """As `interpreted_successors` of states (N, D) int64, shared between the processes where they are many."""
+        """As `interpreted_successors` of states (N, D) int64; where they are many, traced, or shared between the processes."""
+        traced = self._traced.successors(states) if len(states) >= _SHARE else None
+        if traced is not None:
+            return traced
         shares = min(len(self._connections) + 1, len(states) // _SHARE)
         if shares < 2:
             return interpreted_successors(self.env, states.tolist())

@@ -9,12 +9,14 @@ import numpy as np
 
 from pharos.environment import Environment
 from pharos.errors import ParameterError, RuleError, StateSpaceError
+from pharos.state_space._traced import TracedReward
 
 if TYPE_CHECKING:
     from pharos.mdp._rewards import Rewards
     from pharos.state_space._store import StateSpace
 
 _ROWS = 1 << 16
+_WORTH_TRACING = 64  # states
 
 
 def rewards_of_space(space: "StateSpace", rewards: Any = None, *, workers: int | None = None) -> "Rewards":
@@ -64,7 +66,10 @@ def _blocks(space: "StateSpace", env: Environment, workers: int | None):
     rules = compiled_rules(env, space.layout.num_words, ["rewards_of"])
     states, successors, terminal = space.packed_states, space.successors, space.terminal
     if rules is None:
-        yield from ((start, _interpreted_rewards(space, env, start)) for start in starts)
+        traced = TracedReward(env)
+        for start in starts:
+            block = _traced_rewards(space, traced, start)
+            yield start, _interpreted_rewards(space, env, start) if block is None else block
         return
 
     def compiled(start: int) -> np.ndarray:
@@ -88,6 +93,17 @@ def _blocks(space: "StateSpace", env: Environment, workers: int | None):
             if i + window < len(starts):
                 pending[i % window] = pool.submit(compiled, starts[i + window])
             yield start, block
+
+
+def _traced_rewards(space: "StateSpace", traced: TracedReward, start: int) -> np.ndarray | None:
+    """The same by tracing the rule; None where that does not work."""
+    stop = min(start + _ROWS, space.num_states)
+    if not traced.is_on or stop - start < _WORTH_TRACING:
+        return None
+    successors = np.asarray(space.successors[start:stop])
+    following = space.states(successors.ravel()).reshape(*successors.shape, -1)
+    going = np.flatnonzero(~np.asarray(space.terminal[start:stop]))
+    return traced.rewards(space.states(slice(start, stop)), following, going)
 
 
 def _interpreted_rewards(space: "StateSpace", env: Environment, start: int) -> np.ndarray:
