@@ -8,6 +8,7 @@ import fake_training
 from pharos import study
 from pharos.errors import ParameterError
 from pharos.study import _worker
+from pharos.study._latex import returns_table
 from pharos.study._table import _chosen, _last_return, _number
 
 SPECIFICATION = {
@@ -96,6 +97,20 @@ def test_a_cell_is_the_mean_over_seeds(rows, cells):
     assert len(same) == 3
     assert cell["cumulative_regret"] == pytest.approx(same["cumulative_regret"].mean())
     assert cell["return_deviation"] == pytest.approx(np.std(same["return"]))
+
+
+def test_one_seed_has_no_deviation_and_one_run_a_task_no_interval(rows):
+    alone = rows[rows["seed"] == 0]
+    cells = study.cells(alone)
+    assert (
+        set(cells["seeds"]) == {1}
+        and set(cells["steps"]) == set(rows["steps"])
+        and cells["return_deviation"].isna().all()
+    )
+    assert "pm" not in returns_table(cells, "frozen_lake") and "$" in returns_table(cells, "frozen_lake")
+    assert "pm" in returns_table(study.cells(rows), "frozen_lake")
+    known, unknown = (study.intervals(part, resamples=20) for part in (rows, alone))
+    assert known["lower"].notna().all() and unknown["lower"].isna().all() and unknown["iqm"].notna().all()
 
 
 def test_hardness_is_that_of_the_report_and_kept_in_the_folder(done, measured, cells):

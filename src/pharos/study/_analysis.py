@@ -105,7 +105,7 @@ def _together(fits: Sequence[Fit], model: str) -> float | None:
 def intervals(rows: "pd.DataFrame", *, resamples: int = 1000) -> "pd.DataFrame":
     """Interquartile mean of the normalised regret for each class, agent and observation, with 95 % bootstrap interval.
 
-    Runs are resampled within each task (instance and chance), as Agarwal et al. (2021) do.
+    Runs are resampled within each task (instance and chance), as Agarwal et al. (2021) do; NaN where no task has two runs.
     """
     import pandas as pd
 
@@ -120,7 +120,8 @@ def intervals(rows: "pd.DataFrame", *, resamples: int = 1000) -> "pd.DataFrame":
         estimate = stratified_interval(tasks, resamples=resamples)
         line = dict(zip(("environment", "agent", "observation"), key, strict=True))
         line |= {"tasks": len(tasks), "runs": len(defined)}
-        found.append(line | {"iqm": estimate.value, "lower": estimate.lower, "upper": estimate.upper})
+        ends = (estimate.lower, estimate.upper) if max(map(len, tasks)) > 1 else (float("nan"),) * 2
+        found.append(line | {"iqm": estimate.value, "lower": ends[0], "upper": ends[1]})
     columns = ["environment", "agent", "observation", "tasks", "runs", "iqm", "lower", "upper"]
     return pd.DataFrame(found, columns=columns)
 
@@ -170,7 +171,8 @@ class Comparison:
     """Numbers of the paper beside ours.
 
     Attributes:
-        returns: one row a printed mean and deviation: the columns of `paper_returns`, `ours`, `our_deviation`, `difference`.
+        returns: one row a printed mean and deviation: the columns of `paper_returns`, `ours`, `our_deviation`, `our_steps` (the paper's
+            are 50 thousand for grids and lakes, else 600 thousand), `difference`.
         regressions: one row a printed fit: the columns of `paper_regressions`, and for both kinds of regret ours and the difference.
     """
 
@@ -182,22 +184,22 @@ class Comparison:
 def compare(cells: "pd.DataFrame", runs: Sequence[Run], found: Sequence[Models]) -> Comparison:
     """Our value beside each number that the paper prints, where the study has one; NaN elsewhere."""
     numbers = {run.instance: paper_instance(run.config["environment"], run.config["parameters"]) for run in runs}
-    ours: dict[tuple, tuple[float, float]] = {}
+    ours: dict[tuple, tuple[float, ...]] = {}
     for row in cells.to_dict("records"):
         if (number := numbers.get(row["instance"])) is None:
             continue
         chance = row["chance"].split()[0] if "," not in row["chance"] else row["chance"]
         observation = {IMAGE: "image", VECTOR: "vector"}.get(row["observation"], row["observation"])
         key = (row["environment"], number, chance, row["agent"].upper(), observation)
-        ours.setdefault(key, (row["return"], row["return_deviation"]))
+        ours.setdefault(key, (row["return"], row["return_deviation"], row["steps"]))
     returns = paper_returns()
     keys = [
         (row.environment, row.instance, PAPER_CHANCE[row.randomization], row.agent, row.observation)
         for row in returns.itertuples()
     ]
-    nothing = (float("nan"), float("nan"))
-    returns["ours"] = [ours.get(key, nothing)[0] for key in keys]
-    returns["our_deviation"] = [ours.get(key, nothing)[1] for key in keys]
+    nothing = (float("nan"),) * 3
+    for place, column in enumerate(("ours", "our_deviation", "our_steps")):
+        returns[column] = [ours.get(key, nothing)[place] for key in keys]
     returns["difference"] = returns["ours"] - returns["mean"]
     return Comparison(returns, _regressions(cells, found))
 

@@ -91,4 +91,4 @@ def escape(text: str) -> str:
 def _entry(value: tuple[float, float] | None) -> str:
     if value is None or not np.isfinite(value[0]):
         return "--"
-    return rf"${value[0]:.2f} \pm {value[1]:.2f}$"
+    return rf"${value[0]:.2f}$" if np.isnan(value[1]) else rf"${value[0]:.2f} \pm {value[1]:.2f}$"

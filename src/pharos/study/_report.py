@@ -261,7 +261,10 @@ def _regret(estimates: "pd.DataFrame", figures: Figures) -> str:
         "interval over seeds. The paper's figure 2.",
     )
     shown = estimates.assign(
-        interval=[f"{low:.3f} to {high:.3f}" for low, high in zip(estimates["lower"], estimates["upper"], strict=True)]
+        interval=[
+            f"{low:.3f} to {high:.3f}" if np.isfinite(low) else "one run a task"
+            for low, high in zip(estimates["lower"], estimates["upper"], strict=True)
+        ]
     )
     columns = ["environment", "agent", "observation", "tasks", "runs", "iqm", "interval"]
     return text + _html_table(
@@ -406,7 +409,8 @@ def _wide_returns(part: "pd.DataFrame") -> "pd.DataFrame":
             (row["instance"], row["chance"]), {"instance": row["instance"], "chance": row["chance"]}
         )
         name = _figures.label(row["agent"], row["observation"])
-        line[name] = f"{row['return']:.2f} ± {row['return_deviation']:.2f}"
+        deviation = f" ± {row['return_deviation']:.2f}" if row["seeds"] > 1 else ""
+        line[name] = f"{row['return']:.2f}{deviation}"
     names = [_figures.label(*key) for key in columns]
     return pd.DataFrame(list(lines.values()), columns=["instance", "chance", *names]).fillna("")
 
@@ -421,7 +425,7 @@ def _beside(comparison: Comparison) -> str:
     return text + (
         f"<p>Returns: {len(known)} of {len(comparison.returns)} printed values have one of ours; the difference is "
         f"{known['difference'].mean():+.2f} in the mean, and {known['difference'].abs().median():.2f} in the middle case. The paper "
-        f"prints no rewards, discounts, probabilities of chance, or what of a run its returns are means of: differences are to be "
+        f"trains 50 thousand steps on grids and lakes, else 600 thousand; it prints no rewards, discounts, probabilities of chance, or what of a run its returns are means of: differences are to be "
         f"expected.</p><details><summary>All {len(known)} values</summary>"
         + _html_table(known.drop(columns=["parameters_as_printed"]), digits=2)
         + "</details>"

@@ -77,14 +77,16 @@ def cells(rows: "pd.DataFrame", measures: "pd.DataFrame | None" = None) -> "pd.D
     """The means over seeds, a row for each cell; joined with hardness where `measures` (of `hardness_table`) is given.
 
     Returns:
-        Columns of the cell; `seeds`; means of `cumulative_regret`, `normalized_regret`, `final_value`, `value_optimal`, `return`;
-        `return_deviation` over seeds (population, as 0.00 is printed for equal runs); and the measures.
+        Columns of the cell; `seeds`; `steps` (the most, where runs differ); means of `cumulative_regret`, `normalized_regret`,
+        `final_value`, `value_optimal`, `return`; `return_deviation` over seeds (population, as 0.00 is printed for equal runs; NaN for
+        one seed); and the measures.
     """
     values = ["cumulative_regret", "normalized_regret", "final_value", "value_optimal", "return"]
     groups = rows.groupby(CELL, sort=False)
     means = groups[values].mean()
     means.insert(0, "seeds", groups.size())
-    means["return_deviation"] = groups["return"].std(ddof=0)
+    means.insert(1, "steps", groups["steps"].max())
+    means["return_deviation"] = groups["return"].std(ddof=0).where(groups.size() > 1)
     found = means.reset_index()
     if measures is None:
         return found
