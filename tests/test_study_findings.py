@@ -113,7 +113,10 @@ def test_agreement_has_fishers_interval():
     wide = cells.pivot_table(index=["instance", "chance", "observation"], columns="agent", values="return")
     expected = stats.pearsonr(wide["dqn"], wide["ppo"])
     low, high = expected.confidence_interval()
-    assert row.evidence == f"{low:.2f} to {high:.2f} (95 %, 96 cells)"
+    wide = cells.pivot_table(index=["instance", "chance", "observation"], columns="agent", values="normalized_regret")
+    assert row.evidence.startswith(
+        f"of returns {low:.2f} to {high:.2f} (95 %, 96 cells); of normalized regret r = {stats.pearsonr(wide['dqn'], wide['ppo'])[0]:.2f};"
+    )
     assert row.verdict == ("agrees" if low <= 0.81 <= high else "disagrees")
 
 

@@ -171,6 +171,8 @@ def _agreement(cells: "pd.DataFrame") -> dict[str, Any]:
         spread = 1.959964 / math.sqrt(number - 3)
         lower, upper = (math.tanh(math.atanh(r) + side * spread) for side in (-1, 1))
     verdict = "agrees" if lower <= _PRINTED_AGREEMENT <= upper else "disagrees"
-    return _row(
-        finding, "all", paper, f"r = {r:.2f}", f"{lower:.2f} to {upper:.2f} (95 %, {number} cells)", math.nan, verdict
-    )
+    evidence = f"of returns {lower:.2f} to {upper:.2f} (95 %, {number} cells)"
+    for regret in ("normalized_regret", "cumulative_regret"):
+        if (other := agreement(cells, regret)) is not None:
+            evidence += f"; of {regret.replace('_', ' ')} r = {other[0]:.2f}"
+    return _row(finding, "all", paper, f"r = {r:.2f}", evidence, math.nan, verdict)
