@@ -232,7 +232,7 @@ def _warn_once(cls: type, kernel: str, error: str) -> None:
         return
     _warned.add((cls, kernel))
     warnings.warn(
-        f"{cls.__name__}: Numba cannot compile its rules, so they run interpreted, 30 to 100 times slower: {error}",
+        f"{cls.__name__}: Numba cannot compile its rules, so they run interpreted, up to 100 times slower: {error}",
         RuntimeWarning,
         stacklevel=5,
     )
