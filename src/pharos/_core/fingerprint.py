@@ -47,7 +47,7 @@ def mentioned_names(functions: Iterable[Any], owner: type | None = None) -> set[
     pending = [plain_function(function) for function in functions]
     while pending:
         function = pending.pop()
-        if function in seen or not isinstance(function, types.FunctionType):
+        if not isinstance(function, types.FunctionType) or function in seen:
             continue
         seen.add(function)
         mentioned = names_in(function.__code__)
@@ -119,6 +119,16 @@ def value_text(value: Any, names: set[str], seen: dict[Any, int]) -> str:
         return f"{home}.{value.__qualname__}({', '.join(inside)})" if _first_time(value, seen) else value.__qualname__
     if isinstance(value, tuple | list):
         return f"{type(value).__name__}({', '.join(value_text(item, names, seen) for item in value)})"
+    if isinstance(value, dict):
+        items = (f"{value_text(key, names, seen)}: {value_text(item, names, seen)}" for key, item in value.items())
+        return f"{type(value).__name__}({', '.join(items)})"
+    if isinstance(value, set | frozenset):  # whose order may vary from process to process
+        return f"{type(value).__name__}({', '.join(sorted(value_text(item, names, seen) for item in value))})"
+    if type(value).__repr__ is object.__repr__:  # which tells an address, another one in each process
+        kind = f"{home}.{type(value).__qualname__}"
+        first = f"{kind} {id(value)}" not in seen
+        seen.setdefault(f"{kind} {id(value)}", len(seen))
+        return f"{kind}({value_text(getattr(value, '__dict__', {}), names, seen)})" if first else kind
     return repr(value)
 
 
