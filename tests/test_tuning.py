@@ -27,6 +27,15 @@ def test_the_score_is_the_mean_normalized_regret_of_runs_that_anyone_can_repeat(
     assert result.hyperparameters == hyperparameters("q_learning", "frozen_lake", "index")
 
 
+def test_several_kinds_of_chance_count_alike():
+    result = search(1, chances=[{}, {"random": 0.1}, {"sticky": 0.25, "random": 0.1}])
+    rows = []
+    for chance in ({}, {"random": 0.1}, {"sticky": 0.25, "random": 0.1}):
+        runs = [train("q_learning", LAKE, steps=2000, seed=seed, evaluation_interval=100, **chance) for seed in (7, 8)]
+        rows += [row["normalized_regret"] for run in runs for row in run.curve[1:]]
+    assert result.score == pytest.approx(sum(rows) / len(rows))
+
+
 def test_the_best_is_never_worse_than_what_the_table_said():
     result = search(8, space=ONE)
     scores = [trial["score"] for trial in result.trials if trial["status"] == "finished"]
@@ -77,6 +86,9 @@ def test_every_space_holds_hyperparameters_that_the_agent_has(agent):
         ({"space": {"learning_rate": ("log", 0.0, 0.5)}}, "learning_rate is .* expected"),
         ({"seeds": []}, "0 seeds"),
         ({"trials": 0}, "0 trials"),
+        ({"chances": []}, "expected one or the other"),
+        ({"chances": [{}], "random": 0.1}, "expected one or the other"),
+        ({"chances": [{"stiky": 0.1}]}, "unknown kind of chance 'stiky'; did you mean 'sticky'"),
     ],
 )
 def test_a_search_that_cannot_be_done_is_refused(change, message):
@@ -116,3 +128,12 @@ def test_the_command_prints_a_table_and_refuses_wrong_words():
     assert "mean normalized regret" in run("tune", LAKE, *options, "--trials", 1).stdout
     assert run("tune", LAKE, *options, "--seeds", "one").exit_code == 2
     assert run("tune", LAKE, *options, "--search", "gamma").exit_code == 2
+    assert run("tune", LAKE, *options, "--chance", "often").exit_code == 2
+
+
+def test_the_command_takes_several_kinds_of_chance(tmp_path):
+    options = ("--agent", "q_learning", "--steps", 500, "--trials", 1, "--seeds", 4, "--out", tmp_path / "t")
+    chances = ("--chance", "plain", "--chance", "sticky=0.25,random=0.1")
+    assert run("tune", LAKE, *options, *chances).exit_code == 0
+    kept = json.loads((tmp_path / "t" / "tuning.json").read_text())["config"]["chance"]
+    assert kept == [{"sticky": 0.0, "random": 0.0}, {"sticky": 0.25, "random": 0.1}]

@@ -46,6 +46,14 @@ def tune(
     ] = None,
     sticky: Sticky = 0.0,
     random: Random = 0.0,
+    chance: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--chance",
+            metavar="plain|NAME=P,...",
+            help="One of several kinds of chance, each for every instance: --chance plain --chance random=0.1 --chance sticky=0.25.",
+        ),
+    ] = None,
     json: Json = False,
 ) -> None:
     """Search hyperparameters of an agent for one class of environments."""
@@ -62,6 +70,7 @@ def tune(
             seeds=_seeds(seeds),
             sticky=sticky,
             random=random,
+            chances=_chances(chance),
             space=_space(search),
             search_seed=search_seed,
             out=out,
@@ -100,6 +109,21 @@ def _seeds(text: str) -> list[int]:
         return [int(word) for word in text.split(",")]
     except ValueError:
         raise ParameterError(f"--seeds {text!r}; expected whole numbers, such as 1000,1001") from None
+
+
+def _chances(words: list[str] | None) -> list[dict[str, float]] | None:
+    """`["plain", "random=0.1"]` -> `[{}, {"random": 0.1}]`; None where nothing is said."""
+    if not words:
+        return None
+    try:
+        return [
+            {} if word == "plain" else {name: float(p) for name, p in (part.split("=") for part in word.split(","))}
+            for word in words
+        ]
+    except ValueError:
+        raise ParameterError(
+            f"--chance {' '.join(words)!r}; expected plain, or such as random=0.1, or sticky=0.25,random=0.1"
+        ) from None
 
 
 def _space(words: list[str] | None) -> dict[str, tuple[Any, ...]] | None:

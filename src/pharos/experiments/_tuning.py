@@ -22,7 +22,7 @@ from typing import Any
 
 from pharos.agents._hyperparameters import hyperparameters as hyperparameters_of
 from pharos.environment import Environment, make
-from pharos.errors import MissingExtra, ParameterError
+from pharos.errors import MissingExtra, ParameterError, UnknownName
 from pharos.experiments import _results
 from pharos.experiments._task import Task
 from pharos.experiments._train import train_on
@@ -101,6 +101,7 @@ def tune(
     seeds: Iterable[int] = (0, 1),
     sticky: float = 0.0,
     random: float = 0.0,
+    chances: Sequence[Mapping[str, float]] | None = None,
     space: Mapping[str, Sequence[Any]] | None = None,
     search_seed: int = 0,
     out: str | os.PathLike | None = None,
@@ -113,6 +114,8 @@ def tune(
         environments: instances, named or made; all of one class.
         steps, observation, sticky, random: of every run, as for `train`.
         trials: number of trials, those that `out` holds already included.
+        chances: several kinds of chance, such as [{}, {"random": 0.1}, {"sticky": 0.25}], each for every instance; in place of
+            `sticky` and `random`.
         seeds: of the runs of a trial; keep them apart from the seeds of the experiment that follows.
         space: what is searched, in the form of `SPACES`; None: what that says of the agent.
         search_seed: of the search.
@@ -121,7 +124,7 @@ def tune(
     Raises:
         ParameterError: the environments are of several classes, the agent has no space, `out` holds another search, or no trial
             was finished. MissingExtra: Optuna is not installed.
-    Cost: at most trials x instances x seeds runs, about half of it with what is given up.
+    Cost: at most trials x instances x kinds of chance x seeds runs, about half of it with what is given up.
     """
     try:
         import optuna
@@ -136,14 +139,15 @@ def tune(
     if not seeds or trials < 1:
         raise ParameterError(f"{len(seeds)} seeds and {trials} trials; expected at least one of each")
     seen = "index" if agent == "q_learning" else observation
-    tasks = [Task(each, sticky=sticky, random=random, observation=seen) for each in instances]
+    kinds = _checked_chances(chances, sticky, random)
+    tasks = [Task(each, **kind, observation=seen) for each in instances for kind in kinds]
     config = {
         "agent": agent,
         "instances": [{"environment": each.name, "parameters": each.parameters} for each in instances],
         "observation": seen,
         "steps": steps,
         "seeds": seeds,
-        "chance": {"sticky": sticky, "random": random},
+        "chance": kinds[0] if len(kinds) == 1 else kinds,
         "space": {name: list(choices) for name, choices in searched.items()},
         "search_seed": search_seed,
     }
@@ -233,6 +237,21 @@ def _score(
 
 
 # The space --------------------------------------------------------------------------------------------------------------
+
+
+def _checked_chances(
+    chances: Sequence[Mapping[str, float]] | None, sticky: float, random: float
+) -> list[dict[str, float]]:
+    if chances is None:
+        return [{"sticky": sticky, "random": random}]
+    if sticky or random or not chances:
+        raise ParameterError(
+            f"chances are {list(chances)}, sticky is {sticky} and random {random}; expected one or the other"
+        )
+    for chance in chances:
+        if unknown := set(chance) - {"sticky", "random"}:
+            raise UnknownName("kind of chance", sorted(unknown)[0], ("sticky", "random"))
+    return [{"sticky": float(each.get("sticky", 0.0)), "random": float(each.get("random", 0.0))} for each in chances]
 
 
 def _checked_space(agent: str, space: Mapping[str, Sequence[Any]] | None) -> dict[str, tuple[Any, ...]]:
