@@ -140,7 +140,11 @@ def tune(
         raise ParameterError(f"{len(seeds)} seeds and {trials} trials; expected at least one of each")
     seen = "index" if agent == "q_learning" else observation
     kinds = _checked_chances(chances, sticky, random)
-    tasks = [Task(each, **kind, observation=seen) for each in instances for kind in kinds]
+    tasks = [
+        Task(each, sticky=kind["sticky"], random=kind["random"], observation=seen)
+        for each in instances
+        for kind in kinds
+    ]
     config = {
         "agent": agent,
         "instances": [{"environment": each.name, "parameters": each.parameters} for each in instances],
