@@ -425,7 +425,8 @@ def _beside(comparison: Comparison) -> str:
     return text + (
         f"<p>Returns: {len(known)} of {len(comparison.returns)} printed values have one of ours; the difference is "
         f"{known['difference'].mean():+.2f} in the mean, and {known['difference'].abs().median():.2f} in the middle case. The paper "
-        f"trains 50 thousand steps on grids and lakes, else 600 thousand; it prints no rewards, discounts, probabilities of chance, or what of a run its returns are means of: differences are to be "
+        f"trains 50 thousand steps on grids and lakes, else 600 thousand; it prints no rewards, discounts, probabilities of chance, or "
+        f"what of a run its returns are means of: differences are to be "
         f"expected.</p><details><summary>All {len(known)} values</summary>"
         + _html_table(known.drop(columns=["parameters_as_printed"]), digits=2)
         + "</details>"
