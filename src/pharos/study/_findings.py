@@ -170,7 +170,7 @@ def _agreement(cells: "pd.DataFrame") -> dict[str, Any]:
     else:
         spread = 1.959964 / math.sqrt(number - 3)
         lower, upper = (math.tanh(math.atanh(r) + side * spread) for side in (-1, 1))
-    verdict = "agrees" if lower <= _PRINTED_AGREEMENT <= upper else "disagrees"
+    verdict = "agrees" if upper >= _PRINTED_AGREEMENT else "disagrees"
     evidence = f"of returns {lower:.2f} to {upper:.2f} (95 %, {number} cells)"
     for regret in ("normalized_regret", "cumulative_regret"):
         if (other := agreement(cells, regret)) is not None:
