@@ -126,8 +126,7 @@ def value_text(value: Any, names: set[str], seen: dict[Any, int]) -> str:
         return f"{type(value).__name__}({', '.join(sorted(value_text(item, names, seen) for item in value))})"
     if type(value).__repr__ is object.__repr__:  # which tells an address, another one in each process
         kind = f"{home}.{type(value).__qualname__}"
-        first = f"{kind} {id(value)}" not in seen
-        seen.setdefault(f"{kind} {id(value)}", len(seen))
+        first = _first_time(f"{kind} {id(value)}", seen)
         return f"{kind}({value_text(getattr(value, '__dict__', {}), names, seen)})" if first else kind
     return repr(value)
 

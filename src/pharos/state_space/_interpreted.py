@@ -6,13 +6,14 @@ import os
 import signal
 import sys
 import warnings
+from functools import cached_property
 from multiprocessing.connection import Connection
 
 import numpy as np
 
 from pharos.environment import Environment
 from pharos.errors import RuleError
-from pharos.state_space._traced import TracedRules
+from pharos.state_space._traced import WORTH_TRACING, TracedRules
 
 _MOST_FILES = 1 << 16
 _SHARE = 64  # states that are worth sending to another process
@@ -122,7 +123,6 @@ class Interpreters:
 
     def __init__(self, env: Environment, workers: int):
         self.env = env
-        self._traced = TracedRules(env)
         self._connections: list[Connection] = []
         if not sys.platform.startswith("linux"):
             return
@@ -136,9 +136,14 @@ class Interpreters:
             theirs.close()
             self._connections.append(ours)
 
+    @cached_property
+    def _traced(self) -> TracedRules:
+        """Made where it is needed: compiled rules never are interpreted."""
+        return TracedRules(self.env)
+
     def successors(self, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """As `interpreted_successors` of states (N, D) int64; where they are many, traced, or shared between the processes."""
-        traced = self._traced.successors(states) if len(states) >= _SHARE else None
+        traced = self._traced.successors(states) if len(states) >= WORTH_TRACING else None
         if traced is not None:
             return traced
         shares = min(len(self._connections) + 1, len(states) // _SHARE)

@@ -9,14 +9,13 @@ import numpy as np
 
 from pharos.environment import Environment
 from pharos.errors import ParameterError, RuleError, StateSpaceError
-from pharos.state_space._traced import TracedReward
+from pharos.state_space._traced import WORTH_TRACING, TracedReward
 
 if TYPE_CHECKING:
     from pharos.mdp._rewards import Rewards
     from pharos.state_space._store import StateSpace
 
 _ROWS = 1 << 16
-_WORTH_TRACING = 64  # states
 
 
 def rewards_of_space(space: "StateSpace", rewards: Any = None, *, workers: int | None = None) -> "Rewards":
@@ -98,7 +97,7 @@ def _blocks(space: "StateSpace", env: Environment, workers: int | None):
 def _traced_rewards(space: "StateSpace", traced: TracedReward, start: int) -> np.ndarray | None:
     """The same by tracing the rule; None where that does not work."""
     stop = min(start + _ROWS, space.num_states)
-    if not traced.is_on or stop - start < _WORTH_TRACING:
+    if not traced.is_on or stop - start < WORTH_TRACING:
         return None
     successors = np.asarray(space.successors[start:stop])
     following = space.states(successors.ravel()).reshape(*successors.shape, -1)

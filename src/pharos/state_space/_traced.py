@@ -17,6 +17,7 @@ import numpy as np
 
 from pharos.environment import Environment
 
+WORTH_TRACING = 64  # states at a time
 MOST_VALUES = 1 << 16  # of a component that a tree branches on
 MOST_CHILDREN = 1 << 26
 ASKED = 64  # calls before the rest is tried again
