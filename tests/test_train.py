@@ -12,7 +12,9 @@ import pytest
 import pharos
 from pharos.errors import FileFormatError, ParameterError, UnknownName
 from pharos.experiments import _train, read_curve, read_record, train, train_config
+from pharos.experiments._learners import Deep
 from pharos.experiments._results import COLUMNS
+from pharos.experiments._task import Task
 
 SMALL = {"learning_starts": 50, "buffer_size": 1000, "target_update_interval": 50}
 
@@ -112,6 +114,25 @@ def test_a_run_that_died_goes_on_from_its_last_checkpoint(agent, tmp_path):
         assert (tmp_path / "run" / "curve.parquet").read_bytes() == (tmp_path / "whole" / "curve.parquet").read_bytes()
 
 
+@pytest.mark.parametrize("ended", [False, True])
+def test_returns_of_several_steps_end_where_a_run_was_resumed(ended, tmp_path):
+    task = Task.of("simple_grid/4x4-plain", observation="vector")
+    learners = [Deep("dqn", task, {**SMALL, "n_steps": 3}, 400, 1, None) for _ in range(2)]
+    learners[0].model.learn(100)
+    buffer = learners[0].model.replay_buffer
+    buffer.dones[buffer.pos - 1] = ended
+    learners[0].save(tmp_path / "checkpoint")
+    learners[1].load(tmp_path / "checkpoint")
+    resumed = learners[1].model.replay_buffer
+    last = resumed.pos - 1
+    observation = resumed.observations[last]
+    for _ in range(2):
+        resumed.add(observation, observation, resumed.actions[last], np.array([100.0]), np.array([False]), [{}])
+    sample = resumed._get_samples(np.array([last - 1, last]))
+    assert sample.rewards.numpy().max() <= 1.0
+    assert sample.dones.numpy().ravel().tolist() == [float(ended)] * 2  # what did not end is worth what follows
+
+
 def _long_run(folder):
     train("q_learning", "frozen_lake/8x8", steps=40_000_000, evaluation_interval=100_000, out=folder)
 
@@ -143,6 +164,11 @@ def test_a_killed_process_loses_no_more_than_an_interval(tmp_path):
             progress=progress,
         )
     assert steps == [kept["rows"][-1]["step"] + 100_000]
+
+
+def test_a_task_wants_an_environment_not_its_name():
+    with pytest.raises(ParameterError, match=r"use Task\.of"):
+        Task("simple_grid/4x4-plain")
 
 
 def test_a_finished_run_is_returned_and_another_refused(tmp_path):

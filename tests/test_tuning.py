@@ -66,6 +66,16 @@ def test_algorithms_of_stable_baselines3_are_searched_too():
     assert result.trials[1]["hyperparameters"]["batch_size"] in (16, 32)
 
 
+def test_the_first_trial_takes_from_the_agent_what_the_table_leaves_out():
+    few = {"n_steps": ("one of", 5, 1, 3), "tau": ("linear", 0.1, 1.0), "learning_rate": ("log", 1e-4, 1e-2)}
+    result = tune("dqn", "simple_grid/4x4-plain", steps=100, trials=1, seeds=[3], space=few)
+    table = hyperparameters("dqn", "simple_grid", "vector")
+    assert result.trials[0]["hyperparameters"] == {"n_steps": 1, "tau": 1.0, "learning_rate": table["learning_rate"]}
+    few = {"exploration_schedule": ("one of", "exponential", "linear")}
+    result = tune("q_learning", LAKE, steps=100, trials=1, seeds=[3], space=few)
+    assert result.trials[0]["hyperparameters"] == {"exploration_schedule": "linear"}
+
+
 @pytest.mark.parametrize("agent", SPACES)
 def test_every_space_holds_hyperparameters_that_the_agent_has(agent):
     from pharos.agents._deep import algorithm

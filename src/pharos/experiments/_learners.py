@@ -138,3 +138,5 @@ def _restore_buffer(buffer: Any, arrays: Any) -> None:
         if slash and key:
             target = target[key]
         target[: len(arrays[name])] = arrays[name]
+    last = buffer.pos - 1  # its episode is started anew, so returns of several steps must not run on into the next
+    buffer.timeouts[last] = np.logical_or(buffer.timeouts[last], np.logical_not(buffer.dones[last]))

@@ -42,10 +42,10 @@ class Task:
     horizon: int | str | None = "default"
 
     def __post_init__(self) -> None:
-        if self.horizon == "default":
-            object.__setattr__(self, "horizon", int(self.env.max_episode_steps))
         if isinstance(self.env, str):
             raise ParameterError(f"env is {self.env!r}; expected an Environment: use Task.of")
+        if self.horizon == "default":
+            object.__setattr__(self, "horizon", int(self.env.max_episode_steps))
         if self.horizon is None and self.gamma >= 1:
             raise ParameterError(
                 "gamma is 1 without a horizon, so a value may be infinite; give a horizon, or gamma < 1"

@@ -12,6 +12,7 @@ is never worse than that on the instances and seeds of the search.
 Source: Bergstra et al. (2011), Algorithms for hyper-parameter optimization; Akiba et al. (2019), Optuna.
 """
 
+import inspect
 import json
 import math
 import os
@@ -20,7 +21,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from pharos.agents._deep import algorithm
 from pharos.agents._hyperparameters import hyperparameters as hyperparameters_of
+from pharos.agents._q_learning import DEFAULTS as Q_LEARNING
 from pharos.environment import Environment, make
 from pharos.errors import MissingExtra, ParameterError, UnknownName
 from pharos.experiments import _results
@@ -42,6 +45,7 @@ SPACES: dict[str, dict[str, tuple[Any, ...]]] = {
         "learning_rate": ("log", 5e-5, 2e-3),
         "batch_size": ("one of", 32, 64, 128),
         "gamma": ("one of", 0.95, 0.98, 0.99, 0.995),
+        "n_steps": ("one of", 1, 3, 5),
         "train_freq": ("one of", 1, 4, 8),
         "learning_starts": ("one of", 200, 1000, 5000),
         "target_update_interval": ("one of", 100, 500, 1000, 2500),
@@ -170,8 +174,8 @@ def tune(
         load_if_exists=True,
     )
     if not _trials(study) and all(trial.state.name != "WAITING" for trial in study.trials):
-        first = {key: now[key] for key, choices in searched.items() if key in now and _allows(choices, now[key])}
-        study.enqueue_trial(first)
+        before = {key: now.get(key, _default(agent, key)) for key in searched}
+        study.enqueue_trial({key: value for key, value in before.items() if _allows(searched[key], value)})
 
     for task in tasks:
         if not task.reference.optimal - task.reference.uniform > 1e-12:
@@ -282,9 +286,19 @@ def _suggested(trial: Any, name: str, choices: tuple[Any, ...]) -> Any:
     return trial.suggest_float(name, *values, log=kind == "log")
 
 
+def _default(agent: str, name: str) -> Any:
+    """What the agent itself takes for a hyperparameter that the table leaves out; None: it says nothing."""
+    if agent == "q_learning":
+        return Q_LEARNING.get(name)
+    parameter = inspect.signature(algorithm(agent)).parameters.get(name)
+    return None if parameter is None or parameter.default is parameter.empty else parameter.default
+
+
 def _allows(choices: tuple[Any, ...], value: Any) -> bool:
     kind, *values = choices
-    return value in values if kind == "one of" else values[0] <= value <= values[1]
+    if kind == "one of":
+        return value in values
+    return isinstance(value, int | float) and values[0] <= value <= values[1]
 
 
 def _class_of(instances: Sequence[Environment]) -> str:
