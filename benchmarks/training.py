@@ -69,6 +69,7 @@ COMMON = {
     "learning_starts": 500,
     "train_freq": 4,
     "gradient_steps": 1,
+    "n_steps": 1,
     "batch_size": 64,
     "learning_rate": 0.0005,
 }

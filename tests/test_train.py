@@ -1,6 +1,7 @@
 """Training runs: what is written, what a kill loses, that seeds decide everything, and that regret is what it is defined to be."""
 
 import json
+import math
 import multiprocessing
 import os
 import signal
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 import pharos
+from pharos.agents._deep import check_hyperparameters
 from pharos.errors import FileFormatError, ParameterError, UnknownName
 from pharos.experiments import _train, read_curve, read_record, train, train_config
 from pharos.experiments._learners import Deep
@@ -204,7 +206,7 @@ def test_an_algorithm_can_be_named_by_its_path():
         ({"agent": "dqm"}, UnknownName, "did you mean 'dqn'"),
         ({"agent": "stable_baselines3:DQM"}, UnknownName, "did you mean"),
         ({"agent": "dqn", "observation": "vectro"}, UnknownName, "did you mean 'vector'"),
-        ({"agent": "dqn", "hyperparameters": {"learning_rat": 1}}, ParameterError, "learning_rat"),
+        ({"agent": "dqn", "hyperparameters": {"learning_rat": 1}}, UnknownName, "did you mean 'learning_rate'"),
         ({"agent": "q_learning", "steps": 0}, ParameterError, "steps is 0"),
         ({"agent": "q_learning", "evaluation_interval": -1}, ParameterError, "evaluation_interval is -1"),
         ({"agent": "q_learning", "horizon": None}, ParameterError, "give a horizon"),
@@ -215,6 +217,34 @@ def test_what_is_wrong_is_said_before_anything_is_learnt(options, error, message
     agent = options.pop("agent")
     with pytest.raises(error, match=message):
         train(agent, "simple_grid/4x4-plain", **{"steps": 100, **options})
+
+
+@pytest.mark.parametrize(
+    ("agent", "given", "expected"),
+    [
+        ("dqn", {"train_freq": 0}, "an integer of at least 1"),
+        ("dqn", {"batch_size": 0.5}, "an integer of at least 1"),
+        ("dqn", {"buffer_size": math.inf}, "an integer of at least 1"),
+        ("dqn", {"n_envs": "many"}, "an integer of at least 1"),
+        ("dqn", {"learning_rate": -1}, "a number above 0"),
+        ("dqn", {"learning_rate": math.nan}, "a number above 0"),
+        ("dqn", {"gamma": 2}, "a number from 0 to 1"),
+        ("dqn", {"learning_starts": -1}, "a number of at least 0"),
+        ("ppo", {"n_epochs": 0}, "an integer of at least 1"),
+        ("ppo", {"clip_range": True}, "a number above 0"),
+    ],
+)
+def test_numbers_that_an_algorithm_would_take_without_a_word_are_refused(agent, given, expected):
+    (name, value), *_ = given.items()
+    with pytest.raises(ParameterError, match=rf"{name} is {value!r}; expected {expected}"):
+        train(agent, "simple_grid/4x4-plain", steps=100, hyperparameters=given)
+
+
+def test_schedules_and_words_that_an_algorithm_takes_pass():
+    check_hyperparameters(
+        "dqn", {"learning_rate": lambda left: 1e-3 * left, "train_freq": (1, "episode"), "net_arch": [8]}
+    )
+    check_hyperparameters("stable_baselines3:SAC", {"ent_coef": "auto", "n_envs": 2, "gradient_steps": -1})
 
 
 def test_a_folder_that_is_no_run_is_said_to_be_none(tmp_path):

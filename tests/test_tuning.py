@@ -67,10 +67,12 @@ def test_algorithms_of_stable_baselines3_are_searched_too():
 
 
 def test_the_first_trial_takes_from_the_agent_what_the_table_leaves_out():
-    few = {"n_steps": ("one of", 5, 1, 3), "tau": ("linear", 0.1, 1.0), "learning_rate": ("log", 1e-4, 1e-2)}
+    few = {"stats_window_size": ("one of", 50, 100), "tau": ("linear", 0.1, 1.0), "learning_rate": ("log", 1e-4, 1e-2)}
     result = tune("dqn", "simple_grid/4x4-plain", steps=100, trials=1, seeds=[3], space=few)
     table = hyperparameters("dqn", "simple_grid", "vector")
-    assert result.trials[0]["hyperparameters"] == {"n_steps": 1, "tau": 1.0, "learning_rate": table["learning_rate"]}
+    of_the_agent = {"stats_window_size": 100, "tau": 1.0}
+    assert not of_the_agent.keys() & table.keys()
+    assert result.trials[0]["hyperparameters"] == {**of_the_agent, "learning_rate": table["learning_rate"]}
     few = {"exploration_schedule": ("one of", "exponential", "linear")}
     result = tune("q_learning", LAKE, steps=100, trials=1, seeds=[3], space=few)
     assert result.trials[0]["hyperparameters"] == {"exploration_schedule": "linear"}

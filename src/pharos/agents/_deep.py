@@ -6,6 +6,9 @@ representations, not between networks (the pharos paper, section 4.2).
 """
 
 import importlib
+import inspect
+import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -13,6 +16,10 @@ import numpy as np
 from pharos.errors import MissingExtra, ParameterError, UnknownName
 
 FEATURES = 128
+LEAST_ONE = ("n_envs", "n_steps", "n_epochs", "batch_size", "buffer_size", "train_freq", "target_update_interval")
+SHARES = ("gamma", "gae_lambda", "tau", "exploration_fraction", "exploration_initial_eps", "exploration_final_eps")
+POSITIVE = ("learning_rate", "clip_range", "max_grad_norm")
+NOT_NEGATIVE = ("learning_starts", "ent_coef", "vf_coef")
 ALGORITHMS = {"dqn": "stable_baselines3:DQN", "ppo": "stable_baselines3:PPO", "a2c": "stable_baselines3:A2C"}
 
 
@@ -38,6 +45,43 @@ def algorithm(name: str) -> type:
         ) from error
 
 
+def check_hyperparameters(name: str, hyperparameters: Mapping[str, Any]) -> None:
+    """Refuse hyperparameters that the algorithm does not have, and numbers that it would take without a word or fail with late.
+
+    Raises:
+        UnknownName: with the nearest name that it has. ParameterError: a number out of its range, or something else for one.
+    """
+    taken = inspect.signature(algorithm(name)).parameters
+    if all(each.kind is not inspect.Parameter.VAR_KEYWORD for each in taken.values()):
+        known = sorted({*taken, "n_envs", "n_timesteps", "net_arch"} - _OURS)
+        for given in hyperparameters:
+            if given not in known:
+                raise UnknownName(f"hyperparameter of {name}", given, known)
+    for given, value in hyperparameters.items():
+        expected = _expected(given, value)
+        if expected is not None:
+            raise ParameterError(f"agent {name!r}: {given} is {value!r}; expected {expected}")
+
+
+_OURS = {"env", "seed", "device", "tensorboard_log", "_init_setup_model"}
+
+
+def _expected(name: str, value: Any) -> str | None:
+    """What a hyperparameter should be where `value` is not that; schedules and other things than numbers and words pass."""
+    if not isinstance(value, int | float | str):
+        return None
+    number = value if not isinstance(value, bool | str) else math.nan
+    if name in LEAST_ONE and not (number >= 1 and float(number).is_integer()):
+        return "an integer of at least 1"
+    if name in SHARES and not 0 <= number <= 1:
+        return "a number from 0 to 1"
+    if name in POSITIVE and not 0 < number < math.inf:
+        return "a number above 0"
+    if name in NOT_NEGATIVE and value != "auto" and not 0 <= number < math.inf:  # SAC's ent_coef
+        return "a number of at least 0"
+    return None
+
+
 def extractor(space: Any) -> type:
     """The class of feature extractor for an observation space."""
     from stable_baselines3.common.torch_layers import CombinedExtractor
@@ -59,7 +103,7 @@ def make_model(
         env: a VecEnv of Stable-Baselines3.
         hyperparameters: of the algorithm; `net_arch` for the layers after the features; `n_envs` and `n_timesteps` are left out.
     Raises:
-        ParameterError: the algorithm does not know a hyperparameter, or does not fit the environment.
+        ParameterError: the algorithm does not know a hyperparameter (`check_hyperparameters` says so better), or does not fit the environment.
     """
     import torch
 
@@ -81,7 +125,7 @@ def make_model(
             tensorboard_log=tensorboard,
             **options,
         )
-    except (TypeError, AssertionError) as error:
+    except (TypeError, ValueError, AssertionError) as error:
         raise ParameterError(f"agent {name!r} cannot be made: {error}") from error
     if tensorboard is None and not options.get("verbose"):
         from stable_baselines3.common.logger import Logger

@@ -43,8 +43,9 @@ class Deep:
     def __init__(
         self, name: str, task: Task, hyperparameters: dict[str, Any], steps: int, seed: int, tensorboard: str | None
     ):
-        from pharos.agents._deep import DeepPolicy, make_model
+        from pharos.agents._deep import DeepPolicy, check_hyperparameters, make_model
 
+        check_hyperparameters(name, hyperparameters)
         self.task, self.steps = task, steps
         env = vector_environment(task, int(hyperparameters.get("n_envs", 1)), seed)
         self.model = make_model(name, env, hyperparameters, seed=seed, tensorboard=tensorboard)
