@@ -245,6 +245,7 @@ def test_schedules_and_words_that_an_algorithm_takes_pass():
         "dqn", {"learning_rate": lambda left: 1e-3 * left, "train_freq": (1, "episode"), "net_arch": [8]}
     )
     check_hyperparameters("stable_baselines3:SAC", {"ent_coef": "auto", "n_envs": 2, "gradient_steps": -1})
+    check_hyperparameters("stable_baselines3:SAC", {"ent_coef": "auto_0.1"})
 
 
 def test_a_folder_that_is_no_run_is_said_to_be_none(tmp_path):

@@ -20,6 +20,7 @@ LEAST_ONE = ("n_envs", "n_steps", "n_epochs", "batch_size", "buffer_size", "trai
 SHARES = ("gamma", "gae_lambda", "tau", "exploration_fraction", "exploration_initial_eps", "exploration_final_eps")
 POSITIVE = ("learning_rate", "clip_range", "max_grad_norm")
 NOT_NEGATIVE = ("learning_starts", "ent_coef", "vf_coef")
+OURS = {"env", "seed", "device", "tensorboard_log", "_init_setup_model"}  # what `make_model` gives itself
 ALGORITHMS = {"dqn": "stable_baselines3:DQN", "ppo": "stable_baselines3:PPO", "a2c": "stable_baselines3:A2C"}
 
 
@@ -53,7 +54,7 @@ def check_hyperparameters(name: str, hyperparameters: Mapping[str, Any]) -> None
     """
     taken = inspect.signature(algorithm(name)).parameters
     if all(each.kind is not inspect.Parameter.VAR_KEYWORD for each in taken.values()):
-        known = sorted({*taken, "n_envs", "n_timesteps", "net_arch"} - _OURS)
+        known = sorted({*taken, "n_envs", "n_timesteps", "net_arch"} - OURS)
         for given in hyperparameters:
             if given not in known:
                 raise UnknownName(f"hyperparameter of {name}", given, known)
@@ -61,9 +62,6 @@ def check_hyperparameters(name: str, hyperparameters: Mapping[str, Any]) -> None
         expected = _expected(given, value)
         if expected is not None:
             raise ParameterError(f"agent {name!r}: {given} is {value!r}; expected {expected}")
-
-
-_OURS = {"env", "seed", "device", "tensorboard_log", "_init_setup_model"}
 
 
 def _expected(name: str, value: Any) -> str | None:
@@ -77,7 +75,9 @@ def _expected(name: str, value: Any) -> str | None:
         return "a number from 0 to 1"
     if name in POSITIVE and not 0 < number < math.inf:
         return "a number above 0"
-    if name in NOT_NEGATIVE and value != "auto" and not 0 <= number < math.inf:  # SAC's ent_coef
+    if name == "ent_coef" and isinstance(value, str) and value.startswith("auto"):  # SAC's, with or without a first value
+        return None
+    if name in NOT_NEGATIVE and not 0 <= number < math.inf:
         return "a number of at least 0"
     return None
 
