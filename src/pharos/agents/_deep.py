@@ -75,9 +75,7 @@ def _expected(name: str, value: Any) -> str | None:
         return "a number from 0 to 1"
     if name in POSITIVE and not 0 < number < math.inf:
         return "a number above 0"
-    if (
-        name == "ent_coef" and isinstance(value, str) and value.startswith("auto")
-    ):  # SAC's, with or without a first value
+    if name == "ent_coef" and str(value).startswith("auto"):  # SAC's, with or without a first value
         return None
     if name in NOT_NEGATIVE and not 0 <= number < math.inf:
         return "a number of at least 0"
