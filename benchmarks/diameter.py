@@ -13,8 +13,8 @@ import time
 import numpy as np
 
 import pharos
-from pharos.hardness._choices import choices_of
-from pharos.hardness._diameter import Graph
+from pharos.hardness.choices import choices_of
+from pharos.hardness.diameter import Graph
 
 SMALL = {
     "frozen_lake 100": ("frozen_lake", {"size": 100, "seed": 0}),

@@ -15,8 +15,8 @@ from pathlib import Path
 
 import pharos
 from pharos import hardness, importers
-from pharos.hardness._effective_horizon import TIE, _compiled, _Steps, _vectorized
-from pharos.hardness._large_horizon import LargeHorizon
+from pharos.hardness.effective_horizon import TIE, _compiled, _Steps, _vectorized
+from pharos.hardness.large_horizon import LargeHorizon
 from pharos.mdp import sticky_actions
 
 CORRIDOR = Path(__file__).parents[1] / "tests" / "data" / "bridge" / "key-corridor-s3r1.npz"

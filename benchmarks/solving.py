@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 import pharos
-from pharos._core import bellman
+from pharos.kernels import bellman
 
 INSTANCE = sys.argv[1] if len(sys.argv) > 1 else "breakout/12x10x1"
 THREADS = 2

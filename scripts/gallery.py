@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 import pharos
-from pharos import rendering
+from pharos.drawing import pictures as rendering
 from pharos.observations import observe
 
 DOCS = Path(__file__).parents[1] / "docs"

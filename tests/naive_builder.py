@@ -6,7 +6,7 @@ As in the text of the paper (section 3.2), not as printed: every transition is s
 from collections import deque
 from dataclasses import dataclass
 
-from pharos.environment import Environment, State, start_distribution
+from pharos.environments import Environment, State, start_distribution
 
 
 @dataclass(frozen=True)

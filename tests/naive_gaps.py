@@ -1,4 +1,4 @@
-"""Suboptimality gaps from the explicit matrices of `naive_mdp.augmented`: the slow twin of pharos.hardness._gaps."""
+"""Suboptimality gaps from the explicit matrices of `naive_mdp.augmented`: the slow twin of pharos.hardness.gaps."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Least expected hitting times by value iteration on explicit matrices: the slow twin of pharos.hardness._stochastic_diameter."""
+"""Least expected hitting times by value iteration on explicit matrices: the slow twin of pharos.hardness.stochastic_diameter."""
 
 import math
 

@@ -6,7 +6,7 @@ from functools import cached_property
 import numpy as np
 from hypothesis import strategies as st
 
-from pharos.environment import Environment
+from pharos.environments import Environment
 
 
 @dataclass(frozen=True, kw_only=True)

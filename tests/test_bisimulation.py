@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 
 import pharos
 from pharos import importers
-from pharos.bisimulation import minimize
 from pharos.errors import ParameterError
 from pharos.mdp import TabularMDP, random_actions, sticky_actions
+from pharos.mdp.bisimulation import minimize
 from strategies import deterministic_mdps, general_mdps, probabilities
 
 BRIDGE = Path(__file__).parent / "data" / "bridge"

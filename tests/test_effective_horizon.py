@@ -1,5 +1,6 @@
 """The effective horizon: published analyses, its definition by brute force, and theory."""
 
+import importlib
 import json
 import math
 from pathlib import Path
@@ -13,8 +14,8 @@ import pharos
 from naive_horizon import analysis
 from pharos import hardness
 from pharos.errors import ParameterError, UndefinedMeasure
-from pharos.hardness._effective_horizon import TIE, _compiled, _Steps, _vectorized
-from pharos.hardness._large_horizon import LargeHorizon
+from pharos.hardness.effective_horizon import TIE, _compiled, _Steps, _vectorized
+from pharos.hardness.large_horizon import LargeHorizon
 from pharos.mdp import TabularMDP, random_actions, sticky_actions
 from strategies import deterministic_mdps, general_mdps
 
@@ -118,7 +119,7 @@ def test_the_compiled_analysis_of_key_corridor_is_the_published_one():
 def test_larger_games_are_analysed_by_the_compiled_one(monkeypatch):
     mdp = pharos.build(pharos.make("frozen_lake/8x8")).mdp(gamma=1.0)
     expected = hardness.effective_horizon(mdp, horizon=30)
-    monkeypatch.setattr("pharos.hardness._effective_horizon.COMPILED", 0)
+    monkeypatch.setattr(importlib.import_module("pharos.hardness.effective_horizon"), "COMPILED", 0)
     assert hardness.effective_horizon(mdp, horizon=30) == expected
 
 

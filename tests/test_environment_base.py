@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 import pharos
-from pharos.environment import Environment, start_distribution
+from pharos.environments import Environment, start_distribution
 from pharos.errors import ParameterError, PharosError, UnknownName
 
 

@@ -14,9 +14,8 @@ from hypothesis import strategies as st
 import golden_games
 import naive_environments as naive
 import pharos
-from pharos import environments
-from pharos.environment import Environment
-from pharos.environments import named_instances, register, text_drawing
+from pharos.drawing.text import text_drawing
+from pharos.environments import Environment, catalog, named_instances, register
 from pharos.errors import ParameterError, UnknownName
 
 GRIDS = ("simple_grid", "frozen_lake")
@@ -438,7 +437,7 @@ def test_a_registered_class_is_made_by_name_and_built_in_names_are_kept(monkeypa
     class Registered(type(pharos.make("simple_grid"))):
         name = "my_grid"
 
-    monkeypatch.setattr(environments, "_REGISTERED", {})
+    monkeypatch.setattr(catalog, "_REGISTERED", {})
     assert register(Registered) is Registered
     assert type(pharos.make("my_grid", height=3)) is Registered
     assert "my_grid" in pharos.list_environments()
@@ -461,7 +460,7 @@ class Mine(SimpleGrid):
 def test_a_class_of_ones_own_file_is_made_by_its_path(tmp_path, monkeypatch, written):
     (tmp_path / "my_rules.py").write_text(MINE)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(environments, "_REGISTERED", {})
+    monkeypatch.setattr(catalog, "_REGISTERED", {})
     path = list(sys.path)
     env = pharos.make(written.format(folder=tmp_path), height=3)
     assert (env.name, env.height) == ("mine", 3)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from naive_gorp import failure_probability, returns_of_paths
 from pharos import hardness, importers
 from pharos.errors import ParameterError, UndefinedMeasure
-from pharos.hardness._gorp import METHODS, _knapsack, _Search
+from pharos.hardness.gorp import METHODS, _knapsack, _Search
 from pharos.mdp import TabularMDP, sticky_actions
 from strategies import deterministic_mdps, small_mdps
 

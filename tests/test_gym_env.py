@@ -11,10 +11,10 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import pharos
+from pharos.drawing.pictures import human
 from pharos.errors import MissingExtra, ParameterError
-from pharos.gym_env import GymEnv, chance_weights
+from pharos.interaction.gym_env import GymEnv, chance_weights
 from pharos.observations import observe
-from pharos.rendering import human
 
 SMALL = {
     "pharos/SimpleGrid-v0": {"height": 3, "width": 4, "rewards": (((1, 1), 0.1),), "penalties": (((0, 2), -0.5),)},

@@ -9,7 +9,7 @@ from hypothesis.extra import numpy as hnp
 import pharos
 from pharos.errors import ParameterError
 from pharos.mdp import Rewards, TabularMDP, random_actions, sticky_actions
-from pharos.mdp._rewards import RewardsCollector
+from pharos.mdp.rewards import RewardsCollector
 from pharos.solvers import uniform_value, value_iteration, worst_value
 from strategies import deterministic_mdps, probabilities, small_mdps
 

@@ -14,9 +14,9 @@ from typer.testing import CliRunner
 
 import pharos
 from pharos import hardness, importers
-from pharos.bisimulation import minimize
 from pharos.cli import app
 from pharos.errors import MissingExtra, ParameterError, RuleError, StateSpaceTooLarge
+from pharos.mdp.bisimulation import minimize
 
 CORRIDOR = "MiniGrid-KeyCorridorS3R1-v0"
 PUBLISHED = Path(__file__).parent / "data" / "bridge" / "key-corridor-s3r1.npz"

@@ -8,11 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numba import njit
 
-from pharos._core.hash_table import fill, fill_more, fill_range, find, mixed, slot_of
-from pharos._core.packed import clear_fault, fault, get_word, packed_view, set_word
-from pharos.environment import Components
+from pharos.environments import Components
 from pharos.errors import ParameterError
-from pharos.state_space._packing import layout_of, pack, unpack
+from pharos.kernels.hash_table import fill, fill_more, fill_range, find, mixed, slot_of
+from pharos.rules.layout import layout_of, pack, unpack
+from pharos.rules.packed_view import clear_fault, fault, get_word, packed_view, set_word
 
 sizes = st.sampled_from([1, 2, 3, 4, 5, 8, 9, 64, 255, 256, 257, 2**31, 2**32, 2**32 + 1, 2**62, 2**63 - 1])
 ranges = st.lists(st.tuples(st.integers(-(2**62), 0), sizes), min_size=1, max_size=30)

@@ -13,8 +13,8 @@ import pharos
 from pharos import hardness, plots
 from pharos.errors import FileFormatError, ParameterError
 from pharos.experiments import Task, read_curve, train
-from pharos.plots._plane import _label
-from pharos.plots._style import thousands
+from pharos.plots.plane import _label
+from pharos.plots.style import thousands
 
 
 @pytest.fixture(scope="module")

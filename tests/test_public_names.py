@@ -22,18 +22,18 @@ HEAVY = ("numba", "scipy", "pandas", "matplotlib", "torch", "rich", "typer", "st
 
 # A file imports, at its top, only what stands before it. Inside of functions `make` and `StateSpace` look ahead.
 ORDER = (
-    *("errors", "paths", "environment", "environments", "_core", "state_space", "mdp", "solvers", "hardness"),
-    *("bisimulation", "importers", "exporters", "conformance", "observations", "rendering", "_window", "gym_env"),
-    *("vector_env", "sb3_env", "_registration", "agents", "experiments", "plots", "study", "cli", "__main__"),
+    *("errors", "paths", "kernels", "environments", "drawing", "rules", "state_space", "mdp", "solvers", "hardness"),
+    *("importers", "exporters", "observations", "interaction", "agents", "experiments", "plots", "study"),
+    *("sb3_env", "bisimulation", "cli", "__main__"),
 )
 
 # These may never meet, not even inside of a function.
 STRANGERS = {
-    "solvers": {"environment", "environments", "state_space", "observations", "gym_env"},
-    "hardness": {"environment", "environments", "state_space", "observations", "gym_env"},
-    "mdp": {"environment", "environments", "observations", "gym_env", "solvers", "hardness"},
-    "state_space": {"solvers", "hardness", "observations", "gym_env"},
-    "environments": {"state_space", "mdp", "solvers", "hardness", "observations", "gym_env", "_core"},
+    "solvers": {"environments", "state_space", "observations", "interaction"},
+    "hardness": {"environments", "state_space", "observations", "interaction"},
+    "mdp": {"observations", "interaction", "solvers", "hardness"},
+    "state_space": {"solvers", "hardness", "observations", "interaction"},
+    "environments": {"state_space", "mdp", "solvers", "hardness", "observations", "interaction", "kernels"},
 }
 
 

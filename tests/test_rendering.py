@@ -8,9 +8,7 @@ import pytest
 from PIL import Image
 
 from pharos import Environment, Layer, make
-from pharos.environments import text_drawing
-from pharos.errors import ParameterError, UnknownName
-from pharos.rendering import (
+from pharos.drawing.pictures import (
     RENDERERS,
     colored_text,
     episode,
@@ -23,6 +21,8 @@ from pharos.rendering import (
     shade,
     text,
 )
+from pharos.drawing.text import text_drawing
+from pharos.errors import ParameterError, UnknownName
 
 ENVIRONMENTS = ["simple_grid/6x6-decoy", "frozen_lake/8x8", "freeway/16x7-speed2", "breakout/12x8x3"]
 

@@ -8,9 +8,9 @@ from typer.testing import CliRunner
 
 import pharos
 from pharos import hardness
-from pharos.cli._app import app
+from pharos.cli.app import app
 from pharos.errors import ParameterError, UndefinedMeasure, UnknownName
-from pharos.hardness import _registry
+from pharos.hardness import registry as _registry
 from pharos.mdp import TabularMDP
 
 MEASURES = {
@@ -145,7 +145,7 @@ def test_a_horizon_must_be_a_number_of_steps():
 
 
 def run(*words):
-    return CliRunner().invoke(app, ["hardness", *words])
+    return CliRunner().invoke(app, ["hardness", *words], env={"COLUMNS": "160"})
 
 
 def test_the_command_answers_with_the_keys_of_its_contract():

@@ -1,5 +1,6 @@
 """Files of runs: replaced whole, the same bytes for the same rows, and what is damaged or failed is said to be."""
 
+import importlib
 import json
 import math
 import tempfile
@@ -11,7 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pharos.errors import FileFormatError
-from pharos.experiments import _results, _train, read_curve, read_record, train
+from pharos.experiments import read_curve, read_record, train
+from pharos.experiments import results as _results
+
+_train = importlib.import_module("pharos.experiments.train")
 
 ROW = {name: 1 if dtype == "int64" else True if dtype == "bool" else 0.5 for name, dtype in _results.COLUMNS.items()}
 values = st.recursive(

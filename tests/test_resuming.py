@@ -1,6 +1,7 @@
 """The files of a state space do not depend on threads, blocks, or on how often the build was killed, stopped or refused."""
 
 import errno
+import importlib
 import multiprocessing
 import os
 import resource
@@ -14,11 +15,12 @@ import numpy as np
 import pytest
 
 import pharos
-from pharos.environment import Environment
+from pharos.environments import Environment
 from pharos.errors import DiskFull, RuleError, StateSpaceIncomplete, StateSpaceLocked, StateSpaceTooLarge
-from pharos.state_space import _build as building
-from pharos.state_space import _files as writing
+from pharos.state_space import files as writing
 from table_worlds import TableWorld
+
+building = importlib.import_module("pharos.state_space.build")
 
 BREAKOUT = pharos.make("breakout", height=7, columns=5)  # 27,692 states; a frontier of hundreds
 NARROW = TableWorld(num_positions=5000, lows="-1000,0,7", sizes=f"{2**40},{2**30},1", num_starts=3, end_share=0.05)
@@ -294,7 +296,7 @@ def test_indices_widen_while_the_table_is_on_disk(widened, tmp_path, little_memo
 
 
 def test_interpreted_rules_are_enumerated_with_the_table_on_disk(tmp_path, undisturbed, little_memory, monkeypatch):
-    monkeypatch.setattr("pharos._core.compiling.compiled_rules", lambda *args: None)
+    monkeypatch.setattr("pharos.rules.compiled.compiled_rules", lambda *args: None)
     build(BREAKOUT, tmp_path / "space")
     assert_same_files(tmp_path / "space", undisturbed["breakout"])
 
@@ -345,8 +347,8 @@ def test_a_rule_that_fails_is_blamed_with_the_table_on_disk(tmp_path, little_mem
 @pytest.fixture
 def interpreted(monkeypatch):
     """Rules that are neither compiled nor traced: each state is asked."""
-    monkeypatch.setattr("pharos._core.compiling.compiled_rules", lambda *args: None)
-    monkeypatch.setattr("pharos.state_space._traced.TracedRules.successors", lambda self, states: None)
+    monkeypatch.setattr("pharos.rules.compiled.compiled_rules", lambda *args: None)
+    monkeypatch.setattr("pharos.rules.traced.TracedRules.successors", lambda self, states: None)
 
 
 @pytest.mark.parametrize("env", (BREAKOUT, NARROW), ids=lambda env: env.name)

@@ -163,7 +163,7 @@ def test_a_closed_part_of_an_mdp_has_the_same_values_alone(mdp):
 @often
 @given(small_mdps(), st.integers(0, 2**32))
 def test_backups_contract_in_the_maximum_norm(mdp, seed):
-    from pharos.solvers._value_iteration import _Sweeper
+    from pharos.solvers.values import _Sweeper
 
     sweeper = _Sweeper(mdp, 1.0)
     rng = np.random.default_rng(seed)

@@ -1,5 +1,6 @@
 """build, load and StateSpace: Algorithm 1, its files, and what can go wrong."""
 
+import importlib
 import multiprocessing
 import os
 import tempfile
@@ -12,7 +13,7 @@ from hypothesis import given, settings
 
 import naive_builder
 import pharos
-from pharos.environment import Environment
+from pharos.environments import Environment
 from pharos.errors import (
     ParameterError,
     RuleError,
@@ -21,8 +22,9 @@ from pharos.errors import (
     StateSpaceMismatch,
     StateSpaceTooLarge,
 )
-from pharos.state_space import _build as building
 from table_worlds import TableWorld, table_worlds
+
+building = importlib.import_module("pharos.state_space.build")
 
 SMALL = (
     pharos.make("simple_grid", height=5, width=3, penalties=(((1, 1), -1.0),)),
@@ -198,7 +200,7 @@ def test_a_folder_that_cannot_be_written_to_is_refused(tmp_path):
         os._exit(0)
 
     build(GRID, tmp_path / "compiled")  # so that the child compiles nothing
-    for folder in (tmp_path, tmp_path.parent, tmp_path.parent.parent):
+    for folder in (tmp_path, *tmp_path.parents[: len(tmp_path.relative_to(tempfile.gettempdir()).parts)]):
         folder.chmod(0o755)
     (tmp_path / "closed").mkdir(mode=0o555)
     process = multiprocessing.get_context("fork").Process(target=attempt)

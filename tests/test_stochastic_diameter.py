@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 import naive_hitting
 import pharos
 from pharos import hardness
-from pharos.hardness._travel import TravelBounds
+from pharos.hardness.travel import TravelBounds
 from pharos.mdp import TabularMDP, random_actions, sticky_actions
 from strategies import deterministic_mdps, general_mdps
 
@@ -43,9 +43,9 @@ def test_diameters_are_those_of_the_explicit_matrices(mdp, restart):
 @pytest.mark.parametrize("workers", [2, 5])
 def test_results_do_not_depend_on_the_number_of_threads(workers, monkeypatch):
     mdp = random_actions(pharos.build(pharos.make("frozen_lake/8x8")).mdp(), 0.1)
-    monkeypatch.setattr("pharos.hardness._stochastic_diameter.usable_workers", lambda _: 1)
+    monkeypatch.setattr("pharos.hardness.stochastic_diameter.usable_workers", lambda _: 1)
     expected = hardness.diameter(mdp)
-    monkeypatch.setattr("pharos.hardness._stochastic_diameter.usable_workers", lambda _: workers)
+    monkeypatch.setattr("pharos.hardness.stochastic_diameter.usable_workers", lambda _: workers)
     found = hardness.diameter(mdp)
     assert (found.lower, found.upper, found.searches) == (expected.lower, expected.upper, expected.searches)
 
@@ -95,7 +95,7 @@ def test_spaces_too_large_for_a_look_at_each_target_have_the_same_diameter(mdp):
     mdp = random_actions(mdp, 0.25)
     expected, _ = naive_hitting.diameter(mdp, True)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("pharos.hardness._stochastic_diameter.MANY", -1)
+        patch.setattr("pharos.hardness.stochastic_diameter.MANY", -1)
         found = hardness.diameter(mdp)
     if math.isinf(expected):
         assert math.isinf(found.lower) and (found.exact or not found.counted)

@@ -7,9 +7,10 @@ import pytest
 import fake_training
 from pharos import study
 from pharos.errors import ParameterError
-from pharos.study import _worker
-from pharos.study._latex import returns_table
-from pharos.study._table import _chosen, _last_return, _number
+from pharos.study import tables
+from pharos.study import worker as _worker
+from pharos.study.latex import returns_table
+from pharos.study.tables import _chosen, _last_return, _number
 
 SPECIFICATION = {
     "name": "formulas",
@@ -93,7 +94,7 @@ def test_curves_hold_every_evaluation_of_every_run(done):
 def test_a_cell_is_the_mean_over_seeds(rows, cells):
     assert len(cells) == 8 * (2 * 2 + 1) and set(cells["seeds"]) == {3}
     cell = cells.iloc[17]
-    same = rows[(rows[study._table.CELL] == cell[study._table.CELL]).all(axis=1)]
+    same = rows[(rows[tables.CELL] == cell[tables.CELL]).all(axis=1)]
     assert len(same) == 3
     assert cell["cumulative_regret"] == pytest.approx(same["cumulative_regret"].mean())
     assert cell["return_deviation"] == pytest.approx(np.std(same["return"]))
@@ -116,7 +117,7 @@ def test_one_seed_has_no_deviation_and_one_run_a_task_no_interval(rows):
 def test_hardness_is_that_of_the_report_and_kept_in_the_folder(done, measured, cells):
     from pharos import hardness, make
 
-    mdp = study._table.build_mdp("frozen_lake", {"size": 8}, {"sticky": 0.0, "random": 0.0}, 0.99)
+    mdp = tables.build_mdp("frozen_lake", {"size": 8}, {"sticky": 0.0, "random": 0.0}, 0.99)
     report = hardness.report(mdp, ["diameter", "sum_of_reciprocal_gaps"], horizon=make("frozen_lake").max_episode_steps)
     row = measured[measured["instance"] == "frozen_lake/8x8"].iloc[0]
     assert row["diameter"] == report["diameter"].value["lower"]

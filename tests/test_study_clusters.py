@@ -12,7 +12,7 @@ import pytest
 import fake_training
 from pharos import study
 from pharos.errors import MissingExtra, ParameterError
-from pharos.study._execution import shard_of
+from pharos.study.execution import shard_of
 
 SPECIFICATION = study.specification(
     {

@@ -7,7 +7,7 @@ import pytest
 
 from pharos import study
 from pharos.errors import ParameterError
-from pharos.study._specification import parse
+from pharos.study.specification import parse
 
 DOCS = Path(__file__).parents[1] / "docs"
 PAGE = (DOCS / "running-a-study.md").read_text(encoding="utf-8")
@@ -33,7 +33,7 @@ def test_the_numbers_of_runs_on_the_page_are_those_of_the_presets():
 def test_every_option_on_the_page_is_one_of_the_command():
     from typer.main import get_command
 
-    from pharos.cli._study import app
+    from pharos.cli.study import app
 
     commands = get_command(app).commands
     known = {option for command in commands.values() for parameter in command.params for option in parameter.opts}

@@ -14,8 +14,9 @@ import pytest
 import fake_training
 from pharos import study
 from pharos.errors import ParameterError
-from pharos.study import _execution, _worker
-from pharos.study._execution import shard_of
+from pharos.study import execution as _execution
+from pharos.study import worker as _worker
+from pharos.study.execution import shard_of
 
 TESTS = Path(__file__).parent
 

@@ -10,11 +10,11 @@ import pytest
 
 import fake_training
 from pharos import study
-from pharos.study import _worker
-from pharos.study._execution import claim
-from pharos.study._figures import _tasks
-from pharos.study._latex import escape
-from pharos.study._report import number
+from pharos.study import worker as _worker
+from pharos.study.execution import claim
+from pharos.study.figures import _tasks
+from pharos.study.latex import escape
+from pharos.study.report import number
 
 SPECIFICATION = {
     "name": "lakes",

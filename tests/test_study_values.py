@@ -8,7 +8,8 @@ import pytest
 
 from pharos import study
 from pharos.experiments import train_config
-from pharos.study import _execution, _values
+from pharos.study import execution as _execution
+from pharos.study import values as _values
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +60,7 @@ def test_another_seed_agent_or_observation_shares_them(config):
 
 def test_values_of_other_rules_are_not_taken(config, monkeypatch):
     _values.solve(config)
-    monkeypatch.setattr("pharos._core.fingerprint.fingerprint_of_rules", lambda env, names: "other")
+    monkeypatch.setattr("pharos.rules.fingerprint.fingerprint_of_rules", lambda env, names: "other")
     assert _values.kept(config) is None
 
 

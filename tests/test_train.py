@@ -1,5 +1,6 @@
 """Training runs: what is written, what a kill loses, that seeds decide everything, and that regret is what it is defined to be."""
 
+import importlib
 import json
 import math
 import multiprocessing
@@ -11,12 +12,14 @@ import numpy as np
 import pytest
 
 import pharos
-from pharos.agents._deep import check_hyperparameters
+from pharos.agents.deep import check_hyperparameters
 from pharos.errors import FileFormatError, ParameterError, UnknownName
-from pharos.experiments import _train, read_curve, read_record, train, train_config
-from pharos.experiments._learners import Deep
-from pharos.experiments._results import COLUMNS
-from pharos.experiments._task import Task
+from pharos.experiments import read_curve, read_record, train, train_config
+from pharos.experiments.learners import Deep
+from pharos.experiments.results import COLUMNS
+from pharos.experiments.task import Task
+
+_train = importlib.import_module("pharos.experiments.train")
 
 SMALL = {"learning_starts": 50, "buffer_size": 1000, "target_update_interval": 50}
 

@@ -80,8 +80,8 @@ def test_the_first_trial_takes_from_the_agent_what_the_table_leaves_out():
 
 @pytest.mark.parametrize("agent", SPACES)
 def test_every_space_holds_hyperparameters_that_the_agent_has(agent):
-    from pharos.agents._deep import algorithm
-    from pharos.agents._q_learning import DEFAULTS
+    from pharos.agents.deep import algorithm
+    from pharos.agents.q_learning import DEFAULTS
 
     if agent == "q_learning":
         assert set(SPACES[agent]) <= set(DEFAULTS)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from pharos import environments
+from pharos.environments import catalog
 
 PAGE = Path(__file__).parents[1] / "docs" / "adding-an-environment.md"
 BLOCK = re.compile(r"^```(python|text)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
@@ -24,7 +24,7 @@ def page(monkeypatch, tmp_path):
     """A module to run the page in, away from the user's cache and from the list of environments."""
     module = types.ModuleType("tutorial_page")
     monkeypatch.setitem(sys.modules, module.__name__, module)
-    monkeypatch.setattr(environments, "_REGISTERED", {})
+    monkeypatch.setattr(catalog, "_REGISTERED", {})
     monkeypatch.setenv("PHAROS_CACHE_DIR", str(tmp_path))
     return module
 
@@ -53,7 +53,7 @@ def test_the_class_has_fewer_than_40_lines():
 def test_the_class_of_the_page_is_made_from_a_file(tmp_path, monkeypatch):
     import pharos
 
-    monkeypatch.setattr(environments, "_REGISTERED", {})
+    monkeypatch.setattr(catalog, "_REGISTERED", {})
     (tmp_path / "coins.py").write_text(blocks()[0][1])
     env = pharos.make(f"{tmp_path / 'coins.py'}:Coins", size=3)
     assert env.parameters == {"size": 3}

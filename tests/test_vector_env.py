@@ -9,8 +9,8 @@ from scipy.stats import chisquare
 
 import pharos
 from pharos.errors import ParameterError
-from pharos.gym_env import GymEnv
-from pharos.vector_env import Interpreted, make_vec
+from pharos.interaction.gym_env import GymEnv
+from pharos.interaction.vector_env import Interpreted, make_vec
 
 SMALL = {
     "simple_grid": {"height": 3, "width": 4, "rewards": (((1, 1), 0.1),), "penalties": (((0, 2), -0.5),)},
@@ -207,7 +207,7 @@ def test_bad_input_is_refused_in_one_line():
 
 
 def test_stable_baselines_gets_what_it_needs_at_the_ends_of_episodes():
-    from pharos.sb3_env import make_sb3_vec
+    from pharos.interaction.sb3_env import make_sb3_vec
 
     vec = make_sb3_vec("frozen_lake", 3, size=4, time_limit=5, seed=1)
     plain = make_vec("frozen_lake", 3, size=4, time_limit=5, autoreset_mode="SAME_STEP")
@@ -238,7 +238,7 @@ def test_stable_baselines_gets_what_it_needs_at_the_ends_of_episodes():
 def test_stable_baselines_trains_on_it(observation):
     from stable_baselines3 import PPO
 
-    from pharos.sb3_env import make_sb3_vec
+    from pharos.interaction.sb3_env import make_sb3_vec
 
     policy = {"vector": "MlpPolicy", "simple_image": "MlpPolicy"}[observation]
     env = make_sb3_vec("simple_grid", 4, height=3, width=3, observation=observation, seed=0)
@@ -253,7 +253,7 @@ def test_a_discrete_observation_keeps_its_space(breakout):
 
 
 def test_a_vector_environment_draws_each_of_its_environments():
-    from pharos.rendering import human
+    from pharos.drawing.pictures import human
 
     envs = gymnasium.make_vec("pharos/FrozenLake-v0", num_envs=3, size=4, render_mode="rgb_array")
     envs.reset(seed=0)

@@ -13,16 +13,16 @@ that its registry knows the environments.
 import importlib
 from typing import Any
 
-from pharos import _registration  # noqa: F401  (Gymnasium's registry)
+from pharos.interaction import registration as _registration  # noqa: F401  (Gymnasium's registry)
 
 __version__ = "0.1.0"
 
 _HOMES = {
-    "Environment": "pharos.environment",
-    "Layer": "pharos.environment",
-    "make": "pharos.environment",
-    "list_environments": "pharos.environment",
-    "check_environment": "pharos.conformance",
+    "Environment": "pharos.environments",
+    "Layer": "pharos.environments",
+    "make": "pharos.environments",
+    "list_environments": "pharos.environments",
+    "check_environment": "pharos.state_space.conformance",
     "build": "pharos.state_space",
     "load": "pharos.state_space",
     "StateSpace": "pharos.state_space",
@@ -33,14 +33,15 @@ _HOMES = {
     "value_iteration": "pharos.solvers",
     "evaluate_policy": "pharos.solvers",
     "observe": "pharos.observations",
-    "GymEnv": "pharos.gym_env",
-    "make_vec": "pharos.vector_env",
+    "GymEnv": "pharos.interaction.gym_env",
+    "make_vec": "pharos.interaction.vector_env",
     "train": "pharos.experiments",
     "PharosError": "pharos.errors",
 }
+# Modules that stand in another folder than their public name says.
+_MODULES = {"bisimulation": "pharos.mdp.bisimulation", "sb3_env": "pharos.interaction.sb3_env"}
 _PACKAGES = (
     "agents",
-    "bisimulation",
     "environments",
     "errors",
     "experiments",
@@ -55,7 +56,7 @@ _PACKAGES = (
     "study",
 )
 
-__all__ = [*_HOMES, *_PACKAGES, "__version__"]
+__all__ = [*_HOMES, *_PACKAGES, "bisimulation", "__version__"]
 
 
 def __getattr__(name: str) -> Any:
@@ -65,8 +66,10 @@ def __getattr__(name: str) -> Any:
         return value
     if name in _PACKAGES:
         return importlib.import_module(f"pharos.{name}")
+    if name in _MODULES:
+        return importlib.import_module(_MODULES[name])
     raise AttributeError(f"module 'pharos' has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:
-    return sorted([*globals(), *_HOMES, *_PACKAGES])
+    return sorted([*globals(), *_HOMES, *_PACKAGES, *_MODULES])

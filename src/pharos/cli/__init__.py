@@ -4,6 +4,6 @@ Every command takes `--json` (exactly one JSON object on standard output) and ex
 parameters are wrong; 1 where it failed; 130 where it was interrupted; with one line on standard error.
 """
 
-from pharos.cli._app import app, main
+from pharos.cli.app import app, main
 
 __all__ = ["app", "main"]

@@ -20,7 +20,7 @@ from pharos.errors import ParameterError
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from pharos.environment import Environment
+    from pharos.environments import Environment
     from pharos.mdp import TabularMDP
     from pharos.state_space import StateSpace
 
@@ -171,7 +171,7 @@ class Target:
     @property
     def is_imported(self) -> bool:
         """Whether it is an imported MDP: a file, or a folder that `pharos import` wrote. It has a gamma and a horizon of its own."""
-        from pharos.importers._folder import is_folder
+        from pharos.importers.folder import is_folder
 
         return self.path is not None and (self.path.is_file() or is_folder(self.path))
 
@@ -199,7 +199,7 @@ def parse_target(text: str, words: Iterable[str] | None = None) -> Target:
         UnknownName: no such environment, class or parameter. ParameterError: no such folder or file, a parameter is wrong.
     """
     parameters = parse_parameters(words)
-    from pharos.environment import list_environments, make
+    from pharos.environments import list_environments, make
 
     if text in list_environments():
         if Path(text).is_dir():

@@ -1,126 +1,26 @@
-"""The environments that `pharos.make` knows: name -> class, and the named instances of the paper.
+"""Environments: the contract of a class (`Environment`, `Layer`), the built-in classes, and the catalogue of their names."""
 
-This is the only list of environments. A user's own class joins it with `register`.
-"""
-
-import importlib
-import importlib.util
-import os
-import sys
-from collections.abc import Mapping
-from pathlib import Path
-from types import ModuleType
-from typing import Any
-
-from pharos.environment import Environment
-from pharos.environments._breakout import Breakout
-from pharos.environments._drawing import text_drawing
-from pharos.environments._freeway import Freeway
-from pharos.environments._frozen_lake import FrozenLake
-from pharos.environments._simple_grid import SimpleGrid
-from pharos.errors import ParameterError
+from pharos.environments.base import Components, Environment, Layer, State, start_distribution
+from pharos.environments.breakout import Breakout
+from pharos.environments.catalog import classes, imported, list_environments, make, named_instances, register
+from pharos.environments.freeway import Freeway
+from pharos.environments.frozen_lake import FrozenLake
+from pharos.environments.simple_grid import SimpleGrid
 
 __all__ = [
     "Breakout",
+    "Components",
+    "Environment",
     "Freeway",
     "FrozenLake",
+    "Layer",
     "SimpleGrid",
+    "State",
     "classes",
     "imported",
+    "list_environments",
+    "make",
     "named_instances",
     "register",
-    "text_drawing",
+    "start_distribution",
 ]
-
-_BUILT_IN: dict[str, type[Environment]] = {cls.name: cls for cls in (SimpleGrid, FrozenLake, Freeway, Breakout)}
-_REGISTERED: dict[str, type[Environment]] = {}
-
-
-def classes() -> dict[str, type[Environment]]:
-    """Name -> class of every environment, the registered ones last."""
-    return {**_BUILT_IN, **_REGISTERED}
-
-
-def named_instances() -> dict[str, tuple[str, Mapping[str, Any]]]:
-    """Name -> (name of the class, parameters) of the paper's instances: its tables first, then what else it draws.
-
-    `simple_grid/4x4-decoy` (height x width), `frozen_lake/8x8`, `freeway/16x7-speed1` (cars x lane length, player speed),
-    `breakout/12x10x1` (height x columns x paddle width).
-    """
-    instances: dict[str, tuple[str, Mapping[str, Any]]] = {}
-    for size in (4, 6, 8):
-        square = {"height": size, "width": size}
-        decoy = {**square, "rewards": (((size // 2, size // 2), 0.1),)}
-        instances[f"simple_grid/{size}x{size}-decoy"] = ("simple_grid", decoy)
-        instances[f"simple_grid/{size}x{size}-plain"] = ("simple_grid", square)
-    for size in (4, 8):
-        instances[f"frozen_lake/{size}x{size}"] = ("frozen_lake", {"size": size})
-    for cars, length in ((20, 11), (25, 13), (20, 5), (16, 7), (25, 9)):
-        for speed in (1, 2):
-            road = {"num_cars": cars, "lane_length": length, "player_speed": speed}
-            instances[f"freeway/{cars}x{length}-speed{speed}"] = ("freeway", road)
-    printed = [(height, columns, width) for width in (1, 3) for height, columns in _COURTS]
-    for height, columns, width in (*printed, *_DRAWN):
-        court = {"height": height, "columns": columns, "extra_paddle_width": (width - 1) // 2}
-        instances[f"breakout/{height}x{columns}x{width}"] = ("breakout", court)
-    return instances
-
-
-_COURTS = ((12, 10), (12, 8), (16, 8), (20, 8), (24, 8))  # of the paper's table
-_DRAWN = ((14, 8, 1), (14, 10, 3), (20, 10, 1), (20, 10, 3), (24, 10, 3))  # in its appendix B
-
-
-def imported(path: str) -> type[Environment]:
-    """Import a user's class from "module:Class" or "file.py:Class", register it and return it.
-
-    Modules are also looked for in the current directory. A file is read again at every call.
-
-    Raises:
-        ParameterError: no such module, file or class; or one that `register` refuses.
-    """
-    where, _, class_name = path.rpartition(":")
-    try:
-        cls = getattr(_module_of_file(Path(where)) if where.endswith(".py") else _module_called(where), class_name)
-    except Exception as error:
-        reason = " ".join(str(error).split())
-        raise ParameterError(
-            f"{path!r}: {type(error).__name__}: {reason}; expected 'module:Class' or 'file.py:Class'"
-        ) from error
-    return cls if cls in _BUILT_IN.values() else register(cls)
-
-
-def _module_called(name: str) -> ModuleType:
-    sys.path.insert(0, os.getcwd())
-    try:
-        return importlib.import_module(name)
-    finally:
-        sys.path.remove(os.getcwd())
-
-
-def _module_of_file(file: Path) -> ModuleType:
-    name = f"pharos_user_{file.stem}"
-    spec = importlib.util.spec_from_file_location(name, file)
-    if spec is None or spec.loader is None:
-        raise ImportError(f"cannot read {file}")
-    module = sys.modules[name] = importlib.util.module_from_spec(spec)  # dataclasses look their module up there
-    spec.loader.exec_module(module)
-    return module
-
-
-def register(cls: type[Environment]) -> type[Environment]:
-    """Make a user's class known to `pharos.make` under `cls.name`, and return it: usable as a decorator.
-
-    Registering a name again replaces the class, so that a notebook cell can be run twice.
-
-    Raises:
-        ParameterError: `cls` is no subclass of Environment, has no name, or the name of a built-in class.
-    """
-    if not (isinstance(cls, type) and issubclass(cls, Environment)):
-        raise ParameterError(f"register: found {cls!r}; expected a subclass of pharos.Environment")
-    name = getattr(cls, "name", None)
-    if not isinstance(name, str) or not name or "/" in name or ":" in name:
-        raise ParameterError(f"register: {cls.__name__}.name is {name!r}; expected a text without '/' and ':'")
-    if name in _BUILT_IN:
-        raise ParameterError(f"register: {name!r} is the name of a built-in class; choose another name")
-    _REGISTERED[name] = cls
-    return cls

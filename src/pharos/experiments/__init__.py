@@ -1,12 +1,12 @@
 """Experiments: an agent trained on a task, its policies evaluated exactly, and the result written down."""
 
-from pharos.experiments._evaluation import Evaluation, evaluate_agent
-from pharos.experiments._loading import load_agent
-from pharos.experiments._regret import ReferenceValues, RegretCurve, cumulative_expected_regret, regret
-from pharos.experiments._results import read_curve, read_record
-from pharos.experiments._task import Task
-from pharos.experiments._train import TrainingResult, train, train_config
-from pharos.experiments._tuning import SPACES, TuningResult, tune
+from pharos.experiments.evaluation import Evaluation, evaluate_agent
+from pharos.experiments.loading import load_agent
+from pharos.experiments.regret import ReferenceValues, RegretCurve, cumulative_expected_regret, regret
+from pharos.experiments.results import read_curve, read_record
+from pharos.experiments.task import Task
+from pharos.experiments.train import TrainingResult, train, train_config
+from pharos.experiments.tuning import SPACES, TuningResult, tune
 
 __all__ = [
     "SPACES",

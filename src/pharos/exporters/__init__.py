@@ -1,7 +1,7 @@
 """MDPs for other programs: BRIDGE's npz, Gymnasium's `P` table, Storm's explicit DRN format."""
 
-from pharos.exporters._bridge import bridge
-from pharos.exporters._drn import drn
-from pharos.exporters._gymnasium import gym_p
+from pharos.exporters.bridge import bridge
+from pharos.exporters.drn import drn
+from pharos.exporters.gymnasium import gym_p
 
 __all__ = ["bridge", "drn", "gym_p"]

@@ -4,23 +4,23 @@ Visitation complexity: `diameter`, `start_eccentricity`, `covering`. Estimation 
 `environmental_value_norm`. Planning: `effective_horizon`. All of them: `report`; one of your own: `register`.
 """
 
-from pharos.hardness import _built_in  # noqa: F401  (registers the measures; the order of a report)
-from pharos.hardness._action_gap import ActionGapRegularity, action_gap_regularity
-from pharos.hardness._colosseum import colosseum_diameter
-from pharos.hardness._covering import Covering, covering
-from pharos.hardness._diameter import diameter, start_eccentricity
-from pharos.hardness._effective_horizon import EffectiveHorizon, effective_horizon
-from pharos.hardness._gaps import Gaps, gaps, minimal_gap, sum_of_reciprocal_gaps
-from pharos.hardness._gorp import GorpBound, GorpRuns, gorp_bound, run_gorp
-from pharos.hardness._interval import Budget, Interval, Progress
-from pharos.hardness._mismatch import distribution_mismatch
-from pharos.hardness._mixing_time import MixingTime, mixing_time
-from pharos.hardness._occupancy import Occupancy, occupancy
-from pharos.hardness._registry import Measure, Problem, measures, register
-from pharos.hardness._report import Report, Result, report
-from pharos.hardness._return_distribution import ReturnDistribution, return_distribution
-from pharos.hardness._stationary_horizon import StationaryHorizon, stationary_effective_horizon
-from pharos.hardness._value_norm import environmental_value_norm
+from pharos.hardness import built_in as _built_in  # noqa: F401  (registers the measures; the order of a report)
+from pharos.hardness.action_gap import ActionGapRegularity, action_gap_regularity
+from pharos.hardness.colosseum import colosseum_diameter
+from pharos.hardness.covering import Covering, covering
+from pharos.hardness.diameter import diameter, start_eccentricity
+from pharos.hardness.effective_horizon import EffectiveHorizon, effective_horizon
+from pharos.hardness.gaps import Gaps, gaps, minimal_gap, sum_of_reciprocal_gaps
+from pharos.hardness.gorp import GorpBound, GorpRuns, gorp_bound, run_gorp
+from pharos.hardness.interval import Budget, Interval, Progress
+from pharos.hardness.mismatch import distribution_mismatch
+from pharos.hardness.mixing_time import MixingTime, mixing_time
+from pharos.hardness.occupancy import Occupancy, occupancy
+from pharos.hardness.registry import Measure, Problem, measures, register
+from pharos.hardness.report import Report, Result, report
+from pharos.hardness.return_distribution import ReturnDistribution, return_distribution
+from pharos.hardness.stationary_horizon import StationaryHorizon, stationary_effective_horizon
+from pharos.hardness.value_norm import environmental_value_norm
 
 __all__ = [
     "ActionGapRegularity",

@@ -3,9 +3,9 @@
 Nothing here unpickles: files hold plain arrays and JSON, or are refused.
 """
 
-from pharos.importers._bridge import bridge, bridge_screens
-from pharos.importers._folder import load, save
-from pharos.importers._gymnasium import gymnasium, matrices
-from pharos.importers._minigrid import minigrid, minigrid_grids
+from pharos.importers.bridge import bridge, bridge_screens
+from pharos.importers.folder import load, save
+from pharos.importers.gymnasium import gymnasium, matrices
+from pharos.importers.minigrid import minigrid, minigrid_grids
 
 __all__ = ["bridge", "bridge_screens", "gymnasium", "load", "matrices", "minigrid", "minigrid_grids", "save"]

@@ -3,10 +3,10 @@
 `observe(env, "vector")` gives one; calling it with states (N, D) gives N observations. Nothing is stored with the states.
 """
 
-from pharos.observations._complex_image import ComplexImage
-from pharos.observations._observation import FunctionObservation, Observation, add_built_in, names, observe, register
-from pharos.observations._simple_image import SimpleImage
-from pharos.observations._vector import Index, OneHot, Vector
+from pharos.observations.complex_image import ComplexImage
+from pharos.observations.observation import FunctionObservation, Observation, add_built_in, names, observe, register
+from pharos.observations.simple_image import SimpleImage
+from pharos.observations.vector import Index, OneHot, Vector
 
 add_built_in("vector", Vector)
 add_built_in("simple_image", SimpleImage)

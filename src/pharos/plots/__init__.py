@@ -4,11 +4,11 @@ Each function draws on the matplotlib axes given, or on a new figure, and return
 apart by colour-blind people (Okabe and Ito, 2008). Nothing opens a window or changes matplotlib's settings.
 """
 
-from pharos.plots._grid import value_map
-from pharos.plots._growth import growth, states_by_depth
-from pharos.plots._plane import hardness_plane
-from pharos.plots._policies import policies
-from pharos.plots._regret import regret
-from pharos.plots._style import save
+from pharos.plots.grid import value_map
+from pharos.plots.growth import growth, states_by_depth
+from pharos.plots.plane import hardness_plane
+from pharos.plots.policies import policies
+from pharos.plots.regret import regret
+from pharos.plots.style import save
 
 __all__ = ["growth", "hardness_plane", "policies", "regret", "save", "states_by_depth", "value_map"]

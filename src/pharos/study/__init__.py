@@ -1,6 +1,6 @@
 """From hardness and regret to the paper's models, figures and tables."""
 
-from pharos.study._analysis import (
+from pharos.study.analysis import (
     Comparison,
     Models,
     agreement,
@@ -10,16 +10,16 @@ from pharos.study._analysis import (
     models,
     paper_agreement,
 )
-from pharos.study._archive import pack, unpack
-from pharos.study._clusters import run_on_ray, submit
-from pharos.study._execution import Status, run, status
-from pharos.study._findings import findings
-from pharos.study._paper import paper_regressions, paper_returns
-from pharos.study._regression import Fit, aggregate_r_squared, fit, fit_models, leave_one_class_out_r_squared
-from pharos.study._report import StudyReport, report
-from pharos.study._specification import Run, Specification, presets, run_id, specification
-from pharos.study._statistics import Estimate, interquartile_mean, stratified_interval
-from pharos.study._table import cells, curves, hardness_table, paper_instance, table
+from pharos.study.archive import pack, unpack
+from pharos.study.clusters import run_on_ray, submit
+from pharos.study.execution import Status, run, status
+from pharos.study.findings import findings
+from pharos.study.paper import paper_regressions, paper_returns
+from pharos.study.regression import Fit, aggregate_r_squared, fit, fit_models, leave_one_class_out_r_squared
+from pharos.study.report import StudyReport, report
+from pharos.study.specification import Run, Specification, presets, run_id, specification
+from pharos.study.statistics import Estimate, interquartile_mean, stratified_interval
+from pharos.study.tables import cells, curves, hardness_table, paper_instance, table
 
 __all__ = [
     "Comparison",

@@ -1,0 +1,174 @@
+"""Algorithms of Stable-Baselines3 on tasks of pharos: the same network everywhere, apart from what extracts features.
+
+Vectors go through one hidden layer, images through one convolution and one hidden layer (the network of MinAtar: Young and
+Tian, 2019), both to 128 features; then follows one hidden layer. So a difference between observations is one between
+representations, not between networks (the pharos paper, section 4.2).
+"""
+
+import importlib
+import inspect
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from pharos.errors import MissingExtra, ParameterError, UnknownName
+
+FEATURES = 128
+LEAST_ONE = ("n_envs", "n_steps", "n_epochs", "batch_size", "buffer_size", "train_freq", "target_update_interval")
+SHARES = ("gamma", "gae_lambda", "tau", "exploration_fraction", "exploration_initial_eps", "exploration_final_eps")
+POSITIVE = ("learning_rate", "clip_range", "max_grad_norm")
+NOT_NEGATIVE = ("learning_starts", "ent_coef", "vf_coef")
+OURS = {"env", "seed", "device", "tensorboard_log", "_init_setup_model"}  # what `make_model` gives itself
+ALGORITHMS = {"dqn": "stable_baselines3:DQN", "ppo": "stable_baselines3:PPO", "a2c": "stable_baselines3:A2C"}
+
+
+def algorithm(name: str) -> type:
+    """The class of an algorithm: "dqn", "ppo", "a2c", or "module:Class" for any other.
+
+    Raises:
+        UnknownName: no such name, module or class. MissingExtra: Stable-Baselines3 is not installed.
+    """
+    path = ALGORITHMS.get(name, name)
+    module, colon, cls = path.partition(":")
+    if not colon:
+        raise UnknownName("agent", name, ["q_learning", *ALGORITHMS])
+    try:
+        return getattr(importlib.import_module(module), cls)
+    except ModuleNotFoundError as error:
+        if (error.name or "").startswith(("stable_baselines3", "torch")):
+            raise MissingExtra(f"the agent {name!r}", "stable-baselines3", "agents") from error
+        raise UnknownName("module of an agent", module, []) from error
+    except AttributeError as error:
+        raise UnknownName(
+            "agent", path, [f"{module}:{each}" for each in dir(importlib.import_module(module))]
+        ) from error
+
+
+def check_hyperparameters(name: str, hyperparameters: Mapping[str, Any]) -> None:
+    """Refuse hyperparameters that the algorithm does not have, and numbers that it would take without a word or fail with late.
+
+    Raises:
+        UnknownName: with the nearest name that it has. ParameterError: a number out of its range, or something else for one.
+    """
+    taken = inspect.signature(algorithm(name)).parameters
+    if all(each.kind is not inspect.Parameter.VAR_KEYWORD for each in taken.values()):
+        known = sorted({*taken, "n_envs", "n_timesteps", "net_arch"} - OURS)
+        for given in hyperparameters:
+            if given not in known:
+                raise UnknownName(f"hyperparameter of {name}", given, known)
+    for given, value in hyperparameters.items():
+        expected = _expected(given, value)
+        if expected is not None:
+            raise ParameterError(f"agent {name!r}: {given} is {value!r}; expected {expected}")
+
+
+def _expected(name: str, value: Any) -> str | None:
+    """What a hyperparameter should be where `value` is not that; schedules and other things than numbers and words pass."""
+    if not isinstance(value, int | float | str):
+        return None
+    number = value if not isinstance(value, bool | str) else math.nan
+    if name in LEAST_ONE and not (number >= 1 and float(number).is_integer()):
+        return "an integer of at least 1"
+    if name in SHARES and not 0 <= number <= 1:
+        return "a number from 0 to 1"
+    if name in POSITIVE and not 0 < number < math.inf:
+        return "a number above 0"
+    if name == "ent_coef" and str(value).startswith("auto"):  # SAC's, with or without a first value
+        return None
+    if name in NOT_NEGATIVE and not 0 <= number < math.inf:
+        return "a number of at least 0"
+    return None
+
+
+def extractor(space: Any) -> type:
+    """The class of feature extractor for an observation space."""
+    from stable_baselines3.common.torch_layers import CombinedExtractor
+
+    from pharos.agents.networks import SmallCNN, SmallMLP
+
+    if hasattr(space, "spaces"):
+        return CombinedExtractor
+    return SmallCNN if len(space.shape) == 3 and space.dtype == np.uint8 else SmallMLP
+
+
+def make_model(
+    name: str, env: Any, hyperparameters: dict[str, Any], *, seed: int, tensorboard: str | None = None
+) -> Any:
+    """A model of Stable-Baselines3 on the CPU, with the network described above unless `policy_kwargs` says otherwise.
+
+    Args:
+        name: as for `algorithm`.
+        env: a VecEnv of Stable-Baselines3.
+        hyperparameters: of the algorithm; `net_arch` for the layers after the features; `n_envs` and `n_timesteps` are left out.
+    Raises:
+        ParameterError: the algorithm does not know a hyperparameter (`check_hyperparameters` says so better), or does not fit the environment.
+    """
+    import torch
+
+    torch.set_num_threads(1)
+    options = {key: value for key, value in hyperparameters.items() if key not in ("n_envs", "n_timesteps", "policy")}
+    network = {
+        "features_extractor_class": extractor(env.observation_space),
+        "net_arch": options.pop("net_arch", [FEATURES]),
+        **options.pop("policy_kwargs", {}),
+    }
+    many = hasattr(env.observation_space, "spaces")
+    try:
+        model = algorithm(name)(
+            hyperparameters.get("policy", "MultiInputPolicy" if many else "MlpPolicy"),
+            env,
+            seed=seed,
+            device="cpu",
+            policy_kwargs=network,
+            tensorboard_log=tensorboard,
+            **options,
+        )
+    except (TypeError, ValueError, AssertionError) as error:
+        raise ParameterError(f"agent {name!r} cannot be made: {error}") from error
+    if tensorboard is None and not options.get("verbose"):
+        from stable_baselines3.common.logger import Logger
+
+        model.set_logger(Logger(folder=None, output_formats=[]))  # else a folder is left among the temporary files
+    return model
+
+
+class DeepPolicy:
+    """The policy of a model as probabilities: greedy for DQN and its kin, the distribution itself for PPO and its kin.
+
+    Args:
+        deterministic: the most probable action of a distribution, instead of the distribution.
+    """
+
+    def __init__(self, model: Any, *, deterministic: bool = False):
+        self.model, self.deterministic = model, deterministic
+
+    def action_probabilities(self, observations: Any) -> np.ndarray:
+        """(N, A) probabilities for a batch of observations as the environment gives them."""
+        import torch
+
+        policy = self.model.policy
+        policy.set_training_mode(False)
+        batch = _as_policy_sees(observations, policy.observation_space)
+        with torch.no_grad():
+            tensor, _ = policy.obs_to_tensor(batch)
+            if hasattr(policy, "q_net"):
+                scores = policy.q_net(tensor).numpy()
+                return np.eye(scores.shape[1])[scores.argmax(axis=1)]
+            if hasattr(policy, "get_distribution"):
+                probabilities = policy.get_distribution(tensor).distribution.probs.numpy().astype(np.float64)
+                if self.deterministic:
+                    return np.eye(probabilities.shape[1])[probabilities.argmax(axis=1)]
+                return probabilities
+        actions, _ = self.model.predict(batch, deterministic=True)
+        return np.asarray(actions)
+
+
+def _as_policy_sees(observations: Any, space: Any) -> Any:
+    """Images moved to channel first where Stable-Baselines3 has done so with those of the environment."""
+    if isinstance(observations, dict):
+        return {name: _as_policy_sees(values, space.spaces[name]) for name, values in observations.items()}
+    if observations.ndim == 4 and observations.shape[1:] != space.shape:
+        return observations.transpose(0, 3, 1, 2)
+    return observations

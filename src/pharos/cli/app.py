@@ -1,0 +1,133 @@
+"""The application: which verbs there are, and how whatever goes wrong becomes one line and an exit code."""
+
+import os
+import sys
+import warnings
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+from pharos.cli import (
+    build,
+    cache,
+    evaluate,
+    export,
+    hardness,
+    import_,
+    play,
+    plot,
+    render,
+    solve,
+    study,
+    train,
+    tune,
+)
+from pharos.cli import (
+    list as list_,
+)
+from pharos.cli.common import complain
+from pharos.errors import DivergenceError, ParameterError, PharosError
+
+EXIT_FAILED, EXIT_USAGE, EXIT_INTERRUPTED = 1, 2, 130
+
+
+class _Group(TyperGroup):
+    """Runs a command; errors that pharos or the system raise on purpose end as one line, never as a traceback."""
+
+    def main(self, *args: Any, **options: Any) -> Any:
+        options["standalone_mode"] = False
+        options["prog_name"] = "pharos"
+        try:
+            code = super().main(*args, **options)
+            sys.stdout.flush()
+        except Exception as error:
+            code = _exit_code(error)
+            if code is None:
+                raise
+        except KeyboardInterrupt:
+            code = EXIT_INTERRUPTED
+        if code == EXIT_INTERRUPTED:
+            complain("interrupted; finished work is kept, and the same command goes on from there")
+        sys.exit(code if isinstance(code, int) else 0)
+
+
+def _exit_code(error: Exception) -> int | None:
+    """The exit code for an error, said in one line on standard error; None for one that is a bug of pharos."""
+    if isinstance(error, BrokenPipeError):  # the reader had enough, as in `pharos list | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return EXIT_FAILED
+    if isinstance(error, ParameterError | DivergenceError):
+        complain(error)
+        return EXIT_USAGE
+    if isinstance(error, PharosError):
+        complain(error)
+        return EXIT_FAILED
+    if isinstance(error, OSError):
+        where = f"{error.filename}: " if error.filename is not None else ""
+        complain(f"{where}{error.strerror or error}")
+        return EXIT_FAILED
+    if isinstance(error, MemoryError):
+        complain(f"out of memory: {error or 'an array did not fit'}; choose a smaller instance, or set --memory")
+        return EXIT_FAILED
+    if type(error).__name__ == "Abort":
+        return EXIT_INTERRUPTED
+    if hasattr(error, "format_message"):  # of typer, wherever its exceptions live in this version
+        complain(f"{error.format_message()} (see `{_command_of(error)} --help`)")
+        return EXIT_USAGE
+    return None
+
+
+def _command_of(error: Exception) -> str:
+    context = getattr(error, "ctx", None)
+    return context.command_path if context is not None else "pharos"
+
+
+app = typer.Typer(
+    name="pharos",
+    cls=_Group,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+    context_settings={"help_option_names": ["-h", "--help"]},
+    help="Principled reinforcement-learning benchmarking: exact state spaces, values, hardness and regret.",
+    epilog="TARGET is an environment (`pharos list`) with name=value parameters, module:Class for your own, "
+    "a built folder, or an imported file.",
+)
+
+
+@app.callback(invoke_without_command=True)
+def _options(
+    context: typer.Context,
+    version: Annotated[bool, typer.Option("--version", help="Print the version and exit.", is_eager=True)] = False,
+) -> None:
+    if version:
+        from pharos import __version__
+
+        print(f"pharos {__version__}")
+        raise typer.Exit()
+    if context.invoked_subcommand is None:
+        print(context.get_help())
+        raise typer.Exit()
+
+
+app.command("list")(list_.list_)
+app.command("build")(build.build)
+app.command("solve")(solve.solve)
+app.command("hardness")(hardness.hardness)
+app.command("evaluate")(evaluate.evaluate)
+app.command("render")(render.render)
+app.command("play")(play.play)
+app.command("train")(train.train)
+app.command("tune")(tune.tune)
+app.add_typer(plot.app, name="plot")
+app.add_typer(study.app, name="study")
+app.command("export")(export.export)
+app.add_typer(import_.app, name="import")
+app.add_typer(cache.app, name="cache")
+
+
+def main() -> None:
+    """Entry point of the `pharos` command."""
+    warnings.showwarning = lambda message, *_, **__: complain(f"warning: {message}")
+    app()

@@ -1,0 +1,83 @@
+"""pharos build: enumerate a state space."""
+
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pharos.cli.common import (
+    Json,
+    MaxStates,
+    Memory,
+    Parameters,
+    TargetArgument,
+    Workers,
+    bytes_of,
+    describe,
+    parse_environment,
+    parse_size,
+    peak_memory_bytes,
+    print_facts,
+    print_json,
+    size_text,
+)
+
+
+def build(
+    environment: TargetArgument,
+    parameters: Parameters = None,
+    out: Annotated[Path | None, typer.Option("--out", help="Folder to write; the cache when not given.")] = None,
+    memory: Memory = None,
+    workers: Workers = None,
+    max_states: MaxStates = None,
+    json: Json = False,
+) -> None:
+    """Enumerate every state that can be reached, and its transitions, onto disk. The same command resumes."""
+    from pharos import state_space
+    from pharos.state_space.build import cached_folder
+
+    env = parse_environment(environment, parameters)
+    limit = parse_size(memory)
+    found = _is_there(out or cached_folder(env))
+    began = time.perf_counter()
+    space = state_space.build(env, out, memory=limit, workers=workers, max_states=max_states)
+    seconds = time.perf_counter() - began
+    rate, peak, bytes_on_disk = space.num_states / seconds, peak_memory_bytes(), bytes_of(space.folder)
+    answer = {
+        "environment": env.name,
+        "parameters": space.parameters,
+        "num_states": space.num_states,
+        "num_actions": space.num_actions,
+        "num_terminal_states": space.num_terminal_states,
+        "depth": space.depth,
+        "seconds": seconds,
+        "states_per_second": rate,
+        "peak_memory_bytes": peak,
+        "bytes_on_disk": bytes_on_disk,
+        "folder": str(space.folder),
+        "found": found,
+    }
+    if json:
+        print_json(answer)
+        return
+    print_facts(
+        describe(env),
+        [
+            ("states", f"{space.num_states:,} ({space.num_terminal_states:,} terminal)"),
+            ("actions", f"{space.num_actions} ({', '.join(env.actions)})"),
+            ("depth", f"{space.depth:,}"),
+            ("seconds", f"{seconds:.2f} (it was there already)" if found else f"{seconds:.2f} ({rate:,.0f} states/s)"),
+            ("peak memory", size_text(peak)),
+            ("on disk", size_text(bytes_on_disk)),
+            ("folder", space.folder),
+        ],
+    )
+
+
+def _is_there(folder: Path) -> bool:
+    """Whether the finished state space lies there already."""
+    from pharos.state_space.store import read_manifest
+
+    manifest = read_manifest(folder)
+    return manifest is not None and bool(manifest["complete"])

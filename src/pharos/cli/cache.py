@@ -1,0 +1,118 @@
+"""pharos cache: what pharos keeps so that it need not be made again, and throwing it away."""
+
+import contextlib
+import shutil
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from pharos.cli.common import Json, bytes_of, console, print_json, size_text
+from pharos.errors import PharosError, UnknownName
+
+app = typer.Typer(help="List or clear the cached state spaces.", no_args_is_help=False)
+
+
+@app.command("list")
+def list_(json: Json = False) -> None:
+    """Show the cached state spaces and how much room they take."""
+    from pharos import paths
+
+    directory = paths.cache_directory()
+    spaces = _spaces(directory)
+    compiled = bytes_of(directory / "compiled")
+    total = compiled + sum(space["bytes"] for space in spaces)
+    if json:
+        print_json({"directory": directory, "spaces": spaces, "compiled_bytes": compiled, "total_bytes": total})
+        return
+    _print(directory, spaces, compiled, total)
+
+
+@app.command("clear")
+def clear(
+    environments: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[ENVIRONMENT]...", help="Clear only these: names of environments or of cached folders."
+        ),
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Delete cached state spaces (and, when no name is given, compiled rules). They are made again when needed."""
+    from pharos import paths
+    from pharos.state_space.files import lock
+
+    directory = paths.cache_directory()
+    spaces = _spaces(directory)
+    known = {space["environment"] for space in spaces} | {space["name"] for space in spaces}
+    for name in environments or ():
+        if name not in known:
+            raise UnknownName("environment in the cache", name, known)
+    removed, freed = [], 0
+    for space in spaces:
+        if not environments or space["environment"] in environments or space["name"] in environments:
+            folder = Path(space["folder"])
+            with lock(folder):  # StateSpaceLocked while somebody builds there
+                shutil.rmtree(folder)
+            removed.append(space["folder"])
+            freed += space["bytes"]
+    if not environments and (directory / "compiled").is_dir():
+        freed += bytes_of(directory / "compiled")
+        shutil.rmtree(directory / "compiled")
+    if json:
+        print_json({"removed": removed, "bytes_freed": freed, "directory": directory})
+        return
+    print(f"{len(removed)} state space{'s' * (len(removed) != 1)} deleted, {size_text(freed)} freed in {directory}")
+
+
+def _spaces(directory: Path) -> list[dict[str, Any]]:
+    """Every cached state space, the largest first."""
+    from pharos.state_space.store import read_manifest
+
+    found = []
+    for folder in sorted((directory / "spaces").glob("*")):
+        if not folder.is_dir():
+            continue
+        manifest: dict[str, Any] | None = None
+        with contextlib.suppress(PharosError):
+            manifest = read_manifest(folder)
+        state = "damaged" if manifest is None else "complete" if manifest["complete"] else "unfinished"
+        manifest = manifest or {}
+        found.append(
+            {
+                "name": folder.name,
+                "environment": manifest.get("environment", folder.name.rpartition("-")[0]),
+                "parameters": manifest.get("parameters", {}),
+                "num_states": manifest.get("num_states", 0),
+                "state": state,
+                "bytes": bytes_of(folder),
+                "folder": str(folder),
+            }
+        )
+    return sorted(found, key=lambda space: -space["bytes"])
+
+
+def _print(directory: Path, spaces: list[dict[str, Any]], compiled: int, total: int) -> None:
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    table.add_column("environment", style="cyan", no_wrap=True)
+    table.add_column("parameters", overflow="fold")
+    table.add_column("states", justify="right", no_wrap=True)
+    table.add_column("size", justify="right", no_wrap=True)
+    table.add_column("", no_wrap=True)
+    for space in spaces:
+        parameters = " ".join(f"{name}={value}" for name, value in space["parameters"].items() if value is not None)
+        note = "" if space["state"] == "complete" else space["state"]
+        table.add_row(
+            space["environment"], escape(parameters), f"{space['num_states']:,}", size_text(space["bytes"]), note
+        )
+    to = console()
+    if spaces:
+        to.print(table)
+    to.print(
+        f"{len(spaces)} state space{'s' * (len(spaces) != 1)} and {size_text(compiled)} of compiled rules: "
+        f"{size_text(total)} in {escape(str(directory))}",
+        soft_wrap=True,
+    )

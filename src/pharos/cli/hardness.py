@@ -1,0 +1,135 @@
+"""pharos hardness: all measures of one instance in a table, with exactness and sources."""
+
+import math
+from typing import Annotated, Any
+
+import typer
+
+from pharos.cli.common import (
+    Json,
+    MaxStates,
+    Memory,
+    Parameters,
+    Random,
+    Sticky,
+    TargetArgument,
+    Workers,
+    console,
+    describe_chance,
+    parse_size,
+    parse_target,
+    print_json,
+    progress_line,
+)
+
+
+def hardness(
+    target: TargetArgument,
+    parameters: Parameters = None,
+    measures: Annotated[
+        str | None,
+        typer.Option(
+            "--measures", metavar="A,B", help="Names of measures, or all; those that are quick when not given."
+        ),
+    ] = None,
+    gamma: Annotated[
+        float | None,
+        typer.Option(
+            "--gamma",
+            min=0,
+            max=1,
+            help="Discount of values and gaps; 0.99 when not given, or what an imported file says.",
+            show_default=False,
+        ),
+    ] = None,
+    horizon: Annotated[
+        int | None, typer.Option("--horizon", min=1, help="Steps of an episode, for measures of episodes.")
+    ] = None,
+    sticky: Sticky = 0.0,
+    random: Random = 0.0,
+    tolerance: Annotated[
+        float, typer.Option("--tolerance", help="Largest error of the optimal values, in units of return.")
+    ] = 1e-9,
+    restart: Annotated[
+        bool, typer.Option("--restart/--no-restart", help="Whether terminal states lead back to the start.")
+    ] = True,
+    budget: Annotated[
+        float, typer.Option("--budget", min=0, help="Seconds a measure may take before it gives a proven interval.")
+    ] = 300.0,
+    definitions: Annotated[bool, typer.Option("--definitions", help="Show definitions and sources.")] = False,
+    latex: Annotated[bool, typer.Option("--latex", help="Print a LaTeX table.")] = False,
+    fresh: Annotated[bool, typer.Option("--fresh", help="Compute anew what is kept beside the state space.")] = False,
+    memory: Memory = None,
+    workers: Workers = None,
+    max_states: MaxStates = None,
+    json: Json = False,
+) -> None:
+    """Measure how hard an instance is: visitation, estimation and planning complexity."""
+    limit = parse_size(memory)
+    if measures is not None:
+        from pharos.hardness.registry import chosen
+
+        chosen(measures)  # an unknown name is told before anything is built
+    goal = parse_target(target, parameters)
+    own = goal.is_imported  # an imported MDP has a discount and a horizon of its own
+    mdp = goal.mdp(
+        gamma=0.99 if gamma is None and not own else gamma,
+        horizon=horizon if gamma == 1 or own else None,
+        sticky=sticky,
+        random=random,
+        memory=limit,
+        workers=workers,
+        max_states=max_states,
+    )
+    from pharos.hardness import report as measure
+
+    with progress_line("measuring") as tell:
+        report = measure(
+            mdp,
+            measures,
+            horizon=horizon,
+            tolerance=tolerance,
+            restart=restart,
+            budget=budget,
+            keep=not fresh,
+            progress=lambda what, line: tell(f"{what}  {line}"),
+        )
+    if json:
+        print_json(report.to_dict())
+    elif latex:
+        print(report.to_latex())
+    else:
+        _print(" ".join((target, *(parameters or ()))), report, describe_chance(sticky, random), definitions)
+
+
+def _print(title: str, report: Any, chance: str, definitions: bool) -> None:
+    from rich.markup import escape
+    from rich.table import Table
+
+    conventions = report.conventions
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    table.add_column("measure", style="cyan", no_wrap=True)
+    table.add_column("value", overflow="fold")
+    table.add_column("exact")
+    table.add_column("seconds", justify="right")
+    if definitions:
+        table.add_column("definition", overflow="fold")
+        table.add_column("source", overflow="fold", style="dim")
+    for result in report.results.values():
+        value = f"[dim]{escape(result.undefined)}[/dim]" if result.undefined else escape(result.text)
+        exact = "" if result.undefined else "yes" if result.exact else "interval"
+        row = [result.name, value, exact, "kept" if result.kept else f"{result.seconds:.2f}"]
+        table.add_row(*row, *((escape(result.definition), escape(result.source)) if definitions else ()))
+    to = console()
+    to.print(f"[bold]{escape(title)}[/bold]", soft_wrap=True)
+    horizon = "none" if conventions["horizon"] is None else conventions["horizon"]
+    to.print(
+        f"{conventions['num_states']:,} states x {conventions['num_actions']} actions, discount {conventions['gamma']:g}, "
+        f"horizon {horizon}, chance: {chance}",
+        style="dim",
+        soft_wrap=True,
+    )
+    to.print(table)
+    error = conventions.get("error_bound")
+    if error is not None and math.isfinite(error):
+        to.print(f"values are within {error:.2g} of the optimal ones (proven)", style="dim", soft_wrap=True)

@@ -1,0 +1,232 @@
+"""Environment: what a class of environments defines. Small deterministic rules on integer states, nothing else.
+
+A state is a vector of D integers. Chance (sticky and random actions), time limits, observations and pixels are added
+outside, so that the same state space serves every one of them.
+"""
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, ClassVar
+
+import numpy as np
+
+from pharos.errors import ParameterError
+
+State = tuple[int, ...]
+Ranges = Any  # range, or a nested sequence of ranges
+
+
+@dataclass(frozen=True)
+class Layer:
+    """How one kind of thing looks. `draw` puts it on its plane; every picture is made from the planes.
+
+    Attributes:
+        glyph: one character for text drawings; several, one for each value 1, 2, ... on the plane.
+        color: (red, green, blue), 0 to 255; or several, one for each value on the plane.
+        sprite: rows of text, '#' where the sprite has the colour and '.' where the ground shows through; digits 1-9 pick
+            shades from light to dark; several sprites, one for each value on the plane. None draws a full cell.
+    """
+
+    glyph: str | tuple[str, ...]
+    color: tuple[int, int, int] | tuple[tuple[int, int, int], ...]
+    sprite: tuple[str, ...] | tuple[tuple[str, ...], ...] | None = None
+
+
+@dataclass(frozen=True)
+class Components:
+    """The D components of a state vector, derived from `Environment.variables`.
+
+    Attributes:
+        names: D names, such as `row` or `bricks[0,3]`.
+        variables: name of a variable -> slice of the state vector.
+        low, size: (D,) int64; component i takes the values low[i], ..., low[i] + size[i] - 1.
+    """
+
+    names: tuple[str, ...]
+    variables: Mapping[str, slice]
+    low: np.ndarray
+    size: np.ndarray
+
+    @property
+    def high(self) -> np.ndarray:
+        """(D,) int64, the largest value of each component."""
+        return self.low + self.size - 1
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+
+class Environment:
+    """Base class of environments: a frozen dataclass of parameters, and pure functions of one state.
+
+    A subclass is decorated with `@dataclass(frozen=True, kw_only=True)` and defines:
+
+    Class attributes
+        name: str                   the name users type, such as "breakout"
+        actions: tuple[str, ...]    names of the A actions; actions are the integers 0 .. A-1
+        version: int                raised when a transition or reward changes, never for a refactoring
+        layers: dict[str, Layer]    how each plane of `draw` looks; later layers cover earlier ones
+        max_episode_steps: int      the time limit that the Gymnasium environments use unless told otherwise;
+                                    an attribute or a property
+
+    Methods that describe an instance (ordinary Python)
+        validate(self)              raises ParameterError where a parameter is out of range
+        variables(self)             name -> range, or a nested sequence of ranges for an array of variables
+        initial_state(self)         the start state, a sequence of D integers;
+                                    or `initial_states`: several of them with their probabilities
+        grid(self)                  (rows, columns) of the drawing
+
+    Methods that are the rules (compiled by Numba where possible; one state, plain branches, integers)
+        transition(self, state, action, out)        `out` holds a copy of `state`: write what changes
+        is_terminal(self, state) -> bool            the episode has ended in `state`
+        reward(self, state, action, next_state)     the reward of a transition, a float
+        draw(self, state, planes)                   planes (L, rows, columns) uint8, zero: write 1, 2, ... where things are
+
+    In compiled rules `self` offers the numeric fields of the dataclass and the numeric properties of the class (numbers,
+    tuples of numbers, arrays), under the same names; it has no methods. Call module-level functions instead: pharos
+    compiles those that a rule mentions. Rules never change `state`, and use neither chance, time nor anything global that
+    varies.
+    """
+
+    name: ClassVar[str]
+    actions: ClassVar[tuple[str, ...]]
+    version: ClassVar[int] = 1
+    layers: ClassVar[dict[str, Layer]] = {}
+    max_episode_steps: Any = 1000
+
+    def __post_init__(self) -> None:
+        self.validate()
+
+    # What an instance is -------------------------------------------------------------------------------------------------
+
+    def validate(self) -> None:
+        """Raise ParameterError where a parameter is out of range. The base class accepts everything."""
+
+    def variables(self) -> Mapping[str, Ranges]:
+        """Name -> range of values, or a nested sequence of ranges for an array of variables (flattened in C order)."""
+        raise NotImplementedError(f"{type(self).__name__} must define variables()")
+
+    def initial_state(self) -> Sequence[int]:
+        """The state in which every episode starts."""
+        raise NotImplementedError(f"{type(self).__name__} must define initial_state() or initial_states()")
+
+    def initial_states(self) -> Sequence[tuple[Sequence[int], float]]:
+        """The start states with their probabilities, which sum to 1."""
+        return [(self.initial_state(), 1.0)]
+
+    def grid(self) -> tuple[int, int]:
+        """(rows, columns) of the drawing."""
+        raise NotImplementedError(f"{type(self).__name__} must define grid() to be drawn")
+
+    # The rules -----------------------------------------------------------------------------------------------------------
+
+    def transition(self, state, action, out) -> None:
+        """Write into `out`, a copy of `state`, what `action` changes."""
+        raise NotImplementedError(f"{type(self).__name__} must define transition()")
+
+    def is_terminal(self, state) -> bool:
+        """Whether the episode has ended in `state`. The base class never ends."""
+        return False
+
+    def reward(self, state, action, next_state) -> float:
+        """The reward of going from `state` to `next_state` by `action`."""
+        raise NotImplementedError(f"{type(self).__name__} must define reward()")
+
+    def draw(self, state, planes) -> None:
+        """Write 1, 2, ... into planes (L, rows, columns) uint8 where the thing of each layer is."""
+        raise NotImplementedError(f"{type(self).__name__} must define draw() to be drawn")
+
+    # Derived -------------------------------------------------------------------------------------------------------------
+
+    @property
+    def num_actions(self) -> int:
+        """A, the number of actions."""
+        return len(self.actions)
+
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """The parameters of this instance, in the order of the dataclass; JSON-able."""
+        return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}  # type: ignore[arg-type]
+
+    @cached_property
+    def components(self) -> Components:
+        """The D components of a state vector, with their names and ranges."""
+        names: list[str] = []
+        ranges: list[range] = []
+        slices: dict[str, slice] = {}
+        for variable, declared in self.variables().items():
+            start = len(names)
+            for index, values in _flattened(declared):
+                if not isinstance(values, range) or values.step != 1 or not values:
+                    raise ParameterError(
+                        f"{self}: variable {variable!r} is declared as {values!r}; expected a non-empty range with step 1, "
+                        f"or a nested sequence of such ranges"
+                    )
+                if values.start < -(2**63) or values.stop > 2**63 or values.stop - values.start >= 2**63:
+                    raise ParameterError(
+                        f"{self}: variable {variable!r} is declared as {values!r}; "
+                        f"expected integers of 64 bits, and at most 2^63 - 1 values"
+                    )
+                names.append(variable + (f"[{','.join(map(str, index))}]" if index else ""))
+                ranges.append(values)
+            slices[variable] = slice(start, len(names))
+        if not names:
+            raise ParameterError(f"{self}: variables() declares nothing; a state needs at least one variable")
+        low = np.array([values.start for values in ranges], np.int64)
+        size = np.array([values.stop - values.start for values in ranges], np.int64)
+        low.flags.writeable = size.flags.writeable = False
+        return Components(tuple(names), slices, low, size)
+
+    def next_state(self, state: Sequence[int], action: int) -> State:
+        """The state after `action` in `state`, interpreted: for reading, testing and drawing. Works on terminal states too."""
+        out = list(state)
+        self.transition(tuple(state), action, out)
+        return tuple(int(value) for value in out)
+
+    def __str__(self) -> str:
+        fields = ", ".join(f"{name}={value!r}" for name, value in self.parameters.items())
+        return f"{type(self).__name__}({fields})"
+
+
+def start_distribution(env: Environment) -> tuple[list[State], np.ndarray]:
+    """The start states, each once, and their probabilities; ParameterError where they are not a distribution."""
+    merged: dict[State, float] = {}
+    components = env.components
+    for state, probability in env.initial_states():
+        values = np.asarray(state)
+        if values.shape != (len(components),):
+            raise ParameterError(
+                f"{env}: start state {tuple(state)} has {values.size} components; expected {len(components)}"
+            )
+        if values.dtype.kind not in "iub":
+            i = next(i for i, value in enumerate(state) if not isinstance(value, int | np.integer))
+            raise ParameterError(
+                f"{env}: start state {tuple(state)} has {components.names[i]} = {state[i]!r}; expected an integer"
+            )
+        outside = np.flatnonzero((values < components.low) | (values > components.high))
+        if outside.size:
+            i = int(outside[0])
+            raise ParameterError(
+                f"{env}: start state {tuple(state)} has {components.names[i]} = {values[i]}; "
+                f"expected {components.low[i]} to {components.high[i]}"
+            )
+        if not (math.isfinite(probability) and probability > 0):
+            raise ParameterError(
+                f"{env}: start state {tuple(state)} has probability {probability}; expected one in (0, 1]"
+            )
+        key = tuple(int(value) for value in state)
+        merged[key] = merged.get(key, 0.0) + float(probability)
+    if not merged or abs(sum(merged.values()) - 1) > 1e-9:
+        raise ParameterError(f"{env}: probabilities of the start states sum to {sum(merged.values())}; expected 1")
+    return list(merged), np.array(list(merged.values()))
+
+
+def _flattened(declared: Ranges, index: tuple[int, ...] = ()):
+    if isinstance(declared, Sequence) and not isinstance(declared, range | str):
+        for i, inner in enumerate(declared):
+            yield from _flattened(inner, (*index, i))
+    else:
+        yield index, declared

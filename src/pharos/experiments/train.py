@@ -1,0 +1,371 @@
+"""Training an agent on a task, with the exact regret of its policy at chosen steps; what is done stays done.
+
+    FOLDER/run.json         configuration, versions, status, result
+    FOLDER/curve.parquet    a row for each evaluation
+    FOLDER/checkpoint/      while it runs: what the next attempt goes on from; plain arrays, JSON and tensors, never code
+
+A run that is killed goes on from its last checkpoint when it is started again: at most the last interval between evaluations is
+lost (or the last ten seconds, where intervals are shorter). Without interruption the same seed gives the same curve file.
+"""
+
+import json
+import math
+import os
+import shutil
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+from pharos.agents.hyperparameters import hyperparameters as hyperparameters_of
+from pharos.environments import Environment, make
+from pharos.errors import ParameterError
+from pharos.experiments import results as _results
+from pharos.experiments.evaluation import evaluate_agent
+from pharos.experiments.task import Task
+
+Progress = Callable[[int, int, Mapping[str, Any]], None]
+CHECKPOINT_SECONDS = 10.0
+
+
+@dataclass(frozen=True)
+class TrainingResult:
+    """What a run gave.
+
+    Attributes:
+        config: of the run.
+        result: summary: values of the optimal, uniform, worst and final policy, regrets, episodes.
+        curve: a row for each evaluation, a dictionary with the columns of curve.parquet.
+        agent: the trained agent: a `QLearning` or a model of Stable-Baselines3; None where the run was finished before.
+        folder: of the run, or None.
+        seconds: time that it took.
+    """
+
+    config: dict[str, Any]
+    result: dict[str, Any]
+    curve: list[dict[str, Any]]
+    agent: Any
+    folder: Path | None
+    seconds: float
+
+
+def train(
+    agent: str,
+    environment: Environment | str,
+    *,
+    steps: int,
+    observation: str = "vector",
+    observation_options: Mapping[str, Any] | None = None,
+    sticky: float = 0.0,
+    random: float = 0.0,
+    gamma: float = 1.0,
+    horizon: int | str | None = "default",
+    seed: int = 0,
+    evaluation_interval: int | None = None,
+    hyperparameters: Mapping[str, Any] | str | os.PathLike | None = None,
+    out: str | os.PathLike | None = None,
+    tensorboard: bool = False,
+    progress: Progress | None = None,
+    **parameters: Any,
+) -> TrainingResult:
+    """Train an agent, and measure the exact regret of its policy as it learns.
+
+    Args:
+        agent: "q_learning", "dqn", "ppo", "a2c", or "module:Class" of an algorithm for Stable-Baselines3.
+        environment: a name, with its `parameters` as keywords, or an Environment.
+        steps: number of environment steps to learn from.
+        observation, observation_options: what the agent sees; tabular agents see the state's index.
+        sticky, random: chance.
+        gamma, horizon: setting of values and returns, see `Task`; the agent's own discount is a hyperparameter.
+        evaluation_interval: steps between evaluations; None: a hundredth of `steps`.
+        hyperparameters: go before those of agents/hyperparameters.yaml; or a YAML file of the same form, such as one that `tune` wrote.
+        out: folder of the run; None: nothing is written. A finished run there is returned, an unfinished one resumed.
+        tensorboard: write TensorBoard's logs into `out`/tensorboard (algorithms of Stable-Baselines3).
+        progress: called after each evaluation with steps done, steps in all, and the row of the curve.
+    Raises:
+        ParameterError: an option is wrong, or `out` holds another run. UnknownName: no such name; the nearest is suggested.
+        MissingExtra: Stable-Baselines3 is not installed.
+    """
+    env = make(environment, **parameters) if isinstance(environment, str) else environment
+    tabular = agent == "q_learning"
+    given = Task(
+        env,
+        sticky=sticky,
+        random=random,
+        observation="index" if tabular else observation,
+        observation_options=dict(observation_options or {}),
+        gamma=gamma,
+        horizon=horizon,
+    )
+    return train_on(
+        given,
+        agent,
+        steps=steps,
+        seed=seed,
+        evaluation_interval=evaluation_interval,
+        hyperparameters=hyperparameters,
+        out=out,
+        tensorboard=tensorboard,
+        progress=progress,
+    )
+
+
+def train_on(
+    task: Task,
+    agent: str,
+    *,
+    steps: int,
+    seed: int = 0,
+    evaluation_interval: int | None = None,
+    hyperparameters: Mapping[str, Any] | str | os.PathLike | None = None,
+    out: str | os.PathLike | None = None,
+    tensorboard: bool = False,
+    progress: Progress | None = None,
+) -> TrainingResult:
+    """As `train`, on a task, which is built and solved once for all runs on it."""
+    env = task.env
+    if hyperparameters is None or isinstance(hyperparameters, Mapping):
+        given = dict(hyperparameters or {})
+    else:
+        given = hyperparameters_of(agent, env.name, str(task.observation), table=Path(hyperparameters))
+    config = {
+        "environment": env.name,
+        "parameters": json.loads(json.dumps(env.parameters)),
+        "chance": {"sticky": task.sticky, "random": task.random},
+        "observation": task.observation,
+        "observation_options": dict(task.observation_options),
+        "agent": agent,
+        "hyperparameters": given,
+        "steps": steps,
+        "seed": seed,
+        "gamma": task.gamma,
+        "horizon": task.horizon,
+        "evaluation_interval": evaluation_interval or max(1, steps // 100),
+    }
+    return _run(config, task, None if out is None else Path(out), tensorboard, progress)
+
+
+def train_config(
+    config: Mapping[str, Any], folder: str | os.PathLike, progress: Progress | None = None
+) -> TrainingResult:
+    """Train as a configuration says, the `config` of a run.json or of a study; results go into `folder`."""
+    chance = config["chance"]
+    parameters = {name: _tuples(value) for name, value in config["parameters"].items()}
+    task = Task(
+        make(config["environment"], **parameters),
+        sticky=chance["sticky"],
+        random=chance["random"],
+        observation=config["observation"],
+        observation_options=dict(config["observation_options"]),
+        gamma=config["gamma"],
+        horizon=config["horizon"],
+    )
+    return _run(dict(config), task, Path(folder), False, progress)
+
+
+def _tuples(value: Any) -> Any:
+    return tuple(_tuples(item) for item in value) if isinstance(value, list) else value
+
+
+# One run ----------------------------------------------------------------------------------------------------------------
+
+
+class Learner(Protocol):
+    """What a run needs of an agent that learns."""
+
+    agent: Any
+
+    def learn(self, points: list[int], at_point: Callable[[int, int, float], dict[str, Any]]) -> None:
+        """Learn until the last of `points`; at each call at_point(steps, finished episodes, sum of their returns) -> row."""
+
+    def save(self, folder: Path) -> None:
+        """Write what `load` needs."""
+
+    def load(self, folder: Path) -> None:
+        """Go on from what `save` wrote."""
+
+
+@dataclass
+class _Curve:
+    """The rows so far, and the regret of the episodes between evaluations."""
+
+    task: Task
+    rows: list[dict[str, Any]] = field(default_factory=list)
+
+    def add(self, step: int, episodes: int, returns: float, agent: Any) -> dict[str, Any]:
+        """Evaluate the policy after `step` steps, `episodes` finished episodes and the sum `returns` of their returns."""
+        found = evaluate_agent(agent, self.task)
+        best, uniform = self.task.reference.optimal, self.task.reference.uniform
+        last = self.rows[-1] if self.rows else None
+        finished = episodes - (last["episodes"] if last else 0)
+        gained = returns - (last["returns"] if last else 0.0)
+        mean = gained / finished if finished else math.nan
+        regret = best - found.value
+        spread = best - uniform
+        row = {
+            "step": step,
+            "episodes": episodes,
+            "value": found.value,
+            "expected_regret": regret,
+            "cumulative_expected_regret": (
+                last["cumulative_expected_regret"] + finished * last["expected_regret"] if last else 0.0
+            ),
+            "normalized_regret": regret / spread if spread > 1e-12 else math.nan,
+            "mean_return": mean,
+            "realised_regret": best - mean,
+            "cumulative_realised_regret": episodes * best - returns,
+            "exact": found.exact,
+            "error_bound": found.error_bound,
+            "returns": returns,
+        }
+        self.rows.append(row)
+        return row
+
+    def result(self) -> dict[str, Any]:
+        """The summary of a finished run."""
+        task, last = self.task, self.rows[-1]
+        best, uniform = task.reference.optimal, task.reference.uniform
+        scale = last["episodes"] * (best - uniform)
+        return {
+            "value_optimal": best,
+            "value_uniform": uniform,
+            "value_worst": task.reference.worst,
+            "final_value": last["value"],
+            "final_regret": last["expected_regret"],
+            "cumulative_regret": last["cumulative_expected_regret"],
+            "normalized_regret": last["cumulative_expected_regret"] / scale if scale > 1e-12 else math.nan,
+            "cumulative_realised_regret": last["cumulative_realised_regret"],
+            "normalized_realised_regret": last["cumulative_realised_regret"] / scale if scale > 1e-12 else math.nan,
+            "mean_return": last["returns"] / last["episodes"] if last["episodes"] else math.nan,
+            "episodes": last["episodes"],
+            "exact": all(row["exact"] for row in self.rows),
+            "conventions": task.conventions,
+        }
+
+
+def _run(
+    config: dict[str, Any], task: Task, folder: Path | None, tensorboard: bool, progress: Progress | None
+) -> TrainingResult:
+    steps, interval = config["steps"], config["evaluation_interval"]
+    for name, value in (("steps", steps), ("evaluation_interval", interval)):
+        if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+            raise ParameterError(f"{name} is {value!r}; expected a whole number of at least 1")
+    if tensorboard and (folder is None or config["agent"] == "q_learning"):
+        raise ParameterError(
+            f"TensorBoard's logs were asked for, with {config['agent']} and {'a' if folder else 'no'} folder for results; "
+            f"expected an algorithm of Stable-Baselines3 and a folder (out)"
+        )
+    id, began = _results.identifier(config), time.perf_counter()
+    record: dict[str, Any] = {"format": _results.FORMAT, "id": id, "config": config, "versions": _results.versions()}
+    spent = 0.0
+    if folder is not None:
+        folder.mkdir(parents=True, exist_ok=True)
+        done = _finished(folder, config)
+        if done is not None:
+            return done
+    chosen = hyperparameters_of(config["agent"], task.env.name, str(config["observation"]), config["hyperparameters"])
+    logs = str(folder / "tensorboard") if folder is not None and tensorboard else None
+    learner = _learner(config["agent"], task, chosen, steps, config["seed"], logs)
+    curve = _Curve(task)
+    checkpoint = None if folder is None else _Checkpoint(folder / "checkpoint", id)
+    if folder is not None and checkpoint is not None:
+        restored = checkpoint.restore(learner)
+        if restored is not None:
+            curve.rows, spent = restored
+        record |= {"status": "running", "hyperparameters": chosen}
+        _results.write_record(folder, record)
+    if not curve.rows:
+        curve.add(0, 0, 0.0, learner.agent)
+    start = curve.rows[-1]["step"]
+    points = [point for point in [*range(interval, steps, interval), steps] if point > start]
+
+    def at_point(step: int, episodes: int, returns: float) -> dict[str, Any]:
+        row = curve.add(step, episodes, returns, learner.agent)
+        if progress is not None:
+            progress(step, steps, row)
+        if checkpoint is not None and step < steps:
+            checkpoint.save(learner, curve.rows, spent + time.perf_counter() - began)
+        return row
+
+    if points:
+        try:
+            learner.learn(points, at_point)
+        except Exception as error:
+            if folder is not None:
+                said = f"{type(error).__name__}: {' '.join(str(error).split())}"
+                _results.write_record(folder, {**record, "status": "failed", "error": said})
+            raise
+    seconds = spent + time.perf_counter() - began
+    result = curve.result()
+    if folder is not None:
+        if config["agent"] == "q_learning":
+            _results.write_policy(folder, learner.agent.policy_table())
+        else:
+            learner.save(folder / "agent")
+        _results.write_curve(folder, curve.rows)
+        _results.write_record(folder, {**record, "status": "finished", "seconds": seconds, "result": result})
+        shutil.rmtree(folder / "checkpoint", ignore_errors=True)
+    rows = [{name: row[name] for name in _results.COLUMNS} for row in curve.rows]
+    return TrainingResult(config, result, rows, learner.agent, folder, seconds)
+
+
+def _finished(folder: Path, config: Mapping[str, Any]) -> TrainingResult | None:
+    """The result that lies there; None where there is none; ParameterError where it is that of another run."""
+    if not (folder / "run.json").exists():
+        return None
+    record = _results.read_record(folder)
+    if record["config"] != json.loads(json.dumps(config)):
+        different = [key for key in config if record["config"].get(key) != json.loads(json.dumps(config[key]))]
+        raise ParameterError(
+            f"{folder}: holds a run with another {', '.join(different) or 'configuration'}; choose another folder, or delete it"
+        )
+    if record.get("status") != "finished":
+        return None
+    rows = _results.read_curve(folder).to_dict("records")
+    return TrainingResult(record["config"], record["result"], rows, None, folder, record["seconds"])
+
+
+def _learner(agent: str, task: Task, chosen: dict[str, Any], steps: int, seed: int, tensorboard: str | None) -> Learner:
+    from pharos.experiments import learners as _learners
+
+    if agent == "q_learning":
+        return _learners.Tabular(task, chosen, steps, seed)
+    return _learners.Deep(agent, task, chosen, steps, seed, tensorboard)
+
+
+class _Checkpoint:
+    """A folder that holds the last checkpoint, replaced in one step."""
+
+    def __init__(self, folder: Path, id: str):
+        self.folder, self.id = folder, id
+        self._saved = -math.inf
+
+    def save(self, learner: Learner, rows: list[dict[str, Any]], seconds: float) -> None:
+        """Write one, unless the last is not ten seconds old."""
+        if time.monotonic() - self._saved < CHECKPOINT_SECONDS:
+            return
+        partial = self.folder.with_name(f"{self.folder.name}.partial")
+        shutil.rmtree(partial, ignore_errors=True)
+        partial.mkdir(parents=True)
+        learner.save(partial)
+        (partial / "curve.json").write_text(json.dumps({"id": self.id, "rows": rows, "seconds": seconds}))
+        old = self.folder.with_name(f"{self.folder.name}.old")
+        if self.folder.exists():
+            shutil.rmtree(old, ignore_errors=True)
+            os.replace(self.folder, old)
+        os.replace(partial, self.folder)
+        shutil.rmtree(old, ignore_errors=True)
+        self._saved = time.monotonic()
+
+    def restore(self, learner: Learner) -> tuple[list[dict[str, Any]], float] | None:
+        """(rows of the curve, seconds spent) of the last checkpoint, with the learner set to it; None where there is none."""
+        for folder in (self.folder, self.folder.with_name(f"{self.folder.name}.old")):
+            try:
+                kept = json.loads((folder / "curve.json").read_text())
+            except (FileNotFoundError, ValueError):
+                continue
+            if kept.get("id") == self.id:
+                learner.load(folder)
+                return kept["rows"], kept["seconds"]
+        return None

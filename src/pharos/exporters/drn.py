@@ -1,0 +1,64 @@
+"""Storm's explicit format DRN: https://www.stormchecker.org/documentation/background/drn.html"""
+
+import os
+from pathlib import Path
+from typing import TextIO
+
+import numpy as np
+
+from pharos.errors import ParameterError
+from pharos.exporters.gymnasium import gym_p
+from pharos.mdp import TabularMDP
+
+
+def drn(mdp: TabularMDP, path: str | os.PathLike) -> Path:
+    """Write an MDP for Storm, with a reward model "reward" on actions and labels "init" and "terminal".
+
+    Discounting is written out: with gamma < 1 every step ends the episode with probability 1 - gamma, so that Storm's expected total
+    reward `Rmax=? [F "terminal"]` is the discounted value. Several start states become choices of one more, first state.
+
+    Raises:
+        ParameterError: sticky actions (see `gym_p`); or the name does not end in .drn.
+    Cost: a line for each transition; for small MDPs.
+    """
+    path = Path(path)
+    if path.suffix != ".drn":
+        raise ParameterError(f"{path}: expected a name that ends in .drn")
+    table = gym_p(mdp)
+    end = mdp.num_states
+    table.setdefault(end, {a: [(1.0, end, 0.0, True)] for a in range(mdp.num_actions)})
+    absorbing = {s for s in range(end) if mdp.terminal[s]} | {end}
+    with open(path, "w", encoding="ascii") as file:
+        several = len(mdp.start_states) > 1
+        file.write("@type: MDP\n@parameters\n\n@reward_models\nreward\n")
+        file.write(f"@nr_states\n{end + 1 + several}\n@nr_choices\n{(end + 1) * mdp.num_actions + several}\n@model\n")
+        if several:
+            file.write("state 0 [0] init\n\taction start [0]\n")
+            for s, p in zip(mdp.start_states, mdp.start_probabilities, strict=True):
+                file.write(f"\t\t{int(s) + 1} : {float(p)!r}\n")
+        for s in range(end + 1):
+            init = " init" if not several and s == int(mdp.start_states[0]) else ""
+            file.write(f"state {s + several} [0]{init}{' terminal' if s in absorbing else ''}\n")
+            for a in range(mdp.num_actions):
+                _choice(file, table[s][a], a, s in absorbing, mdp.gamma, s, end, several)
+    return path
+
+
+def _choice(
+    file: TextIO, outcomes: list, action: int, absorbing: bool, gamma: float, s: int, end: int, shift: int
+) -> None:
+    """One action: its expected reward, then next states in increasing order with their probabilities."""
+    if absorbing:
+        file.write(f"\taction {action} [0]\n\t\t{s + shift} : 1\n")
+        return
+    reward = float(np.sum([p * paid for p, _, paid, _ in outcomes]))
+    probabilities: dict[int, float] = {}
+    for p, t, _, ended in outcomes:
+        kept = p if ended else gamma * p
+        probabilities[t] = probabilities.get(t, 0.0) + kept
+        if kept < p:
+            probabilities[end] = probabilities.get(end, 0.0) + p - kept
+    file.write(f"\taction {action} [{reward!r}]\n")
+    for t in sorted(probabilities):
+        if probabilities[t] > 0:
+            file.write(f"\t\t{t + shift} : {probabilities[t]!r}\n")

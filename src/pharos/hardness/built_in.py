@@ -1,0 +1,147 @@
+"""The measures that pharos registers, in the order of a report."""
+
+from typing import Any
+
+from pharos.hardness.action_gap import action_gap_regularity
+from pharos.hardness.covering import covering
+from pharos.hardness.diameter import diameter, start_eccentricity
+from pharos.hardness.effective_horizon import effective_horizon
+from pharos.hardness.gorp import gorp_bound
+from pharos.hardness.mismatch import distribution_mismatch
+from pharos.hardness.mixing_time import mixing_time
+from pharos.hardness.registry import Problem, register
+from pharos.hardness.stationary_horizon import stationary_effective_horizon
+from pharos.hardness.value_norm import environmental_value_norm
+
+
+def _diameter(problem: Problem) -> Any:
+    return diameter(problem.mdp, restart=problem.restart, budget=problem.budget, progress=problem.squeezing("diameter"))
+
+
+register(
+    "diameter",
+    _diameter,
+    definition="max over s != s' of min over policies of E[steps from s to s']",
+    source="Jaksch, Ortner and Auer (2010), definition 1; the pharos paper, equation 1",
+    complexity="visitation",
+    version=1,
+    depends="structure",
+)
+register(
+    "start_eccentricity",
+    lambda problem: start_eccentricity(problem.mdp, restart=problem.restart, budget=problem.budget),
+    definition="max over s' of min over policies of E[steps from the start to s']",
+    source="the pharos paper, equation 1, read literally",
+    complexity="visitation",
+    version=1,
+    depends="structure",
+)
+register(
+    "sum_of_reciprocal_gaps",
+    lambda problem: problem.gaps.sum_of_reciprocals,
+    definition="sum of 1 / (V*(s) - Q*(s, a)) over reachable s and actions that are not optimal",
+    source="Simchowitz and Jamieson (2019); the pharos paper, equation 2",
+    complexity="estimation",
+    version=1,
+    depends="values",
+)
+register(
+    "sum_of_reciprocal_gaps_regularized",
+    lambda problem: problem.gaps.regularized,
+    definition="sum of 1 / (V*(s) - Q*(s, a) + 0.1) over all s and a",
+    source="Conserva and Rauber (2022), as in Colosseum",
+    complexity="estimation",
+    version=1,
+    depends="values",
+)
+register(
+    "minimal_gap",
+    lambda problem: problem.gaps.minimal,
+    definition="the smallest V*(s) - Q*(s, a) > 0 over reachable s",
+    source="Simchowitz and Jamieson (2019)",
+    complexity="estimation",
+    version=1,
+    depends="values",
+)
+register(
+    "environmental_value_norm",
+    lambda problem: environmental_value_norm(problem.mdp, problem.solution),
+    definition="max over s, a of the standard deviation of V*(s') under p(. | s, a)",
+    source="Maillard, Mann and Mannor (2014), definition 1",
+    complexity="estimation",
+    version=1,
+    depends="values",
+)
+register(
+    "effective_horizon",
+    lambda problem: effective_horizon(problem.mdp, horizon=problem.episode("effective_horizon")),
+    definition="min over k of k + log_A m_k: m_k samples of k steps followed by random play tell optimal actions apart",
+    source="Laidlaw, Russell and Dragan (2023), theorem 5.4",
+    complexity="planning",
+    version=1,
+    depends="episodes",
+)
+register(
+    "covering",
+    lambda problem: covering(problem.mdp, horizon=problem.episode("covering")),
+    definition="min over s, a of max over t of mu_t(s, a) under uniform play; length <= ln(2 S A) / omega",
+    source="Laidlaw, Russell and Dragan (2023); Even-Dar and Mansour (2003)",
+    complexity="visitation",
+    version=1,
+    depends="episodes",
+)
+register(
+    "action_gap_regularity",
+    lambda problem: action_gap_regularity(problem.mdp, problem.solution),
+    definition="smallest c with P(0 < V*(s) - best Q*(s, a) that is not optimal <= t) <= c t for all t, s uniform",
+    source="Farahmand (2011), assumption A1",
+    complexity="estimation",
+    version=1,
+    depends="values",
+    on_request=True,
+)
+register(
+    "distribution_mismatch",
+    lambda problem: distribution_mismatch(problem.mdp, solution=problem.solution),
+    definition="max over s of d*(s) / d(s), discounted visits of the optimal and of the uniform policy",
+    source="Kakade and Langford (2002); Agarwal et al. (2021), section 4.2",
+    complexity="visitation",
+    version=1,
+    depends="values",
+    on_request=True,
+)
+register(
+    "mixing_time",
+    lambda problem: mixing_time(problem.mdp, restart=problem.restart),
+    definition="min t with max over s of the total variation of P^t(s, .) to the stationary distribution <= 1/4; uniform play",
+    source="Kearns and Singh (2002); Levin, Peres and Wilmer (2009), section 4.5",
+    complexity="visitation",
+    version=1,
+    depends="structure",
+    on_request=True,
+)
+register(
+    "tight_effective_horizon",
+    lambda problem: gorp_bound(problem.mdp, horizon=problem.episode("tight_effective_horizon")),
+    definition="1 + log_A m, m samples with which greedy over random policy fails with probability <= 1/2",
+    source="Laidlaw, Russell and Dragan (2023), appendix C",
+    complexity="planning",
+    version=1,
+    depends="episodes",
+    on_request=True,
+)
+register(
+    "stationary_effective_horizon",
+    lambda problem: stationary_effective_horizon(
+        problem.mdp,
+        problem.solution if problem.mdp.horizon is None else None,
+        steps=problem.horizon,
+        progress=lambda line: problem.report("stationary_effective_horizon", line),
+    ),
+    definition="the effective horizon with one discounted value a state in place of one for each step",
+    source="pharos; after Laidlaw, Russell and Dragan (2023), theorem 5.4",
+    complexity="planning",
+    version=1,
+    depends="all",
+    on_request=True,
+)

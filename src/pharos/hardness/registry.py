@@ -1,0 +1,172 @@
+"""The measures of a report: name, function, definition and source; and how a user adds one."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+from pharos.errors import ParameterError, PrecisionError, UndefinedMeasure, UnknownName
+from pharos.hardness.gaps import Gaps, gaps
+from pharos.hardness.interval import Budget, Progress
+from pharos.mdp import TabularMDP
+from pharos.solvers import Solution, value_iteration
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """An MDP that is being measured, with what several measures need, computed once.
+
+    Attributes:
+        mdp: the MDP. Its gamma, and its horizon where it has one, are those of values and gaps.
+        horizon: number of steps T for measures of episodes; that of the MDP where it has one; or None.
+        tolerance: largest error of a value, in units of return; a larger one is used where floats cannot reach it.
+        restart: convention of the diameter: terminal states lead back to the start.
+        budget: what each measure may spend before it returns a proven interval.
+        progress: called with the name of the running measure and a line on how far it is.
+    """
+
+    mdp: TabularMDP
+    horizon: int | None = None
+    tolerance: float = 1e-9
+    restart: bool = True
+    budget: Budget = field(default_factory=Budget)
+    progress: Callable[[str, str], None] | None = None
+
+    @cached_property
+    def solution(self) -> Solution:
+        """Optimal values."""
+        tolerance = self.tolerance
+        while True:
+            try:
+                return value_iteration(
+                    self.mdp,
+                    tolerance,
+                    keep_all=self.mdp.horizon is not None and self._is_small,
+                    progress=lambda sweeps, bound: self.report("values", f"sweep {sweeps}, error at most {bound:.2g}"),
+                )
+            except PrecisionError:
+                if tolerance > 1:
+                    raise
+                tolerance *= 10
+
+    @cached_property
+    def gaps(self) -> Gaps:
+        """Suboptimality gaps."""
+        return gaps(self.mdp, self.solution)
+
+    def episode(self, measure: str) -> int:
+        """The horizon; UndefinedMeasure where there is none."""
+        if self.horizon is None:
+            raise UndefinedMeasure(f"{measure} is defined for episodes of T steps: give a horizon")
+        return self.horizon
+
+    def report(self, what: str, line: str) -> None:
+        """Say how far one is."""
+        if self.progress is not None:
+            self.progress(what, line)
+
+    def squeezing(self, what: str) -> Callable[[Progress], None]:
+        """A callback for measures that squeeze an interval."""
+
+        def tell(progress: Progress) -> None:
+            upper = f"{progress.upper:.6g}" if math.isfinite(progress.upper) and progress.upper < 2**31 - 1 else "?"
+            self.report(
+                what,
+                f"between {progress.lower:.6g} and {upper}, {progress.searches} searches, {progress.candidates:,} states open",
+            )
+
+        return tell
+
+    @property
+    def _is_small(self) -> bool:
+        width = self.mdp.num_actions if self.mdp.is_sticky else 1
+        return self.mdp.num_states * width * ((self.mdp.horizon or 0) + 1) * 8 <= 2**30
+
+
+@dataclass(frozen=True)
+class Measure:
+    """One line of a report.
+
+    Attributes:
+        name: key of the result.
+        function: Problem -> a number, or an object with `to_dict()`; UndefinedMeasure where it does not exist.
+        definition: formula, in a line.
+        source: who defined it.
+        complexity: "visitation", "estimation", "planning" or "other".
+        version: goes up when the function's results change, so that kept ones are not used; None: never keep results.
+        depends: on what results depend, beside the transitions, chance and start: "structure" (nothing else), "values" (rewards,
+            gamma), "episodes" (rewards, horizon), "all".
+        on_request: only part of a report where it is named, or where all are asked for.
+    """
+
+    name: str
+    function: Callable[[Problem], Any]
+    definition: str
+    source: str
+    complexity: str = "other"
+    version: int | None = None
+    depends: str = "all"
+    on_request: bool = False
+
+
+_MEASURES: dict[str, Measure] = {}
+
+
+def register(
+    name: str,
+    function: Callable[[Problem], Any],
+    *,
+    definition: str,
+    source: str = "the user",
+    complexity: str = "other",
+    version: int | None = None,
+    depends: str = "all",
+    on_request: bool = False,
+) -> Measure:
+    """Make a measure part of every report: `register("density", lambda p: (p.mdp.rewards != 0).mean(), definition="...")`.
+
+    Args:
+        function: takes a `Problem` (`.mdp`, `.solution`, `.gaps`, `.horizon`, `.budget`) and returns a number, or an object with
+            `to_dict()`.
+        definition, source: printed beside the value.
+        version: give one to keep results beside the state space, and raise it when the function changes.
+        depends, on_request: see `Measure`.
+    Raises:
+        ParameterError: the name is no identifier, or taken by a measure of pharos.
+    """
+    if not name.isidentifier():
+        raise ParameterError(
+            f"the measure's name is {name!r}; expected letters, digits and underscores, as in 'my_measure'"
+        )
+    if name in _MEASURES and _MEASURES[name].source != "the user" and source == "the user":
+        raise ParameterError(f"{name!r} is a measure of pharos; choose another name")
+    _MEASURES[name] = Measure(name, function, definition, source, complexity, version, depends, on_request)
+    return _MEASURES[name]
+
+
+def measures() -> dict[str, Measure]:
+    """The known measures by name, in the order of a report."""
+    return dict(_MEASURES)
+
+
+def chosen(names: Any) -> list[Measure]:
+    """The measures of these names; None: all but those on request; "all": these as well.
+
+    Raises:
+        UnknownName: there is no such measure; the nearest is suggested.
+    """
+    if names is None:
+        return [measure for measure in _MEASURES.values() if not measure.on_request]
+    if names == "all":
+        return list(_MEASURES.values())
+    if isinstance(names, str):
+        names = names.split(",")
+    result = []
+    for name in names:
+        if name.strip() not in _MEASURES:
+            raise UnknownName("measure", name.strip(), _MEASURES)
+        result.append(_MEASURES[name.strip()])
+    if not result:
+        raise ParameterError("no measures are named; name at least one, or give None for all")
+    return result

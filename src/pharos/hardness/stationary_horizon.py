@@ -1,0 +1,322 @@
+"""The effective horizon of discounted MDPs without time: one value a state, so that it is within reach of millions of states.
+
+pharos's own variant of Laidlaw, Russell and Dragan's (2023) measure; `effective_horizon` is theirs.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from pharos.errors import ParameterError, PrecisionError, UndefinedMeasure
+from pharos.hardness.choices import Choices, choices_of, reachable
+from pharos.hardness.effective_horizon import _expected_rewards, _single_outcomes
+from pharos.mdp import TabularMDP
+from pharos.solvers import Solution, uniform_value, value_iteration, worst_value
+
+
+@dataclass(frozen=True)
+class StationaryHorizon:
+    """How far ahead one must look in a discounted MDP.
+
+    Attributes:
+        value: min over k of k + log_A m_k, at most `steps`.
+        k_min: smallest k for which acting greedily in Q^k is optimal, Q^1 being the value of uniform play; `steps` where none is.
+        effective_planning_window: the same from Q^1 = r.
+        ks, ms, gaps, vars: for each k that was tried and does not fail: k, the samples m_k, and gap and variance bound where m_k is
+            attained.
+        conventions: gamma, steps, tie tolerance, slack of comparisons.
+    """
+
+    value: float
+    k_min: int
+    effective_planning_window: int
+    ks: list[int]
+    ms: list[int]
+    gaps: list[float]
+    vars: list[float]
+    conventions: dict[str, Any] = field(default_factory=dict)
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able; infinite gaps are None."""
+        return {
+            "value": self.value,
+            "k_min": self.k_min,
+            "effective_planning_window": self.effective_planning_window,
+            "ks": self.ks,
+            "ms": self.ms,
+            "gaps": [gap if math.isfinite(gap) else None for gap in self.gaps],
+            "vars": self.vars,
+            **self.conventions,
+        }
+
+    def __str__(self) -> str:
+        return f"{self.value:.6g} (k_min {self.k_min}, window {self.effective_planning_window})"
+
+
+def stationary_effective_horizon(
+    mdp: TabularMDP,
+    solution: Solution | None = None,
+    *,
+    steps: int | None = None,
+    tie_tolerance: float | None = None,
+    tolerance: float = 1e-9,
+    progress: Callable[[str], None] | None = None,
+) -> StationaryHorizon:
+    """Return the stationary effective horizon of a discounted MDP, under every kind of chance.
+
+        Q^1 = Q of the uniform policy,  Q^{k+1}(s, a) = r(s, a) + gamma E max_b Q^k(s', b)
+        var^1 = (Q^e - Q^w)(Q* - Q^w),  var^{k+1}(s, a) = gamma^2 max over s', b of var^k(s', b)
+        m_k = max over states met of max(1, ceil(16 max_a var^k / gap_k^2 ln(2 T A^k))),  H = min_k k + log_A m_k
+
+    As `effective_horizon`, but for values that do not depend on the step: in place of T steps there are states, and T, the time
+    limit, only counts the decisions. Where an MDP ends by itself within T steps, each state at one depth, both are the same for
+    gamma = 1.
+
+    Args:
+        solution: the optimal solution of `mdp`; None: solved here.
+        steps: T; None: the MDP's horizon, else ceil(1 / (1 - gamma)).
+        tie_tolerance: an action is optimal if its value is within it of the best; None: 2.5 times the largest error of the values,
+            at least 1e-9.
+        tolerance: largest error of the values; a larger one is used where floats cannot reach it.
+        progress: called with a line on how far it is.
+    Raises:
+        UndefinedMeasure: gamma is 1.
+        ParameterError: an option is wrong, or `solution` is not of this MDP. PrecisionError: tie_tolerance is not above twice the error.
+    Exactness: Q^k is known up to an error; what differs by less than `slack`, four times that, counts as equal, which makes k fail
+        rather than pass.
+    Cost: three solutions, then a backup and a walk over the states met for each k. breakout/12x8x1 (2.4 million states) takes
+        about ten seconds.
+    Source: pharos; after Laidlaw, Russell and Dragan (2023), theorem 5.4.
+    """
+    if mdp.gamma == 1.0:
+        raise UndefinedMeasure(
+            "stationary_effective_horizon is defined for gamma < 1; see effective_horizon for episodes"
+        )
+    limit = steps if steps is not None else mdp.horizon or math.ceil(1 / (1 - mdp.gamma))
+    if isinstance(limit, bool) or not isinstance(limit, int | np.integer) or limit < 1:
+        raise ParameterError(f"steps is {limit!r}; expected a whole number of steps, at least 1")
+    endless = mdp if mdp.horizon is None else mdp.with_horizon(None)
+    tell = progress or (lambda line: None)
+    nodes = _Nodes(endless, solution, tolerance, tell)
+    floor = 2 * nodes.error
+    tie = max(1e-9, 1.25 * floor) if tie_tolerance is None else float(tie_tolerance)
+    if not tie > floor:
+        raise PrecisionError(
+            f"tie_tolerance is {tie_tolerance!r}; expected more than twice the error of the values, {floor:.3g}: raise it, or "
+            f"solve with a smaller tolerance"
+        )
+    slack = max(1e-12, 2 * floor)
+    optimal = nodes.best >= nodes.best.max(axis=1, keepdims=True) - tie
+    k_min = window = 0
+    found: list[tuple[int, int, float, float]] = []
+    best, k = float(limit), 1
+    values: _Known | _Ahead = _Known(nodes.explored)
+    spread = ((nodes.explored - nodes.worst) * (nodes.best - nodes.worst)).max(axis=1)
+    log_actions = math.log(mdp.num_actions)
+    while k < best or not k_min:
+        tell(f"k = {k}, bound {best:.4g}")
+        if k < best and (
+            needed := _samples(nodes, values, spread, optimal, slack, math.log(2 * limit) + k * log_actions)
+        ):
+            found.append((k, *needed))
+            best = min(best, k + (math.log(needed[0]) / log_actions if mdp.num_actions > 1 else 0.0))
+        if not k_min and (k >= limit or _is_greedy_optimal(nodes, values, optimal, slack)):
+            k_min = k
+        values = nodes.backup(values.best)
+        spread = mdp.gamma**2 * nodes.following_max(spread)
+        k += 1
+    values, window = _Known(nodes.rewards), 1
+    while window < limit and not _is_greedy_optimal(nodes, values, optimal, slack):
+        tell(f"window {window}")
+        values = nodes.backup(values.best)
+        window += 1
+    ks, ms, gaps, variances = (list(each) for each in zip(*found, strict=True)) if found else ([], [], [], [])
+    conventions = {
+        "gamma": mdp.gamma,
+        "steps": int(limit),
+        "exploration": "uniform",
+        "tie_tolerance": tie,
+        "slack": slack,
+        "states": "pairs (state, previously executed action)" if mdp.is_sticky else "states",
+    }
+    return StationaryHorizon(best, k_min, window, ks, ms, gaps, variances, conventions)
+
+
+class _Known:
+    """Action values that are kept as a table (N, A)."""
+
+    def __init__(self, table: np.ndarray):
+        self.table = table
+
+    @cached_property
+    def best(self) -> np.ndarray:
+        """(N,): max over a."""
+        return self.table.max(axis=1)
+
+    def at(self, nodes: np.ndarray) -> np.ndarray:
+        """(n, A), of some nodes."""
+        return self.table[nodes]
+
+
+class _Ahead:
+    """Action values r + gamma value(next), where each action leads to one node: worked out only where they are asked for."""
+
+    def __init__(self, nodes: "_Nodes", value: np.ndarray):
+        self.nodes, self.value = nodes, value
+
+    @cached_property
+    def best(self) -> np.ndarray:
+        """(N,): max over a."""
+        from pharos.kernels import horizon
+
+        found = np.empty(self.nodes.num_nodes)
+        horizon.lookahead(self.nodes.table, self.nodes.rewards, self.nodes.gamma, self.value, found)
+        return found
+
+    def at(self, nodes: np.ndarray) -> np.ndarray:
+        """(n, A), of some nodes."""
+        assert self.nodes.table is not None
+        return self.nodes.rewards[nodes] + self.nodes.gamma * self.value[self.nodes.table[nodes]]
+
+
+class _Nodes:
+    """Values of optimal, worst and uniform play on the nodes that can be met: states, or pairs with the previous action.
+
+    Attributes:
+        rewards, best, worst, explored: (N, A) of choosing an action. error: the largest error of any of them.
+        table: (N, A), the only node that an action leads to, where that is so everywhere; else None, and matrix (N A, N) says.
+    """
+
+    def __init__(self, mdp: TabularMDP, solution: Solution | None, tolerance: float, tell: Callable[[str], None]):
+        from pharos.hardness.gaps import checked
+
+        self.gamma, self.num_actions = mdp.gamma, mdp.num_actions
+        self.table: np.ndarray | None
+        if mdp.next_states is not None and not mdp.is_sticky and not mdp.is_random:
+            choices, self.table = _states_and_the_end(mdp)
+        else:
+            choices = reachable(choices_of(mdp, restart=False))
+            self.table = _single_outcomes(choices.matrix, len(choices.underlying), mdp.num_actions)
+        self.num_nodes = len(choices.underlying)
+        self.matrix = choices.matrix
+        self.starts = np.array(sorted(node for node, _ in choices.starts))
+        self.rewards = _expected_rewards(mdp, choices)
+        tell("values of optimal play")
+        best = checked(mdp, solution) if solution is not None else _solved(value_iteration, mdp, tolerance)
+        tell("values of the worst play")
+        worst = _solved(worst_value, mdp, tolerance)
+        tell("values of uniform play")
+        explored = _solved(uniform_value, mdp, tolerance)
+        self.error = mdp.gamma * max(best.error_bound, worst.error_bound, explored.error_bound)
+        everywhere = np.arange(self.num_nodes)
+        self.best, self.worst, self.explored = (
+            self.backup(_on_nodes(each, choices, mdp)).at(everywhere) for each in (best, worst, explored)
+        )
+
+    def backup(self, value: np.ndarray) -> _Known | _Ahead:
+        """r + gamma E value(next)."""
+        if self.table is not None:
+            return _Ahead(self, value)
+        return _Known(self.rewards + self.gamma * (self.matrix @ value).reshape(self.num_nodes, self.num_actions))
+
+    def following_max(self, values: np.ndarray) -> np.ndarray:
+        """(N,): the largest of values (N,) >= 0 over the nodes that some action may lead to."""
+        if self.table is not None:
+            from pharos.kernels import horizon
+
+            found = np.empty(self.num_nodes)
+            horizon.largest(self.table, values, found)
+            return found
+        each = np.maximum.reduceat(values[self.matrix.indices], self.matrix.indptr[:-1])
+        return each.reshape(self.rewards.shape).max(axis=1)
+
+    def closure(self, actions: Callable[[np.ndarray], np.ndarray | None]) -> np.ndarray | None:
+        """The nodes met from the start by the actions (n, A) bool that are named for nodes (n,); None where it says None."""
+        met = np.zeros(self.num_nodes, np.bool_)
+        met[self.starts] = True
+        nodes = self.starts
+        while nodes.size:
+            allowed = actions(nodes)
+            if allowed is None:
+                return None
+            rows, chosen = np.nonzero(allowed)
+            if self.table is not None:
+                following = self.table[nodes[rows], chosen]
+            else:
+                following = self.matrix[nodes[rows] * self.num_actions + chosen].indices
+            nodes = np.unique(following[~met[following]])
+            met[nodes] = True
+        return np.flatnonzero(met)
+
+
+def _states_and_the_end(mdp: TabularMDP) -> tuple[Choices, np.ndarray]:
+    """The states without chance, then the implicit end; and where each action leads. What has ended stays where it is."""
+    assert mdp.next_states is not None
+    size = mdp.num_states
+    table = np.full((size + 1, mdp.num_actions), size, mdp.next_states.dtype)
+    table[:size] = mdp.next_states
+    table[table < 0] = size
+    terminal = np.flatnonzero(mdp.terminal)
+    table[terminal] = terminal[:, None]
+    starts = [(int(s), float(p)) for s, p in zip(mdp.start_states, mdp.start_probabilities, strict=True) if p > 0]
+    return Choices(None, np.arange(size + 1), np.full(size + 1, -1), starts, mdp.num_actions, size + 1), table
+
+
+def _solved(solver: Callable[..., Solution], mdp: TabularMDP, tolerance: float) -> Solution:
+    while True:
+        try:
+            return solver(mdp, tolerance)
+        except PrecisionError:
+            if tolerance > 1:
+                raise
+            tolerance *= 10
+
+
+def _on_nodes(solution: Solution, choices: Any, mdp: TabularMDP) -> np.ndarray:
+    """(N,): V of the nodes; 0 at the end. Of starts without a previous action any number, as nothing leads there."""
+    inside = choices.underlying < mdp.num_states
+    v = solution.v
+    if v.ndim == 2:
+        found = v[np.where(inside, choices.underlying, 0), np.clip(choices.previous, 0, mdp.num_actions - 1)]
+    else:
+        found = v[np.where(inside, choices.underlying, 0)]
+    return np.where(inside, found, 0.0)
+
+
+def _is_greedy_optimal(nodes: _Nodes, values: _Known | _Ahead, optimal: np.ndarray, slack: float) -> bool:
+    def greedy(n: np.ndarray) -> np.ndarray | None:
+        q = values.at(n)
+        taken = q >= q.max(axis=1, keepdims=True) - slack
+        return None if (taken & ~optimal[n]).any() else taken
+
+    return nodes.closure(greedy) is not None
+
+
+def _samples(
+    nodes: _Nodes, values: _Known | _Ahead, spread: np.ndarray, optimal: np.ndarray, slack: float, log: float
+) -> tuple[int, float, float] | None:
+    """(m_k, gap, variance where it is attained); None where k fails."""
+
+    def second(n: np.ndarray, q: np.ndarray) -> np.ndarray:
+        return np.where(optimal[n], -math.inf, q).max(axis=1)
+
+    def better(n: np.ndarray) -> np.ndarray | None:
+        q = values.at(n)
+        others = second(n, q)
+        if (q.max(axis=1) - others <= slack).any():
+            return None
+        return optimal[n] & (q > others[:, None] - slack)
+
+    met = nodes.closure(better)
+    if met is None:
+        return None
+    q, largest = values.at(met), spread[met]
+    gap = q.max(axis=1) - second(met, q)
+    with np.errstate(invalid="ignore"):
+        needed = np.where(np.isinf(gap), 0.0, 16 * largest / gap**2 * log)
+    i = int(needed.argmax())
+    return max(1, math.ceil(needed[i])), float(gap[i]), float(largest[i])

@@ -1,0 +1,126 @@
+"""Many environments for Stable-Baselines3: its VecEnv over the native vector environment, without a Python loop of steps."""
+
+import time
+from collections.abc import Mapping
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.vector import AutoresetMode
+from stable_baselines3.common.vec_env import VecEnv
+
+from pharos.environments import Environment
+from pharos.errors import ParameterError
+from pharos.interaction.vector_env import VectorEnv
+
+
+class SB3VecEnv(VecEnv):
+    """A VectorEnv in the mode SAME_STEP as a VecEnv of Stable-Baselines3.
+
+    `infos` are empty but at the end of an episode: "terminal_observation", "TimeLimit.truncated", "episode" with the
+    undiscounted return r, length l and seconds t (as a Monitor writes them), and the last "state" (D,) or "index".
+    Discrete observations such as "index" come as (N,) int64.
+    """
+
+    def __init__(self, env: VectorEnv):
+        if env.metadata["autoreset_mode"] != AutoresetMode.SAME_STEP:
+            raise ParameterError(f"{env.environment}: autoreset_mode is not SAME_STEP; Stable-Baselines3 needs that")
+        self.env = env
+        self.render_mode = None
+        super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
+        self._actions: Any = None
+        self._returns = np.zeros(env.num_envs)
+        self._lengths = np.zeros(env.num_envs, np.int64)
+        self._began = time.perf_counter()
+
+    def reset(self) -> Any:
+        given = [seed is not None for seed in self._seeds]
+        options = {"state": self._options[0]["state"]} if "state" in (self._options[0] or {}) else None
+        observations, _ = self.env.reset(seed=list(self._seeds) if any(given) else None, options=options)
+        self._reset_seeds()
+        self._reset_options()
+        self._returns[:] = 0
+        self._lengths[:] = 0
+        return observations
+
+    def step_async(self, actions: np.ndarray) -> None:
+        self._actions = actions
+
+    def step_wait(self) -> tuple[Any, np.ndarray, np.ndarray, list[dict]]:
+        observations, rewards, terminated, truncated, info = self.env.step(self._actions)
+        done = terminated | truncated
+        self._returns += rewards
+        self._lengths += 1
+        infos: list[dict] = [{} for _ in range(self.num_envs)]
+        if "final_obs" in info:
+            seconds = round(time.perf_counter() - self._began, 6)
+            name = "index" if "index" in info else "state"
+            for i in np.flatnonzero(done):
+                infos[i] = {
+                    "terminal_observation": info["final_obs"][i],
+                    "TimeLimit.truncated": bool(truncated[i] and not terminated[i]),
+                    "episode": {"r": float(self._returns[i]), "l": int(self._lengths[i]), "t": seconds},
+                    name: info["final_info"][name][i],
+                }
+            self._returns[done] = 0
+            self._lengths[done] = 0
+        return observations, rewards.astype(np.float32), done, infos
+
+    def close(self) -> None:
+        self.env.close()
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        return [getattr(self.env, attr_name)] * len(list(self._get_indices(indices)))
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        raise ParameterError(f"{attr_name!r} cannot be set: the environments share their settings; make another VecEnv")
+
+    def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
+        raise ParameterError(
+            f"{method_name!r} cannot be called: there are no single environments; use `.env`, a VectorEnv"
+        )
+
+    def env_is_wrapped(self, wrapper_class: type[gymnasium.Wrapper], indices: Any = None) -> list[bool]:
+        """Episodes are monitored already, other wrappers there are none."""
+        from stable_baselines3.common.monitor import Monitor
+
+        return [issubclass(wrapper_class, Monitor)] * len(list(self._get_indices(indices)))
+
+
+def make_sb3_vec(
+    env: Environment | str,
+    num_envs: int = 1,
+    *,
+    observation: Any = "vector",
+    observation_options: Mapping[str, Any] | None = None,
+    sticky: float = 0.0,
+    random: float = 0.0,
+    time_limit: int | str | None = "default",
+    seed: int | None = None,
+    space: Any = None,
+    **options: Any,
+) -> SB3VecEnv:
+    """Return `num_envs` copies of an environment as a VecEnv of Stable-Baselines3.
+
+    Args:
+        env: a name that `pharos.make` knows, or an Environment.
+        seed: of the first reset; environment i is seeded with seed + i.
+        options: the rest of `pharos.interaction.gym_env.Interaction`, and the parameters of the environment where `env` is a name.
+    Raises:
+        ParameterError: an option or parameter is wrong.
+    """
+    return SB3VecEnv(
+        VectorEnv(
+            env,
+            num_envs,
+            autoreset_mode=AutoresetMode.SAME_STEP,
+            seed=seed,
+            observation=observation,
+            observation_options=observation_options,
+            sticky=sticky,
+            random=random,
+            time_limit=time_limit,
+            space=space,
+            **options,
+        )
+    )

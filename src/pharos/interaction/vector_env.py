@@ -1,0 +1,441 @@
+"""Many environments in one: a native Gymnasium vector environment, whose N states advance by one compiled call.
+
+`make_vec("breakout", 1024, observation="vector", sticky=0.25)`, or `gymnasium.make_vec("pharos/Breakout-v0", num_envs=1024)`.
+Chance is drawn inside the loop, from one stream of random numbers for each environment.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
+
+from pharos.environments import Environment
+from pharos.errors import ParameterError
+from pharos.interaction.gym_env import Simulator, split_options
+from pharos.observations import Index
+from pharos.observations.blocks import in_blocks
+from pharos.observations.context import NO_ACTION
+
+BLOCK = 4096  # steps that are worth a thread's while
+LARGEST_TABLE = 1 << 28  # bytes of observations that are computed beforehand
+_MODES = (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP, AutoresetMode.DISABLED)
+
+
+class VectorEnv(gymnasium.vector.VectorEnv):
+    """`num_envs` copies of one environment as a Gymnasium vector environment.
+
+    With `space` the built state space is walked as a table, and the rules are not run: `info` has "index" (N,) in place of
+    "state" (N, D). It always has "executed_action" (N,), -1 after a reset. Arrays are fresh at every step.
+
+    Args:
+        environment: a name that `pharos.make` knows, or an Environment.
+        num_envs: N.
+        autoreset_mode: of Gymnasium. NEXT_STEP: the step after the end of an episode resets and ignores its action. SAME_STEP:
+            the last step resets too; the last observation is in info["final_obs"]. DISABLED: the caller resets with
+            `options={"reset_mask": mask}`.
+        seed: of the first reset, where that is given none.
+        max_episode_steps: another name of `time_limit`, as `gymnasium.make_vec` calls it.
+        render_mode: None; or "rgb_array": `render()` returns a picture of each environment.
+        options: see `Interaction`, and the parameters of the environment, such as `height=12`.
+    Raises:
+        ParameterError: an option or parameter is wrong.
+    """
+
+    metadata: dict[str, Any]
+
+    def __init__(
+        self,
+        environment: Environment | str,
+        num_envs: int = 1,
+        *,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        seed: int | None = None,
+        max_episode_steps: int | None = None,
+        render_mode: str | None = None,
+        **options: Any,
+    ):
+        if max_episode_steps is not None:
+            options["time_limit"] = None if max_episode_steps == -1 else max_episode_steps
+        interaction, parameters = split_options(options)
+        if isinstance(num_envs, bool) or not isinstance(num_envs, int | np.integer) or num_envs < 1:
+            raise ParameterError(f"num_envs is {num_envs!r}; expected an integer of at least 1")
+        self._mode = _MODES.index(_checked_mode(autoreset_mode))
+        self.simulator = simulator = Simulator(environment, interaction, parameters)
+        self.num_envs = int(num_envs)
+        self.metadata = {"autoreset_mode": _MODES[self._mode], "render_modes": ["rgb_array"], "render_fps": 15}
+        if render_mode not in (None, "rgb_array"):
+            raise ParameterError(f"render_mode is {render_mode!r}; expected None or 'rgb_array'")
+        self.render_mode = render_mode
+        self.single_observation_space = simulator.context.space
+        self.single_action_space = gymnasium.spaces.Discrete(simulator.env.num_actions)
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        self.action_names = simulator.env.actions
+        self._seed = seed
+        self._rng: np.ndarray | None = None
+        n = self.num_envs
+        self._previous = np.full(n, NO_ACTION, np.int64)
+        self._elapsed = np.zeros(n, np.int64)
+        self._ended = np.zeros(n, np.bool_)
+        self._limit = simulator.limit if simulator.limit is not None else 1 << 62
+        walk = _Rules if simulator.state_space is None else _Table
+        self._walk: Any = walk(simulator, n)
+
+    @property
+    def environment(self) -> Environment:
+        """The environment without chance, time limit and observation."""
+        return self.simulator.env
+
+    @property
+    def states(self) -> np.ndarray:
+        """(N, D) int64, the current states."""
+        return self._walk.states(slice(None))
+
+    def render(self) -> tuple[np.ndarray, ...] | None:
+        """The picture for people of each environment, (H, W, 3) uint8, where render_mode is "rgb_array"; else None."""
+        if self.render_mode is None:
+            return None
+        if self._rng is None:
+            raise gymnasium.error.ResetNeeded(f"{self.environment}: call reset() before render()")
+        from pharos.drawing.pictures import human
+
+        return tuple(human(self.environment, state.tolist()) for state in self.states)
+
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Start episodes.
+
+        Args:
+            seed: environment i is seeded with seed + i, or with seed[i].
+            options: {"reset_mask": (N,) bool} resets these environments alone; {"state": (D,) or (N, D)} says where they start.
+        """
+        options = options or {}
+        mask = self._checked_mask(options.get("reset_mask"))
+        self._seed_streams(seed)
+        self._walk.restart(mask, self._rng, options.get("state"))
+        self._previous[mask] = self.simulator.first_previous
+        self._elapsed[mask] = 0
+        self._ended[mask] = False
+        executed = np.full(self.num_envs, NO_ACTION, np.int64)
+        return self._walk.observations(self._previous, self._elapsed), self._info(executed)
+
+    def step(self, actions: Any) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """Choose an action (N,) for every environment."""
+        from pharos.kernels.stepping import DISABLED, SAME_STEP
+
+        if self._rng is None:
+            raise gymnasium.error.ResetNeeded(f"{self.environment}: call reset() before step()")
+        actions = self._checked_actions(actions)
+        if self._mode == DISABLED and self._ended.any():
+            raise gymnasium.error.ResetNeeded(
+                f"{self.environment}: episodes of environments {np.flatnonzero(self._ended)[:8].tolist()} have ended; "
+                f"call reset(options={{'reset_mask': terminated | truncated}}), or choose another autoreset_mode"
+            )
+        n = self.num_envs
+        rewards, executed = np.empty(n), np.empty(n, np.int64)
+        terminated, truncated = np.empty(n, np.bool_), np.empty(n, np.bool_)
+        self._walk.step(
+            (self._limit, self._mode, self.simulator.first_previous),
+            (self._rng, actions),
+            (self._previous, self._elapsed, self._ended, rewards, terminated, truncated, executed),
+        )
+        info = self._info(executed)
+        if self._mode == SAME_STEP:
+            done = terminated | truncated
+            if done.any():
+                self._add_final(info, done, executed)
+        return self._walk.observations(self._previous, self._elapsed), rewards, terminated, truncated, info
+
+    def _info(self, executed: np.ndarray) -> dict[str, Any]:
+        everywhere = np.ones(self.num_envs, np.bool_)
+        name = self._walk.name
+        return {
+            name: self._walk.current.copy(),
+            f"_{name}": everywhere,
+            "executed_action": executed,
+            "_executed_action": everywhere,
+        }
+
+    def _add_final(self, info: dict[str, Any], done: np.ndarray, executed: np.ndarray) -> None:
+        """The last observations and infos, as Gymnasium's own vector environments give them."""
+        rows = np.flatnonzero(done)
+        last = self._walk.final_observations(rows, executed[rows], self._walk.final_elapsed[rows])
+        final = np.full(self.num_envs, None, object)
+        for row, observation in zip(rows, _rows_of(last, len(rows)), strict=True):
+            final[row] = observation
+        name = self._walk.name
+        state = np.zeros_like(self._walk.final)
+        state[rows] = self._walk.final[rows]
+        info["final_obs"], info["_final_obs"] = final, done
+        info["final_info"] = {
+            name: state,
+            f"_{name}": done,
+            "executed_action": np.where(done, executed, 0),
+            "_executed_action": done,
+        }
+        info["_final_info"] = done
+        info["executed_action"] = np.where(done, NO_ACTION, executed)
+
+    def _seed_streams(self, seed: int | Sequence[int | None] | None) -> None:
+        n = self.num_envs
+        if seed is None and self._rng is not None:
+            return
+        seed = self._seed if seed is None else seed
+        if seed is None:
+            self._rng = np.random.SeedSequence().generate_state(n, np.uint64)
+            return
+        seeds: list[int | None] = [seed + i for i in range(n)] if isinstance(seed, int | np.integer) else list(seed)
+        if len(seeds) != n:
+            raise ParameterError(f"seed has {len(seeds)} entries; expected one integer, or {n}")
+        if self._rng is None:
+            self._rng = np.random.SeedSequence().generate_state(n, np.uint64)
+        for i, one in enumerate(seeds):
+            if one is not None:
+                self._rng[i] = np.random.SeedSequence(one).generate_state(1, np.uint64)[0]
+
+    def _checked_mask(self, mask: Any) -> np.ndarray:
+        if mask is None:
+            return np.ones(self.num_envs, np.bool_)
+        mask = np.asarray(mask)
+        if mask.shape != (self.num_envs,) or mask.dtype != np.bool_:
+            raise ParameterError(
+                f"reset_mask has shape {mask.shape} and dtype {mask.dtype}; expected ({self.num_envs},) of bool"
+            )
+        if self._rng is None and not mask.all():
+            raise gymnasium.error.ResetNeeded(f"{self.environment}: reset all environments first")
+        return mask
+
+    def _checked_actions(self, actions: Any) -> np.ndarray:
+        from pharos.kernels.stepping import first_outside
+
+        found = np.asarray(actions)
+        if found.shape != (self.num_envs,) or found.dtype.kind not in "iu":
+            raise ParameterError(
+                f"{self.environment}: actions have shape {found.shape} and dtype {found.dtype}; "
+                f"expected ({self.num_envs},) integers"
+            )
+        found = np.ascontiguousarray(found, np.int64)
+        i = first_outside(found, len(self.action_names))
+        if i >= 0:
+            raise ParameterError(
+                f"{self.environment}: action {found[i]} of environment {i}; expected 0 to {len(self.action_names) - 1}"
+            )
+        return found
+
+
+def make_vec(name_or_env: Environment | str, num_envs: int = 1, **options: Any) -> VectorEnv:
+    """Return `num_envs` copies of an environment as a Gymnasium vector environment; see `VectorEnv` for the options."""
+    return VectorEnv(name_or_env, num_envs, **options)
+
+
+class _Rules:
+    """States (N, D), advanced by the rules."""
+
+    name = "state"
+
+    def __init__(self, simulator: Simulator, num_envs: int):
+        self.simulator = simulator
+        length = len(simulator.env.components)
+        self.current = np.zeros((num_envs, length), np.int64)
+        self.final = np.zeros_like(self.current)
+        self.final_elapsed = np.zeros(num_envs, np.int64)
+        context: Any = simulator.context
+        self._fused = context.is_plain and context.is_vector  # the compiled step writes the vectors as well
+        self._scale = context.observation.scale if self._fused else np.zeros(length)
+        self._vector = np.empty((0, length), np.float32)
+        self._step_many = _step_many(simulator)
+
+    def states(self, rows: Any) -> np.ndarray:
+        return self.current[rows].copy()
+
+    def restart(self, mask: np.ndarray, rng: Any, state: Any) -> None:
+        from pharos.kernels.stepping import draw_starts
+
+        self._vector = self._vector[:0]
+        if state is not None:
+            self.current[mask] = _given_states(self.simulator, state, len(mask))[mask]
+            return
+        chosen = np.zeros(len(mask), np.int64)
+        draw_starts(self.simulator.start_cumulative, rng, mask, chosen)
+        self.current[mask] = self.simulator.start_states[chosen[mask]]
+
+    def step(self, setting: tuple, given: tuple, arrays: tuple) -> None:
+        simulator = self.simulator
+        if self._fused:
+            self._vector = np.empty(self.current.shape, np.float32)
+        self.final_elapsed[:] = arrays[1] + 1
+        faults: list[int] = []
+
+        def run(first: int, last: int) -> None:
+            fault = self._step_many(
+                simulator.rules.parameters, simulator.ranges, self._scale, simulator.chance, *setting,
+                simulator.start_states, simulator.start_cumulative, *given, self.current, *arrays,
+                self.final, self._vector, first, last,
+            )  # fmt: skip
+            if fault >= 0:
+                faults.append(fault)
+
+        in_blocks(run, len(self.current), BLOCK)
+        if faults:
+            i, component = divmod(min(faults), self.current.shape[1])
+            simulator.raise_fault(self.current[i], int(arrays[-1][i]), component)
+
+    def observations(self, previous: np.ndarray, elapsed: np.ndarray) -> Any:
+        if len(self._vector):
+            return self._vector
+        return self.simulator.context(self.current, previous, elapsed)
+
+    def final_observations(self, rows: np.ndarray, previous: np.ndarray, elapsed: np.ndarray) -> Any:
+        return self.simulator.context(self.final[rows], previous, elapsed)
+
+
+class _Table:
+    """Indices (N,) of a built state space, advanced by looking successors up."""
+
+    name = "index"
+
+    def __init__(self, simulator: Simulator, num_envs: int):
+        self.simulator = simulator
+        assert simulator.state_space is not None
+        self.space = simulator.state_space
+        self.current = np.zeros(num_envs, np.int64)
+        self.final = np.zeros(num_envs, np.int64)
+        self.final_elapsed = np.zeros(num_envs, np.int64)
+        self._successors = np.asarray(self.space.successors)
+        self._rewards = np.ascontiguousarray(self.space.mdp().rewards, np.float64)
+        self._starts = self.space.indices(simulator.start_states)
+        context: Any = simulator.context
+        self._is_index = context.is_plain and isinstance(context.observation, Index)
+        self._table: np.ndarray | None = None
+        one = np.prod(context.observation.space.shape or ()) * np.dtype(context.observation.space.dtype).itemsize
+        if context.is_plain and not self._is_index and one * self.space.num_states <= LARGEST_TABLE:
+            self._table = context.observation(self.space.states())
+
+    def states(self, rows: Any) -> np.ndarray:
+        return self.space.states(self.current[rows])
+
+    def restart(self, mask: np.ndarray, rng: Any, state: Any) -> None:
+        from pharos.kernels.stepping import draw_starts
+
+        if state is not None:
+            given = _given_states(self.simulator, state, len(mask))
+            self.current[mask] = self.space.indices(given[mask])
+            return
+        chosen = np.zeros(len(mask), np.int64)
+        draw_starts(self.simulator.start_cumulative, rng, mask, chosen)
+        self.current[mask] = self._starts[chosen[mask]]
+
+    def step(self, setting: tuple, given: tuple, arrays: tuple) -> None:
+        from pharos.kernels import stepping
+
+        walk_table: Any = stepping.walk_table
+        self.final_elapsed[:] = arrays[1] + 1
+        simulator = self.simulator
+
+        def run(first: int, last: int) -> None:
+            walk_table(
+                self._successors, self._rewards, self.space.terminal, simulator.chance, *setting,
+                self._starts, simulator.start_cumulative, *given, self.current, *arrays, self.final, first, last,
+            )  # fmt: skip
+
+        in_blocks(run, len(self.current), BLOCK)
+
+    def observations(self, previous: np.ndarray, elapsed: np.ndarray) -> Any:
+        return self._observed(self.current, previous, elapsed)
+
+    def final_observations(self, rows: np.ndarray, previous: np.ndarray, elapsed: np.ndarray) -> Any:
+        return self._observed(self.final[rows], previous, elapsed)
+
+    def _observed(self, index: np.ndarray, previous: np.ndarray, elapsed: np.ndarray) -> Any:
+        if self._is_index:
+            return index.copy()
+        if self._table is not None:
+            return self._table.take(index, axis=0)
+        return self.simulator.context(self.space.states(index), previous, elapsed)
+
+
+def _given_states(simulator: Simulator, state: Any, num_envs: int) -> np.ndarray:
+    """(N, D) from one state or N of them, checked."""
+    rows = np.asarray(state)
+    if rows.ndim == 1:
+        return np.tile(simulator.checked_state(rows), (num_envs, 1))
+    if len(rows) != num_envs:
+        raise ParameterError(f"{simulator.env}: {len(rows)} states; expected one, or {num_envs}")
+    return np.stack([simulator.checked_state(row) for row in rows])
+
+
+def _rows_of(batch: Any, number: int) -> list[Any]:
+    if isinstance(batch, Mapping):
+        return [{name: values[i] for name, values in batch.items()} for i in range(number)]
+    return list(batch)
+
+
+def _checked_mode(mode: AutoresetMode | str) -> AutoresetMode:
+    for known in _MODES:
+        if mode in (known, known.value, known.name):
+            return known
+    raise ParameterError(f"autoreset_mode is {mode!r}; expected one of {', '.join(known.name for known in _MODES)}")
+
+
+def _step_many(simulator: Simulator) -> Any:
+    """The compiled loop, or its twin where the rules run interpreted."""
+    compiled = getattr(simulator.rules, "step_many", None)
+    return compiled if compiled is not None else Interpreted(simulator)
+
+
+class Interpreted:
+    """`interaction_template.step_many` in plain Python, for rules that Numba cannot compile, and as a witness in tests."""
+
+    def __init__(self, simulator: Simulator):
+        self.simulator = simulator
+
+    def __call__(
+        self, parameters, ranges, scale, chance, limit, mode, first_previous, starts, cumulative, rng, actions,
+        states, previous, elapsed, ended, rewards, terminated, truncated, executed, final, vector, first, last,
+    ) -> int:  # fmt: skip
+        env, simulator = self.simulator.env, self.simulator
+        for i in range(first, last):
+            rewards[i], terminated[i], truncated[i], executed[i] = 0.0, False, False, NO_ACTION
+            restart = bool(ended[i])
+            if not restart:
+                action = int(actions[i])
+                if simulator.has_chance:
+                    action = simulator.executed(action, int(previous[i]), _uniform_number(rng, i))
+                before = tuple(states[i].tolist())
+                after = env.next_state(before, action)
+                executed[i] = action
+                for c, value in enumerate(after):
+                    if not ranges[0, c] <= value <= ranges[1, c]:
+                        return i * len(after) + c
+                rewards[i], terminated[i] = env.reward(before, action, after), env.is_terminal(after)
+                previous[i] = action
+                elapsed[i] += 1
+                truncated[i] = elapsed[i] >= limit
+                ended[i] = terminated[i] or truncated[i]
+                states[i] = after
+                restart = _MODES[mode] == AutoresetMode.SAME_STEP and bool(ended[i])
+                if restart:
+                    final[i] = after
+            if restart:
+                several = len(cumulative) > 1
+                k = np.searchsorted(cumulative, _uniform_number(rng, i), side="right") if several else 0
+                states[i] = starts[k]
+                previous[i], elapsed[i], ended[i] = first_previous, 0, False
+        if len(vector):
+            vector[first:last] = (states[first:last] - ranges[0]) * scale
+        return -1
+
+
+def _uniform_number(rng: np.ndarray, i: int) -> float:
+    """SplitMix64, as in `stepping.uniform_number`."""
+    mask = (1 << 64) - 1
+    z = (int(rng[i]) + 0x9E3779B97F4A7C15) & mask
+    rng[i] = z
+    z = (z ^ (z >> 30)) * 0xBF58476D1CE4E5B9 & mask
+    z = (z ^ (z >> 27)) * 0x94D049BB133111EB & mask
+    z ^= z >> 31
+    return (z >> 11) * 2.0**-53

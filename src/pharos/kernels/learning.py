@@ -1,0 +1,112 @@
+"""Tabular Q-learning on a table of next states: the loop that agents/_q_learning.py describes, compiled.
+
+Random numbers: SplitMix64 (Steele, Lea and Flood 2014), whose whole state is one 64-bit word that can be stored and restored.
+"""
+
+import numpy as np
+from numba import njit, uint64
+
+from pharos.kernels.bellman import reward_at
+
+
+@njit(forceinline=True)
+def _random(word):
+    """A number uniform in [0, 1); moves word[0] on."""
+    word[0] += uint64(0x9E3779B97F4A7C15)
+    z = word[0]
+    z = (z ^ (z >> uint64(30))) * uint64(0xBF58476D1CE4E5B9)
+    z = (z ^ (z >> uint64(27))) * uint64(0x94D049BB133111EB)
+    z = z ^ (z >> uint64(31))
+    return (z >> uint64(11)) * 2.0**-53
+
+
+@njit(forceinline=True)
+def _below(word, n):
+    return min(int(_random(word) * n), n - 1)
+
+
+@njit(cache=True, nogil=True)
+def q_learning(
+    next_states,
+    table,
+    palette,
+    terminal,
+    starts,
+    cumulative,
+    chance,
+    limit,
+    schedule,
+    q,
+    visits,
+    place,
+    sums,
+    word,
+    steps,
+):
+    """`steps` steps of Watkins' Q-learning; everything that changes is in the arrays, so that it goes on from them.
+
+    next_states (S, A); table, palette: rewards; starts (K,), cumulative (K,): start states and their cumulated probabilities;
+    chance: (chosen, previous, uniform, first_chosen); limit: steps of an episode; q, visits (R, A): values and number of
+    updates, R = S, or S (A + 1) with rows s (A + 1) + b where the previous action b (A: none) is seen.
+    schedule: (learning rate, exponent of visits or 0, gamma, first epsilon, last epsilon, steps of exploration, exponential?).
+    place: int64 (state or -1, previous action, steps in the episode, steps in all, episodes); sums: float64 (return of this
+    episode, its discount, sum of finished returns); word: uint64 (1,).
+    """
+    num_states, num_actions = next_states.shape
+    chosen_weight, previous_weight, _, first_chosen = chance
+    rate, exponent, gamma, first_epsilon, last_epsilon, exploration, exponential, measure_gamma = schedule
+    sees_previous = len(q) > num_states
+    for _ in range(steps):
+        if place[0] < 0:
+            place[0] = starts[np.searchsorted(cumulative, _random(word), side="right")]
+            place[1] = num_actions
+            place[2] = 0
+            sums[0] = 0.0
+            sums[1] = 1.0
+        s, b = place[0], place[1]
+        row = s * (num_actions + 1) + b if sees_previous else s
+        share = min(1.0, place[3] / exploration) if exploration > 0 else 1.0
+        if exponential > 0.0:
+            epsilon = first_epsilon * (last_epsilon / first_epsilon) ** share
+        else:
+            epsilon = first_epsilon + share * (last_epsilon - first_epsilon)
+        if _random(word) < epsilon:
+            action = _below(word, num_actions)
+        else:  # greedy, ties at random
+            best, ties, action = q[row, 0], 1, 0
+            for a in range(1, num_actions):
+                if q[row, a] > best:
+                    best, ties, action = q[row, a], 1, a
+                elif q[row, a] == best:
+                    ties += 1
+                    if _random(word) * ties < 1.0:
+                        action = a
+        executed = action
+        u = _random(word)
+        if b == num_actions:
+            if u >= first_chosen:
+                executed = _below(word, num_actions)
+        elif u >= chosen_weight:
+            executed = b if u < chosen_weight + previous_weight else _below(word, num_actions)
+        reward = reward_at(table, palette, s, executed)
+        t = next_states[s, executed]
+        ended = t < 0 or terminal[t]
+        value = 0.0
+        if not ended:
+            after = t * (num_actions + 1) + executed if sees_previous else t
+            value = q[after, 0]
+            for a in range(1, num_actions):
+                value = max(value, q[after, a])
+        visits[row, action] += 1
+        alpha = rate if exponent == 0.0 else max(rate, visits[row, action] ** -exponent)
+        q[row, action] += alpha * (reward + gamma * value - q[row, action])
+        sums[0] += sums[1] * reward
+        sums[1] *= measure_gamma
+        place[0] = t
+        place[1] = executed
+        place[2] += 1
+        place[3] += 1
+        if ended or place[2] >= limit:
+            sums[2] += sums[0]
+            place[4] += 1
+            place[0] = -1

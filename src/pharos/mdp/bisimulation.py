@@ -1,0 +1,158 @@
+"""Bisimulation: states that no sequence of actions can tell apart, merged. Source: Givan, Dean and Greig (2003).
+
+Two states are bisimilar if they pay the same reward for every action and lead to bisimilar states. The coarsest such partition is found
+by refinement: start from terminal flag, rewards and, if wanted, observations; split classes by the classes that their states lead to,
+until nothing splits (Moore 1956; Kanellakis and Smolka 1990).
+"""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from pharos.errors import ParameterError
+from pharos.mdp import TabularMDP
+
+
+@dataclass(frozen=True, eq=False)
+class Minimization:
+    """An MDP with bisimilar states merged.
+
+    Attributes:
+        mdp: the merged MDP, with the same discount, horizon and chance; classes are numbered by their first states.
+        classes: (S,) int64, the class of each state.
+        representatives: (C,) int64, the first state of each class.
+        rounds: refinements until nothing split.
+    """
+
+    mdp: TabularMDP
+    classes: np.ndarray
+    representatives: np.ndarray
+    rounds: int
+
+    @property
+    def num_classes(self) -> int:
+        """C."""
+        return len(self.representatives)
+
+
+def minimize(mdp: TabularMDP, observations: Any = None) -> Minimization:
+    """Return the smallest MDP that cannot be told from this one.
+
+    V(s) = V(class of s) for every policy that depends on classes, under sticky and random actions too, because both act on executed
+    actions. Terminal states are not merged with others, as they restart.
+
+    Args:
+        observations: (S, ...) one for each state: states that look different stay apart. None: rewards alone tell them apart.
+    Raises:
+        ParameterError: there is not one observation for each state.
+    Exactness: exact for tables of next states. In general MDPs the probabilities of reaching a class are compared after rounding to
+        2^-40, so that the order of additions does not split classes.
+    Cost: O(S A) to find whose next states changed, in each round, and O(A) for each such state; rounds are at most the number of
+        steps that tell two states apart. About 40 bytes a state. Of general MDPs a pass over all transitions in each round.
+    Source: Givan, Dean and Greig (2003), "Equivalence notions and model minimization in Markov decision processes"; BRIDGE's
+        consolidation (Laidlaw, Russell and Dragan 2023).
+    """
+    table = mdp.reward_table
+    paid = table.table if len(table.palette) else table.table + 0.0  # -0.0 and 0.0 are one reward
+    classes = _numbered(paid, np.asarray(mdp.terminal).astype(np.int64))
+    if observations is not None:
+        seen = np.asarray(observations)
+        if seen.ndim == 0 or len(seen) != mdp.num_states:
+            found = len(seen) if seen.ndim else "a number"
+            raise ParameterError(f"there are {found} observations; expected {mdp.num_states}, one for each state")
+        rows = seen.reshape(mdp.num_states, -1)
+        classes = _numbered(rows + 0.0 if seen.dtype.kind == "f" else rows, classes)
+    classes, rounds = _refined(mdp, classes) if mdp.next_states is not None else _refined_general(mdp, classes)
+    _, representatives = np.unique(classes, return_index=True)
+    return Minimization(_merged(mdp, classes, representatives), classes, representatives, rounds)
+
+
+def _numbered(rows: np.ndarray, before: np.ndarray) -> np.ndarray:
+    """(N,) int64: equal pairs (before, row) get equal numbers, in the order in which they appear first."""
+    from pharos.kernels import partition
+
+    rows = np.ascontiguousarray(rows)
+    numbers = np.empty(len(rows), np.int64)
+    partition.number_rows(rows.view(np.uint8).reshape(len(rows), -1), before, _slots(len(rows)), numbers)
+    return numbers
+
+
+def _slots(rows: int) -> np.ndarray:
+    return np.full(1 << max(3, (2 * rows - 1).bit_length()), -1, np.int32 if rows < 2**31 else np.int64)
+
+
+def _refined(mdp: TabularMDP, classes: np.ndarray) -> tuple[np.ndarray, int]:
+    """(coarsest stable partition, rounds) of a table of next states."""
+    from pharos.kernels import partition
+
+    table, states = mdp.next_states, mdp.num_states
+    small = np.int32 if states < 2**31 else np.int64
+    slots, now = _slots(states), classes.astype(small)
+    asked, used, new = np.arange(states, dtype=small), np.empty(states, small), np.empty(states, small)
+    count = int(now.max()) + 1
+    sizes = np.zeros(states, small)
+    sizes[:count] = np.bincount(now)
+    changed = np.zeros(states, np.bool_)
+    rounds, n = 0, states
+    while n:
+        count = partition.split(table, now, sizes, count, asked, n, slots, used, new, changed)
+        rounds += 1
+        n = partition.states_to_ask(table, changed, asked)
+    return _numbered(now[:, None], np.zeros(states, np.int64)), rounds
+
+
+def _refined_general(mdp: TabularMDP, classes: np.ndarray) -> tuple[np.ndarray, int]:
+    """The same for transition probabilities."""
+    rounds, count = 0, int(classes.max()) + 1
+    while True:
+        reached = _to_classes(mdp, classes, count)
+        whole = np.rint(reached.data * 2.0**40).astype(np.int64)
+        keep = whole > 0
+        edges = np.concatenate([[0], np.cumsum(keep)])[reached.indptr]
+        columns, weights = reached.indices[keep].astype(np.int64), whole[keep]
+        known: dict[tuple[Any, ...], int] = {}
+        refined = np.empty_like(classes)
+        for s in range(mdp.num_states):
+            ends = edges[s * mdp.num_actions : (s + 1) * mdp.num_actions + 1]
+            inside = slice(ends[0], ends[-1])
+            key = (int(classes[s]), (ends - ends[0]).tobytes(), columns[inside].tobytes(), weights[inside].tobytes())
+            refined[s] = known.setdefault(key, len(known))
+        classes, rounds = refined, rounds + 1
+        if len(known) == count:
+            return classes, rounds
+        count = len(known)
+
+
+def _to_classes(mdp: TabularMDP, classes: np.ndarray, count: int) -> Any:
+    """(S A, C) CSR, the probability of reaching each class; columns in order."""
+    from scipy import sparse
+
+    states = mdp.num_states
+    members = sparse.csr_matrix((np.ones(states), (np.arange(states), classes)), shape=(states, count))
+    reached = sparse.csr_matrix(mdp.transitions @ members)
+    reached.sort_indices()
+    return reached
+
+
+def _merged(mdp: TabularMDP, classes: np.ndarray, representatives: np.ndarray) -> TabularMDP:
+    count = len(representatives)
+    initial = np.zeros(count)
+    np.add.at(initial, classes[mdp.start_states], mdp.start_probabilities)
+    start: Any = int(initial.argmax()) if np.count_nonzero(initial) == 1 else initial / initial.sum()
+    rewards = mdp.reward_table.rows(representatives)
+    if mdp.next_states is not None:
+        table = np.asarray(mdp.next_states)[representatives].astype(np.int64)
+        smaller = TabularMDP.from_arrays(
+            np.where(table >= 0, classes[table], -1),
+            rewards,
+            gamma=mdp.gamma,
+            initial=start,
+            horizon=mdp.horizon,
+            terminal=np.asarray(mdp.terminal)[representatives],
+        )
+    else:
+        rows = (representatives[:, None] * mdp.num_actions + np.arange(mdp.num_actions)).ravel()
+        matrix = _to_classes(mdp, classes, count)[rows]
+        smaller = TabularMDP.from_matrices(matrix, rewards, gamma=mdp.gamma, initial=start, horizon=mdp.horizon)
+    return replace(smaller, chance=mdp.chance)

@@ -1,0 +1,97 @@
+"""An observation together with what a pure function of the state cannot see: the previous action, the remaining time."""
+
+from typing import Any
+
+import numpy as np
+
+from pharos.errors import ParameterError
+from pharos.observations.observation import Observation
+from pharos.observations.vector import Vector
+
+NO_ACTION = -1  # the previous action on the first step of an episode
+
+
+class ObservationInContext:
+    """What the agent gets: an observation of the state, with the previous executed action and the remaining time if wanted.
+
+    Without either, the observation itself. A `vector` is extended: one entry for each action (1 for the previous one, all 0 on
+    the first step), then the remaining time. Any other observation becomes a Dict of "observation", "previous_action"
+    (Discrete(A + 1), A on the first step) and "remaining_time" (Box (1,)).
+    The remaining time is (limit - elapsed) / limit, in [0, 1].
+
+    Attributes:
+        observation: the function of the state.
+        space: Gymnasium space of what the agent gets.
+        names: of the entries of a vector; None for others.
+    Raises:
+        ParameterError: the remaining time is wanted where there is no time limit.
+    """
+
+    def __init__(self, observation: Observation, *, previous_action: bool, remaining_time: bool, limit: int | None):
+        from gymnasium.spaces import Box, Dict, Discrete, Space
+
+        if remaining_time and limit is None:
+            raise ParameterError(f"{observation.env}: remaining_time=True without a time limit; set time_limit")
+        env = observation.env
+        self.observation = observation
+        self.names = observation.names
+        self.is_plain = not previous_action and not remaining_time
+        self.is_vector = isinstance(observation, Vector)
+        self._previous_action = previous_action
+        self._remaining_time = remaining_time
+        self._limit = limit
+        self._num_actions = env.num_actions
+        self.space: Space = observation.space
+        if self.is_plain:
+            return
+        if self.is_vector:
+            self.names = (
+                *(observation.names or ()),
+                *(f"previous_action={action}" for action in env.actions if previous_action),
+                *(["remaining_time"] if remaining_time else []),
+            )
+            self.space = Box(0.0, 1.0, (len(self.names),), np.float32)
+            return
+        parts: dict[str, Space] = {"observation": observation.space}
+        if previous_action:
+            parts["previous_action"] = Discrete(env.num_actions + 1)
+        if remaining_time:
+            parts["remaining_time"] = Box(0.0, 1.0, (1,), np.float32)
+        self.space = Dict(parts)
+
+    def __call__(self, states: np.ndarray, previous: np.ndarray, elapsed: np.ndarray) -> Any:
+        """States (N, D), previous actions (N,), elapsed steps (N,) -> a batch of observations (a dict of batches)."""
+        if self.is_plain:
+            return self.observation(states)
+        if self.is_vector:
+            from pharos.kernels.observation_kernels import normalize
+
+            observation: Any = self.observation
+            out = np.zeros((len(states), *self.space.shape), np.float32)  # type: ignore[misc]
+            normalize(states, observation.low, observation.scale, out)
+            self._write_context(out, states.shape[1], previous, elapsed)
+            return out
+        batch: dict[str, Any] = {"observation": self.observation(states)}
+        if self._previous_action:
+            batch["previous_action"] = np.where(previous == NO_ACTION, self._num_actions, previous).astype(np.int64)
+        if self._remaining_time:
+            batch["remaining_time"] = self._remaining(elapsed).astype(np.float32)[:, None]
+        return batch
+
+    def one(self, state: np.ndarray, previous: int, elapsed: int) -> Any:
+        """The observation of one state (D,)."""
+        if self.is_plain:
+            return self.observation.one(state)
+        batch = self(state[None], np.array([previous]), np.array([elapsed]))
+        return batch[0] if self.is_vector else {name: values[0] for name, values in batch.items()}
+
+    def _write_context(self, out: np.ndarray, column: int, previous: np.ndarray, elapsed: np.ndarray) -> None:
+        if self._previous_action:
+            rows = np.flatnonzero(previous != NO_ACTION)
+            out[rows, column + previous[rows]] = 1
+        if self._remaining_time:
+            out[:, -1] = self._remaining(elapsed)
+
+    def _remaining(self, elapsed: np.ndarray) -> np.ndarray:
+        assert self._limit is not None
+        return np.maximum(self._limit - elapsed, 0) / self._limit

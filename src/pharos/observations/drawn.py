@@ -1,0 +1,79 @@
+"""What simple and complex images share: the rules' `draw`, compiled where possible, over blocks of states."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from pharos.environments import Environment, Layer
+from pharos.errors import ParameterError
+from pharos.observations.blocks import in_blocks
+
+
+def num_values(layer: Layer) -> int:
+    """How many values a plane of this layer may have besides 0."""
+    colors = len(layer.color) if np.ndim(layer.color) == 2 else 1
+    sprites = len(layer.sprite) if layer.sprite is not None and not isinstance(layer.sprite[0], str) else 1
+    return max(len(layer.glyph), colors, sprites)
+
+
+class Drawing:
+    """Runs a drawing kernel of `interaction_template.py` on batches of states; a twin in Python where Numba cannot compile it.
+
+    Attributes:
+        env: the environment; rows, columns: of its grid. `block` frames are worth a thread's while.
+    Raises:
+        ParameterError: the environment declares no grid, no layers or no draw().
+    """
+
+    def __init__(self, env: Environment, kernel: str, interpreted: Callable[..., None], block: int):
+        self.env, self._block = env, block
+        try:
+            self.rows, self.columns = env.grid()
+            planes = np.zeros((len(env.layers), self.rows, self.columns), np.uint8)
+            env.draw(tuple(env.initial_states()[0][0]), planes)
+        except NotImplementedError as error:
+            raise ParameterError(f"{env}: cannot be drawn: {error}") from None
+        if not env.layers:
+            raise ParameterError(f"{env}: cannot be drawn: it declares no layers")
+        self._shape = planes.shape
+        self._kernel = kernel
+        self._interpreted = interpreted
+        self._compiled: Any = None
+
+    def __call__(self, states: np.ndarray, out: np.ndarray, *tables: Any) -> None:
+        """Draw states (N, D) into out (N, ...), with the tables that the kernel takes between the planes and `out`."""
+        if self._compiled is None:
+            self._compiled = self._function(states, out, tables)
+        in_blocks(
+            lambda first, last: self._compiled(states, first, last, self._planes(), *tables, out),
+            len(states),
+            self._block,
+        )
+
+    def one(self, state: np.ndarray, out: np.ndarray, *tables: Any) -> None:
+        """Draw one state (D,) into out (1, ...); as the call for many, without its cost."""
+        if self._compiled is None:
+            self._compiled = self._function(state[None], out, tables)
+        self._compiled(state[None], 0, 1, self._planes(), *tables, out)
+
+    def _planes(self) -> np.ndarray:
+        return np.empty(self._shape, np.uint8)  # zeroed by the kernel
+
+    def _function(self, states: np.ndarray, out: np.ndarray, tables: tuple[Any, ...]) -> Callable[..., None]:
+        from pharos.rules.compiled import InteractionRules, _first_lines, _warn_once
+
+        try:
+            rules = InteractionRules(self.env)
+            kernel = getattr(rules.kernels, self._kernel)
+            kernel(rules.parameters, states, 0, 0, self._planes(), *tables, out)
+        except Exception as error:  # Numba raises its own errors, and others from inside of it
+            _warn_once(type(self.env), "draw", _first_lines(str(error)) or type(error).__name__)
+            return self._interpret
+        return lambda *arguments: kernel(rules.parameters, *arguments)
+
+    def _interpret(self, states, first, last, planes, *tables_and_out) -> None:
+        for n in range(first, last):
+            planes[:] = 0
+            self.env.draw(tuple(states[n].tolist()), planes)
+            self._interpreted(planes, *tables_and_out[:-1], tables_and_out[-1][n])

@@ -1,0 +1,168 @@
+"""What an observation is: a pure function of the state with a Gymnasium space, for one environment."""
+
+import inspect
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pharos.environments import Environment
+from pharos.errors import ParameterError, UnknownName
+
+if TYPE_CHECKING:
+    import gymnasium
+
+    from pharos.state_space import StateSpace
+
+Function = Callable[[Environment, np.ndarray], np.ndarray]
+
+
+class Observation:
+    """A function of the state for one environment; called with a batch of states it gives a batch of observations.
+
+    Attributes:
+        name: such as "vector".
+        env: the environment.
+        space: Gymnasium space of one observation.
+        names: of the entries of a one-dimensional observation; None for others.
+    """
+
+    name: str
+    env: Environment
+    space: "gymnasium.Space"
+    names: tuple[str, ...] | None = None
+
+    def __call__(self, states: np.ndarray) -> np.ndarray:
+        """(N, D) int64 states -> (N, *space.shape) of space.dtype, a fresh array."""
+        raise NotImplementedError
+
+    def one(self, state: np.ndarray) -> Any:
+        """The observation of one state (D,): a fresh array, or an integer where the space is Discrete."""
+        return self(state[None])[0]
+
+    def __repr__(self) -> str:
+        return f"<observation {self.name!r} of {self.env}: {self.space}>"
+
+
+class FunctionObservation(Observation):
+    """A user's function(env, states) with its Gymnasium space, checked at every call.
+
+    The function gets the environment and states (N, D) int64, and returns an array (N, *space.shape). Its numbers are converted
+    to the space's dtype where that keeps their kind (float64 to float32, integers to floats).
+
+    Raises:
+        ParameterError: the result has another shape, or a dtype that does not fit; for the start states also where a value lies
+        outside the space.
+    """
+
+    def __init__(self, env: Environment, function: Function, space: Any, *, name: str | None = None):
+        from gymnasium import spaces
+
+        self.name = name or str(getattr(function, "__name__", "function"))
+        self.env = env
+        self.function = function
+        self.space = space(env) if callable(space) else space
+        if not isinstance(self.space, spaces.Box | spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary):
+            raise ParameterError(
+                f"observation {self.name!r}: its space is {self.space!r}; "
+                f"expected a Box, Discrete, MultiDiscrete or MultiBinary of Gymnasium, or a function that gives one for env"
+            )
+        starts = np.array([state for state, _ in env.initial_states()], np.int64)
+        for state, observation in zip(starts, self(starts), strict=True):
+            if not self.space.contains(observation):
+                raise ParameterError(
+                    f"observation {self.name!r} of the start state {tuple(state.tolist())} is {_short(observation)}, "
+                    f"which is not in its space {self.space}"
+                )
+
+    def __call__(self, states: np.ndarray) -> np.ndarray:
+        found = np.asarray(self.function(self.env, states))
+        expected = (len(states), *(self.space.shape or ()))
+        if found.shape != expected:
+            raise ParameterError(
+                f"observation {self.name!r} has shape {found.shape} for {len(states)} states; expected {expected}: "
+                f"one row a state, each as its space says"
+            )
+        dtype = np.dtype(self.space.dtype)
+        if found.dtype != dtype and not np.can_cast(found.dtype, dtype, "same_kind"):
+            raise ParameterError(
+                f"observation {self.name!r} has dtype {found.dtype}; expected {dtype}, as its space says: use .astype"
+            )
+        return np.array(found, dtype)  # a copy: functions may return the same buffer twice
+
+
+_built_in: dict[str, Callable[..., Observation]] = {}
+_registered: dict[str, tuple[Function, Any]] = {}
+
+
+def names() -> list[str]:
+    """The names that `observation=` knows, the registered ones last."""
+    return [*_built_in, *_registered]
+
+
+def register(name: str, function: Function, space: Any) -> None:
+    """Make a user's observation known as `observation=name`, so that a spec, a study or a command can name it.
+
+    Args:
+        name: a new name; registering it again replaces the function, so that a notebook cell can be run twice.
+        function: function(env, states (N, D) int64) -> (N, *space.shape).
+        space: a Gymnasium space, or a function env -> space.
+    Raises:
+        ParameterError: the name belongs to a built-in observation.
+    """
+    if name in _built_in:
+        raise ParameterError(f"observations.register: {name!r} is built in; choose another name")
+    _registered[name] = (function, space)
+
+
+def add_built_in(name: str, make: Callable[..., Observation]) -> None:
+    """Put one of pharos' own among the known names; `make` takes the environment, and options as keywords."""
+    _built_in[name] = make
+
+
+def observe(
+    env: Environment, observation: Any = "vector", *, state_space: "StateSpace | None" = None, **options: Any
+) -> Observation:
+    """Return an observation of `env`.
+
+    Args:
+        observation: a name (see `names`); a pair (function, Gymnasium space) as in `register`; or an Observation, which is
+            returned.
+        state_space: the built state space; "index" needs it.
+        options: of the named observation, such as `grey=True`.
+    Raises:
+        UnknownName: no such observation or option; the nearest is suggested.
+        ParameterError: the observation does not exist for this environment.
+    """
+    if isinstance(observation, Observation):
+        if observation.env != env:
+            raise ParameterError(
+                f"observation {observation.name!r} belongs to {observation.env}; expected one of {env}"
+            )
+        made = observation
+        known: list[str] = []
+    elif isinstance(observation, tuple) and len(observation) == 2 and callable(observation[0]):
+        made, known = FunctionObservation(env, *observation), []
+    elif not isinstance(observation, str):
+        raise ParameterError(
+            f"observation is {observation!r}; expected one of {', '.join(names())}, or a pair (function, Gymnasium space)"
+        )
+    elif observation in _registered:
+        made, known = FunctionObservation(env, *_registered[observation], name=observation), []
+    elif observation in _built_in:
+        make = _built_in[observation]
+        parameters = inspect.signature(make).parameters
+        known = [name for name, parameter in parameters.items() if parameter.kind is parameter.KEYWORD_ONLY]
+        space = {"state_space": state_space} if "state_space" in parameters else {}
+        made = make(env, **space, **{name: value for name, value in options.items() if name in known})
+    else:
+        raise UnknownName("observation", observation, names())
+    for option in options:
+        if option not in known:
+            raise UnknownName(f"option of observation {made.name!r}", option, known)
+    return made
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 80 else text[:77] + "..."

@@ -1,0 +1,86 @@
+"""Simple images: one small plane for each kind of thing, a pixel for each cell; or all things on one grey plane."""
+
+import numpy as np
+
+from pharos.environments import Environment
+from pharos.errors import ParameterError
+from pharos.observations.drawn import Drawing, num_values
+from pharos.observations.observation import Observation
+
+DARKEST = 128  # of the shades of things on a plane of their own
+
+
+class SimpleImage(Observation):
+    """One plane for each layer of the environment, channel first: (L, rows k, columns k) uint8, 0 where nothing is.
+
+    A layer with one kind of thing shows it as 255; one with several (such as cars of several colours) in even shades from 255
+    down to 128. Shows where things are, not where they go: directions and timers that `draw` leaves out cannot be seen.
+
+    Args:
+        grey: one plane (1, rows k, columns k) for all things, each in a shade of its own, later layers over earlier ones.
+        scale: k, pixels on each side of a cell. None: 1, or more where there are more planes than rows or columns, because
+            Stable-Baselines3 takes the smallest dimension for the channels.
+    Attributes:
+        shades: (L, 256) uint8, the shade of every value on the plane of every layer.
+        is_flat: a pixel is a cell, and each layer has a plane of its own.
+    Raises:
+        ParameterError: the environment cannot be drawn, or there are more planes than pixels on a side.
+    """
+
+    def __init__(self, env: Environment, *, grey: bool = False, scale: int | None = None):
+        from gymnasium.spaces import Box
+
+        self.name = "simple_image"
+        self.env = env
+        self._drawing = Drawing(env, "draw_simple", _paint, block=512)
+        self._covering = bool(grey)
+        rows, columns = self._drawing.rows, self._drawing.columns
+        planes = 1 if grey else len(env.layers)
+        if scale is None:
+            scale = -(-planes // min(rows, columns))
+        if isinstance(scale, bool) or not isinstance(scale, int) or scale < 1:
+            raise ParameterError(f"simple_image: scale is {scale!r}; expected an integer of at least 1")
+        if planes > min(rows, columns) * scale:
+            raise ParameterError(
+                f"simple_image of {env}: {planes} planes ({', '.join(env.layers)}) of {rows * scale} x {columns * scale} pixels "
+                f"would be taken for an image of {min(rows, columns) * scale} channels; "
+                f"use scale={-(-planes // min(rows, columns))} or grey=True"
+            )
+        self.space = Box(0, 255, (planes, rows * scale, columns * scale), np.uint8)
+        self._one = (1, planes, rows * scale, columns * scale)
+        self.shades = _shades(env, self._covering)
+        self.is_flat = scale == 1 and not grey
+
+    def __call__(self, states: np.ndarray) -> np.ndarray:
+        out = np.zeros((len(states), *self.space.shape), np.uint8)  # type: ignore[misc]
+        self._drawing(states, out, self.shades, self._covering)
+        return out
+
+    def one(self, state: np.ndarray) -> np.ndarray:
+        out = np.zeros(self._one, np.uint8)
+        self._drawing.one(state, out, self.shades, self._covering)
+        return out[0]
+
+
+def _shades(env: Environment, covering: bool) -> np.ndarray:
+    """(L, 256) uint8, the shade of every value on the plane of every layer; values beyond the declared ones look like the last."""
+    shades = np.zeros((len(env.layers), 256), np.uint8)
+    counts = [num_values(layer) for layer in env.layers.values()]
+    before = np.cumsum(counts) - counts
+    for layer, count in enumerate(counts):
+        if covering:
+            values = 255 * (before[layer] + 1 + np.arange(count)) / sum(counts)
+        else:
+            values = np.linspace(255, DARKEST, count)
+        shades[layer, 1 : 1 + count] = np.rint(values)
+        shades[layer, 1 + count :] = shades[layer, count]
+    return shades
+
+
+def _paint(planes: np.ndarray, shades: np.ndarray, covering: bool, out: np.ndarray) -> None:
+    """The twin of the kernel for one state: what `interaction_template.draw_simple` does after drawing."""
+    size = out.shape[1] // planes.shape[1]
+    for layer, plane in enumerate(planes):
+        shade = shades[layer, plane].repeat(size, axis=0).repeat(size, axis=1)
+        target = out[0 if covering else layer]
+        target[shade > 0] = shade[shade > 0]

@@ -1,0 +1,114 @@
+"""Vectors: every component of the state, normalized by its declared range; one-hot; the number of the state."""
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pharos.environments import Environment
+from pharos.errors import ParameterError
+from pharos.observations.observation import Observation
+
+if TYPE_CHECKING:
+    from pharos.state_space import StateSpace
+
+MOST_EXACT = 1 << 24  # integers up to here are told apart in float32
+MOST_ONE_HOT = 1 << 20
+
+
+class Vector(Observation):
+    """(value - low) / (high - low) of every component, in the order of `env.components`: (D,) float32 in [0, 1].
+
+    Complete: different states have different vectors. A component with one value only is always 0.
+
+    Attributes:
+        low, scale: (D,), the observation is (state - low) * scale.
+    Raises:
+        ParameterError: a component has more values than float32 tells apart.
+    """
+
+    def __init__(self, env: Environment):
+        from gymnasium.spaces import Box
+
+        components = env.components
+        if (components.size > MOST_EXACT).any():
+            i = int(np.argmax(components.size))
+            raise ParameterError(
+                f"{env}: {components.names[i]} has {components.size[i]} values; the vector observation tells at most "
+                f"{MOST_EXACT} apart: pass an observation of your own"
+            )
+        self.name = "vector"
+        self.env = env
+        self.names = components.names
+        self.low = components.low
+        self.scale = np.where(components.size > 1, 1 / np.maximum(components.size - 1, 1), 0.0)
+        self.space = Box(0.0, 1.0, (len(components),), np.float32)
+
+    def __call__(self, states: np.ndarray) -> np.ndarray:
+        from pharos.kernels.observation_kernels import normalize
+
+        out = np.empty(states.shape, np.float32)
+        normalize(states, self.low, self.scale, out)
+        return out
+
+
+class OneHot(Observation):
+    """A one for the value of every component and zeros elsewhere: (sum of the sizes of the ranges,) uint8. Complete.
+
+    Raises:
+        ParameterError: it would have more than MOST_ONE_HOT entries.
+    """
+
+    def __init__(self, env: Environment):
+        from gymnasium.spaces import MultiBinary
+
+        components = env.components
+        length = int(components.size.sum())
+        if length > MOST_ONE_HOT:
+            raise ParameterError(
+                f"{env}: one_hot would have {length} entries; expected at most {MOST_ONE_HOT}: use 'vector'"
+            )
+        self.name = "one_hot"
+        self.env = env
+        self.names = tuple(
+            f"{name}={low + value}"
+            for name, low, size in zip(components.names, components.low, components.size, strict=True)
+            for value in range(size)
+        )
+        self.space = MultiBinary(length)
+        self._low = components.low
+        self._offset = np.cumsum(components.size) - components.size
+
+    def __call__(self, states: np.ndarray) -> np.ndarray:
+        from pharos.kernels.observation_kernels import mark_components
+
+        out = np.zeros((len(states), len(self.names or ())), np.int8)
+        mark_components(states, self._low, self._offset, out)
+        return out
+
+
+class Index(Observation):
+    """The number of the state in a built state space: Discrete(S). Complete; what tabular agents learn from.
+
+    Raises:
+        ParameterError: no state space was given, or one of another environment.
+    """
+
+    def __init__(self, env: Environment, state_space: "StateSpace | None" = None):
+        from gymnasium.spaces import Discrete
+
+        if state_space is None:
+            raise ParameterError(f"{env}: observation 'index' needs the built state space: space=pharos.build(env)")
+        if state_space.environment != env:
+            raise ParameterError(
+                f"observation 'index': the state space belongs to {state_space.environment}; expected one of {env}"
+            )
+        self.name = "index"
+        self.env = env
+        self.state_space = state_space
+        self.space = Discrete(state_space.num_states)
+
+    def __call__(self, states: np.ndarray) -> np.ndarray:
+        return self.state_space.indices(states)
+
+    def one(self, state: np.ndarray) -> Any:
+        return self.state_space.indices(state[None])[0]

@@ -1,0 +1,95 @@
+"""Values and a policy drawn over the cells of a grid world."""
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pharos.errors import ParameterError
+from pharos.plots.style import INK, single, styled
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from pharos.solvers import Solution
+    from pharos.state_space import StateSpace
+
+ARROWS = {"up": (0, -1), "down": (0, 1), "left": (-1, 0), "right": (1, 0)}
+
+
+@styled
+def value_map(space: "StateSpace", solution: "Solution", *, title: str = "", axes: Any = None) -> "Figure":
+    """Draw V over the cells of a grid, with an arrow for each action that the policy may take.
+
+    Arrows are those of all optimal actions for an optimal solution; for a given policy as long as their probability. A dot stands
+    where every action is as good. Terminal cells are grey and outside of the colours' range; the number is the reward
+    of getting there.
+
+    Args:
+        space: of an environment whose state is a row and a column, such as simple_grid and frozen_lake.
+        solution: of an MDP on this space, without sticky actions: optimal, worst, or of a policy.
+        axes: where to draw; None for a new figure.
+    Raises:
+        ParameterError: states are no cells, or values belong to pairs.
+    """
+    if space.component_names != ("row", "column"):
+        raise ParameterError(
+            f"{space.manifest['environment']}: a state has {', '.join(space.component_names[:4])}; expected row and column alone"
+        )
+    if solution.v.ndim != 1:
+        raise ParameterError(
+            "values under sticky actions belong to pairs (state, previous action); expected one a state"
+        )
+    assert space.environment is not None
+    rows, columns = space.environment.grid()
+    states, mdp = space.states(), solution.mdp
+    terminal = np.asarray(mdp.terminal)
+    values = np.full((rows, columns), np.nan)
+    values[states[:, 0], states[:, 1]] = np.where(terminal, np.nan, solution.v)
+    drawn, axis = single(axes, (max(3.2, 0.62 * columns + 1.2), max(2.8, 0.62 * rows + 0.6)))
+    axis.set_facecolor("#c9ccd1")
+    image = axis.imshow(values, cmap="cividis")
+    drawn.colorbar(image, ax=axis, shrink=0.8, label="value").outline.set_visible(False)
+    lengths = _lengths(solution)
+    low, high = _range_of(values)
+    for s, (row, column) in enumerate(states):
+        value = values[row, column]
+        dark = np.isnan(value) or (high > low and (value - low) / (high - low) > 0.5)
+        color = "#101216" if dark else "#f4f5f7"
+        if terminal[s]:
+            axis.text(column, row, _reward_on_entering(mdp, s), ha="center", va="center", color=INK, fontsize=9)
+        elif np.isnan(value) or lengths[s].min() == lengths[s].max():
+            axis.plot(column, row, "o", color=color, markersize=3)
+        else:
+            for action in np.flatnonzero(lengths[s] > 0.02):
+                x, y = ARROWS.get(space.environment.actions[action], (0, 0))
+                head: Any = {"arrowstyle": "->", "color": color, "lw": 1.3, "shrinkA": 0, "shrinkB": 0}
+                length = 0.1 + 0.26 * lengths[s, action]
+                axis.annotate("", (column + length * x, row + length * y), (column, row), arrowprops=head)
+    axis.set(xticks=[], yticks=[], title=title)
+    axis.grid(False)
+    for spine in axis.spines.values():
+        spine.set_visible(False)
+    return drawn
+
+
+def _range_of(values: np.ndarray) -> tuple[float, float]:
+    known = values[~np.isnan(values)]
+    return (float(known.min()), float(known.max())) if known.size else (0.0, 0.0)
+
+
+def _lengths(solution: "Solution") -> np.ndarray:
+    """(S, A) in [0, 1]: which actions the policy takes, and how often."""
+    if solution.kind == "policy":
+        given = np.asarray(solution.policy)
+        return np.eye(solution.mdp.num_actions)[given] if given.ndim == 1 else np.nan_to_num(given)
+    sign, tolerance = (-1 if solution.kind == "worst" else 1), max(1e-9, 2 * solution.error_bound)
+    q = sign * solution.q
+    return (q >= q.max(axis=1, keepdims=True) - tolerance).astype(np.float64)
+
+
+def _reward_on_entering(mdp: Any, terminal: int) -> str:
+    """The reward of the transitions that lead into a terminal state; empty where they differ or there are none."""
+    table = mdp.next_states
+    into = (table == terminal) & ~np.asarray(mdp.terminal)[:, None]
+    paid = np.unique(mdp.rewards[into])
+    return f"{paid[0]:g}" if len(paid) == 1 else ""

@@ -1,0 +1,111 @@
+"""Regret curves of training runs: what the learnt policy loses, and what was lost on the way."""
+
+import json
+import os
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pharos.errors import ParameterError
+from pharos.plots.style import COLORS, INK, figure, styled, thousands
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+@styled
+def regret(
+    folders: Sequence[str | os.PathLike],
+    *,
+    confidence: float = 0.95,
+    resamples: int = 1000,
+    axes: Sequence[Any] | None = None,
+) -> "Figure":
+    """Draw the regret of runs over their steps; runs that differ in the seed alone become one line with a bootstrap interval.
+
+    Left, the normalized expected regret of the policy learnt so far: 0 is optimal, 1 is playing at random (in units of return where
+    playing at random is optimal in one of the tasks). Right, the cumulative realised regret of all episodes played, exploration
+    included; a dotted line is what playing at random would have cost in as many episodes.
+
+    Args:
+        folders: of finished runs, on any number of tasks.
+        confidence, resamples: of the bootstrap interval of the mean over seeds (percentile).
+        axes: two axes to draw on; None for a new figure.
+    Raises:
+        FileFormatError: a folder holds no finished run. ParameterError: no folder is given.
+    """
+    if not folders:
+        raise ParameterError("no runs to draw; give at least one folder of a finished run")
+    groups = _groups(folders)
+    left, right = axes if axes is not None else figure(1, 2, (4.6, 3.5))[1][0]
+    relative = not any(np.isnan(curve["normalized_regret"]).any() for runs in groups.values() for _, curve in runs)
+    column = "normalized_regret" if relative else "expected_regret"
+    for number, (label, runs) in enumerate(groups.items()):
+        color = COLORS[number % len(COLORS)]
+        steps, normalized = _aligned(runs, column)
+        _line(left, steps, normalized, color, label, confidence, resamples)
+        steps, realised = _aligned(runs, "cumulative_realised_regret")
+        _line(right, steps, realised, color, label, confidence, resamples)
+        spread = np.array(
+            [[record["result"]["value_optimal"] - record["result"]["value_uniform"]] for record, _ in runs]
+        )
+        random = (_aligned(runs, "episodes")[1] * spread).mean(axis=0)
+        right.plot(steps, random, ":", color=color, linewidth=1.2)
+    if relative:
+        left.axhline(1, color=INK, linewidth=0.8, linestyle=":")
+    left.set(title="policy learnt so far", xlabel="steps", ylabel=column.replace("_", " "))
+    left.set_ylim(bottom=min(0.0, left.get_ylim()[0]))
+    right.set(title="all episodes played", xlabel="steps", ylabel="cumulative realised regret")
+    for axis in (left, right):
+        axis.xaxis.set_major_formatter(thousands)
+    right.yaxis.set_major_formatter(thousands)
+    right.plot([], [], ":", color=INK, linewidth=1.2, label="at random")
+    right.legend(loc="upper left")
+    return left.figure
+
+
+def _groups(folders: Sequence[str | os.PathLike]) -> dict[str, list[tuple[dict[str, Any], Any]]]:
+    """label -> [(record, curve)]: the runs that differ in the seed alone."""
+    from pharos.experiments import read_curve, read_record
+
+    found: dict[str, list[tuple[dict[str, Any], Any]]] = {}
+    for folder in folders:
+        record = read_record(folder)
+        key = json.dumps({**record["config"], "seed": None}, sort_keys=True)
+        found.setdefault(key, []).append((record, read_curve(folder)))
+    configs = [runs[0][0]["config"] for runs in found.values()]
+    return {_label(config, configs): runs for config, runs in zip(configs, found.values(), strict=True)}
+
+
+def _label(config: dict[str, Any], configs: list[dict[str, Any]]) -> str:
+    """What tells this group of runs from the others."""
+    parts = [config["agent"]]
+    if config["agent"] != "q_learning":
+        parts.append(config["observation"].replace("_", " "))
+    for key in ("environment", "parameters", "chance", "steps", "hyperparameters"):
+        if len({json.dumps(other[key], sort_keys=True) for other in configs}) > 1:
+            value = config[key]
+            text = " ".join(f"{k}={v}" for k, v in value.items() if v) if isinstance(value, dict) else str(value)
+            parts.append(text or "plain" if key == "chance" else text)
+    return ", ".join(parts)
+
+
+def _aligned(runs: list[tuple[dict[str, Any], Any]], column: str) -> tuple[np.ndarray, np.ndarray]:
+    """(steps (N,), values (runs, N)) at the steps that all runs have."""
+    steps = runs[0][1]["step"].to_numpy()
+    for _, curve in runs[1:]:
+        steps = np.intersect1d(steps, curve["step"].to_numpy())
+    return steps, np.stack([curve.set_index("step")[column].loc[steps].to_numpy(float) for _, curve in runs])
+
+
+def _line(
+    axis: Any, steps: np.ndarray, values: np.ndarray, color: str, label: str, confidence: float, resamples: int
+) -> None:
+    axis.plot(steps, values.mean(axis=0), color=color, label=label)
+    if len(values) > 1:
+        drawn = np.random.default_rng(0).integers(len(values), size=(resamples, len(values)))
+        means = values[drawn].mean(axis=1)
+        tail = (1 - confidence) / 2
+        low, high = np.quantile(means, [tail, 1 - tail], axis=0)
+        axis.fill_between(steps, low, high, color=color, alpha=0.18, linewidth=0)

@@ -1,0 +1,1 @@
+"""The rules of an environment at three speeds: compiled, traced and interpreted."""

@@ -1,0 +1,148 @@
+"""Files that grow by appending, with a checksum for every block; room on the disk; one builder at a time."""
+
+import contextlib
+import json
+import os
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xxhash
+
+from pharos.errors import DiskFull, ParameterError, StateSpaceCorrupted, StateSpaceLocked
+from pharos.state_space.store import CHECKSUM_BYTES, MANIFEST, digest_of
+
+
+class GrowingFile:
+    """A file that is appended to, its length, and one checksum for every CHECKSUM_BYTES of it."""
+
+    def __init__(self, path: Path, committed: dict[str, Any] | None = None):
+        self.path = path
+        self.bytes = 0
+        self.checksums: list[str] = []
+        self._partial = xxhash.xxh3_128()
+        self._partial_bytes = 0
+        self._failure: DiskFull | None = None
+        self._unsynced: DiskFull | None = None
+        try:
+            self._file = open(path, "r+b" if committed else "w+b", buffering=0)  # noqa: SIM115
+        except OSError as error:
+            raise cannot_write(path, error) from error
+        if committed:
+            try:
+                self._take_over(committed)
+            except BaseException:
+                self.close()
+                raise
+
+    def _take_over(self, committed: dict[str, Any]) -> None:
+        """Cut what was written after the last checkpoint; verify what was committed."""
+        self._file.truncate(committed["bytes"])
+        self._file.seek(0)
+        while block := self._file.read(CHECKSUM_BYTES):
+            self._note(memoryview(block))
+        if self.entry()["checksums"] != committed["checksums"] or self.bytes != committed["bytes"]:
+            raise StateSpaceCorrupted(
+                f"{self.path}: does not match the checksums of its last checkpoint: it was changed; delete the folder and build again"
+            )
+
+    def append(self, rows: np.ndarray) -> None:
+        """Append the bytes of an array; DiskFull where the disk has no room, and ever after: a file has no gaps."""
+        if self._failure:
+            raise self._failure
+        data = np.ascontiguousarray(rows).reshape(-1).view(np.uint8).data
+        written = 0
+        try:
+            while written < len(data):
+                written += self._file.write(data[written:])
+        except OSError as error:
+            self._failure = cannot_write(self.path, error)
+            raise self._failure from error
+        self._note(data)
+
+    def _note(self, data: memoryview) -> None:
+        self.bytes += len(data)
+        while len(data):
+            taken = min(len(data), CHECKSUM_BYTES - self._partial_bytes)
+            self._partial.update(data[:taken])
+            self._partial_bytes += taken
+            data = data[taken:]
+            if self._partial_bytes == CHECKSUM_BYTES:
+                self.checksums.append(self._partial.hexdigest())
+                self._partial, self._partial_bytes = xxhash.xxh3_128(), 0
+
+    def entry(self) -> dict[str, Any]:
+        """What the manifest says of the file."""
+        partial = [self._partial.hexdigest()] if self._partial_bytes else []
+        return {"bytes": self.bytes, "checksums": self.checksums + partial}
+
+    def sync(self) -> None:
+        """Wait until everything appended is on the disk; a second try after a failure would not tell the truth."""
+        if self._unsynced:
+            raise self._unsynced
+        try:
+            os.fsync(self._file.fileno())
+        except OSError as error:
+            self._unsynced = cannot_write(self.path, error)
+            raise self._unsynced from error
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+
+def cannot_write(path: Path, error: OSError) -> DiskFull:
+    """The error for a write that failed."""
+    free = shutil.disk_usage(path.parent).free
+    return DiskFull(
+        f"{path}: cannot write ({error.strerror}; {free / 2**20:.0f} MiB free); what was committed is kept: "
+        f"free room on the disk, or build in another folder, and the same command resumes"
+    )
+
+
+@contextlib.contextmanager
+def lock(folder: Path):
+    """Hold the folder for this process; StateSpaceLocked where another one builds there. A killed process holds nothing."""
+    import fcntl
+
+    path = folder / "lock"
+    try:
+        file = open(path, "a+")  # noqa: SIM115
+    except OSError as error:
+        raise ParameterError(f"{folder}: cannot be written to: {error.strerror}; choose another folder") from error
+    with file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            file.seek(0)
+            holder = file.read().strip()
+            raise StateSpaceLocked(
+                f"{folder}: another process{f' ({holder})' if holder else ''} is building there; wait for it, or use another folder"
+            ) from None
+        file.truncate(0)
+        with contextlib.suppress(OSError):  # a full disk: the name of the holder is a courtesy
+            os.write(file.fileno(), f"process {os.getpid()}".encode())
+        try:
+            yield
+        finally:
+            file.truncate(0)
+
+
+def write_manifest(folder: Path, manifest: dict[str, Any]) -> None:
+    """Replace the manifest in one step: it is the commit point of everything else in the folder."""
+    manifest = {**manifest, "digest": digest_of(json.loads(json.dumps(manifest)))}
+    temporary = folder / (MANIFEST + ".tmp")
+    try:
+        with open(temporary, "w") as file:
+            json.dump(manifest, file, indent=1)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, folder / MANIFEST)
+        directory = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(directory)
+        finally:
+            os.close(directory)
+    except OSError as error:
+        raise cannot_write(temporary, error) from error

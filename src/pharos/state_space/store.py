@@ -1,0 +1,326 @@
+"""StateSpace: the folder on disk, read through memory maps. docs/format.md specifies it to the byte."""
+
+import hashlib
+import json
+import os
+from collections.abc import Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import xxhash
+
+from pharos.environments import Environment, State, start_distribution
+from pharos.errors import (
+    ParameterError,
+    StateSpaceCorrupted,
+    StateSpaceError,
+    StateSpaceIncomplete,
+    StateSpaceMismatch,
+)
+from pharos.rules.layout import Layout, layout_of, pack, unpack
+
+if TYPE_CHECKING:
+    from pharos.mdp import TabularMDP
+
+FORMAT_VERSION = 1
+MANIFEST = "manifest.json"
+STATES, SUCCESSORS, TERMINAL = "states.bin", "successors.bin", "terminal.bin"
+WIDE_SUCCESSORS = "successors64.bin"  # in place of successors.bin beyond 2^31 states
+CHECKSUM_BYTES = 1 << 24  # a checksum covers this many bytes of a file
+
+
+class StateSpace:
+    """The reachable states of an environment and their transitions, S states and A actions.
+
+    States are numbered in the order in which breadth-first search finds them: start states first.
+
+    Attributes:
+        environment: the environment, with its parameters; None for a folder whose class pharos does not know.
+        folder: where the files are.
+        num_states, num_actions, num_terminal_states, depth: S, A, terminal states, largest distance from the start states.
+        successors: (S, A) int32 (int64 beyond 2^31 states), index of the next state; terminal states lead to themselves.
+        packed_states: (S, W) uint64, see docs/format.md.
+        start_states, start_probabilities: indices and probabilities of the start states.
+    """
+
+    def __init__(self, folder: Path, manifest: dict[str, Any], environment: Environment | None):
+        self.folder = folder
+        self.manifest = manifest
+        self.environment = environment
+        self.num_states: int = manifest["num_states"]
+        self.num_actions: int = manifest["num_actions"]
+        self.num_terminal_states: int = manifest["num_terminal_states"]
+        self.depth: int = manifest["depth"]
+        self.parameters: dict[str, Any] = manifest["parameters"]
+        self.start_states = np.array([index for index, _ in manifest["initial"]], np.int64)
+        self.start_probabilities = np.array([probability for _, probability in manifest["initial"]], np.float64)
+
+    @cached_property
+    def packed_states(self) -> np.ndarray:
+        """(S, W) uint64, read-only memory map."""
+        return self._map(STATES, "<u8", (self.num_states, self.layout.num_words))
+
+    @cached_property
+    def successors(self) -> np.ndarray:
+        """(S, A) int32 or int64, read-only memory map."""
+        name = successors_name(self.manifest["arrays"])
+        return self._map(name, self.manifest["arrays"][name]["dtype"], (self.num_states, self.num_actions))
+
+    @cached_property
+    def terminal_bits(self) -> np.ndarray:
+        """(ceil(S / 8),) uint8, read-only memory map: state i is terminal where bit i % 8 of byte i // 8 is set."""
+        return self._map(TERMINAL, "|u1", (-(-self.num_states // 8),))
+
+    @cached_property
+    def terminal(self) -> np.ndarray:
+        """(S,) bool, in memory."""
+        terminal = np.unpackbits(self.terminal_bits, count=self.num_states, bitorder="little").view(np.bool_)
+        terminal.flags.writeable = False
+        return terminal
+
+    @cached_property
+    def layout(self) -> Layout:
+        """Where each component of a state sits in its words."""
+        table = self.manifest["layout"]
+        return Layout(
+            word=np.array(table["word"], np.uint64),
+            shift=np.array(table["shift"], np.uint64),
+            mask=np.array([(1 << bits) - 1 for bits in table["bits"]], np.uint64),
+            low=np.array(table["low"], np.int64),
+            size=np.array(table["size"], np.int64),
+            num_words=table["num_words"],
+        )
+
+    @property
+    def component_names(self) -> tuple[str, ...]:
+        """Names of the D components of a state."""
+        return tuple(self.manifest["layout"]["names"])
+
+    def states(self, indices: Any = slice(None)) -> np.ndarray:
+        """(N, D) int64, the states with these indices (an array of integers or a slice)."""
+        return unpack(self.layout, np.atleast_2d(self.packed_states[indices]))
+
+    def state(self, i: int) -> State:
+        """State number i, as a tuple of D integers."""
+        self._check_index(i)
+        return tuple(int(value) for value in self.states(np.array([i]))[0])
+
+    def is_terminal(self, i: int) -> bool:
+        """Whether state number i is terminal."""
+        self._check_index(i)
+        return bool(self.terminal_bits[i // 8] >> (i % 8) & 1)
+
+    def index(self, state: Sequence[int]) -> int:
+        """The number of a state; ParameterError where it is not reachable. The first call indexes all states, in O(S)."""
+        return int(self.indices(np.array([tuple(state)]))[0])
+
+    def indices(self, states: np.ndarray) -> np.ndarray:
+        """(N, D) integers -> (N,) int64, the numbers of these states; ParameterError where one is not reachable."""
+        from pharos.kernels.hash_table import find
+
+        states = np.asarray(states)
+        if states.ndim != 2 or states.shape[1] != len(self.component_names):
+            raise ParameterError(
+                f"{self}: a state has {len(self.component_names)} components; found an array of shape {states.shape}"
+            )
+        if states.dtype.kind not in "iub":
+            raise ParameterError(f"{self}: a state consists of integers; found {states.dtype}")
+        out = np.empty(len(states), np.int64)
+        inside = (states >= self.layout.low) & (states < self.layout.low + self.layout.size)
+        keys = pack(self.layout, np.where(inside, states, self.layout.low))
+        find(self._table, self.packed_states, keys, out)
+        wrong = np.flatnonzero((out < 0) | ~inside.all(axis=1))
+        if wrong.size:
+            raise ParameterError(
+                f"{self}: state {tuple(int(v) for v in states[wrong[0]])} is not reachable from the start"
+            )
+        return out
+
+    @cached_property
+    def _table(self) -> np.ndarray:
+        from pharos.kernels.hash_table import fill
+
+        slots = max(65536, -(-int(self.num_states / 0.6) // 65536) * 65536)
+        table = np.full(slots, -1, self.successors.dtype)
+        fill(table, self.packed_states, self.num_states)
+        return table
+
+    def mdp(self, gamma: float = 0.99, rewards: Any = None) -> "TabularMDP":
+        """The tabular MDP on these states.
+
+        Args:
+            gamma: discount, in [0, 1].
+            rewards: None for the environment's own, computed from the stored transitions; an (S, A) array; or a function
+                reward(self, state, action, next_state) in place of the environment's.
+        Cost: the rewards of all S A transitions, 20 to 50 ns each on one core; nothing is built again.
+        """
+        from pharos.mdp import TabularMDP
+        from pharos.mdp.rewards_of_space import rewards_of_space
+
+        return TabularMDP.from_space(self, rewards_of_space(self, rewards), gamma)
+
+    def verify(self) -> None:
+        """Read every file once and compare it with its checksums; StateSpaceCorrupted where one differs."""
+        for name, entry in self.manifest["arrays"].items():
+            with open(self.folder / name, "rb") as file:
+                for number, expected in enumerate(entry["checksums"]):
+                    if xxhash.xxh3_128_hexdigest(file.read(CHECKSUM_BYTES)) != expected:
+                        raise StateSpaceCorrupted(
+                            f"{self.folder / name}: block {number} (bytes {number * CHECKSUM_BYTES} on) does not match its "
+                            f"checksum: the file was changed after it was written; delete the folder and build again"
+                        )
+
+    def _map(self, name: str, dtype: str, shape: tuple[int, ...]) -> np.ndarray:
+        return np.memmap(self.folder / name, dtype=dtype, mode="r", shape=shape)
+
+    def _check_index(self, i: int) -> None:
+        if not 0 <= i < self.num_states:
+            raise ParameterError(f"{self}: state number {i} does not exist; expected 0 to {self.num_states - 1}")
+
+    def __repr__(self) -> str:
+        what = self.environment or f"{self.manifest['environment']} {self.parameters}"
+        return f"StateSpace({what}, num_states={self.num_states})"
+
+
+def load(folder: str | os.PathLike, *, verify: bool = True, environment: Environment | None = None) -> StateSpace:
+    """Open a state space that `build` wrote.
+
+    Args:
+        folder: where it is.
+        verify: compare every file with its checksums (one read of the files, several GB/s); False trusts their lengths.
+        environment: whose state space it is; None for what the manifest says, where pharos knows its class.
+    Raises:
+        StateSpaceError: there is no state space; StateSpaceIncomplete: its build did not finish; StateSpaceCorrupted: a file
+        is missing, truncated or changed; StateSpaceMismatch: the rules of the environment are not those it was built with.
+    """
+    folder = Path(folder)
+    manifest = read_manifest(folder)
+    if manifest is None:
+        raise StateSpaceError(
+            f"{folder}: no state space there (no {MANIFEST}); build one with pharos.build or `pharos build`"
+        )
+    if not manifest["complete"]:
+        raise StateSpaceIncomplete(
+            f"{folder}: the build stopped at {manifest['num_states']} states; the same build command resumes it"
+        )
+    check_lengths(folder, manifest)
+    space = StateSpace(folder, manifest, environment or _environment_of(folder, manifest))
+    if verify:
+        space.verify()
+    if space.environment is not None:
+        check_rules(folder, space.environment, space.layout, space.packed_states, space.successors, space.terminal_bits)
+    return space
+
+
+def read_manifest(folder: Path) -> dict[str, Any] | None:
+    """The manifest of a folder, None where there is none; StateSpaceCorrupted where it is nonsense."""
+    try:
+        text = (folder / MANIFEST).read_text()
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    except (OSError, UnicodeDecodeError) as error:
+        raise StateSpaceCorrupted(f"{folder / MANIFEST}: cannot be read: {error}") from None
+    try:
+        manifest = json.loads(text)
+        if manifest.get("format") != "pharos state space":
+            raise ValueError("it is not the manifest of a pharos state space")
+        if manifest["format_version"] != FORMAT_VERSION:
+            raise StateSpaceMismatch(
+                f"{folder}: format version {manifest['format_version']}; this pharos reads version {FORMAT_VERSION}: build again"
+            )
+        if digest_of(manifest) != manifest["digest"]:
+            raise ValueError("it was changed after it was written")
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise StateSpaceCorrupted(f"{folder / MANIFEST}: {error}; delete the folder and build again") from None
+    return manifest
+
+
+def successors_name(arrays: dict[str, Any]) -> str:
+    """The file of successors: its name depends on the width of the indices."""
+    return WIDE_SUCCESSORS if WIDE_SUCCESSORS in arrays else SUCCESSORS
+
+
+def digest_of(manifest: dict[str, Any]) -> str:
+    """SHA-256 of a manifest without its own digest."""
+    content = {key: value for key, value in manifest.items() if key != "digest"}
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def check_lengths(folder: Path, manifest: dict[str, Any]) -> None:
+    """StateSpaceCorrupted where a file is missing or shorter than what was committed."""
+    for name, entry in manifest["arrays"].items():
+        path = folder / name
+        found = path.stat().st_size if path.exists() else None
+        if found is None or found < entry["bytes"] or (manifest["complete"] and found != entry["bytes"]):
+            raise StateSpaceCorrupted(
+                f"{path}: expected {entry['bytes']} bytes, found {'no such file' if found is None else found}: "
+                f"the file was truncated or replaced; delete the folder and build again"
+            )
+
+
+def check_rules(
+    folder: Path, env: Environment, layout: Layout, states: np.ndarray, successors: np.ndarray, bits: np.ndarray
+) -> None:
+    """StateSpaceMismatch where the rules of `env` disagree with stored transitions, in 64 states spread over the file."""
+    chosen = np.unique(np.linspace(0, len(successors) - 1, 64).astype(np.int64))
+    following = unpack(layout, states[successors[chosen].ravel()]).tolist()
+    for n, (i, row) in enumerate(zip(chosen.tolist(), unpack(layout, states[chosen]).tolist(), strict=True)):
+        state = tuple(row)
+        stored = [tuple(row) for row in following[n * env.num_actions : (n + 1) * env.num_actions]]
+        ended = bool(env.is_terminal(state))
+        found = [state if ended else env.next_state(state, action) for action in range(env.num_actions)]
+        if stored != found or ended != bool(bits[i // 8] >> (i % 8) & 1):
+            raise StateSpaceMismatch(
+                f"{folder}: was built with other rules: from state {state} they lead to {stored}, those of this {env.name} to "
+                f"{found}; build in another folder, and raise `version` when you change rules"
+            )
+
+
+def identity_of(env: Environment) -> dict[str, Any]:
+    """What makes a state space the state space of `env`: kept in the manifest and hashed into the cache's folder names."""
+    layout = layout_of(env.components)
+    return {
+        "environment": env.name,
+        "class": f"{type(env).__module__}:{type(env).__qualname__}",
+        "rules_version": env.version,
+        "parameters": json.loads(json.dumps(env.parameters)),
+        "actions": list(env.actions),
+        "layout": {
+            "names": list(env.components.names),
+            "low": env.components.low.tolist(),
+            "size": env.components.size.tolist(),
+            "bits": [int(mask).bit_length() for mask in layout.mask],
+            "word": layout.word.tolist(),
+            "shift": layout.shift.tolist(),
+            "num_words": layout.num_words,
+        },
+        "start": [[list(state), float(p)] for state, p in zip(*start_distribution(env), strict=True)],
+    }
+
+
+def _environment_of(folder: Path, manifest: dict[str, Any]) -> Environment | None:
+    """The environment that a manifest names, where its class is a built-in or registered one."""
+    from pharos.environments import classes
+
+    cls = classes().get(manifest["environment"])
+    if cls is None:
+        return None
+    try:
+        env = cls(**{name: _tuples(value) for name, value in manifest["parameters"].items()})
+    except (TypeError, ParameterError) as error:
+        raise StateSpaceMismatch(
+            f"{folder}: its parameters are not those of this pharos' {manifest['environment']}: {error}; build again"
+        ) from error
+    found = identity_of(env)
+    for key in ("rules_version", "parameters", "actions", "layout", "start"):
+        if found[key] != manifest[key]:
+            raise StateSpaceMismatch(
+                f"{folder}: {key} of {env.name} is {manifest[key]} in the folder and {found[key]} in this pharos; build again"
+            )
+    return env
+
+
+def _tuples(value: Any) -> Any:
+    return tuple(_tuples(item) for item in value) if isinstance(value, list) else value

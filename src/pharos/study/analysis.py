@@ -1,0 +1,230 @@
+"""What a study says: intervals, linear models, correlation of agents, and each beside what the paper printed."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pharos.errors import ParameterError
+from pharos.study.paper import paper_regressions, paper_returns
+from pharos.study.regression import MEASURES, Fit, aggregate_r_squared, fit, leave_one_class_out_r_squared
+from pharos.study.specification import TABULAR_OBSERVATION, Run
+from pharos.study.statistics import stratified_interval
+from pharos.study.tables import paper_instance
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+REGRETS = {"cumulative_regret": "cumulative regret", "normalized_regret": "normalised regret"}
+PAPER_CHANCE = {"none": "plain", "random_actions": "random", "sticky_actions": "sticky"}
+IMAGE, VECTOR = "simple_image", "vector"
+
+
+@dataclass(frozen=True)
+class Models:
+    """The linear models of section 4.3 for one agent and one kind of regret.
+
+    Attributes:
+        regret: the column that is explained.
+        fits: those that there are enough rows for.
+        notes: one line for whatever was left out, and why.
+        representation_r_squared, class_r_squared: of the fits together; None without them.
+        leave_one_class_out: R2 for classes that the model has not seen; None where there are fewer than two.
+    """
+
+    regret: str
+    fits: Sequence[Fit]
+    notes: Sequence[str]
+    representation_r_squared: float | None
+    class_r_squared: float | None
+    leave_one_class_out: float | None
+
+    def get(self, model: str, subset: str) -> Fit | None:
+        """One of the fits."""
+        return next((found for found in self.fits if (found.model, found.subset) == (model, subset)), None)
+
+
+def models(
+    cells: "pd.DataFrame", *, agent: str = "dqn", regret: str = "cumulative_regret", measures: Sequence[str] = MEASURES
+) -> Models:
+    """Fit the models to the cells of one agent: the single one, one a representation, one a class; as far as there are rows.
+
+    Rows without one of the measures are left out; measures that no row has are left out of the models. Both are noted.
+    """
+    notes: list[str] = []
+    rows = cells[(cells["agent"] == agent) & (cells["observation"] != TABULAR_OBSERVATION)]
+    rows = rows.rename(columns={regret: "regret"})
+    used = []
+    for measure in measures:
+        known = measure in rows and bool((np.isfinite(rows[measure].to_numpy(float)) & (rows[measure] > 0)).any())
+        used += [measure] if known else []
+        if not known:
+            notes.append(f"{measure} is known for no instance: the models leave it out")
+    for column in ("regret", *used):
+        values = rows[column].to_numpy(float)
+        usable = np.isfinite(values) & ((values > 0) | (column == "regret"))
+        if not usable.all():
+            notes.append(f"{int((~usable).sum())} of {len(rows)} cells have no positive {column}: left out")
+            rows = rows[usable]
+    if len(rows) == 0:
+        notes.append(f"no cell of {agent} has all measures: there are no models")
+        return Models(regret, [], notes, None, None, None)
+    fits: list[Fit] = []
+    kinds: list[tuple[str, str, Any, list[str]]] = [("single", "all", rows, ["observation", "environment"])]
+    for observation, part in rows.groupby("observation", sort=True):
+        kinds.append(("representation", str(observation), part, ["environment"]))
+    for environment, part in rows.groupby("environment", sort=True):
+        kinds.append(("class", str(environment), part, ["observation"]))
+    for model, subset, part, dummies in kinds:
+        try:
+            found = fit(part.reset_index(drop=True), model, subset, [*dummies, *used])
+        except ParameterError as error:
+            notes.append(str(error))
+            continue
+        fits.append(found)
+        if found.dropped:
+            notes.append(
+                f"the {model} model of {subset} leaves out {', '.join(found.dropped)}: constant, or a combination of the others"
+            )
+    try:
+        outside = leave_one_class_out_r_squared(rows, measures=used)
+    except ParameterError as error:
+        outside = None
+        notes.append(str(error))
+    return Models(
+        regret, fits, notes, _together(fits, "representation"), _together(fits, "class"), outside
+    )  # fmt: skip
+
+
+def _together(fits: Sequence[Fit], model: str) -> float | None:
+    parts = [found for found in fits if found.model == model]
+    return aggregate_r_squared(parts) if len(parts) > 1 else None
+
+
+def intervals(rows: "pd.DataFrame", *, resamples: int = 1000) -> "pd.DataFrame":
+    """Interquartile mean of the normalised regret for each class, agent and observation, with 95 % bootstrap interval.
+
+    Runs are resampled within each task (instance and chance), as Agarwal et al. (2021) do; NaN where no task has two runs.
+    """
+    import pandas as pd
+
+    found = []
+    for key, part in rows.groupby(["environment", "agent", "observation"], sort=True):
+        defined = part[
+            np.isfinite(part["normalized_regret"].to_numpy(float))
+        ]  # else random play is optimal, or no episode ended
+        if len(defined) == 0:
+            continue
+        tasks = [task["normalized_regret"].to_numpy(float) for _, task in defined.groupby(["instance", "chance"])]
+        estimate = stratified_interval(tasks, resamples=resamples)
+        line = dict(zip(("environment", "agent", "observation"), key, strict=True))
+        line |= {"tasks": len(tasks), "runs": len(defined)}
+        ends = (estimate.lower, estimate.upper) if max(map(len, tasks)) > 1 else (float("nan"),) * 2
+        found.append(line | {"iqm": estimate.value, "lower": ends[0], "upper": ends[1]})
+    columns = ["environment", "agent", "observation", "tasks", "runs", "iqm", "lower", "upper"]
+    return pd.DataFrame(found, columns=columns)
+
+
+def mean_curve(
+    tasks: Sequence[np.ndarray], *, resamples: int = 500, seed: int = 0
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Mean over tasks of the mean over runs, and the ends of its 95 % interval; runs are resampled within each task.
+
+    Args:
+        tasks: for each task an array (runs, T).
+    Returns:
+        mean, lower, upper: (T,) each.
+    """
+    rng = np.random.default_rng(seed)
+    mean = np.mean([task.mean(axis=0) for task in tasks], axis=0)
+    draws = np.zeros((resamples, len(mean)))
+    for task in tasks:
+        n = len(task)
+        weights = rng.multinomial(n, np.full(n, 1 / n), size=resamples) / n
+        draws += weights @ task / len(tasks)
+    lower, upper = np.quantile(draws, [0.025, 0.975], axis=0)
+    return mean, lower, upper
+
+
+def agreement(cells: "pd.DataFrame", value: str, agents: tuple[str, str] = ("dqn", "ppo")) -> tuple[float, int] | None:
+    """Pearson correlation of two agents over the cells that both have, and how many these are; None for fewer than three."""
+    wide = cells.pivot_table(index=["instance", "chance", "observation"], columns="agent", values=value)
+    if not set(agents) <= set(wide.columns):
+        return None
+    both = wide[list(agents)].dropna()
+    if len(both) < 3 or (both.std() == 0).any():
+        return None
+    return float(np.corrcoef(both[agents[0]], both[agents[1]])[0, 1]), len(both)
+
+
+def paper_agreement() -> float:
+    """The same correlation over the returns that the paper prints in appendix C."""
+    wide = paper_returns().pivot_table(
+        index=["environment", "instance", "randomization", "observation"], columns="agent", values="mean"
+    )
+    return float(np.corrcoef(wide["DQN"], wide["PPO"])[0, 1])
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Numbers of the paper beside ours.
+
+    Attributes:
+        returns: one row a printed mean and deviation: the columns of `paper_returns`, `ours`, `our_deviation`, `our_steps` (the paper's
+            are 50 thousand for grids and lakes, else 600 thousand), `difference`.
+        regressions: one row a printed fit: the columns of `paper_regressions`, and for both kinds of regret ours and the difference.
+    """
+
+    returns: "pd.DataFrame"
+    regressions: "pd.DataFrame"
+    notes: Sequence[str] = field(default_factory=list)
+
+
+def compare(cells: "pd.DataFrame", runs: Sequence[Run], found: Sequence[Models]) -> Comparison:
+    """Our value beside each number that the paper prints, where the study has one; NaN elsewhere."""
+    numbers = {run.instance: paper_instance(run.config["environment"], run.config["parameters"]) for run in runs}
+    ours: dict[tuple, tuple[float, ...]] = {}
+    for row in cells.to_dict("records"):
+        if (number := numbers.get(row["instance"])) is None:
+            continue
+        chance = row["chance"].split()[0] if "," not in row["chance"] else row["chance"]
+        observation = {IMAGE: "image", VECTOR: "vector"}.get(row["observation"], row["observation"])
+        key = (row["environment"], number, chance, row["agent"].upper(), observation)
+        ours.setdefault(key, (row["return"], row["return_deviation"], row["steps"]))
+    returns = paper_returns()
+    keys = [
+        (row.environment, row.instance, PAPER_CHANCE[row.randomization], row.agent, row.observation)
+        for row in returns.itertuples()
+    ]
+    nothing = (float("nan"),) * 3
+    for place, column in enumerate(("ours", "our_deviation", "our_steps")):
+        returns[column] = [ours.get(key, nothing)[place] for key in keys]
+    returns["difference"] = returns["ours"] - returns["mean"]
+    return Comparison(returns, _regressions(cells, found))
+
+
+def _regressions(cells: "pd.DataFrame", found: Sequence[Models]) -> "pd.DataFrame":
+    printed = paper_regressions()
+    printed["paper"] = printed["r_squared"].astype(str).str.extract(r"([0-9.]+)")[0].astype(float)
+    for result in found:
+        values = []
+        for row in printed.itertuples():
+            values.append(_ours(str(row.model), str(row.subset), result, cells))
+        name = result.regret.removesuffix("_regret")
+        printed[f"ours_{name}"] = values
+        printed[f"difference_{name}"] = printed[f"ours_{name}"] - printed["paper"]
+    return printed
+
+
+def _ours(model: str, subset: str, found: Models, cells: "pd.DataFrame") -> float:
+    missing = float("nan")
+    if model == "agents":
+        agreed = agreement(cells, "return")
+        return agreed[0] if agreed else missing
+    if "aggregate" in subset:
+        value = found.representation_r_squared if model == "representation" else found.class_r_squared
+        return missing if value is None else value
+    name = {"image": IMAGE}.get(subset, subset)
+    one = found.get(model.split()[0], name)
+    return missing if one is None else one.r_squared

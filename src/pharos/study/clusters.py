@@ -1,0 +1,167 @@
+"""The same runs on more than one machine: shards as a Slurm array through submitit, or single runs on Ray.
+
+Runs do not depend on the engine: every one of these executes what is missing in a folder that all machines share, and may be
+killed, repeated, or followed by another.
+"""
+
+import os
+import time
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from pharos.errors import MissingExtra, ParameterError
+from pharos.study import worker as _worker
+from pharos.study.execution import (
+    ATTEMPTS,
+    STATUS_SECONDS,
+    Status,
+    _Execution,
+    claim,
+    opened,
+    processors,
+    run,
+    shard_of,
+    train,
+)
+from pharos.study.specification import Run, Source
+
+
+def submit(
+    source: Source,
+    folder: str | os.PathLike | None = None,
+    *,
+    shards: int,
+    cluster: str = "slurm",
+    parameters: Mapping[str, Any] | None = None,
+    retry_failed: bool = False,
+    resume: bool = False,
+    timeout: float | None = None,
+    workers: int = 1,
+    runner: _worker.Runner = train,
+) -> list[Any]:
+    """Submit a study as an array of jobs, each of which executes one of `shards` parts with `workers` processes.
+
+    Args:
+        folder: of the results, on a disk that all machines share.
+        cluster: "slurm"; or "local": all jobs at once on this machine, to try it.
+        parameters: of submitit's executor, such as {"timeout_min": 600, "slurm_partition": "cpu", "slurm_array_parallelism": 50}.
+    Returns:
+        submitit's jobs, one for each part in which runs are missing: `job.job_id`, `job.result()` waits. Their logs are in the
+        folder `jobs`.
+    Raises:
+        MissingExtra: submitit is not installed. ParameterError: there is no such cluster, or an option is wrong.
+    """
+    try:
+        import submitit
+    except ImportError as error:
+        raise MissingExtra("running on Slurm", "submitit", "cluster") from error
+    if cluster not in ("slurm", "local"):
+        raise ParameterError(f"cluster is {cluster!r}; expected slurm or local")
+    if shards < 1:
+        raise ParameterError(f"shards is {shards}; expected at least 1")
+    study, place = opened(source, folder)
+    place = place.absolute()
+    claim(study, place)
+    try:
+        executor = submitit.AutoExecutor(folder=str(place / "jobs"), cluster=cluster)
+    except RuntimeError as error:  # there is no sbatch here
+        raise ParameterError(f"cannot submit to {cluster}: {error}") from error
+    options = {"cpus_per_task": workers, "timeout_min": 24 * 60, "name": f"pharos-{study.name}"}
+    executor.update_parameters(**{**options, **(parameters or {})})
+    how = {"retry_failed": retry_failed, "resume": resume, "timeout": timeout, "workers": workers, "runner": runner}
+    parts = [f"{part}/{shards}" for part in range(1, shards + 1)]
+    parts = [part for part in parts if _has_work(shard_of(study.runs, part), place, retry_failed)]
+    if not parts:
+        return []
+    with executor.batch():
+        return [executor.submit(run_shard, str(place), part, how) for part in parts]
+
+
+def _has_work(runs: Iterable[Run], place: Path, retry_failed: bool) -> bool:
+    over = ("finished",) if retry_failed else ("finished", "failed")
+    return any(_worker.read_status(place, run.id) not in over for run in runs)
+
+
+def run_shard(folder: str, shard: str, options: dict[str, Any]) -> dict[str, Any]:
+    """What a job does: its part of the study whose specification stands in the folder."""
+    return run(folder, folder, shard=shard, **options).to_dict()
+
+
+def run_on_ray(
+    source: Source,
+    folder: str | os.PathLike | None = None,
+    *,
+    address: str | None = None,
+    shard: str | None = None,
+    retry_failed: bool = False,
+    resume: bool = False,
+    progress: Callable[[Status], None] | None = None,
+    runner: _worker.Runner = train,
+) -> Status:
+    """Execute the runs of a study that are not over on a Ray cluster, one processor a run.
+
+    Args:
+        folder: of the results, on a disk that all nodes share.
+        address: of the cluster; None for the one of this machine or RAY_ADDRESS, or else a new local one.
+    Raises:
+        MissingExtra: Ray is not installed.
+    """
+    try:
+        import ray
+    except ImportError as error:
+        raise MissingExtra("running on Ray", "ray", "ray") from error
+    study, place = opened(source, folder)
+    place = place.absolute()
+    claim(study, place)
+    execution = _Execution(
+        study,
+        place,
+        shard_of(study.runs, shard),
+        "status.json",
+        retry_failed,
+        resume,
+        None,
+        processors(),
+        progress,
+        runner,
+    )
+    ours = not ray.is_initialized()
+    if ours:
+        ray.init(address=address, log_to_driver=False, include_dashboard=False if address is None else None)
+    try:
+        remote = ray.remote(num_cpus=1, max_retries=ATTEMPTS - 1)(_attempt)
+        return _follow(ray, remote, execution)
+    finally:
+        if ours:
+            ray.shutdown()
+
+
+def _attempt(runner: _worker.Runner, config: Mapping[str, Any], id: str, folder: str, again: bool, resume: bool) -> str:
+    _worker.use_one_thread()
+    while (end := _worker.attempt(runner, config, id, Path(folder), again=again, resume=resume)) == _worker.BUSY:
+        time.sleep(STATUS_SECONDS)
+    return end
+
+
+def _follow(ray: Any, remote: Any, execution: _Execution) -> Status:
+    """Start every run, and await them one by one; one whose process died too often has failed."""
+    started: dict[Any, Run] = {}
+    while execution.pending:
+        _, run = execution.pending.popleft()
+        how = (run.id in execution.again, execution.resume)
+        arguments = (execution.runner, dict(run.config), run.id, str(execution.folder), *how)
+        started[remote.remote(*arguments)] = run
+    while started:
+        for reference in ray.wait(list(started), num_returns=1, timeout=STATUS_SECONDS)[0]:
+            run = started.pop(reference)
+            try:
+                ray.get(reference)
+            except Exception as error:  # of Ray: `attempt` keeps those of the run itself
+                partial = execution.folder / "partial" / run.id
+                partial.mkdir(parents=True, exist_ok=True)
+                _worker.write_failure(partial, run.config, run.id, _worker.describe(error), 0.0)
+                _worker.publish(partial, execution.folder, run.id)
+            execution.note(run)
+        execution.report()
+    return execution.report(final=True)

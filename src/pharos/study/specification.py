@@ -1,0 +1,459 @@
+"""What a study runs: a YAML file of blocks, checked key by key, and the list of runs that it stands for.
+
+    name: lakes
+    steps: 50000                       # of every block that does not say otherwise; so do evaluations, seeds, gamma, horizon
+    hyperparameters:
+      patient: {learning_rate: 1e-4}
+    blocks:
+      - environments: [frozen_lake/4x4, {name: frozen_lake, parameters: {size: 6, seed: 1}}]
+        chance: [plain, {sticky: 0.25}, {random: 0.1}]
+        observations: [vector, {name: simple_image, options: {size: 84}}]
+        agents: [dqn, ppo, q_learning]
+        hyperparameters: {dqn: patient, ppo: {n_steps: 256}}
+
+A block is the product of its lists. Tabular agents see the index of the state whatever the block's observations are.
+"""
+
+import json
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Any
+
+from pharos.errors import MissingExtra, ParameterError, UnknownName
+from pharos.study.regression import MEASURES
+
+try:
+    import yaml
+    from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, field_validator
+except ImportError as error:
+    raise MissingExtra("a study", str(error.name), "study") from error
+
+TABULAR_OBSERVATION = "index"
+Loc = tuple[int | str, ...]
+
+
+@dataclass(frozen=True)
+class Run:
+    """One training run of a study.
+
+    Attributes:
+        config: what determines its result; keys as in the file run.json.
+        instance: name of the environment as the specification gives it, such as "frozen_lake/4x4".
+    """
+
+    config: Mapping[str, Any]
+    instance: str
+
+    @cached_property
+    def id(self) -> str:
+        """Name of the run's folder: a hash of the config."""
+        return run_id(self.config)
+
+    @property
+    def chance(self) -> str:
+        """`plain`, or such as `sticky 0.25`."""
+        return chance_label(self.config["chance"])
+
+    @property
+    def kind(self) -> tuple[str, str, str]:
+        """Class of environment, agent and observation: runs of a kind take about as long for each step."""
+        return (self.config["environment"], self.config["agent"], self.config["observation"])
+
+
+def run_id(config: Mapping[str, Any]) -> str:
+    """The hash of a config: XXH3 with 64 bits of its sorted JSON, 16 hexadecimal digits."""
+    import xxhash
+
+    return xxhash.xxh3_64_hexdigest(json.dumps(config, sort_keys=True, separators=(",", ":")).encode())
+
+
+def chance_label(chance: Mapping[str, float]) -> str:
+    """`plain`, `sticky 0.25`, `random 0.1`, or both."""
+    parts = [f"{name} {chance[name]:g}" for name in ("sticky", "random") if chance.get(name)]
+    return ", ".join(parts) or "plain"
+
+
+# The file ---------------------------------------------------------------------------------------------------------------
+
+
+def _entry(value: Any) -> Any:
+    return {"name": value} if isinstance(value, str) else value
+
+
+def _chance(value: Any) -> Any:
+    if value == "plain" or value is None:
+        return {}
+    if isinstance(value, str):
+        raise UnknownName("chance", value, ("plain", "{sticky: 0.25}", "{random: 0.1}"))
+    return value
+
+
+def _seeds(value: Any) -> Any:
+    if isinstance(value, list):
+        return value
+    if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+        raise ParameterError(f"seeds: found {value!r}; expected how many, at least 1, or a list of seeds")
+    return list(range(value))
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class EnvironmentEntry(_Part):
+    """An environment: a name that `pharos.make` knows, and parameters."""
+
+    name: str
+    parameters: dict[str, Any] = {}
+
+    @cached_property
+    def instance(self) -> Any:
+        from pharos.environments import make
+
+        return make(self.name, **{name: _tuples(value) for name, value in self.parameters.items()})
+
+    @cached_property
+    def label(self) -> str:
+        if not self.parameters:
+            return self.name
+        return f"{self.name}({', '.join(f'{name}={value}' for name, value in self.parameters.items())})"
+
+
+class Chance(_Part):
+    """Probabilities that the previous action, or a uniformly random one, is executed instead of the chosen one."""
+
+    sticky: float = Field(default=0.0, ge=0, le=1)
+    random: float = Field(default=0.0, ge=0, le=1)
+
+
+class ObservationEntry(_Part):
+    """An observation and its options."""
+
+    name: str
+    options: dict[str, Any] = {}
+
+    @field_validator("name")
+    @classmethod
+    def _known(cls, name: str) -> str:
+        from pharos.observations import names
+
+        if name not in names():
+            raise UnknownName("observation", name, names())
+        return name
+
+
+class Hardness(_Part):
+    """Which measures of hardness are taken, with which discount, and how many seconds each may take for one instance."""
+
+    gamma: float = Field(default=0.99, ge=0, le=1)
+    measures: list[str] = Field(default_factory=lambda: [name for name in MEASURES if name in registered()])
+    budget: float = Field(default=60.0, gt=0)
+
+    @field_validator("measures")
+    @classmethod
+    def _known(cls, measures: list[str]) -> list[str]:
+        for measure in measures:
+            if measure not in registered():
+                raise UnknownName("measure of hardness", measure, registered())
+        return measures
+
+    @property
+    def predictors(self) -> list[str]:
+        """Those measures that explain regret in the linear models: the paper's three, or all where none of them is taken.
+
+        The stationary effective horizon stands for the effective horizon where that is not taken.
+        """
+        stand_in = {"effective_horizon": "stationary_effective_horizon"}
+        taken = [name if name in self.measures else stand_in.get(name) for name in MEASURES]
+        return [name for name in taken if name in self.measures] or list(self.measures)
+
+
+def _horizon(value: Any) -> Any:
+    if value in ("limit", "none") or (isinstance(value, int) and not isinstance(value, bool) and value >= 1):
+        return value
+    raise ParameterError(f"horizon: found {value!r}; expected a number of steps, limit (the environment's), or none")
+
+
+Seeds = Annotated[list[Annotated[int, Field(ge=0)]], BeforeValidator(_seeds), Field(min_length=1)]
+Steps = Annotated[int, Field(ge=1)]
+Gamma = Annotated[float, Field(ge=0, le=1)]
+Horizon = Annotated[Any, BeforeValidator(_horizon)]
+
+
+class Block(_Part):
+    """A product of environments, kinds of chance, observations, agents and seeds."""
+
+    environments: list[Annotated[EnvironmentEntry, BeforeValidator(_entry)]] = Field(min_length=1)
+    chance: list[Annotated[Chance, BeforeValidator(_chance)]] = Field([Chance()], min_length=1)
+    observations: list[Annotated[ObservationEntry, BeforeValidator(_entry)]] = Field(
+        [ObservationEntry(name="vector")], min_length=1
+    )
+    agents: list[str] = Field(min_length=1)
+    seeds: Seeds | None = None
+    steps: Steps | None = None
+    evaluations: Steps | None = None
+    gamma: Gamma | None = None
+    horizon: Horizon | None = None
+    hyperparameters: dict[str, str | dict[str, Any]] = {}
+
+
+class Specification(_Part):
+    """A study: its blocks, and what holds for every block that does not say otherwise."""
+
+    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")
+    description: str = ""
+    blocks: list[Block] = Field(min_length=1)
+    seeds: Seeds = list(range(5))
+    steps: Steps = 50_000
+    evaluations: Steps = 100
+    gamma: Gamma = 1.0
+    horizon: Horizon = "limit"
+    hyperparameters: dict[str, dict[str, Any]] = {}
+    hardness: Hardness = Field(default_factory=Hardness)
+
+    @cached_property
+    def runs(self) -> tuple[Run, ...]:
+        """Every run, each once, in the order of the blocks."""
+        found: dict[str, Run] = {}
+        for block in self.blocks:
+            for run in self._runs_of(block):
+                found.setdefault(run.id, run)
+        return tuple(found.values())
+
+    def _runs_of(self, block: Block) -> Iterator[Run]:
+        steps = block.steps or self.steps
+        evaluations = block.evaluations or self.evaluations
+        gamma = self.gamma if block.gamma is None else block.gamma
+        horizon = self.horizon if block.horizon is None else block.horizon
+        for environment in block.environments:
+            for chance in block.chance:
+                for agent in block.agents:
+                    observations: Sequence[ObservationEntry] = block.observations
+                    if agent in tabular_agents():
+                        observations = [ObservationEntry(name=TABULAR_OBSERVATION)]
+                    for observation in observations:
+                        for seed in block.seeds or self.seeds:
+                            yield Run(
+                                {
+                                    "environment": environment.instance.name,
+                                    "parameters": _jsonable(environment.instance.parameters),
+                                    "chance": {"sticky": chance.sticky, "random": chance.random},
+                                    "observation": observation.name,
+                                    "observation_options": dict(observation.options),
+                                    "agent": agent,
+                                    "hyperparameters": self._hyperparameters(
+                                        block, agent, environment.instance.name, observation.name
+                                    ),
+                                    "steps": steps,
+                                    "seed": seed,
+                                    "gamma": gamma,
+                                    "horizon": steps_of(horizon, environment.instance),
+                                    "evaluation_interval": max(1, steps // evaluations),
+                                },
+                                environment.label,
+                            )
+
+    def _hyperparameters(self, block: Block, agent: str, environment: str, observation: str) -> dict[str, Any]:
+        """All of them, those of the library's table included: when that changes, these are other runs."""
+        from pharos.agents.hyperparameters import hyperparameters
+
+        given = block.hyperparameters.get(agent, {})
+        own = self.hyperparameters[given] if isinstance(given, str) else given
+        return hyperparameters(agent, environment, observation, own)
+
+
+_PARTS: dict[Loc, type[BaseModel]] = {
+    (): Specification,
+    ("hardness",): Hardness,
+    ("blocks",): Block,
+    ("blocks", "environments"): EnvironmentEntry,
+    ("blocks", "chance"): Chance,
+    ("blocks", "observations"): ObservationEntry,
+}
+
+
+def agents() -> tuple[str, ...]:
+    """The names of the agents; besides, `module:Class` is an algorithm for Stable-Baselines3."""
+    return ("q_learning", "dqn", "ppo", "a2c")
+
+
+def tabular_agents() -> tuple[str, ...]:
+    """Those agents that see the index of the state."""
+    return ("q_learning",)
+
+
+def steps_of(horizon: int | str, environment: Any) -> int | None:
+    """The number of steps of an episode in values and returns; None for discounted values without a limit."""
+    if horizon == "none":
+        return None
+    return int(environment.max_episode_steps) if horizon == "limit" else int(horizon)
+
+
+def registered() -> list[str]:
+    """The names of the measures of hardness."""
+    from pharos.hardness import measures
+
+    return list(measures())
+
+
+# Reading ----------------------------------------------------------------------------------------------------------------
+
+
+def presets() -> list[str]:
+    """The names of the studies that come with pharos."""
+    folder = resources.files("pharos.study").joinpath("presets")
+    return sorted(Path(file.name).stem for file in folder.iterdir() if file.name.endswith(".yaml"))
+
+
+Source = str | Path | Mapping[str, Any] | Specification
+"""What is taken for a study: a YAML file, a preset's name, a mapping, a Specification, or the folder of a study."""
+
+
+def specification(source: Source) -> Specification:
+    """The specification in a YAML file or a study's folder, of a preset by its name, or from a mapping.
+
+    Raises:
+        UnknownName: no such file or preset. ParameterError: something in it is wrong; the message names file, line and key.
+    """
+    if isinstance(source, Specification):
+        return source
+    if isinstance(source, Mapping):
+        return _validated(source, "specification", None)
+    if str(source) in presets():
+        file = resources.files("pharos.study").joinpath("presets", f"{source}.yaml")
+        return parse(file.read_text(encoding="utf-8"), f"preset {source}")
+    path = Path(source)
+    if path.is_dir():
+        path = path / "study.yaml"
+    if not path.is_file():
+        raise UnknownName("study (no such file, and no such preset)", source, presets())
+    return parse(path.read_text(encoding="utf-8"), str(path))
+
+
+def parse(text: str, name: str = "specification") -> Specification:
+    """The specification in a text of YAML; `name` stands before the line number in messages."""
+    try:
+        root = yaml.compose(text, _Loader)
+        if root is None:
+            raise ParameterError(f"{name}: is empty; expected a mapping with name and blocks")
+        _refuse_repeated_keys(root, name)
+        data = yaml.load(text, _Loader)
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        where = f"{name}:{mark.line + 1}" if mark is not None else name
+        problem = getattr(error, "problem", None) or "this is no YAML"
+        raise ParameterError(f"{where}: {problem}") from error
+    if not isinstance(data, dict):
+        raise ParameterError(f"{name}:1: found {type(data).__name__}; expected a mapping with name and blocks")
+    return _validated(data, name, root)
+
+
+class _Loader(yaml.SafeLoader):
+    """Safe YAML in which 1e-4 is a number, not a text."""
+
+
+_Loader.yaml_implicit_resolvers = {k: list(v) for k, v in yaml.SafeLoader.yaml_implicit_resolvers.items()}
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float", re.compile(r"^[-+]?(\d+(\.\d*)?|\.\d+)[eE][-+]?\d+$"), list("-+0123456789.")
+)
+
+
+def _validated(data: Mapping[str, Any], name: str, root: Any) -> Specification:
+    try:
+        found = Specification.model_validate(data)
+    except ValidationError as error:
+        raise ParameterError(_messages(error, name, root)) from error
+    wrong = [*_wrong(found)]
+    if wrong:
+        raise ParameterError("; ".join(f"{_where(name, root, loc)}: {message}" for loc, message in wrong))
+    return found
+
+
+def _wrong(found: Specification) -> Iterator[tuple[Loc, str]]:
+    """What only the whole specification shows: names of agents and of hyperparameters, environments that cannot be made."""
+    for i, block in enumerate(found.blocks):
+        for j, entry in enumerate(block.environments):
+            try:
+                _ = entry.instance
+            except ParameterError as error:
+                yield ("blocks", i, "environments", j), str(error)
+        gamma = found.gamma if block.gamma is None else block.gamma
+        if (block.horizon or found.horizon) == "none" and gamma == 1:
+            yield ("blocks", i), "gamma is 1 and horizon is none, so values may be infinite; expected a gamma below 1"
+        for j, agent in enumerate(block.agents):
+            if agent not in agents() and ":" not in agent:
+                yield ("blocks", i, "agents", j), str(UnknownName("agent", agent, agents()))
+        for agent, given in block.hyperparameters.items():
+            loc = ("blocks", i, "hyperparameters", agent)
+            if agent not in block.agents:
+                yield loc, str(UnknownName("agent of this block", agent, block.agents))
+            elif isinstance(given, str) and given not in found.hyperparameters:
+                yield loc, str(UnknownName("set of hyperparameters", given, found.hyperparameters))
+
+
+def _messages(error: ValidationError, name: str, root: Any) -> str:
+    said: dict[str, None] = {}
+    for problem in error.errors():
+        loc = problem["loc"]
+        if "hyperparameters" in loc and loc[-1] in ("str", "dict[str,any]"):
+            loc = loc[:-1]
+        key = str(loc[-1]) if loc else ""
+        if problem["type"] == "extra_forbidden":
+            part = _PARTS.get(tuple(part for part in loc[:-1] if isinstance(part, str)))
+            message = str(UnknownName("key", key, part.model_fields if part else ()))
+        elif problem["type"] == "missing":
+            message = f"the key {key!r} is missing"
+            loc = loc[:-1]
+        elif problem["type"] == "value_error":
+            message = str(problem["ctx"]["error"])
+        else:
+            expected = problem["msg"][0].lower() + problem["msg"][1:]
+            message = f"{key}: found {problem['input']!r}; expected: {expected.removeprefix('input should be ')}"
+        said[f"{_where(name, root, loc)}: {message}"] = None
+    return "; ".join(said)
+
+
+def _where(name: str, root: Any, loc: Loc) -> str:
+    """`file:line`, the line of the innermost node on the path that exists; the path itself where there is no file."""
+    if root is None:
+        return ".".join(map(str, (name, *loc)))
+    node, line = root, root.start_mark.line
+    for part in loc:
+        if isinstance(node, yaml.MappingNode):
+            pair = next(((key, value) for key, value in node.value if key.value == str(part)), None)
+            if pair is None:
+                break
+            line, node = pair[0].start_mark.line, pair[1]
+        elif isinstance(node, yaml.SequenceNode) and isinstance(part, int) and part < len(node.value):
+            node = node.value[part]
+            line = node.start_mark.line
+        else:
+            break
+    return f"{name}:{line + 1}"
+
+
+def _refuse_repeated_keys(node: Any, name: str) -> None:
+    if isinstance(node, yaml.MappingNode):
+        seen: dict[str, int] = {}
+        for key, value in node.value:
+            if key.value in seen:
+                raise ParameterError(
+                    f"{name}:{key.start_mark.line + 1}: the key {key.value!r} stands there twice (line {seen[key.value]})"
+                )
+            seen[key.value] = key.start_mark.line + 1
+            _refuse_repeated_keys(value, name)
+    elif isinstance(node, yaml.SequenceNode):
+        for item in node.value:
+            _refuse_repeated_keys(item, name)
+
+
+def _tuples(value: Any) -> Any:
+    return tuple(_tuples(item) for item in value) if isinstance(value, list) else value
+
+
+def _jsonable(value: Any) -> Any:
+    return json.loads(json.dumps(value))

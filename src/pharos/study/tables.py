@@ -1,0 +1,289 @@
+"""The results of a study as tables: a row for each run, a row for each point of a curve, a row for each cell of the grid.
+
+A cell is one agent on one instance under one kind of chance with one observation: its row is the mean over seeds.
+"""
+
+import json
+import os
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pharos.errors import ParameterError, UnknownName
+from pharos.study import worker as _worker
+from pharos.study.execution import opened
+from pharos.study.specification import Run, Source, Specification
+from pharos.study.values import tuple_of
+from pharos.study.worker import write_atomically
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from pharos.mdp import TabularMDP
+
+CELL = ["environment", "instance", "chance", "agent", "observation"]
+WIDEST = 2  # a proven interval enters as one number if its upper end is at most so many times its lower end
+LAST = 0.1  # part of the evaluations at the end over which the return is averaged
+
+
+def table(source: Source, folder: str | os.PathLike | None = None) -> "pd.DataFrame":
+    """One row a finished run.
+
+    Returns:
+        Columns `id`, `environment` (class), `instance`, `chance`, `agent`, `observation`, `seed`, `steps`, `seconds`; the result
+        of the run (`cumulative_regret`, `normalized_regret`, `value_optimal`, ...); and `return`, the mean return of the
+        training episodes in the last tenth of the run, undiscounted.
+    Raises:
+        ParameterError: no run is finished.
+    """
+    import pandas as pd
+
+    study, place = opened(source, folder)
+    rows = []
+    for run in study.runs:
+        record = _worker.read_record(place / "runs" / run.id)
+        if record is None or record["status"] != "finished":
+            continue
+        described = {"id": run.id, **_described(run), "seconds": record["seconds"]}
+        result = {
+            name: float("nan") if value is None else value
+            for name, value in record["result"].items()
+            if not isinstance(value, dict)
+        }
+        rows.append(described | result | {"return": _last_return(read_curve(place, run.id))})
+    if not rows:
+        raise ParameterError(f"{place}: no run of {study.name!r} is finished; execute `pharos study run` first")
+    return pd.DataFrame(rows)
+
+
+def curves(source: Source, folder: str | os.PathLike | None = None) -> "pd.DataFrame":
+    """One row an evaluation of a finished run: the columns of curve.parquet, and those that describe the run."""
+    import pandas as pd
+
+    study, place = opened(source, folder)
+    parts = []
+    for run in study.runs:
+        if _worker.read_status(place, run.id) == "finished":
+            parts.append(read_curve(place, run.id).assign(id=run.id, **_described(run)))
+    if not parts:
+        raise ParameterError(f"{place}: no run of {study.name!r} is finished; execute `pharos study run` first")
+    return pd.concat(parts, ignore_index=True)
+
+
+def cells(rows: "pd.DataFrame", measures: "pd.DataFrame | None" = None) -> "pd.DataFrame":
+    """The means over seeds, a row for each cell; joined with hardness where `measures` (of `hardness_table`) is given.
+
+    Returns:
+        Columns of the cell; `seeds`; `steps` (the most, where runs differ); means of `cumulative_regret`, `normalized_regret`,
+        `final_value`, `value_optimal`, `return`; `return_deviation` over seeds (population, as 0.00 is printed for equal runs; NaN for
+        one seed); and the measures.
+    """
+    values = ["cumulative_regret", "normalized_regret", "final_value", "value_optimal", "return"]
+    groups = rows.groupby(CELL, sort=False)
+    means = groups[values].mean()
+    means.insert(0, "seeds", groups.size())
+    means.insert(1, "steps", groups["steps"].max())
+    means["return_deviation"] = groups["return"].std(ddof=0).where(groups.size() > 1)
+    found = means.reset_index()
+    if measures is None:
+        return found
+    return found.merge(measures, on=["environment", "instance", "chance"], how="left")
+
+
+def read_curve(folder: Path, id: str) -> "pd.DataFrame":
+    """The curve of one run."""
+    import pandas as pd
+
+    return pd.read_parquet(folder / "runs" / id / "curve.parquet")
+
+
+def _last_return(curve: "pd.DataFrame") -> float:
+    """Mean return of training episodes over the last tenth of the evaluations that saw an episode end."""
+    ended = np.diff(curve["episodes"].to_numpy(), prepend=0)
+    returns = curve["mean_return"].to_numpy(float)
+    known = np.isfinite(returns) & (ended > 0)
+    known[: len(known) - max(1, int(len(known) * LAST))] &= not known[-max(1, int(len(known) * LAST)) :].any()
+    return float(np.average(returns[known], weights=ended[known])) if known.any() else float("nan")
+
+
+def _described(run: Run) -> dict[str, Any]:
+    config = run.config
+    return {
+        "environment": config["environment"],
+        "instance": run.instance,
+        "chance": run.chance,
+        "agent": config["agent"],
+        "observation": config["observation"],
+        "seed": config["seed"],
+        "steps": config["steps"],
+    }
+
+
+# Hardness ---------------------------------------------------------------------------------------------------------------
+
+
+def hardness_table(
+    source: Source, folder: str | os.PathLike | None = None, *, progress: Callable[[str], None] | None = None
+) -> "pd.DataFrame":
+    """The measures of every instance under every kind of chance; computed once, and kept in the folder `hardness`.
+
+    Returns:
+        Columns `environment`, `instance`, `chance`; each measure as a number; `num_states`; and `notes`: where a measure is
+        undefined or unknown, where it is the geometric mean of a proven interval (whose ends differ by a factor of at most two),
+        and where it is that of the instance without chance, because the measure does not exist, or cannot be computed within
+        the budget, under this chance.
+    Cost: a state space and a report of hardness for each row, each measure at most the budget of the specification.
+    """
+    import pandas as pd
+
+    study, place = opened(source, folder)
+    rows: dict[tuple[str, str], dict[str, Any]] = {}
+    for run in study.runs:
+        key = (run.instance, run.chance)
+        if key in rows:
+            continue
+        if progress is not None:
+            progress(f"hardness of {run.instance}, {run.chance}")
+        plain = {**run.config, "chance": {"sticky": 0.0, "random": 0.0}}
+        own = _measured(study, place, run.config)
+        without = _measured(study, place, plain) if run.chance != "plain" else own
+        rows[key] = {"environment": run.config["environment"], "instance": run.instance, "chance": run.chance}
+        rows[key] |= _chosen(study.hardness.measures, own, without)
+    return pd.DataFrame(list(rows.values()))
+
+
+def _chosen(names: Sequence[str], own: Mapping[str, Any], plain: Mapping[str, Any]) -> dict[str, Any]:
+    row: dict[str, Any] = {"num_states": own.get("num_states") or plain.get("num_states")}
+    notes = []
+    for name in names:
+        mine, other = (_usable(report["measures"].get(name, {})) for report in (own, plain))
+        used = mine if mine.get("value") is not None else other
+        row[name] = float("nan") if used.get("value") is None else used["value"]
+        if used is not mine and used.get("value") is not None:
+            notes.append(f"{name}: without chance, because {mine.get('why') or 'there is none with it'}")
+        if used.get("value") is None:
+            notes.append(f"{name}: none, because {used.get('why') or 'it is undefined'}")
+        elif not used.get("exact", True):
+            notes.append(f"{name}: geometric mean of the proven interval {used['lower']:g} to {used['upper']:g}")
+    return {**row, "notes": "; ".join(notes)}
+
+
+def _usable(measure: dict[str, Any]) -> dict[str, Any]:
+    """The measure, or why it says too little: a proven interval that is too wide to be one number."""
+    if measure.get("value") is None or measure.get("exact", True) or measure["upper"] <= WIDEST * measure["lower"]:
+        return measure
+    return {"value": None, "why": f"only {measure['lower']:g} to {measure['upper']:g} is proven within the budget"}
+
+
+def _measured(study: Specification, place: Path, config: Mapping[str, Any]) -> dict[str, Any]:
+    import xxhash
+
+    asked = {name: config[name] for name in ("environment", "parameters", "chance", "horizon")}
+    asked["gamma"] = study.hardness.gamma
+    key = xxhash.xxh3_64_hexdigest(json.dumps(asked, sort_keys=True).encode())
+    file = place / "hardness" / f"{key}.json"
+    kept: dict[str, Any] = {**asked, "measures": {}, "num_states": None}
+    if file.is_file():
+        kept = json.loads(file.read_text(encoding="utf-8"))
+    missing = [name for name in study.hardness.measures if name not in kept["measures"]]
+    if missing:
+        kept, found = _measure(study, config, missing, kept)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(file, json.dumps(kept, indent=1) + "\n")
+        return found
+    return kept
+
+
+def _measure(
+    study: Specification, config: Mapping[str, Any], names: Sequence[str], kept: dict[str, Any]
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """What is kept with the measures added (value, lower, upper, exact; or why there is none); the same with those that failed."""
+    from pharos.environments import make
+    from pharos.hardness import report
+
+    environment = make(config["environment"], **_arguments(config["parameters"]))
+    mdp = build_mdp(config["environment"], config["parameters"], config["chance"], study.hardness.gamma)
+    steps = config["horizon"] or environment.max_episode_steps
+    measures, failed = dict(kept["measures"]), {}
+    for name in names:
+        try:
+            result = report(mdp, [name], horizon=steps, budget=study.hardness.budget)[name]
+            measures[name] = {"why": result.undefined} if result.undefined else _number(result.value, result.exact)
+        except UnknownName as error:
+            raise ParameterError(f"study {study.name!r}: {error}") from error
+        except Exception as error:  # whatever it is, a report without this measure is better than none
+            failed[name] = {"why": _worker.describe(error)}
+    kept = {**kept, "measures": measures, "num_states": mdp.num_states}
+    return kept, {**kept, "measures": {**measures, **failed}}
+
+
+def build_mdp(
+    environment: str, parameters: Mapping[str, Any], chance: Mapping[str, float], gamma: float
+) -> "TabularMDP":
+    """The tabular MDP that a run is about; its state space is built, or taken from the cache."""
+    from pharos.environments import make
+    from pharos.mdp import random_actions, sticky_actions
+    from pharos.state_space import build
+
+    mdp = build(make(environment, **_arguments(parameters)), progress=False).mdp(gamma=gamma)
+    if chance["sticky"]:
+        mdp = sticky_actions(mdp, chance["sticky"])
+    return random_actions(mdp, chance["random"]) if chance["random"] else mdp
+
+
+def _arguments(parameters: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: tuple_of(value) for name, value in parameters.items()}
+
+
+def _number(value: Any, exact: bool) -> dict[str, Any]:
+    """A measure as one positive number: itself, or the geometric mean of an interval with a finite upper end."""
+    found: dict[str, Any]
+    if not isinstance(value, Mapping):
+        number = None if value is None else float(value)
+        found = {"value": number, "lower": number, "upper": number, "exact": exact}
+    elif value.get("lower") is not None and (value.get("upper") is not None or not value.get("exact", exact)):
+        lower, upper = value["lower"], value.get("upper")
+        finite = upper is not None and np.isfinite(upper)
+        number = lower if value.get("exact") else float(np.sqrt(lower * upper)) if finite else None
+        found = {"value": number, "lower": lower, "upper": upper, "exact": bool(value.get("exact", exact))}
+        if number is None:
+            found["why"] = f"only a lower bound of {lower:g} is proven within the budget"
+    else:
+        number = None if value.get("value") is None else float(value["value"])
+        found = {"value": number, "lower": number, "upper": number, "exact": bool(value.get("exact", exact))}
+    if found["value"] is not None and not np.isfinite(found["value"]):
+        found = {"value": None, "why": "it is infinite"}
+    elif found["value"] is None:
+        found.setdefault("why", "it is infinite or undefined")
+    return found
+
+
+# The paper's instances --------------------------------------------------------------------------------------------------
+
+
+@cache
+def _paper_instances() -> dict[tuple[str, str], tuple[str, int]]:
+    """(class, parameters as JSON) -> (class, number of its block in the paper's table)."""
+    from pharos.environments import make, named_instances
+
+    found: dict[tuple[str, str], tuple[str, int]] = {}
+    numbers: dict[str, int] = {}
+    printed = {"simple_grid": 6, "frozen_lake": 2, "freeway": 10, "breakout": 10}
+    for name, (environment, _) in named_instances().items():
+        numbers[environment] = numbers.get(environment, 0) + 1
+        if numbers[environment] <= printed[environment]:
+            found[environment, _key(make(name).parameters)] = (environment, numbers[environment])
+    return found
+
+
+def _key(parameters: Mapping[str, Any]) -> str:
+    return json.dumps(parameters, sort_keys=True)
+
+
+def paper_instance(environment: str, parameters: Mapping[str, Any]) -> int | None:
+    """The number of the instance among the blocks of its class in the paper's appendix C, counted from 1; None if not there."""
+    found = _paper_instances().get((environment, _key(parameters)))
+    return None if found is None else found[1]

@@ -1,0 +1,214 @@
+"""One run in one process: the folder of a run appears whole, or not at all.
+
+    DIR/partial/ID/   while it is being run: its log, and whatever the runner writes
+    DIR/runs/ID/      when it is over, moved there in one step: run.json (finished or failed), curve.parquet, log.txt
+    DIR/locks/ID/     held by the process that runs it
+
+A process that is killed leaves a folder in `partial`, which the next attempt throws away, unless its result is complete, or
+unless it is to be resumed: then the runner finds there what it wrote before.
+"""
+
+import contextlib
+import json
+import os
+import shutil
+import signal
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from pharos.errors import PharosError, StateSpaceLocked
+from pharos.state_space.files import lock
+
+FINISHED, FAILED, BUSY = "finished", "failed", "busy"
+EXIT_BUSY = 75
+PARENT_GONE = 76
+THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
+
+Runner = Callable[[Mapping[str, Any], Path], Any]
+
+
+def read_status(folder: Path, id: str) -> str | None:
+    """`finished` or `failed`; None where the run has no folder yet."""
+    record = read_record(folder / "runs" / id)
+    return None if record is None else str(record.get("status"))
+
+
+def read_record(folder: Path) -> dict[str, Any] | None:
+    """What run.json of one run says; None where there is none."""
+    try:
+        return json.loads((folder / "run.json").read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return None
+
+
+def attempt(
+    runner: Runner, config: Mapping[str, Any], id: str, folder: Path, *, again: bool = False, resume: bool = False
+) -> str:
+    """Execute one run unless it is finished already; FINISHED, FAILED or BUSY (another process is at it).
+
+    A run that raises is FAILED: its error stands in run.json and its log; `again` repeats such runs. With `resume` the runner
+    gets what an attempt that was killed left behind, else an empty folder.
+    """
+    holder = folder / "locks" / id
+    holder.mkdir(parents=True, exist_ok=True)
+    try:
+        with lock(holder):
+            return _attempt(runner, config, id, folder, again, resume)
+    except StateSpaceLocked:
+        return BUSY
+
+
+def _attempt(runner: Runner, config: Mapping[str, Any], id: str, folder: Path, again: bool, resume: bool) -> str:
+    done = read_status(folder, id)
+    if done == FINISHED or (done == FAILED and not again):
+        return done
+    partial = folder / "partial" / id
+    if not _is_complete(partial):
+        if partial.exists() and not resume:
+            shutil.rmtree(partial)
+        partial.mkdir(parents=True, exist_ok=True)
+        began = time.perf_counter()
+        with _log(partial / "log.txt"):
+            try:
+                runner(config, partial)
+                if not _is_complete(partial):
+                    raise RuntimeError("the runner returned without a finished run.json and a curve.parquet")
+            except Exception as error:
+                traceback.print_exc()
+                write_failure(partial, config, id, describe(error), time.perf_counter() - began)
+    publish(partial, folder, id)
+    return read_status(folder, id) or FAILED
+
+
+def describe(error: BaseException) -> str:
+    """An error in one line: as pharos says it, or with its type."""
+    text = " ".join(str(error).split())
+    return text if isinstance(error, PharosError) else f"{type(error).__name__}: {text}"
+
+
+def write_failure(folder: Path, config: Mapping[str, Any], id: str, error: str, seconds: float) -> None:
+    """A run.json that says why there is no result."""
+    record = {"format": 1, "id": id, "config": dict(config), "status": FAILED, "error": error, "seconds": seconds}
+    (folder / "run.json").write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+
+
+def publish(partial: Path, folder: Path, id: str) -> None:
+    """Move a run's folder to its place, on disk before it is there; an earlier failed attempt makes room."""
+    for path in partial.rglob("*"):
+        if path.is_file():
+            _sync(path)
+    runs = folder / "runs"
+    runs.mkdir(parents=True, exist_ok=True)
+    place = runs / id
+    if place.exists():
+        old = folder / "partial" / f"{id}.failed"
+        if old.exists():
+            shutil.rmtree(old)
+        os.rename(place, old)
+        os.rename(partial, place)
+        shutil.rmtree(old)
+    else:
+        os.rename(partial, place)
+    _sync(runs)
+
+
+def write_atomically(file: Path, text: str) -> None:
+    """Replace a file in one step."""
+    temporary = file.with_name(f".{file.name}.{os.getpid()}")
+    temporary.write_text(text, encoding="utf-8")
+    os.replace(temporary, file)
+
+
+def _is_complete(partial: Path) -> bool:
+    try:
+        record = read_record(partial)
+    except ValueError:  # cut short
+        return False
+    return record is not None and record.get("status") == FINISHED and (partial / "curve.parquet").exists()
+
+
+def _sync(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+@contextlib.contextmanager
+def _log(path: Path):
+    """What this process prints goes to a file."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    saved = os.dup(1), os.dup(2)
+    with open(path, "ab") as file:
+        os.dup2(file.fileno(), 1)
+        os.dup2(file.fileno(), 2)
+        try:
+            with (
+                open(1, "w", closefd=False) as out,
+                open(2, "w", closefd=False, buffering=1) as err,
+                contextlib.redirect_stdout(out),
+                contextlib.redirect_stderr(err),
+            ):
+                yield
+        finally:
+            for number, old in zip((1, 2), saved, strict=True):
+                os.dup2(old, number)
+                os.close(old)
+
+
+# As a process -----------------------------------------------------------------------------------------------------------
+
+
+def main(
+    runner: Runner,
+    config: Mapping[str, Any],
+    id: str,
+    folder: Path,
+    again: bool,
+    resume: bool,
+    environment: Mapping[str, str],
+) -> None:
+    """The body of a worker process: ends with the process that started it, leaves interrupts to it, uses one thread.
+
+    `environment` holds the variables of that process now, which may not be those of when workers began to be forked.
+    """
+    threads = {
+        name: os.environ[name] for name in THREAD_VARIABLES if name in os.environ
+    }  # Numba refuses that they change
+    os.environ.clear()
+    os.environ.update({**environment, **threads})
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    end_with_parent()
+    use_one_thread()
+    if attempt(runner, config, id, folder, again=again, resume=resume) == BUSY:
+        sys.exit(EXIT_BUSY)
+
+
+def end_with_parent() -> None:
+    """End this process at once when the one that started it is gone, however it went."""
+    from multiprocessing import connection, parent_process
+
+    parent = parent_process()
+    if parent is None:
+        return
+
+    def watch() -> None:
+        connection.wait([parent.sentinel])
+        os._exit(PARENT_GONE)
+
+    threading.Thread(target=watch, daemon=True, name="watch").start()
+
+
+def use_one_thread() -> None:
+    """One thread for PyTorch, if it is loaded, and for Numba; a process per run keeps the processors busy."""
+    if "torch" in sys.modules:
+        sys.modules["torch"].set_num_threads(1)
+    if "numba" in sys.modules:
+        sys.modules["numba"].set_num_threads(1)
