@@ -14,8 +14,9 @@ import pharos
 from naive_horizon import analysis
 from pharos import hardness
 from pharos.errors import ParameterError, UndefinedMeasure
-from pharos.hardness.effective_horizon import TIE, _compiled, _Steps, _vectorized
+from pharos.hardness.effective_horizon import _compiled, _vectorized
 from pharos.hardness.large_horizon import LargeHorizon
+from pharos.hardness.steps import TIE, Steps
 from pharos.mdp import TabularMDP, random_actions, sticky_actions
 from strategies import deterministic_mdps, general_mdps
 
@@ -101,7 +102,7 @@ def test_it_is_what_its_definition_says(mdp, chance, steps):
 @settings(max_examples=150, deadline=None)
 @given(deterministic_mdps(max_states=6, max_actions=3), st.integers(1, 7))
 def test_the_compiled_analysis_is_the_other_one(mdp, steps):
-    one = _vectorized(_Steps(mdp, steps))
+    one = _vectorized(Steps(mdp, steps))
     other = _compiled(LargeHorizon(mdp, steps, TIE))
     assert one.keys() == other.keys()
     for name in one:
@@ -188,7 +189,7 @@ def test_a_report_with_a_horizon_has_it_and_one_without_says_what_is_missing():
 )
 def test_states_that_no_episode_meets_do_not_matter(mdp, chance, steps):
     mdp = random_actions(sticky_actions(mdp, chance.get("sticky", 0.0)), chance.get("random", 0.0))
-    whole, part = (_vectorized(_Steps(each, steps)) for each in (mdp, mdp.within(steps)))
+    whole, part = (_vectorized(Steps(each, steps)) for each in (mdp, mdp.within(steps)))
     for name in whole:
         assert part[name] == pytest.approx(whole[name], rel=1e-9, abs=1e-12), name
     if not chance and mdp.next_states is not None:

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from pharos.errors import ParameterError
-from pharos.hardness.interval import Budget, Interval, Progress, Spending
+from pharos.hardness.interval import Budget, Interval, Progress, Spending, conventions_of
+from pharos.hardness.stochastic_diameter import stochastic_diameter, stochastic_start_eccentricity
 from pharos.mdp import TabularMDP
 
 _WIDE = 1024  # nodes of a layer, beyond which layers are not narrow
@@ -57,10 +58,8 @@ def diameter(
     spending = Spending(Budget.of(budget), progress)
     graph = Graph.of(mdp, restart)
     if graph is None:
-        from pharos.hardness.stochastic_diameter import stochastic_diameter
-
         return stochastic_diameter(mdp, restart, tolerance, spending)
-    return _Sweep(graph, spending, _conventions(mdp, restart)).interval()
+    return _Sweep(graph, spending, conventions_of(mdp, restart)).interval()
 
 
 def start_eccentricity(
@@ -84,20 +83,10 @@ def start_eccentricity(
     """
     graph = Graph.of(mdp, restart)
     if graph is None:
-        from pharos.hardness.stochastic_diameter import stochastic_start_eccentricity
-
         return stochastic_start_eccentricity(mdp, restart, tolerance, Budget.of(budget))
     distance = np.empty(graph.num_nodes, np.int32)
     found, largest, _ = graph.search_forward(graph.pivot, distance)
     return float(largest) if found == graph.num_nodes else math.inf
-
-
-def _conventions(mdp: TabularMDP, restart: bool) -> dict[str, Any]:
-    return {
-        "restart": restart,
-        "start_states": len(mdp.start_states),
-        "chance": {"chosen": mdp.chance.chosen, "previous": mdp.chance.previous, "uniform": mdp.chance.uniform},
-    }
 
 
 def _kernels() -> Any:

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from pharos.errors import ParameterError, UndefinedMeasure
-from pharos.hardness.effective_horizon import TIE, _Steps, steps_of
 from pharos.hardness.return_distribution import central_moments
+from pharos.hardness.steps import TIE, Steps, steps_of
 from pharos.mdp import TabularMDP
 
 METHODS = ("binomial", "berry_esseen", "bernstein", "bennett", "exact")
@@ -176,7 +176,7 @@ def run_gorp(
         if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
             raise ParameterError(f"{name} is {value!r}; expected a whole number, at least 1")
     _needs_one_outcome("run_gorp", mdp)
-    tree = _Steps(mdp, steps)
+    tree = Steps(mdp, steps)
     if len(tree.starts) != 1:
         raise UndefinedMeasure(f"run_gorp: there are {len(tree.starts)} start states; GORP plans from one")
     assert tree.table is not None
@@ -197,7 +197,7 @@ def run_gorp(
 
 
 def _completions(
-    tree: _Steps, node: int, t: int, sequences: np.ndarray, m: int, generator: np.random.Generator
+    tree: Steps, node: int, t: int, sequences: np.ndarray, m: int, generator: np.random.Generator
 ) -> np.ndarray:
     """(A^k m,): the returns from step t of each sequence m times, continued at random."""
     assert tree.table is not None
@@ -227,7 +227,7 @@ class _Search:
     """The smallest m, to 1 %, that is proven to make GORP fail with probability 1/2 at most."""
 
     def __init__(self, mdp: TabularMDP, steps: int, methods: tuple[str, ...]):
-        self.tree, self.methods = _Steps(mdp, steps), methods
+        self.tree, self.methods = Steps(mdp, steps), methods
         assert self.tree.table is not None
         self.met = [self.tree.first]
         for t in range(steps - 1):

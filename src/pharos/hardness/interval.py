@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from pharos.errors import ParameterError
+from pharos.mdp import TabularMDP
 
 
 @dataclass(frozen=True)
@@ -65,6 +66,15 @@ class Interval:
         if self.exact:
             return f"{self.upper:.10g}"
         return f"[{self.lower:.10g}, {self.upper:.10g}]"
+
+
+def conventions_of(mdp: TabularMDP, restart: bool) -> dict[str, Any]:
+    """What the steps between states refer to."""
+    return {
+        "restart": restart,
+        "start_states": len(mdp.start_states),
+        "chance": {"chosen": mdp.chance.chosen, "previous": mdp.chance.previous, "uniform": mdp.chance.uniform},
+    }
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,4 +1,4 @@
-"""The effective horizon of deterministic MDPs of millions of states: the same numbers as in _effective_horizon, compiled.
+"""The effective horizon of deterministic MDPs of millions of states: the same numbers as in effective_horizon, compiled.
 
 Q^k_t(s, a) = r(s, a) + W^{k-1}_{t+1}(next state) with W^0 = V of uniform play and W^k_t(s) = max_a Q^k_t(s, a): one number a state and
 step is kept instead of one for each action, and each k overwrites the one before, as step t needs only step t + 1 of it.

@@ -8,7 +8,7 @@ import numpy as np
 from scipy import sparse
 
 from pharos.errors import UndefinedMeasure
-from pharos.hardness.effective_horizon import MEMORY, steps_of
+from pharos.hardness.steps import MEMORY, steps_of
 from pharos.mdp import TabularMDP
 from pharos.solvers import uniform_policy
 from pharos.solvers.policy_values import _probabilities

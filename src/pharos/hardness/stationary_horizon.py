@@ -13,7 +13,7 @@ import numpy as np
 
 from pharos.errors import ParameterError, PrecisionError, UndefinedMeasure
 from pharos.hardness.choices import Choices, choices_of, reachable
-from pharos.hardness.effective_horizon import _expected_rewards, _single_outcomes
+from pharos.hardness.steps import expected_rewards, single_outcomes
 from pharos.mdp import TabularMDP
 from pharos.solvers import Solution, uniform_value, value_iteration, worst_value
 
@@ -200,11 +200,11 @@ class _Nodes:
             choices, self.table = _states_and_the_end(mdp)
         else:
             choices = reachable(choices_of(mdp, restart=False))
-            self.table = _single_outcomes(choices.matrix, len(choices.underlying), mdp.num_actions)
+            self.table = single_outcomes(choices.matrix, len(choices.underlying), mdp.num_actions)
         self.num_nodes = len(choices.underlying)
         self.matrix = choices.matrix
         self.starts = np.array(sorted(node for node, _ in choices.starts))
-        self.rewards = _expected_rewards(mdp, choices)
+        self.rewards = expected_rewards(mdp, choices)
         tell("values of optimal play")
         best = checked(mdp, solution) if solution is not None else _solved(value_iteration, mdp, tolerance)
         tell("values of the worst play")

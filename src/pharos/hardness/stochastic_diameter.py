@@ -31,7 +31,7 @@ from scipy.sparse.linalg import splu
 
 from pharos.errors import UndefinedMeasure
 from pharos.hardness.choices import Choices, choices_of
-from pharos.hardness.interval import Budget, Interval, Spending
+from pharos.hardness.interval import Budget, Interval, Spending, conventions_of
 from pharos.hardness.travel import TravelBounds
 from pharos.mdp import TabularMDP
 from pharos.rules.compiled import usable_workers
@@ -187,10 +187,8 @@ def _met(low: float, high: float, tolerance: float) -> bool:
 
 def stochastic_diameter(mdp: TabularMDP, restart: bool, tolerance: float, spending: Spending) -> Interval:
     """The diameter of an MDP with chance: exact up to `tolerance`, or the interval proven when the budget ends."""
-    from pharos.hardness.diameter import _conventions
-
     choices = choices_of(mdp, restart)
-    conventions = {**_conventions(mdp, restart), "nodes": len(choices.underlying), "sticky_pairs": mdp.is_sticky}
+    conventions = {**conventions_of(mdp, restart), "nodes": len(choices.underlying), "sticky_pairs": mdp.is_sticky}
     return _Diameter(mdp, restart, choices, tolerance, spending).interval(conventions)
 
 
