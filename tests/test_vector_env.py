@@ -10,7 +10,8 @@ from scipy.stats import chisquare
 import pharos
 from pharos.errors import ParameterError
 from pharos.interaction.gym_env import GymEnv
-from pharos.interaction.vector_env import Interpreted, make_vec
+from pharos.interaction.vector_env import make_vec
+from pharos.rules import InterpretedStepping
 
 SMALL = {
     "simple_grid": {"height": 3, "width": 4, "rewards": (((1, 1), 0.1),), "penalties": (((0, 2), -0.5),)},
@@ -65,7 +66,7 @@ def test_rules_table_and_interpreted_twin_walk_the_same_way(space, mode, chance)
     compiled = make_vec(space.environment, 5, **options)
     table = make_vec(space.environment, 5, space=space, **options)
     twin = make_vec(space.environment, 5, **options)
-    twin._walk._step_many = Interpreted(twin.simulator)
+    twin._walk._step_many = InterpretedStepping(twin.environment).step_many
     walks = (compiled, table, twin)
     first = [walk.reset()[0] for walk in walks]
     np.testing.assert_array_equal(first[0], first[1])

@@ -17,6 +17,7 @@ from pharos.environments import Environment, make, start_distribution
 from pharos.errors import ParameterError, RuleError
 from pharos.observations import Index, SimpleImage, observe
 from pharos.observations.context import NO_ACTION, ObservationInContext
+from pharos.rules import stepping_rules
 
 if TYPE_CHECKING:
     from pharos.state_space import StateSpace
@@ -84,7 +85,7 @@ class Simulator:
         self.start_cumulative[-1] = 1.0
         components = self.env.components
         self.ranges = np.stack([components.low, components.high])
-        self.rules = rules_for_interaction(self.env, self.start_states[0])
+        self.rules = stepping_rules(self.env, self.start_states[0])
 
     def drawn_start(self, rng: np.random.Generator) -> int:
         """Which of the start states; draws one number where there are several."""
@@ -295,67 +296,12 @@ class GymEnv(gymnasium.Env):
         return self.simulator.context.one(self._started(), self._previous, self._elapsed)
 
 
-# Rules, compiled or interpreted ------------------------------------------------------------------------------------------
-
-
-class _InterpretedRules:
-    """The rules of an environment, run by Python: the same functions as `interaction_template.py`, 30 to 100 times slower."""
-
-    def __init__(self, env: Environment):
-        self.env = env
-        self.parameters = None
-
-    def step_one(self, parameters, ranges, scale, state, action, following, vector) -> tuple[float, int]:
-        before = tuple(state.tolist())
-        after = self.env.next_state(before, action)
-        for i, value in enumerate(after):
-            if not ranges[0, i] <= value <= ranges[1, i]:
-                return 0.0, 2 + i
-        following[:] = after
-        if len(vector):
-            vector[:] = (following - ranges[0]) * scale
-        return float(self.env.reward(before, action, after)), int(bool(self.env.is_terminal(after)))
-
-    def is_terminal_one(self, parameters, state) -> bool:
-        return bool(self.env.is_terminal(tuple(state.tolist())))
-
-
-class _CompiledRules:
-    """The kernels of `interaction_template.py` for one environment."""
-
-    def __init__(self, env: Environment):
-        from pharos.rules.compiled import InteractionRules
-
-        rules = InteractionRules(env)
-        self.parameters = rules.parameters
-        self.step_one = rules.kernels.step_one
-        self.step_and_draw_one = rules.kernels.step_and_draw_one
-        self.step_many = rules.kernels.step_many
-        self.is_terminal_one = rules.kernels.is_terminal_one
-
-
-def rules_for_interaction(env: Environment, state: np.ndarray) -> Any:
-    """The compiled rules of `env`; interpreted ones, after a warning for each class, where Numba cannot compile them."""
-    from pharos.rules.compiled import _first_lines, _warn_once
-
-    try:
-        rules = _CompiledRules(env)
-        components = env.components
-        ranges = np.stack([components.low, components.high])
-        following, vector = np.empty_like(state), np.empty(0, np.float32)
-        rules.step_one(rules.parameters, ranges, np.zeros(0), state, 0, following, vector)
-        return rules
-    except Exception as error:  # Numba raises its own errors, and others from inside of it
-        _warn_once(type(env), "step_one", _first_lines(str(error)) or type(error).__name__)
-        return _InterpretedRules(env)
-
-
 def _step_and_draw(simulator: Simulator) -> Any:
     """The compiled step that draws as well, for simple images with a pixel for each cell; else None."""
     observation = simulator.context.observation
     if not simulator.context.is_plain or not isinstance(observation, SimpleImage) or not observation.is_flat:
         return None
-    kernel = getattr(simulator.rules, "step_and_draw_one", None)
+    kernel = simulator.rules.step_and_draw_one
     if kernel is None:
         return None
     state, image = simulator.start_states[0], observation.one(simulator.start_states[0])

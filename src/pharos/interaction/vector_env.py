@@ -247,7 +247,7 @@ class _Rules:
         self._fused = context.is_plain and context.is_vector  # the compiled step writes the vectors as well
         self._scale = context.observation.scale if self._fused else np.zeros(length)
         self._vector = np.empty((0, length), np.float32)
-        self._step_many = _step_many(simulator)
+        self._step_many: Any = simulator.rules.step_many
 
     def states(self, rows: Any) -> np.ndarray:
         return self.current[rows].copy()
@@ -379,63 +379,3 @@ def _checked_mode(mode: AutoresetMode | str) -> AutoresetMode:
         if mode in (known, known.value, known.name):
             return known
     raise ParameterError(f"autoreset_mode is {mode!r}; expected one of {', '.join(known.name for known in _MODES)}")
-
-
-def _step_many(simulator: Simulator) -> Any:
-    """The compiled loop, or its twin where the rules run interpreted."""
-    compiled = getattr(simulator.rules, "step_many", None)
-    return compiled if compiled is not None else Interpreted(simulator)
-
-
-class Interpreted:
-    """`interaction_template.step_many` in plain Python, for rules that Numba cannot compile, and as a witness in tests."""
-
-    def __init__(self, simulator: Simulator):
-        self.simulator = simulator
-
-    def __call__(
-        self, parameters, ranges, scale, chance, limit, mode, first_previous, starts, cumulative, rng, actions,
-        states, previous, elapsed, ended, rewards, terminated, truncated, executed, final, vector, first, last,
-    ) -> int:  # fmt: skip
-        env, simulator = self.simulator.env, self.simulator
-        for i in range(first, last):
-            rewards[i], terminated[i], truncated[i], executed[i] = 0.0, False, False, NO_ACTION
-            restart = bool(ended[i])
-            if not restart:
-                action = int(actions[i])
-                if simulator.has_chance:
-                    action = simulator.executed(action, int(previous[i]), _uniform_number(rng, i))
-                before = tuple(states[i].tolist())
-                after = env.next_state(before, action)
-                executed[i] = action
-                for c, value in enumerate(after):
-                    if not ranges[0, c] <= value <= ranges[1, c]:
-                        return i * len(after) + c
-                rewards[i], terminated[i] = env.reward(before, action, after), env.is_terminal(after)
-                previous[i] = action
-                elapsed[i] += 1
-                truncated[i] = elapsed[i] >= limit
-                ended[i] = terminated[i] or truncated[i]
-                states[i] = after
-                restart = _MODES[mode] == AutoresetMode.SAME_STEP and bool(ended[i])
-                if restart:
-                    final[i] = after
-            if restart:
-                several = len(cumulative) > 1
-                k = np.searchsorted(cumulative, _uniform_number(rng, i), side="right") if several else 0
-                states[i] = starts[k]
-                previous[i], elapsed[i], ended[i] = first_previous, 0, False
-        if len(vector):
-            vector[first:last] = (states[first:last] - ranges[0]) * scale
-        return -1
-
-
-def _uniform_number(rng: np.ndarray, i: int) -> float:
-    """SplitMix64, as in `stepping.uniform_number`."""
-    mask = (1 << 64) - 1
-    z = (int(rng[i]) + 0x9E3779B97F4A7C15) & mask
-    rng[i] = z
-    z = (z ^ (z >> 30)) * 0xBF58476D1CE4E5B9 & mask
-    z = (z ^ (z >> 27)) * 0x94D049BB133111EB & mask
-    z ^= z >> 31
-    return (z >> 11) * 2.0**-53

@@ -1,0 +1,131 @@
+"""The rules of one environment for interaction: states are rows of int64; compiled, or run by Python where Numba cannot.
+
+Both classes offer the same functions, those of `interaction_template.py`, where their arguments are described.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from pharos.environments import Environment
+
+NO_ACTION = -1  # the previous action on the first step of an episode
+SAME_STEP = 1  # kernels.stepping.SAME_STEP, without loading Numba
+
+
+class CompiledStepping:
+    """The kernels of `interaction_template.py` for one environment.
+
+    Attributes:
+        parameters: the first argument of every kernel.
+    """
+
+    def __init__(self, env: Environment):
+        from pharos.rules.compiled import InteractionRules
+
+        rules = InteractionRules(env)
+        self.parameters: Any = rules.parameters
+        self.step_one = rules.kernels.step_one
+        self.step_and_draw_one = rules.kernels.step_and_draw_one
+        self.step_many = rules.kernels.step_many
+        self.is_terminal_one = rules.kernels.is_terminal_one
+
+
+class InterpretedStepping:
+    """The same functions in plain Python, 30 to 100 times slower: for rules that Numba cannot compile, and as a witness."""
+
+    parameters: Any = None
+    step_and_draw_one: Any = None
+
+    def __init__(self, env: Environment):
+        self.env = env
+
+    def step_one(self, parameters, ranges, scale, state, action, following, vector) -> tuple[float, int]:
+        before = tuple(state.tolist())
+        after = self.env.next_state(before, action)
+        for i, value in enumerate(after):
+            if not ranges[0, i] <= value <= ranges[1, i]:
+                return 0.0, 2 + i
+        following[:] = after
+        if len(vector):
+            vector[:] = (following - ranges[0]) * scale
+        return float(self.env.reward(before, action, after)), int(bool(self.env.is_terminal(after)))
+
+    def is_terminal_one(self, parameters, state) -> bool:
+        return bool(self.env.is_terminal(tuple(state.tolist())))
+
+    def step_many(
+        self, parameters, ranges, scale, chance, limit, mode, first_previous, starts, cumulative, rng, actions,
+        states, previous, elapsed, ended, rewards, terminated, truncated, executed, final, vector, first, last,
+    ) -> int:  # fmt: skip
+        for i in range(first, last):
+            rewards[i], terminated[i], truncated[i], executed[i] = 0.0, False, False, NO_ACTION
+            restart = bool(ended[i])
+            if not restart:
+                action = self._executed(int(actions[i]), int(previous[i]), chance, rng, i)
+                before = tuple(states[i].tolist())
+                after = self.env.next_state(before, action)
+                executed[i] = action
+                for c, value in enumerate(after):
+                    if not ranges[0, c] <= value <= ranges[1, c]:
+                        return i * len(after) + c
+                rewards[i] = self.env.reward(before, action, after)
+                terminated[i] = self.env.is_terminal(after)
+                previous[i] = action
+                elapsed[i] += 1
+                truncated[i] = elapsed[i] >= limit
+                ended[i] = terminated[i] or truncated[i]
+                states[i] = after
+                restart = mode == SAME_STEP and bool(ended[i])
+                if restart:
+                    final[i] = after
+            if restart:
+                several = len(cumulative) > 1
+                k = np.searchsorted(cumulative, _uniform_number(rng, i), side="right") if several else 0
+                states[i] = starts[k]
+                previous[i], elapsed[i], ended[i] = first_previous, 0, False
+        if len(vector):
+            vector[first:last] = (states[first:last] - ranges[0]) * scale
+        return -1
+
+    def _executed(self, chosen: int, previous: int, chance, rng: np.ndarray, i: int) -> int:
+        """The executed action, as `kernels.stepping.executed_action`."""
+        stay, stick, uniform = chance
+        if stay >= 1.0:
+            return chosen
+        u = _uniform_number(rng, i)
+        if u < stay or (u < stay + stick and previous == NO_ACTION):
+            return chosen
+        if u < stay + stick:
+            return previous
+        return min(int((u - stay - stick) / uniform * self.env.num_actions), self.env.num_actions - 1)
+
+
+def stepping_rules(env: Environment, state: np.ndarray) -> CompiledStepping | InterpretedStepping:
+    """The compiled rules of `env`; interpreted ones, after one warning for each class, where Numba cannot compile them.
+
+    Args:
+        state: (D,) int64, any state: the rules are compiled by one step from it.
+    """
+    from pharos.rules.compiled import _first_lines, _warn_once
+
+    try:
+        rules = CompiledStepping(env)
+        ranges = np.stack([env.components.low, env.components.high])
+        following, vector = np.empty_like(state), np.empty(0, np.float32)
+        rules.step_one(rules.parameters, ranges, np.zeros(0), state, 0, following, vector)
+        return rules
+    except Exception as error:  # Numba raises its own errors, and others from inside of it
+        _warn_once(type(env), "step_one", _first_lines(str(error)) or type(error).__name__)
+        return InterpretedStepping(env)
+
+
+def _uniform_number(rng: np.ndarray, i: int) -> float:
+    """SplitMix64, as in `kernels.stepping.uniform_number`."""
+    mask = (1 << 64) - 1
+    z = (int(rng[i]) + 0x9E3779B97F4A7C15) & mask
+    rng[i] = z
+    z = (z ^ (z >> 30)) * 0xBF58476D1CE4E5B9 & mask
+    z = (z ^ (z >> 27)) * 0x94D049BB133111EB & mask
+    z ^= z >> 31
+    return (z >> 11) * 2.0**-53
