@@ -5,6 +5,7 @@ import pandas as pd
 import pytest
 
 from pharos.errors import ParameterError
+from pharos.experiments import bootstrap_interval
 from pharos.study import (
     aggregate_r_squared,
     fit,
@@ -127,6 +128,37 @@ def test_interval_contains_the_estimate_and_shrinks_with_more_runs():
 def test_an_interval_of_equal_results_is_a_point():
     estimate = stratified_interval([np.full(5, 0.25), np.full(3, 0.25)])
     assert (estimate.value, estimate.lower, estimate.upper) == (0.25, 0.25, 0.25)
+
+
+def test_the_interval_is_that_of_resampling_each_task_by_a_loop():
+    """The twin of the vectorised bootstrap; both ends within four standard errors of such a quantile."""
+    rng = np.random.default_rng(3)
+    tasks = [rng.normal(size=5), rng.normal(2, 3, size=4), np.array([7.0])]
+    draws = [interquartile_mean(*(rng.choice(task, len(task)) for task in tasks)) for _ in range(4000)]
+    estimate = stratified_interval(tasks, resamples=4000)
+    assert estimate.value == interquartile_mean(*tasks)
+    for end, tail in ((estimate.lower, 0.025), (estimate.upper, 0.975)):
+        near = np.quantile(draws, [max(0, tail - 0.014), min(1, tail + 0.014)])
+        assert near[0] <= end <= near[1]
+
+
+def test_runs_are_drawn_whole_and_tasks_of_one_run_stay_as_they_are():
+    runs = np.random.default_rng(0).normal(size=(5, 3))
+    twice = np.concatenate([runs, runs], axis=1).T  # (6 points, 5 runs): points 3 to 5 repeat 0 to 2
+    lower, upper = bootstrap_interval([twice], lambda task, axis: task.mean(axis=axis), resamples=50)
+    assert (lower[:3] == lower[3:]).all() and (upper[:3] == upper[3:]).all() and (lower < upper).all()
+    lower, upper = bootstrap_interval(
+        [np.zeros((2, 4)), np.full((2, 1), 8.0)],
+        lambda *tasks, axis: np.mean([task.mean(axis=axis) for task in tasks], axis=0),
+    )
+    assert lower.tolist() == upper.tolist() == [4.0, 4.0]
+
+
+def test_a_bootstrap_of_nothing_and_of_what_is_not_finite_is_refused():
+    with pytest.raises(ParameterError, match="at least one run of each task"):
+        stratified_interval([np.arange(3.0), np.array([])])
+    with pytest.raises(ParameterError, match="finite"):
+        stratified_interval([np.array([0.0, np.nan])])
 
 
 def test_the_papers_tables_hold_every_printed_block():

@@ -1,5 +1,6 @@
 """Experiments: an agent trained on a task, its policies evaluated exactly, and the result written down."""
 
+from pharos.experiments.bootstrap import bootstrap_interval
 from pharos.experiments.evaluation import Evaluation, evaluate_agent
 from pharos.experiments.loading import load_agent
 from pharos.experiments.regret import ReferenceValues, RegretCurve, cumulative_expected_regret, regret
@@ -16,6 +17,7 @@ __all__ = [
     "Task",
     "TrainingResult",
     "TuningResult",
+    "bootstrap_interval",
     "cumulative_expected_regret",
     "evaluate_agent",
     "load_agent",

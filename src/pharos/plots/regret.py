@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pharos.errors import ParameterError
+from pharos.experiments import bootstrap_interval, read_curve, read_record
 from pharos.plots.style import COLORS, INK, figure, styled, thousands
 
 if TYPE_CHECKING:
@@ -67,8 +68,6 @@ def regret(
 
 def _groups(folders: Sequence[str | os.PathLike]) -> dict[str, list[tuple[dict[str, Any], Any]]]:
     """label -> [(record, curve)]: the runs that differ in the seed alone."""
-    from pharos.experiments import read_curve, read_record
-
     found: dict[str, list[tuple[dict[str, Any], Any]]] = {}
     for folder in folders:
         record = read_record(folder)
@@ -104,8 +103,9 @@ def _line(
 ) -> None:
     axis.plot(steps, values.mean(axis=0), color=color, label=label)
     if len(values) > 1:
-        drawn = np.random.default_rng(0).integers(len(values), size=(resamples, len(values)))
-        means = values[drawn].mean(axis=1)
-        tail = (1 - confidence) / 2
-        low, high = np.quantile(means, [tail, 1 - tail], axis=0)
+        low, high = bootstrap_interval([values.T], _mean, confidence=confidence, resamples=resamples)
         axis.fill_between(steps, low, high, color=color, alpha=0.18, linewidth=0)
+
+
+def _mean(values: np.ndarray, axis: int) -> np.ndarray:
+    return values.mean(axis=axis)

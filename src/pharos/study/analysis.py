@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pharos.errors import ParameterError
+from pharos.experiments import bootstrap_interval
 from pharos.study.paper import paper_regressions, paper_returns
 from pharos.study.regression import MEASURES, Fit, aggregate_r_squared, fit, leave_one_class_out_r_squared
 from pharos.study.specification import TABULAR_OBSERVATION, Run
-from pharos.study.statistics import stratified_interval
+from pharos.study.statistics import mean_of_means, stratified_interval
 from pharos.study.tables import paper_instance
 
 if TYPE_CHECKING:
@@ -136,15 +137,9 @@ def mean_curve(
     Returns:
         mean, lower, upper: (T,) each.
     """
-    rng = np.random.default_rng(seed)
-    mean = np.mean([task.mean(axis=0) for task in tasks], axis=0)
-    draws = np.zeros((resamples, len(mean)))
-    for task in tasks:
-        n = len(task)
-        weights = rng.multinomial(n, np.full(n, 1 / n), size=resamples) / n
-        draws += weights @ task / len(tasks)
-    lower, upper = np.quantile(draws, [0.025, 0.975], axis=0)
-    return mean, lower, upper
+    curves = [np.asarray(task).T for task in tasks]
+    lower, upper = bootstrap_interval(curves, mean_of_means, resamples=resamples, seed=seed)
+    return mean_of_means(*curves), lower, upper
 
 
 def agreement(cells: "pd.DataFrame", value: str, agents: tuple[str, str] = ("dqn", "ppo")) -> tuple[float, int] | None:

@@ -4,12 +4,13 @@ Source: Agarwal et al. (2021), Deep reinforcement learning at the edge of the st
 through scipy.stats (the authors' library does not import beside pandas 3).
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from pharos.errors import ParameterError
+from pharos.experiments import bootstrap_interval
 
 
 @dataclass(frozen=True)
@@ -22,42 +23,45 @@ class Estimate:
     confidence: float
 
 
-def interquartile_mean(*tasks: np.ndarray) -> float:
-    """The mean of the middle half of all runs of all tasks pooled (25 % trimmed mean)."""
+def interquartile_mean(*tasks: np.ndarray, axis: int | None = None) -> Any:
+    """Return the mean of the middle half of all runs of all tasks pooled: their 25 % trimmed mean.
+
+    Args:
+        tasks: an array for each task.
+        axis: None: every entry is a run, and the result is a float. Else the axis that counts runs, for each entry of the
+            other axes.
+    """
     from scipy import stats
 
-    return float(stats.trim_mean(np.concatenate([np.ravel(task) for task in tasks]), 0.25))
+    if axis is None:
+        return float(stats.trim_mean(np.concatenate([np.ravel(task) for task in tasks]), 0.25))
+    return stats.trim_mean(np.concatenate(tasks, axis=axis), 0.25, axis=axis)
+
+
+def mean_of_means(*tasks: np.ndarray, axis: int = -1) -> np.ndarray:
+    """Return the mean over tasks of the mean over runs."""
+    return np.mean([task.mean(axis=axis) for task in tasks], axis=0)
 
 
 def stratified_interval(
     tasks: Sequence[np.ndarray],
     *,
-    statistic=interquartile_mean,
+    statistic: Callable[..., Any] = interquartile_mean,
     confidence: float = 0.95,
     resamples: int = 2000,
     seed: int = 0,
 ) -> Estimate:
-    """The percentile bootstrap interval of a statistic of several tasks, runs resampled within each task.
+    """Return a statistic of several tasks with its percentile bootstrap interval; runs are resampled within each task.
 
     Args:
         tasks: for each task an array of the results of its runs (seeds).
-        statistic: of the arrays, one argument a task.
+        statistic: `statistic(*tasks, axis=-1)`, vectorised over all other axes.
         confidence, resamples, seed: of the bootstrap.
     Raises:
         ParameterError: there is no task, a task has no run, or a result is not finite.
     Note: with five runs a task, percentile intervals are too narrow (about 85 % coverage for a nominal 95 %).
-    Cost: resamples times the statistic.
+    Cost: `resamples` times the statistic.
     """
     arrays = [np.ravel(np.asarray(task, np.float64)) for task in tasks]
-    if not arrays or any(len(array) == 0 for array in arrays):
-        raise ParameterError(
-            f"a bootstrap needs at least one run of each task; found {[len(array) for array in arrays]}"
-        )
-    if not all(np.isfinite(array).all() for array in arrays):
-        raise ParameterError("a bootstrap needs finite results; found NaN or infinity")
-    value = float(statistic(*arrays))
-    rng = np.random.default_rng(seed)
-    draws = np.array([statistic(*(rng.choice(array, len(array)) for array in arrays)) for _ in range(resamples)])
-    tail = (1 - confidence) / 2
-    lower, upper = np.quantile(draws, [tail, 1 - tail])
-    return Estimate(value, float(lower), float(upper), confidence)
+    lower, upper = bootstrap_interval(arrays, statistic, confidence=confidence, resamples=resamples, seed=seed)
+    return Estimate(float(statistic(*arrays, axis=-1)), float(lower), float(upper), confidence)
