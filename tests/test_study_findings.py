@@ -86,19 +86,99 @@ def test_slopes_of_their_own_are_needed_where_they_differ():
     assert images[by_representation, "all"].verdict == "agrees"
 
 
+def by_task(cells):
+    """One row a task: DQN's regret, the mean over observations and the difference between them."""
+    rows = cells[cells["agent"] == "dqn"]
+    wide = rows.pivot_table(
+        index=["environment", "instance", "chance", *MEASURES], columns="observation", values="cumulative_regret"
+    ).reset_index()
+    return wide.assign(regret=(wide["simple_image"] + wide["vector"]) / 2, more=wide["simple_image"] - wide["vector"])
+
+
+LOGS = " + ".join(f"np.log({name})" for name in MEASURES)
+
+
 def test_the_test_of_slopes_is_that_of_an_analysis_of_variance():
-    """Against statsmodels' comparison of the nested models, written as one formula each."""
+    """Against statsmodels' comparison of the nested models, written as one formula each, a row for each task."""
     import statsmodels.formula.api as smf
     from statsmodels.stats.anova import anova_lm
 
     cells = made(slopes=(1, 0.9, 1.1, 1), noise=1.0)
-    rows = cells[cells["agent"] == "dqn"].rename(columns={"cumulative_regret": "regret"})
-    logs = " + ".join(f"np.log({name})" for name in MEASURES)
-    small = smf.ols(f"regret ~ C(observation) + C(environment) + {logs}", rows).fit()
-    large = smf.ols(f"regret ~ C(environment) * (C(observation) + {logs})", rows).fit()
+    rows = by_task(cells)
+    found = verdicts(cells)
+    small = smf.ols(f"regret ~ C(environment) + {LOGS}", rows).fit()
+    large = smf.ols(f"regret ~ C(environment) * ({LOGS})", rows).fit()
     expected = anova_lm(small, large)["Pr(>F)"].iloc[1]
-    row = verdicts(cells)["models by class explain more than one", "all"]
-    assert row.p == pytest.approx(expected, rel=1e-6)
+    assert found["models by class explain more than one", "all"].p == pytest.approx(expected, rel=1e-6)
+    expected = smf.ols(f"more ~ C(environment) + {LOGS}", rows).fit().f_pvalue
+    assert found["models by representation explain more than one", "all"].p == pytest.approx(expected, rel=1e-6)
+    assert found["one model explains next to nothing", "all"].p == pytest.approx(small.f_pvalue, rel=1e-6)
+
+
+@pytest.mark.parametrize("finding", ("one model explains next to nothing", "models by class explain more than one"))
+def test_a_task_seen_twice_is_one_piece_of_evidence(finding):
+    """Images repeat what vectors told: the p-value is that of the vectors alone."""
+    cells = made(slopes=(0.1, 0, 0.2, 0), noise=1.0)
+    vectors = cells[cells["observation"] == "vector"]
+    twice = pd.concat([vectors, vectors.assign(observation="simple_image")])
+    assert verdicts(twice)[finding, "all"].p == pytest.approx(verdicts(vectors)[finding, "all"].p, rel=1e-6)
+
+
+def test_tests_without_effect_are_significant_as_often_as_the_level_says():
+    """Noise that both observations of a task share, as nothing else than the task decides on it: 5 of 100 expected."""
+    names = ("one model explains next to nothing", "models by class explain more than one")
+    significant = 0
+    for seed in range(50):
+        cells = made(slopes=(0, 0, 0, 0), noise=0.1, seed=seed)
+        random = np.random.default_rng(seed)
+        shared = {key: random.normal() for key in cells.groupby(["instance", "chance"]).groups}
+        cells["cumulative_regret"] += [shared[row.instance, row.chance] for row in cells.itertuples()]
+        significant += sum(verdicts(cells)[name, "all"].p < 0.05 for name in names)
+    assert significant <= 12
+
+
+def test_regret_that_only_the_class_explains_is_said_to_be_so():
+    cells = made(slopes=(0, 0, 0, 0), noise=0.1)
+    cells["cumulative_regret"] += cells["environment"].map(CLASSES.index)
+    row = verdicts(cells)["one model explains next to nothing", "all"]
+    assert row.verdict == "disagrees, mostly by class" and "measures add 0.00" in row.evidence
+
+
+def test_standard_errors_of_the_models_count_a_task_once():
+    import statsmodels.formula.api as smf
+
+    cells = made(noise=1.0, image_harder=0.5)
+    rows, models = by_task(cells), study.models(cells)
+    expected = smf.ols(f"regret ~ C(environment) + {LOGS}", rows).fit()
+    single = models.get("single", "all").coefficients
+    for name in (*(f"np.log({measure})" for measure in MEASURES), "C(environment)[T.freeway]"):
+        assert single.loc[name, "estimate"] == pytest.approx(expected.params[name])
+        assert single.loc[name, "standard_error"] == pytest.approx(expected.bse[name])
+        assert single.loc[name, "p_value"] == pytest.approx(expected.pvalues[name])
+        assert single.loc[name, ["lower", "upper"]].tolist() == pytest.approx(expected.conf_int().loc[name].tolist())
+    paired = stats.ttest_rel(rows["vector"], rows["simple_image"])
+    assert single.loc["C(observation)[T.vector]", "p_value"] == pytest.approx(paired.pvalue)
+
+
+def test_r_squared_outside_leaves_out_the_whole_task():
+    cells = made(noise=1.0, instances=3)
+    rows = cells[cells["agent"] == "dqn"].reset_index(drop=True)
+    single = study.models(cells).get("single", "all")
+    press = 0.0
+    for task in set(single.tasks):
+        inside = np.array([other == task for other in single.tasks])
+        coefficients, *_ = np.linalg.lstsq(single.design[~inside], single.actual[~inside], rcond=None)
+        press += ((single.actual[inside] - single.design[inside] @ coefficients) ** 2).sum()
+    total = ((rows["cumulative_regret"] - rows["cumulative_regret"].mean()) ** 2).sum()
+    assert single.cross_validated_r_squared == pytest.approx(1 - press / total)
+
+
+def test_where_tasks_differ_in_their_observations_errors_are_clustered():
+    cells = made(noise=1.0)
+    lacking = cells.drop(cells[(cells["observation"] == "vector") & (cells["agent"] == "dqn")].index[:3])
+    coefficients = study.models(lacking).get("single", "all").coefficients
+    assert np.isfinite(coefficients["standard_error"]).all()
+    assert verdicts(lacking)["one model explains next to nothing", "all"].evidence.startswith("F(6, 38)")
 
 
 def test_vectors_that_hardness_explains_better_are_found():

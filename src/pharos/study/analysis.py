@@ -32,6 +32,8 @@ class Models:
         notes: one line for whatever was left out, and why.
         representation_r_squared, class_r_squared: of the fits together; None without them.
         leave_one_class_out: R2 for classes that the model has not seen; None where there are fewer than two.
+        class_alone: R2 of the single model without the measures: class and representation alone; None without a model.
+        agent: whose regret it is.
     """
 
     regret: str
@@ -40,6 +42,8 @@ class Models:
     representation_r_squared: float | None
     class_r_squared: float | None
     leave_one_class_out: float | None
+    class_alone: float | None = None
+    agent: str = "dqn"
 
     def get(self, model: str, subset: str) -> Fit | None:
         """One of the fits."""
@@ -58,9 +62,11 @@ def models(
     rows = rows.rename(columns={regret: "regret"})
     used = []
     for measure in measures:
-        known = measure in rows and bool((np.isfinite(rows[measure].to_numpy(float)) & (rows[measure] > 0)).any())
-        used += [measure] if known else []
-        if not known:
+        if _has_positive(rows, measure):
+            used.append(measure)
+        elif len(rows) == 0 and _has_positive(cells, measure):
+            continue  # it is the agent that has no cells, which the last note says
+        else:
             notes.append(f"{measure} is known for no instance: the models leave it out")
     for column in ("regret", *used):
         values = rows[column].to_numpy(float)
@@ -70,32 +76,46 @@ def models(
             rows = rows[usable]
     if len(rows) == 0:
         notes.append(f"no cell of {agent} has all measures: there are no models")
-        return Models(regret, [], notes, None, None, None)
-    fits: list[Fit] = []
-    kinds: list[tuple[str, str, Any, list[str]]] = [("single", "all", rows, ["observation", "environment"])]
-    for observation, part in rows.groupby("observation", sort=True):
-        kinds.append(("representation", str(observation), part, ["environment"]))
-    for environment, part in rows.groupby("environment", sort=True):
-        kinds.append(("class", str(environment), part, ["observation"]))
-    for model, subset, part, dummies in kinds:
-        try:
-            found = fit(part.reset_index(drop=True), model, subset, [*dummies, *used])
-        except ParameterError as error:
-            notes.append(str(error))
-            continue
-        fits.append(found)
-        if found.dropped:
-            notes.append(
-                f"the {model} model of {subset} leaves out {', '.join(found.dropped)}: constant, or a combination of the others"
-            )
+        return Models(regret, [], notes, None, None, None, agent=agent)
+    fits = _fits(rows, used, notes)
     try:
         outside = leave_one_class_out_r_squared(rows, measures=used)
     except ParameterError as error:
         outside = None
         notes.append(str(error))
-    return Models(
-        regret, fits, notes, _together(fits, "representation"), _together(fits, "class"), outside
-    )  # fmt: skip
+    together = (_together(fits, "representation"), _together(fits, "class"))
+    alone = _class_alone(rows) if any(part.model == "single" for part in fits) else None
+    return Models(regret, fits, notes, *together, outside, alone, agent)
+
+
+def _has_positive(rows: "pd.DataFrame", measure: str) -> bool:
+    return measure in rows and bool((np.isfinite(rows[measure].to_numpy(float)) & (rows[measure] > 0)).any())
+
+
+def _fits(rows: "pd.DataFrame", measures: Sequence[str], notes: list[str]) -> list[Fit]:
+    """The models that there are enough rows for; a note for each other."""
+    kinds: list[tuple[str, str, Any, list[str]]] = [("single", "all", rows, ["observation", "environment"])]
+    for observation, part in rows.groupby("observation", sort=True):
+        kinds.append(("representation", str(observation), part, ["environment"]))
+    for environment, part in rows.groupby("environment", sort=True):
+        kinds.append(("class", str(environment), part, ["observation"]))
+    fits: list[Fit] = []
+    for model, subset, part, dummies in kinds:
+        try:
+            fits.append(fit(part.reset_index(drop=True), model, subset, [*dummies, *measures]))
+        except ParameterError as error:
+            notes.append(str(error))
+            continue
+        if dropped := fits[-1].dropped:
+            notes.append(
+                f"the {model} model of {subset} leaves out {', '.join(dropped)}: constant, or a combination of the others"
+            )
+    return fits
+
+
+def _class_alone(rows: "pd.DataFrame") -> float:
+    """R2 of class and representation, without measures."""
+    return fit(rows.reset_index(drop=True), "single", "all", ["observation", "environment"]).r_squared
 
 
 def _together(fits: Sequence[Fit], model: str) -> float | None:

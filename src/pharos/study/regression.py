@@ -3,6 +3,13 @@
 One row of the data is one agent on one instance under one kind of chance with one observation, averaged over seeds:
 columns `environment` (class), `observation`, `regret`, and the measures `effective_horizon`, `sum_of_reciprocal_gaps`,
 `diameter`, which enter as logarithms.
+
+A task is an instance under one kind of chance. Its rows, one for each observation, have the same measures, so they are not
+independent: tests and R2 outside the sample count a task once. Where every task has the same observations, the estimates of
+least squares come from two strata that are independent of each other (a split plot): class and measures from the means of
+the tasks, observations from the differences within tasks. Otherwise standard errors are clustered by task.
+
+Source: Cochran and Cox (1957), Experimental designs, chapter 7 (split plots); Liang and Zeger (1986) for clusters.
 """
 
 from collections.abc import Sequence
@@ -26,12 +33,14 @@ class Fit:
     Attributes:
         model, subset: such as ("class", "freeway").
         r_squared, adjusted_r_squared: in sample.
-        cross_validated_r_squared: leave one row out, from the leverages: 1 - PRESS / total sum of squares.
+        cross_validated_r_squared: each task predicted by the model fitted on the others, from the leverages:
+            1 - PRESS / total sum of squares. Without columns of tasks a row is a task.
         coefficients: one row a predictor: estimate, standard error, p-value, lower and upper end of its 95 % interval.
         dropped: predictors left out because they are constant or a linear combination of the others.
         condition_number: of the standardised predictors.
-        fitted, actual: one entry a row; influence: Cook's distances; classes: of environments; tasks: instance and chance.
-        design: (rows, predictors), as they entered.
+        fitted, actual: one entry a row; influence: Cook's distances; classes: of environments; tasks: instance and chance;
+        observations: what the agent saw.
+        design: (rows, predictors), as they entered, in the order of `coefficients`.
     """
 
     model: str
@@ -49,6 +58,7 @@ class Fit:
     influence: np.ndarray
     classes: tuple[str, ...] = ()
     tasks: tuple[str, ...] = ()
+    observations: tuple[str, ...] = ()
     design: np.ndarray = field(default_factory=lambda: np.empty((0, 0)))
 
 
@@ -81,9 +91,10 @@ def fit(rows: "pd.DataFrame", model: str, subset: str, predictors: Sequence[str]
     formula = "regret ~ " + (" + ".join(terms) if terms else "1")
     result = smf.ols(formula, rows).fit()
     influence = result.get_influence()
-    residuals = np.asarray(result.resid) / (1 - np.clip(influence.hat_matrix_diag, 0, 1 - 1e-12))
     actual = rows["regret"].to_numpy(float)
+    tasks = _tasks(rows)
     total = float(((actual - actual.mean()) ** 2).sum())
+    errors = _errors_without_the_task(np.asarray(result.model.exog, float), np.asarray(result.resid), tasks)
     return Fit(
         model=model,
         subset=subset,
@@ -91,19 +102,40 @@ def fit(rows: "pd.DataFrame", model: str, subset: str, predictors: Sequence[str]
         num_rows=len(rows),
         r_squared=float(result.rsquared),
         adjusted_r_squared=float(result.rsquared_adj),
-        cross_validated_r_squared=1 - float((residuals**2).sum()) / total if total > 0 else float("nan"),
-        coefficients=_coefficients(result),
+        cross_validated_r_squared=1 - float((errors**2).sum()) / total if total > 0 else float("nan"),
+        coefficients=_coefficients(result, rows, tasks),
         dropped=tuple(dropped),
         condition_number=_condition_number(result.model.exog),
         fitted=np.asarray(result.fittedvalues),
         actual=actual,
         influence=np.asarray(influence.cooks_distance[0]),
         classes=tuple(map(str, rows["environment"])) if "environment" in rows else (),
-        tasks=tuple(map(" ".join, zip(rows["instance"], rows["chance"], strict=True)))
-        if {"instance", "chance"} <= {*rows}
-        else (),
+        tasks=tasks,
+        observations=tuple(map(str, rows["observation"])) if "observation" in rows else (),
         design=np.asarray(result.model.exog, np.float64),
     )
+
+
+def _tasks(rows: "pd.DataFrame") -> tuple[str, ...]:
+    """The task of each row; empty where the rows do not say."""
+    if not {"instance", "chance"} <= {*rows}:
+        return ()
+    return tuple(map(" ".join, zip(rows["instance"], rows["chance"], strict=True)))
+
+
+def _errors_without_the_task(design: np.ndarray, residuals: np.ndarray, tasks: Sequence[str]) -> np.ndarray:
+    """The error of each row under the model fitted without its task: (I - H)^-1 residuals, for the task's block of H."""
+    basis, _ = np.linalg.qr(design)
+    errors = np.empty(len(residuals))
+    places: dict[Any, list[int]] = {}
+    for row, task in enumerate(tasks or range(len(residuals))):
+        places.setdefault(task, []).append(row)
+    for rows in places.values():
+        remainder = np.eye(len(rows)) - basis[rows] @ basis[rows].T
+        errors[rows] = np.linalg.lstsq(np.maximum(remainder, 1e-12) if len(rows) == 1 else remainder, residuals[rows])[
+            0
+        ]
+    return errors
 
 
 def aggregate_r_squared(fits: Sequence[Fit]) -> float:
@@ -171,19 +203,61 @@ def _independent(rows: "pd.DataFrame", predictors: Sequence[str]) -> tuple[list[
     return kept, dropped
 
 
-def _coefficients(result: Any) -> "pd.DataFrame":
+def _coefficients(result: Any, rows: "pd.DataFrame", tasks: Sequence[str]) -> "pd.DataFrame":
+    """Estimates of least squares with standard errors that count a task once; see the head of this file."""
+    import pandas as pd
+    from scipy import stats
+
+    table = pd.DataFrame({"estimate": result.params, "standard_error": result.bse, "p_value": result.pvalues})
+    table["lower"], table["upper"] = result.conf_int()[0], result.conf_int()[1]
+    if len(set(tasks)) == len(tasks):
+        return table
+    groups = pd.factorize(pd.Series(tasks))[0]
+    strata = _strata(result, rows, groups)
+    if strata is None:
+        clustered = result.get_robustcov_results("cluster", groups=groups, use_t=True)
+        table["standard_error"], free = clustered.bse, pd.Series(groups.max(), table.index)
+    else:
+        table["standard_error"], free = strata
+    p = 2 * stats.t.sf((table["estimate"] / table["standard_error"].replace(0, np.nan)).abs(), free)
+    table["p_value"] = np.where(table["standard_error"] > 0, p, 0.0)
+    width = stats.t.ppf(0.975, free) * table["standard_error"]
+    table["lower"], table["upper"] = table["estimate"] - width, table["estimate"] + width
+    return table
+
+
+def _strata(result: Any, rows: "pd.DataFrame", groups: np.ndarray) -> tuple["pd.Series", "pd.Series"] | None:
+    """Standard errors and degrees of freedom from the strata between and within tasks.
+
+    None where tasks differ in their observations, or there are too few tasks.
+    """
     import pandas as pd
 
-    interval = result.conf_int()
-    return pd.DataFrame(
-        {
-            "estimate": result.params,
-            "standard_error": result.bse,
-            "p_value": result.pvalues,
-            "lower": interval[0],
-            "upper": interval[1],
-        }
-    )
+    design = pd.DataFrame(result.model.exog, columns=result.params.index)
+    actual = pd.Series(np.asarray(result.model.endog, float))
+    observations = rows["observation"].reset_index(drop=True) if "observation" in rows else pd.Series(dtype=str)
+    number, each = groups.max() + 1, observations.nunique()
+    if number * each != len(rows) or pd.DataFrame({"g": groups, "o": observations}).duplicated().any():
+        return None
+    within = [name for name in design if name.startswith("C(observation)")]
+    between = [name for name in design if name not in within]
+    means, regrets = design.groupby(groups).mean()[between], actual.groupby(groups).mean()
+    free = {name: number - len(between) for name in between} | {name: (number - 1) * (each - 1) for name in within}
+    if min(free.values()) < 1:
+        return None
+    rest = regrets - means @ np.linalg.lstsq(means, regrets)[0]
+    spread = float((rest**2).sum()) / (number - len(between))
+    covariance = np.linalg.pinv(means.T @ means) * spread
+    errors = dict(zip(between, np.sqrt(np.diag(covariance)), strict=True))
+    if within:
+        inside = actual - regrets.to_numpy()[groups]
+        inside -= inside.groupby(observations).transform("mean")
+        difference = np.sqrt(2 * float((inside**2).sum()) / ((number - 1) * (each - 1)) / number)
+        errors |= dict.fromkeys(within, difference)
+        # The intercept is the level of the first observation: the mean of the tasks less that of the differences
+        if "Intercept" in errors:
+            errors["Intercept"] = np.hypot(errors["Intercept"], difference * np.sqrt((each - 1) / (2 * each)))
+    return pd.Series(errors)[design.columns], pd.Series(free)[design.columns]
 
 
 def _condition_number(design: np.ndarray) -> float:
