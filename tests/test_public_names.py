@@ -22,7 +22,19 @@ HEAVY = ("numba", "scipy", "pandas", "matplotlib", "torch", "rich", "typer", "st
 
 # A file imports, at its top, only what stands before it. Inside of functions `make` and `StateSpace` look ahead.
 ORDER = (
-    *("errors", "paths", "kernels", "environments", "drawing", "rules", "state_space", "mdp", "solvers", "hardness"),
+    *(
+        "errors",
+        "paths",
+        "storage",
+        "kernels",
+        "environments",
+        "drawing",
+        "rules",
+        "state_space",
+        "mdp",
+        "solvers",
+        "hardness",
+    ),
     *("importers", "exporters", "observations", "interaction", "agents", "experiments", "plots", "study"),
     *("sb3_env", "bisimulation", "cli", "__main__"),
 )

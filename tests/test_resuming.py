@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 import pharos
+from pharos import storage
 from pharos.environments import Environment
 from pharos.errors import DiskFull, RuleError, StateSpaceIncomplete, StateSpaceLocked, StateSpaceTooLarge
 from pharos.state_space import files as writing
@@ -515,6 +516,8 @@ class FullDisk:
 
         def opened(path, *args, **options):
             name = Path(path).name
+            if storage.is_temporary(name):
+                name = "manifest.json.tmp"
             if name not in ("lock", "meminfo"):
                 self.count("open")
             file = real_open(path, *args, **options)
@@ -529,6 +532,7 @@ class FullDisk:
             real_replace(*args)
 
         monkeypatch.setattr(writing, "open", opened, raising=False)
+        monkeypatch.setattr(storage, "open", opened, raising=False)
         monkeypatch.setattr(os, "fsync", fsync)
         monkeypatch.setattr(os, "replace", replace)
 

@@ -9,9 +9,11 @@ PharosError
 │   ├── StateSpaceIncomplete        the build has not finished; the same command resumes it
 │   ├── StateSpaceCorrupted         truncated or tampered files
 │   ├── StateSpaceMismatch          the folder holds another environment, parameters or version of its rules
-│   ├── StateSpaceLocked            another process is building there
+│   ├── StateSpaceLocked            another process is building there (a FolderLocked as well)
 │   └── DiskFull                    no room; finished work is kept
-├── FileFormatError (ValueError)    an imported file lacks something or holds nonsense
+├── FolderLocked                    another process is at work in a folder
+├── FileFormatError (ValueError)    a file lacks something or holds nonsense
+│   └── ResultCorrupted             a result was cut short, or changed after it was written
 ├── PrecisionError                  the requested precision is finer than the error bound allows
 ├── DivergenceError (ValueError)    the value asked for may be infinite
 ├── UndefinedMeasure                the measure does not exist for this MDP; the message says what would define it
@@ -66,7 +68,11 @@ class StateSpaceMismatch(StateSpaceError):
     """The folder holds another environment, other parameters or another version of its rules."""
 
 
-class StateSpaceLocked(StateSpaceError):
+class FolderLocked(PharosError):
+    """Another process is at work in the folder."""
+
+
+class StateSpaceLocked(StateSpaceError, FolderLocked):
     """Another process is building in the folder."""
 
 
@@ -75,7 +81,11 @@ class DiskFull(StateSpaceError):
 
 
 class FileFormatError(PharosError, ValueError):
-    """An imported file lacks something or holds nonsense."""
+    """A file lacks something or holds nonsense."""
+
+
+class ResultCorrupted(FileFormatError):
+    """A file of a result was cut short, or changed after it was written."""
 
 
 class PrecisionError(PharosError):

@@ -22,7 +22,7 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from pharos import paths
+from pharos import paths, storage
 from pharos.environments import Environment, start_distribution
 from pharos.errors import DiskFull, ParameterError, RuleError, StateSpaceMismatch, StateSpaceTooLarge
 from pharos.rules.fingerprint import fingerprint_of_rules
@@ -46,7 +46,7 @@ from pharos.state_space.store import (
     successors_name,
 )
 
-OUR_FILES = (STATES, SUCCESSORS, WIDE_SUCCESSORS, TERMINAL, MANIFEST + ".tmp", "lock")
+OUR_FILES = (STATES, SUCCESSORS, WIDE_SUCCESSORS, TERMINAL, MANIFEST + ".tmp", storage.LOCK, storage.CLAIM)
 CHUNK = (
     1 << 16
 )  # states expanded between two looks at the clock; a multiple of 8, so that terminal bits fill whole bytes
@@ -143,7 +143,7 @@ def cached_folder(env: Environment) -> Path:
 def _manifest_of(env: Environment, path: Path, identity: dict[str, Any]) -> dict[str, Any] | None:
     manifest = read_manifest(path)
     if manifest is None:
-        if path.is_dir() and any(item.name not in OUR_FILES for item in path.iterdir()):
+        if path.is_dir() and any(not _is_ours(item.name) for item in path.iterdir()):
             raise ParameterError(f"{path}: is not empty and holds no state space; choose another folder")
         return None
     for key, expected in identity.items():
@@ -154,6 +154,10 @@ def _manifest_of(env: Environment, path: Path, identity: dict[str, Any]) -> dict
             )
     check_lengths(path, manifest)
     return manifest
+
+
+def _is_ours(name: str) -> bool:
+    return name in OUR_FILES or storage.is_temporary(name)
 
 
 def _short(value: Any) -> str:

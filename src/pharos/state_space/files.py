@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 import xxhash
 
-from pharos.errors import DiskFull, ParameterError, StateSpaceCorrupted, StateSpaceLocked
+from pharos import storage
+from pharos.errors import DiskFull, StateSpaceCorrupted, StateSpaceLocked
 from pharos.state_space.store import CHECKSUM_BYTES, MANIFEST, digest_of
 
 
@@ -101,48 +102,18 @@ def cannot_write(path: Path, error: OSError) -> DiskFull:
     )
 
 
-@contextlib.contextmanager
-def lock(folder: Path):
-    """Hold the folder for this process; StateSpaceLocked where another one builds there. A killed process holds nothing."""
-    import fcntl
-
-    path = folder / "lock"
-    try:
-        file = open(path, "a+")  # noqa: SIM115
-    except OSError as error:
-        raise ParameterError(f"{folder}: cannot be written to: {error.strerror}; choose another folder") from error
-    with file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            file.seek(0)
-            holder = file.read().strip()
-            raise StateSpaceLocked(
-                f"{folder}: another process{f' ({holder})' if holder else ''} is building there; wait for it, or use another folder"
-            ) from None
-        file.truncate(0)
-        with contextlib.suppress(OSError):  # a full disk: the name of the holder is a courtesy
-            os.write(file.fileno(), f"process {os.getpid()}".encode())
-        try:
-            yield
-        finally:
-            file.truncate(0)
+def lock(folder: Path) -> contextlib.AbstractContextManager[None]:
+    """Hold the folder for this process; StateSpaceLocked where another one builds there. See `storage.lock`."""
+    return storage.lock(folder, StateSpaceLocked, "building")
 
 
 def write_manifest(folder: Path, manifest: dict[str, Any]) -> None:
     """Replace the manifest in one step: it is the commit point of everything else in the folder."""
     manifest = {**manifest, "digest": digest_of(json.loads(json.dumps(manifest)))}
-    temporary = folder / (MANIFEST + ".tmp")
+    path = folder / MANIFEST
     try:
-        with open(temporary, "w") as file:
-            json.dump(manifest, file, indent=1)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, folder / MANIFEST)
-        directory = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(directory)
-        finally:
-            os.close(directory)
+        storage.replace_file(path, json.dumps(manifest, indent=1))
+        storage.remove_leftovers(path)
+        (folder / (MANIFEST + ".tmp")).unlink(missing_ok=True)  # of an older pharos that was killed
     except OSError as error:
-        raise cannot_write(temporary, error) from error
+        raise cannot_write(path, error) from error

@@ -1,0 +1,371 @@
+"""Files that are there whole or not at all: replacement in one step, locks, JSON, digests. Knows no format of pharos.
+
+Every writer of pharos replaces files by `replacing`, `replace_file` or `replace_json`: whoever reads, and whatever happens to the
+machine, finds the old file or the new one. A new file is written beside the old one under a name that holds the host, the process
+and a random number, so that two machines that share a file system never write to the same file.
+"""
+
+import contextlib
+import errno
+import json
+import math
+import os
+import socket
+import stat
+import time
+import uuid
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import xxhash
+
+from pharos.errors import FileFormatError, FolderLocked, ParameterError, PharosError
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
+
+LOCK = "lock"
+CLAIM = "lock.claim"
+"""Stands in for a lock where the file system has none: whoever makes it holds the folder."""
+CLAIM_ATTEMPTS = 200
+
+DIGEST = "digest"
+BLOCK_BYTES = 1 << 24
+
+_HELD = (errno.EWOULDBLOCK, errno.EAGAIN, errno.EACCES)
+_UNSUPPORTED = (errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOTSUP, errno.EINVAL)
+_LEFTOVER_SECONDS = 86400.0
+
+
+# Replacing files --------------------------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def replacing(path: str | os.PathLike, *, durable: bool = True) -> Iterator[BinaryIO]:
+    """Open a file for writing that takes the place of `path` when the block ends, and never where it raises.
+
+    Args:
+        path: where a symbolic link stands, the file it leads to is replaced; what is no file (a pipe, a device) is written to.
+        durable: the new file is on the disk before it has its name, and the name before this returns.
+    Raises:
+        OSError: the file cannot be written; an older one of that name is then as it was.
+    """
+    if _is_special(Path(path)):
+        with open(path, "wb") as file:
+            yield file
+        return
+    path = Path(os.path.realpath(path))
+    temporary = temporary_path(path)
+    try:
+        with open(temporary, "xb") as file:
+            yield file
+            file.flush()
+            if durable:
+                os.fsync(file.fileno())
+        os.replace(temporary, path)
+        if durable:
+            sync(path.parent)
+    except OSError as error:
+        if error.filename in (None, str(temporary), temporary):
+            error.filename, error.filename2 = str(path), None
+        raise
+    finally:
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
+
+
+def replace_file(path: str | os.PathLike, data: bytes | str, *, durable: bool = True) -> None:
+    """Replace a file by these bytes, or by this text in UTF-8, in one step; see `replacing`."""
+    with replacing(path, durable=durable) as file:
+        file.write(data.encode() if isinstance(data, str) else data)
+
+
+def replace_json(path: str | os.PathLike, value: Any, *, durable: bool = True) -> None:
+    """Replace a file by a value in JSON (see `json_text`), in one step."""
+    replace_file(path, json_text(value) + "\n", durable=durable)
+
+
+def sync(path: Path) -> None:
+    """Wait until a file, or the list of files of a folder, is on the disk."""
+    is_folder = path.is_dir()
+    if is_folder and os.name == "nt":
+        return
+    try:
+        descriptor = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+    except OSError as error:  # some file systems do not sync folders, and some folders cannot be read
+        if not is_folder or error.errno not in (errno.EINVAL, errno.EOPNOTSUPP, errno.ENOTSUP, errno.EACCES):
+            raise
+
+
+def temporary_path(path: Path) -> Path:
+    """A name beside `path` that no other process of any machine has: .NAME.HOST.PROCESS.RANDOM.tmp."""
+    return path.with_name(f"{_temporary_prefix(path)}{_host()}.{os.getpid()}.{uuid.uuid4().hex[:12]}.tmp")
+
+
+def is_temporary(name: str) -> bool:
+    """Whether a file of this name is one that `replacing` writes, or left behind when its process was killed."""
+    parts = name.split(".")
+    return len(parts) >= 6 and not parts[0] and parts[-1] == "tmp" and parts[-3].isdigit() and len(parts[-2]) == 12
+
+
+def remove_leftovers(path: Path) -> None:
+    """Remove unfinished replacements of `path`: of processes of this machine that are gone, and those older than a day."""
+    for leftover in path.parent.iterdir():
+        if not is_temporary(leftover.name) or not leftover.name.startswith(_temporary_prefix(path)):
+            continue
+        host, process = leftover.name.split(".")[-4:-2]
+        with contextlib.suppress(OSError):
+            old = time.time() - leftover.stat().st_mtime > _LEFTOVER_SECONDS
+            if old or (host == _host() and not _is_alive(int(process))):
+                leftover.unlink()
+
+
+def _temporary_prefix(path: Path) -> str:
+    return f".{path.name[:100]}."
+
+
+def _is_special(path: Path) -> bool:
+    try:
+        mode = path.stat().st_mode
+    except OSError:
+        return False
+    return not stat.S_ISREG(mode) and not stat.S_ISDIR(mode)
+
+
+def _host() -> str:
+    """The name of this machine, as part of a file's name."""
+    return "".join(c if c.isalnum() or c in "-_" else "-" for c in socket.gethostname())[:40] or "localhost"
+
+
+def _is_alive(process: int) -> bool:
+    """Whether a process of this machine lives; True where that cannot be told."""
+    if os.name == "nt":
+        return True
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except (OSError, OverflowError):
+        return True
+    try:
+        text = Path(f"/proc/{process}/stat").read_text(errors="replace")
+    except OSError:  # no Linux
+        return True
+    return text.rpartition(")")[2].split()[0] not in ("Z", "X")  # it is over, but its parent has not asked yet
+
+
+# Locks ------------------------------------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def lock(folder: Path, error: type[PharosError] = FolderLocked, activity: str = "at work") -> Iterator[None]:
+    """Hold a folder for this process: by `flock` on its file `lock`, so that a process that is killed holds nothing.
+
+    Where the file system has no such locks (ENOSYS, ENOLCK, EOPNOTSUPP: Lustre without `-o flock`, some network file systems),
+    the folder is held by a file `lock.claim` that only one process can make. It says who made it. One whose process is gone is
+    removed by the next process of the same machine; from another machine nobody can tell, so the error names the file.
+
+    Args:
+        folder: exists.
+        error, activity: raised where another process holds the folder: "another process (process 7) is `activity` there".
+    Raises:
+        ParameterError: the folder cannot be written to, or cannot be locked at all.
+    """
+    path = folder / LOCK
+    try:
+        file = open(path, "a+")  # noqa: SIM115
+    except OSError as problem:
+        raise ParameterError(f"{folder}: cannot be written to: {problem.strerror}; choose another folder") from problem
+    with file:
+        if not _flock(file, folder, error, activity):
+            with _claim(folder, error, activity):
+                yield
+            return
+        file.truncate(0)
+        with contextlib.suppress(OSError):  # a full disk: the name of the holder is a courtesy
+            os.write(file.fileno(), _holder().encode())
+        try:
+            yield
+        finally:
+            file.truncate(0)
+
+
+def _flock(file: Any, folder: Path, error: type[PharosError], activity: str) -> bool:
+    """Take the lock; False where the file system has none."""
+    if fcntl is None:
+        return False
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as problem:
+        if problem.errno in _HELD:
+            file.seek(0)
+            raise error(_held(folder, file.read().strip(), activity)) from None
+        if problem.errno in _UNSUPPORTED:
+            return False
+        raise ParameterError(f"{folder}: cannot be locked: {problem.strerror}; choose another folder") from problem
+    return True
+
+
+@contextlib.contextmanager
+def _claim(folder: Path, error: type[PharosError], activity: str) -> Iterator[None]:
+    """Hold a folder by making the file `lock.claim`, which only one process can."""
+    path = folder / CLAIM
+    mine = f"{_holder()}, {uuid.uuid4().hex}"
+    for _ in range(CLAIM_ATTEMPTS):
+        if _create(path, mine):
+            break
+        holder = _text(path)
+        if holder is not None and not _is_of_a_dead_process(holder):
+            said = _held(folder, holder.split(",")[0], activity)
+            raise error(f"{said}; if it is gone, delete {path}")
+        if holder is not None:
+            _remove_claim(path, holder)
+    else:
+        raise error(f"{_held(folder, '', activity)}; if there is none, delete {path} and {_guard_of(path)}")
+    try:
+        yield
+    finally:
+        if _text(path) == mine:
+            path.unlink(missing_ok=True)
+
+
+def _create(path: Path, text: str) -> bool:
+    """Make a file that is not there; False where it is."""
+    try:
+        descriptor = os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o644)
+    except FileExistsError:
+        return False
+    try:
+        os.write(descriptor, text.encode())
+    except OSError:
+        path.unlink(missing_ok=True)
+        raise
+    finally:
+        os.close(descriptor)
+    return True
+
+
+def _remove_claim(path: Path, holder: str) -> None:
+    """Remove the claim of a process that is gone. Only one process at a time removes, and only what it has read."""
+    guard = _guard_of(path)
+    if not _create(guard, _holder()):
+        time.sleep(0.01)
+        return
+    try:
+        if _text(path) == holder:
+            path.unlink(missing_ok=True)
+    finally:
+        guard.unlink(missing_ok=True)
+
+
+def _guard_of(path: Path) -> Path:
+    return path.with_name(f"{path.name}.removal")
+
+
+def _holder() -> str:
+    return f"process {os.getpid()} on {_host()}"
+
+
+def _is_of_a_dead_process(holder: str) -> bool:
+    words = holder.split(",")[0].split()
+    return len(words) == 4 and words[1].isdigit() and words[3] == _host() and not _is_alive(int(words[1]))
+
+
+def _held(folder: Path, holder: str, activity: str) -> str:
+    holder = holder.removesuffix(f" on {_host()}")
+    return (
+        f"{folder}: another process{f' ({holder})' if holder else ''} is {activity} there; "
+        f"wait for it, or use another folder"
+    )
+
+
+def _text(path: Path) -> str | None:
+    try:
+        return path.read_text(encoding="utf-8", errors="replace")
+    except FileNotFoundError:
+        return None
+
+
+# JSON and digests -------------------------------------------------------------------------------------------------------
+
+
+def json_text(value: Any) -> str:
+    """A value in JSON: arrays are lists, and numbers that JSON cannot say (NaN, infinity) are null.
+
+    Raises:
+        TypeError: it holds something else than numbers, text, lists, arrays and mappings.
+    """
+    return json.dumps(plain(value), indent=1, allow_nan=False)
+
+
+def plain(value: Any) -> Any:
+    """A value as JSON has it: mappings with names, lists, text, finite numbers and None."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if hasattr(value, "tolist"):
+        return plain(value.tolist())
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def read_json(path: str | os.PathLike, error: type[PharosError] = FileFormatError, advice: str = "") -> Any:
+    """The value that a file of JSON holds.
+
+    Args:
+        error, advice: raised where the file is none, in one line that ends with the advice.
+    Raises:
+        FileNotFoundError: there is no such file.
+    """
+    advice = f"; {advice}" if advice else ""
+    try:
+        data = Path(path).read_bytes()
+    except (FileNotFoundError, NotADirectoryError) as problem:
+        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path)) from problem
+    except OSError as problem:
+        raise error(f"{path}: cannot be read: {problem.strerror}{advice}") from None
+    try:
+        return json.loads(data)
+    except RecursionError:
+        raise error(f"{path}: is no JSON that pharos reads: its lists or objects are nested too deep{advice}") from None
+    except ValueError as problem:
+        raise error(f"{path}: is no JSON, or was cut short: {' '.join(str(problem).split())}{advice}") from None
+
+
+def digest_of_json(value: Any) -> str:
+    """XXH3-128 of a value as compact JSON with sorted keys; NaN and infinity are null."""
+    text = json.dumps(plain(value), sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return xxhash.xxh3_128_hexdigest(text.encode())
+
+
+def digest_of_bytes(data: bytes | memoryview) -> str:
+    """XXH3-128 of bytes."""
+    return xxhash.xxh3_128_hexdigest(data)
+
+
+def digest_of_file(path: str | os.PathLike, block_bytes: int = BLOCK_BYTES) -> str:
+    """XXH3-128 of a file, read in blocks."""
+    digest = xxhash.xxh3_128()
+    with open(path, "rb") as file:
+        while block := file.read(block_bytes):
+            digest.update(block)
+    return digest.hexdigest()
+
+
+def sealed(record: Mapping[str, Any]) -> dict[str, Any]:
+    """A record, as JSON has it, with the digest of all that it says under the key `digest`."""
+    content = {key: value for key, value in plain(record).items() if key != DIGEST}
+    return {**content, DIGEST: digest_of_json(content)}
+
+
+def is_intact(record: Mapping[str, Any]) -> bool:
+    """Whether a record says what it said when it was sealed; True for one without a digest, as older versions wrote them."""
+    content = {key: value for key, value in record.items() if key != DIGEST}
+    return DIGEST not in record or record[DIGEST] == digest_of_json(content)

@@ -1,0 +1,322 @@
+"""Replacement in one step, locks on file systems with and without them, JSON and digests."""
+
+import errno
+import json
+import math
+import multiprocessing
+import os
+import resource
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pharos import storage
+from pharos.errors import FileFormatError, FolderLocked, ParameterError, StateSpaceLocked
+
+fork = multiprocessing.get_context("fork")
+values = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | st.text(max_size=5),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
+    max_leaves=10,
+)
+
+
+def names(folder):
+    return sorted(path.name for path in folder.iterdir())
+
+
+# Replacing files --------------------------------------------------------------------------------------------------------
+
+
+def test_a_file_that_cannot_be_written_whole_leaves_the_old_one(tmp_path):
+    file = tmp_path / "kept"
+    storage.replace_file(file, "old")
+    with pytest.raises(RuntimeError), storage.replacing(file) as out:
+        out.write(b"half")
+        raise RuntimeError
+    assert file.read_text() == "old" and names(tmp_path) == ["kept"]
+
+
+def _write_with_little_disk(limit, file):
+    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+    try:
+        storage.replace_file(file, b"x" * 20_000)
+    except OSError as error:
+        os._exit(7 if error.filename == str(file) and error.errno == errno.EFBIG else 1)
+    os._exit(0)
+
+
+@pytest.mark.parametrize("limit", (0, 100, 10_000))
+def test_a_full_disk_leaves_the_old_file_and_names_it(limit, tmp_path):
+    file = tmp_path / "kept"
+    file.write_text("old")
+    process = fork.Process(target=_write_with_little_disk, args=(limit, file))
+    process.start()
+    process.join()
+    assert process.exitcode == 7
+    assert file.read_text() == "old" and names(tmp_path) == ["kept"]
+
+
+@pytest.mark.parametrize("call", ["fsync", "replace"])
+def test_a_file_has_its_name_only_once_it_is_on_the_disk(call, tmp_path, monkeypatch):
+    file = tmp_path / "kept"
+    file.write_text("old")
+
+    def full(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, call, full)
+    with pytest.raises(OSError, match="No space left"):
+        storage.replace_file(file, "new")
+    assert file.read_text() == "old" and names(tmp_path) == ["kept"]
+
+
+def test_writers_with_the_same_process_number_do_not_meet(tmp_path, monkeypatch):
+    """As in containers, where each runner is process 1."""
+    monkeypatch.setattr(os, "getpid", lambda: 1)
+    errors = []
+
+    def write(text):
+        for _ in range(300):
+            try:
+                storage.replace_file(tmp_path / "status.json", text * 1000, durable=False)
+            except OSError as error:
+                errors.append(error)
+
+    threads = [threading.Thread(target=write, args=(text,)) for text in "ab"]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert errors == []
+    assert (tmp_path / "status.json").read_text() in ("a" * 1000, "b" * 1000)
+    assert names(tmp_path) == ["status.json"]
+
+
+def test_links_are_followed_and_devices_are_written_to(tmp_path):
+    (tmp_path / "real").mkdir()
+    (tmp_path / "real" / "file").write_text("old")
+    (tmp_path / "link").symlink_to(tmp_path / "real" / "file")
+    storage.replace_file(tmp_path / "link", "new")
+    assert (tmp_path / "link").is_symlink() and (tmp_path / "real" / "file").read_text() == "new"
+    done = subprocess.run(
+        [sys.executable, "-c", "from pharos import storage; storage.replace_file('/dev/stdout', 'hello')"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert done.stdout == "hello"
+
+
+def test_leftovers_of_killed_processes_are_removed_and_others_stay(tmp_path):
+    file = tmp_path / "kept.json"
+
+    def die():
+        with storage.replacing(file) as out:
+            out.write(b"half")
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    process = fork.Process(target=die)
+    process.start()
+    process.join()
+    assert len(names(tmp_path)) == 1 and storage.is_temporary(names(tmp_path)[0])
+    alive = storage.temporary_path(file)
+    elsewhere = tmp_path / f".kept.json.another-machine.{process.pid}.0123456789ab.tmp"
+    other = storage.temporary_path(tmp_path / "other")
+    for path in (alive, elsewhere, other):
+        path.write_text("being written")
+    storage.remove_leftovers(file)
+    assert names(tmp_path) == sorted([alive.name, elsewhere.name, other.name])
+    os.utime(elsewhere, (0, 0))
+    storage.remove_leftovers(file)
+    assert names(tmp_path) == sorted([alive.name, other.name])
+
+
+# Locks ------------------------------------------------------------------------------------------------------------------
+
+
+def _hold(folder, ready, release):
+    with storage.lock(folder):
+        ready.set()
+        release.wait()
+
+
+@pytest.fixture(params=["flock", "ENOSYS", "ENOLCK", "EOPNOTSUPP"])
+def locks(request, monkeypatch):
+    """File systems that lock, and those that answer that they do not."""
+    if request.param != "flock":
+        number = getattr(errno, request.param)
+
+        def refuse(*_):
+            raise OSError(number, os.strerror(number))
+
+        monkeypatch.setattr(storage.fcntl, "flock", refuse)
+    return request.param
+
+
+def test_one_process_holds_a_folder_until_it_ends(locks, tmp_path):
+    ready, release = fork.Event(), fork.Event()
+    process = fork.Process(target=_hold, args=(tmp_path, ready, release))
+    process.start()
+    ready.wait()
+    for error, activity in ((FolderLocked, "at work"), (StateSpaceLocked, "building")):
+        with (
+            pytest.raises(error, match=rf"another process \(process {process.pid}\) is {activity} there; wait for it"),
+            storage.lock(tmp_path, error, activity),
+        ):
+            raise AssertionError
+    release.set()
+    process.join()
+    with storage.lock(tmp_path):
+        pass
+    assert names(tmp_path) == ["lock"] and (tmp_path / "lock").read_text() == ""
+
+
+def test_a_process_that_is_killed_holds_nothing(locks, tmp_path):
+    ready, release = fork.Event(), fork.Event()
+    process = fork.Process(target=_hold, args=(tmp_path, ready, release))
+    process.start()
+    ready.wait()
+    os.kill(process.pid, signal.SIGKILL)
+    process.join()
+    with storage.lock(tmp_path):
+        pass
+    with storage.lock(tmp_path):
+        pass
+    assert names(tmp_path) == ["lock"]
+
+
+def test_a_claim_of_another_machine_is_left_alone_and_named(tmp_path, monkeypatch):
+    def refuse(*_):
+        raise OSError(errno.ENOSYS, "Function not implemented")
+
+    monkeypatch.setattr(storage.fcntl, "flock", refuse)
+    (tmp_path / storage.CLAIM).write_text("process 1 on another-machine, 0123")
+    with (
+        pytest.raises(FolderLocked, match=r"\(process 1 on another-machine\).*if it is gone, delete .*lock\.claim"),
+        storage.lock(tmp_path),
+    ):
+        raise AssertionError
+    assert names(tmp_path) == ["lock", "lock.claim"]
+
+
+def test_a_claim_that_cannot_be_removed_is_said_to_be_there(tmp_path, monkeypatch):
+    def refuse(*_):
+        raise OSError(errno.ENOSYS, "Function not implemented")
+
+    monkeypatch.setattr(storage.fcntl, "flock", refuse)
+    monkeypatch.setattr(storage, "CLAIM_ATTEMPTS", 3)
+    dead = fork.Process(target=int)
+    dead.start()
+    dead.join()
+    (tmp_path / storage.CLAIM).write_text(f"process {dead.pid} on {storage._host()}, 0123")
+    (tmp_path / "lock.claim.removal").write_text("killed in the middle of it")
+    with pytest.raises(FolderLocked, match=r"delete .*lock\.claim and .*removal"), storage.lock(tmp_path):
+        raise AssertionError
+
+
+def _count(folder, times, counter):
+    def refuse(*_):
+        raise OSError(errno.ENOSYS, "Function not implemented")
+
+    storage.fcntl.flock = refuse
+    done, deadline = 0, time.monotonic() + 60
+    while done < times and time.monotonic() < deadline:
+        try:
+            with storage.lock(folder):
+                value = int(counter.read_text())
+                counter.write_text(str(value + 1))
+                done += 1
+                if done == times // 2:
+                    os.kill(os.getpid(), signal.SIGKILL)
+        except FolderLocked:
+            continue
+
+
+def test_processes_with_claims_never_hold_a_folder_together(tmp_path):
+    """Half of them are killed while they hold it, so that others race to take the claim over."""
+    folder, counter = tmp_path / "folder", tmp_path / "counter"
+    folder.mkdir()
+    counter.write_text("0")
+    processes = [fork.Process(target=_count, args=(folder, 100, counter)) for _ in range(6)]
+    for process in processes:
+        process.start()
+    for process in processes:
+        process.join()
+    assert int(counter.read_text()) == 6 * 50
+
+
+def test_a_lock_that_fails_otherwise_is_no_lock_of_another(tmp_path, monkeypatch):
+    def refuse(*_):
+        raise OSError(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr(storage.fcntl, "flock", refuse)
+    with pytest.raises(ParameterError, match="cannot be locked: Input/output error"), storage.lock(tmp_path):
+        raise AssertionError
+
+
+# JSON and digests -------------------------------------------------------------------------------------------------------
+
+
+@settings(max_examples=100, deadline=None)
+@given(value=st.dictionaries(st.text(max_size=5), values, max_size=4))
+def test_what_is_written_as_json_comes_back_and_is_intact(tmp_path_factory, value):
+    file = tmp_path_factory.mktemp("json") / "value.json"
+    record = storage.sealed(value)
+    storage.replace_json(file, record, durable=False)
+    back = storage.read_json(file)
+    assert back == record and storage.is_intact(back)
+    assert {**back, "digest": 0} == {**value, "digest": 0}
+    back["added"] = not back.get("added")
+    assert not storage.is_intact(back)
+
+
+def test_numbers_that_json_cannot_say_are_null():
+    value = {"a": math.nan, "b": [math.inf, np.float64(2.5), np.arange(3)], 3: (True, None)}
+    assert json.loads(storage.json_text(value)) == {"a": None, "b": [None, 2.5, [0, 1, 2]], "3": [True, None]}
+    assert storage.is_intact(json.loads(storage.json_text(storage.sealed(value))))
+    with pytest.raises(TypeError):
+        storage.json_text({"a": object()})
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (b'{"a": 1', "is no JSON, or was cut short"),
+        (b"", "is no JSON, or was cut short"),
+        (b"\xff\xfe\x01", "is no JSON"),
+        (b"[" * 100_000, "nested too deep"),
+    ],
+)
+def test_what_is_no_json_is_said_in_one_line(data, message, tmp_path):
+    (tmp_path / "x.json").write_bytes(data)
+    with pytest.raises(FileFormatError, match=message) as caught:
+        storage.read_json(tmp_path / "x.json", advice="write it again")
+    assert str(tmp_path / "x.json") in str(caught.value) and "\n" not in str(caught.value)
+    assert str(caught.value).endswith("; write it again")
+    with pytest.raises(FileFormatError, match="cannot be read: Is a directory"):
+        storage.read_json(tmp_path)
+    with pytest.raises(FileNotFoundError):
+        storage.read_json(tmp_path / "none.json")
+
+
+def test_a_file_has_the_digest_of_its_bytes(tmp_path):
+    data = bytes(range(256)) * 10
+    (tmp_path / "x").write_bytes(data)
+    assert storage.digest_of_file(tmp_path / "x", block_bytes=100) == storage.digest_of_bytes(data)
+
+
+def test_nothing_heavy_is_loaded():
+    code = "import sys, pharos.storage; print([n for n in ('numba', 'scipy', 'pandas') if n in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+    assert Path(storage.__file__).name == "storage.py"
