@@ -3,10 +3,12 @@
 import json
 import subprocess
 import sys
+import time
 
 import pytest
 import xxhash
 
+from pharos import study
 from pharos.errors import ParameterError, UnknownName
 from pharos.study import Specification, presets, run_id, specification
 from pharos.study.specification import parse
@@ -169,3 +171,42 @@ def test_the_predictors_of_the_models_are_the_papers_three_as_far_as_they_are_me
     assert predictors(*three, "stationary_effective_horizon") == three
     assert specification("paper").hardness.predictors == ["stationary_effective_horizon", *three[1:]]
     assert predictors("environmental_value_norm") == ["environmental_value_norm"]
+
+
+LAUGHS = "a0: &a0 [x, x, x, x, x, x, x, x, x]\n" + "".join(
+    f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]\n" for i in range(1, 10)
+)
+HOSTILE = {
+    b"name: a\n? [x, y] : 1\n": "study.yaml:2: a key is a list or a mapping; expected a word",
+    b"name: a\n? {x: y}\n: 1\n": "study.yaml:2: a key is a list or a mapping; expected a word",
+    b"name: \xff\xfe\n": "study.yaml: byte 6 is not UTF-8",
+    b"name: a\nblocks: &a [*a]\n": "study.yaml:2: an alias stands within what it names",
+    b"name: a\nblocks: " + b"[" * 5000 + b"]" * 5000 + b"\n": "study.yaml: is nested too deeply",
+    LAUGHS.encode(): "entries, aliases written out",
+    b"name: a\nseeds: 1000000000\nblocks: []\n": "study.yaml:2: seeds: found 1000000000; a study has at most 1,000,000 runs",
+    b"name: a\nsteps: " + b"9" * 5000 + b"\n": "study.yaml: Exceeds the limit",
+    b"name: 2001-99-99\n": "study.yaml: month must be in 1..12",
+    b"name: a\n1: 2\nblocks: []\n": "study.yaml:",
+    b"name: a\n\x00\n": "study.yaml: ",
+}
+
+
+@pytest.mark.parametrize("text", HOSTILE, ids=lambda text: repr(text[:20]))
+def test_a_hostile_file_is_one_line_at_once(tmp_path, text):
+    (tmp_path / "study.yaml").write_bytes(text)
+    began = time.perf_counter()
+    with pytest.raises(ParameterError) as caught:
+        study.specification(tmp_path)
+    assert time.perf_counter() - began < 5
+    assert HOSTILE[text] in str(caught.value) and "\n" not in str(caught.value) and len(str(caught.value)) < 400
+
+
+def test_a_million_runs_of_a_product_are_refused_before_they_are_listed():
+    block = {"environments": ["frozen_lake/4x4"] * 1000, "agents": ["q_learning"], "seeds": 2000}
+    with pytest.raises(ParameterError, match="2,000,000 runs up to here; a study has at most 1,000,000"):
+        study.specification({"name": "a", "blocks": [block]})
+
+
+def test_aliases_that_share_a_node_are_no_mistake():
+    text = "name: a\nblocks:\n  - &b {environments: [frozen_lake/4x4], agents: &g [q_learning]}\n  - *b\n"
+    assert len(parse(text).runs) == 5

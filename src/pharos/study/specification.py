@@ -33,6 +33,9 @@ except ImportError as error:
     raise MissingExtra("a study", str(error.name), "study") from error
 
 TABULAR_OBSERVATION = "index"
+# Bounds on a specification, so that every mistake is told at once
+MOST_RUNS = 1_000_000
+MOST_NODES = 1_000_000
 Loc = tuple[int | str, ...]
 
 
@@ -97,6 +100,8 @@ def _seeds(value: Any) -> Any:
         return value
     if isinstance(value, bool) or not isinstance(value, int) or value < 1:
         raise ParameterError(f"seeds: found {value!r}; expected how many, at least 1, or a list of seeds")
+    if value > MOST_RUNS:
+        raise ParameterError(f"seeds: found {value}; a study has at most {MOST_RUNS:,} runs")
     return list(range(value))
 
 
@@ -331,7 +336,16 @@ def specification(source: Source) -> Specification:
         path = path / "study.yaml"
     if not path.is_file():
         raise UnknownName("study (no such file, and no such preset)", source, presets())
-    return parse(path.read_text(encoding="utf-8"), str(path))
+    return parse(_text_of(path), str(path))
+
+
+def _text_of(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise ParameterError(f"{path}: byte {error.start} is not UTF-8; expected a text file in YAML") from error
+    except OSError as error:
+        raise ParameterError(f"{path}: cannot be read ({error.strerror}); expected a YAML file") from error
 
 
 def parse(text: str, name: str = "specification") -> Specification:
@@ -340,13 +354,19 @@ def parse(text: str, name: str = "specification") -> Specification:
         root = yaml.compose(text, _Loader)
         if root is None:
             raise ParameterError(f"{name}: is empty; expected a mapping with name and blocks")
-        _refuse_repeated_keys(root, name)
+        _check_nodes(root, name)
         data = yaml.load(text, _Loader)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         where = f"{name}:{mark.line + 1}" if mark is not None else name
         problem = getattr(error, "problem", None) or "this is no YAML"
         raise ParameterError(f"{where}: {problem}") from error
+    except RecursionError:
+        raise ParameterError(f"{name}: is nested too deeply; expected a mapping with name and blocks") from None
+    except ParameterError:
+        raise
+    except (ValueError, OverflowError) as error:  # numbers and dates that Python cannot hold
+        raise ParameterError(f"{name}: {' '.join(str(error).split())}") from error
     if not isinstance(data, dict):
         raise ParameterError(f"{name}:1: found {type(data).__name__}; expected a mapping with name and blocks")
     return _validated(data, name, root)
@@ -375,7 +395,13 @@ def _validated(data: Mapping[str, Any], name: str, root: Any) -> Specification:
 
 def _wrong(found: Specification) -> Iterator[tuple[Loc, str]]:
     """What only the whole specification shows: names of agents and of hyperparameters, environments that cannot be made."""
+    number = 0
     for i, block in enumerate(found.blocks):
+        kinds = len(block.environments) * len(block.chance) * len(block.agents) * len(block.observations)
+        number += kinds * len(block.seeds or found.seeds)
+        if number > MOST_RUNS:
+            yield ("blocks", i), f"{number:,} runs up to here; a study has at most {MOST_RUNS:,}"
+            return
         for j, entry in enumerate(block.environments):
             try:
                 _ = entry.instance
@@ -436,19 +462,45 @@ def _where(name: str, root: Any, loc: Loc) -> str:
     return f"{name}:{line + 1}"
 
 
-def _refuse_repeated_keys(node: Any, name: str) -> None:
-    if isinstance(node, yaml.MappingNode):
-        seen: dict[str, int] = {}
-        for key, value in node.value:
-            if key.value in seen:
-                raise ParameterError(
-                    f"{name}:{key.start_mark.line + 1}: the key {key.value!r} stands there twice (line {seen[key.value]})"
-                )
-            seen[key.value] = key.start_mark.line + 1
-            _refuse_repeated_keys(value, name)
-    elif isinstance(node, yaml.SequenceNode):
-        for item in node.value:
-            _refuse_repeated_keys(item, name)
+def _check_nodes(root: Any, name: str) -> None:
+    """Refuse what no specification needs: keys that are no words or repeated, nodes within themselves, millions by aliases.
+
+    A node that aliases share is looked at once; its size counts wherever it stands.
+    """
+    sizes: dict[int, int] = {}
+
+    def size(node: Any) -> int:
+        """How many nodes stand below this one, aliases written out."""
+        if id(node) in sizes:
+            if not sizes[id(node)]:
+                raise ParameterError(f"{name}:{node.start_mark.line + 1}: an alias stands within what it names")
+            return sizes[id(node)]
+        sizes[id(node)] = 0  # until all below it are counted
+        children: list[Any] = []
+        if isinstance(node, yaml.MappingNode):
+            _check_keys(node, name)
+            children = [value for _, value in node.value]
+        elif isinstance(node, yaml.SequenceNode):
+            children = node.value
+        total = 1 + sum(map(size, children))
+        if total > MOST_NODES:
+            line = node.start_mark.line + 1
+            raise ParameterError(f"{name}:{line}: stands for more than {MOST_NODES:,} entries, aliases written out")
+        sizes[id(node)] = total
+        return total
+
+    size(root)
+
+
+def _check_keys(node: Any, name: str) -> None:
+    lines: dict[str, int] = {}
+    for key, _ in node.value:
+        line = key.start_mark.line + 1
+        if not isinstance(key, yaml.ScalarNode):
+            raise ParameterError(f"{name}:{line}: a key is a list or a mapping; expected a word")
+        if key.value in lines:
+            raise ParameterError(f"{name}:{line}: the key {key.value!r} stands there twice (line {lines[key.value]})")
+        lines[key.value] = line
 
 
 def _tuples(value: Any) -> Any:
