@@ -1,4 +1,4 @@
-"""Makes docs/gallery.md and its pictures: every class, several instances, what people and agents see, and an optimal policy at play.
+"""Makes docs/gallery.md and its pictures: every class, what people and agents see, and an optimal policy at play.
 
 python scripts/gallery.py
 """
@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 import pharos
-from pharos.drawing import pictures as rendering
-from pharos.observations import observe
+from pharos import drawing
+from pharos.observations import observe, render
 
 DOCS = Path(__file__).parents[1] / "docs"
 FOLDER = DOCS / "gallery"
@@ -43,9 +43,9 @@ def enlarged(picture, height):
     return picture.repeat(factor, axis=0).repeat(factor, axis=1)
 
 
-def beside(pictures, gap=12, height=260):
-    """Pictures beside each other on white, tops aligned."""
-    pictures = [enlarged(picture, height) for picture in pictures]
+def beside(panels, gap=12, height=260):
+    """Pictures beside each other on white, tops aligned, each with its label below."""
+    pictures = [np.asarray(drawing.image(enlarged(picture, height), label)) for label, picture in panels.items()]
     rows = max(map(len, pictures))
     parts = []
     for picture in pictures:
@@ -56,18 +56,18 @@ def beside(pictures, gap=12, height=260):
 
 
 def shown(env, state):
-    """Human drawing, complex image at its natural size and at 84 x 84, simple image."""
+    """Human drawing, complex image at its natural size and at 84 x 84, simple image with a plane for each layer."""
     return beside(
-        [
-            rendering.render(env, state),
-            rendering.render(env, state, "complex_image", size="natural"),
-            rendering.render(env, state, "complex_image"),
-            rendering.render(env, state, "simple_image"),
-        ]
+        {
+            "for people": render(env, state),
+            "complex_image, natural": render(env, state, "complex_image", size="natural"),
+            "complex_image": render(env, state, "complex_image"),
+            "simple_image: " + ", ".join(env.layers): render(env, state, "simple_image"),
+        }
     )
 
 
-def told(env, space, state):
+def numbers(env, space, state):
     """The observations that are numbers, in a sentence."""
     states = np.array([state])
     vector, one_hot = observe(env, "vector"), observe(env, "one_hot")
@@ -86,26 +86,27 @@ def main() -> None:
     lines = [
         "# Gallery",
         "",
-        "Made by `python scripts/gallery.py`. In each row, from the left: the drawing for people, the complex image at its natural size",
-        "and at 84 x 84 pixels, and the planes of the simple image; below it, the observations that are numbers. What agents learnt, at play",
-        "beside the optimal policy and a random one: [large-runs.md](large-runs.md).",
+        "Made by `python scripts/gallery.py`. In each row, from the left: the drawing for people, the complex image at its",
+        "natural size and at 84 x 84 pixels, and the planes of the simple image, one for each layer; below it, the",
+        "observations that are numbers. What agents learnt, at play beside the optimal policy and a random one:",
+        "[large-runs.md](large-runs.md).",
         "",
     ]
     for cls, instances in INSTANCES.items():
         lines += [f"## {cls}", "", " ".join(pharos.make(cls).__doc__.split("\n")[0].split()), ""]
         for name, steps in instances:
             env, policy = optimal(name)
-            state = rendering.episode(env, policy, env.initial_states()[0][0], steps=steps)[-1][0]
+            state = drawing.episode(env, policy, env.initial_states()[0][0], steps=steps)[-1][0]
             file = FOLDER / f"{name.replace('/', '-')}.png"
-            rendering.save_png(file, shown(env, state))
+            drawing.save_png(file, shown(env, state))
             space = pharos.build(env)
             lines += [f"`{name}`, {space.num_states:,} states, after {steps} steps of the optimal policy:", ""]
-            lines += [f"![{name}](gallery/{file.name})", "", told(env, space, state), ""]
+            lines += [f"![{name}](gallery/{file.name})", "", numbers(env, space, state), ""]
         env, policy = optimal(PLAYED[cls])
-        played = rendering.episode(env, policy, env.initial_states()[0][0], steps=FRAMES)
-        pictures = [rendering.render(env, state, "complex_image", size="natural") for state, _, _ in played]
+        played = drawing.episode(env, policy, env.initial_states()[0][0], steps=FRAMES)
+        pictures = [render(env, state, "complex_image", size="natural") for state, _, _ in played]
         file = FOLDER / f"{PLAYED[cls].replace('/', '-')}.gif"
-        rendering.save_gif(file, pictures, frames_per_second=12, at_least=160)
+        drawing.save_gif(file, pictures, frames_per_second=12, at_least=160)
         lines += [f"The optimal policy of `{PLAYED[cls]}`:", "", f"![{PLAYED[cls]}](gallery/{file.name})", ""]
     (DOCS / "gallery.md").write_text("\n".join(lines))
 

@@ -6,7 +6,7 @@ Look at every frame that changed: a golden game is right because someone has rea
 from pathlib import Path
 
 import pharos
-from pharos.drawing.text import text_drawing
+from pharos.drawing import text_drawing
 
 FOLDER = Path(__file__).with_name("golden")
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 import golden_games
 import naive_environments as naive
 import pharos
-from pharos.drawing.text import text_drawing
+from pharos.drawing import text_drawing
 from pharos.environments import Environment, catalog, named_instances, register
 from pharos.errors import ParameterError, UnknownName
 

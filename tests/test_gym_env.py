@@ -11,7 +11,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import pharos
-from pharos.drawing.pictures import human
+from pharos.drawing import human
 from pharos.errors import MissingExtra, ParameterError
 from pharos.interaction.gym_env import GymEnv, chance_weights
 from pharos.observations import observe

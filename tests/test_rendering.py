@@ -8,21 +8,19 @@ import pytest
 from PIL import Image
 
 from pharos import Environment, Layer, make
-from pharos.drawing.pictures import (
-    RENDERERS,
+from pharos.drawing import (
     colored_text,
     episode,
     human,
     image,
     planes_of,
-    render,
     save_gif,
     save_png,
     shade,
-    text,
+    text_drawing,
 )
-from pharos.drawing.text import text_drawing
 from pharos.errors import ParameterError, UnknownName
+from pharos.observations import RENDERERS, render
 
 ENVIRONMENTS = ["simple_grid/6x6-decoy", "frozen_lake/8x8", "freeway/16x7-speed2", "breakout/12x8x3"]
 
@@ -82,8 +80,8 @@ def test_cars_look_where_they_go():
 
 def test_text_is_the_drawing_of_the_environment():
     env = make("frozen_lake")
-    assert text(env, (0, 0)) == text_drawing(env, (0, 0)) == "A...\n.O.O\n...O\nO..G"
-    assert colored_text(env, (0, 0)).plain.replace(" ", "") == text(env, (0, 0))
+    assert text_drawing(env, (0, 0)) == "A...\n.O.O\n...O\nO..G"
+    assert colored_text(env, (0, 0)).plain.replace(" ", "") == text_drawing(env, (0, 0))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -254,7 +254,7 @@ def test_a_discrete_observation_keeps_its_space(breakout):
 
 
 def test_a_vector_environment_draws_each_of_its_environments():
-    from pharos.drawing.pictures import human
+    from pharos.drawing import human
 
     envs = gymnasium.make_vec("pharos/FrozenLake-v0", num_envs=3, size=4, render_mode="rgb_array")
     envs.reset(seed=0)

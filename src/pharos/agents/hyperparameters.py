@@ -1,10 +1,15 @@
-"""Hyperparameters of every agent, class of environments and observation: hyperparameters.yaml, in RL Zoo's convention."""
+"""Hyperparameters for every agent, class of environments and observation, in RL Zoo's convention.
+
+hyperparameters.yaml has those of each agent; a class of environments declares what suits it better (`Environment.hyperparameters`).
+A table of one's own holds both.
+"""
 
 from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any
 
+from pharos.environments import classes
 from pharos.errors import MissingExtra, ParameterError
 
 TABLE = Path(__file__).with_name("hyperparameters.yaml")
@@ -16,15 +21,17 @@ def hyperparameters(
     """Return the hyperparameters of an agent for a class of environments and an observation.
 
     Args:
-        given: go before those of the table.
-        table: another YAML of the same form, such as one that `pharos tune` wrote.
+        given: go before all others.
+        table: a YAML that says all of it (agent, then "default" or the class, then "default" or the observation), such as one that
+            `pharos tune` wrote; None for what pharos and the class declare.
     Raises:
         ParameterError: the table has another form. MissingExtra: PyYAML is not installed.
     """
     entries = _read(table or TABLE).get(agent, {})
-    classes = entries.get(environment, {})
+    declaring = None if table else classes().get(environment)
+    by_observation = declaring.hyperparameters.get(agent, {}) if declaring else entries.get(environment, {})
     result: dict[str, Any] = {}
-    for part in (entries.get("default"), classes.get("default"), classes.get(observation), given):
+    for part in (entries.get("default"), by_observation.get("default"), by_observation.get(observation), given):
         result.update(part or {})
     return result
 

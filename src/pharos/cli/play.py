@@ -118,7 +118,7 @@ def _picture(game: Game) -> "RenderableType":
     from rich.console import Group
     from rich.text import Text
 
-    from pharos.drawing.pictures import colored_text
+    from pharos.drawing import colored_text
 
     last = game.history[-1] if game.history else None
     line = Text.assemble((game.env.name, "bold cyan"), f"   step {game.steps}   return {game.total:g}")

@@ -54,12 +54,12 @@ def render(
     json: Json = False,
 ) -> None:
     """Draw a state (PNG) or an episode (GIF, or the state after --steps as PNG); in the terminal without --out."""
-    from pharos.drawing import pictures as rendering
+    from pharos import drawing, observations
 
     goal = parse_target(target, parameters)
     suffix = check_format(out, (".png", ".gif", ".txt")) if out else ""
     options = parse_parameters(option)
-    if observation != "text" and observation not in (known := rendering.renderers()):
+    if observation != "text" and observation not in (known := observations.renderers()):
         raise UnknownName("observation to render", observation, [*known, "text"])
     if policy not in POLICIES:
         raise UnknownName("policy", policy, POLICIES)
@@ -68,22 +68,22 @@ def render(
     if steps is None:
         steps = min(env.max_episode_steps, 200) if suffix == ".gif" else 0
     used, choose = (policy, None) if steps == 0 else find_policy(goal, env, policy, gamma, seed)
-    played = rendering.episode(env, choose or (lambda _: 0), start, steps=steps)
+    played = drawing.episode(env, choose or (lambda _: 0), start, steps=steps)
 
     returned = sum(reward for _, _, reward in played)
     last = played[-1][0]
     if out is None and not json:
         print_in_color(env, last)
     elif out is not None and suffix == ".txt":
-        frames = [rendering.text(env, each) for each, _, _ in played]
+        frames = [drawing.text_drawing(env, each) for each, _, _ in played]
         out.write_text("\n\n".join(frames) + "\n")
     elif out is not None and suffix == ".gif":
         shown = played if len(played) > 1 else [played[0]]
-        pictures = [rendering.render(env, each, observation, **options) for each, _, _ in shown]
+        pictures = [observations.render(env, each, observation, **options) for each, _, _ in shown]
         captions = _captions(env, shown) if observation == "human" else ()
-        rendering.save_gif(out, pictures, captions=captions, frames_per_second=fps, at_least=_at_least(observation))
+        drawing.save_gif(out, pictures, captions=captions, frames_per_second=fps, at_least=_at_least(observation))
     elif out is not None:
-        rendering.save_png(out, rendering.render(env, last, observation, **options), at_least=_at_least(observation))
+        drawing.save_png(out, observations.render(env, last, observation, **options), at_least=_at_least(observation))
     if json:
         print_json(
             {
@@ -134,7 +134,7 @@ def environment_of(target: Target) -> "Environment":
 
 def find_state(target: Target, env: "Environment", text: str | None) -> "State":
     """The state that `--state` names: its number in the state space, or its values; the start state when not given."""
-    from pharos.drawing.pictures import check_state
+    from pharos.drawing import check_state
 
     if text is None:
         return tuple(int(value) for value in env.initial_states()[0][0])
@@ -177,6 +177,6 @@ def _optimal(target: Target, gamma: float, max_states: int | None) -> Callable[[
 def print_in_color(env: "Environment", state: Sequence[int]) -> None:
     """The text drawing, in the colours of the layers where the terminal has them."""
     from pharos.cli.common import console
-    from pharos.drawing.pictures import colored_text
+    from pharos.drawing import colored_text
 
     console().print(colored_text(env, state))

@@ -1,10 +1,16 @@
 """Environments drawn as text: one glyph a cell, later layers cover earlier ones."""
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pharos.drawing.planes import planes_of
+from pharos.drawing.shapes import color_of, glyph_of
 from pharos.environments import Environment
+
+if TYPE_CHECKING:
+    from rich.text import Text
 
 GROUND = "."
 
@@ -15,13 +21,32 @@ def text_drawing(env: Environment, state: Sequence[int]) -> str:
     Args:
         state: D integers.
     Raises:
-        NotImplementedError: the class declares no `grid` or `draw`.
+        ParameterError: the class declares no `grid` or `draw`, or `state` is none of its states.
     """
-    rows, columns = env.grid()
-    planes = np.zeros((len(env.layers), rows, columns), np.uint8)
-    env.draw(tuple(state), planes)
-    picture = np.full((rows, columns), GROUND)
+    planes = planes_of(env, state)
+    picture = np.full(planes.shape[1:], GROUND)
     for plane, layer in zip(planes, env.layers.values(), strict=True):
         for value, glyph in enumerate(layer.glyph, start=1):
             picture[plane == value] = glyph
     return "\n".join("".join(row) for row in picture)
+
+
+def colored_text(env: Environment, state: Sequence[int]) -> "Text":
+    """Return `state` as Rich text for a terminal: two columns for each cell, in the colours of the layers."""
+    from rich.text import Text
+
+    drawn = Text()
+    planes = planes_of(env, state)
+    layers = list(env.layers.values())
+    for row in range(planes.shape[1]):
+        for column in range(planes.shape[2]):
+            here = np.flatnonzero(planes[:, row, column])
+            if not here.size:
+                drawn.append(" .", style="bright_black")
+                continue
+            layer, value = layers[here[-1]], int(planes[here[-1], row, column])
+            red, green, blue = color_of(layer, value)
+            drawn.append(f" {glyph_of(layer, value)}", style=f"bold rgb({red},{green},{blue})")
+        drawn.append("\n")
+    drawn.rstrip()
+    return drawn

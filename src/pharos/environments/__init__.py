@@ -1,26 +1,51 @@
 """Environments: the contract of a class (`Environment`, `Layer`), the built-in classes, and the catalogue of their names."""
 
-from pharos.environments.base import Components, Environment, Layer, State, start_distribution
+from pharos.environments.base import Components, Environment, State, start_distribution
 from pharos.environments.breakout import Breakout
-from pharos.environments.catalog import classes, imported, list_environments, make, named_instances, register
+from pharos.environments.catalog import (
+    classes,
+    imported,
+    list_environments,
+    make,
+    named_instances,
+    on_registration,
+    register,
+)
 from pharos.environments.freeway import Freeway
 from pharos.environments.frozen_lake import FrozenLake
+from pharos.environments.look import Color, Ground, Layer, Look, Margin, Scenery, Shape, Sprite
+from pharos.environments.parameters import CELL, VALUED_CELLS, Kind, Parameter, declared_parameters, integers, parameter
 from pharos.environments.simple_grid import SimpleGrid
 
 __all__ = [
+    "CELL",
+    "VALUED_CELLS",
     "Breakout",
+    "Color",
     "Components",
     "Environment",
     "Freeway",
     "FrozenLake",
+    "Ground",
+    "Kind",
     "Layer",
+    "Look",
+    "Margin",
+    "Parameter",
+    "Scenery",
+    "Shape",
     "SimpleGrid",
+    "Sprite",
     "State",
     "classes",
+    "declared_parameters",
     "imported",
+    "integers",
     "list_environments",
     "make",
     "named_instances",
+    "on_registration",
+    "parameter",
     "register",
     "start_distribution",
 ]

@@ -13,26 +13,12 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from pharos.environments.look import Layer, Look
+from pharos.environments.parameters import check_parameters
 from pharos.errors import ParameterError
 
 State = tuple[int, ...]
 Ranges = Any  # range, or a nested sequence of ranges
-
-
-@dataclass(frozen=True)
-class Layer:
-    """How one kind of thing looks. `draw` puts it on its plane; every picture is made from the planes.
-
-    Attributes:
-        glyph: one character for text drawings; several, one for each value 1, 2, ... on the plane.
-        color: (red, green, blue), 0 to 255; or several, one for each value on the plane.
-        sprite: rows of text, '#' where the sprite has the colour and '.' where the ground shows through; digits 1-9 pick
-            shades from light to dark; several sprites, one for each value on the plane. None draws a full cell.
-    """
-
-    glyph: str | tuple[str, ...]
-    color: tuple[int, int, int] | tuple[tuple[int, int, int], ...]
-    sprite: tuple[str, ...] | tuple[tuple[str, ...], ...] | None = None
 
 
 @dataclass(frozen=True)
@@ -68,12 +54,22 @@ class Environment:
         name: str                   the name users type, such as "breakout"
         actions: tuple[str, ...]    names of the A actions; actions are the integers 0 .. A-1
         version: int                raised when a transition or reward changes, never for a refactoring
-        layers: dict[str, Layer]    how each plane of `draw` looks; later layers cover earlier ones
         max_episode_steps: int      the time limit that the Gymnasium environments use unless told otherwise;
                                     an attribute or a property
+        layers: dict[str, Layer]    how each plane of `draw` looks; later layers cover earlier ones
+
+    Class attributes that may be left out
+        look: Look                  the ground below the layers, the screen of complex images, the colour in plots
+        instances: dict             name -> parameters: `make("breakout/12x8x1")` and "pharos/Breakout-12x8x1-v0"
+        paper_instances: tuple      those of them that stand in the tables of the pharos paper, in their order
+        hyperparameters: dict       agent -> observation, or "default" for all -> values that suit the class; they go
+                                    before those of agents/hyperparameters.yaml
+        first_version: int          the `version` that the Gymnasium id pharos/ClassName-v0 stands for
+
+    Parameters are the fields of the dataclass. `parameter(12, low=4)` as a default declares what they may be.
 
     Methods that describe an instance (ordinary Python)
-        validate(self)              raises ParameterError where a parameter is out of range
+        validate(self)              raises ParameterError where parameters do not go together
         variables(self)             name -> range, or a nested sequence of ranges for an array of variables
         initial_state(self)         the start state, a sequence of D integers;
                                     or `initial_states`: several of them with their probabilities
@@ -94,16 +90,22 @@ class Environment:
     name: ClassVar[str]
     actions: ClassVar[tuple[str, ...]]
     version: ClassVar[int] = 1
-    layers: ClassVar[dict[str, Layer]] = {}
     max_episode_steps: Any = 1000
+    layers: ClassVar[dict[str, Layer]] = {}
+    look: ClassVar[Look] = Look()
+    instances: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
+    paper_instances: ClassVar[tuple[str, ...]] = ()
+    hyperparameters: ClassVar[Mapping[str, Mapping[str, Mapping[str, Any]]]] = {}
+    first_version: ClassVar[int] = 1
 
     def __post_init__(self) -> None:
+        check_parameters(self)
         self.validate()
 
     # What an instance is -------------------------------------------------------------------------------------------------
 
     def validate(self) -> None:
-        """Raise ParameterError where a parameter is out of range. The base class accepts everything."""
+        """Raise ParameterError where parameters do not go together; each has been checked against its declaration."""
 
     def variables(self) -> Mapping[str, Ranges]:
         """Name -> range of values, or a nested sequence of ranges for an array of variables (flattened in C order)."""

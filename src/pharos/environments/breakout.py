@@ -2,11 +2,28 @@
 
 from dataclasses import dataclass
 
-from pharos.environments.base import Environment, Layer
-from pharos.environments.parameters import integer, truth
+from pharos.environments.base import Environment
+from pharos.environments.look import Layer, Look, Scenery
+from pharos.environments.parameters import parameter
 
 BALL_ROW, BALL_COLUMN, BALL_RIGHT, BALL_DOWN, PADDLE, BRICKS = range(6)  # bricks follow, row by row
 LEFT, STAY, RIGHT = range(3)
+
+# Complex images, after the Atari 2600 game: wide pixels, the colours of its palette; bricks begin in row 1
+ROW_COLORS = ((66, 72, 200), (200, 72, 72), (198, 108, 58), (180, 122, 48), (162, 162, 42), (72, 160, 72))
+WIDE_BRICK = ("#" * 16,) * 11 + ("." * 16,)
+WIDE_PADDLE = ("." * 16,) * 2 + ("#" * 16,) * 5 + ("." * 16,) * 5
+WIDE_BALL = ("." * 16,) * 3 + ("." * 6 + "#" * 4 + "." * 6,) * 6 + ("." * 16,) * 3
+
+# (height, columns, paddle width): those of the paper's table, then those that its appendix B draws
+PAPER = tuple(
+    (height, columns, width) for width in (1, 3) for height, columns in ((12, 10), (12, 8), (16, 8), (20, 8), (24, 8))
+)
+DRAWN = ((14, 8, 1), (14, 10, 3), (20, 10, 1), (20, 10, 3), (24, 10, 3))
+INSTANCES = {
+    f"{height}x{columns}x{width}": {"height": height, "columns": columns, "extra_paddle_width": (width - 1) // 2}
+    for height, columns, width in (*PAPER, *DRAWN)
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,11 +55,11 @@ class Breakout(Environment):
         respawn: whether cleared bricks come back.
     """
 
-    height: int = 12
-    columns: int = 8
-    brick_rows: int = 2
-    extra_paddle_width: int = 0
-    respawn: bool = True
+    height: int = parameter(12, low=lambda env: env.brick_rows + 4)
+    columns: int = parameter(8, low=lambda env: max(2, env.paddle_width))
+    brick_rows: int = parameter(2, low=1)
+    extra_paddle_width: int = parameter(0, low=0)
+    respawn: bool = parameter(True)
 
     name = "breakout"
     actions = ("left", "stay", "right")
@@ -54,12 +71,35 @@ class Breakout(Environment):
         "ball": Layer("o", (236, 236, 236)),
     }
 
-    def validate(self) -> None:
-        extra = integer(self, "extra_paddle_width", 0)
-        brick_rows = integer(self, "brick_rows", 1)
-        integer(self, "height", brick_rows + 4)
-        integer(self, "columns", max(2, 1 + 2 * extra))
-        truth(self, "respawn")
+    look = Look(
+        ground="court",
+        color="#009E73",
+        scenery=Scenery(
+            cell=(12, 16),
+            margin=(16, 8, 4, 8),
+            ground="walls",
+            sprites={"bricks": WIDE_BRICK, "paddle": WIDE_PADDLE, "ball": WIDE_BALL},
+            row_colors={"bricks": ROW_COLORS},
+        ),
+    )
+    instances = INSTANCES
+    paper_instances = tuple(INSTANCES)[: len(PAPER)]
+    first_version = 2
+    hyperparameters = {
+        "q_learning": {"default": {"initial_q": 0.0}},
+        "dqn": {
+            "default": {
+                "buffer_size": 100000,
+                "learning_rate": 0.00025,
+                "learning_starts": 5000,
+                "target_update_interval": 1000,
+                "exploration_fraction": 0.1,
+                "exploration_final_eps": 0.02,
+                "batch_size": 32,
+            },
+            "complex_image": {"buffer_size": 20000},
+        },
+    }
 
     @property
     def paddle_width(self) -> int:

@@ -1,6 +1,7 @@
-"""The catalogue of environments that `pharos.make` knows: name -> class, and the named instances of the paper.
+"""The catalogue of environments that `pharos.make` knows: classes by name, and their named instances.
 
-This is the only list of environments. A user's own class joins it with `register`.
+BUILT_IN is the only list of environments: everything else about a class stands in its own file. A user's own class joins the
+catalogue with `register`.
 """
 
 import dataclasses
@@ -8,27 +9,37 @@ import importlib
 import importlib.util
 import os
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 from pharos.environments.base import Environment
-from pharos.environments.breakout import Breakout
-from pharos.environments.freeway import Freeway
-from pharos.environments.frozen_lake import FrozenLake
-from pharos.environments.simple_grid import SimpleGrid
 from pharos.errors import ParameterError, UnknownName
 
-_BUILT_IN: dict[str, type[Environment]] = {cls.name: cls for cls in (SimpleGrid, FrozenLake, Freeway, Breakout)}
+BUILT_IN = (  # file:class, in the order in which they are listed
+    "simple_grid:SimpleGrid",
+    "frozen_lake:FrozenLake",
+    "freeway:Freeway",
+    "breakout:Breakout",
+)
+
+
+def _built_in(place: str) -> type[Environment]:
+    file, _, class_name = place.partition(":")
+    return getattr(importlib.import_module(f"pharos.environments.{file}"), class_name)
+
+
+_BUILT_IN: dict[str, type[Environment]] = {cls.name: cls for cls in map(_built_in, BUILT_IN)}
 _REGISTERED: dict[str, type[Environment]] = {}
+_LISTENERS: list[Callable[[type[Environment]], None]] = []
 
 
 def make(name: str, **parameters: Any) -> Environment:
     """Return the environment called `name`, with `parameters` for its class.
 
     Args:
-        name: a class (`"breakout"`), a named instance of the paper (`"breakout/12x10x1"`, see `list_environments`), or where
+        name: a class (`"breakout"`), a named instance (`"breakout/12x10x1"`, see `list_environments`), or where
             your own class is (`"my_module:MyClass"`, `"folder/my_file.py:MyClass"`), which registers it.
         parameters: of the class; those of a named instance may be overridden.
     Raises:
@@ -53,7 +64,7 @@ def make(name: str, **parameters: Any) -> Environment:
 
 
 def list_environments() -> list[str]:
-    """The names that `make` knows: every class, then every named instance of the paper."""
+    """The names that `make` knows: every class, then every named instance."""
 
     return [*classes(), *named_instances()]
 
@@ -64,32 +75,12 @@ def classes() -> dict[str, type[Environment]]:
 
 
 def named_instances() -> dict[str, tuple[str, Mapping[str, Any]]]:
-    """Name -> (name of the class, parameters) of the paper's instances: its tables first, then what else it draws.
-
-    `simple_grid/4x4-decoy` (height x width), `frozen_lake/8x8`, `freeway/16x7-speed1` (cars x lane length, player speed),
-    `breakout/12x10x1` (height x columns x paddle width).
-    """
-    instances: dict[str, tuple[str, Mapping[str, Any]]] = {}
-    for size in (4, 6, 8):
-        square = {"height": size, "width": size}
-        decoy = {**square, "rewards": (((size // 2, size // 2), 0.1),)}
-        instances[f"simple_grid/{size}x{size}-decoy"] = ("simple_grid", decoy)
-        instances[f"simple_grid/{size}x{size}-plain"] = ("simple_grid", square)
-    for size in (4, 8):
-        instances[f"frozen_lake/{size}x{size}"] = ("frozen_lake", {"size": size})
-    for cars, length in ((20, 11), (25, 13), (20, 5), (16, 7), (25, 9)):
-        for speed in (1, 2):
-            road = {"num_cars": cars, "lane_length": length, "player_speed": speed}
-            instances[f"freeway/{cars}x{length}-speed{speed}"] = ("freeway", road)
-    printed = [(height, columns, width) for width in (1, 3) for height, columns in _COURTS]
-    for height, columns, width in (*printed, *_DRAWN):
-        court = {"height": height, "columns": columns, "extra_paddle_width": (width - 1) // 2}
-        instances[f"breakout/{height}x{columns}x{width}"] = ("breakout", court)
-    return instances
-
-
-_COURTS = ((12, 10), (12, 8), (16, 8), (20, 8), (24, 8))  # of the paper's table
-_DRAWN = ((14, 8, 1), (14, 10, 3), (20, 10, 1), (20, 10, 3), (24, 10, 3))  # in its appendix B
+    """Name, such as "breakout/12x8x1" -> (name of the class, parameters): the `instances` of every class."""
+    return {
+        f"{name}/{instance}": (name, parameters)
+        for name, cls in classes().items()
+        for instance, parameters in cls.instances.items()
+    }
 
 
 def imported(path: str) -> type[Environment]:
@@ -145,4 +136,13 @@ def register(cls: type[Environment]) -> type[Environment]:
     if name in _BUILT_IN:
         raise ParameterError(f"register: {name!r} is the name of a built-in class; choose another name")
     _REGISTERED[name] = cls
+    for hear in _LISTENERS:
+        hear(cls)
     return cls
+
+
+def on_registration(hear: Callable[[type[Environment]], None]) -> None:
+    """Call `hear` with every class that is known, and with every one that is registered from now on."""
+    for cls in classes().values():
+        hear(cls)
+    _LISTENERS.append(hear)

@@ -6,25 +6,17 @@ from typing import Any
 
 import numpy as np
 
-from pharos.environments.base import Environment, Layer
-from pharos.environments.parameters import integer, integers, number, store, truth
+from pharos.environments.base import Environment
+from pharos.environments.look import Layer, Look, Scenery
+from pharos.environments.parameters import integers, parameter, store
 
 PLAYER_ROW, PLAYER_TIMER, CARS = range(3)  # positions of the cars follow, then their timers
 STAY, UP, DOWN = range(3)
 
 SPEEDS = (1, 2, 3, 4, 5, 6, 7, 8, 11)  # least common multiple 9240
 COLORS = ((200, 72, 72), (214, 186, 92), (66, 158, 130), (110, 140, 220), (186, 110, 190))
-CAR = (
-    "........",
-    "..####..",
-    "33####33",
-    ".##11##.",
-    ".##11##.",
-    "33####33",
-    "..####..",
-    "........",
-)
-CHICKEN = (
+NUM_COLORS = len(COLORS)
+CHICKEN = (  # in pictures for people
     "...##...",
     "...###..",
     "...#....",
@@ -34,6 +26,40 @@ CHICKEN = (
     "..#.#...",
     ".##.##..",
 )
+WIDE_CAR = (  # in complex images, whose pixels are wide as those of the Atari 2600
+    "....................",
+    "...9999.....9999....",
+    "...9999.....9999....",
+    ".###############....",
+    ".#################..",
+    ".####3333####9######",
+    "3####3333####9######",
+    "3####3333####9######",
+    ".####3333####9######",
+    ".#################..",
+    ".###############....",
+    "...9999.....9999....",
+)
+WIDE_CHICKEN = (
+    ".........####.......",
+    ".........######.....",
+    ".........##88##77...",
+    "..##.....######.....",
+    "..####...####.......",
+    "..############......",
+    "....############....",
+    "....############....",
+    "......########......",
+    "........####........",
+    "........7..7........",
+    "......777.777.......",
+)
+
+INSTANCES = {
+    f"{cars}x{length}-speed{speed}": {"num_cars": cars, "lane_length": length, "player_speed": speed}
+    for cars, length in ((20, 11), (25, 13), (20, 5), (16, 7), (25, 9))
+    for speed in (1, 2)
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,13 +98,13 @@ class Freeway(Environment):
         hit_penalty: what a hit costs, at least 0.
     """
 
-    num_cars: int = 16
-    lane_length: int = 7
-    player_speed: int = 1
-    car_speeds: Any = None
-    directions: Any = None
-    restart_on_hit: bool = True
-    hit_penalty: float = 1.0
+    num_cars: int = parameter(16, low=1)
+    lane_length: int = parameter(7, low=2)
+    player_speed: int = parameter(1, low=1)
+    car_speeds: Any = parameter(None, kind=integers("at least 1", lambda period: period >= 1))
+    directions: Any = parameter(None, kind=integers("1 (right) or -1 (left)", lambda direction: direction in (1, -1)))
+    restart_on_hit: bool = parameter(True)
+    hit_penalty: float = parameter(1.0, low=0.0)
 
     name = "freeway"
     actions = ("stay", "up", "down")
@@ -86,22 +112,47 @@ class Freeway(Environment):
     max_episode_steps = 1000
     layers = {
         "kerb": Layer("=", (142, 142, 142)),
-        "cars": Layer((*">" * len(COLORS), *"<" * len(COLORS)), COLORS * 2, (CAR,) * (2 * len(COLORS))),
+        "cars": Layer((*">" * NUM_COLORS, *"<" * NUM_COLORS), COLORS * 2, shape="car"),
         "player": Layer("@", (252, 252, 84), CHICKEN),
     }
 
+    look = Look(
+        ground="road",
+        color="#D55E00",
+        scenery=Scenery(
+            cell=(12, 20),
+            margin=(0, 0, 0, 0),
+            ground="asphalt",
+            sprites={
+                "kerb": None,
+                "cars": (WIDE_CAR,) * NUM_COLORS + (tuple(row[::-1] for row in WIDE_CAR),) * NUM_COLORS,
+                "player": WIDE_CHICKEN,
+            },
+        ),
+    )
+    instances = INSTANCES
+    paper_instances = tuple(INSTANCES)
+    hyperparameters = {
+        "q_learning": {"default": {"initial_q": 0.0}},
+        "dqn": {
+            "default": {
+                "buffer_size": 100000,
+                "learning_rate": 0.00025,
+                "learning_starts": 5000,
+                "target_update_interval": 1000,
+                "exploration_fraction": 0.1,
+                "exploration_final_eps": 0.02,
+                "batch_size": 32,
+            },
+            "complex_image": {"buffer_size": 20000},
+        },
+    }
+
     def validate(self) -> None:
-        integer(self, "num_cars", 1)
-        integer(self, "lane_length", 2)
-        integer(self, "player_speed", 1)
         if self.car_speeds is None:
             store(self, "car_speeds", SPEEDS)
         if self.directions is None:
             store(self, "directions", (1, -1))
-        integers(self, "car_speeds", "at least 1", lambda period: period >= 1)
-        integers(self, "directions", "1 (right) or -1 (left)", lambda direction: direction in (1, -1))
-        truth(self, "restart_on_hit")
-        number(self, "hit_penalty", low=0.0)
 
     @property
     def column(self) -> int:
@@ -176,9 +227,6 @@ class Freeway(Environment):
             goes_left = self.car_directions[i] < 0
             planes[1, 1 + i, state[CARS + i]] = 1 + i % NUM_COLORS + NUM_COLORS * goes_left
         planes[2, state[PLAYER_ROW], self.column] = 1
-
-
-NUM_COLORS = len(COLORS)
 
 
 def row_after_move(row, timer, action, start_row):

@@ -5,8 +5,9 @@ from functools import cached_property
 
 import numpy as np
 
-from pharos.environments.base import Environment, Layer
-from pharos.environments.parameters import integer, number, store
+from pharos.environments.base import Environment
+from pharos.environments.look import Layer, Look
+from pharos.environments.parameters import parameter, store
 from pharos.errors import ParameterError
 
 ROW, COLUMN = range(2)
@@ -47,10 +48,10 @@ class FrozenLake(Environment):
         frozen_probability: of each tile of a random map to be ice, in (0, 1]; as in Gymnasium 0.8.
     """
 
-    size: int | None = None
+    size: int | None = parameter(None, kind=int, low=2)
     map: str | None = None
-    seed: int | None = None
-    frozen_probability: float = FROZEN_PROBABILITY
+    seed: int | None = parameter(None, kind=int, low=0)
+    frozen_probability: float = parameter(FROZEN_PROBABILITY, low=0.0, high=1.0)
 
     name = "frozen_lake"
     actions = ("left", "down", "right", "up")
@@ -61,8 +62,23 @@ class FrozenLake(Environment):
         "agent": Layer("A", (66, 72, 200)),
     }
 
+    look = Look(ground="ice", color="#56B4E9")
+    instances = {"4x4": {"size": 4}, "8x8": {"size": 8}}
+    paper_instances = ("4x4", "8x8")
+    hyperparameters = {
+        # With a discount of 0.99 the goal of 8x8 is not found.
+        "dqn": {
+            "default": {
+                "gamma": 0.95,
+                "learning_rate": 0.001,
+                "target_update_interval": 1000,
+                "exploration_fraction": 0.5,
+                "exploration_final_eps": 0.02,
+            }
+        }
+    }
+
     def validate(self) -> None:
-        number(self, "frozen_probability", 0.0, 1.0)
         if self.map is not None:
             if self.size is not None or self.seed is not None:
                 raise ParameterError("FrozenLake: map was given with size or seed; expected a map alone")
@@ -70,20 +86,16 @@ class FrozenLake(Environment):
             return
         if self.size is None:
             store(self, "size", 4)
-        if self.seed is None:
-            size = integer(self, "size", 2)
-            if size not in MAPS:
-                raise ParameterError(
-                    f"FrozenLake: size={size} has no map of its own; expected 4 or 8, or seed=... for a random map"
-                )
-            if self.frozen_probability != FROZEN_PROBABILITY:
-                raise ParameterError(
-                    f"FrozenLake: frozen_probability={self.frozen_probability} has no effect without a seed; add seed=..."
-                )
-        else:
-            integer(self, "size", 2)
-            integer(self, "seed", 0)
+        if self.seed is not None:
             _ = self.tiles
+        elif self.size not in MAPS:
+            raise ParameterError(
+                f"FrozenLake: size={self.size} has no map of its own; expected 4 or 8, or seed=... for a random map"
+            )
+        elif self.frozen_probability != FROZEN_PROBABILITY:
+            raise ParameterError(
+                f"FrozenLake: frozen_probability={self.frozen_probability} has no effect without a seed; add seed=..."
+            )
 
     @cached_property
     def tiles(self) -> np.ndarray:

@@ -1,43 +1,182 @@
-"""Checks that the classes of environments share: each normalizes one parameter, or says whose, expected and found."""
+"""What the parameters of a class may be: declared in the fields of its dataclass, and checked when an instance is made.
 
+height: int = parameter(12, low=4)
+restart_on_hit: bool = parameter(True)
+car_speeds: Any = parameter(None, kind=integers("at least 1", lambda period: period >= 1))
+"""
+
+import dataclasses
 import math
 import numbers
 import operator
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from typing import Any
 
-from pharos.environments.base import Environment
 from pharos.errors import ParameterError
 
 
-def integer(env: Environment, name: str, low: int, high: int | None = None) -> int:
-    """Store parameter `name` of `env` as an int and return it; ParameterError unless low <= value <= high."""
-    value = getattr(env, name)
-    expected = f"expected an integer of at least {low}" if high is None else f"expected an integer from {low} to {high}"
+@dataclass(frozen=True)
+class Kind:
+    """A kind of values beside numbers and truths.
+
+    Attributes:
+        text: how a value is written on the command line, such as "row,column".
+        checked: function(environment, name of the parameter, value) -> the value as it is stored; raises ParameterError.
+    """
+
+    text: str
+    checked: Callable[[Any, str, Any], Any]
+
+
+_DECLARED = "pharos parameter"
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """The values that a parameter may take.
+
+    Attributes:
+        kind: int, float, bool, or a Kind.
+        low, high: of numbers; constants, or functions of the environment.
+        optional: whether None is a value too.
+    """
+
+    kind: type | Kind
+    low: Any = None
+    high: Any = None
+    optional: bool = False
+
+    @property
+    def is_bounded_by_others(self) -> bool:
+        """Whether a bound depends on other parameters, which have to be checked first."""
+        return callable(self.low) or callable(self.high)
+
+    @property
+    def text(self) -> str:
+        """The type, and the range where it is constant: "integer >= 1", "number in [0, 1]", "true or false"."""
+        if self.kind is bool:
+            return "true or false"
+        if isinstance(self.kind, Kind):
+            return self.kind.text
+        name = "integer" if self.kind is int else "number"
+        low, high = (None if callable(bound) else bound for bound in (self.low, self.high))
+        if low is not None and high is not None:
+            return f"{name} in [{low:g}, {high:g}]"
+        return name + (f" >= {low:g}" if low is not None else f" <= {high:g}" if high is not None else "")
+
+    def checked(self, env: Any, name: str, value: Any) -> Any:
+        """The value as it is stored; ParameterError where it is out of range."""
+        if value is None and self.optional:
+            return None
+        low, high = (bound(env) if callable(bound) else bound for bound in (self.low, self.high))
+        if self.kind is int:
+            return _integer(env, name, value, low, high)
+        if self.kind is float:
+            return _number(env, name, value, -math.inf if low is None else low, math.inf if high is None else high)
+        if self.kind is bool:
+            return _truth(env, name, value)
+        assert isinstance(self.kind, Kind)
+        return self.kind.checked(env, name, value)
+
+
+def parameter(default: Any, *, low: Any = None, high: Any = None, kind: type | Kind | None = None) -> Any:
+    """A field of an environment's dataclass, with the values that it may take.
+
+    Args:
+        default: the value when none is given; None as a default is a value that is not checked.
+        low, high: bounds of a number; functions of the environment where they depend on other parameters.
+        kind: int, float, bool, or a Kind; None: the type of the default.
+    """
+    declared = Parameter(kind or type(default), low, high, default is None)
+    return dataclasses.field(default=default, metadata={_DECLARED: declared})
+
+
+def declared_parameters(cls: type) -> dict[str, Parameter]:
+    """Name -> what `parameter` declared for the fields of a class; a subclass that gives another default keeps the declaration."""
+    declared: dict[str, Parameter] = {}
+    for base in reversed(cls.__mro__):
+        for name, field in vars(base).get("__dataclass_fields__", {}).items():
+            if _DECLARED in field.metadata:
+                declared[name] = field.metadata[_DECLARED]
+    return declared
+
+
+def check_parameters(env: Any) -> None:
+    """Check and store the declared parameters of an environment that is being made; ParameterError names the first wrong one."""
+    declared = declared_parameters(type(env))
+    for name in sorted(declared, key=lambda name: declared[name].is_bounded_by_others):
+        store(env, name, declared[name].checked(env, name, getattr(env, name)))
+
+
+def store(env: Any, name: str, value: Any) -> Any:
+    """Set a field of a frozen dataclass while it is being made."""
+    object.__setattr__(env, name, value)
+    return value
+
+
+# Kinds -------------------------------------------------------------------------------------------------------------------
+
+
+def integers(expected: str, allowed: Callable[[int], bool]) -> Kind:
+    """Non-empty tuples of integers, from a number, a sequence, or text such as "1,2,3".
+
+    Args:
+        expected: of each, in words, such as "at least 1".
+        allowed: whether an integer is.
+    """
+
+    def checked(env: Any, name: str, value: Any) -> tuple[int, ...]:
+        try:
+            if isinstance(value, str):
+                values = tuple(int(part) for part in value.split(","))
+            else:
+                values = tuple(map(operator.index, value)) if isinstance(value, Iterable) else (operator.index(value),)
+        except (TypeError, ValueError):
+            values = ()
+        if not values or not all(map(allowed, values)):
+            raise ParameterError(f"{type(env).__name__}: {name}={value!r}; expected integers, each {expected}")
+        return values
+
+    return Kind(f"integers, each {expected}", checked)
+
+
+def _cell(env: Any, name: str, value: Any) -> tuple[int, int]:
+    """A cell inside `env.height` x `env.width`, from (row, column) or text such as "3,2"."""
     try:
-        number = operator.index(value)
-    except TypeError:
-        number = None
-    if number is None or isinstance(value, bool) or number < low or (high is not None and number > high):
-        raise ParameterError(f"{type(env).__name__}: {name}={value!r}; {expected}")
-    return store(env, name, int(number))
+        row, column = (int(part) for part in value.split(",")) if isinstance(value, str) else value
+        inside = 0 <= row < env.height and 0 <= column < env.width and int(row) == row and int(column) == column
+    except (TypeError, ValueError):
+        inside = False
+    if not inside:
+        raise ParameterError(
+            f"{type(env).__name__}: {name} has {value!r}; "
+            f"expected a cell (row, column) inside {env.height} x {env.width}"
+        )
+    return int(row), int(column)
 
 
-def number(env: Environment, name: str, low: float = -math.inf, high: float = math.inf) -> float:
-    """Store parameter `name` of `env` as a float; ParameterError unless finite and low <= value <= high."""
-    value = getattr(env, name)
-    if not is_real(value) or not low <= value <= high:
-        bounds = "" if math.isinf(low) and math.isinf(high) else f" from {low:g} to {high:g}"
-        raise ParameterError(f"{type(env).__name__}: {name}={value!r}; expected a finite number{bounds}")
-    return store(env, name, float(value))
+def _valued_cells(env: Any, name: str, value: Any) -> tuple[tuple[tuple[int, int], float], ...]:
+    """Cells with a number each, from ((row, column), number) pairs or text such as "2,2:0.1; 0,3:0.5"."""
+    pairs: list[tuple[Any, Any]]
+    try:
+        if isinstance(value, str):
+            texts = [part.split(":") for part in value.split(";") if part.strip()]
+            pairs = [(place, float(number)) for place, number in texts]
+        else:
+            pairs = [(place, number) for place, number in value]
+    except (TypeError, ValueError):
+        pairs = [(None, None)]
+    if not all(is_real(number) for _, number in pairs):
+        raise ParameterError(
+            f"{type(env).__name__}: {name}={value!r}; expected ((row, column), value) pairs, "
+            f"or text such as '2,2:0.1; 0,3:0.5'"
+        )
+    return tuple((_cell(env, name, place), float(number)) for place, number in pairs)
 
 
-def truth(env: Environment, name: str) -> bool:
-    """Store parameter `name` of `env` as a bool and return it; ParameterError unless it is True, False, 0 or 1."""
-    value = getattr(env, name)
-    if isinstance(value, str) or value not in (True, False):
-        raise ParameterError(f"{type(env).__name__}: {name}={value!r}; expected True or False")
-    return store(env, name, bool(value))
+CELL = Kind("row,column", _cell)
+VALUED_CELLS = Kind("row,column:value; ...", _valued_cells)
 
 
 def is_real(value: object) -> bool:
@@ -45,22 +184,26 @@ def is_real(value: object) -> bool:
     return isinstance(value, numbers.Real) and not isinstance(value, bool) and math.isfinite(value)
 
 
-def store(env: Environment, name: str, value: Any) -> Any:
-    """Set a field of a frozen dataclass while it is being made."""
-    object.__setattr__(env, name, value)
-    return value
-
-
-def integers(env: Environment, name: str, expected: str, allowed: Callable[[int], bool]) -> tuple[int, ...]:
-    """Store parameter `name` of `env`, a number, a sequence or text such as "1,2,3", as a non-empty tuple of ints."""
-    found = getattr(env, name)
+def _integer(env: Any, name: str, value: Any, low: int | None, high: int | None) -> int:
+    bounds = "" if low is None else f" of at least {low}" if high is None else f" from {low} to {high}"
     try:
-        if isinstance(found, str):
-            values = tuple(int(part) for part in found.split(","))
-        else:
-            values = tuple(map(operator.index, found)) if isinstance(found, Iterable) else (operator.index(found),)
-    except (TypeError, ValueError):
-        values = ()
-    if not values or not all(map(allowed, values)):
-        raise ParameterError(f"{type(env).__name__}: {name}={found!r}; expected integers, each {expected}")
-    return store(env, name, values)
+        number = operator.index(value)
+    except TypeError:
+        number = None
+    outside = number is not None and ((low is not None and number < low) or (high is not None and number > high))
+    if number is None or isinstance(value, bool) or outside:
+        raise ParameterError(f"{type(env).__name__}: {name}={value!r}; expected an integer{bounds}")
+    return int(number)
+
+
+def _number(env: Any, name: str, value: Any, low: float, high: float) -> float:
+    if not is_real(value) or not low <= value <= high:
+        bounds = "" if math.isinf(low) and math.isinf(high) else f" from {low:g} to {high:g}"
+        raise ParameterError(f"{type(env).__name__}: {name}={value!r}; expected a finite number{bounds}")
+    return float(value)
+
+
+def _truth(env: Any, name: str, value: Any) -> bool:
+    if isinstance(value, str) or value not in (True, False):
+        raise ParameterError(f"{type(env).__name__}: {name}={value!r}; expected True or False")
+    return bool(value)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium
 import numpy as np
 
-from pharos.drawing.window import Window
+from pharos.drawing import Window, human, text_drawing
 from pharos.environments import Environment, make, start_distribution
 from pharos.errors import ParameterError, RuleError
 from pharos.observations import Index, SimpleImage, observe
@@ -263,11 +263,7 @@ class GymEnv(gymnasium.Env):
         if self.render_mode is None:
             return None
         if self.render_mode == "ansi":
-            from pharos.drawing.text import text_drawing
-
             return text_drawing(self.environment, self.state)
-        from pharos.drawing.pictures import human
-
         picture = human(self.environment, self.state)
         if self._window is None:
             return picture

@@ -12,6 +12,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
+from pharos.drawing import human
 from pharos.environments import Environment
 from pharos.errors import ParameterError
 from pharos.interaction.gym_env import Simulator, split_options
@@ -100,8 +101,6 @@ class VectorEnv(gymnasium.vector.VectorEnv):
             return None
         if self._rng is None:
             raise gymnasium.error.ResetNeeded(f"{self.environment}: call reset() before render()")
-        from pharos.drawing.pictures import human
-
         return tuple(human(self.environment, state.tolist()) for state in self.states)
 
     def reset(

@@ -5,6 +5,7 @@
 
 from pharos.observations.complex_image import ComplexImage
 from pharos.observations.observation import FunctionObservation, Observation, add_built_in, names, observe, register
+from pharos.observations.rendered import RENDERERS, render, renderers
 from pharos.observations.simple_image import SimpleImage
 from pharos.observations.vector import Index, OneHot, Vector
 
@@ -15,6 +16,7 @@ add_built_in("one_hot", OneHot)
 add_built_in("index", Index)
 
 __all__ = [
+    "RENDERERS",
     "ComplexImage",
     "FunctionObservation",
     "Index",
@@ -25,4 +27,6 @@ __all__ = [
     "names",
     "observe",
     "register",
+    "render",
+    "renderers",
 ]

@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from pharos.drawing.scenery import Scenery, scenery_of
-from pharos.environments import Environment, Layer
+from pharos.drawing import color_of, glyph_of, ground_of, scenery_of, shape_of, sprite_of, sprite_pixels
+from pharos.environments import Environment, Layer, Scenery
 from pharos.errors import ParameterError
 from pharos.observations.drawn import Drawing, num_values
 from pharos.observations.observation import Observation
@@ -47,7 +47,7 @@ class ComplexImage(Observation):
                 f"{self._drawing.rows} x {self._drawing.columns} cells; expected a larger size, such as {natural}"
             )
         ground = np.zeros((*natural, 3))
-        scenery.ground(ground, scenery)
+        ground_of(scenery.ground)(ground, scenery.cell, scenery.margin)
         picture = _scaled(ground, height, width)
         sprite, place, color, keep = _sprite_tables(env, scenery, np.diff(top), np.diff(left))
         if grey:
@@ -121,9 +121,7 @@ def _sprite_tables(
             first = len(images) + count * (row % len(looks))
             sprite[number, row, 1:] = first + count - 1
             sprite[number, row, 1 : 1 + count] = first + np.arange(count)
-        images += [
-            _sprite_image(env.name, name, look, value, scenery) for look in looks for value in range(1, count + 1)
-        ]
+        images += [_sprite_image(name, look, value, scenery) for look in looks for value in range(1, count + 1)]
     place = np.zeros((max(1, len(images)), heights.max() + 1, widths.max() + 1), np.int64)
     pixels: list[np.ndarray] = []
     used = 0
@@ -138,25 +136,14 @@ def _sprite_tables(
     return sprite, place, table[:, :3], keep
 
 
-def _sprite_image(class_name: str, name: str, layer: Layer, value: int, scenery: Scenery) -> np.ndarray:
+def _sprite_image(name: str, layer: Layer, value: int, scenery: Scenery) -> np.ndarray:
     """(h, w, 4): colour 0 .. 255 times cover, and cover 0 .. 1."""
-    from pharos.drawing.pictures import SHAPES, _block, _of_value, shade
-
-    several = np.ndim(layer.color) == 2
-    color: Any = _of_value(layer.color, value, several)
-    rows: Any = scenery.sprites.get(name, layer.sprite)
-    if rows is not None and not isinstance(rows[0], str):
-        rows = _of_value(rows, value, True)
-    if rows is None:
-        shape: Any = SHAPES.get(f"{class_name}.{name}") or SHAPES.get(name, _block)
-        glyph = _of_value(layer.glyph, value, isinstance(layer.glyph, tuple))
-        image = shape(np.array(color, np.float64), 4 * scenery.cell[0], glyph).copy()
+    color = color_of(layer, value)
+    sprite = scenery.sprites.get(name, layer.sprite)
+    if sprite is None:
+        image = shape_of(name, layer)(np.array(color, np.float64), 4 * scenery.cell[0], glyph_of(layer, value)).copy()
     else:
-        image = np.zeros((len(rows), max(map(len, rows)), 4))
-        for y, row in enumerate(rows):
-            for x, letter in enumerate(row):
-                if letter not in ". ":
-                    image[y, x] = (*shade(color, letter), 1.0)
+        image = sprite_pixels(sprite_of(sprite, value), color)
     image[..., :3] *= image[..., 3:]
     return image
 

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pharos.drawing.pictures import NIGHT, image, save_gif
-from pharos.drawing.pictures import render as render_state
+from pharos.drawing import NIGHT, image, save_gif
 from pharos.errors import ParameterError
+from pharos.observations import render as render_state
 
 if TYPE_CHECKING:
     from pharos.environments import State

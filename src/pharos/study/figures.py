@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pharos.environments import classes
 from pharos.study.analysis import IMAGE, REGRETS, VECTOR, Models, mean_curve
 from pharos.study.regression import Fit
 from pharos.study.specification import TABULAR_OBSERVATION
@@ -16,8 +17,7 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
-# Okabe and Ito's colours, which people tell apart whatever their sight
-CLASS_COLORS = {"simple_grid": "#0072B2", "frozen_lake": "#56B4E9", "freeway": "#D55E00", "breakout": "#009E73"}
+# Okabe and Ito's colours, which people tell apart whatever their sight; those of classes stand in their `look`
 MORE_COLORS = ("#CC79A7", "#E69F00", "#F0E442", "#999999")
 OBSERVATION_COLORS = {TABULAR_OBSERVATION: "#009E73", VECTOR: "#0072B2", IMAGE: "#D55E00"}
 CHANCE_MARKERS = {"plain": "o", "random": "^", "sticky": "s"}
@@ -51,9 +51,10 @@ def title(name: str) -> str:
 
 
 def class_color(name: str, names: Sequence[str]) -> str:
-    """The colour of a class of environments among `names`."""
-    others = [other for other in names if other not in CLASS_COLORS]
-    return CLASS_COLORS.get(name) or MORE_COLORS[others.index(name) % len(MORE_COLORS)]
+    """The colour of a class of environments among `names`: its own, or one of MORE_COLORS."""
+    own = {other: cls.look.color for other, cls in classes().items() if cls.look.color is not None}
+    others = [other for other in names if other not in own]
+    return own.get(name) or MORE_COLORS[others.index(name) % len(MORE_COLORS)]
 
 
 def regret_curves(points: "pd.DataFrame", *, by: str = "environment") -> "Figure":

@@ -142,7 +142,7 @@ def _pictures(study: Specification) -> dict[str, bytes]:
     """Instance -> PNG of its start state; environments that draw nothing are left out."""
     from PIL import Image
 
-    from pharos.drawing.pictures import human
+    from pharos.drawing import human
     from pharos.environments import make, start_distribution
     from pharos.errors import PharosError
 

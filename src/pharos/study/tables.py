@@ -267,16 +267,13 @@ def _number(value: Any, exact: bool) -> dict[str, Any]:
 @cache
 def _paper_instances() -> dict[tuple[str, str], tuple[str, int]]:
     """(class, parameters as JSON) -> (class, number of its block in the paper's table)."""
-    from pharos.environments import make, named_instances
+    from pharos.environments import classes, make
 
-    found: dict[tuple[str, str], tuple[str, int]] = {}
-    numbers: dict[str, int] = {}
-    printed = {"simple_grid": 6, "frozen_lake": 2, "freeway": 10, "breakout": 10}
-    for name, (environment, _) in named_instances().items():
-        numbers[environment] = numbers.get(environment, 0) + 1
-        if numbers[environment] <= printed[environment]:
-            found[environment, _key(make(name).parameters)] = (environment, numbers[environment])
-    return found
+    return {
+        (environment, _key(make(f"{environment}/{name}").parameters)): (environment, number)
+        for environment, cls in classes().items()
+        for number, name in enumerate(cls.paper_instances, start=1)
+    }
 
 
 def _key(parameters: Mapping[str, Any]) -> str:
