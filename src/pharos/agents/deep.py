@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from pharos.agents.kinds import AGENTS
 from pharos.errors import MissingExtra, ParameterError, UnknownName
 
 FEATURES = 128
@@ -33,7 +34,7 @@ def algorithm(name: str) -> type:
     path = ALGORITHMS.get(name, name)
     module, colon, cls = path.partition(":")
     if not colon:
-        raise UnknownName("agent", name, ["q_learning", *ALGORITHMS])
+        raise UnknownName("agent", name, AGENTS)
     try:
         return getattr(importlib.import_module(module), cls)
     except ModuleNotFoundError as error:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from pharos.environments import as_tuples
 from pharos.errors import ParameterError
 
 if TYPE_CHECKING:
@@ -79,14 +80,10 @@ def parse_value(text: str) -> Any:
         return words[text.lower()]
     for read in (json.loads, ast.literal_eval):
         try:
-            return _tuples(read(text))
+            return as_tuples(read(text))
         except (ValueError, SyntaxError, MemoryError, RecursionError):
             continue
     return text
-
-
-def _tuples(value: Any) -> Any:
-    return tuple(_tuples(item) for item in value) if isinstance(value, list | tuple) else value
 
 
 _UNITS = {"": 1, "K": 10**3, "M": 10**6, "G": 10**9, "T": 10**12, "KI": 2**10, "MI": 2**20, "GI": 2**30, "TI": 2**40}
@@ -150,23 +147,19 @@ class Target:
         **building: Any,
     ) -> "TabularMDP":
         """The tabular MDP, with chance; `gamma` None stands for 0.99, or 1 with a horizon. `building` as for `space`."""
-        from pharos.mdp import random_actions, sticky_actions
+        from pharos.experiments import ChanceSetting
 
+        chance = ChanceSetting(sticky, random)
         if self.is_imported:
             mdp = self._imported(horizon)
-            mdp = mdp if gamma is None else mdp.with_gamma(gamma)
-            mdp = sticky_actions(mdp, sticky) if sticky else mdp
-            return random_actions(mdp, random) if random else mdp
+            return chance.of(mdp if gamma is None else mdp.with_gamma(gamma))
         space = self.space(**building)
         if space.environment is None:
             raise ParameterError(
                 f"{self.text}: pharos does not know the class {space.manifest['class']} of this environment, so not its "
                 f"rewards; name it as module:Class instead of its folder"
             )
-        mdp = space.mdp(gamma=discount(gamma, horizon)).with_horizon(horizon)
-        if sticky:
-            mdp = sticky_actions(mdp, sticky)
-        return random_actions(mdp, random) if random else mdp
+        return chance.of(space.mdp(gamma=discount(gamma, horizon)).with_horizon(horizon))
 
     @property
     def is_imported(self) -> bool:

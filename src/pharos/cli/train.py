@@ -71,12 +71,13 @@ def train(
 ) -> None:
     """Train an agent and measure the exact regret of its policy on the way."""
     env = parse_environment(target, parameters)
+    from pharos.agents import agent_kind
     from pharos.agents import hyperparameters as hyperparameters_of
     from pharos.experiments import train as learn
 
     given = parse_parameters(hyperparameter)
     if table is not None:
-        seen = "index" if agent == "q_learning" else observation
+        seen = agent_kind(agent).observation(observation)
         given = hyperparameters_of(agent, env.name, seen, given, table=table)
 
     with progress_bar("training", steps) as show:

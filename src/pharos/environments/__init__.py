@@ -14,7 +14,16 @@ from pharos.environments.catalog import (
 from pharos.environments.freeway import Freeway
 from pharos.environments.frozen_lake import FrozenLake
 from pharos.environments.look import Color, Ground, Layer, Look, Margin, Scenery, Shape, Sprite
-from pharos.environments.parameters import CELL, VALUED_CELLS, Kind, Parameter, declared_parameters, integers, parameter
+from pharos.environments.parameters import (
+    CELL,
+    VALUED_CELLS,
+    Kind,
+    Parameter,
+    as_tuples,
+    declared_parameters,
+    integers,
+    parameter,
+)
 from pharos.environments.simple_grid import SimpleGrid
 
 __all__ = [
@@ -37,6 +46,7 @@ __all__ = [
     "SimpleGrid",
     "Sprite",
     "State",
+    "as_tuples",
     "classes",
     "declared_parameters",
     "imported",

@@ -15,6 +15,7 @@ from types import ModuleType
 from typing import Any
 
 from pharos.environments.base import Environment
+from pharos.environments.parameters import as_tuples
 from pharos.errors import ParameterError, UnknownName
 
 BUILT_IN = (  # file:class, in the order in which they are listed
@@ -60,7 +61,7 @@ def make(name: str, **parameters: Any) -> Environment:
     for parameter in parameters:
         if parameter not in known:
             raise UnknownName(f"parameter of {class_name}", parameter, known)
-    return cls(**{**defaults, **parameters})
+    return cls(**{**defaults, **{name: as_tuples(value) for name, value in parameters.items()}})
 
 
 def list_environments() -> list[str]:

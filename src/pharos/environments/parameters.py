@@ -207,3 +207,8 @@ def _truth(env: Any, name: str, value: Any) -> bool:
     if isinstance(value, str) or value not in (True, False):
         raise ParameterError(f"{type(env).__name__}: {name}={value!r}; expected True or False")
     return bool(value)
+
+
+def as_tuples(value: Any) -> Any:
+    """Lists as tuples, all the way down: parameters as JSON or YAML writes them become those of a class."""
+    return tuple(as_tuples(item) for item in value) if isinstance(value, list | tuple) else value

@@ -1,20 +1,25 @@
 """Experiments: an agent trained on a task, its policies evaluated exactly, and the result written down."""
 
 from pharos.experiments.bootstrap import bootstrap_interval
+from pharos.experiments.config import ChanceSetting, Horizon, RunConfig, run_id
 from pharos.experiments.evaluation import Evaluation, evaluate_agent
 from pharos.experiments.loading import load_agent
 from pharos.experiments.regret import ReferenceValues, RegretCurve, cumulative_expected_regret, regret
 from pharos.experiments.results import read_curve, read_record
-from pharos.experiments.task import Task
+from pharos.experiments.task import Task, TaskValues
 from pharos.experiments.train import TrainingResult, train, train_config
 from pharos.experiments.tuning import SPACES, TuningResult, tune
 
 __all__ = [
     "SPACES",
+    "ChanceSetting",
     "Evaluation",
+    "Horizon",
     "ReferenceValues",
     "RegretCurve",
+    "RunConfig",
     "Task",
+    "TaskValues",
     "TrainingResult",
     "TuningResult",
     "bootstrap_interval",
@@ -24,6 +29,7 @@ __all__ = [
     "read_curve",
     "read_record",
     "regret",
+    "run_id",
     "train",
     "train_config",
     "tune",

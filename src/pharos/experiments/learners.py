@@ -4,15 +4,46 @@ import contextlib
 import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from pharos.agents import QLearning
 from pharos.errors import FileFormatError
+from pharos.experiments import results
+from pharos.experiments.config import RunConfig
 from pharos.experiments.task import Task
 
 AtPoint = Callable[[int, int, float], dict[str, Any]]
+"""at_point(steps, finished episodes, sum of their returns) -> row of the curve."""
+
+
+class Learner(Protocol):
+    """What a run needs of an agent that learns."""
+
+    agent: Any
+
+    def learn(self, points: list[int], at_point: AtPoint) -> None:
+        """Learn until the last of `points`, and call `at_point` at each."""
+
+    def save(self, folder: Path) -> None:
+        """Write what `load` needs."""
+
+    def load(self, folder: Path) -> None:
+        """Go on from what `save` wrote."""
+
+    def publish(self, folder: Path) -> None:
+        """Write what was learnt into the folder of the run, as `load_agent` reads it."""
+
+
+def make_learner(
+    config: RunConfig, task: Task, hyperparameters: dict[str, Any], tensorboard: Path | None = None
+) -> Learner:
+    """The learner of a run, with all its hyperparameters."""
+    if config.is_tabular:
+        return Tabular(task, hyperparameters, config.steps, config.seed)
+    logs = None if tensorboard is None else str(tensorboard)
+    return Deep(config.agent, task, hyperparameters, config.steps, config.seed, logs)
 
 
 class Tabular:
@@ -35,6 +66,10 @@ class Tabular:
         """From plain arrays."""
         with _said_to_be_damaged(folder), np.load(folder / "q_learning.npz", allow_pickle=False) as stored:
             self.agent.restore({name: stored[name] for name in stored.files})
+
+    def publish(self, folder: Path) -> None:
+        """The greedy policy, as policy.npy."""
+        results.write_policy(folder, self.agent.policy_table())
 
 
 class Deep:
@@ -92,6 +127,10 @@ class Deep:
                 with np.load(folder / "replay.npz", allow_pickle=False) as arrays:
                     _restore_buffer(buffer, arrays)
         model.set_random_seed(model.seed + model.num_timesteps)
+
+    def publish(self, folder: Path) -> None:
+        """The network, in the folder agent."""
+        self.save(folder / "agent")
 
 
 @contextlib.contextmanager

@@ -1,13 +1,12 @@
 """The agent that a finished run has trained, read back for evaluation and for drawing."""
 
 import os
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from pharos.environments import make
 from pharos.errors import FileFormatError
 from pharos.experiments import results as _results
+from pharos.experiments.config import RunConfig
 from pharos.experiments.task import Task
 
 
@@ -24,36 +23,19 @@ def load_agent(folder: str | os.PathLike) -> tuple[Task, Any]:
 
     folder = Path(folder)
     record = _results.read_record(folder)
-    config = record["config"]
+    config = RunConfig.from_dict(record["config"])
     if record.get("status") != "finished":
         raise FileFormatError(
             f"{folder}: the run is {record.get('status')}; the same command that began it finishes it"
         )
-    task = _task_of(config)
-    if config["agent"] == "q_learning":
+    task = config.task()
+    if config.is_tabular:
         try:
             return task, np.load(folder / "policy.npy", allow_pickle=False)
         except (OSError, ValueError, EOFError) as error:
             raise FileFormatError(f"{folder / 'policy.npy'}: cannot be read: {error}") from error
     from pharos.experiments.learners import Deep
 
-    learner = Deep(config["agent"], task, record["hyperparameters"], config["steps"], config["seed"], None)
+    learner = Deep(config.agent, task, record["hyperparameters"], config.steps, config.seed, None)
     learner.load(folder / "agent")
     return task, learner.agent
-
-
-def _task_of(config: Mapping[str, Any]) -> Task:
-    chance = config["chance"]
-    return Task(
-        make(config["environment"], **{name: _tuples(value) for name, value in config["parameters"].items()}),
-        sticky=chance["sticky"],
-        random=chance["random"],
-        observation=config["observation"],
-        observation_options=dict(config["observation_options"]),
-        gamma=config["gamma"],
-        horizon=config["horizon"],
-    )
-
-
-def _tuples(value: Any) -> Any:
-    return tuple(_tuples(item) for item in value) if isinstance(value, list) else value

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pharos.errors import FileFormatError, MissingExtra
+from pharos.experiments.config import run_id
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -31,9 +32,7 @@ COLUMNS = {
 
 def identifier(config: Mapping[str, Any]) -> str:
     """The name of a run: a digest of its configuration, the same on every machine."""
-    import xxhash
-
-    return xxhash.xxh3_64_hexdigest(json.dumps(config, sort_keys=True, separators=(",", ":")).encode())
+    return run_id(config)
 
 
 def versions() -> dict[str, str]:

@@ -1,27 +1,49 @@
 """A task: an environment with chance, an observation, and the setting in which values and returns are measured."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from pharos.environments import Environment, make
 from pharos.errors import ParameterError
+from pharos.experiments.config import ChanceSetting, Horizon
+from pharos.experiments.regret import ReferenceValues
+from pharos.mdp import TabularMDP
+from pharos.solvers import Solution, uniform_value, value_iteration, worst_value
+from pharos.state_space import StateSpace, build
 
-if TYPE_CHECKING:
-    from pharos.experiments.regret import ReferenceValues
-    from pharos.mdp import TabularMDP
-    from pharos.solvers import Solution
-    from pharos.state_space import StateSpace
+
+@dataclass(frozen=True)
+class TaskValues:
+    """Values at the start of a task, which are expensive to compute and the same for every run on it.
+
+    Attributes:
+        reference: of the optimal, the uniform and the worst policy.
+        return_range: the lowest and the highest return that an episode can have.
+    """
+
+    reference: ReferenceValues
+    return_range: tuple[float, float]
+
+    @staticmethod
+    def from_dict(entry: Mapping[str, Any]) -> "TaskValues":
+        """Read what `to_dict` gave."""
+        low, high = entry["return_range"]
+        return TaskValues(ReferenceValues(**entry["reference"]), (low, high))
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able."""
+        return {"reference": asdict(self.reference), "return_range": list(self.return_range)}
 
 
 @dataclass(frozen=True, eq=False)
 class Task:
     """What an agent learns, and what its policies are measured against.
 
-    Value and return are always in the same setting: undiscounted returns (gamma = 1) of episodes of at most `horizon` steps,
-    the time limit of the environment, unless told otherwise. With `horizon=None` values are discounted without a limit, while
-    the episodes that an agent sees still end at the environment's time limit.
+    Value and return are always in the same setting: undiscounted returns (gamma = 1) of episodes of at most `horizon`
+    steps, the time limit of the environment, unless told otherwise. With `horizon=None` values are discounted without a
+    limit, while the episodes that an agent sees still end at the environment's time limit.
 
     Attributes:
         env: the environment.
@@ -29,7 +51,9 @@ class Task:
         observation, observation_options: what the agent sees.
         previous_action: whether the agent also sees the previously executed action.
         gamma: discount of values and returns.
-        horizon: number of steps of an episode in values and returns; "default": the environment's time limit.
+        horizon: number of steps of an episode in values and returns, as `Horizon.of` reads it; "default": the environment's
+            time limit.
+        values: at the start, where they are known already; None: solved for when they are needed.
     """
 
     env: Environment
@@ -39,13 +63,13 @@ class Task:
     observation_options: Mapping[str, Any] = field(default_factory=dict)
     previous_action: bool = False
     gamma: float = 1.0
-    horizon: int | str | None = "default"
+    horizon: Horizon | int | str | None = "default"
+    values: TaskValues | None = None
 
     def __post_init__(self) -> None:
         if isinstance(self.env, str):
             raise ParameterError(f"env is {self.env!r}; expected an Environment: use Task.of")
-        if self.horizon == "default":
-            object.__setattr__(self, "horizon", int(self.env.max_episode_steps))
+        object.__setattr__(self, "horizon", Horizon.of(self.horizon).steps(self.env))
         if self.horizon is None and self.gamma >= 1:
             raise ParameterError(
                 "gamma is 1 without a horizon, so a value may be infinite; give a horizon, or gamma < 1"
@@ -61,9 +85,19 @@ class Task:
         return Task(environment, **options)
 
     @property
+    def chance(self) -> ChanceSetting:
+        """The chance that is added to the environment."""
+        return ChanceSetting(self.sticky, self.random)
+
+    @property
+    def horizon_steps(self) -> int | None:
+        """Steps of an episode in values and returns; None for discounted values without a horizon."""
+        return self.horizon  # type: ignore[return-value]  # __post_init__ has resolved it
+
+    @property
     def time_limit(self) -> int:
         """Steps after which the episodes that an agent sees end."""
-        return int(self.horizon) if self.horizon is not None else int(self.env.max_episode_steps)
+        return int(self.env.max_episode_steps) if self.horizon_steps is None else self.horizon_steps
 
     @property
     def conventions(self) -> dict[str, Any]:
@@ -84,68 +118,62 @@ class Task:
         return {**options, "space": self.space} if self.observation == "index" else options
 
     @cached_property
-    def space(self) -> "StateSpace":
+    def space(self) -> StateSpace:
         """The state space, built or from the cache."""
-        from pharos.state_space import build
-
         return build(self.env)
 
     @cached_property
-    def mdp(self) -> "TabularMDP":
+    def mdp(self) -> TabularMDP:
         """The tabular MDP, with chance, gamma and horizon."""
-        from pharos.mdp import random_actions, sticky_actions
+        return self.chance.of(self._mdp_without_chance)
 
-        mdp = self.space.mdp(gamma=self.gamma).with_horizon(self.horizon)  # type: ignore[arg-type]
-        if self.sticky:
-            mdp = sticky_actions(mdp, self.sticky)
-        return random_actions(mdp, self.random) if self.random else mdp
+    @property
+    def _mdp_without_chance(self) -> TabularMDP:
+        return self.space.mdp(gamma=self.gamma).with_horizon(self.horizon_steps)
 
     @cached_property
-    def optimal(self) -> "Solution":
+    def optimal(self) -> Solution:
         """Optimal values."""
-        from pharos.solvers import value_iteration
-
         return value_iteration(self.mdp)
 
     @cached_property
-    def uniform(self) -> "Solution":
+    def uniform(self) -> Solution:
         """Values of the uniformly random policy."""
-        from pharos.solvers import uniform_value
-
         return uniform_value(self.mdp)
 
     @cached_property
-    def worst(self) -> "Solution":
+    def worst(self) -> Solution:
         """Values of the worst policy."""
-        from pharos.solvers import worst_value
-
         return worst_value(self.mdp)
 
-    @cached_property
-    def reference(self) -> "ReferenceValues":
-        """What regret is measured against: the values at the start of the optimal, the uniform and the worst policy."""
-        from pharos.experiments.regret import ReferenceValues
-        from pharos.solvers import uniform_value, value_iteration, worst_value
+    @property
+    def reference(self) -> ReferenceValues:
+        """What regret is measured against: values at the start of the optimal, the uniform and the worst policy."""
+        return self._solved_reference if self.values is None else self.values.reference
 
+    @cached_property
+    def _solved_reference(self) -> ReferenceValues:
         mdp = self._episodes(self.mdp)
-        found = [solve(mdp) for solve in (value_iteration, uniform_value, worst_value)]
-        error = max(solution.error_bound for solution in found)
-        optimal, uniform, worst = (float(solution.value_at_start) for solution in found)
+        solutions = [solve(mdp) for solve in (value_iteration, uniform_value, worst_value)]
+        error = max(solution.error_bound for solution in solutions)
+        optimal, uniform, worst = (float(solution.value_at_start) for solution in solutions)
         return ReferenceValues(optimal, uniform, worst, error)
 
-    @cached_property
+    @property
     def return_range(self) -> tuple[float, float]:
         """The lowest and the highest return that an episode can have, whatever is executed."""
-        from pharos.solvers import value_iteration, worst_value
+        return self._solved_return_range if self.values is None else self.values.return_range
 
-        if not self.sticky and not self.random and len(self.mdp.start_states) == 1:
-            known = self.reference
-            return known.worst - known.error_bound, known.optimal + known.error_bound
-        plain = self._episodes(self.space.mdp(gamma=self.gamma).with_horizon(self.horizon))  # type: ignore[arg-type]
+    @cached_property
+    def _solved_return_range(self) -> tuple[float, float]:
+        if not self.chance and len(self.mdp.start_states) == 1:
+            reference = self.reference
+            return reference.worst - reference.error_bound, reference.optimal + reference.error_bound
+        plain = self._episodes(self._mdp_without_chance)
         low, high = worst_value(plain), value_iteration(plain)
         starts = plain.start_states
         return float(low.v[starts].min() - low.error_bound), float(high.v[starts].max() + high.error_bound)
 
-    def _episodes(self, mdp: "TabularMDP") -> "TabularMDP":
-        """Those states that an episode can meet: of a Freeway of a million, some thousand."""
-        return mdp if self.horizon is None else mdp.within(int(self.horizon))
+    def _episodes(self, mdp: TabularMDP) -> TabularMDP:
+        """The states that an episode can meet: of a Freeway of a million, some thousand."""
+        return mdp if self.horizon_steps is None else mdp.within(self.horizon_steps)

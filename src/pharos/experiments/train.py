@@ -16,14 +16,17 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
-from pharos.agents.hyperparameters import hyperparameters as hyperparameters_of
+from pharos.agents import agent_kind
+from pharos.agents import hyperparameters as hyperparameters_of
 from pharos.environments import Environment, make
 from pharos.errors import ParameterError
 from pharos.experiments import results as _results
+from pharos.experiments.config import RunConfig
 from pharos.experiments.evaluation import evaluate_agent
-from pharos.experiments.task import Task
+from pharos.experiments.learners import Learner, make_learner
+from pharos.experiments.task import Task, TaskValues
 
 Progress = Callable[[int, int, Mapping[str, Any]], None]
 CHECKPOINT_SECONDS = 10.0
@@ -87,19 +90,17 @@ def train(
         ParameterError: an option is wrong, or `out` holds another run. UnknownName: no such name; the nearest is suggested.
         MissingExtra: Stable-Baselines3 is not installed.
     """
-    env = make(environment, **parameters) if isinstance(environment, str) else environment
-    tabular = agent == "q_learning"
-    given = Task(
-        env,
+    task = Task(
+        make(environment, **parameters) if isinstance(environment, str) else environment,
         sticky=sticky,
         random=random,
-        observation="index" if tabular else observation,
+        observation=agent_kind(agent).observation(observation),
         observation_options=dict(observation_options or {}),
         gamma=gamma,
         horizon=horizon,
     )
     return train_on(
-        given,
+        task,
         agent,
         steps=steps,
         seed=seed,
@@ -124,66 +125,40 @@ def train_on(
     progress: Progress | None = None,
 ) -> TrainingResult:
     """As `train`, on a task, which is built and solved once for all runs on it."""
-    env = task.env
-    if hyperparameters is None or isinstance(hyperparameters, Mapping):
-        given = dict(hyperparameters or {})
-    else:
-        given = hyperparameters_of(agent, env.name, str(task.observation), table=Path(hyperparameters))
-    config = {
-        "environment": env.name,
-        "parameters": json.loads(json.dumps(env.parameters)),
-        "chance": {"sticky": task.sticky, "random": task.random},
-        "observation": task.observation,
-        "observation_options": dict(task.observation_options),
-        "agent": agent,
-        "hyperparameters": given,
-        "steps": steps,
-        "seed": seed,
-        "gamma": task.gamma,
-        "horizon": task.horizon,
-        "evaluation_interval": evaluation_interval or max(1, steps // 100),
-    }
+    if hyperparameters is not None and not isinstance(hyperparameters, Mapping):
+        table = Path(hyperparameters)
+        hyperparameters = hyperparameters_of(agent, task.env.name, str(task.observation), table=table)
+    config = RunConfig.of_task(
+        task,
+        agent,
+        steps=steps,
+        seed=seed,
+        evaluation_interval=evaluation_interval,
+        hyperparameters=hyperparameters,
+    )
     return _run(config, task, None if out is None else Path(out), tensorboard, progress)
 
 
 def train_config(
-    config: Mapping[str, Any], folder: str | os.PathLike, progress: Progress | None = None
+    config: RunConfig | Mapping[str, Any],
+    folder: str | os.PathLike,
+    progress: Progress | None = None,
+    *,
+    values: TaskValues | None = None,
 ) -> TrainingResult:
-    """Train as a configuration says, the `config` of a run.json or of a study; results go into `folder`."""
-    chance = config["chance"]
-    parameters = {name: _tuples(value) for name, value in config["parameters"].items()}
-    task = Task(
-        make(config["environment"], **parameters),
-        sticky=chance["sticky"],
-        random=chance["random"],
-        observation=config["observation"],
-        observation_options=dict(config["observation_options"]),
-        gamma=config["gamma"],
-        horizon=config["horizon"],
-    )
-    return _run(dict(config), task, Path(folder), False, progress)
+    """Train as a configuration says, the `config` of a run.json or of a study; results go into `folder`.
 
-
-def _tuples(value: Any) -> Any:
-    return tuple(_tuples(item) for item in value) if isinstance(value, list) else value
+    Args:
+        values: at the start of the task, where they are known already.
+    Raises:
+        FileFormatError: it is not the configuration of a run. Else as `train`.
+    """
+    if not isinstance(config, RunConfig):
+        config = RunConfig.from_dict(config)
+    return _run(config, config.task(values), Path(folder), False, progress)
 
 
 # One run ----------------------------------------------------------------------------------------------------------------
-
-
-class Learner(Protocol):
-    """What a run needs of an agent that learns."""
-
-    agent: Any
-
-    def learn(self, points: list[int], at_point: Callable[[int, int, float], dict[str, Any]]) -> None:
-        """Learn until the last of `points`; at each call at_point(steps, finished episodes, sum of their returns) -> row."""
-
-    def save(self, folder: Path) -> None:
-        """Write what `load` needs."""
-
-    def load(self, folder: Path) -> None:
-        """Go on from what `save` wrote."""
 
 
 @dataclass
@@ -245,30 +220,32 @@ class _Curve:
 
 
 def _run(
-    config: dict[str, Any], task: Task, folder: Path | None, tensorboard: bool, progress: Progress | None
+    config: RunConfig, task: Task, folder: Path | None, tensorboard: bool, progress: Progress | None
 ) -> TrainingResult:
-    steps, interval = config["steps"], config["evaluation_interval"]
-    for name, value in (("steps", steps), ("evaluation_interval", interval)):
-        if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-            raise ParameterError(f"{name} is {value!r}; expected a whole number of at least 1")
-    if tensorboard and (folder is None or config["agent"] == "q_learning"):
+    if tensorboard and (folder is None or config.is_tabular):
         raise ParameterError(
-            f"TensorBoard's logs were asked for, with {config['agent']} and {'a' if folder else 'no'} folder for results; "
+            f"TensorBoard's logs were asked for, with {config.agent} and {'a' if folder else 'no'} folder for results; "
             f"expected an algorithm of Stable-Baselines3 and a folder (out)"
         )
-    id, began = _results.identifier(config), time.perf_counter()
-    record: dict[str, Any] = {"format": _results.FORMAT, "id": id, "config": config, "versions": _results.versions()}
+    began = time.perf_counter()
+    entry = config.to_dict()
+    record: dict[str, Any] = {
+        "format": _results.FORMAT,
+        "id": config.id,
+        "config": entry,
+        "versions": _results.versions(),
+    }
     spent = 0.0
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
-        done = _finished(folder, config)
+        done = _finished(folder, entry)
         if done is not None:
             return done
-    chosen = hyperparameters_of(config["agent"], task.env.name, str(config["observation"]), config["hyperparameters"])
-    logs = str(folder / "tensorboard") if folder is not None and tensorboard else None
-    learner = _learner(config["agent"], task, chosen, steps, config["seed"], logs)
+    chosen = hyperparameters_of(config.agent, config.environment, config.observation, config.hyperparameters)
+    logs = folder / "tensorboard" if folder is not None and tensorboard else None
+    learner = make_learner(config, task, chosen, logs)
     curve = _Curve(task)
-    checkpoint = None if folder is None else _Checkpoint(folder / "checkpoint", id)
+    checkpoint = None if folder is None else _Checkpoint(folder / "checkpoint", config.id)
     if folder is not None and checkpoint is not None:
         restored = checkpoint.restore(learner)
         if restored is not None:
@@ -277,7 +254,7 @@ def _run(
         _results.write_record(folder, record)
     if not curve.rows:
         curve.add(0, 0, 0.0, learner.agent)
-    start = curve.rows[-1]["step"]
+    start, steps, interval = curve.rows[-1]["step"], config.steps, config.evaluation_interval
     points = [point for point in [*range(interval, steps, interval), steps] if point > start]
 
     def at_point(step: int, episodes: int, returns: float) -> dict[str, Any]:
@@ -299,15 +276,12 @@ def _run(
     seconds = spent + time.perf_counter() - began
     result = curve.result()
     if folder is not None:
-        if config["agent"] == "q_learning":
-            _results.write_policy(folder, learner.agent.policy_table())
-        else:
-            learner.save(folder / "agent")
+        learner.publish(folder)
         _results.write_curve(folder, curve.rows)
         _results.write_record(folder, {**record, "status": "finished", "seconds": seconds, "result": result})
         shutil.rmtree(folder / "checkpoint", ignore_errors=True)
     rows = [{name: row[name] for name in _results.COLUMNS} for row in curve.rows]
-    return TrainingResult(config, result, rows, learner.agent, folder, seconds)
+    return TrainingResult(entry, result, rows, learner.agent, folder, seconds)
 
 
 def _finished(folder: Path, config: Mapping[str, Any]) -> TrainingResult | None:
@@ -324,14 +298,6 @@ def _finished(folder: Path, config: Mapping[str, Any]) -> TrainingResult | None:
         return None
     rows = _results.read_curve(folder).to_dict("records")
     return TrainingResult(record["config"], record["result"], rows, None, folder, record["seconds"])
-
-
-def _learner(agent: str, task: Task, chosen: dict[str, Any], steps: int, seed: int, tensorboard: str | None) -> Learner:
-    from pharos.experiments import learners as _learners
-
-    if agent == "q_learning":
-        return _learners.Tabular(task, chosen, steps, seed)
-    return _learners.Deep(agent, task, chosen, steps, seed, tensorboard)
 
 
 class _Checkpoint:

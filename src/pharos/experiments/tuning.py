@@ -21,12 +21,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from pharos.agents import agent_kind
+from pharos.agents import hyperparameters as hyperparameters_of
 from pharos.agents.deep import algorithm
-from pharos.agents.hyperparameters import hyperparameters as hyperparameters_of
 from pharos.agents.q_learning import DEFAULTS as Q_LEARNING
 from pharos.environments import Environment, make
-from pharos.errors import MissingExtra, ParameterError, UnknownName
+from pharos.errors import MissingExtra, ParameterError
 from pharos.experiments import results as _results
+from pharos.experiments.config import ChanceSetting
 from pharos.experiments.task import Task
 from pharos.experiments.train import train_on
 
@@ -142,12 +144,10 @@ def tune(
     seeds = [int(seed) for seed in seeds]
     if not seeds or trials < 1:
         raise ParameterError(f"{len(seeds)} seeds and {trials} trials; expected at least one of each")
-    seen = "index" if agent == "q_learning" else observation
+    seen = agent_kind(agent).observation(observation)
     kinds = _checked_chances(chances, sticky, random)
     tasks = [
-        Task(each, sticky=kind["sticky"], random=kind["random"], observation=seen)
-        for each in instances
-        for kind in kinds
+        Task(each, sticky=kind.sticky, random=kind.random, observation=seen) for each in instances for kind in kinds
     ]
     config = {
         "agent": agent,
@@ -155,7 +155,7 @@ def tune(
         "observation": seen,
         "steps": steps,
         "seeds": seeds,
-        "chance": kinds[0] if len(kinds) == 1 else kinds,
+        "chance": kinds[0].to_dict() if len(kinds) == 1 else [kind.to_dict() for kind in kinds],
         "space": {name: list(choices) for name, choices in searched.items()},
         "search_seed": search_seed,
     }
@@ -249,17 +249,14 @@ def _score(
 
 def _checked_chances(
     chances: Sequence[Mapping[str, float]] | None, sticky: float, random: float
-) -> list[dict[str, float]]:
+) -> list[ChanceSetting]:
     if chances is None:
-        return [{"sticky": sticky, "random": random}]
+        return [ChanceSetting(sticky, random)]
     if sticky or random or not chances:
         raise ParameterError(
             f"chances are {list(chances)}, sticky is {sticky} and random {random}; expected one or the other"
         )
-    for chance in chances:
-        if unknown := set(chance) - {"sticky", "random"}:
-            raise UnknownName("kind of chance", sorted(unknown)[0], ("sticky", "random"))
-    return [{"sticky": float(each.get("sticky", 0.0)), "random": float(each.get("random", 0.0))} for each in chances]
+    return [ChanceSetting.from_dict({name: float(value) for name, value in each.items()}) for each in chances]
 
 
 def _checked_space(agent: str, space: Mapping[str, Sequence[Any]] | None) -> dict[str, tuple[Any, ...]]:
@@ -288,7 +285,7 @@ def _suggested(trial: Any, name: str, choices: tuple[Any, ...]) -> Any:
 
 def _default(agent: str, name: str) -> Any:
     """What the agent itself takes for a hyperparameter that the table leaves out; None: it says nothing."""
-    if agent == "q_learning":
+    if agent_kind(agent).is_tabular:
         return Q_LEARNING.get(name)
     parameter = inspect.signature(algorithm(agent)).parameters.get(name)
     return None if parameter is None or parameter.default is parameter.empty else parameter.default

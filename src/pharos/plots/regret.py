@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pharos.agents import agent_kind
 from pharos.errors import ParameterError
 from pharos.experiments import bootstrap_interval, read_curve, read_record
 from pharos.plots.style import COLORS, INK, figure, styled, thousands
@@ -80,7 +81,7 @@ def _groups(folders: Sequence[str | os.PathLike]) -> dict[str, list[tuple[dict[s
 def _label(config: dict[str, Any], configs: list[dict[str, Any]]) -> str:
     """What tells this group of runs from the others."""
     parts = [config["agent"]]
-    if config["agent"] != "q_learning":
+    if not agent_kind(config["agent"]).is_tabular:
         parts.append(config["observation"].replace("_", " "))
     for key in ("environment", "parameters", "chance", "steps", "hyperparameters"):
         if len({json.dumps(other[key], sort_keys=True) for other in configs}) > 1:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xxhash
 
-from pharos.environments import Environment, State, start_distribution
+from pharos.environments import Environment, State, as_tuples, start_distribution
 from pharos.errors import (
     ParameterError,
     StateSpaceCorrupted,
@@ -308,7 +308,7 @@ def _environment_of(folder: Path, manifest: dict[str, Any]) -> Environment | Non
     if cls is None:
         return None
     try:
-        env = cls(**{name: _tuples(value) for name, value in manifest["parameters"].items()})
+        env = cls(**{name: as_tuples(value) for name, value in manifest["parameters"].items()})
     except (TypeError, ParameterError) as error:
         raise StateSpaceMismatch(
             f"{folder}: its parameters are not those of this pharos' {manifest['environment']}: {error}; build again"
@@ -320,7 +320,3 @@ def _environment_of(folder: Path, manifest: dict[str, Any]) -> Environment | Non
                 f"{folder}: {key} of {env.name} is {manifest[key]} in the folder and {found[key]} in this pharos; build again"
             )
     return env
-
-
-def _tuples(value: Any) -> Any:
-    return tuple(_tuples(item) for item in value) if isinstance(value, list) else value

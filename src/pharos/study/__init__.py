@@ -1,5 +1,6 @@
 """From hardness and regret to the paper's models, figures and tables."""
 
+from pharos.experiments import run_id
 from pharos.study.analysis import (
     Comparison,
     Models,
@@ -17,7 +18,7 @@ from pharos.study.findings import findings
 from pharos.study.paper import paper_regressions, paper_returns
 from pharos.study.regression import Fit, aggregate_r_squared, fit, fit_models, leave_one_class_out_r_squared
 from pharos.study.report import StudyReport, report
-from pharos.study.specification import Run, Specification, presets, run_id, specification
+from pharos.study.specification import Run, Specification, presets, specification
 from pharos.study.statistics import Estimate, interquartile_mean, stratified_interval
 from pharos.study.tables import cells, curves, hardness_table, paper_instance, table
 

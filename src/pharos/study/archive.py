@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, Any
 import yaml
 
 from pharos.errors import FileFormatError, ParameterError
+from pharos.experiments import run_id
 from pharos.study import worker as _worker
 from pharos.study.execution import claim, opened
-from pharos.study.specification import Source, Specification, parse, run_id
+from pharos.study.specification import Source, Specification, parse
 
 if TYPE_CHECKING:
     import pyarrow as pa

@@ -92,14 +92,10 @@ def opened(source: Source, folder: str | os.PathLike | None = None) -> tuple[Spe
 
 def train(config: Mapping[str, Any], folder: Path) -> None:
     """The runner of studies: trains as `config` says and writes run.json and curve.parquet into `folder`."""
-    from pharos.experiments import train_config
-    from pharos.experiments.train import _run
+    from pharos.experiments import TaskValues, train_config
 
-    known = _values.kept(config)
-    if known is None:
-        train_config(config, folder)
-    else:
-        _run(dict(config), _values.with_values(_values.task_of(config), known), folder, False, None)
+    values = _values.kept(config)
+    train_config(config, folder, values=None if values is None else TaskValues.from_dict(values))
 
 
 def prepare_instance(config: Mapping[str, Any]) -> None:

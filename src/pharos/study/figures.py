@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pharos.agents import TABULAR_OBSERVATION
 from pharos.environments import classes
 from pharos.study.analysis import IMAGE, REGRETS, VECTOR, Models, mean_curve
 from pharos.study.regression import Fit
-from pharos.study.specification import TABULAR_OBSERVATION
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -143,7 +143,7 @@ def _pictures(study: Specification) -> dict[str, bytes]:
     from PIL import Image
 
     from pharos.drawing import human
-    from pharos.environments import make, start_distribution
+    from pharos.environments import start_distribution
     from pharos.errors import PharosError
 
     pictures = {}
@@ -151,7 +151,7 @@ def _pictures(study: Specification) -> dict[str, bytes]:
         if run.instance in pictures:
             continue
         try:
-            environment = make(run.config["environment"], **_table._arguments(run.config["parameters"]))
+            environment = run.configuration.make_environment()
             image = Image.fromarray(human(environment, start_distribution(environment)[0][0], cell=16))
         except PharosError:
             continue

@@ -23,7 +23,10 @@ from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any
 
+from pharos.agents import AGENTS, TABULAR_OBSERVATION, agent_kind
+from pharos.environments import as_tuples
 from pharos.errors import MissingExtra, ParameterError, UnknownName
+from pharos.experiments import ChanceSetting, Horizon, RunConfig
 from pharos.study.regression import MEASURES
 
 try:
@@ -32,7 +35,6 @@ try:
 except ImportError as error:
     raise MissingExtra("a study", str(error.name), "study") from error
 
-TABULAR_OBSERVATION = "index"
 # Bounds on a specification, so that every mistake is told at once
 MOST_RUNS = 1_000_000
 MOST_NODES = 1_000_000
@@ -44,40 +46,32 @@ class Run:
     """One training run of a study.
 
     Attributes:
-        config: what determines its result; keys as in the file run.json.
+        configuration: what determines its result.
         instance: name of the environment as the specification gives it, such as "frozen_lake/4x4".
     """
 
-    config: Mapping[str, Any]
+    configuration: RunConfig
     instance: str
+
+    @cached_property
+    def config(self) -> Mapping[str, Any]:
+        """The configuration with the keys of the file run.json."""
+        return self.configuration.to_dict()
 
     @cached_property
     def id(self) -> str:
         """Name of the run's folder: a hash of the config."""
-        return run_id(self.config)
+        return self.configuration.id
 
     @property
     def chance(self) -> str:
         """`plain`, or such as `sticky 0.25`."""
-        return chance_label(self.config["chance"])
+        return str(self.configuration.chance)
 
     @property
     def kind(self) -> tuple[str, str, str]:
         """Class of environment, agent and observation: runs of a kind take about as long for each step."""
-        return (self.config["environment"], self.config["agent"], self.config["observation"])
-
-
-def run_id(config: Mapping[str, Any]) -> str:
-    """The hash of a config: XXH3 with 64 bits of its sorted JSON, 16 hexadecimal digits."""
-    import xxhash
-
-    return xxhash.xxh3_64_hexdigest(json.dumps(config, sort_keys=True, separators=(",", ":")).encode())
-
-
-def chance_label(chance: Mapping[str, float]) -> str:
-    """`plain`, `sticky 0.25`, `random 0.1`, or both."""
-    parts = [f"{name} {chance[name]:g}" for name in ("sticky", "random") if chance.get(name)]
-    return ", ".join(parts) or "plain"
+        return (self.configuration.environment, self.configuration.agent, self.configuration.observation)
 
 
 # The file ---------------------------------------------------------------------------------------------------------------
@@ -119,7 +113,7 @@ class EnvironmentEntry(_Part):
     def instance(self) -> Any:
         from pharos.environments import make
 
-        return make(self.name, **{name: _tuples(value) for name, value in self.parameters.items()})
+        return make(self.name, **{name: as_tuples(value) for name, value in self.parameters.items()})
 
     @cached_property
     def label(self) -> str:
@@ -128,11 +122,16 @@ class EnvironmentEntry(_Part):
         return f"{self.name}({', '.join(f'{name}={value}' for name, value in self.parameters.items())})"
 
 
-class Chance(_Part):
+class ChanceEntry(_Part):
     """Probabilities that the previous action, or a uniformly random one, is executed instead of the chosen one."""
 
     sticky: float = Field(default=0.0, ge=0, le=1)
     random: float = Field(default=0.0, ge=0, le=1)
+
+    @property
+    def setting(self) -> ChanceSetting:
+        """The same for a run."""
+        return ChanceSetting(self.sticky, self.random)
 
 
 class ObservationEntry(_Part):
@@ -178,22 +177,20 @@ class Hardness(_Part):
 
 
 def _horizon(value: Any) -> Any:
-    if value in ("limit", "none") or (isinstance(value, int) and not isinstance(value, bool) and value >= 1):
-        return value
-    raise ParameterError(f"horizon: found {value!r}; expected a number of steps, limit (the environment's), or none")
+    return Horizon.of(value).value
 
 
 Seeds = Annotated[list[Annotated[int, Field(ge=0)]], BeforeValidator(_seeds), Field(min_length=1)]
 Steps = Annotated[int, Field(ge=1)]
 Gamma = Annotated[float, Field(ge=0, le=1)]
-Horizon = Annotated[Any, BeforeValidator(_horizon)]
+HorizonEntry = Annotated[Any, BeforeValidator(_horizon)]
 
 
 class Block(_Part):
     """A product of environments, kinds of chance, observations, agents and seeds."""
 
     environments: list[Annotated[EnvironmentEntry, BeforeValidator(_entry)]] = Field(min_length=1)
-    chance: list[Annotated[Chance, BeforeValidator(_chance)]] = Field([Chance()], min_length=1)
+    chance: list[Annotated[ChanceEntry, BeforeValidator(_chance)]] = Field([ChanceEntry()], min_length=1)
     observations: list[Annotated[ObservationEntry, BeforeValidator(_entry)]] = Field(
         [ObservationEntry(name="vector")], min_length=1
     )
@@ -202,7 +199,7 @@ class Block(_Part):
     steps: Steps | None = None
     evaluations: Steps | None = None
     gamma: Gamma | None = None
-    horizon: Horizon | None = None
+    horizon: HorizonEntry | None = None
     hyperparameters: dict[str, str | dict[str, Any]] = {}
 
 
@@ -216,7 +213,7 @@ class Specification(_Part):
     steps: Steps = 50_000
     evaluations: Steps = 100
     gamma: Gamma = 1.0
-    horizon: Horizon = "limit"
+    horizon: HorizonEntry = "limit"
     hyperparameters: dict[str, dict[str, Any]] = {}
     hardness: Hardness = Field(default_factory=Hardness)
 
@@ -238,27 +235,27 @@ class Specification(_Part):
             for chance in block.chance:
                 for agent in block.agents:
                     observations: Sequence[ObservationEntry] = block.observations
-                    if agent in tabular_agents():
+                    if agent_kind(agent).is_tabular:
                         observations = [ObservationEntry(name=TABULAR_OBSERVATION)]
                     for observation in observations:
                         for seed in block.seeds or self.seeds:
                             yield Run(
-                                {
-                                    "environment": environment.instance.name,
-                                    "parameters": _jsonable(environment.instance.parameters),
-                                    "chance": {"sticky": chance.sticky, "random": chance.random},
-                                    "observation": observation.name,
-                                    "observation_options": dict(observation.options),
-                                    "agent": agent,
-                                    "hyperparameters": self._hyperparameters(
+                                RunConfig(
+                                    environment=environment.instance.name,
+                                    parameters=_jsonable(environment.instance.parameters),
+                                    chance=chance.setting,
+                                    observation=observation.name,
+                                    observation_options=dict(observation.options),
+                                    agent=agent,
+                                    hyperparameters=self._hyperparameters(
                                         block, agent, environment.instance.name, observation.name
                                     ),
-                                    "steps": steps,
-                                    "seed": seed,
-                                    "gamma": gamma,
-                                    "horizon": steps_of(horizon, environment.instance),
-                                    "evaluation_interval": max(1, steps // evaluations),
-                                },
+                                    steps=steps,
+                                    seed=seed,
+                                    gamma=gamma,
+                                    horizon=Horizon.of(horizon).steps(environment.instance),
+                                    evaluation_interval=max(1, steps // evaluations),
+                                ),
                                 environment.label,
                             )
 
@@ -276,26 +273,9 @@ _PARTS: dict[Loc, type[BaseModel]] = {
     ("hardness",): Hardness,
     ("blocks",): Block,
     ("blocks", "environments"): EnvironmentEntry,
-    ("blocks", "chance"): Chance,
+    ("blocks", "chance"): ChanceEntry,
     ("blocks", "observations"): ObservationEntry,
 }
-
-
-def agents() -> tuple[str, ...]:
-    """The names of the agents; besides, `module:Class` is an algorithm for Stable-Baselines3."""
-    return ("q_learning", "dqn", "ppo", "a2c")
-
-
-def tabular_agents() -> tuple[str, ...]:
-    """Those agents that see the index of the state."""
-    return ("q_learning",)
-
-
-def steps_of(horizon: int | str, environment: Any) -> int | None:
-    """The number of steps of an episode in values and returns; None for discounted values without a limit."""
-    if horizon == "none":
-        return None
-    return int(environment.max_episode_steps) if horizon == "limit" else int(horizon)
 
 
 def registered() -> list[str]:
@@ -411,8 +391,8 @@ def _wrong(found: Specification) -> Iterator[tuple[Loc, str]]:
         if (block.horizon or found.horizon) == "none" and gamma == 1:
             yield ("blocks", i), "gamma is 1 and horizon is none, so values may be infinite; expected a gamma below 1"
         for j, agent in enumerate(block.agents):
-            if agent not in agents() and ":" not in agent:
-                yield ("blocks", i, "agents", j), str(UnknownName("agent", agent, agents()))
+            if agent not in AGENTS and ":" not in agent:
+                yield ("blocks", i, "agents", j), str(UnknownName("agent", agent, AGENTS))
         for agent, given in block.hyperparameters.items():
             loc = ("blocks", i, "hyperparameters", agent)
             if agent not in block.agents:
@@ -501,10 +481,6 @@ def _check_keys(node: Any, name: str) -> None:
         if key.value in lines:
             raise ParameterError(f"{name}:{line}: the key {key.value!r} stands there twice (line {lines[key.value]})")
         lines[key.value] = line
-
-
-def _tuples(value: Any) -> Any:
-    return tuple(_tuples(item) for item in value) if isinstance(value, list) else value
 
 
 def _jsonable(value: Any) -> Any:

@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pharos.errors import ParameterError, UnknownName
+from pharos.experiments import ChanceSetting
 from pharos.study import worker as _worker
 from pharos.study.execution import opened
 from pharos.study.specification import Run, Source, Specification
-from pharos.study.values import tuple_of
 from pharos.study.worker import write_atomically
 
 if TYPE_CHECKING:
@@ -204,7 +204,7 @@ def _measure(
     from pharos.environments import make
     from pharos.hardness import report
 
-    environment = make(config["environment"], **_arguments(config["parameters"]))
+    environment = make(config["environment"], **config["parameters"])
     mdp = build_mdp(config["environment"], config["parameters"], config["chance"], study.hardness.gamma)
     steps = config["horizon"] or environment.max_episode_steps
     measures, failed = dict(kept["measures"]), {}
@@ -225,17 +225,10 @@ def build_mdp(
 ) -> "TabularMDP":
     """The tabular MDP that a run is about; its state space is built, or taken from the cache."""
     from pharos.environments import make
-    from pharos.mdp import random_actions, sticky_actions
     from pharos.state_space import build
 
-    mdp = build(make(environment, **_arguments(parameters)), progress=False).mdp(gamma=gamma)
-    if chance["sticky"]:
-        mdp = sticky_actions(mdp, chance["sticky"])
-    return random_actions(mdp, chance["random"]) if chance["random"] else mdp
-
-
-def _arguments(parameters: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: tuple_of(value) for name, value in parameters.items()}
+    mdp = build(make(environment, **parameters), progress=False).mdp(gamma=gamma)
+    return ChanceSetting.from_dict(chance).of(mdp)
 
 
 def _number(value: Any, exact: bool) -> dict[str, Any]:

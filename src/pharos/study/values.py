@@ -6,7 +6,6 @@ for each run would take longer than some training.
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,30 +17,23 @@ if TYPE_CHECKING:
 
 def task_of(config: Mapping[str, Any]) -> "Task":
     """The task of a run."""
-    from pharos.environments import make
-    from pharos.experiments import Task
+    from pharos.experiments import RunConfig
 
-    return Task(
-        make(config["environment"], **{name: tuple_of(value) for name, value in config["parameters"].items()}),
-        sticky=config["chance"]["sticky"],
-        random=config["chance"]["random"],
-        observation=config["observation"],
-        observation_options=dict(config["observation_options"]),
-        gamma=config["gamma"],
-        horizon=config["horizon"],
-    )
+    return RunConfig.from_dict(config).task()
 
 
 def solve(config: Mapping[str, Any]) -> dict[str, Any]:
-    """What a task knows of its values, `reference` and `return_range`; solved now unless they are kept."""
-    known = kept(config)
-    if known is None:
+    """The values at the start of a task, as `TaskValues.to_dict` writes them; solved now unless they are stored."""
+    values = kept(config)
+    if values is None:
+        from pharos.experiments import TaskValues
+
         task = task_of(config)
-        known = {"reference": asdict(task.reference), "return_range": list(task.return_range)}
+        values = TaskValues(task.reference, task.return_range).to_dict()
         file = _file(config)
         file.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(file, json.dumps({"task": _key(config), "values": known}, indent=1) + "\n")
-    return known
+        write_atomically(file, json.dumps({"task": _key(config), "values": values}, indent=1) + "\n")
+    return values
 
 
 def kept(config: Mapping[str, Any]) -> dict[str, Any] | None:
@@ -51,20 +43,6 @@ def kept(config: Mapping[str, Any]) -> dict[str, Any] | None:
     except (FileNotFoundError, ValueError):
         return None
     return said["values"] if said.get("task") == _key(config) else None
-
-
-def with_values(task: "Task", values: Mapping[str, Any]) -> "Task":
-    """The task, which now knows these values instead of solving for them."""
-    from pharos.experiments import ReferenceValues
-
-    task.__dict__["reference"] = ReferenceValues(**values["reference"])
-    task.__dict__["return_range"] = tuple(values["return_range"])
-    return task
-
-
-def tuple_of(value: Any) -> Any:
-    """Lists as tuples, all the way down."""
-    return tuple(tuple_of(item) for item in value) if isinstance(value, list) else value
 
 
 def _file(config: Mapping[str, Any]) -> Path:

@@ -1,0 +1,42 @@
+"""What each agent is: tabular or a network, and how figures call it."""
+
+from dataclasses import dataclass
+
+TABULAR_OBSERVATION = "index"
+"""What tabular agents see."""
+
+
+@dataclass(frozen=True)
+class AgentKind:
+    """What the rest of pharos needs to know of an agent before it exists.
+
+    Attributes:
+        name: as `train` takes it.
+        title: as figures and tables write it.
+        is_tabular: whether it learns a table over the states, whose index it sees; else a network over observations.
+    """
+
+    name: str
+    title: str
+    is_tabular: bool = False
+
+    def observation(self, requested: str) -> str:
+        """The observation that it gets where `requested` was asked for: tables see the index of the state."""
+        return TABULAR_OBSERVATION if self.is_tabular else requested
+
+
+AGENTS = {
+    kind.name: kind
+    for kind in (
+        AgentKind("q_learning", "tabular Q-learning", is_tabular=True),
+        AgentKind("dqn", "DQN"),
+        AgentKind("ppo", "PPO"),
+        AgentKind("a2c", "A2C"),
+    )
+}
+"""The agents that have a name. Any other algorithm for Stable-Baselines3 is named by its class, `module:Class`."""
+
+
+def agent_kind(name: str) -> AgentKind:
+    """What the agent called `name` is; a class of an algorithm for Stable-Baselines3 is a network."""
+    return AGENTS.get(name) or AgentKind(name, name.rpartition(":")[2])
