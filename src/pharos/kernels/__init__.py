@@ -1,1 +1,20 @@
-"""Compiled loops: flat arrays in, flat arrays out, nothing else. Importing a module here loads Numba."""
+"""Compiled loops: flat arrays in, flat arrays out, nothing else.
+
+The package announces its files; each is loaded where it is used, and loads Numba.
+"""
+
+__all__ = [
+    "bellman",
+    "disk_table",
+    "graph",
+    "hash_table",
+    "hitting",
+    "horizon",
+    "learning",
+    "observation_kernels",
+    "occupancy",
+    "partition",
+    "stepping",
+    "tails",
+    "travel",
+]
