@@ -7,8 +7,9 @@ from hypothesis import strategies as st
 
 import naive_mdp
 from pharos.errors import DivergenceError, ParameterError, PrecisionError
-from pharos.mdp import TabularMDP, random_actions, sticky_actions
+from pharos.mdp import BEST, TabularMDP, random_actions, sticky_actions
 from pharos.solvers import evaluate_policy, uniform_policy, uniform_value, value_iteration, worst_value
+from pharos.solvers.fixed_point import Backup
 from strategies import deterministic_mdps, probabilities, small_mdps
 
 ROUNDING = 1e-9  # of the twins, which solve linear systems
@@ -163,13 +164,11 @@ def test_a_closed_part_of_an_mdp_has_the_same_values_alone(mdp):
 @often
 @given(small_mdps(), st.integers(0, 2**32))
 def test_backups_contract_in_the_maximum_norm(mdp, seed):
-    from pharos.solvers.values import _Sweeper
-
-    sweeper = _Sweeper(mdp, 1.0)
+    backup = Backup(mdp, BEST)
     rng = np.random.default_rng(seed)
-    x, y = (rng.normal(size=sweeper.x.shape) for _ in range(2))
+    x, y = (rng.normal(size=backup.zeros().shape) for _ in range(2))
     x[-1] = y[-1] = 0
-    before, after = np.abs(x - y).max(), np.abs(sweeper.backup(x) - sweeper.backup(y)).max()
+    before, after = np.abs(x - y).max(), np.abs(backup(x) - backup(y)).max()
     assert after <= mdp.gamma * before + 1e-12
 
 

@@ -7,14 +7,13 @@ and beyond a limit the value is estimated from simulated episodes instead, and t
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from pharos.errors import DivergenceError, ParameterError
 from pharos.experiments.task import Task
-from pharos.mdp import TabularMDP
+from pharos.mdp import PolicyTable, TabularMDP
 from pharos.solvers import Solution
 
 BATCH = 4096  # observations that a policy is asked about at once
@@ -104,18 +103,6 @@ class ReachedSolution(Solution):
         """The expected value of an episode's first state."""
         return self.start
 
-    @cached_property
-    def v(self) -> np.ndarray:
-        """(S,) values; (S, A) under sticky actions; NaN where the policy does not get."""
-        if self._v is not None:
-            return self._v
-        assert self._q is not None and self._policy is not None
-        chance, q = self.mdp.chance, self._q
-        policy = self._policy[:, None] if self._policy.ndim == 2 else self._policy[:, : q.shape[1]]
-        known = np.where(np.isnan(q), 0.0, q)  # times a probability of 0
-        choice = np.where(np.isnan(policy), np.nan, policy * known[:, None]).sum(axis=2)
-        return chance.previous * q + chance.chosen * choice + chance.uniform * known.mean(axis=1, keepdims=True)
-
 
 def evaluate_observing(
     mdp: TabularMDP,
@@ -164,51 +151,44 @@ def evaluate_observing(
     _reach(task, asked, None, None)
     sub, chosen = _sub_mdp(task, asked)
     found = evaluate_policy(sub, chosen, tolerance)
-    states = np.unique(asked.rows // asked.width)
-    v = q = before = None
+    x, following = (_on_all_states(task, asked, each) for each in (found.x, found.next_x))
     if mdp.is_sticky:
-        q = _scattered(found.q, states, mdp.num_states)
-        q[states] = np.where(_executed_where_reached(task, asked, states), q[states], np.nan)
-        known = np.full((mdp.num_states, asked.width, mdp.num_actions), np.nan)
-        known[asked.rows // asked.width, asked.rows % asked.width] = asked.probabilities
+        table = np.full((mdp.num_states, asked.width, mdp.num_actions), np.nan)
+        table[asked.rows // asked.width, asked.rows % asked.width] = asked.probabilities
     else:
-        v, known = _scattered(found.v, asked.rows, mdp.num_states), None
-        before = None if found._v_next is None else _scattered(found._v_next, asked.rows, mdp.num_states)
-        known = _scattered(asked.probabilities, asked.rows, mdp.num_states)
-    if before is not None and v is not None:
-        before[np.asarray(mdp.terminal)] = 0.0
-    if v is not None:
-        v[np.asarray(mdp.terminal)] = 0.0
+        table = _scattered(asked.probabilities, asked.rows, mdp.num_states)[:, None]
     return ReachedSolution(
         mdp,
         found.error_bound,
         found.sweeps,
         found.seconds,
-        mdp.gamma,
         mdp.horizon,
-        "policy",
-        v,
-        q,
-        _v_next=before,
-        _policy=known,
+        PolicyTable(mdp.num_actions, table),
+        x,
+        following,
         start=found.value_at_start,
-        states_reached=len(states),
+        states_reached=len(np.unique(asked.rows // asked.width)),
     )
+
+
+def _on_all_states(task: Task, asked: "_Asked", x: np.ndarray) -> np.ndarray:
+    """(S + 1, W): values on the states that the policy reaches (N + 1, W), NaN elsewhere; 0 in terminal states."""
+    mdp = task.mdp
+    states = np.unique(asked.rows // asked.width) if mdp.is_sticky else asked.rows
+    values = np.full((mdp.num_states + 1, x.shape[1]), np.nan)
+    values[states] = x[:-1]
+    if mdp.is_sticky:
+        rows = states[:, None] * asked.width + np.arange(mdp.num_actions)
+        values[states] = np.where(asked.index(rows) >= 0, values[states], np.nan)
+    values[:-1][np.asarray(mdp.terminal)] = 0.0
+    values[-1] = 0.0
+    return values
 
 
 def _scattered(values: np.ndarray, rows: np.ndarray, count: int) -> np.ndarray:
     out = np.full((count, *values.shape[1:]), np.nan)
     out[rows] = values
     return out
-
-
-def _executed_where_reached(task: Task, asked: "_Asked", states: np.ndarray) -> np.ndarray:
-    """(N, A) bool: whether what follows on executing an action in `states` is the end, or a pair that the policy reaches."""
-    mdp = task.mdp
-    assert mdp.next_states is not None
-    table = mdp.next_states[states].astype(np.int64)
-    ended = (table < 0) | np.asarray(mdp.terminal)[table]
-    return ended | (asked.index(table * asked.width + np.arange(mdp.num_actions)) >= 0)
 
 
 def _policy_of(agent: Any) -> Callable[[Any], Any]:

@@ -293,7 +293,7 @@ def _steps(mdp: TabularMDP, solution: Solution) -> Iterator[tuple[np.ndarray, tu
     later = np.zeros(mdp.num_states, np.int64) if mdp.is_sticky else reached.astype(np.int64)
     for step in range(1, horizon + 1):
         to_go = horizon - step + 1
-        q = all_steps[to_go] if mdp.is_sticky else _executed(mdp, all_steps[to_go - 1], solution.gamma)
+        q = _executed(mdp, all_steps[to_go - 1], solution.gamma)
         yield q, (later, first)
         arrived = _arrivals(mdp, reached)
         first = np.zeros_like(first)
@@ -302,8 +302,5 @@ def _steps(mdp: TabularMDP, solution: Solution) -> Iterator[tuple[np.ndarray, tu
 
 
 def _executed(mdp: TabularMDP, v: np.ndarray, gamma: float) -> np.ndarray:
-    """(S, A), the values of executing each action once and then collecting `v`."""
-    if mdp.transitions is not None:
-        return mdp.rewards + gamma * (mdp.transitions @ v).reshape(mdp.num_states, mdp.num_actions)
-    assert mdp.next_states is not None
-    return mdp.rewards + gamma * np.where(mdp.next_states >= 0, v[mdp.next_states], 0.0)
+    """(S, A), the values of executing each action once and then collecting `v`, (S,) or (S, A) by what was executed."""
+    return mdp.rewards + gamma * mdp.dynamics.expected(np.concatenate([v, np.zeros((1, *v.shape[1:]))]))

@@ -9,9 +9,7 @@ from scipy import sparse
 from scipy.sparse import csgraph
 
 from pharos.errors import ParameterError, UndefinedMeasure
-from pharos.mdp import TabularMDP
-from pharos.solvers import uniform_policy
-from pharos.solvers.policy_values import _probabilities
+from pharos.mdp import PolicyTable, TabularMDP
 
 MOST_NODES = 4096
 ROUNDING = 1e-12  # of a distance, that a tie with epsilon is one
@@ -80,9 +78,9 @@ def mixing_time(
     size = len(choices.underlying)
     if size > MOST_NODES:
         raise UndefinedMeasure(_too_many(size))
-    given = _probabilities(mdp, np.asarray(uniform_policy(mdp) if policy is None else policy))
+    table = PolicyTable.of(mdp, policy)
     inside = np.minimum(choices.underlying, mdp.num_states - 1)
-    actions = given[inside, choices.previous] if given.ndim == 3 else given[inside]
+    actions = table.probabilities[inside, choices.previous if table.looks_back else 0]
     chain = sparse.csr_matrix(choices.matrix.multiply(actions.reshape(-1, 1)))
     owner = sparse.csr_matrix(
         (np.ones(chain.shape[0]), (np.repeat(np.arange(size), mdp.num_actions), np.arange(chain.shape[0])))

@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 
 from pharos.errors import ParameterError, UndefinedMeasure
-from pharos.mdp import TabularMDP
-from pharos.solvers import uniform_policy
-from pharos.solvers.policy_values import _probabilities
+from pharos.kernels import occupancy as kernels
+from pharos.mdp import Chance, Play, PolicyTable, TabularMDP
 
 _MEMORY = 8 << 30  # bytes that all steps together may take
 _LEAST = 1e-280  # mass that is not worth a step: smaller numbers lose their digits, and take a hundred times longer
@@ -136,19 +135,12 @@ def discounted_visits(mdp: TabularMDP, policy: Any = None, *, tolerance: float =
         UndefinedMeasure: gamma is 1. ParameterError: the policy is wrong.
     Cost: O(S A) a pass; at most ln(1 / tolerance) / (1 - gamma) passes, in breadth-first order a tenth of them and fewer.
     """
-    from pharos.kernels import occupancy as kernels
-
     walk = Walk(mdp if mdp.horizon is None else mdp.with_horizon(None), policy, None)
-    if mdp.next_states is None:
-        found = occupancy(walk.mdp, policy, tolerance=tolerance)
-        return found.states, found.error_bound
     visits, waiting = walk.after_the_start()
     waiting *= mdp.gamma if mdp.is_sticky else 1.0
     before = math.inf
     while True:
-        waits = kernels.settle(
-            mdp.next_states, walk.live, walk.policy, walk.weights, mdp.gamma, _LEAST, waiting, visits
-        )
+        waits = mdp.dynamics.settle(walk.later, mdp.gamma, _LEAST, waiting, visits)
         left = waits / (1 - mdp.gamma)
         if left <= tolerance or left >= before:
             return visits, left
@@ -164,19 +156,10 @@ def support(mdp: TabularMDP, policy: Any = None) -> np.ndarray:
         ParameterError: the policy is wrong.
     Cost: O(S A); with transitions as a matrix that for each step to the last state that is met.
     """
-    from pharos.kernels import occupancy as kernels
-
     walk = Walk(mdp, policy, 1)
     started, met = walk.after_the_start()
     met = (met > 0).astype(np.float64)
-    if mdp.next_states is not None:
-        kernels.support(mdp.next_states, walk.live, walk.policy, walk.weights, met)
-    else:
-        grows, after = True, np.zeros_like(met)
-        while grows:
-            walk._push(met, False, after)
-            new = (after > 0) & (met == 0)
-            met[new], grows = 1.0, bool(new.any())
+    mdp.dynamics.support(walk.later, met)
     return walk.live & ((met > 0).any(axis=1) | (started > 0))
 
 
@@ -193,14 +176,10 @@ class Walk:
             )
         self.mdp, self.horizon = mdp, None if steps is None else int(steps)
         self.live = ~np.asarray(mdp.terminal)
-        given = _probabilities(mdp, np.asarray(uniform_policy(mdp) if policy is None else policy))
-        by_previous = given.ndim == 3
-        self.policy = np.ascontiguousarray(given[:, : mdp.num_actions] if by_previous else given[:, None, :])
-        self.first_policy = np.ascontiguousarray(given[:, -1:] if by_previous else given[:, None, :])
-        chance = mdp.chance
-        self.weights = (float(chance.chosen), float(chance.previous), float(chance.uniform))
-        self.first_weights = (float(chance.first_chosen), 0.0, float(chance.first_uniform))
-        self.width = mdp.num_actions if mdp.is_sticky else 1
+        table = PolicyTable.of(mdp, policy)
+        self.first = Play(self.live, table.first, mdp.chance.first)
+        self.later = Play(self.live, table.later, mdp.chance)
+        self.width = mdp.width
 
     def after_the_start(self) -> tuple[np.ndarray, np.ndarray]:
         """((S,), (S, W)): under sticky actions where play starts, and where it is a step later; else nothing, and where it starts.
@@ -234,34 +213,12 @@ class Walk:
 
     def record(self, nodes: "Nodes", executed: bool, scale: float, total: np.ndarray, largest: np.ndarray) -> None:
         """Add the pairs (state, action) of one step."""
-        from pharos.kernels import occupancy as kernels
-
-        policy = self.first_policy if nodes.first else self.policy
-        weights = (self.first_weights if nodes.first else self.weights) if executed else (1.0, 0.0, 0.0)
-        kernels.record(self.live, policy, weights, nodes.mass, scale, total, largest)
+        play = self.first if nodes.first else self.later
+        weights = (play.chance if executed else Chance()).triple
+        kernels.record(self.live, play.policy, weights, nodes.mass, scale, total, largest)
 
     def _push(self, now: np.ndarray, first: bool, after: np.ndarray) -> float:
-        from pharos.kernels import occupancy as kernels
-
-        mdp = self.mdp
-        policy, weights = (self.first_policy, self.first_weights) if first else (self.policy, self.weights)
-        if mdp.next_states is not None and not (first and mdp.is_sticky):
-            return kernels.push(mdp.next_states, self.live, policy, weights, now, after)
-        executed = np.zeros((mdp.num_states, mdp.num_actions))
-        kernels.record(self.live, policy, weights, now, 1.0, executed, np.zeros_like(executed))
-        after[:] = 0.0
-        if mdp.transitions is not None:
-            if mdp.is_sticky:
-                for action in range(mdp.num_actions):
-                    after[:, action] = mdp.transitions[action :: mdp.num_actions].T @ executed[:, action]
-            else:
-                after[:, 0] = mdp.transitions.T @ executed.ravel()
-        else:
-            assert mdp.next_states is not None
-            s, a = np.nonzero(executed)
-            t = mdp.next_states[s, a]
-            np.add.at(after, (t[t >= 0], a[t >= 0]), executed[s, a][t >= 0])
-        return float(after[self.live].sum())
+        return self.mdp.dynamics.move(self.first if first else self.later, now, after)
 
 
 @dataclass(frozen=True, eq=False)

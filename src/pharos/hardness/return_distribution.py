@@ -5,13 +5,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from scipy import sparse
 
 from pharos.errors import UndefinedMeasure
 from pharos.hardness.steps import MEMORY, steps_of
-from pharos.mdp import TabularMDP
-from pharos.solvers import uniform_policy
-from pharos.solvers.policy_values import _probabilities
+from pharos.mdp import PolicyTable, TabularMDP
 
 SAME = 1e-9  # returns closer than this are one return
 
@@ -104,11 +101,11 @@ def _backward(mdp: TabularMDP, policy: Any, steps: int) -> Iterator[tuple[np.nda
     Under sticky actions also (S + 1, 1, K), as if no action had been executed before, for the last of them.
     """
     states, num_actions, chance = mdp.num_states, mdp.num_actions, mdp.chance
-    given = _probabilities(mdp, np.asarray(uniform_policy(mdp) if policy is None else policy))
+    table = PolicyTable.of(mdp, policy)
     rewards = np.where(np.asarray(mdp.terminal)[:, None], 0.0, mdp.rewards)
     paid, which = np.unique(rewards, return_inverse=True)
     which = which.reshape(rewards.shape)
-    width = num_actions if mdp.is_sticky else 1
+    width = mdp.width
     support, values = np.zeros(1), np.ones((states + 1, width, 1))
     for t in range(steps - 1, -1, -1):
         sums = np.sort(np.append((paid[:, None] + support).ravel(), 0.0))  # what has ended has return 0
@@ -119,7 +116,7 @@ def _backward(mdp: TabularMDP, policy: Any, steps: int) -> Iterator[tuple[np.nda
                 f"{MEMORY / 2**30:.0f} GiB hold; a smaller horizon or instance would define it"
             )
         executed = np.zeros((states, num_actions, len(following)))
-        after = _expected(mdp, values)
+        after = mdp.dynamics.expected(values)
         for i, reward in enumerate(paid):
             s, a = np.nonzero(which == i)
             place = np.searchsorted(following, reward + support + SAME / 2) - 1
@@ -129,37 +126,12 @@ def _backward(mdp: TabularMDP, policy: Any, steps: int) -> Iterator[tuple[np.nda
         now = np.zeros((states + 1, width, len(following)))
         origin = int(np.abs(following).argmin())
         now[states, :, origin] = 1.0
-        by_previous = given[:, :num_actions] if given.ndim == 3 else given[:, None]
-        uniform = chance.uniform * executed.mean(axis=1)
-        for b in range(width):
-            chosen = by_previous[:, min(b, by_previous.shape[1] - 1)]
-            now[:states, b] = chance.chosen * np.einsum("sa,sak->sk", chosen, executed) + uniform
-            if mdp.is_sticky:
-                now[:states, b] += chance.previous * executed[:, b]
+        now[:states] = chance.choice(executed, table.value(executed))
         first = None
         if mdp.is_sticky and t == 0:
-            chosen = given[:, -1] if given.ndim == 3 else given
             first = np.zeros((states + 1, 1, len(following)))
-            first[:states, 0] = chance.first_chosen * np.einsum("sa,sak->sk", chosen, executed)
-            first[:states, 0] += chance.first_uniform * executed.mean(axis=1)
+            first[:states] = chance.first.choice(executed, table.first_value(executed))
             first[states, 0, origin] = 1.0
         live = (now > 0).any(axis=(0, 1)) | (False if first is None else (first > 0).any(axis=(0, 1)))
         support, values = following[live], now[..., live]
         yield support, values, None if first is None else first[..., live]
-
-
-def _expected(mdp: TabularMDP, values: np.ndarray) -> np.ndarray:
-    """(S, A, K): what follows the execution of each action; values (S + 1, W, K), W = A by the executed action, or 1."""
-    states, num_actions = mdp.num_states, mdp.num_actions
-    if mdp.next_states is not None:
-        following = np.asarray(mdp.next_states).astype(np.int64)
-        following[following < 0] = states
-        return values[following, np.arange(num_actions)[None] if values.shape[1] > 1 else 0]
-    assert mdp.transitions is not None
-    result = np.empty((states, num_actions, values.shape[2]))
-    for a in range(num_actions):
-        matrix = sparse.csr_matrix(mdp.transitions)[a::num_actions]
-        column = values[:, a if values.shape[1] > 1 else 0]
-        ends = np.maximum(0, 1 - np.asarray(matrix.sum(axis=1)).ravel())
-        result[:, a] = matrix @ column[:-1] + ends[:, None] * column[-1]
-    return result

@@ -1,9 +1,10 @@
-"""Bellman backups in place, over flat arrays. solvers/ says what they mean and proves their bounds.
+"""Bellman backups in place, over flat arrays. mdp/dynamics.py says what they mean, solvers/ proves their bounds.
 
-Common arguments: next_states (S, A), -1 where the episode ends; table, palette: see mdp/_rewards.py; v (S + 1,) float64 with
-v[S] = 0, so that index -1 reads 0; weights: (chosen, previous, uniform); sign: 1 maximises, -1 minimises; actions: a tuple
-of A zeros, whose length the compiler knows, so that the loops over actions are unrolled (a third faster). Each sweep goes
-from the last state to the first and returns the largest change of an entry.
+Common arguments: next_states (S, A), -1 where the episode ends; table, palette: see mdp/rewards.py; v (S + 1,) float64, under
+sticky actions (S + 1, A) by the previously executed action, with row S 0, so that index -1 reads 0; weights: (chosen,
+previous, uniform); sign: 1 maximises, -1 minimises; actions: a tuple of A zeros, whose length the compiler knows, so that the
+loops over actions are unrolled (a third faster). Each sweep goes from the last state to the first and returns the largest
+change of an entry.
 """
 
 import numpy as np
@@ -55,72 +56,67 @@ def optimal_block(next_states, table, palette, gamma, uniform, sign, v, out, act
 
 
 @njit(forceinline=True)
-def _sticky_backup(next_states, table, palette, gamma, weights, sign, q, actions, s, a):
-    """r(s, a) + gamma V(next, a); V(t, b) = chosen max_x q(t, x) + previous q(t, b) + uniform mean q(t, .)."""
-    chosen, previous, uniform = weights
-    t = next_states[s, a]
+def _sticky_values(next_states, table, palette, gamma, sign, v, actions, q, s):
+    """q[a] = r(s, a) + gamma v(next, a). Returns (the best of them, their sum)."""
     best = -np.inf
     total = 0.0
-    for x in range(len(actions)):
-        best = max(best, sign * q[t, x])
-        total += q[t, x]
-    following = chosen * sign * best + previous * q[t, a] + uniform * total / len(actions)
-    return reward_at(table, palette, s, a) + gamma * following
+    for a in range(len(actions)):
+        q[a] = reward_at(table, palette, s, a) + gamma * v[next_states[s, a], a]
+        best = max(best, sign * q[a])
+        total += q[a]
+    return sign * best, total
 
 
 @njit(cache=True, nogil=True)
-def sticky_sweep(next_states, table, palette, gamma, weights, sign, q, actions):
-    """q (S + 1, A), the values of executing an action, in place; row S is 0."""
+def sticky_sweep(next_states, table, palette, gamma, weights, sign, v, actions, q):
+    """v[s, b] = chosen max_a q(s, a) + previous q(s, b) + uniform mean_a q(s, a), in place. v (S + 1, A); q (A,) scratch."""
+    chosen, previous, uniform = weights
     change = 0.0
     for s in range(len(next_states) - 1, -1, -1):
-        for a in range(len(actions)):
-            value = _sticky_backup(next_states, table, palette, gamma, weights, sign, q, actions, s, a)
-            change = max(change, abs(value - q[s, a]))
-            q[s, a] = value
+        best, total = _sticky_values(next_states, table, palette, gamma, sign, v, actions, q, s)
+        shared = chosen * best + uniform * total / len(actions)
+        for b in range(len(actions)):
+            value = shared + previous * q[b]
+            change = max(change, abs(value - v[s, b]))
+            v[s, b] = value
     return change
 
 
 @njit(cache=True, nogil=True)
-def sticky_block(next_states, table, palette, gamma, weights, sign, q, out, actions, start, stop):
-    """The same for states in [start, stop), not in place."""
+def sticky_block(next_states, table, palette, gamma, weights, sign, v, out, actions, start, stop):
+    """out[s, b] = the backup of v for s in [start, stop), not in place."""
+    chosen, previous, uniform = weights
+    q = np.empty(len(actions))
     for s in range(start, stop):
-        for a in range(len(actions)):
-            out[s, a] = _sticky_backup(next_states, table, palette, gamma, weights, sign, q, actions, s, a)
+        best, total = _sticky_values(next_states, table, palette, gamma, sign, v, actions, q, s)
+        shared = chosen * best + uniform * total / len(actions)
+        for b in range(len(actions)):
+            out[s, b] = shared + previous * q[b]
 
 
 @njit(cache=True, nogil=True)
-def policy_sweep(next_states, table, palette, gamma, policy, v):
-    """v[s] = sum_a policy[s, a] q(s, a), in place; policy (S, A): probabilities of executing."""
-    num_states, num_actions = next_states.shape
-    change = 0.0
-    for s in range(num_states - 1, -1, -1):
-        value = 0.0
-        for a in range(num_actions):
-            value += policy[s, a] * (reward_at(table, palette, s, a) + gamma * v[next_states[s, a]])
-        change = max(change, abs(value - v[s]))
-        v[s] = value
-    return change
+def policy_sweep(next_states, table, palette, gamma, weights, policy, v, q):
+    """v[s, b] = sum_a (chosen policy[s, b, a] + uniform / A) q(s, a) + previous q(s, b), in place.
 
-
-@njit(cache=True, nogil=True)
-def sticky_policy_sweep(next_states, table, palette, gamma, weights, policy, q):
-    """q of a policy under sticky actions, in place; policy (S, B, A): B is A, or 1 where the previous action is not seen."""
+    v (S + 1, W): W is A where `previous` > 0, else 1. policy (S, B, A): B is W, or 1 where the previous action does not
+    matter. q (A,) scratch.
+    """
     num_states, num_actions = next_states.shape
     chosen, previous, uniform = weights
-    seen = policy.shape[1] > 1
+    width = v.shape[1]
     change = 0.0
     for s in range(num_states - 1, -1, -1):
         for a in range(num_actions):
-            t = next_states[s, a]
-            b = a if seen else 0
-            value = 0.0
-            if t >= 0:
-                for x in range(num_actions):
-                    value += (chosen * policy[t, b, x] + uniform / num_actions) * q[t, x]
-                value += previous * q[t, a]
-            value = reward_at(table, palette, s, a) + gamma * value
-            change = max(change, abs(value - q[s, a]))
-            q[s, a] = value
+            q[a] = reward_at(table, palette, s, a) + gamma * v[next_states[s, a], a if width > 1 else 0]
+        shared = 0.0
+        for b in range(width):
+            if b == 0 or policy.shape[1] > 1:
+                shared = 0.0
+                for a in range(num_actions):
+                    shared += (chosen * policy[s, b, a] + uniform / num_actions) * q[a]
+            value = shared + previous * q[b] if previous > 0.0 else shared
+            change = max(change, abs(value - v[s, b]))
+            v[s, b] = value
     return change
 
 

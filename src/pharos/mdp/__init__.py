@@ -1,7 +1,26 @@
-"""Tabular MDPs, and the chance that can be added to them."""
+"""Tabular MDPs: dynamics, rewards, the chance that can be added, and what is chosen."""
 
 from pharos.mdp.chance import Chance, random_actions, sticky_actions
+from pharos.mdp.dynamics import BellmanEquation, Dynamics, Matrices, Outcomes, Play, Table
 from pharos.mdp.rewards import Rewards
+from pharos.mdp.selection import BEST, WORST, Extreme, PolicyTable, Selection
 from pharos.mdp.tabular import TabularMDP
 
-__all__ = ["Chance", "Rewards", "TabularMDP", "random_actions", "sticky_actions"]
+__all__ = [
+    "BEST",
+    "WORST",
+    "BellmanEquation",
+    "Chance",
+    "Dynamics",
+    "Extreme",
+    "Matrices",
+    "Outcomes",
+    "Play",
+    "PolicyTable",
+    "Rewards",
+    "Selection",
+    "Table",
+    "TabularMDP",
+    "random_actions",
+    "sticky_actions",
+]

@@ -1,11 +1,14 @@
 """Chance that derives from a deterministic transition function: sticky and random actions. An MDP in, an MDP out.
 
-Nothing is copied: an MDP carries three weights, and solvers and measures use them implicitly.
+Nothing is copied: an MDP carries three weights, and `Chance` says what they do to values (`choice`), to distributions
+(`executed`), to the weights of each action (`weights`) and to single steps (`draw`).
 """
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from pharos.errors import ParameterError
 
@@ -17,8 +20,8 @@ if TYPE_CHECKING:
 class Chance:
     """Which action is executed: the chosen one, the previously executed one, or any one; the weights sum to 1.
 
-    On the first step there is no previous action: the chosen one is executed with probability `first_chosen`, else a uniform
-    one. (Only where random actions come before sticky ones does this differ from `chosen + previous`.)
+    On the first step there is no previous action: the chosen one is executed with probability `first_chosen`, else a
+    uniform one. (Only where random actions come before sticky ones does this differ from `chosen + previous`.)
     """
 
     chosen: float = 1.0
@@ -26,10 +29,125 @@ class Chance:
     uniform: float = 0.0
     first_chosen: float = 1.0
 
+    @staticmethod
+    def of(sticky: float = 0.0, random: float = 0.0) -> "Chance":
+        """The chance of `random_actions(sticky_actions(mdp, sticky), random)`.
+
+        Raises:
+            ParameterError: a probability is not in [0, 1].
+        """
+        return Chance().with_sticky(sticky).with_random(random)
+
+    def with_random(self, p: float) -> "Chance":
+        """Random actions with probability p, before this chance."""
+        _check_probability("random_actions", p)
+        return Chance((1 - p) * self.chosen, self.previous, p * self.chosen + self.uniform, (1 - p) * self.first_chosen)
+
+    def with_sticky(self, p: float) -> "Chance":
+        """Sticky actions with probability p, before this chance."""
+        _check_probability("sticky_actions", p)
+        return Chance((1 - p) * self.chosen, p * self.chosen + self.previous, self.uniform, self.first_chosen)
+
+    # What it is -----------------------------------------------------------------------------------------------------
+
     @property
     def first_uniform(self) -> float:
         """Probability that a uniform action is executed on the first step."""
         return 1 - self.first_chosen
+
+    @property
+    def first(self) -> "Chance":
+        """The chance of the first step, which has no previous action."""
+        return Chance(self.first_chosen, 0.0, self.first_uniform, self.first_chosen)
+
+    @property
+    def is_none(self) -> bool:
+        """Whether the chosen action is always executed."""
+        return self.chosen == 1.0 and self.first_chosen == 1.0
+
+    @property
+    def is_sticky(self) -> bool:
+        """Whether values and distributions belong to pairs (state, previously executed action)."""
+        return self.previous > 0
+
+    @property
+    def is_random(self) -> bool:
+        """Whether a uniform action is executed now and then."""
+        return self.uniform > 0
+
+    @property
+    def executes_any(self) -> bool:
+        """Whether any action can be executed after any other, by some choice; false where every step repeats the first."""
+        return self.chosen > 0 or self.uniform > 0
+
+    @property
+    def triple(self) -> tuple[float, float, float]:
+        """(chosen, previous, uniform), what kernels take."""
+        return float(self.chosen), float(self.previous), float(self.uniform)
+
+    def width(self, num_actions: int) -> int:
+        """W: the previous actions that values and distributions distinguish, A under sticky actions, else 1."""
+        return num_actions if self.is_sticky else 1
+
+    # What it does ---------------------------------------------------------------------------------------------------
+
+    def choice(self, q: np.ndarray, value: np.ndarray) -> np.ndarray:
+        """(N, W, ...): the value of what is executed, given the value of what is chosen; W previous actions.
+
+            V(s, b) = chosen value(s, b) + previous q(s, b) + uniform mean_x q(s, x)
+
+        Args:
+            q: (N, A, ...), the values of executing each action.
+            value: (N, 1, ...), the value of the chosen action; (N, A, ...) where the choice depends on the previous action.
+        """
+        result = self.chosen * value
+        if self.uniform:
+            result = result + self.uniform * q.mean(axis=1, keepdims=True)
+        return result + self.previous * q if self.previous else result
+
+    def executed(self, mass: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+        """(N, A): how the mass of states executes the actions; the adjoint of `choice`.
+
+        Args:
+            mass: (N, W), of states, by the previously executed action where that matters.
+            chosen: (N, A), the mass that chooses each action.
+        """
+        result = self.chosen * chosen
+        if self.uniform:
+            result = result + self.uniform * mass.sum(axis=1, keepdims=True) / chosen.shape[1]
+        return result + self.previous * mass if self.previous else result
+
+    def weights(self, chosen: np.ndarray, previous: np.ndarray | None = None) -> np.ndarray:
+        """(N, A): the probability that each action is executed.
+
+        Args:
+            chosen: (N, A), the probabilities of choosing each action.
+            previous: (N,) previously executed actions, A where there is none; None: none anywhere that matters.
+        """
+        num_actions = chosen.shape[1]
+        later = self.chosen * chosen + self.uniform / num_actions
+        if previous is None:
+            return later
+        later = later + self.previous * (np.asarray(previous)[:, None] == np.arange(num_actions))
+        is_first = (np.asarray(previous) == num_actions)[:, None]
+        return np.where(is_first, self.first_chosen * chosen + self.first_uniform / num_actions, later)
+
+    def draw(self, chosen: np.ndarray, previous: np.ndarray, num_actions: int, rng: np.random.Generator) -> np.ndarray:
+        """(N,): executed actions at random. previous (N,), A where there is none. Draws 2 N numbers of `rng`."""
+        u, is_first = rng.random(len(chosen)), previous == num_actions
+        uniform = np.where(is_first, u >= self.first_chosen, u >= self.chosen + self.previous)
+        sticks = ~is_first & ~uniform & (u >= self.chosen)
+        anything = rng.integers(num_actions, size=len(chosen))
+        return np.where(sticks, previous, np.where(uniform, anything, chosen))
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able."""
+        return {
+            "chosen": self.chosen,
+            "previous": self.previous,
+            "uniform": self.uniform,
+            "first_chosen": self.first_chosen,
+        }
 
 
 def random_actions(mdp: "TabularMDP", p: float) -> "TabularMDP":
@@ -43,27 +161,21 @@ def random_actions(mdp: "TabularMDP", p: float) -> "TabularMDP":
         ParameterError: p is not in [0, 1].
     Source: the pharos paper, section 3.3 and appendix A; Conserva and Rauber (2022).
     """
-    _check_probability("random_actions", p)
-    old = mdp.chance
-    chance = Chance((1 - p) * old.chosen, old.previous, p * old.chosen + old.uniform, (1 - p) * old.first_chosen)
-    return replace(mdp, chance=chance)
+    return replace(mdp, chance=mdp.chance.with_random(p))
 
 
 def sticky_actions(mdp: "TabularMDP", p: float) -> "TabularMDP":
     """The MDP in which, with probability p, the previously executed action is executed again.
 
-    V(s, b) = (1 - p) max_a q(s, a) + p q(s, b), where b is the previously executed action and q(s, x) the value of executing
-    x. On the first step of an episode there is no previous action: the chosen one is executed (as in Gymnasium's
-    StickyAction). Combined with random actions: this chance comes before that of `mdp`.
+    V(s, b) = (1 - p) max_a q(s, a) + p q(s, b), where b is the previously executed action and q(s, x) the value of
+    executing x. On the first step of an episode there is no previous action: the chosen one is executed (as in
+    Gymnasium's StickyAction). Combined with random actions: this chance comes before that of `mdp`.
 
     Raises:
         ParameterError: p is not in [0, 1].
     Source: Machado et al. (2018), section 5; the pharos paper, appendix A.
     """
-    _check_probability("sticky_actions", p)
-    old = mdp.chance
-    chance = Chance((1 - p) * old.chosen, p * old.chosen + old.previous, old.uniform, old.first_chosen)
-    return replace(mdp, chance=chance)
+    return replace(mdp, chance=mdp.chance.with_sticky(p))
 
 
 def _check_probability(name: str, p: float) -> None:

@@ -2,13 +2,14 @@
 
 import math
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pharos.errors import ParameterError
 from pharos.mdp.chance import Chance
+from pharos.mdp.dynamics import Dynamics, Matrices, Table
+from pharos.mdp.matrices import expected_rewards, transitions_of
 from pharos.mdp.rewards import Rewards
 
 if TYPE_CHECKING:
@@ -24,10 +25,7 @@ class TabularMDP:
     Made by `StateSpace.mdp`, `from_arrays` or `from_matrices`; `sticky_actions` and `random_actions` add chance.
 
     Attributes:
-        next_states: (S, A) int32 or int64, where each action leads; -1: the episode ends there, as if in one more, terminal
-            state. None for a general MDP.
-        transitions: None, or for a general MDP the probabilities as a sparse (S A, S) matrix with rows s A + a; what a row
-            lacks to 1 is the probability that the episode ends.
+        dynamics: what executing an action does; solvers and measures ask it, whatever it is stored as.
         reward_table: the rewards, compactly; `rewards` is the same as (S, A) float64.
         terminal: (S,) bool, the terminal states: they lead to themselves with reward 0 (or are whole rows of -1, reward 0).
         gamma: discount, in [0, 1].
@@ -37,7 +35,7 @@ class TabularMDP:
         folder: of the state space, where there is one.
     """
 
-    next_states: np.ndarray | None
+    dynamics: Dynamics
     reward_table: Rewards
     terminal: np.ndarray
     gamma: float = 0.99
@@ -45,7 +43,6 @@ class TabularMDP:
     start_states: np.ndarray = field(default_factory=lambda: np.zeros(1, np.int64))
     start_probabilities: np.ndarray = field(default_factory=lambda: np.ones(1))
     chance: Chance = field(default_factory=Chance)
-    transitions: "csr_matrix | None" = None
     folder: Any = None
 
     def __post_init__(self) -> None:
@@ -103,7 +100,7 @@ class TabularMDP:
                     f"(or to -1) with reward 0 by every action"
                 )
         states, probabilities = _start(initial, len(table))
-        return TabularMDP(table, reward_table, mask, gamma, horizon, states, probabilities)
+        return TabularMDP(Table(table), reward_table, mask, gamma, horizon, states, probabilities)
 
     @staticmethod
     def from_matrices(
@@ -119,55 +116,20 @@ class TabularMDP:
         Raises:
             ParameterError: shapes do not fit, or a probability or reward is out of range.
         """
-        from scipy import sparse
-
-        if isinstance(P, list | tuple) and len(P) and sparse.issparse(P[0]):
-            num_states, num_actions = P[0].shape[0], len(P)
-            stacked = sparse.vstack([sparse.csr_matrix(matrix) for matrix in P]).tocsr()
-            order = (np.arange(num_actions)[None, :] * num_states + np.arange(num_states)[:, None]).ravel()
-            matrix = stacked[order]
-        elif sparse.issparse(P):
-            matrix = sparse.csr_matrix(P, dtype=np.float64)
-            num_states = matrix.shape[1]
-            num_actions = matrix.shape[0] // max(num_states, 1)
-        else:
-            dense = np.asarray(P, np.float64)
-            if dense.ndim != 3 or dense.shape[0] != dense.shape[2]:
-                raise ParameterError(f"P has shape {dense.shape}; expected (states, actions, states)")
-            num_states, num_actions = dense.shape[:2]
-            matrix = sparse.csr_matrix(dense.reshape(num_states * num_actions, num_states))
-        if matrix.shape != (num_states * num_actions, num_states) or not num_actions:
-            raise ParameterError(f"P has shape {matrix.shape}; expected (states * actions, states)")
-        matrix = matrix.astype(np.float64)
-        matrix.sum_duplicates()
-        sums = np.asarray(matrix.sum(axis=1)).ravel()
-        if not (np.isfinite(matrix.data).all() and (matrix.data >= 0).all()):
-            raise ParameterError("P has entries that are negative, NaN or infinite; expected probabilities")
-        if (sums > 1 + 1e-9).any():
-            row = int(np.argmax(sums))
-            raise ParameterError(
-                f"P of state {row // num_actions}, action {row % num_actions} sums to {sums[row]}; expected at most 1"
-            )
-        expected = np.asarray(R, np.float64)
-        if (
-            expected.shape == (num_states, num_actions, num_states)
-            and not sparse.issparse(P)
-            and not isinstance(P, list | tuple)
-        ):
-            expected = (np.asarray(P, np.float64) * expected).sum(axis=2)
-        elif expected.shape == (num_states,) and num_actions >= 1:
-            expected = np.repeat(expected[:, None], num_actions, axis=1)
-        reward_table = _rewards_of_shape(expected, (num_states, num_actions))
-        ended = sums.reshape(num_states, num_actions) <= 1e-12
+        matrix, num_actions = transitions_of(P)
+        dynamics = Matrices(matrix, num_actions)
+        shape = (dynamics.num_states, num_actions)
+        reward_table = _rewards_of_shape(expected_rewards(P, R, *shape), shape)
+        ended = np.asarray(matrix.sum(axis=1)).reshape(shape) <= 1e-12
         terminal = ended.all(axis=1) & (reward_table.array == 0).all(axis=1)
-        states, probabilities = _start(initial, num_states)
-        return TabularMDP(None, reward_table, terminal, gamma, horizon, states, probabilities, transitions=matrix)
+        states, probabilities = _start(initial, dynamics.num_states)
+        return TabularMDP(dynamics, reward_table, terminal, gamma, horizon, states, probabilities)
 
     @staticmethod
     def from_space(space: "StateSpace", rewards: Rewards, gamma: float = 0.99) -> "TabularMDP":
         """The MDP on the states of a state space; `StateSpace.mdp` computes the rewards."""
         return TabularMDP(
-            space.successors,
+            Table(space.successors),
             rewards,
             space.terminal,
             gamma,
@@ -190,6 +152,19 @@ class TabularMDP:
         return self.reward_table.shape[1]
 
     @property
+    def next_states(self) -> np.ndarray | None:
+        """(S, A) int32 or int64, where each action leads; -1: the episode ends. None where that is not how they are stored."""
+        return getattr(self.dynamics, "next_states", None)
+
+    @property
+    def transitions(self) -> "csr_matrix | None":
+        """(S A, S) sparse probabilities with rows s A + a; what a row lacks to 1 is the probability that the episode ends.
+
+        None where that is not how they are stored.
+        """
+        return getattr(self.dynamics, "transitions", None)
+
+    @property
     def rewards(self) -> np.ndarray:
         """(S, A) float64, expected rewards of executed actions."""
         return self.reward_table.array
@@ -206,22 +181,68 @@ class TabularMDP:
     @property
     def is_sticky(self) -> bool:
         """Whether the state of the MDP is (state, previously executed action)."""
-        return self.chance.previous > 0
+        return self.chance.is_sticky
 
     @property
     def is_random(self) -> bool:
         """Whether a uniform action is executed now and then."""
-        return self.chance.uniform > 0
+        return self.chance.is_random
+
+    @property
+    def width(self) -> int:
+        """W: values and distributions belong to (S, W) pairs; A previous actions under sticky actions, else 1."""
+        return self.chance.width(self.num_actions)
 
     @property
     def is_deterministic(self) -> bool:
         """Whether every choice has one outcome."""
-        return self.next_states is not None and not self.is_sticky and not self.is_random
+        return self.dynamics.is_deterministic and not self.is_sticky and not self.is_random
 
-    @cached_property
+    @property
     def has_ends(self) -> bool:
-        """Whether some transition ends the episode by -1."""
-        return self.next_states is not None and bool((self.next_states == -1).any())
+        """Whether some transition ends the episode without a next state."""
+        return self.dynamics.has_ends
+
+    # What can be met ---------------------------------------------------------------------------------------------------
+
+    @property
+    def starts(self) -> np.ndarray:
+        """(K,) the states that an episode may start in, ascending."""
+        return np.unique(self.start_states[self.start_probabilities > 0])
+
+    def states_within(self, steps: int | None = None) -> np.ndarray:
+        """(S,) bool: the states that can be met within `steps` steps (None: any number) from a start, by any actions."""
+        return self.dynamics.reachable(self.starts, steps)
+
+    def pairs_within(self, steps: int | None = None) -> np.ndarray:
+        """(S, A) bool: the pairs (state, previously executed action) that can be met within `steps` steps from a start.
+
+        Which actions can be executed after which, chance says: where every action is a repetition, those of the first step
+        go on. Start states without a previous action are not among them.
+        """
+        if self.chance.executes_any:
+            if steps == 0:
+                return np.zeros((self.num_states, self.num_actions), np.bool_)
+            before = self.states_within(None if steps is None else steps - 1) & ~np.asarray(self.terminal)
+            return self.dynamics.arrivals(np.flatnonzero(before))
+        met = np.zeros((self.num_states + 1, self.num_actions), np.bool_)
+        met[-1] = True
+        states, actions = (
+            np.repeat(self.starts, self.num_actions),
+            np.tile(np.arange(self.num_actions), len(self.starts)),
+        )
+        level = 0
+        while len(states) and (steps is None or level < steps):
+            live = ~np.asarray(self.terminal)[states]
+            states, actions = states[live], actions[live]
+            outcomes = self.dynamics.outcomes(states, actions)
+            pairs = np.unique(outcomes.states * self.num_actions + actions[outcomes.which])
+            states, actions = np.divmod(pairs, self.num_actions)
+            new = ~met[states, actions]
+            states, actions = states[new], actions[new]
+            met[states, actions] = True
+            level += 1
+        return met[:-1]
 
     # Variants ------------------------------------------------------------------------------------------------------------
 
@@ -250,8 +271,8 @@ class TabularMDP:
     def within(self, steps: int) -> "TabularMDP":
         """The same MDP with only those states that can be met within `steps` steps from a start; they keep their order.
 
-        Whatever episodes of at most `steps` steps from the start tell is the same for both: values there, returns, effective horizon. Of
-        states that take all the steps to reach, only that they exist is right: actions that lead out of the set lead back.
+        Both agree on every episode of at most `steps` steps from the start: values there, returns, effective horizon. Of
+        states that take all the steps to reach, only that they exist is right: what leads out of the set does not any more.
 
         Returns:
             This MDP where all of its states are met; else one without a folder, as its states have other numbers.
@@ -261,62 +282,24 @@ class TabularMDP:
         met[self.start_states] = True
         if met.all():
             return self
-        kept = np.flatnonzero(met)
+        states = np.flatnonzero(met)
         number = np.full(self.num_states, -1, np.int64)
-        number[kept] = np.arange(len(kept))
-        next_states, transitions = None, None
-        if self.next_states is not None:
-            table = np.asarray(self.next_states[kept])
-            inside = number[table]  # what leads to -1 gets any number here
-            own = np.broadcast_to(np.arange(len(kept))[:, None], table.shape)
-            following = np.where(table < 0, -1, np.where(inside < 0, own, inside))
-            next_states = following.astype(np.int32 if len(kept) < 2**31 else np.int64)
-        else:
-            assert self.transitions is not None
-            rows = (kept[:, None] * self.num_actions + np.arange(self.num_actions)).ravel()
-            transitions = self.transitions[rows][:, kept].tocsr()
+        number[states] = np.arange(len(states))
         return replace(
             self,
-            next_states=next_states,
-            transitions=transitions,
-            reward_table=replace(self.reward_table, table=np.asarray(self.reward_table.table[kept])),
-            terminal=np.asarray(self.terminal[kept]),
+            dynamics=self.dynamics.restricted_to(states),
+            reward_table=replace(self.reward_table, table=np.asarray(self.reward_table.table[states])),
+            terminal=np.asarray(self.terminal[states]),
             start_states=number[self.start_states],
             folder=None,
         )
 
-    def states_within(self, steps: int) -> np.ndarray:
-        """(S,) bool: the states that can be met within `steps` steps from a start."""
-        met = np.zeros(self.num_states, np.bool_)
-        frontier = np.unique(self.start_states[self.start_probabilities > 0])
-        met[frontier] = True
-        if self.next_states is None:
-            assert self.transitions is not None
-            for _ in range(steps):
-                if not len(frontier):
-                    break
-                rows = (frontier[:, None] * self.num_actions + np.arange(self.num_actions)).ravel()
-                found = np.unique(self.transitions[rows].indices)
-                frontier = found[~met[found]]
-                met[frontier] = True
-            return met
-        from pharos.kernels.graph import onwards
-
-        now, following = (np.empty(self.num_states, np.int64) for _ in range(2))
-        count = len(frontier)
-        now[:count] = frontier
-        for _ in range(steps):
-            count = onwards(self.next_states, now, count, following, met)
-            if not count:
-                break
-            now, following = following, now
-        return met
-
     def __repr__(self) -> str:
-        kind = "general, " if self.transitions is not None else ""
+        kind = "" if self.dynamics.is_deterministic else "general, "
         chance = "" if self.chance == Chance() else f", {self.chance}"
         horizon = "" if self.horizon is None else f", horizon={self.horizon}"
-        return f"TabularMDP({kind}{self.num_states} states, {self.num_actions} actions, gamma={self.gamma}{horizon}{chance})"
+        size = f"{self.num_states} states, {self.num_actions} actions"
+        return f"TabularMDP({kind}{size}, gamma={self.gamma}{horizon}{chance})"
 
 
 def _check_gamma(gamma: Any) -> None:

@@ -1,0 +1,199 @@
+"""The fixed point of a Bellman equation, with an error bound that is proven and met.
+
+Sweeps go in place and in reverse order of discovery: breadth-first search numbers a state before those that it leads to, so
+a sweep from the last state to the first carries values back along whole paths. 20 to 40 sweeps solve games that take a
+thousand plain ones. Where sweeps are slow, because gamma is near 1, policy iteration gives a better x to go on from.
+
+The bound. Let T be the backup, a contraction with factor rho, x* its fixed point, and let one sweep in place change entries
+by at most d, with rounding errors of at most e an entry. Every new entry is a backup of entries that are old or already new,
+so it is within rho max(|x_old - x*|, |x_new - x*|) + e of x*. With D = |x_new - x*| in the maximum norm and
+|x_old - x*| <= D + d, D <= rho (D + d) + e, hence D <= (rho d + e) / (1 - rho). Nothing is assumed of x_old: it may be a
+guess. rho is gamma times the largest sum of probabilities, which is 1 up to the rounding of what was given.
+
+Values that follow from x are as accurate: q = r + gamma E x has an error of at most rho D + e <= D.
+"""
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from pharos.errors import DivergenceError, PrecisionError
+from pharos.mdp import BellmanEquation, Selection, TabularMDP
+from pharos.solvers.policy_iteration import PolicyIteration
+
+_UNIT = 2.0**-53
+# Rounding of the computation of a bound itself, and products of rounding errors.
+_MARGIN = 1 + 2.0**-40
+
+
+class FixedPoint(NamedTuple):
+    """The fixed point of a backup.
+
+    Attributes:
+        x: (S + 1, W) float64: V(s, b), row S the end; W previous actions under sticky actions, else 1.
+        bound: every entry is within this of the true one.
+        sweeps: what it took.
+    """
+
+    x: np.ndarray
+    bound: float
+    sweeps: int
+
+
+class Backup:
+    """The backup T of an MDP and of what is chosen in its states."""
+
+    def __init__(self, mdp: TabularMDP, select: Selection):
+        chance = mdp.chance
+        self.mdp, self.select = mdp, select
+        self.equation = BellmanEquation(mdp.reward_table, mdp.gamma, chance, select)
+        executed = chance.chosen * select.mass + chance.previous + chance.uniform
+        is_exact = select.mass == 1.0 and mdp.dynamics.mass == 1.0 and not chance.is_sticky and not chance.is_random
+        mass = 1.0 if is_exact else max(1.0, executed * mdp.dynamics.mass) * (1 + 8 * _UNIT)
+        self.factor = mdp.gamma * mass
+        # q: a product and a sum; the mean over actions; a product and a sum for each of three weights, and their rounding
+        self.operations = mdp.num_actions + 12 + select.operations(mdp.num_actions) + mdp.dynamics.operations
+        self.largest_reward = max(abs(mdp.reward_table.lowest), abs(mdp.reward_table.highest))
+
+    def zeros(self) -> np.ndarray:
+        """(S + 1, W)."""
+        return np.zeros((self.mdp.num_states + 1, self.mdp.width))
+
+    def __call__(self, x: np.ndarray) -> np.ndarray:
+        """T x, not in place."""
+        out = np.empty_like(x)
+        self.mdp.dynamics.backup(self.equation, x, out)
+        return out
+
+    def sweep(self, x: np.ndarray) -> float:
+        """x = T x in place, from the last state to the first where that is possible; the largest change."""
+        return self.mdp.dynamics.sweep(self.equation, x)
+
+    def rounding(self, largest: float) -> float:
+        """A bound on the rounding error of one backup of entries up to `largest`: each operation is off by half a unit."""
+        return self.operations * (_UNIT * (self.largest_reward + largest) + 2.0**-1074)
+
+
+def fixed_point(
+    mdp: TabularMDP,
+    select: Selection,
+    tolerance: float,
+    progress: Callable[[int, float], None] | None = None,
+) -> FixedPoint:
+    """Sweep until the proven bound is at most the tolerance.
+
+    Raises:
+        DivergenceError: gamma is 1, and a state can be visited again, so that the value may be infinite.
+        PrecisionError: 64-bit floats cannot reach the tolerance.
+    """
+    backup = Backup(mdp, select)
+    if mdp.gamma == 1.0:
+        return _without_cycles(backup, tolerance, progress)
+    rho = backup.factor
+    least = backup.rounding(0.0) / (1 - rho) if rho < 1 else math.inf
+    if not least <= tolerance:
+        raise _imprecise(mdp, least, tolerance)
+    x, sweeps = backup.zeros(), 0
+    better = PolicyIteration(mdp, select)
+    while True:
+        change = backup.sweep(x)
+        sweeps += 1
+        rounding = backup.rounding(largest_of(x) + change)
+        bound = (rho * change + rounding) / (1 - rho) * _MARGIN
+        if progress is not None:
+            progress(sweeps, bound)
+        if bound <= tolerance:
+            return FixedPoint(x, bound, sweeps)
+        if not rho * change > rounding:  # also where values are infinite
+            raise _imprecise(mdp, bound, tolerance)
+        if better.is_worth_it(sweeps, change, tolerance):
+            better.improve(x)
+
+
+def backward_induction(
+    mdp: TabularMDP, select: Selection, horizon: int, keep_all: bool = False
+) -> tuple[FixedPoint, np.ndarray, np.ndarray | None]:
+    """(values with `horizon` steps to go, x with one step less, (T + 1, S + 1, W) with every number of steps where all are kept).
+
+    Raises:
+        PrecisionError: values are too large for 64-bit floats.
+    """
+    backup = Backup(mdp, select)
+    x = backup.zeros()
+    before, bound = x, 0.0
+    steps: Any = np.zeros((horizon + 1, *x.shape)) if keep_all else None
+    largest = 0.0
+    for t in range(horizon):
+        before, x = x, backup(x)
+        bound = backup.factor * bound + backup.rounding(largest)
+        largest = largest_of(x)
+        if steps is not None:
+            steps[t + 1] = x
+    bound *= _MARGIN
+    if not math.isfinite(bound + largest):
+        raise PrecisionError(
+            f"{mdp}: the values of {horizon} steps pass 1.8e308, the largest 64-bit float; use smaller rewards"
+        )
+    return FixedPoint(x, bound, horizon), before, steps
+
+
+def chain_bound(mdp: TabularMDP, select: Selection, x: np.ndarray, successor: np.ndarray, reward: np.ndarray) -> float:
+    """The error of values x on the functional graph of a deterministic policy.
+
+    gamma < 1: |x - x*| <= |T x - x| / (1 - gamma), with the rounding of T x. gamma = 1: what does not end goes round in cycles
+    of value 0, and rounding errors add up along at most S steps.
+    """
+    rounding = Backup(mdp, select).rounding(largest_of(x))
+    if mdp.gamma == 1.0:
+        bound = rounding * mdp.num_states
+    else:
+        residual = np.abs(reward + mdp.gamma * x[successor, 0] - x[:-1, 0]).max(initial=0.0)
+        bound = (float(residual) + rounding) / (1 - mdp.gamma)
+    if not math.isfinite(bound):
+        raise _imprecise(mdp, bound, 0.0)
+    return bound * _MARGIN
+
+
+def largest_of(x: np.ndarray) -> float:
+    """max |x|; NaN where an entry is NaN."""
+    return max(float(x.max()), -float(x.min())) if x.size else 0.0
+
+
+def _without_cycles(backup: Backup, tolerance: float, progress: Callable[[int, float], None] | None) -> FixedPoint:
+    """gamma = 1: allowed where no state can be visited again, so that values settle after finitely many sweeps.
+
+    A state with n steps at most before it has settled values after n + 1 sweeps. Rounding errors add up along the way.
+    """
+    mdp = backup.mdp
+    longest = mdp.dynamics.longest_path(~np.asarray(mdp.terminal))
+    if longest < 0:
+        raise DivergenceError(
+            f"{mdp}: gamma is 1, there is no horizon, and some states can be visited again and again, so the value may be "
+            f"infinite; give a horizon (the environment's time limit, say), or gamma < 1"
+        )
+    x, sweeps = backup.zeros(), 0
+    while True:
+        change = backup.sweep(x)
+        sweeps += 1
+        if progress is not None:
+            progress(sweeps, math.inf if change else 0.0)
+        if change == 0.0 or sweeps > longest + 2 or not math.isfinite(change):
+            break
+    bound = backup.rounding(largest_of(x)) * (longest + 1) * max(1.0, backup.factor) ** longest * _MARGIN
+    if not bound <= tolerance:
+        raise _imprecise(mdp, bound, tolerance)
+    return FixedPoint(x, bound, sweeps)
+
+
+def _imprecise(mdp: TabularMDP, bound: float, tolerance: float) -> PrecisionError:
+    if not math.isfinite(bound):
+        return PrecisionError(
+            f"{mdp}: 64-bit floats give no bound at gamma = {mdp.gamma!r}: values pass 1.8e308, or probabilities sum to "
+            f"1 / gamma or more; lower gamma or the rewards"
+        )
+    return PrecisionError(
+        f"{mdp}: 64-bit floats reach a bound of {bound:.2g} at gamma = {mdp.gamma!r}; asked for {tolerance:.2g}: "
+        f"raise the tolerance or lower gamma"
+    )

@@ -1,0 +1,108 @@
+"""Policy iteration: values of the greedy policy by linear algebra, where sweeps would take too long.
+
+What it gives is only a better place to go on sweeping from: the bound of `fixed_point` comes from the next sweep alone.
+Source: Howard (1960); Puterman (1994), section 6.4.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+
+from pharos.kernels import bellman
+from pharos.mdp import PolicyTable, Selection, TabularMDP
+
+# Sweeps before the first attempt; later ones come after twice as many sweeps each.
+FIRST_ATTEMPT = 64
+# Nodes (states, or pairs with a previous action) of the largest linear system, and of the largest dense one.
+MOST_NODES, DENSE = 3000, 400
+# Improvements of one attempt.
+MOST_IMPROVEMENTS = 60
+# Operations that calling a sweep costs, however few states there are.
+CALL = 5000
+
+
+class PolicyIteration:
+    """Decides when it pays, by counting operations, and improves values."""
+
+    def __init__(self, mdp: TabularMDP, select: Selection):
+        self.mdp, self.select = mdp, select
+        self.nodes = mdp.num_states * mdp.width
+
+    def is_worth_it(self, sweeps: int, change: float, tolerance: float) -> bool:
+        """Whether the sweeps that are left cost more than solving some linear systems."""
+        if sweeps < FIRST_ATTEMPT or sweeps & (sweeps - 1) or self.mdp.gamma == 0.0:
+            return False
+        gamma = self.mdp.gamma
+        left = math.log(max(change, 1e-300) / (tolerance * (1 - gamma))) / -math.log(gamma)
+        of_sweeps = left * (CALL + 4.0 * self.nodes * self.mdp.num_actions)
+        if self.is_chain:
+            return of_sweeps > 100.0 * self.nodes
+        return self.nodes <= MOST_NODES and of_sweeps > float(self.nodes) ** 3
+
+    @property
+    def is_chain(self) -> bool:
+        """Whether a deterministic policy has one way from each state."""
+        policy = self.select
+        return self.mdp.is_deterministic and not (isinstance(policy, PolicyTable) and policy.actions is None)
+
+    def improve(self, x: np.ndarray) -> None:
+        """Replace x (S + 1, W) by values of a policy that is greedy in its own values, or nearly so."""
+        actions: Any = None
+        for _ in range(MOST_IMPROVEMENTS):
+            q = self.mdp.rewards + self.mdp.gamma * self.mdp.dynamics.expected(x)
+            policy = self.select.policy(q)
+            if actions is not None and (policy.actions is None or (policy.actions == actions).all()):
+                return
+            if self.is_chain and policy.actions is not None:
+                values = chain_values(self.mdp.gamma, *chain(self.mdp, policy.actions))[0][:, None]
+            else:
+                values = linear_values(self.mdp, policy)
+            if not np.isfinite(values).all():
+                return
+            x[:-1] = values
+            actions = policy.actions if policy.actions is not None else ()
+
+
+def chain(mdp: TabularMDP, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """((S,) next state, -1 for the end; (S,) reward) of a deterministic policy on a deterministic MDP."""
+    table, rewards = mdp.dynamics.deterministic_table(), mdp.reward_table
+    assert table is not None
+    rows = np.arange(mdp.num_states)
+    paid = rewards.table[rows, actions]
+    return table[rows, actions].astype(np.int64), rewards.palette[paid] if len(rewards.palette) else paid
+
+
+def chain_values(gamma: float, successor: np.ndarray, reward: np.ndarray) -> tuple[np.ndarray, int]:
+    """((S,) values on a functional graph, in O(S); a state on a cycle of infinite value, where gamma is 1, or -1)."""
+    v = np.empty(len(successor))
+    return v, int(bellman.chain_values(successor, reward, gamma, v, np.empty(len(successor), np.int64)))
+
+
+def linear_values(mdp: TabularMDP, policy: PolicyTable) -> np.ndarray:
+    """(S, W): the values of a policy, as the solution of (1 - gamma P) x = r."""
+    from scipy import sparse
+    from scipy.sparse import linalg
+
+    states, actions, width = mdp.num_states, mdp.num_actions, mdp.width
+    nodes = states * width
+    # weights: (S W, S A), the probability that being in (s, b) executes a
+    chosen = np.broadcast_to(policy.later, (states, width, actions)).reshape(nodes, actions)
+    previous = np.tile(np.arange(width), states) if mdp.is_sticky else None
+    executed = mdp.chance.weights(chosen, previous)
+    columns = np.repeat(np.arange(states), width)[:, None] * actions + np.arange(actions)
+    weights = sparse.csr_matrix(
+        (executed.ravel(), columns.ravel(), np.arange(nodes + 1) * actions), shape=(nodes, states * actions)
+    )
+    outcomes = mdp.dynamics.matrix().tocoo()
+    inside = outcomes.col < states
+    row, column = outcomes.row[inside], outcomes.col[inside].astype(np.int64)
+    following = column * width + (row % actions if width > 1 else 0)
+    moves = sparse.csr_matrix((outcomes.data[inside], (row, following)), shape=(states * actions, nodes))
+    system = sparse.identity(nodes, format="csr") - mdp.gamma * (weights @ moves)
+    paid = weights @ mdp.rewards.ravel()
+    try:
+        solved = np.linalg.solve(system.toarray(), paid) if nodes <= DENSE else linalg.splu(system.tocsc()).solve(paid)
+    except (np.linalg.LinAlgError, RuntimeError):  # singular to the last bit
+        solved = np.full(nodes, np.nan)
+    return solved.reshape(states, width)
