@@ -14,6 +14,7 @@ __all__ = [
     "observation_kernels",
     "occupancy",
     "partition",
+    "paths",
     "stepping",
     "tails",
     "travel",

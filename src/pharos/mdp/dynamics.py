@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from pharos.kernels import bellman, graph, occupancy, paths
 from pharos.mdp.chance import Chance
 from pharos.mdp.rewards import Rewards
 from pharos.mdp.selection import Extreme, PolicyTable, Selection, chosen_mass
@@ -216,11 +217,9 @@ class Dynamics(ABC):
 
     def longest_path(self, live: np.ndarray) -> int:
         """The number of steps of the longest way through live states (S,) bool; -1 where one can be visited again."""
-        from pharos.kernels.paths import longest_path
-
         matrix = self.matrix(live)
         first = matrix.indptr[:: self.num_actions].astype(np.int64)
-        return int(longest_path(first, matrix.indices.astype(np.int64), self.num_states))
+        return int(paths.longest_path(first, matrix.indices.astype(np.int64), self.num_states))
 
     def matrix(self, live: np.ndarray | None = None) -> "csr_matrix":
         """(S A, S + 1): the probabilities of all outcomes, row s A + a, column S for the end; rows of other than live states empty."""
@@ -312,8 +311,6 @@ class Table(Dynamics):
     # Compiled: the same, without temporary arrays ------------------------------------------------------------------------
 
     def backup(self, equation: BellmanEquation, x: np.ndarray, out: np.ndarray) -> None:
-        from pharos.kernels import bellman
-
         rewards, gamma, chance, select = equation
         if not isinstance(select, Extreme):
             return super().backup(equation, x, out)
@@ -330,8 +327,6 @@ class Table(Dynamics):
         )
 
     def sweep(self, equation: BellmanEquation, x: np.ndarray) -> float:
-        from pharos.kernels import bellman
-
         rewards, gamma, chance, select = equation
         tables = (self.next_states, rewards.table, rewards.palette, gamma)
         actions = (0,) * self.num_actions
@@ -343,26 +338,18 @@ class Table(Dynamics):
         return bellman.optimal_sweep(*tables, chance.uniform, select.sign, x[:, 0], actions)
 
     def move(self, play: Play, now: np.ndarray, after: np.ndarray) -> float:
-        from pharos.kernels import occupancy
-
         if now.shape[1] != after.shape[1]:  # the first step of sticky actions
             return super().move(play, now, after)
         return occupancy.push(self.next_states, play.live, play.policy, play.chance.triple, now, after)
 
     def settle(self, play: Play, gamma: float, least: float, waiting: np.ndarray, visits: np.ndarray) -> float:
-        from pharos.kernels import occupancy
-
         weights = play.chance.triple
         return occupancy.settle(self.next_states, play.live, play.policy, weights, gamma, least, waiting, visits)
 
     def support(self, play: Play, reached: np.ndarray) -> None:
-        from pharos.kernels import occupancy
-
         occupancy.support(self.next_states, play.live, play.policy, play.chance.triple, reached)
 
     def reachable(self, starts: np.ndarray, steps: int | None = None) -> np.ndarray:
-        from pharos.kernels.graph import onwards
-
         met = np.zeros(self.num_states, np.bool_)
         frontier = np.unique(starts)
         met[frontier] = True
@@ -371,15 +358,13 @@ class Table(Dynamics):
         count, level = len(frontier), 0
         now[:count] = frontier
         while count and (steps is None or level < steps):
-            count = onwards(self.next_states, now, count, following, met)
+            count = graph.onwards(self.next_states, now, count, following, met)
             now, following = following, now
             level += 1
         return met
 
     def longest_path(self, live: np.ndarray) -> int:
-        from pharos.kernels.paths import longest_path_of_table
-
-        return int(longest_path_of_table(self.next_states, live))
+        return int(paths.longest_path_of_table(self.next_states, live))
 
 
 class Matrices(Dynamics):
