@@ -1,6 +1,8 @@
 """Least expected hitting times by value iteration on explicit matrices: the slow twin of pharos.hardness.stochastic_diameter."""
 
+import itertools
 import math
+from fractions import Fraction
 
 import numpy as np
 
@@ -73,3 +75,41 @@ def start_eccentricity(mdp, restart):
     targets = range(mdp.num_states + any_end(mdp))
     first = start > 0
     return max(float(times[first, e] @ start[first]) for e in targets)
+
+
+def exact_hitting_times(matrix):
+    """[s][e] least expected steps from s to e, as exact fractions or inf; matrix (S, A, S). Every policy, one after the other."""
+    num_states, num_actions, _ = matrix.shape
+    best = [[math.inf] * num_states for _ in range(num_states)]
+    rows = [[[Fraction(float(p)) for p in matrix[s, a]] for a in range(num_actions)] for s in range(num_states)]
+    for policy in itertools.product(range(num_actions), repeat=num_states):
+        chain = [rows[s][a] for s, a in enumerate(policy)]
+        for goal in range(num_states):
+            for s, time in enumerate(_times_of(chain, goal)):
+                best[s][goal] = min(best[s][goal], time)
+    return best
+
+
+def _times_of(chain, goal):
+    """Expected steps to the goal from each state of a chain of fractions."""
+    size = len(chain)
+    reaches = {goal}  # those from which the goal can be reached
+    while more := {s for s in range(size) if s not in reaches and any(chain[s][t] for t in reaches)}:
+        reaches |= more
+    sure = set(reaches)  # and what cannot be reached from them cannot be missed
+    while bad := {s for s in sure - {goal} if any(chain[s][t] for t in range(size) if t not in sure)}:
+        sure -= bad
+    inner = sorted(sure - {goal})
+    table = [[(s == t) - chain[s][t] for t in inner] + [Fraction(1)] for s in inner]
+    for i in range(len(inner)):
+        pivot = next(k for k in range(i, len(inner)) if table[k][i])
+        table[i], table[pivot] = table[pivot], table[i]
+        table[i] = [x / table[i][i] for x in table[i]]
+        for k in range(len(inner)):
+            if k != i and table[k][i]:
+                table[k] = [x - table[k][i] * y for x, y in zip(table[k], table[i], strict=True)]
+    result = [math.inf] * size
+    result[goal] = Fraction(0)
+    for s, row in zip(inner, table, strict=True):
+        result[s] = row[-1]
+    return result

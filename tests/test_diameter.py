@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from naive_hardness import distances
-from pharos import TabularMDP, hardness
+from pharos import TabularMDP, hardness, random_actions
 from pharos.errors import ParameterError
 
 
@@ -174,3 +174,49 @@ def test_a_clock_with_layers_of_many_words_is_followed():
     assert "clock" in found.method
     # the walker crosses 89 rows in 89 steps, and misses the other end one step before
     assert (found.lower, found.upper) == (period + rows - 2, period + rows - 2)
+
+
+# Start eccentricity -------------------------------------------------------------------------------------------------------
+
+
+def ring(length, starts):
+    table = ((np.arange(length) + 1) % length)[:, None]
+    return TabularMDP.from_arrays(table, np.zeros((length, 1)), initial=starts)
+
+
+def test_every_start_state_counts_where_a_state_is_out_of_reach_of_one():
+    """From state 9 nothing is reached."""
+    table = np.append(np.arange(1, 10), 9)[:, None]
+    mdp = TabularMDP.from_arrays(table, np.zeros((10, 1)), initial=[0, 9])
+    assert hardness.start_eccentricity(mdp, restart=False) == math.inf
+    assert hardness.start_eccentricity(mdp.with_initial(0), restart=False) == 9
+
+
+def test_the_distance_from_several_start_states_is_its_mean():
+    """To the state before a start: 9 steps from it, and 4 from the other."""
+    found = hardness.start_eccentricity_interval(ring(10, [0, 5]))
+    assert found.exact
+    assert found.lower <= 6.5 <= found.upper <= 6.5 * (1 + 1e-15)
+    assert hardness.start_eccentricity(random_actions(ring(10, [0, 5]), 0.5)) == pytest.approx(6.5, rel=1e-6)
+
+
+@settings(max_examples=100, deadline=None)
+@given(deterministic_mdps(), st.data())
+def test_the_start_eccentricity_is_the_largest_mean_distance(mdp, data):
+    starts = data.draw(st.lists(st.integers(0, mdp.num_states - 1), min_size=1, max_size=4))
+    mdp = mdp.with_initial(starts)
+    d = distances(mdp.with_initial(0), restart=False)
+    weights = np.bincount(starts, minlength=len(d)) / len(starts)
+    expected = d[weights > 0].T @ weights[weights > 0]
+    found = hardness.start_eccentricity_interval(mdp, restart=False)
+    assert found.exact
+    if np.isinf(expected).any():
+        assert found.lower == found.upper == math.inf
+    else:
+        assert found.lower * (1 - 1e-15) <= expected.max() <= found.upper * (1 + 1e-15)
+
+
+def test_a_budget_that_ends_between_start_states_leaves_an_interval():
+    found = hardness.start_eccentricity_interval(ring(10, [0, 5]), budget=hardness.Budget(searches=1))
+    assert not found.exact and "1 of 2 start states" in found.note
+    assert found.lower <= 6.5 <= found.upper

@@ -1,6 +1,7 @@
 """Diameter under chance: against value iteration on explicit matrices, theory, and published values."""
 
 import math
+from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from hypothesis import strategies as st
 import naive_hitting
 import pharos
 from pharos import hardness
+from pharos.errors import UndefinedMeasure
 from pharos.hardness.travel import TravelBounds
 from pharos.mdp import TabularMDP, random_actions, sticky_actions
 from strategies import deterministic_mdps, general_mdps
@@ -174,3 +176,89 @@ def test_progress_shows_bounds_that_squeeze():
     found = hardness.diameter(mdp, progress=seen.append)
     assert seen[-1].candidates == 0
     assert all(each.lower <= found.upper <= each.upper * (1 + 1e-9) for each in seen)
+
+
+# Large hitting times ------------------------------------------------------------------------------------------------------
+
+
+def combination_lock(length, wrong=0.5):
+    """`length` right actions in a row; anything else leads back to the start. A wrong one is executed with probability wrong / 2."""
+    following = [[i + 1, 0] for i in range(length)] + [[0, 0]]
+    plain = TabularMDP.from_arrays(following, np.zeros((length + 1, 2)), gamma=0.9)
+    return random_actions(plain, wrong)
+
+
+def time_to_open(length):
+    """E[steps] = sum over k = 1, ..., length of (4 / 3)^k, where the right action is executed with probability 3 / 4."""
+    return sum(Fraction(4, 3) ** k for k in range(1, length + 1))
+
+
+@pytest.mark.parametrize("length", [10, 40, 60, 70, 75, 80, 90, 100, 110, 120])
+def test_hitting_times_beyond_the_digits_of_a_float_are_proven(length):
+    truth = time_to_open(length)
+    diameter = hardness.diameter(combination_lock(length))
+    assert diameter.exact
+    assert Fraction(diameter.lower) <= truth <= Fraction(diameter.upper)
+    assert diameter.upper - diameter.lower <= 2e-6 * diameter.upper
+    start = hardness.start_eccentricity_interval(combination_lock(length))
+    assert start.exact
+    assert Fraction(start.lower) <= truth <= Fraction(start.upper)
+
+
+@pytest.mark.parametrize("length", [130, 150, 300])
+def test_where_floats_prove_no_closer_bounds_an_interval_comes_at_once(length):
+    truth = time_to_open(length)
+    diameter = hardness.diameter(combination_lock(length))
+    assert not diameter.exact and "64-bit floats" in diameter.note
+    assert Fraction(diameter.lower) <= truth <= Fraction(diameter.upper)
+    start = hardness.start_eccentricity_interval(combination_lock(length))
+    assert not start.exact and "64-bit floats" in start.note
+    assert Fraction(start.lower) <= truth <= Fraction(start.upper)
+    assert max(diameter.seconds, start.seconds) < 60  # of a budget of 300
+    with pytest.raises(UndefinedMeasure, match="between"):
+        hardness.start_eccentricity(combination_lock(length))
+
+
+@pytest.mark.parametrize(("width", "truth"), [(24, 520457582.872), (28, 14083681318.474), (36, 10312830586529.5)])
+def test_long_lakes_have_the_diameter_of_sixty_digits(width, truth):
+    """Truth: policy iteration with 60 digits, to the digits given."""
+    rows = "H" * width, "S" + "F" * (width - 2) + "G", "H" * width
+    lake = pharos.build(pharos.make("frozen_lake", map="/".join(rows))).mdp()
+    found = hardness.diameter(random_actions(lake, 0.8))
+    assert found.exact
+    assert found.lower <= truth * (1 + 1e-12) and truth * (1 - 1e-12) <= found.upper
+
+
+@st.composite
+def rare_rows(draw, max_states=4, max_actions=2):
+    """(S, A) of (state, rare state, k): an action leads to the rare state with probability 2^-k, else to the other one."""
+    num_states, num_actions = draw(st.integers(2, max_states)), draw(st.integers(1, max_actions))
+    state = st.integers(0, num_states - 1)
+    outcome = st.tuples(state, state, st.sampled_from([1, 4, 12, 20, 30, 40, 50]))
+    row = st.lists(outcome, min_size=num_actions, max_size=num_actions)
+    return draw(st.lists(row, min_size=num_states, max_size=num_states))
+
+
+@settings(max_examples=150, deadline=None)
+@given(rare_rows())
+def test_intervals_hold_the_hitting_times_of_exact_fractions(rows):
+    """Probabilities are exact in binary, down to 2^-50, so hitting times go up to 1e45."""
+    num_states, num_actions = len(rows), len(rows[0])
+    matrix = np.zeros((num_states, num_actions, num_states))
+    for s, a in np.ndindex(num_states, num_actions):
+        state, rare, k = rows[s][a]
+        matrix[s, a, state] += 1 - 2.0**-k
+        matrix[s, a, rare] += 2.0**-k
+    times = naive_hitting.exact_hitting_times(matrix)
+    truth = max(times[s][e] for s in range(num_states) for e in range(num_states) if s != e)
+    mdp = TabularMDP.from_matrices(matrix, np.zeros((num_states, num_actions)))
+    found = hardness.diameter(mdp, budget=60)
+    start = hardness.start_eccentricity_interval(mdp, budget=60)
+    for interval, value in ((found, truth), (start, max(times[0]))):
+        if value == math.inf:
+            assert interval.lower == interval.upper == math.inf
+        else:
+            assert math.isfinite(interval.lower) and Fraction(interval.lower) <= value
+            assert interval.upper == math.inf or value <= Fraction(interval.upper)
+            assert not interval.exact or interval.upper - interval.lower <= 2e-6 * interval.upper
+            assert value > 1e13 or interval.exact

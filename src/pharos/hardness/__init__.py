@@ -8,7 +8,7 @@ from pharos.hardness import built_in as _built_in  # noqa: F401  (registers the 
 from pharos.hardness.action_gap import ActionGapRegularity, action_gap_regularity
 from pharos.hardness.colosseum import colosseum_diameter
 from pharos.hardness.covering import Covering, covering
-from pharos.hardness.diameter import diameter, start_eccentricity
+from pharos.hardness.diameter import diameter, start_eccentricity, start_eccentricity_interval
 from pharos.hardness.effective_horizon import EffectiveHorizon, effective_horizon
 from pharos.hardness.gaps import Gaps, gaps, minimal_gap, sum_of_reciprocal_gaps
 from pharos.hardness.gorp import GorpBound, GorpRuns, gorp_bound, run_gorp
@@ -58,6 +58,7 @@ __all__ = [
     "return_distribution",
     "run_gorp",
     "start_eccentricity",
+    "start_eccentricity_interval",
     "stationary_effective_horizon",
     "sum_of_reciprocal_gaps",
 ]

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from pharos.errors import ParameterError
+from pharos.errors import ParameterError, UndefinedMeasure
 from pharos.hardness.interval import Budget, Interval, Progress, Spending, conventions_of
 from pharos.hardness.stochastic_diameter import stochastic_diameter, stochastic_start_eccentricity
 from pharos.mdp import TabularMDP
@@ -53,8 +53,7 @@ def diameter(
     Source: Jaksch, Ortner and Auer (2010), definition 1; Borassi et al. (2015), "Fast diameter and radius BFS-based
         computation in (weakly connected) real-world graphs", section 4.
     """
-    if not (isinstance(tolerance, int | float) and 0 < tolerance < 1):
-        raise ParameterError(f"tolerance is {tolerance!r}; expected a number between 0 and 1")
+    _check_tolerance(tolerance)
     spending = Spending(Budget.of(budget), progress)
     graph = Graph.of(mdp, restart)
     if graph is None:
@@ -71,22 +70,75 @@ def start_eccentricity(
 
     Args:
         restart: as in `diameter`; without chance and with one start state it makes no difference.
-        tolerance: relative accuracy under chance; a deterministic MDP with one start state is exact.
-        budget: under chance, seconds (300 by default), or a `Budget`.
+        tolerance: relative accuracy under chance, and with several start states; else it is counted.
+        budget: seconds (300 by default), or a `Budget`, under chance and with several start states.
     Returns:
-        Steps; infinite where some state cannot be reached from the start. Under chance the upper bound, proven to lie within
-        `tolerance`.
+        Steps; infinite where some state cannot be reached from some start state. An expectation comes as its upper bound,
+        proven to lie within `tolerance`.
     Raises:
-        UndefinedMeasure: under chance, out of reach of the budget.
-    Cost: one search; under chance one stochastic shortest path problem for each target that bounds do not rule out.
+        UndefinedMeasure: out of reach of the budget or of 64-bit floats; it names the interval that is proven.
+        `start_eccentricity_interval` returns it.
+    Cost: one search for each start state; under chance, and where terminal states lead back to several start states, one
+        stochastic shortest path problem for each target that bounds do not rule out.
     Source: the pharos paper, equation 1.
     """
+    interval = start_eccentricity_interval(mdp, restart=restart, tolerance=tolerance, budget=budget)
+    if not interval.exact:
+        raise UndefinedMeasure(
+            f"start_eccentricity: between {interval.lower:.6g} and {interval.upper:.6g}; {interval.note}"
+        )
+    return interval.upper
+
+
+def start_eccentricity_interval(
+    mdp: TabularMDP, *, restart: bool = True, tolerance: float = 1e-6, budget: Budget | float | None = None
+) -> Interval:
+    """Return `start_eccentricity` as an `Interval`: exact, or what is proven within the budget. Arguments: the same."""
+    _check_tolerance(tolerance)
+    spending = Spending(Budget.of(budget), None)
     graph = Graph.of(mdp, restart)
     if graph is None:
-        return stochastic_start_eccentricity(mdp, restart, tolerance, Budget.of(budget))
-    distance = np.empty(graph.num_nodes, np.int32)
-    found, largest, _ = graph.search_forward(graph.pivot, distance)
-    return float(largest) if found == graph.num_nodes else math.inf
+        return stochastic_start_eccentricity(mdp, restart, tolerance, spending)
+    starts = mdp.start_states[mdp.start_probabilities > 0]
+    weights = mdp.start_probabilities[mdp.start_probabilities > 0]
+    mean, distance = np.zeros(graph.num_nodes), np.empty(graph.num_nodes, np.int32)
+    note, infinite, largest = "", False, 0
+    for start, weight in zip(starts, weights, strict=True):
+        if spending.is_over and spending.searches:
+            note = f"budget spent after the searches from {spending.searches} of {len(starts)} start states"
+            break
+        reached, largest, _ = graph.search_forward(int(start), distance)
+        spending.searches += 1
+        if reached < graph.num_nodes:
+            infinite = True
+            break
+        mean += weight * distance
+    if infinite:
+        lower = upper = math.inf
+    elif len(starts) == 1:
+        lower = upper = float(largest)
+    else:  # a rounding of each product and each sum; a distance is at most the number of nodes less one
+        rounding = 1 + (len(starts) + 2) * 2.0**-53
+        lower, upper = float(mean.max()) / rounding, float(mean.max()) * rounding
+    if note:
+        upper = math.inf
+    return Interval(
+        lower,
+        upper,
+        exact=not note,
+        finite_part=0.0 if infinite else lower,
+        tolerance=0.0 if len(starts) == 1 else tolerance,
+        searches=spending.searches,
+        method="a breadth-first search from each start state",
+        conventions=conventions_of(mdp, restart),
+        note=note,
+        seconds=spending.seconds,
+    )
+
+
+def _check_tolerance(tolerance: float) -> None:
+    if not (isinstance(tolerance, int | float) and 0 < tolerance < 1):
+        raise ParameterError(f"tolerance is {tolerance!r}; expected a number between 0 and 1")
 
 
 def _kernels() -> Any:

@@ -1,10 +1,13 @@
 """Least expected hitting times on explicit choices: nodes, A actions each, row n A + a of a sparse matrix (first, node, weight).
 
-hardness/_stochastic_diameter.py says what is computed and why the bounds hold. `goal` (N,) bool marks the nodes of the target.
+hardness/hitting_times.py says what is computed and why the bounds hold. `goal` (N,) bool marks the nodes of the target.
 """
 
 import numpy as np
 from numba import njit
+
+# Half the distance from 1 to the next float: the relative rounding error of one operation.
+UNIT = 2.0**-53
 
 
 @njit(cache=True, nogil=True)
@@ -60,7 +63,11 @@ def sweep_in_place(rows, common, goal, order, count, j):
 
 @njit(cache=True, nogil=True)
 def residuals(rows, common, goal, order, count, j, policy):
-    """(largest T j - j, largest j - T j, largest j) over nodes that are not the goal; policy[n] = the action that attains T j."""
+    """(bound of T j - j, bound of j - T j, largest j) over nodes that are not the goal; policy[n] = the action that attains T j.
+
+    T j(n) - j(n) = 1 + min_a sum_m p(m | n, a) (j(m) - j(n)): written with differences, no rounding error grows with j itself.
+    Both bounds count all rounding: `operations` says how many units in the last place one sum may be off.
+    """
     first, node, weight = rows
     always, always_node, always_weight = common
     num_actions = (len(first) - 1) // len(goal)
@@ -69,22 +76,96 @@ def residuals(rows, common, goal, order, count, j, policy):
         n = order[i]
         if goal[n]:
             continue
-        best, choice = np.inf, 0
+        here = j[n]
+        shared, size = 0.0, 1.0
+        for k in range(always[n], always[n + 1]):
+            step = always_weight[k] * (j[always_node[k]] - here)
+            shared += step
+            size += abs(step)
+        shared += 1.0
+        best, least, most, choice = np.inf, np.inf, np.inf, 0
         for a in range(num_actions):
             row = n * num_actions + a
-            total = 0.0
+            total, own = 0.0, size
             for k in range(first[row], first[row + 1]):
-                total += weight[k] * j[node[k]]
+                step = weight[k] * (j[node[k]] - here)
+                total += step
+                own += abs(step)
+            error = operations(num_actions, first[row + 1] - first[row] + always[n + 1] - always[n]) * UNIT * own
+            total += shared
+            least, most = min(least, total - error), min(most, total + error)
             if total < best:
                 best, choice = total, a
-        best += 1.0
-        for k in range(always[n], always[n + 1]):
-            best += always_weight[k] * j[always_node[k]]
         policy[n] = choice
-        above = max(above, best - j[n])
-        below = max(below, j[n] - best)
-        largest = max(largest, j[n])
+        above = max(above, most)
+        below = max(below, -least)
+        largest = max(largest, here)
     return above, below, largest
+
+
+@njit(cache=True, nogil=True)
+def residuals_of_pairs(rows, common, goal, order, count, high, low, policy, residual, error):
+    """As `residuals`, for j = high + low: two floats a node, so that j may be 1e16 times its differences.
+
+    residual, error (N,): T j - j, and by how much it may be off. The error of a difference of two such numbers is a unit of the
+    difference and eight units of a unit of the numbers.
+    """
+    first, node, weight = rows
+    always, always_node, always_weight = common
+    num_actions = (len(first) - 1) // len(goal)
+    above, below = 0.0, 0.0
+    for i in range(count):
+        n = order[i]
+        if goal[n]:
+            continue
+        shared, size, scale = 0.0, 1.0, 0.0
+        for k in range(always[n], always[n + 1]):
+            m = always_node[k]
+            step = always_weight[k] * _difference(high[m], low[m], high[n], low[n])
+            shared += step
+            size += abs(step)
+            scale += always_weight[k] * (abs(high[m]) + abs(high[n]))
+        shared += 1.0
+        best, least, most, choice = np.inf, np.inf, np.inf, 0
+        for a in range(num_actions):
+            row = n * num_actions + a
+            total, own, reach = 0.0, size, scale
+            for k in range(first[row], first[row + 1]):
+                m = node[k]
+                step = weight[k] * _difference(high[m], low[m], high[n], low[n])
+                total += step
+                own += abs(step)
+                reach += weight[k] * (abs(high[m]) + abs(high[n]))
+            terms = first[row + 1] - first[row] + always[n + 1] - always[n]
+            off = operations(num_actions, terms) * UNIT * own + 8 * UNIT * UNIT * reach
+            total += shared
+            least, most = min(least, total - off), min(most, total + off)
+            if total < best:
+                best, choice = total, a
+                error[n] = off
+        policy[n], residual[n] = choice, best
+        above = max(above, most)
+        below = max(below, -least)
+    return above, below
+
+
+@njit(cache=True, nogil=True)
+def operations(num_actions, terms):
+    """Units in the last place by which a sum of so many products may be off, relative to the sum of their sizes.
+
+    One for each product, difference and addition; num_actions + 8 for a probability, itself a sum over the actions that chance
+    may execute; 9 for what `common` left out.
+    """
+    return terms + num_actions + 24
+
+
+@njit(cache=True, nogil=True)
+def _difference(high, low, other_high, other_low):
+    """(high + low) - (other_high + other_low), to a unit of the difference."""
+    total = high - other_high
+    part = total - high
+    rest = (high - (total - part)) - (other_high + part)
+    return total + (rest + (low - other_low))
 
 
 @njit(cache=True, nogil=True)
@@ -118,3 +199,36 @@ def almost_surely(first, node, num_actions, goal, sure, found):
             sure[n] = found[n]
         if same:
             return
+
+
+@njit(cache=True, nogil=True)
+def proper_policy(first, node, weight, num_actions, goal, order, count, sure, policy):
+    """policy[n] of order[:count]: an action that may lead nearer to the goal and never out of these nodes; so it surely arrives.
+
+    order: nodes by distance to the goal; all of them surely reach it. The most probable way nearer is taken. sure (N,) is scratch.
+    """
+    sure[:] = False
+    for i in range(count):
+        sure[order[i]] = True
+    nearer = goal.copy()
+    grew = True
+    while grew:
+        grew = False
+        for i in range(count):
+            n = order[i]
+            if nearer[n]:
+                continue
+            best = 0.0
+            for a in range(num_actions):
+                row = n * num_actions + a
+                stays, chance = True, 0.0
+                for k in range(first[row], first[row + 1]):
+                    stays = stays and sure[node[k]]
+                    if nearer[node[k]]:
+                        chance += weight[k]
+                if stays and chance > best:
+                    best = chance
+                    policy[n] = a
+            if best > 0:
+                nearer[n] = True
+                grew = True

@@ -1,4 +1,4 @@
-"""Bounds of expected times between neighbouring states, for all pairs at once; hardness/_travel.py says what and why.
+"""Bounds of expected times between neighbouring states, for all pairs at once; hardness/travel.py says what and why.
 
 Outcomes: state x has those numbered first[x] to first[x + 1]: outcome i happens with probability prob[i] when action[i] is
 executed (-1: any action), and leads to node[i]. Outcome i stands for the aim to go from x to node[i] by choosing action[i].
@@ -9,7 +9,10 @@ import heapq
 import numpy as np
 from numba import njit
 
-NONE = 255  # no way back was found nearby
+# There is no way back nearby.
+NONE = 255
+# More than the rounding error of a sum of probabilities.
+ROUNDING = 1e-12
 
 
 @njit(cache=True, nogil=True)
@@ -173,7 +176,10 @@ def attempt(begin, end, outcomes, owner, weights, num_previous, square, steps, s
 
 @njit(cache=True, nogil=True)
 def times_from(hub, first, node, cost, leak):
-    """(N,) least t with t(hub) = 0, t(y) = (t(x) + cost[i]) / (1 - leak[i]) over outcomes i from x to y, by Dijkstra's algorithm."""
+    """(N,) least t with t(hub) = 0, t(y) = (t(x) + cost[i]) / (1 - leak[i]) over outcomes i from x to y, by Dijkstra's algorithm.
+
+    Where almost all attempts are given up, 1 - leak is no more than the rounding of a sum of probabilities, which is taken off.
+    """
     bound = np.full(len(first) - 1, np.inf)
     done = np.zeros(len(bound), np.bool_)
     bound[hub] = 0.0
@@ -185,8 +191,9 @@ def times_from(hub, first, node, cost, leak):
         done[x] = True
         for i in range(first[x], first[x + 1]):
             y = node[i]
-            if not done[y] and leak[i] < 1:
-                there = (so_far + cost[i]) / (1 - leak[i])
+            kept = 1 - leak[i] - ROUNDING
+            if not done[y] and kept > 0:
+                there = (so_far + cost[i]) / kept
                 if there < bound[y]:
                     bound[y] = there
                     heapq.heappush(heap, (there, y))

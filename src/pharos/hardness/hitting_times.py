@@ -1,0 +1,329 @@
+"""Least expected hitting times of one target under chance, with a certificate that counts rounding.
+
+For a target e let T J(n) = 1 + min_a sum_m p(m | n, a) J(m), J = 0 at e. The least expected hitting time J* is its fixed point.
+
+Certificate. For any J >= 0 with T J - J <= above < 1 and J - T J <= below everywhere,
+
+    J / (1 + below)  <=  J*  <=  J / (1 - above).
+
+With c = 1 / (1 - above), T(c J) = 1 + c (T J - 1) <= 1 + c (J + above - 1) = c J: the policy that is greedy in c J loses at least
+one expected step a step, so it needs at most c J. With c = 1 / (1 + below), T(c J) >= c J in the same way, and iterating T from
+c J rises to J*. It does not matter where J comes from, and the second half holds for J of any sign.
+
+Rounding. Rows sum to 1, so T J(n) - J(n) = 1 + min_a sum_m p(m | n, a) (J(m) - J(n)), and its rounding error is a few units in the
+last place of sum_m p(m | n, a) |J(m) - J(n)|; the kernels add it to `above` and `below`. What is left is that J itself is rounded: a
+float of 1e10 is known to 1e-6 steps, and each of the 1e10 visits on the way to the target may lose as much. So beyond
+1e9 or so J is kept as the sum of two floats, improved by Newton's method (`_refined`), and moved up and down by W with
+
+    W(n) - sum_m p(m | n, policy) W(m) = 2 (|residual(n)| + its error): what the residuals cost over all visits.
+
+J + W then falls short of no step, J - W exceeds none: both certificates hold with 0. W is about 1e-12 of J. Where the linear solver
+itself has no correct digit (J beyond 1e15), the bounds of plain floats stand, wide as they are.
+"""
+
+import math
+from copy import copy
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy import sparse
+from scipy.sparse.linalg import splu
+
+from pharos.hardness.choices import Choices
+from pharos.hardness.interval import Spending
+from pharos.kernels import hitting
+
+# Sweeps before a policy is evaluated by a linear solve: as many as cost about as much as one.
+SWEEPS = 40
+# Nodes up to which linear solves are tried: beyond, their fill-in takes more memory than the MDP.
+SOLVABLE = 60_000
+# Stands for infinity in the hitting times of nodes that do not surely reach the target: products with it stay finite.
+TOP = 1e300
+# The residual of a float J is some units in its last place: where that is more than the tolerance, one float is too short.
+RESIDUAL_UNITS = 16
+# Linear solves that do not halve the distance of the bounds, after which one float is too short as well.
+STALLS = 3
+# Newton steps and policies that are tried with two floats a node; each step gains two digits or more, or is the last.
+REFINEMENTS = 12
+# Linear solves without a proper policy as result, one after the other, after which the bounds stand as they are.
+FAILURES = 3
+# Relative rounding of a product of a bound and a factor.
+PRODUCT = 1 + 2.0**-50
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """Bounds of all hitting times of a target: J* lies between J times `low` and J times `high`.
+
+    largest: the largest J. limited: whether floats are too short for closer bounds, so that more time would not help.
+    """
+
+    low: float
+    high: float
+    largest: float
+    limited: bool = False
+
+    @property
+    def lower(self) -> float:
+        """Lower bound of the largest hitting time."""
+        return self.largest * self.low / PRODUCT
+
+    @property
+    def upper(self) -> float:
+        """Upper bound of the largest hitting time."""
+        return self.largest * self.high * PRODUCT
+
+    @property
+    def apart(self) -> float:
+        """Upper divided by lower bound, minus 1."""
+        return self.high / self.low - 1 if self.low > 0 else math.inf
+
+    def meets(self, tolerance: float) -> bool:
+        """Whether the bounds are within `tolerance` of each other."""
+        return math.isfinite(self.high) and self.high - self.low <= tolerance * self.high
+
+    def but_limited(self) -> "Bounds":
+        """The same bounds, as close as floats allow."""
+        return Bounds(self.low, self.high, self.largest, True)
+
+
+class HittingTimes:
+    """The hitting times of one target after the other."""
+
+    def __init__(self, choices: Choices):
+        matrix = choices.matrix
+        self.choices = choices
+        self.support = (matrix.indptr.astype(np.int64), matrix.indices.astype(np.int64), choices.num_actions)
+        self.arrays = _without_common(matrix, choices.num_actions)
+        first, previous = choices.reversed
+        self.back = (first.astype(np.int64), previous.astype(np.int64))
+        self.members = np.argsort(choices.underlying, kind="stable")
+        self.edges = np.searchsorted(choices.underlying[self.members], np.arange(choices.num_targets + 1))
+        self.initial_scale = 1.0
+        self._allocate()
+
+    def _allocate(self) -> None:
+        size = len(self.choices.underlying)
+        self.order, self.distance = np.empty(size, np.int64), np.empty(size, np.int64)
+        self.policy, self.goal = np.zeros(size, np.int64), np.zeros(size, np.bool_)
+
+    def for_another_thread(self) -> "HittingTimes":
+        """The same problem with arrays of its own."""
+        other = copy(self)
+        other._allocate()
+        return other
+
+    def nodes_of(self, target: int) -> np.ndarray:
+        """The nodes of a target: one, or under sticky actions one for each previous action."""
+        return self.members[self.edges[target] : self.edges[target + 1]]
+
+    def scale_of(self, j: np.ndarray) -> float:
+        """99th percentile of hitting time divided by distance, of the target last opened."""
+        there = (self.distance > 0) & (j < TOP)
+        return float(np.quantile(j[there] / self.distance[there], 0.99)) if there.any() else 1.0
+
+    def distances(self, target: int) -> int:
+        """Put the nodes that lead to the target into `order` by their `distance`; returns how many they are."""
+        self.goal[:] = False
+        self.goal[self.nodes_of(target)] = True
+        return int(hitting.backward_order(*self.back, self.goal, self.order, self.distance))
+
+    def open(self, target: int) -> tuple[np.ndarray, int, np.ndarray | None]:
+        """Begin with a target.
+
+        Returns:
+            (J, nodes to sweep, nodes that do not surely reach the target, or None). J is a guess: `initial_scale` times the
+            distance. A guess from above proves after few sweeps that a target is not the farthest.
+        """
+        count = self.distances(target)
+        j = np.maximum(self.distance, 0) * self.initial_scale
+        if self.choices.is_connected:
+            return j, count, None
+        sure, reached = np.empty_like(self.goal), np.empty_like(self.goal)
+        hitting.almost_surely(*self.support, self.goal, sure, reached)
+        nodes = self.order[:count][sure[self.order[:count]]]
+        self.order[: nodes.size] = nodes
+        j[~sure] = TOP  # a choice that may lead there is never the best
+        return j, nodes.size, ~sure
+
+    def bounds(self, j: np.ndarray, count: int) -> Bounds:
+        """Bounds by the residuals of J; the greedy policy stands in `policy` then."""
+        above, below, largest = hitting.residuals(*self.arrays, self.goal, self.order, count, j, self.policy)
+        return _certified(above, below, largest)
+
+    def sweep(self, j: np.ndarray, count: int, sweeps: int, enough: float, spending: Spending) -> Bounds:
+        """Sweeps in place; ends early where the upper bound is at most `enough`, the budget ends, or J does not move."""
+        for number in range(sweeps):
+            change = hitting.sweep_in_place(*self.arrays, self.goal, self.order, count, j)
+            if number % 4 == 3 or change < 1e-13:
+                bounds = self.bounds(j, count)
+                if change < max(1e-13, 4 * hitting.UNIT * bounds.largest):
+                    return bounds.but_limited()
+                if bounds.upper <= enough or spending.is_over:
+                    return bounds
+        return self.bounds(j, count)
+
+    def solve(self, j: np.ndarray, count: int, tolerance: float, enough: float, spending: Spending) -> Bounds:
+        """Bounds within `tolerance` of each other, or an upper bound of at most `enough`, or what budget and floats allow."""
+        bounds, failures, stalls, apart = self.sweep(j, count, SWEEPS, enough, spending), 0, 0, math.inf
+        while not bounds.meets(tolerance) and bounds.upper > enough and not spending.is_over:
+            if count > SOLVABLE:
+                if bounds.limited:
+                    return bounds
+                bounds = self.sweep(j, count, 8 * SWEEPS, enough, spending)
+                continue
+            improved = self._evaluate(count)
+            if improved is None:  # the greedy policy may stay away for ever: begin with one that does not
+                arrays = (*self.support[:2], self.choices.matrix.data, self.support[2])
+                hitting.proper_policy(*arrays, self.goal, self.order, count, np.empty_like(self.goal), self.policy)
+                improved = self._evaluate(count)
+            if improved is None:
+                failures += 1
+                if failures >= FAILURES:
+                    return bounds.but_limited()
+            else:
+                failures = 0
+                j[self.order[:count]] = improved
+                bounds = self.bounds(j, count)
+                if bounds.meets(tolerance) or bounds.upper <= enough:
+                    return bounds
+                stalls = stalls + 1 if bounds.apart > apart / 2 else 0
+                apart = bounds.apart
+                if RESIDUAL_UNITS * hitting.UNIT * bounds.largest > tolerance or stalls >= STALLS:
+                    return self._refined(j, count, tolerance, bounds, spending)
+            bounds = self.sweep(j, count, SWEEPS, enough, spending)
+        return bounds
+
+    def _factored(self, count: int) -> tuple[np.ndarray, Any] | None:
+        """(inner nodes, factors of 1 - P of the greedy policy); None where no policy is proper. Rows are made to sum to 1."""
+        nodes = self.order[:count]
+        inner = nodes[~self.goal[nodes]]
+        rows = sparse.csr_matrix(self.choices.matrix[inner * self.choices.num_actions + self.policy[inner]])
+        itself = np.repeat(inner, np.diff(rows.indptr)) == rows.indices
+        rows.data = np.where(itself, 0.0, rows.data)
+        leaving = np.asarray(rows.sum(axis=1)).ravel()
+        try:
+            return inner, splu(sparse.csc_matrix(sparse.diags(leaving) - rows[:, inner]))
+        except RuntimeError:  # singular
+            return None
+
+    def _evaluate(self, count: int) -> np.ndarray | None:
+        """The hitting times of the greedy policy; None where it is not proper."""
+        factored = self._factored(count)
+        if factored is None:
+            return None
+        inner, factors = factored
+        times = factors.solve(np.ones(inner.size))
+        if not (np.isfinite(times).all() and (times > 0).all()):
+            return None
+        full = np.zeros(len(self.goal))
+        full[inner] = times
+        return full[self.order[:count]]
+
+    # Two floats a node ---------------------------------------------------------------------------------------------------
+
+    def _refined(self, j: np.ndarray, count: int, tolerance: float, plain: Bounds, spending: Spending) -> Bounds:
+        """Bounds of a J that is the sum of two floats; `plain`, those of one, where they are no better. j becomes J + W."""
+        high, low = j.copy(), np.zeros_like(j)
+        best, policy = plain.but_limited(), None
+        for _ in range(REFINEMENTS):
+            residual, _, _ = self._residuals(high, low, count)
+            if policy is None or (policy != self.policy).any():
+                policy, factored = self.policy.copy(), self._factored(count)
+            if factored is None or spending.is_over:
+                break
+            inner, factors = factored
+            correction = factors.solve(residual[inner])
+            if not np.isfinite(correction).all():
+                break
+            high[inner], low[inner] = _added(high[inner], low[inner], correction)
+            if not (high[inner] > 0).all():
+                break
+            if np.abs(correction).max(initial=0.0) > 1e-3 * tolerance * high[inner].max(initial=0.0):
+                continue
+            bounds, above = self._moved(high, low, count, factored)
+            if bounds.high - bounds.low < best.high - best.low:
+                best = bounds
+                j[:] = above
+            if best.meets(tolerance):
+                break
+        return best
+
+    def _moved(self, high: np.ndarray, low: np.ndarray, count: int, factored: Any) -> tuple[Bounds, np.ndarray]:
+        """(bounds of J* relative to J + W, J + W rounded up); a policy that is greedy in J - W in place of that in J where ties need it."""
+        inner, factors = factored
+        residual, error, _ = self._residuals(high, low, count)
+        cost = 2 * (np.abs(residual[inner]) + error[inner])
+        margin = np.zeros_like(high)
+        margin[inner] = np.maximum(factors.solve(cost), 0.0)
+        _, _, (above, _) = self._residuals(*_added(high, low, margin), count)
+        upper = _certified(above, 0.0, 1.0).high
+        ceiling = np.nextafter(high + margin, math.inf) * PRODUCT
+        ceiling[self.goal] = 0.0
+        for _ in range(REFINEMENTS):
+            below_high, below_low = _added(high, low, -margin)
+            residual, error, (_, below) = self._residuals(below_high, below_low, count)
+            if below <= 1e-9:
+                break
+            again = self._factored(count)
+            if again is None:
+                break
+            more = again[1].solve(np.maximum(-(residual[inner]), 0.0) + 2 * error[inner])
+            if not np.isfinite(more).all():
+                break
+            margin[inner] += np.maximum(more, 0.0)
+        lower = _certified(0.0, below, 1.0).low
+        ratio = float(np.min(below_high[inner] / ceiling[inner], initial=1.0)) / PRODUCT
+        return Bounds(max(ratio * lower, 0.0), upper, float(ceiling[inner].max(initial=0.0)), True), ceiling
+
+    def _residuals(
+        self, high: np.ndarray, low: np.ndarray, count: int
+    ) -> tuple[np.ndarray, np.ndarray, tuple[float, float]]:
+        """(residuals of J = high + low, their errors, (bound of T J - J, bound of J - T J)); the greedy policy stands in `policy`."""
+        residual, error = np.zeros_like(high), np.zeros_like(high)
+        arrays = (high, low, self.policy, residual, error)
+        return residual, error, hitting.residuals_of_pairs(*self.arrays, self.goal, self.order, count, *arrays)
+
+
+def _certified(above: float, below: float, largest: float) -> Bounds:
+    """The bounds that follow from T J - J <= above and J - T J <= below."""
+    high = PRODUCT / (1 - above) if above < 1 - 1e-9 else math.inf
+    return Bounds(1 / ((1 + below) * PRODUCT), high, largest)
+
+
+def _added(high: np.ndarray, low: np.ndarray, more: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """high + low + more as two floats, the first of which is the nearest to the sum. Source: Knuth's and Dekker's sums."""
+    total = high + more
+    part = total - high
+    rest = (high - (total - part)) + (more - part) + low
+    result = total + rest
+    return result, rest - (result - total)
+
+
+def _without_common(matrix: Any, num_actions: int) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
+    """What the actions of a node have in common is added up once: under random and sticky actions most of a row.
+
+    Returns:
+        ((first, node, weight) of the rows without it, one for each action; (first, node, weight) of it, one for each node).
+    """
+    nodes = matrix.shape[0] // num_actions
+    row = np.repeat(np.arange(matrix.shape[0]), np.diff(matrix.indptr))
+    pairs, place, times = np.unique(
+        (row // num_actions) * np.int64(nodes) + matrix.indices, return_inverse=True, return_counts=True
+    )
+    least = np.full(len(pairs), np.inf)
+    np.minimum.at(least, place, matrix.data)
+    least[times < num_actions] = 0.0
+    rest = matrix.data - least[place]
+    distinct = rest > 8 * hitting.UNIT * matrix.data  # the kernels count as much as rounding of `least`
+    if distinct.sum() + np.count_nonzero(least) >= matrix.nnz:  # nothing gained
+        least[:] = 0.0
+        rest, distinct = matrix.data, np.ones(matrix.nnz, np.bool_)
+    shared = least > 0
+    first = np.concatenate([[0], np.cumsum(np.bincount(row[distinct], minlength=matrix.shape[0]))])
+    always = np.concatenate([[0], np.cumsum(np.bincount(pairs[shared] // nodes, minlength=nodes))])
+    return (
+        (first.astype(np.int64), matrix.indices[distinct].astype(np.int64), rest[distinct]),
+        (always.astype(np.int64), (pairs[shared] % nodes).astype(np.int64), least[shared]),
+    )
