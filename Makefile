@@ -13,10 +13,10 @@ quickstart: .venv/.ok
 	$(BIN)/python scripts/quickstart.py
 
 test: .venv/.ok
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n auto --dist worksteal
 
 test-fast: .venv/.ok
-	$(BIN)/python -m pytest -m "not slow"
+	$(BIN)/python -m pytest -n auto --dist worksteal -m "not slow"
 
 lint: .venv/.ok
 	$(BIN)/ruff check .

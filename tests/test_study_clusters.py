@@ -33,7 +33,7 @@ def undisturbed(tmp_path):
 
 
 def test_submitted_jobs_execute_their_shards(tmp_path, undisturbed, monkeypatch):
-    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")]))
     parameters = {"timeout_min": 2}
     jobs = study.submit(
         SPECIFICATION, tmp_path / "there", shards=2, cluster="local", parameters=parameters, runner=fake_training.train
