@@ -177,7 +177,12 @@ if __name__ == "__main__":
 
 
 def start_runner(tmp_path, log):
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(TESTS), os.environ.get("PYTHONPATH", "")]), "PHAROS_FAKE_LOG": str(log), "PHAROS_FAKE_SECONDS": "0.2"}
+    environment = {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join([str(TESTS), os.environ.get("PYTHONPATH", "")]),
+        "PHAROS_FAKE_LOG": str(log),
+        "PHAROS_FAKE_SECONDS": "0.2",
+    }
     arguments = [sys.executable, "-c", RUNNER, str(tmp_path / "fake.yaml"), str(tmp_path / "out")]
     return subprocess.Popen(arguments, env=environment)
 

@@ -46,7 +46,9 @@ class Interval:
         for name, kind in (("lower", float), ("upper", float), ("finite_part", float), ("exact", bool)):
             object.__setattr__(self, name, kind(getattr(self, name)))
         if not self.lower <= self.upper:
-            raise ValueError(f"an interval from {self.lower} to {self.upper}: the lower end must not exceed the upper one")
+            raise ValueError(
+                f"an interval from {self.lower} to {self.upper}: the lower end must not exceed the upper one"
+            )
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-able; an infinite bound is None, as in JSON nothing else is, and `infinite` says so."""
