@@ -15,12 +15,14 @@ import numpy as np
 
 from pharos.agents.kinds import AGENTS
 from pharos.errors import MissingExtra, ParameterError, UnknownName
+from pharos.policies import DeepPolicy
 
 FEATURES = 128
 LEAST_ONE = ("n_envs", "n_steps", "n_epochs", "batch_size", "buffer_size", "train_freq", "target_update_interval")
 SHARES = ("gamma", "gae_lambda", "tau", "exploration_fraction", "exploration_initial_eps", "exploration_final_eps")
 POSITIVE = ("learning_rate", "clip_range", "max_grad_norm")
 NOT_NEGATIVE = ("learning_starts", "ent_coef", "vf_coef")
+__all__ = ["ALGORITHMS", "DeepPolicy", "algorithm", "check_hyperparameters", "extractor", "make_model"]
 OURS = {"env", "seed", "device", "tensorboard_log", "_init_setup_model"}  # what `make_model` gives itself
 ALGORITHMS = {"dqn": "stable_baselines3:DQN", "ppo": "stable_baselines3:PPO", "a2c": "stable_baselines3:A2C"}
 
@@ -133,43 +135,3 @@ def make_model(
 
         model.set_logger(Logger(folder=None, output_formats=[]))  # else a folder is left among the temporary files
     return model
-
-
-class DeepPolicy:
-    """The policy of a model as probabilities: greedy for DQN and its kin, the distribution itself for PPO and its kin.
-
-    Args:
-        deterministic: the most probable action of a distribution, instead of the distribution.
-    """
-
-    def __init__(self, model: Any, *, deterministic: bool = False):
-        self.model, self.deterministic = model, deterministic
-
-    def action_probabilities(self, observations: Any) -> np.ndarray:
-        """(N, A) probabilities for a batch of observations as the environment gives them."""
-        import torch
-
-        policy = self.model.policy
-        policy.set_training_mode(False)
-        batch = _as_policy_sees(observations, policy.observation_space)
-        with torch.no_grad():
-            tensor, _ = policy.obs_to_tensor(batch)
-            if hasattr(policy, "q_net"):
-                scores = policy.q_net(tensor).numpy()
-                return np.eye(scores.shape[1])[scores.argmax(axis=1)]
-            if hasattr(policy, "get_distribution"):
-                probabilities = policy.get_distribution(tensor).distribution.probs.numpy().astype(np.float64)
-                if self.deterministic:
-                    return np.eye(probabilities.shape[1])[probabilities.argmax(axis=1)]
-                return probabilities
-        actions, _ = self.model.predict(batch, deterministic=True)
-        return np.asarray(actions)
-
-
-def _as_policy_sees(observations: Any, space: Any) -> Any:
-    """Images moved to channel first where Stable-Baselines3 has done so with those of the environment."""
-    if isinstance(observations, dict):
-        return {name: _as_policy_sees(values, space.spaces[name]) for name, values in observations.items()}
-    if observations.ndim == 4 and observations.shape[1:] != space.shape:
-        return observations.transpose(0, 3, 1, 2)
-    return observations

@@ -111,7 +111,8 @@ def _values(mdp: "TabularMDP", policy: str, given: "Given | None", tolerance: fl
 
 def solution_of(mdp: "TabularMDP", policy: str, given: "Given | None", tolerance: float) -> "Solution":
     """The values of a policy: one of POLICIES, or what `read_policy` gave."""
-    from pharos.solvers import evaluate_policy, uniform_value, value_iteration, worst_value
+    from pharos.policies import evaluate_policy
+    from pharos.solvers import uniform_value, value_iteration, worst_value
 
     if given is not None:
         return evaluate_policy(mdp, given[0], tolerance, **given[1])

@@ -10,6 +10,7 @@ from pharos.errors import ParameterError
 from pharos.experiments.config import ChanceSetting, Horizon
 from pharos.experiments.regret import ReferenceValues
 from pharos.mdp import TabularMDP
+from pharos.policies import Sight
 from pharos.solvers import Solution, uniform_value, value_iteration, worst_value
 from pharos.state_space import StateSpace, build
 
@@ -121,6 +122,18 @@ class Task:
     def space(self) -> StateSpace:
         """The state space, built or from the cache."""
         return build(self.env)
+
+    @cached_property
+    def sight(self) -> Sight:
+        """What a policy sees of the states."""
+        return Sight(
+            self.space,
+            self.env,
+            self.observation,
+            dict(self.observation_options),
+            self.previous_action,
+            self.time_limit,
+        )
 
     @cached_property
     def mdp(self) -> TabularMDP:

@@ -4,6 +4,7 @@
 """
 
 from pharos.observations.complex_image import ComplexImage
+from pharos.observations.context import ObservationInContext
 from pharos.observations.observation import FunctionObservation, Observation, add_built_in, names, observe, register
 from pharos.observations.rendered import RENDERERS, render, renderers
 from pharos.observations.simple_image import SimpleImage
@@ -21,6 +22,7 @@ __all__ = [
     "FunctionObservation",
     "Index",
     "Observation",
+    "ObservationInContext",
     "OneHot",
     "SimpleImage",
     "Vector",

@@ -13,7 +13,7 @@ from pharos.observations import render as render_state
 
 if TYPE_CHECKING:
     from pharos.environments import State
-    from pharos.experiments.task import Task
+    from pharos.experiments import Task
 
 GAP = 12  # pixels between two pictures
 
@@ -91,7 +91,7 @@ def _episode(task: "Task", agent: Any, steps: int, seed: int) -> list[tuple["Sta
 
 def _chooser(task: "Task", agent: Any, rng: np.random.Generator) -> Callable[[Any, "State"], int]:
     """A function (observation, state) -> action."""
-    from pharos.experiments.evaluation import _Asked
+    from pharos.policies import PolicyAnswers
 
     if hasattr(agent, "policy_table"):
         agent = agent.policy_table()
@@ -103,7 +103,7 @@ def _chooser(task: "Task", agent: Any, rng: np.random.Generator) -> Callable[[An
             )
         asked = None
     else:
-        asked = _Asked(agent, task)
+        asked = PolicyAnswers(agent, task.mdp, task.sight)
 
     def choose(seen: Any, state: "State") -> int:
         if asked is None:

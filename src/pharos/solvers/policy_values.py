@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from pharos.errors import DivergenceError, ParameterError
+from pharos.errors import DivergenceError
 from pharos.mdp import PolicyTable, TabularMDP
 from pharos.solvers.fixed_point import chain_bound
 from pharos.solvers.policy_iteration import chain, chain_values
@@ -19,10 +19,8 @@ def evaluate_policy(
     tolerance: float = 1e-6,
     *,
     horizon: int | None = None,
-    observation: Any = None,
-    **seeing: Any,
 ) -> Solution:
-    """The values of a policy.
+    """The values of a policy over states; `pharos.evaluate_policy` also takes policies that see observations.
 
     V(s) = sum_a pi(a | s) q(s, a), q(s, a) = r(s, a) + gamma E V(next); chance acts between what the policy chooses and what
     is executed, see `random_actions` and `sticky_actions`.
@@ -30,20 +28,14 @@ def evaluate_policy(
     Args:
         policy: (S,) integers, an action for each state; or (S, A) probabilities. Under sticky actions also (S, A + 1)
             integers or (S, A + 1, A) probabilities, for each previously executed action and, last, for none; or a function
-            from an array of state indices to either. Or a policy that sees observations: a model of Stable-Baselines3, or,
-            with `observation`, a function of a batch of observations that returns (N, A) probabilities or (N,) actions.
+            from an array of state indices to either; or an agent with such a `policy_table()`.
         tolerance: every value is within this of the true one, proven.
         horizon: number of steps to go, instead of the MDP's own.
-        observation: what the policy sees, a name or an Observation; of models "vector" when not given.
-        seeing: further options of policies that see observations: `observation_options`, a dictionary; `previous_action`,
-            whether they see it, under sticky actions; `deterministic`, whether the most probable action is taken.
     Returns:
         A Solution of kind "policy". A deterministic policy on a deterministic MDP is evaluated on its functional graph, in
-        O(S), exactly up to rounding, whatever the tolerance. A policy that sees observations is asked only in the states that
-        it reaches from the start; values elsewhere are NaN.
+        O(S), exactly up to rounding, whatever the tolerance.
     Raises:
-        ParameterError: the policy has the wrong shape, or its rows are not probabilities; or it sees observations, and the MDP
-            was not made from a state space.
+        ParameterError: the policy has the wrong shape, or its rows are not probabilities.
         DivergenceError: gamma is 1, there is no horizon, and the value is or may be infinite.
         PrecisionError: 64-bit floats cannot reach the tolerance, or hold the values.
     Source: Puterman (1994), section 6.1.
@@ -52,13 +44,6 @@ def evaluate_policy(
     horizon = checked_horizon(mdp, horizon)
     if hasattr(policy, "policy_table"):
         policy = policy.policy_table()
-    if observation is not None or hasattr(policy, "action_probabilities") or hasattr(policy, "predict"):
-        from pharos.experiments.evaluation import evaluate_observing
-
-        timed = mdp if horizon == mdp.horizon else mdp.with_horizon(horizon)
-        return evaluate_observing(timed, policy, tolerance, observation=observation or "vector", **seeing)
-    if seeing:
-        raise ParameterError(f"{', '.join(seeing)} given for a policy that sees no observations; name the observation")
     began = time.perf_counter()
     select = PolicyTable.of(mdp, policy)
     if select.actions is not None and mdp.is_deterministic and horizon is None:

@@ -1,0 +1,234 @@
+"""The exact value of a policy: it is asked in the states that it reaches, and evaluated there.
+
+A deterministic policy in a deterministic game of a million states reaches some hundred of them; under chance it may reach many,
+and beyond a limit the value is estimated from simulated episodes instead, and the answer says so.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from pharos import solvers
+from pharos.errors import DivergenceError, ParameterError
+from pharos.mdp import PolicyTable, TabularMDP
+from pharos.policies.asking import Answers, PolicyAnswers, Sight, TableAnswers
+from pharos.policies.estimation import estimate
+from pharos.policies.policy import Model, Policy, PolicyLike, TabularAgent
+from pharos.solvers import Solution
+from pharos.state_space import load
+
+# Part of a discounted value that is left out: of states that the policy reaches after so many steps.
+TAIL = 1e-9
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """The value of a policy from the start.
+
+    Attributes:
+        value: expected return of an episode, in the setting of the task.
+        exact: whether the value is computed, not estimated.
+        error_bound: proven bound on the error of an exact value; for an estimate, half the width of an interval that holds the
+            value with a probability of at least 99 % (empirical Bernstein bound).
+        states: number of states (or pairs of state and previous action) in which the policy was asked.
+        episodes: simulated episodes behind an estimate; 0 where the value is exact.
+    """
+
+    value: float
+    exact: bool
+    error_bound: float
+    states: int
+    episodes: int = 0
+
+
+def evaluate_seeing(
+    policy: PolicyLike,
+    mdp: TabularMDP,
+    sight: Callable[[], Sight],
+    return_range: Callable[[], tuple[float, float]],
+    *,
+    deterministic: bool = False,
+    max_states: int = 100_000,
+    episodes: int = 2_000,
+    seed: int = 0,
+) -> Evaluation:
+    """Return the value of a policy from the start: exact where it reaches few states, else estimated with a bound.
+
+    Args:
+        sight: gives what the policy sees; called for policies over observations alone.
+        return_range: gives the lowest and the highest return of an episode; called where the value is estimated.
+        deterministic, max_states, episodes, seed: as for `experiments.evaluate_agent`.
+    """
+    if isinstance(policy, TabularAgent):
+        policy = policy.policy_table()
+    answers: Answers
+    if isinstance(policy, np.ndarray):
+        table = policy.argmax(axis=-1) if deterministic and policy.dtype.kind == "f" else policy
+        if mdp.num_states <= max_states:
+            solution = solvers.evaluate_policy(mdp, table)
+            return Evaluation(solution.value_at_start, True, solution.error_bound, mdp.num_states)
+        answers = TableAnswers(table, mdp)
+    else:
+        answers = PolicyAnswers(policy, mdp, sight(), deterministic=deterministic)
+    steps, error = _steps_that_matter(mdp)
+    if answers.reach(max_states, steps):
+        solution = solvers.evaluate_policy(*answers.reached_mdp())
+        return Evaluation(solution.value_at_start, True, solution.error_bound + error, len(answers.rows))
+    value, width = estimate(answers, return_range(), episodes, np.random.default_rng(seed))
+    return Evaluation(value, False, width, len(answers.rows), episodes)
+
+
+def evaluate_policy(
+    mdp: TabularMDP,
+    policy: PolicyLike,
+    tolerance: float = 1e-6,
+    *,
+    horizon: int | None = None,
+    observation: Any = None,
+    **seeing: Any,
+) -> Solution:
+    """The values of a policy.
+
+    V(s) = sum_a pi(a | s) q(s, a), q(s, a) = r(s, a) + gamma E V(next); chance acts between what the policy chooses and
+    what is executed, see `random_actions` and `sticky_actions`.
+
+    Args:
+        policy: (S,) integers, an action for each state; or (S, A) probabilities. Under sticky actions also (S, A + 1)
+            integers or (S, A + 1, A) probabilities, for each previously executed action and, last, for none; or a
+            function from an array of state indices to either. Or a policy that sees observations: a model of
+            Stable-Baselines3, or, with `observation`, a function of a batch of observations that returns (N, A)
+            probabilities or (N,) actions.
+        tolerance: every value is within this of the true one, proven.
+        horizon: number of steps to go, instead of the MDP's own.
+        observation: what the policy sees, a name or an Observation; of models "vector" when not given.
+        seeing: further options of policies that see observations: `observation_options`, a dictionary;
+            `previous_action`, whether they see it, under sticky actions; `deterministic`, whether the most probable
+            action is taken.
+    Returns:
+        A Solution of kind "policy", see `pharos.solvers.evaluate_policy`. A policy that sees observations is asked only in
+        the states that it reaches from the start; values elsewhere are NaN.
+    Raises:
+        ParameterError: the policy has the wrong shape, or its rows are not probabilities; or it sees observations, and the
+            MDP was not made from a state space.
+        DivergenceError: gamma is 1, there is no horizon, and the value is or may be infinite.
+    Source: Puterman (1994), section 6.1.
+    """
+    if isinstance(policy, TabularAgent):
+        policy = policy.policy_table()
+    if observation is not None or isinstance(policy, Policy | Model):
+        timed = mdp if horizon is None else mdp.with_horizon(horizon)
+        return evaluate_observing(timed, policy, tolerance, observation=observation or "vector", **seeing)
+    if seeing:
+        raise ParameterError(f"{', '.join(seeing)} given for a policy that sees no observations; name the observation")
+    return solvers.evaluate_policy(mdp, policy, tolerance, horizon=horizon)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class ReachedSolution(Solution):
+    """Values of a policy in the states that it reaches from the start, numbered as in the whole MDP; NaN elsewhere.
+
+    Attributes:
+        start: value of an episode's first state.
+        states_reached: number of states in which the policy was answers.
+    """
+
+    start: float = math.nan
+    states_reached: int = 0
+
+    @property
+    def value_at_start(self) -> float:
+        """The expected value of an episode's first state."""
+        return self.start
+
+
+def evaluate_observing(
+    mdp: TabularMDP,
+    policy: PolicyLike,
+    tolerance: float = 1e-6,
+    *,
+    observation: Any = "vector",
+    observation_options: Mapping[str, Any] | None = None,
+    previous_action: bool = False,
+    deterministic: bool = False,
+) -> ReachedSolution:
+    """Evaluate a policy that sees observations; `experiments.evaluate_agent` also gives estimates.
+
+    Raises:
+        ParameterError: the MDP was not made from a state space of an environment, the policy is none for its observations, or
+            it sees the previous action where actions are not sticky, so that values do not belong to states.
+        DivergenceError: gamma is 1 and there is no horizon.
+    """
+    if mdp.horizon is None and mdp.gamma == 1.0:
+        raise DivergenceError(
+            f"{mdp}: gamma is 1 and there is no horizon, so the value may be infinite; give one, or gamma < 1"
+        )
+    if previous_action and not mdp.is_sticky:
+        raise ParameterError(
+            "the policy sees the previous action, so its values belong to no state; use experiments.evaluate_agent"
+        )
+    space = None if mdp.folder is None else load(mdp.folder, verify=False)
+    if space is None or space.environment is None:
+        raise ParameterError(
+            f"{mdp}: is not of a state space whose environment is known, so there is nothing to observe; "
+            f"give the policy as a table"
+        )
+    sight = Sight(space, space.environment, observation, dict(observation_options or {}), previous_action, mdp.horizon)
+    answers = PolicyAnswers(policy, mdp, sight, deterministic=deterministic)
+    answers.reach()
+    sub, chosen = answers.reached_mdp()
+    solution = solvers.evaluate_policy(sub, chosen, tolerance)
+    x, following = (_on_all_states(answers, each) for each in (solution.x, solution.next_x))
+    if mdp.is_sticky:
+        table = np.full((mdp.num_states, answers.width, mdp.num_actions), np.nan)
+        table[answers.rows // answers.width, answers.rows % answers.width] = answers.probabilities
+    else:
+        table = _scattered(answers.probabilities, answers.rows, mdp.num_states)[:, None]
+    return ReachedSolution(
+        mdp,
+        solution.error_bound,
+        solution.sweeps,
+        solution.seconds,
+        mdp.horizon,
+        PolicyTable(mdp.num_actions, table),
+        x,
+        following,
+        start=solution.value_at_start,
+        states_reached=len(np.unique(answers.rows // answers.width)),
+    )
+
+
+def _on_all_states(answers: Answers, x: np.ndarray) -> np.ndarray:
+    """(S + 1, W): values on the states that the policy reaches (N + 1, W), NaN elsewhere; 0 in terminal states."""
+    mdp = answers.mdp
+    states = np.unique(answers.rows // answers.width) if mdp.is_sticky else answers.rows
+    values = np.full((mdp.num_states + 1, x.shape[1]), np.nan)
+    values[states] = x[:-1]
+    if mdp.is_sticky:
+        rows = states[:, None] * answers.width + np.arange(mdp.num_actions)
+        values[states] = np.where(answers.index(rows) >= 0, values[states], np.nan)
+    values[:-1][np.asarray(mdp.terminal)] = 0.0
+    values[-1] = 0.0
+    return values
+
+
+def _scattered(values: np.ndarray, rows: np.ndarray, count: int) -> np.ndarray:
+    out = np.full((count, *values.shape[1:]), np.nan)
+    out[rows] = values
+    return out
+
+
+def _steps_that_matter(mdp: TabularMDP) -> tuple[int, float]:
+    """The number of steps after which nothing changes the value at the start by more than a bound, and the bound.
+
+    Without a horizon 2 gamma^n max |r| / (1 - gamma), below TAIL; what a policy would do later is not asked.
+    """
+    if mdp.horizon is not None:
+        return mdp.horizon, 0.0
+    largest = 2 * max(abs(mdp.reward_table.lowest), abs(mdp.reward_table.highest)) / (1 - mdp.gamma)
+    if largest <= TAIL or mdp.gamma == 0.0:
+        return 1, largest * mdp.gamma
+    steps = max(1, math.ceil(math.log(TAIL / largest) / math.log(mdp.gamma)))
+    return steps, largest * mdp.gamma**steps
