@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from strategies import small_mdps
 
 from pharos.mdp import TabularMDP
 from pharos.policies import TableAnswers, evaluate_seeing
 from pharos.solvers import evaluate_policy
+from strategies import small_mdps
 
 
 @settings(max_examples=100, deadline=None)
