@@ -21,7 +21,7 @@ from pharos.hardness.interval import Interval, Spending, conventions_of
 from pharos.hardness.travel import TravelBounds
 from pharos.kernels.hitting import UNIT
 from pharos.mdp import TabularMDP
-from pharos.rules.compiled import usable_workers
+from pharos.workers import usable_workers
 
 # Most targets that threads look at before they learn of a larger hitting time: a target may be looked at in vain that often.
 BATCH = 64

@@ -24,7 +24,7 @@ import numpy as np
 
 from pharos.hardness.choices import outcomes_of
 from pharos.mdp import TabularMDP
-from pharos.rules.compiled import usable_workers
+from pharos.workers import usable_workers
 
 NEARBY = 64  # nodes around each state that are looked at
 LIMIT = 0.8  # of the expected steps on ways back: a step takes at most five times as long

@@ -11,6 +11,13 @@ import numpy as np
 from numba import njit
 from numba.extending import overload
 
+UNROLLED = 128  # actions
+
+
+def actions_of(num_actions: int) -> "tuple[int, ...] | np.ndarray":
+    """The argument `actions`: a tuple of A zeros; an array where unrolled loops would take minutes to compile."""
+    return (0,) * num_actions if num_actions <= UNROLLED else np.zeros(num_actions, np.int8)
+
 
 def reward_at(table, palette, s, a):
     """The reward of (s, a): a palette's colour, or the entry itself."""

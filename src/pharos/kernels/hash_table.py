@@ -3,12 +3,15 @@
 The keys are not in the table: slot -> index -> states[index], so it costs 4 bytes a slot, whatever the width of a state.
 """
 
+from typing import Any
+
+import numba.extending
 import numpy as np
 from llvmlite import ir
 from numba import int64, njit, types, uint64
 from numba.core import cgutils
-from numba.extending import intrinsic
 
+intrinsic: Any = numba.extending.intrinsic  # whose types would hide those of the functions that it makes
 _BATCH = 32
 
 

@@ -315,7 +315,7 @@ class Table(Dynamics):
         if not isinstance(select, Extreme):
             return super().backup(equation, x, out)
         tables = (self.next_states, rewards.table, rewards.palette, gamma)
-        actions = (0,) * self.num_actions
+        actions = bellman.actions_of(self.num_actions)
         kernel, weights, x_, out_ = (
             (bellman.sticky_block, chance.triple, x, out)
             if chance.is_sticky
@@ -329,7 +329,7 @@ class Table(Dynamics):
     def sweep(self, equation: BellmanEquation, x: np.ndarray) -> float:
         rewards, gamma, chance, select = equation
         tables = (self.next_states, rewards.table, rewards.palette, gamma)
-        actions = (0,) * self.num_actions
+        actions = bellman.actions_of(self.num_actions)
         if isinstance(select, PolicyTable):
             return bellman.policy_sweep(*tables, chance.triple, select.later, x, np.empty(self.num_actions))
         assert isinstance(select, Extreme)
@@ -467,7 +467,7 @@ def _as_indices(table: np.ndarray, num_states: int) -> np.ndarray:
 
 def _shared(block: Callable[[int, int], None], num_states: int) -> None:
     """block(start, stop) over all states, on all processors where there are enough states to share."""
-    from pharos.rules.compiled import usable_workers
+    from pharos.workers import usable_workers
 
     workers = usable_workers(None) if num_states >= 1 << 16 else 1
     if workers == 1:

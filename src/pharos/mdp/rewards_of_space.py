@@ -59,7 +59,8 @@ def _refused(space: "StateSpace", env: Environment, s: int, a: int, why: str) ->
 
 def _blocks(space: "StateSpace", env: Environment, workers: int | None):
     """(start, rewards of the states from start on), in order."""
-    from pharos.rules.compiled import compiled_rules, usable_workers
+    from pharos.rules.compiled import compiled_rules
+    from pharos.workers import usable_workers
 
     starts = range(0, space.num_states, _ROWS)
     rules = compiled_rules(env, space.layout.num_words, ["rewards_of"])

@@ -1,48 +1,51 @@
-"""Rules in Python -> rules compiled by Numba, once per class of environments, cached on disk across processes.
+"""Rules in Python -> kernels compiled by Numba, once per class of environments, cached on disk across processes.
 
-Numba's own file cache knows a function by its file and does not see changes in what the function calls. So the kernels
-that call a user's rules (`exploration_template.py`) are copied to a file of their own in the cache directory, named by a
-fingerprint of the rules (`fingerprint.py`), and compiled from there: edited rules get another file, unchanged ones are found
-compiled. The parameters of an instance are arguments, not constants: all instances of a class share one compilation.
+Numba's own file cache knows a function by its file and does not see changes in what the function calls. So kernels that call a
+user's rules (`exploration.py`, `interaction.py`) are cached under a fingerprint of the rules (`fingerprint.py`) and of the code
+around them: edited rules get another file, unchanged ones are found compiled. The parameters of an instance are arguments, not
+constants: all instances of a class share one compilation.
 """
 
 import hashlib
-import os
-import sys
 import types as python_types
 import warnings
 from collections import namedtuple
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numba
 import numpy as np
+from numba.extending import overload
 
-from pharos import paths
 from pharos.environments import Environment
-from pharos.errors import ParameterError
+from pharos.rules.exploration import Exploration, exploration
 from pharos.rules.fingerprint import closure_of, function_text, mentioned_names, names_in, plain_function
+from pharos.rules.interaction import Interaction, interaction
+from pharos.rules.kernel_cache import cache_of_kernel
 
 RULES = ("transition", "is_terminal", "reward", "draw")
 _HERE = Path(__file__).parent
 _KERNELS = _HERE.parent / "kernels"
-_TEMPLATE = _HERE / "exploration_template.py"
-_MACHINERY = (Path(__file__), _HERE / "packed_view.py", _KERNELS / "hash_table.py", _KERNELS / "stepping.py")
+_MACHINERY = (
+    *(_HERE / name for name in ("compiled.py", "exploration.py", "interaction.py", "packed_view.py")),
+    *(_KERNELS / name for name in ("hash_table.py", "stepping.py")),
+)
 
 
 class CompiledRules:
-    """The rules of one environment instance, ready to be called from compiled code.
+    """The rules of one environment instance, ready to be called from compiled code, on packed states.
 
     Attributes:
         parameters: tuple of the numeric attributes of the instance that its rules mention, the first argument of every kernel.
-        kernels: namespace of `exploration_template.py`, compiled for these rules and for states of `num_words` words.
+        kernels: of `exploration.py`, compiled for these rules and for states of `num_words` words.
     """
 
     def __init__(self, env: Environment, num_words: int):
         names, self.parameters = numeric_attributes(env)
-        self.kernels = _kernels(type(env), names, num_words, env.num_actions)
+        self.num_words, self.num_actions = num_words, env.num_actions
+        self.kernels = exploration_kernels(type(env), names, num_words, env.num_actions)
 
 
 def compiled_rules(
@@ -67,12 +70,12 @@ class InteractionRules:
 
     Attributes:
         parameters: as in CompiledRules.
-        kernels: namespace of `interaction_template.py`.
+        kernels: of `interaction.py`.
     """
 
     def __init__(self, env: Environment):
         names, self.parameters = numeric_attributes(env)
-        self.kernels = _kernels(type(env), names, 0, env.num_actions, _HERE / "interaction_template.py")
+        self.kernels = interaction_kernels(type(env), names, env.num_actions)
 
 
 def numeric_attributes(env: Environment) -> tuple[tuple[str, ...], tuple[Any, ...]]:
@@ -101,33 +104,63 @@ def _plain(value: Any) -> Any:
 
 
 @cache
-def _kernels(
-    cls: type[Environment], names: tuple[str, ...], num_words: int, num_actions: int, template: Path = _TEMPLATE
-) -> Any:
-    compiler = _RuleCompiler()
-    rules = {rule: compiler.compiled(getattr(cls, rule)) for rule in RULES}
+def exploration_kernels(
+    cls: type[Environment], names: tuple[str, ...], num_words: int, num_actions: int
+) -> Exploration:
+    """The kernels of `exploration.py` for the rules of a class that mention the attributes `names`."""
+    compiler, rules, parameters = _compiler_of(cls, names, num_words, num_actions)
+    return exploration(compiler, rules, parameters, num_words, num_actions)
+
+
+@cache
+def interaction_kernels(cls: type[Environment], names: tuple[str, ...], num_actions: int) -> Interaction:
+    """The kernels of `interaction.py`."""
+    compiler, rules, parameters = _compiler_of(cls, names, 0, num_actions)
+    return interaction(compiler, rules, parameters, num_actions)
+
+
+def _compiler_of(cls: type[Environment], names: tuple[str, ...], *numbers: int) -> tuple["Compiler", dict, type]:
+    """What a maker needs: the compiler, the compiled rules by their names, and the class of `self`."""
+    rule_compiler = _RuleCompiler()
+    rules = {rule: rule_compiler.compiled(getattr(cls, rule)) for rule in RULES}
     texts = [function_text(getattr(cls, rule), {}) for rule in RULES]
-    source = template.read_text()
-    machinery = [path.read_text() for path in _MACHINERY]
-    key = (source, machinery, texts, names, num_words, num_actions, numba.__version__)
+    key = (_machinery(), texts, names, numbers, numba.__version__)
     digest = hashlib.sha256(repr(key).encode()).hexdigest()[:20]
-    file = paths.cache_directory() / "compiled" / f"{cls.__name__.lower()}_{digest}.py"
-    can_cache = _write_once(file, source)
-    module = python_types.ModuleType(f"pharos_compiled_{digest}")
-    sys.modules[module.__name__] = module  # Numba looks functions up by their module when it reads its cache
-    vars(module).update(
-        {
-            "__file__": str(file),
-            "Parameters": namedtuple("Parameters", names, module=module.__name__),
-            "NUM_WORDS": num_words,
-            "WORDS": (0,) * num_words,
-            "NUM_ACTIONS": num_actions,
-            "CACHE": can_cache,
-            **rules,
-        }
-    )
-    exec(compile(source, str(file), "exec"), vars(module))
-    return module
+    return Compiler(f"{cls.__name__.lower()}_{digest}"), rules, namedtuple("Parameters", names)
+
+
+@cache
+def _machinery() -> tuple[str, ...]:
+    return tuple(path.read_text() for path in _MACHINERY)
+
+
+class Compiler:
+    """Compiles the inner functions of the makers, under a name that is theirs for these rules alone.
+
+    The name goes into the symbols of the machine code: code of several classes of environments, compiled in several processes, is
+    loaded into one.
+    """
+
+    def __init__(self, name: str):
+        self.name = name
+
+    def inlined(self, function: Callable) -> Any:
+        """A function that becomes part of its callers."""
+        return numba.njit(forceinline=True)(self._named(function))
+
+    def function(self, function: Callable) -> Any:
+        """A function that kernels call."""
+        return numba.njit(nogil=True)(self._named(function))
+
+    def kernel(self, function: Callable) -> Any:
+        """A function that Python calls; the compiled form is kept on disk."""
+        kernel = numba.njit(nogil=True)(self._named(function))
+        kernel._cache = cache_of_kernel(f"{self.name}.{function.__name__}")
+        return kernel
+
+    def _named(self, function: Any) -> Any:
+        function.__qualname__ = f"{self.name}.{function.__name__}"
+        return function
 
 
 class _RuleCompiler:
@@ -163,17 +196,12 @@ class _RuleCompiler:
         return {n: self.compiled(f) for n, f in functions.items() if isinstance(f, python_types.FunctionType)}
 
 
-def _write_once(file: Path, source: str) -> bool:
-    """Put the kernels' source where Numba keeps the compiled form beside it; False where nothing can be written."""
-    try:
-        if not file.exists() or file.read_text() != source:
-            file.parent.mkdir(parents=True, exist_ok=True)
-            temporary = file.with_suffix(f".{os.getpid()}.tmp")
-            temporary.write_text(source)
-            os.replace(temporary, file)
-        return os.access(file.parent, os.W_OK)
-    except OSError:
-        return False
+@overload(float)
+def _float_of_truth(value):
+    """`float(x == y)`, the most natural reward of 0 or 1, which Numba does not know."""
+    if isinstance(value, numba.types.Boolean):
+        return lambda value: 1.0 if value else 0.0
+    return None
 
 
 # Rules that do not compile -----------------------------------------------------------------------------------------------
@@ -184,7 +212,7 @@ _warned: set[tuple[type, str]] = set()
 
 def _compilation_error(compiled: CompiledRules, kernel: str) -> str:
     """Compile a kernel, by calling it with no work to do; "" where that works."""
-    key = (compiled.kernels.__name__, tuple(map(_type_text, compiled.parameters)), kernel)
+    key = (compiled.kernels, tuple(map(_type_text, compiled.parameters)), kernel)
     if key in _known:
         return _known[key]
     try:
@@ -206,18 +234,18 @@ def _type_text(value: Any) -> str:
 
 def _call_explore(compiled: CompiledRules) -> None:
     table, layout = np.full(1 << 16, -1, np.int32), _empty_layout()
-    rows = (np.empty((1, compiled.kernels.NUM_ACTIONS), np.int32), np.empty(1, np.uint8))
-    states = np.empty((1, compiled.kernels.NUM_WORDS), np.uint64)
+    rows = (np.empty((1, compiled.num_actions), np.int32), np.empty(1, np.uint8))
+    states = np.empty((1, compiled.num_words), np.uint64)
     compiled.kernels.explore(compiled.parameters, layout, states, *rows, table, 0, 0, 0, np.zeros(5, np.int64))
 
 
 def _call_rewards_of(compiled: CompiledRules) -> None:
-    states = np.empty((1, compiled.kernels.NUM_WORDS), np.uint64)
-    successors = np.empty((1, compiled.kernels.NUM_ACTIONS), np.int32)
+    states = np.empty((1, compiled.num_words), np.uint64)
+    successors = np.empty((1, compiled.num_actions), np.int32)
     terminal = np.empty(1, np.bool_)
     for array in (states, successors, terminal):
         array.flags.writeable = False  # as they come out of a StateSpace
-    out = np.empty((0, compiled.kernels.NUM_ACTIONS))
+    out = np.empty((0, compiled.num_actions))
     compiled.kernels.rewards_of(compiled.parameters, _empty_layout(), states, successors, terminal, 0, 0, out)
 
 
@@ -242,19 +270,9 @@ def _warn_once(cls: type, kernel: str, error: str) -> None:
 def _first_lines(message: str) -> str:
     """What went wrong and in which line, out of Numba's long message."""
     lines = [line.strip() for line in message.splitlines() if line.strip()]
-    what = next((line for line in lines if not line.startswith(("Failed in", "During:"))), lines[0] if lines else "")
-    where = [
-        line
-        for line in lines
-        if line.startswith("File ") and "exploration_template" not in line and f"{os.sep}compiled{os.sep}" not in line
-    ]
+    start = next((i for i, line in enumerate(lines) if not line.startswith(("Failed in", "During:"))), 0)
+    what = lines[start] if lines else ""
+    if what.endswith("for signature:"):  # the useful words stand below
+        what += "".join(f" {line.removeprefix('>>>').strip()}" for line in lines[start + 1 : start + 2])
+    where = [line for line in lines if line.startswith("File ") and str(_HERE) not in line]
     return what + (f" ({where[-1].rstrip(':')})" if where else "")
-
-
-def usable_workers(workers: int | None) -> int:
-    """`workers`, or the number of processors that this process may use."""
-    if workers is None:
-        return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    if workers < 1:
-        raise ParameterError(f"workers is {workers}; expected at least 1")
-    return int(workers)

@@ -9,11 +9,15 @@ goes on with a harmless value; the caller looks at `fault` and stops.
 """
 
 import operator
+from typing import Any
 
+import numba.extending
 from llvmlite import ir
 from numba import int64, types
 from numba.core import cgutils
-from numba.extending import intrinsic, models, overload, register_model
+from numba.extending import models, overload, register_model
+
+intrinsic: Any = numba.extending.intrinsic  # whose types would hide those of the functions that it makes
 
 _WORD = ir.IntType(64)
 _REGISTER_WORDS = 8  # views on more words than this are in memory

@@ -224,7 +224,8 @@ class _Builder:
     """One run of the build: memory, files and the loop."""
 
     def __init__(self, env, path, identity, max_states, memory, workers, report, checkpoint_seconds):
-        from pharos.rules.compiled import compiled_rules, usable_workers
+        from pharos.rules.compiled import compiled_rules
+        from pharos.workers import usable_workers
 
         self.env, self.path, self.identity = env, path, identity
         self.max_states, self.memory, self.report = max_states, memory, report

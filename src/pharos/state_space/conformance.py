@@ -14,7 +14,6 @@ import warnings
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -460,16 +459,19 @@ def _check_compiled(env: Environment, check: _InterpretedCheck, states: list[Sta
                     f"{check.rewards[state, action]} interpreted; expected the same"
                 )
     if env.layers:
-        _check_compiled_drawings(check, rules, states, notes)
+        _check_compiled_drawings(check, states, notes)
     return True
 
 
-def _check_compiled_drawings(check: _InterpretedCheck, rules: Any, states: list[State], notes: list[str]) -> None:
+def _check_compiled_drawings(check: _InterpretedCheck, states: list[State], notes: list[str]) -> None:
     from numba.core.errors import NumbaError
+
+    from pharos.rules.compiled import InteractionRules
 
     planes = np.zeros((len(states), *check.drawings[states[0]].shape), np.uint8)
     try:
-        _drawing_kernel(rules.kernels)(rules.parameters, np.array(states, np.int64), planes)
+        rules = InteractionRules(check.env)
+        rules.kernels.draw_planes(rules.parameters, np.array(states, np.int64), planes)
     except NumbaError as error:
         reason = next((line.strip() for line in str(error).splitlines()[1:] if line.strip()), "")
         notes.append(f"Numba cannot compile draw, so drawing runs interpreted: {reason}")
@@ -481,21 +483,6 @@ def _check_compiled_drawings(check: _InterpretedCheck, rules: Any, states: list[
                 f"{check._where('draw', state)} writes {drawn[layer, row, column]} at [{layer}, {row}, {column}] compiled, "
                 f"{check.drawings[state][layer, row, column]} interpreted; expected the same"
             )
-
-
-@cache
-def _drawing_kernel(kernels: Any) -> Callable:
-    from numba import njit
-
-    draw, parameters_class = kernels.draw, kernels.Parameters
-
-    @njit
-    def drawings(parameters, states, planes):
-        self = parameters_class(*parameters)
-        for i in range(len(states)):
-            draw(self, states[i], planes[i])
-
-    return drawings
 
 
 def _check_built(env: Environment, check: _InterpretedCheck, states: list[State], notes: list[str]) -> None:

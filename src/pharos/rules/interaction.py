@@ -1,0 +1,259 @@
+"""Makers of the kernels of interaction: they call the rules of one class on states that are rows of int64.
+
+As in exploration.py, what the inner functions take from their makers are constants for Numba: the rules; `Parameters`, what the
+rules see as `self`; A actions. `ranges` (2, D) int64: lowest and highest value of each component.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import int64
+
+from pharos.kernels.stepping import SAME_STEP, drawn_start, executed_action
+
+
+class Interaction(NamedTuple):
+    """The compiled kernels; see the makers below."""
+
+    step_one: Any
+    step_and_draw_one: Any
+    step_many: Any
+    is_terminal_one: Any
+    draw_simple: Any
+    draw_complex: Any
+    draw_planes: Any
+
+
+def interaction(compiler: Any, rules: Any, Parameters: Any, A: int) -> Interaction:
+    """The kernels of a class of environments with A actions."""
+    advance = advance_function(compiler, rules)
+    draw_flat = draw_flat_function(compiler, rules)
+    return Interaction(
+        step_one=step_one_kernel(compiler, Parameters, advance),
+        step_and_draw_one=step_and_draw_one_kernel(compiler, Parameters, advance, draw_flat),
+        step_many=step_many_kernel(compiler, Parameters, advance, A),
+        is_terminal_one=is_terminal_one_kernel(compiler, rules, Parameters),
+        draw_simple=draw_simple_kernel(compiler, rules, Parameters, draw_flat),
+        draw_complex=draw_complex_kernel(compiler, rules, Parameters),
+        draw_planes=draw_planes_kernel(compiler, rules, Parameters),
+    )
+
+
+def advance_function(compiler: Any, rules: Any) -> Any:
+    """One step by the rules, checked."""
+    transition, is_terminal, reward = rules["transition"], rules["is_terminal"], rules["reward"]
+
+    @compiler.inlined
+    def advance(self, ranges, state, action, following):
+        """Write the successor of `state`; return the reward and 0 (goes on), 1 (terminal) or 2 + i (component i left its range)."""
+        for i in range(len(state)):
+            following[i] = state[i]
+        transition(self, state, action, following)
+        for i in range(len(state)):
+            if following[i] < ranges[0, i] or following[i] > ranges[1, i]:
+                return 0.0, 2 + i
+        return float(reward(self, state, action, following)), int64(is_terminal(self, following))
+
+    return advance
+
+
+def step_one_kernel(compiler: Any, Parameters: Any, advance: Any) -> Any:
+    """One step of one environment."""
+
+    @compiler.kernel
+    def step_one(parameters, ranges, scale, state, action, following, vector):
+        """One step: `advance`, and vector[i] = (following[i] - low[i]) * scale[i] where `vector` has room (0 entries: not wanted)."""
+        value, code = advance(Parameters(*parameters), ranges, state, action, following)
+        if len(vector) > 0:
+            for i in range(len(state)):
+                vector[i] = (following[i] - ranges[0, i]) * scale[i]
+        return value, code
+
+    return step_one
+
+
+def draw_flat_function(compiler: Any, rules: Any) -> Any:
+    """A simple image, a pixel for each cell."""
+    draw = rules["draw"]
+
+    @compiler.inlined
+    def draw_flat(self, state, shades, image):
+        """image[l] = shades[l, value of layer l], a pixel for each cell; image (L, rows, columns) uint8, zero."""
+        draw(self, state, image)
+        layers, rows, columns = image.shape
+        for layer in range(layers):
+            plane = image[layer].reshape(rows * columns)
+            only = shades[layer, 1]
+            if only == shades[layer, 255]:  # one kind of thing: no table, so that the loop is vectorized
+                for i in range(rows * columns):
+                    plane[i] = only if plane[i] != 0 else 0
+            else:
+                for i in range(rows * columns):
+                    plane[i] = shades[layer, plane[i]]
+
+    return draw_flat
+
+
+def step_and_draw_one_kernel(compiler: Any, Parameters: Any, advance: Any, draw_flat: Any) -> Any:
+    """One step of one environment, and its image."""
+
+    @compiler.kernel
+    def step_and_draw_one(parameters, ranges, state, action, following, shades, image):
+        """One step: `advance`, and the simple image of the successor, a pixel for each cell, on planes of their own.
+
+        shades (L, 256) uint8 as in `draw_simple`; image (L, rows, columns) uint8, zero.
+        """
+        self = Parameters(*parameters)
+        value, code = advance(self, ranges, state, action, following)
+        if code <= 1:
+            draw_flat(self, following, shades, image)
+        return value, code
+
+    return step_and_draw_one
+
+
+def step_many_kernel(compiler: Any, Parameters: Any, advance: Any, A: int) -> Any:
+    """One step of many environments."""
+
+    @compiler.kernel
+    def step_many(parameters, ranges, scale, chance, limit, mode, first_previous, starts, cumulative, rng, actions,
+                  states, previous, elapsed, ended, rewards, terminated, truncated, executed, final, vector, first, last):  # fmt: skip
+        """One step of environments first .. last - 1; return -1, or i * D + c where component c of environment i left its range.
+
+        An environment that has `ended` is reset instead (the mode DISABLED never comes here with one); in the mode SAME_STEP it is
+        reset at once, and `final` gets its last state. starts (K, D), cumulative (K,): the start distribution; rng (N,) uint64;
+        states, final (N, D); vector (N, D) float32 as in `step_one`, (0, D) where it is not wanted; the others (N,).
+        """
+        self = Parameters(*parameters)
+        length = states.shape[1]
+        following = np.empty(length, np.int64)
+        for i in range(first, last):
+            rewards[i], terminated[i], truncated[i], executed[i] = 0.0, False, False, -1
+            restart = ended[i]
+            if not restart:
+                action = executed_action(actions[i], previous[i], chance, A, rng, i)
+                value, code = advance(self, ranges, states[i], action, following)
+                if code > 1:
+                    executed[i] = action
+                    return i * length + code - 2
+                rewards[i] = value
+                previous[i] = executed[i] = action
+                elapsed[i] += 1
+                terminated[i] = code == 1
+                truncated[i] = elapsed[i] >= limit
+                ended[i] = terminated[i] or truncated[i]
+                restart = mode == SAME_STEP and ended[i]
+                for c in range(length):
+                    states[i, c] = following[c]
+                    if restart:
+                        final[i, c] = following[c]
+            if restart:
+                k = drawn_start(cumulative, rng, i)
+                for c in range(length):
+                    states[i, c] = starts[k, c]
+                previous[i], elapsed[i], ended[i] = first_previous, 0, False
+            if len(vector) > 0:
+                for c in range(length):
+                    vector[i, c] = (states[i, c] - ranges[0, c]) * scale[c]
+        return -1
+
+    return step_many
+
+
+def is_terminal_one_kernel(compiler: Any, rules: Any, Parameters: Any) -> Any:
+    """Whether one state is terminal."""
+    is_terminal = rules["is_terminal"]
+
+    @compiler.kernel
+    def is_terminal_one(parameters, state):
+        """Whether `state` is terminal."""
+        return bool(is_terminal(Parameters(*parameters), state))
+
+    return is_terminal_one
+
+
+def draw_simple_kernel(compiler: Any, rules: Any, Parameters: Any, draw_flat: Any) -> Any:
+    """Simple images of many states."""
+    draw = rules["draw"]
+
+    @compiler.kernel
+    def draw_simple(parameters, states, first, last, planes, shades, covering, out):
+        """out[n, l] = shades[l, value of layer l], each cell enlarged to a square, for states first .. last - 1.
+
+        planes (L, rows, columns) uint8 is room to draw; shades (L, 256) uint8; out (N, L or 1, rows k, columns k) uint8, zero.
+        With `covering`, all layers go to one plane and later ones cover earlier ones.
+        """
+        self = Parameters(*parameters)
+        layers, rows, columns = planes.shape
+        size = out.shape[2] // rows
+        for n in range(first, last):
+            if size == 1 and not covering:
+                draw_flat(self, states[n], shades, out[n])
+                continue
+            planes[:] = 0
+            draw(self, states[n], planes)
+            for layer in range(layers):
+                target = 0 if covering else layer
+                for row in range(rows):
+                    for column in range(columns):
+                        shade = shades[layer, planes[layer, row, column]]
+                        if shade > 0:
+                            for y in range(row * size, (row + 1) * size):
+                                for x in range(column * size, (column + 1) * size):
+                                    out[n, target, y, x] = shade
+
+    return draw_simple
+
+
+def draw_complex_kernel(compiler: Any, rules: Any, Parameters: Any) -> Any:
+    """Complex images of many states."""
+    draw = rules["draw"]
+
+    @compiler.kernel
+    def draw_complex(parameters, states, first, last, planes, picture, top, left, sprite, place, color, keep, out):
+        """Lay the sprites of states first .. last - 1 on the ground, later layers over earlier ones.
+
+        picture (height, width, C) uint8: the ground; top (rows + 1,), left (columns + 1,): edges of the cells in pixels.
+        sprite (L, rows, 256): number of the sprite of a value of a layer in a row, -1 for none; place (sprites, heights, widths): where its pixels
+        for a cell of this height and width begin in color (P, C) uint8, premultiplied, and keep (P,) uint16: how much of the ground
+        stays, of 256.
+        """
+        self = Parameters(*parameters)
+        layers, rows, columns = planes.shape
+        channels = picture.shape[2]
+        for n in range(first, last):
+            planes[:] = 0
+            draw(self, states[n], planes)
+            out[n] = picture
+            for layer in range(layers):
+                for row in range(rows):
+                    for column in range(columns):
+                        value = planes[layer, row, column]
+                        if value == 0 or sprite[layer, row, value] < 0:
+                            continue
+                        height = top[row + 1] - top[row]
+                        width = left[column + 1] - left[column]
+                        pixel = place[sprite[layer, row, value], height, width]
+                        for y in range(top[row], top[row + 1]):
+                            for x in range(left[column], left[column + 1]):
+                                stays = keep[pixel]
+                                for channel in range(channels):
+                                    ground = int64(out[n, y, x, channel]) * stays >> 8
+                                    out[n, y, x, channel] = color[pixel, channel] + ground
+                                pixel += 1
+
+    return draw_complex
+
+
+def draw_planes_kernel(compiler: Any, rules: Any, Parameters: Any) -> Any:
+    """What `draw` writes, for many states."""
+    draw = rules["draw"]
+
+    @compiler.kernel
+    def draw_planes(parameters, states, planes):
+        """planes (N, L, rows, columns) uint8, zero, get the drawings of states (N, D)."""
+        self = Parameters(*parameters)
+        for i in range(len(states)):
+            draw(self, states[i], planes[i])
+
+    return draw_planes
