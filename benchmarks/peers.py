@@ -14,7 +14,7 @@ import gymnasium
 import numpy as np
 
 import pharos
-from pharos.interaction.vector_env import make_vec
+from pharos.interaction import make_vec
 from stepping import NUM_ENVS, _rate, steps_per_second_of_one, steps_per_second_of_vector
 
 GAMES = {"breakout": {"height": 10, "columns": 10, "brick_rows": 3}, "freeway": {"num_cars": 8, "lane_length": 10}}

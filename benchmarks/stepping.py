@@ -10,7 +10,7 @@ import gymnasium
 import numpy as np
 
 import pharos
-from pharos.interaction.vector_env import make_vec
+from pharos.interaction import make_vec
 
 NUM_ENVS = 1024
 

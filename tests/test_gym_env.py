@@ -13,7 +13,8 @@ from gymnasium.utils.env_checker import check_env
 import pharos
 from pharos.drawing import human
 from pharos.errors import MissingExtra, ParameterError
-from pharos.interaction.gym_env import GymEnv, chance_weights
+from pharos.interaction import GymEnv
+from pharos.interaction.simulator import chance_weights
 from pharos.observations import observe
 
 SMALL = {
@@ -316,3 +317,69 @@ def test_what_a_step_returns_is_of_its_state_and_stays_so(name, observation, opt
         assert (given == given_then).all() and (state == state_then).all()
         assert given.dtype == env.observation_space.dtype and (given == of_state.one(state)).all()
     assert len({state.tobytes() for _, state, _, _ in kept}) > 10
+
+
+# What Gymnasium's tools ask for ------------------------------------------------------------------------------------------
+
+
+def steps_until_truncated(env):
+    """Steps of the same action until the episode is truncated; None where 200 are not."""
+    env.reset(seed=0)
+    for step in range(1, 201):
+        if env.step(0)[3]:
+            return step
+    return None
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "limit"),
+    [
+        ("pharos/SimpleGrid-v0", {}, 32),
+        ("pharos/SimpleGrid-v0", {"height": 20, "width": 20}, 160),
+        ("pharos/SimpleGrid-4x4-plain-v0", {}, 32),
+        ("pharos/SimpleGrid-v0", {"time_limit": 50}, 50),
+        ("pharos/SimpleGrid-v0", {"time_limit": None}, None),
+        ("pharos/SimpleGrid-v0", {"max_episode_steps": 9}, 9),
+    ],
+)
+def test_the_specification_says_the_limit_at_which_episodes_are_truncated(name, arguments, limit):
+    env = gymnasium.make(name, **arguments)
+    assert env.spec.max_episode_steps == limit
+    assert steps_until_truncated(env) == limit
+    again = gymnasium.make(env.spec)
+    assert again.spec.max_episode_steps == limit
+    assert steps_until_truncated(again) == limit
+
+
+def test_the_specification_of_a_vector_environment_says_its_limit():
+    vec = gymnasium.make_vec("pharos/SimpleGrid-v0", num_envs=2, height=20, width=20)
+    assert vec.spec.max_episode_steps == 160
+    assert gymnasium.make_vec("pharos/SimpleGrid-v0", num_envs=2, time_limit=7).spec.max_episode_steps == 7
+
+
+def test_actions_have_meanings():
+    env = gymnasium.make("pharos/Breakout-v0", height=8, columns=4)
+    assert env.unwrapped.get_action_meanings() == ["left", "stay", "right"]
+    assert pharos.make_vec("frozen_lake", 2).get_action_meanings() == ["left", "down", "right", "up"]
+
+
+def test_the_observation_index_builds_its_state_space_so_that_a_specification_survives_json(tmp_path, monkeypatch):
+    monkeypatch.setenv("PHAROS_CACHE_DIR", str(tmp_path))
+    env = gymnasium.make("pharos/FrozenLake-v0", observation="index")
+    assert env.observation_space.n == 16
+    again = gymnasium.make(gymnasium.envs.registration.EnvSpec.from_json(env.spec.to_json()))
+    assert again.observation_space == env.observation_space
+    assert env.reset(seed=1)[0] == again.reset(seed=1)[0] == 0
+
+
+def test_the_observation_index_says_what_to_do_where_there_are_too_many_states(tmp_path, monkeypatch):
+    monkeypatch.setenv("PHAROS_CACHE_DIR", str(tmp_path))
+    monkeypatch.setattr("pharos.interaction.simulator.LARGEST_INDEX", 5)
+    with pytest.raises(ParameterError, match=r"builds at most 5 states; build it yourself and give space=pharos.build"):
+        gymnasium.make("pharos/FrozenLake-v0", observation="index")
+
+
+def test_a_named_instance_has_an_id_of_its_own():
+    env = gymnasium.make("pharos/Breakout-12x8x1-v0")
+    assert env.unwrapped.environment == pharos.make("breakout/12x8x1")
+    assert gymnasium.make("pharos/Breakout-12x8x1-v0", brick_rows=1).unwrapped.environment.brick_rows == 1

@@ -8,7 +8,7 @@ from gymnasium.utils.env_checker import check_env
 
 import pharos
 from pharos.errors import ParameterError
-from pharos.interaction.gym_env import GymEnv
+from pharos.interaction import GymEnv
 from pharos.observations import observe
 
 SMALL = {

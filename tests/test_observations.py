@@ -117,3 +117,9 @@ def test_unknown_names_and_options_suggest_the_nearest():
         observations.observe(env, "vector", gray=True)
     with pytest.raises(ParameterError, match="expected one of vector"):
         observations.observe(env, 7)
+
+
+def test_environments_may_be_given_by_name():
+    assert observations.observe("breakout/12x8x1", "vector").env == pharos.make("breakout/12x8x1")
+    with pytest.raises(ParameterError, match="env is 3; expected a pharos Environment, or a name"):
+        observations.observe(3, "vector")

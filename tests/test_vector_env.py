@@ -9,8 +9,7 @@ from scipy.stats import chisquare
 
 import pharos
 from pharos.errors import ParameterError
-from pharos.interaction.gym_env import GymEnv
-from pharos.interaction.vector_env import make_vec
+from pharos.interaction import GymEnv, make_vec
 from pharos.rules import InterpretedStepping
 
 SMALL = {

@@ -33,13 +33,13 @@ _HOMES = {
     "value_iteration": "pharos.solvers",
     "evaluate_policy": "pharos.policies",
     "observe": "pharos.observations",
-    "GymEnv": "pharos.interaction.gym_env",
-    "make_vec": "pharos.interaction.vector_env",
+    "GymEnv": "pharos.interaction",
+    "make_vec": "pharos.interaction",
     "train": "pharos.experiments",
     "PharosError": "pharos.errors",
 }
 # Modules that stand in another folder than their public name says.
-_MODULES = {"bisimulation": "pharos.mdp.bisimulation", "sb3_env": "pharos.interaction.sb3_env"}
+_MODULES = {"bisimulation": "pharos.bisimulation", "sb3_env": "pharos.sb3_env"}
 _PACKAGES = (
     "agents",
     "environments",

@@ -1,5 +1,5 @@
-"""The public name of `pharos.interaction.sb3_env`."""
+"""The public name of what `pharos.interaction` has for Stable-Baselines3."""
 
-from pharos.interaction.sb3_env import make_sb3_vec
+from pharos.interaction import SB3VecEnv, make_sb3_vec
 
-__all__ = ["make_sb3_vec"]
+__all__ = ["SB3VecEnv", "make_sb3_vec"]

@@ -1,1 +1,46 @@
-"""Stepping an environment: one (Gymnasium), many at once (vector), and those of Stable-Baselines3."""
+"""Stepping an environment: one (Gymnasium), many at once (vector), and those of Stable-Baselines3.
+
+`import pharos` needs `registration` alone, so that everything else is loaded when it is first used.
+"""
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from pharos.interaction.gym_env import GymEnv
+    from pharos.interaction.registration import ids_of, register_class
+    from pharos.interaction.sb3_env import SB3VecEnv, make_sb3_vec
+    from pharos.interaction.simulator import Interaction, Simulator, split_options
+    from pharos.interaction.vector_env import VectorEnv, make_vec
+
+_FILES = {
+    "GymEnv": "gym_env",
+    "Interaction": "simulator",
+    "SB3VecEnv": "sb3_env",
+    "Simulator": "simulator",
+    "VectorEnv": "vector_env",
+    "ids_of": "registration",
+    "make_sb3_vec": "sb3_env",
+    "make_vec": "vector_env",
+    "register_class": "registration",
+    "split_options": "simulator",
+}
+
+__all__ = [
+    "GymEnv",
+    "Interaction",
+    "SB3VecEnv",
+    "Simulator",
+    "VectorEnv",
+    "ids_of",
+    "make_sb3_vec",
+    "make_vec",
+    "register_class",
+    "split_options",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _FILES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"{__name__}.{_FILES[name]}"), name)

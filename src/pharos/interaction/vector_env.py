@@ -15,13 +15,11 @@ from gymnasium.vector.utils import batch_space
 from pharos.drawing import human
 from pharos.environments import Environment
 from pharos.errors import ParameterError
-from pharos.interaction.gym_env import Simulator, split_options
-from pharos.observations import Index
-from pharos.observations.blocks import in_blocks
-from pharos.observations.context import NO_ACTION
+from pharos.interaction.simulator import Simulator, spec_with_limit, split_options
+from pharos.interaction.walks import RulesWalk, TableWalk
+from pharos.kernels.stepping import DISABLED, SAME_STEP, first_outside
+from pharos.observations import NO_ACTION
 
-BLOCK = 4096  # steps that are worth a thread's while
-LARGEST_TABLE = 1 << 28  # bytes of observations that are computed beforehand
 _MODES = (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP, AutoresetMode.DISABLED)
 
 
@@ -75,6 +73,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.action_names = simulator.env.actions
+        self._spec: Any = None
         self._seed = seed
         self._rng: np.ndarray | None = None
         n = self.num_envs
@@ -82,13 +81,26 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         self._elapsed = np.zeros(n, np.int64)
         self._ended = np.zeros(n, np.bool_)
         self._limit = simulator.limit if simulator.limit is not None else 1 << 62
-        walk = _Rules if simulator.state_space is None else _Table
+        walk = RulesWalk if simulator.state_space is None else TableWalk
         self._walk: Any = walk(simulator, n)
 
     @property
     def environment(self) -> Environment:
         """The environment without chance, time limit and observation."""
         return self.simulator.env
+
+    @property
+    def spec(self) -> Any:  # type: ignore[override]
+        """Gymnasium's specification, with the limit of this instance as `max_episode_steps`; None unless made by an id."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: Any) -> None:
+        self._spec = spec_with_limit(spec, self.simulator.limit)
+
+    def get_action_meanings(self) -> list[str]:
+        """The names of the actions, as the Arcade Learning Environment gives them."""
+        return list(self.action_names)
 
     @property
     def states(self) -> np.ndarray:
@@ -124,8 +136,6 @@ class VectorEnv(gymnasium.vector.VectorEnv):
 
     def step(self, actions: Any) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Choose an action (N,) for every environment."""
-        from pharos.kernels.stepping import DISABLED, SAME_STEP
-
         if self._rng is None:
             raise gymnasium.error.ResetNeeded(f"{self.environment}: call reset() before step()")
         actions = self._checked_actions(actions)
@@ -209,8 +219,6 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         return mask
 
     def _checked_actions(self, actions: Any) -> np.ndarray:
-        from pharos.kernels.stepping import first_outside
-
         found = np.asarray(actions)
         if found.shape != (self.num_envs,) or found.dtype.kind not in "iu":
             raise ParameterError(
@@ -229,142 +237,6 @@ class VectorEnv(gymnasium.vector.VectorEnv):
 def make_vec(name_or_env: Environment | str, num_envs: int = 1, **options: Any) -> VectorEnv:
     """Return `num_envs` copies of an environment as a Gymnasium vector environment; see `VectorEnv` for the options."""
     return VectorEnv(name_or_env, num_envs, **options)
-
-
-class _Rules:
-    """States (N, D), advanced by the rules."""
-
-    name = "state"
-
-    def __init__(self, simulator: Simulator, num_envs: int):
-        self.simulator = simulator
-        length = len(simulator.env.components)
-        self.current = np.zeros((num_envs, length), np.int64)
-        self.final = np.zeros_like(self.current)
-        self.final_elapsed = np.zeros(num_envs, np.int64)
-        context: Any = simulator.context
-        self._fused = context.is_plain and context.is_vector  # the compiled step writes the vectors as well
-        self._scale = context.observation.scale if self._fused else np.zeros(length)
-        self._vector = np.empty((0, length), np.float32)
-        self._step_many: Any = simulator.rules.step_many
-
-    def states(self, rows: Any) -> np.ndarray:
-        return self.current[rows].copy()
-
-    def restart(self, mask: np.ndarray, rng: Any, state: Any) -> None:
-        from pharos.kernels.stepping import draw_starts
-
-        self._vector = self._vector[:0]
-        if state is not None:
-            self.current[mask] = _given_states(self.simulator, state, len(mask))[mask]
-            return
-        chosen = np.zeros(len(mask), np.int64)
-        draw_starts(self.simulator.start_cumulative, rng, mask, chosen)
-        self.current[mask] = self.simulator.start_states[chosen[mask]]
-
-    def step(self, setting: tuple, given: tuple, arrays: tuple) -> None:
-        simulator = self.simulator
-        if self._fused:
-            self._vector = np.empty(self.current.shape, np.float32)
-        self.final_elapsed[:] = arrays[1] + 1
-        faults: list[int] = []
-
-        def run(first: int, last: int) -> None:
-            fault = self._step_many(
-                simulator.rules.parameters, simulator.ranges, self._scale, simulator.chance, *setting,
-                simulator.start_states, simulator.start_cumulative, *given, self.current, *arrays,
-                self.final, self._vector, first, last,
-            )  # fmt: skip
-            if fault >= 0:
-                faults.append(fault)
-
-        in_blocks(run, len(self.current), BLOCK)
-        if faults:
-            i, component = divmod(min(faults), self.current.shape[1])
-            simulator.raise_fault(self.current[i], int(arrays[-1][i]), component)
-
-    def observations(self, previous: np.ndarray, elapsed: np.ndarray) -> Any:
-        if len(self._vector):
-            return self._vector
-        return self.simulator.context(self.current, previous, elapsed)
-
-    def final_observations(self, rows: np.ndarray, previous: np.ndarray, elapsed: np.ndarray) -> Any:
-        return self.simulator.context(self.final[rows], previous, elapsed)
-
-
-class _Table:
-    """Indices (N,) of a built state space, advanced by looking successors up."""
-
-    name = "index"
-
-    def __init__(self, simulator: Simulator, num_envs: int):
-        self.simulator = simulator
-        assert simulator.state_space is not None
-        self.space = simulator.state_space
-        self.current = np.zeros(num_envs, np.int64)
-        self.final = np.zeros(num_envs, np.int64)
-        self.final_elapsed = np.zeros(num_envs, np.int64)
-        self._successors = np.asarray(self.space.successors)
-        self._rewards = np.ascontiguousarray(self.space.mdp().rewards, np.float64)
-        self._starts = self.space.indices(simulator.start_states)
-        context: Any = simulator.context
-        self._is_index = context.is_plain and isinstance(context.observation, Index)
-        self._table: np.ndarray | None = None
-        one = np.prod(context.observation.space.shape or ()) * np.dtype(context.observation.space.dtype).itemsize
-        if context.is_plain and not self._is_index and one * self.space.num_states <= LARGEST_TABLE:
-            self._table = context.observation(self.space.states())
-
-    def states(self, rows: Any) -> np.ndarray:
-        return self.space.states(self.current[rows])
-
-    def restart(self, mask: np.ndarray, rng: Any, state: Any) -> None:
-        from pharos.kernels.stepping import draw_starts
-
-        if state is not None:
-            given = _given_states(self.simulator, state, len(mask))
-            self.current[mask] = self.space.indices(given[mask])
-            return
-        chosen = np.zeros(len(mask), np.int64)
-        draw_starts(self.simulator.start_cumulative, rng, mask, chosen)
-        self.current[mask] = self._starts[chosen[mask]]
-
-    def step(self, setting: tuple, given: tuple, arrays: tuple) -> None:
-        from pharos.kernels import stepping
-
-        walk_table: Any = stepping.walk_table
-        self.final_elapsed[:] = arrays[1] + 1
-        simulator = self.simulator
-
-        def run(first: int, last: int) -> None:
-            walk_table(
-                self._successors, self._rewards, self.space.terminal, simulator.chance, *setting,
-                self._starts, simulator.start_cumulative, *given, self.current, *arrays, self.final, first, last,
-            )  # fmt: skip
-
-        in_blocks(run, len(self.current), BLOCK)
-
-    def observations(self, previous: np.ndarray, elapsed: np.ndarray) -> Any:
-        return self._observed(self.current, previous, elapsed)
-
-    def final_observations(self, rows: np.ndarray, previous: np.ndarray, elapsed: np.ndarray) -> Any:
-        return self._observed(self.final[rows], previous, elapsed)
-
-    def _observed(self, index: np.ndarray, previous: np.ndarray, elapsed: np.ndarray) -> Any:
-        if self._is_index:
-            return index.copy()
-        if self._table is not None:
-            return self._table.take(index, axis=0)
-        return self.simulator.context(self.space.states(index), previous, elapsed)
-
-
-def _given_states(simulator: Simulator, state: Any, num_envs: int) -> np.ndarray:
-    """(N, D) from one state or N of them, checked."""
-    rows = np.asarray(state)
-    if rows.ndim == 1:
-        return np.tile(simulator.checked_state(rows), (num_envs, 1))
-    if len(rows) != num_envs:
-        raise ParameterError(f"{simulator.env}: {len(rows)} states; expected one, or {num_envs}")
-    return np.stack([simulator.checked_state(row) for row in rows])
 
 
 def _rows_of(batch: Any, number: int) -> list[Any]:

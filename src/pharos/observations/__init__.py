@@ -3,8 +3,9 @@
 `observe(env, "vector")` gives one; calling it with states (N, D) gives N observations. Nothing is stored with the states.
 """
 
+from pharos.observations.blocks import in_blocks
 from pharos.observations.complex_image import ComplexImage
-from pharos.observations.context import ObservationInContext
+from pharos.observations.context import NO_ACTION, ObservationInContext
 from pharos.observations.observation import FunctionObservation, Observation, add_built_in, names, observe, register
 from pharos.observations.rendered import RENDERERS, render, renderers
 from pharos.observations.simple_image import SimpleImage
@@ -17,6 +18,7 @@ add_built_in("one_hot", OneHot)
 add_built_in("index", Index)
 
 __all__ = [
+    "NO_ACTION",
     "RENDERERS",
     "ComplexImage",
     "FunctionObservation",
@@ -26,6 +28,7 @@ __all__ = [
     "OneHot",
     "SimpleImage",
     "Vector",
+    "in_blocks",
     "names",
     "observe",
     "register",

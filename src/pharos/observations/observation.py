@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pharos.environments import Environment
+from pharos.environments import Environment, make
 from pharos.errors import ParameterError, UnknownName
 
 if TYPE_CHECKING:
@@ -121,11 +121,12 @@ def add_built_in(name: str, make: Callable[..., Observation]) -> None:
 
 
 def observe(
-    env: Environment, observation: Any = "vector", *, state_space: "StateSpace | None" = None, **options: Any
+    env: Environment | str, observation: Any = "vector", *, state_space: "StateSpace | None" = None, **options: Any
 ) -> Observation:
     """Return an observation of `env`.
 
     Args:
+        env: an Environment, or a name that `pharos.make` knows.
         observation: a name (see `names`); a pair (function, Gymnasium space) as in `register`; or an Observation, which is
             returned.
         state_space: the built state space; "index" needs it.
@@ -134,6 +135,9 @@ def observe(
         UnknownName: no such observation or option; the nearest is suggested.
         ParameterError: the observation does not exist for this environment.
     """
+    env = make(env) if isinstance(env, str) else env
+    if not isinstance(env, Environment):
+        raise ParameterError(f"env is {env!r}; expected a pharos Environment, or a name such as 'breakout/12x8x1'")
     if isinstance(observation, Observation):
         if observation.env != env:
             raise ParameterError(
@@ -150,11 +154,11 @@ def observe(
     elif observation in _registered:
         made, known = FunctionObservation(env, *_registered[observation], name=observation), []
     elif observation in _built_in:
-        make = _built_in[observation]
-        parameters = inspect.signature(make).parameters
+        maker = _built_in[observation]
+        parameters = inspect.signature(maker).parameters
         known = [name for name, parameter in parameters.items() if parameter.kind is parameter.KEYWORD_ONLY]
         space = {"state_space": state_space} if "state_space" in parameters else {}
-        made = make(env, **space, **{name: value for name, value in options.items() if name in known})
+        made = maker(env, **space, **{name: value for name, value in options.items() if name in known})
     else:
         raise UnknownName("observation", observation, names())
     for option in options:

@@ -74,7 +74,7 @@ def _beside(parts: Sequence[np.ndarray]) -> np.ndarray:
 
 def _episode(task: "Task", agent: Any, steps: int, seed: int) -> list[tuple["State", float]]:
     """[(state, return so far)] from the start to the end of one episode, as `GymEnv` plays it."""
-    from pharos.interaction.gym_env import GymEnv
+    from pharos.interaction import GymEnv
 
     env = GymEnv(task.env, **task.interaction)
     choose = _chooser(task, agent, np.random.default_rng(seed))

@@ -1,0 +1,211 @@
+"""An environment made ready for interaction: the options that single and vector environments share, and what they make."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from pharos.environments import Environment, make, start_distribution
+from pharos.errors import ParameterError, RuleError, StateSpaceTooLarge
+from pharos.observations import NO_ACTION, ObservationInContext, observe
+from pharos.rules import stepping_rules
+from pharos.state_space import StateSpace, build, load
+
+LARGEST_INDEX = (
+    20_000_000  # states that are built on the way where the observation "index" is asked for without `space`
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Interaction:
+    """The options of interaction, which single and vector environments share.
+
+    Attributes:
+        observation: a name (`pharos.observations.names()`), a pair (function, Gymnasium space), or an Observation.
+        observation_options: of the named observation, such as {"grey": True}.
+        sticky: probability that the previously executed action is executed again.
+        random: probability that the action is replaced by one uniform over all; with both, the choice is replaced first and
+            then may stick: the chance of `random_actions(sticky_actions(mdp, sticky), random)`.
+        initial_previous_action: what sticks on the first step. None: nothing, the chosen action is executed (as in Gymnasium's
+            StickyAction); the Arcade Learning Environment starts with its action "noop".
+        previous_action: whether the agent sees the previously executed action.
+        remaining_time: whether the agent sees the share of the time limit that is left.
+        time_limit: steps after which an episode is truncated; "default" for that of the class, None for no limit.
+        space: the built state space of the environment, or its folder; adds "index" to info. The observation "index" needs
+            it: where none is given, it is taken from the user's cache, or built.
+    """
+
+    observation: Any = "vector"
+    observation_options: Mapping[str, Any] | None = None
+    sticky: float = 0.0
+    random: float = 0.0
+    initial_previous_action: int | None = None
+    previous_action: bool = False
+    remaining_time: bool = False
+    time_limit: int | str | None = "default"
+    space: Any = None
+
+
+class Simulator:
+    """An environment made ready for interaction: rules as compiled functions, observation, chance, time limit.
+
+    Attributes:
+        env, state_space, context, limit: as the options say; `context` maps states to what the agent gets.
+        chance: (chosen, previous, uniform), weights of the executed action; they sum to 1.
+        has_chance: whether another than the chosen action may be executed.
+        start_states (K, D), start_cumulative (K,): start states and the cumulative sum of their probabilities.
+        ranges: (2, D) int64, lowest and highest value of each component.
+    """
+
+    def __init__(self, environment: Environment | str, options: Interaction, parameters: Mapping[str, Any]):
+        self.env = _environment(environment, parameters)
+        self.state_space = _state_space(options, self.env)
+        self.limit = _time_limit(options.time_limit, self.env)
+        observation = observe(
+            self.env, options.observation, state_space=self.state_space, **(options.observation_options or {})
+        )
+        self.context = ObservationInContext(
+            observation,
+            previous_action=options.previous_action,
+            remaining_time=options.remaining_time,
+            limit=self.limit,
+        )
+        self.chance = chance_weights(options.sticky, options.random)
+        self.has_chance = self.chance != (1.0, 0.0, 0.0)
+        self.first_previous = _first_previous(options.initial_previous_action, self.env)
+        states, probabilities = start_distribution(self.env)
+        self.start_states = np.array(states, np.int64)
+        self.start_cumulative = np.cumsum(probabilities)
+        self.start_cumulative[-1] = 1.0
+        components = self.env.components
+        self.ranges = np.stack([components.low, components.high])
+        self.rules = stepping_rules(self.env, self.start_states[0])
+
+    def drawn_start(self, rng: np.random.Generator) -> int:
+        """Which of the start states; draws one number where there are several."""
+        if len(self.start_states) == 1:
+            return 0
+        return int(np.searchsorted(self.start_cumulative, rng.random(), side="right"))
+
+    def executed(self, chosen: int, previous: int, u: float) -> int:
+        """The executed action, by one uniform number u in [0, 1): chosen, then previous, then uniform."""
+        stay, stick, uniform = self.chance
+        if u < stay or (u < stay + stick and previous == NO_ACTION):
+            return chosen
+        if u < stay + stick:
+            return previous
+        return min(int((u - stay - stick) / uniform * self.env.num_actions), self.env.num_actions - 1)
+
+    def checked_state(self, state: Any) -> np.ndarray:
+        """(D,) int64 from what a user gave; ParameterError unless every component is in its range."""
+        values = np.asarray(state)
+        if values.shape != (len(self.env.components),) or values.dtype.kind not in "iub":
+            raise ParameterError(
+                f"{self.env}: state {state!r}; expected {len(self.env.components)} integers: "
+                f"{', '.join(self.env.components.names[:8])}{' ...' if len(self.env.components) > 8 else ''}"
+            )
+        values = values.astype(np.int64)
+        outside = np.flatnonzero((values < self.ranges[0]) | (values > self.ranges[1]))
+        if outside.size:
+            i = int(outside[0])
+            raise ParameterError(
+                f"{self.env}: state has {self.env.components.names[i]} = {values[i]}; "
+                f"expected {self.ranges[0, i]} to {self.ranges[1, i]}"
+            )
+        return values
+
+    def raise_fault(self, state: np.ndarray, action: int, component: int) -> None:
+        """RuleError: the rules left the declared range of a component."""
+        raise RuleError(
+            f"{self.env}: action {self.env.actions[action]!r} in state {tuple(state.tolist())} takes "
+            f"{self.env.components.names[component]} out of its range {self.ranges[0, component]} to "
+            f"{self.ranges[1, component]}; declare a wider range in variables(), or mend transition()"
+        )
+
+
+def chance_weights(sticky: float, random: float) -> tuple[float, float, float]:
+    """(chosen, previous, uniform), the chance of `random_actions(sticky_actions(mdp, sticky), random)`.
+
+    Raises:
+        ParameterError: a probability is not in [0, 1].
+    """
+    for name, p in (("sticky", sticky), ("random", random)):
+        if isinstance(p, bool) or not isinstance(p, int | float) or not 0 <= p <= 1:
+            raise ParameterError(f"{name} is {p!r}; expected a probability in [0, 1]")
+    return (1 - random) * (1 - sticky), float(sticky), random * (1 - sticky)
+
+
+def split_options(options: Mapping[str, Any]) -> tuple[Interaction, dict[str, Any]]:
+    """The options of interaction, and the rest: parameters of the environment."""
+    known = Interaction.__dataclass_fields__
+    interaction = Interaction(**{name: value for name, value in options.items() if name in known})
+    return interaction, {name: value for name, value in options.items() if name not in known}
+
+
+def _environment(environment: Environment | str, parameters: Mapping[str, Any]) -> Environment:
+    if isinstance(environment, str):
+        env = make(environment, **parameters)
+    elif isinstance(environment, Environment):
+        if parameters:
+            raise ParameterError(
+                f"{environment}: unknown options {', '.join(parameters)}; its parameters are set already"
+            )
+        env = environment
+    else:
+        raise ParameterError(f"environment is {environment!r}; expected a name or a pharos Environment")
+    clashes = sorted(set(env.parameters) & set(Interaction.__dataclass_fields__))
+    if clashes:
+        raise ParameterError(
+            f"{env}: parameter {clashes[0]!r} is also an option of the Gymnasium environment; rename it"
+        )
+    return env
+
+
+def _state_space(options: Interaction, env: Environment) -> StateSpace | None:
+    if options.space is None:
+        return _indexed(env) if options.observation == "index" else None
+    space = options.space if isinstance(options.space, StateSpace) else load(options.space)
+    if space.environment != env:
+        raise ParameterError(f"space holds the states of {space.environment}; expected those of {env}")
+    return space
+
+
+def _indexed(env: Environment) -> StateSpace:
+    """The state space of `env`, from the user's cache or built, for the observation "index"."""
+    try:
+        return build(env, max_states=LARGEST_INDEX)
+    except StateSpaceTooLarge as error:
+        raise ParameterError(
+            f"{env}: observation 'index' without space= builds at most {LARGEST_INDEX:,} states; "
+            f"build it yourself and give space=pharos.build(env), or its folder"
+        ) from error
+
+
+def spec_with_limit(spec: gymnasium.envs.registration.EnvSpec | None, limit: int | None) -> Any:
+    """The specification of an environment that truncates its episodes itself, with its true limit.
+
+    The registry says None, because the limit depends on the arguments of `gymnasium.make`: with a number there, Gymnasium would
+    wrap the environment in a second TimeLimit that knows nothing of `height=20` or `time_limit=None`.
+    """
+    return None if spec is None else replace(spec, max_episode_steps=limit)
+
+
+def _time_limit(limit: int | str | None, env: Environment) -> int | None:
+    chosen = env.max_episode_steps if limit == "default" else limit
+    if chosen is None:
+        return None
+    if isinstance(chosen, bool) or not isinstance(chosen, int | np.integer) or chosen < 1:
+        raise ParameterError(f"time_limit is {limit!r}; expected a number of steps of at least 1, None or 'default'")
+    return int(chosen)
+
+
+def _first_previous(action: int | None, env: Environment) -> int:
+    if action is None:
+        return NO_ACTION
+    if isinstance(action, bool) or not isinstance(action, int | np.integer) or not 0 <= action < env.num_actions:
+        raise ParameterError(
+            f"initial_previous_action is {action!r}; expected None or an action from 0 to {env.num_actions - 1}"
+        )
+    return int(action)

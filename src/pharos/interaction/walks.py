@@ -1,0 +1,143 @@
+"""How the N states of a vector environment advance: by the rules, or by looking successors up in a built state space."""
+
+from typing import Any
+
+import numpy as np
+
+from pharos.errors import ParameterError
+from pharos.interaction.simulator import Simulator
+from pharos.kernels import stepping
+from pharos.observations import Index, in_blocks
+
+BLOCK = 4096  # steps that are worth a thread's while
+LARGEST_TABLE = 1 << 28  # bytes of observations that are computed beforehand
+
+
+class RulesWalk:
+    """States (N, D), advanced by the rules."""
+
+    name = "state"
+
+    def __init__(self, simulator: Simulator, num_envs: int):
+        self.simulator = simulator
+        length = len(simulator.env.components)
+        self.current = np.zeros((num_envs, length), np.int64)
+        self.final = np.zeros_like(self.current)
+        self.final_elapsed = np.zeros(num_envs, np.int64)
+        context: Any = simulator.context
+        self._fused = context.is_plain and context.is_vector  # the compiled step writes the vectors as well
+        self._scale = context.observation.scale if self._fused else np.zeros(length)
+        self._vector = np.empty((0, length), np.float32)
+        self._step_many: Any = simulator.rules.step_many
+
+    def states(self, rows: Any) -> np.ndarray:
+        return self.current[rows].copy()
+
+    def restart(self, mask: np.ndarray, rng: Any, state: Any) -> None:
+        self._vector = self._vector[:0]
+        if state is not None:
+            self.current[mask] = _given_states(self.simulator, state, len(mask))[mask]
+            return
+        chosen = np.zeros(len(mask), np.int64)
+        stepping.draw_starts(self.simulator.start_cumulative, rng, mask, chosen)
+        self.current[mask] = self.simulator.start_states[chosen[mask]]
+
+    def step(self, setting: tuple, given: tuple, arrays: tuple) -> None:
+        simulator = self.simulator
+        if self._fused:
+            self._vector = np.empty(self.current.shape, np.float32)
+        self.final_elapsed[:] = arrays[1] + 1
+        faults: list[int] = []
+
+        def run(first: int, last: int) -> None:
+            fault = self._step_many(
+                simulator.rules.parameters, simulator.ranges, self._scale, simulator.chance, *setting,
+                simulator.start_states, simulator.start_cumulative, *given, self.current, *arrays,
+                self.final, self._vector, first, last,
+            )  # fmt: skip
+            if fault >= 0:
+                faults.append(fault)
+
+        in_blocks(run, len(self.current), BLOCK)
+        if faults:
+            i, component = divmod(min(faults), self.current.shape[1])
+            simulator.raise_fault(self.current[i], int(arrays[-1][i]), component)
+
+    def observations(self, previous: np.ndarray, elapsed: np.ndarray) -> Any:
+        if len(self._vector):
+            return self._vector
+        return self.simulator.context(self.current, previous, elapsed)
+
+    def final_observations(self, rows: np.ndarray, previous: np.ndarray, elapsed: np.ndarray) -> Any:
+        return self.simulator.context(self.final[rows], previous, elapsed)
+
+
+class TableWalk:
+    """Indices (N,) of a built state space, advanced by looking successors up."""
+
+    name = "index"
+
+    def __init__(self, simulator: Simulator, num_envs: int):
+        self.simulator = simulator
+        assert simulator.state_space is not None
+        self.space = simulator.state_space
+        self.current = np.zeros(num_envs, np.int64)
+        self.final = np.zeros(num_envs, np.int64)
+        self.final_elapsed = np.zeros(num_envs, np.int64)
+        self._successors = np.asarray(self.space.successors)
+        self._rewards = np.ascontiguousarray(self.space.mdp().rewards, np.float64)
+        self._starts = self.space.indices(simulator.start_states)
+        context: Any = simulator.context
+        self._is_index = context.is_plain and isinstance(context.observation, Index)
+        self._table: np.ndarray | None = None
+        one = np.prod(context.observation.space.shape or ()) * np.dtype(context.observation.space.dtype).itemsize
+        if context.is_plain and not self._is_index and one * self.space.num_states <= LARGEST_TABLE:
+            self._table = context.observation(self.space.states())
+
+    def states(self, rows: Any) -> np.ndarray:
+        return self.space.states(self.current[rows])
+
+    def restart(self, mask: np.ndarray, rng: Any, state: Any) -> None:
+        if state is not None:
+            given = _given_states(self.simulator, state, len(mask))
+            self.current[mask] = self.space.indices(given[mask])
+            return
+        chosen = np.zeros(len(mask), np.int64)
+        stepping.draw_starts(self.simulator.start_cumulative, rng, mask, chosen)
+        self.current[mask] = self._starts[chosen[mask]]
+
+    def step(self, setting: tuple, given: tuple, arrays: tuple) -> None:
+        walk_table: Any = stepping.walk_table
+        self.final_elapsed[:] = arrays[1] + 1
+        simulator = self.simulator
+
+        def run(first: int, last: int) -> None:
+            walk_table(
+                self._successors, self._rewards, self.space.terminal, simulator.chance, *setting,
+                self._starts, simulator.start_cumulative, *given, self.current, *arrays, self.final, first, last,
+            )  # fmt: skip
+
+        in_blocks(run, len(self.current), BLOCK)
+
+    def observations(self, previous: np.ndarray, elapsed: np.ndarray) -> Any:
+        return self._observed(self.current, previous, elapsed)
+
+    def final_observations(self, rows: np.ndarray, previous: np.ndarray, elapsed: np.ndarray) -> Any:
+        return self._observed(self.final[rows], previous, elapsed)
+
+    def _observed(self, index: np.ndarray, previous: np.ndarray, elapsed: np.ndarray) -> Any:
+        if self._is_index:
+            return index.copy()
+        if self._table is not None:
+            return self._table.take(index, axis=0)
+        return self.simulator.context(self.space.states(index), previous, elapsed)
+
+
+def _given_states(simulator: Simulator, state: Any, num_envs: int) -> np.ndarray:
+    """(N, D) from one state or N of them, checked."""
+    rows = np.asarray(state)
+    if rows.ndim == 1:
+        return np.tile(simulator.checked_state(rows), (num_envs, 1))
+    if len(rows) != num_envs:
+        raise ParameterError(f"{simulator.env}: {len(rows)} states; expected one, or {num_envs}")
+    return np.stack([simulator.checked_state(row) for row in rows])
