@@ -3,6 +3,7 @@
 import importlib
 import json
 import math
+import shutil
 import tempfile
 from pathlib import Path
 
@@ -11,8 +12,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pharos.errors import FileFormatError
-from pharos.experiments import read_curve, read_record, train
+from pharos.errors import FileFormatError, ResultCorrupted
+from pharos.experiments import load_agent, read_curve, read_record, run_id, train
 from pharos.experiments import results as _results
 
 _train = importlib.import_module("pharos.experiments.train")
@@ -132,3 +133,132 @@ def test_the_page_about_agents_defines_every_column_and_every_key():
     page = (Path(__file__).parents[1] / "docs" / "agents.md").read_text()
     result = train("q_learning", "simple_grid/4x4-plain", steps=10).result
     assert [name for name in (*_results.COLUMNS, *result) if f"`{name}`" not in page] == []
+
+
+# Damage ------------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    """Two finished runs, in folders that have their names."""
+    folders = []
+    for seed in range(2):
+        made = tmp_path_factory.mktemp("runs") / "run"
+        options = {"steps": 400, "evaluation_interval": 20, "seed": seed, "out": made}
+        config = train("q_learning", "simple_grid/4x4-decoy", **options).config
+        folders.append(made.rename(made.with_name(run_id(config))))
+    return folders
+
+
+@pytest.fixture
+def copies(runs, tmp_path):
+    return [Path(shutil.copytree(folder, tmp_path / folder.name)) for folder in runs]
+
+
+def one_line(caught, file):
+    assert str(file) in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_result_that_was_not_changed_is_read(copies):
+    for folder in copies:
+        assert read_record(folder)["status"] == "finished"
+        assert len(read_curve(folder)) == 21
+        load_agent(folder)
+
+
+def test_every_digit_of_a_record_counts(copies):
+    file = copies[0] / "run.json"
+    text = file.read_text()
+    digits = [place for place, letter in enumerate(text) if letter.isdigit()]
+    rng = np.random.default_rng(0)
+    for place in rng.choice(digits, 60, replace=False):
+        file.write_text(text[:place] + str((int(text[place]) + 1) % 10) + text[place + 1 :])
+        with pytest.raises(FileFormatError) as caught:
+            read_record(copies[0])
+        one_line(caught, file)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.99])
+@pytest.mark.parametrize("name", ["run.json", "curve.parquet"])
+def test_a_file_that_was_cut_short_is_said_to_be(name, share, copies):
+    file = copies[0] / name
+    file.write_bytes(file.read_bytes()[: int(share * file.stat().st_size)])
+    with pytest.raises(ResultCorrupted, match="cut short") as caught:
+        read_record(copies[0])
+        read_curve(copies[0])
+    one_line(caught, file)
+
+
+def test_runs_that_were_exchanged_are_noticed(copies):
+    one, other = copies
+    one.rename(one.with_name("aside"))
+    other.rename(one)
+    one.with_name("aside").rename(other)
+    for folder, inside in ((one, other), (other, one)):
+        with pytest.raises(ResultCorrupted, match=f"holds run {inside.name}, in the folder of run {folder.name}"):
+            read_record(folder)
+    moved = one.rename(one.with_name("anywhere"))
+    assert read_record(moved)["id"] == other.name
+
+
+def test_the_curve_of_another_run_is_noticed(copies):
+    shutil.copy(copies[1] / "curve.parquet", copies[0] / "curve.parquet")
+    with pytest.raises(ResultCorrupted, match="does not match its checksum") as caught:
+        read_curve(copies[0])
+    one_line(caught, copies[0] / "curve.parquet")
+
+
+def test_no_bit_of_a_curve_changes_what_is_read(copies):
+    file = copies[0] / "curve.parquet"
+    data, expected = file.read_bytes(), read_curve(copies[0])
+    rng = np.random.default_rng(1)
+    for bit in rng.choice(8 * len(data), 300, replace=False):
+        damaged = bytearray(data)
+        damaged[bit // 8] ^= 1 << bit % 8
+        file.write_bytes(damaged)
+        try:
+            found = read_curve(copies[0])
+        except FileFormatError as error:
+            assert str(file) in str(error) and "\n" not in str(error)
+        else:
+            assert found.equals(expected)
+
+
+def test_the_pages_of_a_curve_have_checksums(copies):
+    """So that a bit is noticed where no record says what the curve was."""
+    file = copies[0] / "curve.parquet"
+    (copies[0] / "run.json").unlink()
+    data = bytearray(file.read_bytes())
+    data[len(data) // 3] ^= 1
+    file.write_bytes(data)
+    with pytest.raises(ResultCorrupted, match="cut short or changed"):
+        read_curve(copies[0])
+
+
+def test_what_an_agent_learnt_has_checksums(copies):
+    file = copies[0] / "policy.npy"
+    policy = np.load(file)
+    np.save(file, policy + 1)
+    with pytest.raises(ResultCorrupted, match=r"policy\.npy: was changed"):
+        load_agent(copies[0])
+    file.unlink()
+    with pytest.raises(ResultCorrupted, match=r"policy\.npy: cannot be read"):
+        load_agent(copies[0])
+
+
+def test_runs_of_older_versions_are_read_and_their_configuration_is_held_against_their_name(copies):
+    file = copies[0] / "run.json"
+    record = json.loads(file.read_text())
+    del record["digest"], record["checksums"]
+    file.write_text(json.dumps(record))
+    assert read_record(copies[0]) == record
+    assert len(read_curve(copies[0])) == 21
+    load_agent(copies[0])
+    record["config"]["seed"] += 1
+    file.write_text(json.dumps(record))
+    with pytest.raises(ResultCorrupted, match="its configuration is that of run"):
+        read_record(copies[0])
+    del record["id"]
+    file.write_text(json.dumps(record))
+    with pytest.raises(ResultCorrupted, match=f"in the folder of run {copies[0].name}"):
+        read_record(copies[0])

@@ -2,7 +2,9 @@
 
 import json
 import os
+import shutil
 
+import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -10,7 +12,7 @@ import pytest
 
 import fake_training
 from pharos import study
-from pharos.errors import FileFormatError, ParameterError
+from pharos.errors import FileFormatError, ParameterError, ResultCorrupted
 
 BLOCK = {
     "environments": ["frozen_lake/4x4"],
@@ -43,6 +45,13 @@ def changed(packed, **columns):
     pq.write_table(pa.table(data, schema=table.schema), packed)
 
 
+def older(packed):
+    """As versions of pharos before digests packed it."""
+    table = pq.read_table(packed)
+    metadata = {name: text for name, text in table.schema.metadata.items() if name != b"pharos.digests"}
+    pq.write_table(table.replace_schema_metadata(metadata), packed)
+
+
 def test_unpacked_runs_have_the_same_tables_and_curves(folder, packed, tmp_path):
     place, added = study.unpack(packed, tmp_path / "other")
     assert (place, added) == (tmp_path / "other", 8)
@@ -63,6 +72,7 @@ def test_runs_are_unpacked_into_another_study_that_has_them(folder, packed, tmp_
 
 def test_what_is_missing_is_run_and_what_is_there_stays(packed, tmp_path, monkeypatch):
     changed(packed, **{name: lambda values: values[:5] for name in pq.read_schema(packed).names})
+    older(packed)
     log = tmp_path / "log"
     monkeypatch.setenv("PHAROS_FAKE_LOG", str(log))
     place, _ = study.unpack(packed, tmp_path / "other")
@@ -106,6 +116,7 @@ def another_seed(records):
 )
 def test_files_that_were_changed_are_refused_before_anything_is_written(packed, tmp_path, columns, message):
     changed(packed, **columns)
+    older(packed)
     with pytest.raises(FileFormatError, match=message):
         study.unpack(packed, tmp_path / "other")
     assert not (tmp_path / "other").exists()
@@ -130,3 +141,74 @@ def test_a_folder_of_another_study_is_not_written_to(packed, tmp_path):
     study.run(SPEC | {"name": "other"}, tmp_path / "other", runner=fake_training.train, workers=2)
     with pytest.raises(ParameterError, match="holds the study 'other'"):
         study.unpack(packed, tmp_path / "other")
+
+
+def same_study(place, folder):
+    pd.testing.assert_frame_equal(study.table(place), study.table(folder))
+    pd.testing.assert_frame_equal(study.curves(place), study.curves(folder))
+
+
+def test_no_bit_of_a_packed_study_changes_its_results(folder, packed, tmp_path):
+    data = packed.read_bytes()
+    rng = np.random.default_rng(0)
+    refused = 0
+    for bit in rng.choice(8 * len(data), 120, replace=False):
+        damaged = bytearray(data)
+        damaged[bit // 8] ^= 1 << bit % 8
+        packed.write_bytes(damaged)
+        place = tmp_path / "other"
+        try:
+            study.unpack(packed, place)
+        except (FileFormatError, ParameterError) as error:
+            assert "\n" not in str(error)
+            refused += 1
+        else:
+            same_study(place, folder)
+        shutil.rmtree(place, ignore_errors=True)
+    assert refused > 60
+
+
+@pytest.mark.parametrize(
+    "columns",
+    [
+        {"value": lambda values: [[number + 1 for number in values[0]], *values[1:]]},
+        {"record": lambda values: [values[0].replace('"seconds": 0.5', '"seconds": 0.6'), *values[1:]]},
+        {"record": lambda values: [values[0], *values[:0:-1]]},
+        {"value": lambda values: values[::-1]},
+    ],
+)
+def test_edited_runs_of_a_packed_study_are_refused(packed, tmp_path, columns):
+    changed(packed, **columns)
+    with pytest.raises(FileFormatError, match=r"run [0-9a-f]{16}"):
+        study.unpack(packed, tmp_path / "other")
+    assert not (tmp_path / "other").exists()
+
+
+def test_a_packed_study_whose_specification_was_edited_is_refused(packed, tmp_path):
+    table = pq.read_table(packed)
+    metadata = {**table.schema.metadata, b"pharos.study": table.schema.metadata[b"pharos.study"] + b"\n# more\n"}
+    pq.write_table(table.replace_schema_metadata(metadata), packed)
+    with pytest.raises(ResultCorrupted, match="was changed after it was packed; fetch or pack it again"):
+        study.unpack(packed, tmp_path / "other")
+
+
+def test_a_run_left_out_of_a_packed_study_is_missed(packed, tmp_path):
+    changed(packed, **{name: lambda values: values[1:] for name in pq.read_schema(packed).names})
+    with pytest.raises(ResultCorrupted, match="the list of its runs, was changed"):
+        study.unpack(packed, tmp_path / "other")
+
+
+def test_packed_studies_of_older_versions_are_read(folder, packed, tmp_path):
+    older(packed)
+    place, added = study.unpack(packed, tmp_path / "other")
+    assert added == 8
+    same_study(place, folder)
+
+
+def test_damaged_runs_are_not_packed(folder, tmp_path):
+    copy = shutil.copytree(folder, tmp_path / "copy")
+    file = sorted(copy.glob("runs/*/curve.parquet"))[0]
+    file.write_bytes(file.read_bytes()[:-100])
+    with pytest.raises(ResultCorrupted, match="cut short"):
+        study.pack(copy, file=tmp_path / "fake.parquet")
+    assert not (tmp_path / "fake.parquet").exists()

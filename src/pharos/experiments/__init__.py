@@ -5,7 +5,16 @@ from pharos.experiments.config import ChanceSetting, Horizon, RunConfig, run_id
 from pharos.experiments.evaluation import Evaluation, evaluate_agent
 from pharos.experiments.loading import load_agent
 from pharos.experiments.regret import ReferenceValues, RegretCurve, cumulative_expected_regret, regret
-from pharos.experiments.results import read_curve, read_record
+from pharos.experiments.results import (
+    check_agent,
+    digest_of_curve,
+    read_curve,
+    read_curve_table,
+    read_record,
+    read_table,
+    write_record,
+    write_table,
+)
 from pharos.experiments.task import Task, TaskValues
 from pharos.experiments.train import TrainingResult, train, train_config
 from pharos.experiments.tuning import SPACES, TuningResult, tune
@@ -23,14 +32,20 @@ __all__ = [
     "TrainingResult",
     "TuningResult",
     "bootstrap_interval",
+    "check_agent",
     "cumulative_expected_regret",
+    "digest_of_curve",
     "evaluate_agent",
     "load_agent",
     "read_curve",
+    "read_curve_table",
     "read_record",
+    "read_table",
     "regret",
     "run_id",
     "train",
     "train_config",
     "tune",
+    "write_record",
+    "write_table",
 ]

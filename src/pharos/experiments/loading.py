@@ -16,7 +16,7 @@ def load_agent(folder: str | os.PathLike) -> tuple[Task, Any]:
     Returns:
         The task, and (S,) actions of tabular agents, else the policy of the model.
     Raises:
-        FileFormatError: the folder holds no finished run, or its files are damaged.
+        FileFormatError: the folder holds no finished run. ResultCorrupted: its files were cut short or changed.
         MissingExtra: Stable-Baselines3 is not installed.
     """
     import numpy as np
@@ -28,6 +28,7 @@ def load_agent(folder: str | os.PathLike) -> tuple[Task, Any]:
         raise FileFormatError(
             f"{folder}: the run is {record.get('status')}; the same command that began it finishes it"
         )
+    _results.check_agent(folder)
     task = config.task()
     if config.is_tabular:
         try:

@@ -1,19 +1,23 @@
-"""The result of a run on disk: run.json and curve.parquet, each written whole or not at all; nothing is pickled."""
+"""The result of a run on disk: run.json and curve.parquet, each written whole or not at all, with digests; nothing is pickled."""
 
-import json
-import math
 import os
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pharos.errors import FileFormatError, MissingExtra
+from pharos import storage
+from pharos.errors import FileFormatError, MissingExtra, ResultCorrupted
 from pharos.experiments.config import run_id
 
 if TYPE_CHECKING:
     import pandas as pd
+    import pyarrow as pa
 
 FORMAT = 1
+RECORD, CURVE, POLICY, AGENT = "run.json", "curve.parquet", "policy.npy", "agent"
+AGAIN = "delete the folder and execute the run again"
+_ID = re.compile(r"[0-9a-f]{16}")
 COLUMNS = {
     "step": "int64",
     "episodes": "int64",
@@ -52,94 +56,176 @@ def versions() -> dict[str, str]:
 
 
 def write_record(folder: Path, record: Mapping[str, Any]) -> None:
-    """run.json, replaced in one step; numbers that JSON cannot say are null."""
-    replace_file(folder / "run.json", (as_json(record) + "\n").encode())
+    """Replace run.json in one step; numbers that JSON cannot say are null.
+
+    The record gets a `digest` of all that it says; that of a finished run also `checksums` of the other files of the run, which
+    are written before it: of `curve.parquet` (see `digest_of_curve`), and of what the agent has learnt.
+    """
+    if record.get("status") == "finished":
+        record = {**record, "checksums": _checksums(folder)}
+    storage.replace_json(folder / RECORD, storage.sealed(record))
 
 
 def write_curve(folder: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """curve.parquet, replaced in one step; the same rows give the same bytes."""
+    """Replace curve.parquet in one step, with checksums of its pages; the same rows give the same bytes."""
     try:
         import pyarrow as pa
-        import pyarrow.parquet as pq
     except ImportError as error:
         raise MissingExtra("writing results", "pyarrow", "agents") from error
     schema = pa.schema([(name, pa.type_for_alias(dtype)) for name, dtype in COLUMNS.items()])
     columns = [pa.array([row[name] for row in rows], schema.field(name).type) for name in COLUMNS]
-    sink = pa.BufferOutputStream()
-    pq.write_table(pa.Table.from_arrays(columns, schema=schema), sink, compression="zstd")
-    replace_file(folder / "curve.parquet", sink.getvalue().to_pybytes())
+    write_table(folder / CURVE, pa.Table.from_arrays(columns, schema=schema))
 
 
 def read_record(folder: str | os.PathLike) -> dict[str, Any]:
-    """What run.json says.
+    """Return what run.json says.
 
     Raises:
-        FileFormatError: there is none, or it is not of a run.
+        FileFormatError: there is none, or it is not of a run. ResultCorrupted: it was cut short or changed after it was written,
+        or the folder has the name of another run.
     """
-    path = Path(folder) / "run.json"
+    path = Path(folder) / RECORD
     try:
-        record = json.loads(path.read_text(encoding="utf-8"))
+        record = storage.read_json(path, ResultCorrupted, AGAIN)
     except FileNotFoundError:
         raise FileFormatError(f"{path}: no such file; expected the folder of a run") from None
-    except ValueError as error:
-        raise FileFormatError(f"{path}: is no JSON: {error}") from None
-    if not isinstance(record, dict) or record.get("format") != FORMAT or "config" not in record:
+    if not isinstance(record, dict) or record.get("format") != FORMAT or not isinstance(record.get("config"), dict):
         raise FileFormatError(f"{path}: is not the record of a run in format {FORMAT}")
+    if not storage.is_intact(record):
+        raise ResultCorrupted(f"{path}: was changed after it was written; {AGAIN}")
+    id, name = identifier(record["config"]), path.absolute().parent.name
+    if (
+        storage.DIGEST in record and "id" in record
+    ):  # what was written says so; a configuration may hold infinite numbers
+        id = record["id"]
+    elif record.get("id", id) != id:
+        raise ResultCorrupted(
+            f"{path}: says that it is run {record['id']}, but its configuration is that of run {id}; {AGAIN}"
+        )
+    if _ID.fullmatch(name) and name != id:
+        raise ResultCorrupted(f"{path}: holds run {id}, in the folder of run {name}; move it back, or delete it")
     return record
 
 
-def read_curve(folder: str | os.PathLike) -> "pd.DataFrame":
-    """The evaluations of a run, a row each.
+def read_curve(folder: str | os.PathLike, *, columns: Iterable[str] = tuple(COLUMNS)) -> "pd.DataFrame":
+    """Return the evaluations of a run, a row each; see `read_curve_table`."""
+    return read_curve_table(folder, columns).to_pandas()
 
+
+def read_curve_table(folder: str | os.PathLike, columns: Iterable[str] = tuple(COLUMNS)) -> "pa.Table":
+    """Return the evaluations of a run, a row each, as an Arrow table.
+
+    Args:
+        columns: those that must be there.
     Raises:
-        FileFormatError: there are none, or columns are missing.
+        FileFormatError: there are none, or columns are missing. ResultCorrupted: the file was cut short or changed after it was
+        written, or is that of another run.
     """
-    import pandas as pd
-
-    path = Path(folder) / "curve.parquet"
-    try:
-        curve = pd.read_parquet(path)
-    except FileNotFoundError:
-        raise FileFormatError(f"{path}: no such file; expected the folder of a finished run") from None
-    except Exception as error:  # pyarrow has many
-        raise FileFormatError(f"{path}: cannot be read: {error}") from None
-    missing = [name for name in COLUMNS if name not in curve]
+    path = Path(folder) / CURVE
+    table = read_table(path)
+    missing = [name for name in columns if name not in table.column_names]
     if missing:
         raise FileFormatError(f"{path}: lacks the columns {', '.join(missing)}")
-    return curve
+    if (path.parent / RECORD).exists():
+        expected = _expected_checksums(path.parent).get(CURVE)
+        if expected is not None and digest_of_curve(table) != expected:
+            raise ResultCorrupted(f"{path}: does not match its checksum in {RECORD}; {AGAIN}")
+    return table
 
 
-def as_json(record: Mapping[str, Any]) -> str:
-    """Text in JSON; numbers that it cannot say are null."""
-    return json.dumps(_finite(record), indent=1, allow_nan=False)
+def check_agent(folder: Path) -> None:
+    """Check the files of what the agent has learnt against the checksums in run.json.
+
+    Raises:
+        ResultCorrupted: one is missing or was changed after it was written.
+    """
+    for name, expected in _expected_checksums(folder).items():
+        if name == CURVE:
+            continue
+        try:
+            found = storage.digest_of_file(folder / name)
+        except OSError as error:
+            raise ResultCorrupted(f"{folder / name}: cannot be read: {error.strerror}; {AGAIN}") from None
+        if found != expected:
+            raise ResultCorrupted(f"{folder / name}: was changed after it was written; {AGAIN}")
 
 
-def replace_file(path: Path, data: bytes) -> None:
-    """Write a file whole, on disk before it has its name."""
-    partial = path.with_name(f"{path.name}.{os.getpid()}")
-    with open(partial, "wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(partial, path)
+def write_table(path: Path, table: "pa.Table") -> None:
+    """Replace a Parquet file in one step, with checksums of its pages."""
+    import pyarrow.parquet as pq
+
+    with storage.replacing(path) as file:
+        pq.write_table(table, file, compression="zstd", write_page_checksum=True)
 
 
-def _finite(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {str(key): _finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
-    if hasattr(value, "tolist"):
-        return _finite(value.tolist())
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+def read_table(path: Path, advice: str = AGAIN) -> "pa.Table":
+    """Read a Parquet file, and compare its pages with their checksums.
+
+    Raises:
+        FileFormatError: there is no such file. ResultCorrupted: it cannot be read; the message ends with the advice.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        return pq.read_table(path, partitioning=None, page_checksum_verification=True)
+    except FileNotFoundError:
+        raise FileFormatError(f"{path}: no such file; expected the folder of a finished run") from None
+    except (pa.ArrowException, OSError, ValueError, KeyError) as error:
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise ResultCorrupted(f"{path}: cannot be read, it was cut short or changed: {reason}; {advice}") from None
+
+
+def digest_of_curve(table: "pa.Table") -> str:
+    """XXH3-128 of what a curve says, whatever the order of its columns or the version of Parquet that holds it.
+
+    For each column, by name: its name, type and number of rows, and its values as little-endian int64, float64 (NaN where there
+    is none) or bytes of truth; of other types as JSON.
+    """
+    import numpy as np
+    import xxhash
+
+    digest = xxhash.xxh3_128()
+    for name in sorted(table.column_names):
+        values = table.column(name).to_numpy()
+        kind = values.dtype.kind
+        if kind == "f":
+            values = np.where(np.isnan(values), np.nan, values).astype("<f8")
+        elif kind in "iu":
+            values = values.astype("<i8")
+        elif kind == "b":
+            values = values.astype("|u1")
+        else:
+            text = storage.json_text(table.column(name).to_pylist())
+            kind, values = "O", np.frombuffer(text.encode(), "|u1")
+        digest.update(f"{name}:{kind}:{table.num_rows}:".encode())
+        digest.update(np.ascontiguousarray(values).data)
+    return digest.hexdigest()
+
+
+def _checksums(folder: Path) -> dict[str, str]:
+    """Checksums of the files of a finished run, by their names within its folder."""
+    checksums = {CURVE: digest_of_curve(read_table(folder / CURVE))} if (folder / CURVE).exists() else {}
+    for path in (folder / POLICY, *sorted((folder / AGENT).rglob("*"))):
+        if path.is_file():
+            storage.sync(path)
+            checksums[path.relative_to(folder).as_posix()] = storage.digest_of_file(path)
+    return checksums
+
+
+def _expected_checksums(folder: Path) -> dict[str, str]:
+    checksums = read_record(folder).get("checksums", {})
+    if not isinstance(checksums, dict):
+        raise ResultCorrupted(f"{folder / RECORD}: its checksums are none; {AGAIN}")
+    return checksums
 
 
 def write_policy(folder: Path, policy: Any) -> None:
-    """policy.npy: what a tabular agent has learnt, as `pharos evaluate --policy` takes it."""
+    """Replace policy.npy: what a tabular agent has learnt, as `pharos evaluate --policy` takes it."""
     import io
 
     import numpy as np
 
     sink = io.BytesIO()
     np.save(sink, policy, allow_pickle=False)
-    replace_file(folder / "policy.npy", sink.getvalue())
+    storage.replace_file(folder / POLICY, sink.getvalue())

@@ -21,6 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from pharos import storage
 from pharos.agents import agent_kind
 from pharos.agents import hyperparameters as hyperparameters_of
 from pharos.agents.deep import algorithm
@@ -342,8 +343,8 @@ def _write(
         record["best"] = {"trial": study.best_trial.number, "score": study.best_value, "hyperparameters": best}
         told = f"# Mean normalised regret {study.best_value:.4f} after {_done(study)} trials, see tuning.json\n"
         text = told + yaml.safe_dump({agent: {name: {seen: best}}}, sort_keys=False)
-        _results.replace_file(folder / "hyperparameters.yaml", text.encode())
-    _results.replace_file(folder / "tuning.json", (_results.as_json(record) + "\n").encode())
+        storage.replace_file(folder / "hyperparameters.yaml", text)
+    storage.replace_json(folder / "tuning.json", record)
 
 
 def _trials(study: Any) -> list[dict[str, Any]]:

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import yaml
 
-from pharos.errors import FileFormatError, ParameterError
+from pharos import experiments, storage
+from pharos.errors import FileFormatError, ParameterError, ResultCorrupted
 from pharos.experiments import run_id
 from pharos.study import worker as _worker
 from pharos.study.execution import claim, opened
@@ -20,20 +21,22 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 FORMAT = 1
-_STUDY, _FORMAT = b"pharos.study", b"pharos.format"
+CURVE_COLUMNS = ("step",)
+_STUDY, _FORMAT, _DIGESTS = b"pharos.study", b"pharos.format", b"pharos.digests"
+_AGAIN = "fetch or pack it again"
 
 
 def pack(source: Source, folder: str | os.PathLike | None = None, *, file: str | os.PathLike) -> int:
     """Write the finished runs of a study into one Parquet file; return how many.
 
-    A row for each run: `id`; `record`, its run.json; and for each column of curve.parquet a list. The specification is among the
-    metadata of the file. What agents learnt stays in the folder: some hundred kilobytes a run, where a row takes two.
+    A row for each run: `id`; `record`, its run.json; and for each column of curve.parquet a list. Among the metadata of the file
+    are the specification, its digest, and a digest of each run. What agents learnt stays in the folder: some hundred kilobytes a
+    run, where a row takes two.
 
     Raises:
         ParameterError: no run is finished. OSError: the file cannot be written; an older one then stays as it was.
     """
     import pyarrow as pa
-    import pyarrow.parquet as pq
 
     study, place = opened(source, folder)
     ids, records, curves = [], [], []
@@ -42,7 +45,7 @@ def pack(source: Source, folder: str | os.PathLike | None = None, *, file: str |
         if record is not None and record["status"] == _worker.FINISHED:
             ids.append(run.id)
             records.append(json.dumps(record))
-            curves.append(pq.read_table(place / "runs" / run.id / "curve.parquet"))
+            curves.append(experiments.read_curve_table(place / "runs" / run.id, CURVE_COLUMNS))
     if not ids:
         raise ParameterError(f"{place}: no run of {study.name!r} is finished; execute `pharos study run` first")
     columns: dict[str, Any] = {"id": pa.array(ids), "record": pa.array(records)}
@@ -50,15 +53,12 @@ def pack(source: Source, folder: str | os.PathLike | None = None, *, file: str |
         lists = [curve.column(field.name).to_pylist() if field.name in curve.column_names else None for curve in curves]
         columns[field.name] = pa.array(lists, pa.list_(field.type))
     text = yaml.safe_dump(study.model_dump(mode="json", exclude_unset=True), sort_keys=False, width=120)
-    table = pa.table(columns).replace_schema_metadata({_STUDY: text.encode(), _FORMAT: str(FORMAT).encode()})
+    runs = zip(ids, records, curves, strict=True)
+    digests = {"study": storage.digest_of_json(text), "runs": {id: _digest(id, *rest) for id, *rest in runs}}
+    metadata = {_STUDY: text.encode(), _FORMAT: str(FORMAT).encode(), _DIGESTS: json.dumps(digests).encode()}
     file = Path(file)
     file.parent.mkdir(parents=True, exist_ok=True)
-    temporary = file.with_name(f".{file.name}.{os.getpid()}")
-    try:
-        pq.write_table(table, temporary, compression="zstd")
-        os.replace(temporary, file)
-    finally:
-        temporary.unlink(missing_ok=True)
+    experiments.write_table(file, pa.table(columns).replace_schema_metadata(metadata))
     return len(ids)
 
 
@@ -77,13 +77,16 @@ def unpack(
         FileFormatError: not such a file, or a run in it is not one of its study. ParameterError: the folder holds another study.
     """
     file = Path(file)
-    study, table = _read(file)
+    study, table, digests = _read(file)
     target, place = opened(study if into is None else into, folder)
     configs, wanted = {run.id: run.config for run in study.runs}, {run.id for run in target.runs}
     runs = []
-    for row in table.to_pylist():
+    for row in _rows(file, table):
         id, record = row.pop("id"), row.pop("record")
-        runs.append((id, _checked(file, id, record, configs), _curve(file, id, row, table.schema)))
+        run = id, _checked(file, id, record, configs), _curve(file, id, row, table.schema)
+        if digests is not None and digests["runs"].get(id) != _digest(id, record, run[2]):
+            raise ResultCorrupted(f"{file}: run {id} was changed after it was packed; {_AGAIN}")
+        runs.append(run)
     claim(target, place)
     added = sum(_write(place, *run) for run in runs if run[0] in wanted)
     with contextlib.suppress(OSError):  # others may be at work there
@@ -91,26 +94,41 @@ def unpack(
     return place, added
 
 
-def _read(file: Path) -> tuple[Specification, "pa.Table"]:
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    try:
-        table = pq.read_table(file)
-    except FileNotFoundError:
-        raise ParameterError(f"{file}: no such file") from None
-    except (pa.ArrowException, OSError) as error:
-        raise FileFormatError(
-            f"{file}: not a Parquet file, or cut short ({str(error).splitlines()[0]}); fetch or pack it again"
-        ) from error
+def _read(file: Path) -> tuple[Specification, "pa.Table", dict[str, Any] | None]:
+    """The study, its runs, and the digests of both; None in place of digests where an older version packed it."""
+    if not file.exists():
+        raise ParameterError(f"{file}: no such file")
+    table = experiments.read_table(file, _AGAIN)
     metadata = table.schema.metadata or {}
     if _STUDY not in metadata or not {"id", "record"} <= set(table.column_names):
         raise FileFormatError(f"{file}: not a packed study; expected a file made by `pharos study pack`")
     if metadata.get(_FORMAT) != str(FORMAT).encode():
         raise FileFormatError(
-            f"{file}: format {metadata.get(_FORMAT, b'?').decode()} of packed studies; this version of pharos reads {FORMAT}"
+            f"{file}: format {metadata.get(_FORMAT, b'?').decode(errors='replace')} of packed studies; "
+            f"this version of pharos reads {FORMAT}"
         )
-    return parse(metadata[_STUDY].decode(), str(file)), table
+    try:
+        text = metadata[_STUDY].decode()
+        digests = json.loads(metadata[_DIGESTS]) if _DIGESTS in metadata else None
+        if digests is not None and (
+            digests["study"] != storage.digest_of_json(text) or set(digests["runs"]) != set(table["id"].to_pylist())
+        ):
+            raise ValueError("its study, or the list of its runs, was changed after it was packed")
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise ResultCorrupted(f"{file}: its description cannot be read: {error}; {_AGAIN}") from None
+    return parse(text, str(file)), table, digests
+
+
+def _rows(file: Path, table: "pa.Table") -> list[dict[str, Any]]:
+    try:
+        return table.to_pylist()
+    except (ValueError, TypeError) as error:  # text that is none
+        raise ResultCorrupted(f"{file}: its rows cannot be read: {error}; {_AGAIN}") from None
+
+
+def _digest(id: str, record: str, curve: "pa.Table") -> str:
+    """The digest of a run: of its id, its record as text, and the values of its curve."""
+    return storage.digest_of_json([id, record, experiments.digest_of_curve(curve)])
 
 
 def _checked(file: Path, id: str, record: str, configs: dict[str, Any]) -> dict[str, Any]:
@@ -118,8 +136,10 @@ def _checked(file: Path, id: str, record: str, configs: dict[str, Any]) -> dict[
     try:
         found = json.loads(record)
         config, status = found["config"], found["status"]
-    except (ValueError, KeyError, TypeError) as error:
-        raise FileFormatError(f"{file}: the record of run {id} cannot be read; fetch or pack the file again") from error
+        if not storage.is_intact(found):
+            raise ValueError("it was changed after it was written")
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise ResultCorrupted(f"{file}: the record of run {id} cannot be read: {error}; {_AGAIN}") from None
     if id not in configs or run_id(config) != id:
         raise FileFormatError(f"{file}: run {id} is not one of the study, or its configuration was changed")
     if status != _worker.FINISHED:
@@ -131,23 +151,25 @@ def _curve(file: Path, id: str, row: dict[str, list | None], schema: "pa.Schema"
     import pyarrow as pa
 
     columns = {name: values for name, values in row.items() if values is not None}
-    lengths = {len(values) for values in columns.values()}
-    if "step" not in columns or len(lengths) != 1:
-        raise FileFormatError(f"{file}: the columns of the curve of run {id} differ in length, or have no steps")
-    return pa.table({name: pa.array(values, schema.field(name).type.value_type) for name, values in columns.items()})
+    try:
+        if not set(CURVE_COLUMNS) <= set(columns) or len({len(values) for values in columns.values()}) != 1:
+            raise ValueError("its columns differ in length, or have no steps")
+        return pa.table(
+            {name: pa.array(values, schema.field(name).type.value_type) for name, values in columns.items()}
+        )
+    except (ValueError, TypeError, AttributeError, pa.ArrowException) as error:
+        raise FileFormatError(f"{file}: the curve of run {id} cannot be read: {error}; {_AGAIN}") from None
 
 
 def _write(place: Path, id: str, record: dict[str, Any], curve: "pa.Table") -> bool:
     """Whether the run was added: a finished one that is there already stays."""
-    import pyarrow.parquet as pq
-
     if _worker.read_status(place, id) == _worker.FINISHED:
         return False
     partial = place / "partial" / f"{id}.{uuid.uuid4().hex}"
     partial.mkdir(parents=True)
     try:
-        pq.write_table(curve, partial / "curve.parquet")
-        (partial / "run.json").write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+        experiments.write_table(partial / "curve.parquet", curve)
+        storage.replace_json(partial / "run.json", record)
         _worker.publish(partial, place, id)
     finally:
         shutil.rmtree(partial, ignore_errors=True)

@@ -95,9 +95,9 @@ def cells(rows: "pd.DataFrame", measures: "pd.DataFrame | None" = None) -> "pd.D
 
 def read_curve(folder: Path, id: str) -> "pd.DataFrame":
     """The curve of one run."""
-    import pandas as pd
+    from pharos import experiments
 
-    return pd.read_parquet(folder / "runs" / id / "curve.parquet")
+    return experiments.read_curve(folder / "runs" / id, columns=("step", "episodes", "mean_return"))
 
 
 def _last_return(curve: "pd.DataFrame") -> float:

@@ -9,7 +9,6 @@ unless it is to be resumed: then the runner finds there what it wrote before.
 """
 
 import contextlib
-import json
 import os
 import shutil
 import signal
@@ -21,8 +20,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from pharos.errors import PharosError, StateSpaceLocked
-from pharos.state_space.files import lock
+from pharos import experiments, storage
+from pharos.errors import FolderLocked, PharosError
 
 FINISHED, FAILED, BUSY = "finished", "failed", "busy"
 EXIT_BUSY = 75
@@ -39,11 +38,8 @@ def read_status(folder: Path, id: str) -> str | None:
 
 
 def read_record(folder: Path) -> dict[str, Any] | None:
-    """What run.json of one run says; None where there is none."""
-    try:
-        return json.loads((folder / "run.json").read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        return None
+    """What run.json of one run says; None where there is none; ResultCorrupted where it was cut short or changed."""
+    return experiments.read_record(folder) if (folder / "run.json").exists() else None
 
 
 def attempt(
@@ -57,9 +53,9 @@ def attempt(
     holder = folder / "locks" / id
     holder.mkdir(parents=True, exist_ok=True)
     try:
-        with lock(holder):
+        with storage.lock(holder):
             return _attempt(runner, config, id, folder, again, resume)
-    except StateSpaceLocked:
+    except FolderLocked:
         return BUSY
 
 
@@ -94,14 +90,14 @@ def describe(error: BaseException) -> str:
 def write_failure(folder: Path, config: Mapping[str, Any], id: str, error: str, seconds: float) -> None:
     """A run.json that says why there is no result."""
     record = {"format": 1, "id": id, "config": dict(config), "status": FAILED, "error": error, "seconds": seconds}
-    (folder / "run.json").write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+    storage.replace_json(folder / "run.json", storage.sealed(record))
 
 
 def publish(partial: Path, folder: Path, id: str) -> None:
     """Move a run's folder to its place, on disk before it is there; an earlier failed attempt makes room."""
     for path in partial.rglob("*"):
         if path.is_file():
-            _sync(path)
+            storage.sync(path)
     runs = folder / "runs"
     runs.mkdir(parents=True, exist_ok=True)
     place = runs / id
@@ -114,14 +110,12 @@ def publish(partial: Path, folder: Path, id: str) -> None:
         shutil.rmtree(old)
     else:
         os.rename(partial, place)
-    _sync(runs)
+    storage.sync(runs)
 
 
 def write_atomically(file: Path, text: str) -> None:
     """Replace a file in one step."""
-    temporary = file.with_name(f".{file.name}.{os.getpid()}")
-    temporary.write_text(text, encoding="utf-8")
-    os.replace(temporary, file)
+    storage.replace_file(file, text)
 
 
 def _is_complete(partial: Path) -> bool:
@@ -130,14 +124,6 @@ def _is_complete(partial: Path) -> bool:
     except ValueError:  # cut short
         return False
     return record is not None and record.get("status") == FINISHED and (partial / "curve.parquet").exists()
-
-
-def _sync(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 @contextlib.contextmanager
