@@ -172,7 +172,10 @@ def test_every_digit_of_a_record_counts(copies):
     digits = [place for place, letter in enumerate(text) if letter.isdigit()]
     rng = np.random.default_rng(0)
     for place in rng.choice(digits, 60, replace=False):
-        file.write_text(text[:place] + str((int(text[place]) + 1) % 10) + text[place + 1 :])
+        changed = text[:place] + str((int(text[place]) + 1) % 10) + text[place + 1 :]
+        if json.loads(changed) == json.loads(text):  # the 17th digit of a number
+            continue
+        file.write_text(changed)
         with pytest.raises(FileFormatError) as caught:
             read_record(copies[0])
         one_line(caught, file)
