@@ -200,7 +200,7 @@ def workers_of(folder):
     found = []
     for lock in Path(folder).glob("locks/*/lock"):
         words = lock.read_text().split()
-        if len(words) == 2 and Path(f"/proc/{words[1]}").exists():
+        if len(words) == 4 and Path(f"/proc/{words[1]}").exists():
             found.append(int(words[1]))
     return found
 
