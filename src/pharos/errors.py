@@ -2,7 +2,8 @@
 
 PharosError
 ├── ParameterError (ValueError)     a parameter, name or option is wrong: nothing was computed  (exit code 2)
-│   └── UnknownName                 no such environment, measure, observation, agent ...: nearest match suggested
+│   ├── UnknownName                 no such environment, measure, observation, agent ...: nearest match suggested
+│   └── UntrustedCode               a file names code of somebody else, which is executed only where it is trusted
 ├── RuleError                       an environment's rules broke their contract, for a named state and action
 ├── StateSpaceError                 something is wrong with a folder that holds a state space
 │   ├── StateSpaceTooLarge          more states than `max_states`
@@ -42,6 +43,10 @@ class UnknownName(ParameterError):
         nearest = difflib.get_close_matches(str(found), known, n=1, cutoff=0.5)
         hint = f"did you mean {nearest[0]!r}?" if nearest else f"known: {', '.join(known) or 'none'}"
         super().__init__(f"unknown {kind} {str(found)!r}; {hint}")
+
+
+class UntrustedCode(ParameterError):
+    """A file names code, a module or a Python file, which is executed only where it is trusted."""
 
 
 class RuleError(PharosError):

@@ -13,35 +13,45 @@ from typing import Any
 
 import numpy as np
 
-from pharos.agents.kinds import AGENTS
+from pharos.agents.kinds import AGENTS, agent_source, is_known
 from pharos.errors import MissingExtra, ParameterError, UnknownName
 from pharos.policies import DeepPolicy
+from pharos.sources import load
+
+__all__ = ["ALGORITHMS", "DeepPolicy", "algorithm", "check_hyperparameters", "extractor", "make_model"]
 
 FEATURES = 128
 LEAST_ONE = ("n_envs", "n_steps", "n_epochs", "batch_size", "buffer_size", "train_freq", "target_update_interval")
 SHARES = ("gamma", "gae_lambda", "tau", "exploration_fraction", "exploration_initial_eps", "exploration_final_eps")
 POSITIVE = ("learning_rate", "clip_range", "max_grad_norm")
 NOT_NEGATIVE = ("learning_starts", "ent_coef", "vf_coef")
-__all__ = ["ALGORITHMS", "DeepPolicy", "algorithm", "check_hyperparameters", "extractor", "make_model"]
-OURS = {"env", "seed", "device", "tensorboard_log", "_init_setup_model"}  # what `make_model` gives itself
+# What `make_model` gives itself.
+OURS = {"env", "seed", "device", "tensorboard_log", "_init_setup_model"}
 ALGORITHMS = {"dqn": "stable_baselines3:DQN", "ppo": "stable_baselines3:PPO", "a2c": "stable_baselines3:A2C"}
 
 
-def algorithm(name: str) -> type:
-    """The class of an algorithm: "dqn", "ppo", "a2c", or "module:Class" for any other.
+def algorithm(agent: str | type) -> type:
+    """The class of an algorithm: "dqn", "ppo", "a2c", or "module:Class" or "file.py:Class" for any other; or a class itself.
 
     Raises:
-        UnknownName: no such name, module or class. MissingExtra: Stable-Baselines3 is not installed.
+        UnknownName: no such name or class. ParameterError: no such module or file.
+        MissingExtra: Stable-Baselines3 is not installed.
     """
-    path = ALGORITHMS.get(name, name)
-    module, colon, cls = path.partition(":")
+    if isinstance(agent, type):
+        return agent
+    path = ALGORITHMS.get(agent, agent)
+    module, colon, name = path.partition(":")
     if not colon:
-        raise UnknownName("agent", name, AGENTS)
+        raise UnknownName("agent", agent, AGENTS)
+    if not is_known(path):
+        source = agent_source(path)
+        assert source is not None
+        return load(source)
     try:
-        return getattr(importlib.import_module(module), cls)
+        return getattr(importlib.import_module(module), name)
     except ModuleNotFoundError as error:
         if (error.name or "").startswith(("stable_baselines3", "torch")):
-            raise MissingExtra(f"the agent {name!r}", "stable-baselines3", "agents") from error
+            raise MissingExtra(f"the agent {agent!r}", "stable-baselines3", "agents") from error
         raise UnknownName("module of an agent", module, []) from error
     except AttributeError as error:
         raise UnknownName(
@@ -49,13 +59,14 @@ def algorithm(name: str) -> type:
         ) from error
 
 
-def check_hyperparameters(name: str, hyperparameters: Mapping[str, Any]) -> None:
-    """Refuse hyperparameters that the algorithm does not have, and numbers that it would take without a word or fail with late.
+def check_hyperparameters(agent: str | type, hyperparameters: Mapping[str, Any]) -> None:
+    """Refuse hyperparameters that the algorithm lacks, and values that it would accept silently or fail with late.
 
     Raises:
         UnknownName: with the nearest name that it has. ParameterError: a number out of its range, or something else for one.
     """
-    taken = inspect.signature(algorithm(name)).parameters
+    name = _title(agent)
+    taken = inspect.signature(algorithm(agent)).parameters
     if all(each.kind is not inspect.Parameter.VAR_KEYWORD for each in taken.values()):
         known = sorted({*taken, "n_envs", "n_timesteps", "net_arch"} - OURS)
         for given in hyperparameters:
@@ -65,6 +76,10 @@ def check_hyperparameters(name: str, hyperparameters: Mapping[str, Any]) -> None
         expected = _expected(given, value)
         if expected is not None:
             raise ParameterError(f"agent {name!r}: {given} is {value!r}; expected {expected}")
+
+
+def _title(agent: str | type) -> str:
+    return agent if isinstance(agent, str) else agent.__name__
 
 
 def _expected(name: str, value: Any) -> str | None:
@@ -97,12 +112,12 @@ def extractor(space: Any) -> type:
 
 
 def make_model(
-    name: str, env: Any, hyperparameters: dict[str, Any], *, seed: int, tensorboard: str | None = None
+    agent: str | type, env: Any, hyperparameters: dict[str, Any], *, seed: int, tensorboard: str | None = None
 ) -> Any:
     """A model of Stable-Baselines3 on the CPU, with the network described above unless `policy_kwargs` says otherwise.
 
     Args:
-        name: as for `algorithm`.
+        agent: as for `algorithm`.
         env: a VecEnv of Stable-Baselines3.
         hyperparameters: of the algorithm; `net_arch` for the layers after the features; `n_envs` and `n_timesteps` are left out.
     Raises:
@@ -119,7 +134,7 @@ def make_model(
     }
     many = hasattr(env.observation_space, "spaces")
     try:
-        model = algorithm(name)(
+        model = algorithm(agent)(
             hyperparameters.get("policy", "MultiInputPolicy" if many else "MlpPolicy"),
             env,
             seed=seed,
@@ -129,7 +144,7 @@ def make_model(
             **options,
         )
     except (TypeError, ValueError, AssertionError) as error:
-        raise ParameterError(f"agent {name!r} cannot be made: {error}") from error
+        raise ParameterError(f"agent {_title(agent)!r} cannot be made: {error}") from error
     if tensorboard is None and not options.get("verbose"):
         from stable_baselines3.common.logger import Logger
 

@@ -1,6 +1,10 @@
 """What each agent is: tabular or a network, and how figures call it."""
 
 from dataclasses import dataclass
+from pathlib import Path
+
+from pharos.errors import ParameterError
+from pharos.sources import Source, find, is_reference, load
 
 TABULAR_OBSERVATION = "index"
 """What tabular agents see."""
@@ -40,3 +44,30 @@ AGENTS = {
 def agent_kind(name: str) -> AgentKind:
     """What the agent called `name` is; a class of an algorithm for Stable-Baselines3 is a network."""
     return AGENTS.get(name) or AgentKind(name, name.rpartition(":")[2])
+
+
+LIBRARIES = ("stable_baselines3", "sb3_contrib")
+"""Their algorithms are known by name: they need no trust, and no source in the configuration of a run."""
+
+
+def is_known(name: str) -> bool:
+    """Whether an agent comes with pharos or with one of LIBRARIES, so that it is not code of the user's own."""
+    return not is_reference(name) or name.partition(":")[0].split(".")[0] in LIBRARIES
+
+
+def agent_source(name: str, folder: str | Path | None = None) -> Source | None:
+    """Where an agent of the user's own is, which is imported; None for all others.
+
+    Args:
+        folder: relative files and modules are looked for there first; None: in the current directory.
+    Raises:
+        ParameterError: it cannot be imported, or is no class.
+    """
+    if is_known(name):
+        return None
+    source = find(name, folder)
+    if not isinstance(load(source), type):
+        raise ParameterError(
+            f"{name!r}: found {load(source)!r}; expected the class of an algorithm for Stable-Baselines3"
+        )
+    return source

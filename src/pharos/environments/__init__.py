@@ -3,6 +3,7 @@
 from pharos.environments.base import Components, Environment, State, start_distribution
 from pharos.environments.breakout import Breakout
 from pharos.environments.catalog import (
+    class_of,
     classes,
     imported,
     list_environments,
@@ -10,6 +11,7 @@ from pharos.environments.catalog import (
     named_instances,
     on_registration,
     register,
+    source_of,
 )
 from pharos.environments.freeway import Freeway
 from pharos.environments.frozen_lake import FrozenLake
@@ -47,6 +49,7 @@ __all__ = [
     "Sprite",
     "State",
     "as_tuples",
+    "class_of",
     "classes",
     "declared_parameters",
     "imported",
@@ -57,5 +60,6 @@ __all__ = [
     "on_registration",
     "parameter",
     "register",
+    "source_of",
     "start_distribution",
 ]

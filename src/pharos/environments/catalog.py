@@ -6,17 +6,16 @@ catalogue with `register`.
 
 import dataclasses
 import importlib
-import importlib.util
 import os
-import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
+from pharos import sources
 from pharos.environments.base import Environment
 from pharos.environments.parameters import as_tuples
 from pharos.errors import ParameterError, UnknownName
+from pharos.sources import Source
 
 BUILT_IN = (  # file:class, in the order in which they are listed
     "simple_grid:SimpleGrid",
@@ -52,11 +51,13 @@ def make(name: str, **parameters: Any) -> Environment:
     class_name = name
     if name in named_instances():
         class_name, defaults = named_instances()[name]
-    if ":" in class_name:
-        class_name = imported(class_name).name
-    if class_name not in classes():
+    if sources.is_reference(class_name):
+        cls = imported(class_name)
+        class_name = cls.name
+    elif class_name in classes():
+        cls = classes()[class_name]
+    else:
         raise UnknownName("environment", name, [*classes(), *named_instances()])
-    cls = classes()[class_name]
     known = {field.name for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
     for parameter in parameters:
         if parameter not in known:
@@ -84,41 +85,40 @@ def named_instances() -> dict[str, tuple[str, Mapping[str, Any]]]:
     }
 
 
-def imported(path: str) -> type[Environment]:
+def imported(path: str, folder: str | os.PathLike | None = None) -> type[Environment]:
     """Import a user's class from "module:Class" or "file.py:Class", register it and return it.
 
-    Modules are also looked for in the current directory. A file is read again at every call.
-
+    Args:
+        folder: relative files and modules are looked for there first; None: in the current directory.
     Raises:
         ParameterError: no such module, file or class; or one that `register` refuses.
     """
-    where, _, class_name = path.rpartition(":")
-    try:
-        cls = getattr(_module_of_file(Path(where)) if where.endswith(".py") else _module_called(where), class_name)
-    except Exception as error:
-        reason = " ".join(str(error).split())
+    source = sources.find(path, None if folder is None else Path(folder))
+    return _known_class(source, sources.load(source))
+
+
+def class_of(source: Source, *, trust: bool = False, strict: bool = False) -> type[Environment]:
+    """The class that a stored configuration names; registered, so that `make` knows it.
+
+    Args:
+        trust, strict: as for `pharos.sources.resolve`.
+    Raises:
+        UntrustedCode: it was not imported before, and is not trusted. ParameterError: it cannot be imported.
+    """
+    return _known_class(source, sources.resolve(source, trust=trust, strict=strict))
+
+
+def source_of(cls: type[Environment]) -> Source | None:
+    """Where a user's class comes from; None for built-in classes, and for those that no other process can import."""
+    return None if cls in _BUILT_IN.values() else sources.source_of(cls)
+
+
+def _known_class(source: Source, cls: Any) -> type[Environment]:
+    if not isinstance(cls, type) or not issubclass(cls, Environment):
         raise ParameterError(
-            f"{path!r}: {type(error).__name__}: {reason}; expected 'module:Class' or 'file.py:Class'"
-        ) from error
+            f"{source.name!r}: found {cls!r}; expected 'module:Class' or 'file.py:Class' of a subclass of pharos.Environment"
+        )
     return cls if cls in _BUILT_IN.values() else register(cls)
-
-
-def _module_called(name: str) -> ModuleType:
-    sys.path.insert(0, os.getcwd())
-    try:
-        return importlib.import_module(name)
-    finally:
-        sys.path.remove(os.getcwd())
-
-
-def _module_of_file(file: Path) -> ModuleType:
-    name = f"pharos_user_{file.stem}"
-    spec = importlib.util.spec_from_file_location(name, file)
-    if spec is None or spec.loader is None:
-        raise ImportError(f"cannot read {file}")
-    module = sys.modules[name] = importlib.util.module_from_spec(spec)  # dataclasses look their module up there
-    spec.loader.exec_module(module)
-    return module
 
 
 def register(cls: type[Environment]) -> type[Environment]:

@@ -10,9 +10,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any
 
-from pharos.agents import agent_kind
-from pharos.environments import Environment, as_tuples, make
-from pharos.errors import FileFormatError, ParameterError, UnknownName
+from pharos.agents import agent_kind, agent_source, is_known
+from pharos.environments import Environment, as_tuples, class_of, make, source_of
+from pharos.errors import FileFormatError, ParameterError, UnknownName, UntrustedCode
+from pharos.observations import OwnObservation, observation_of
+from pharos.sources import Source, is_reference, resolve
 
 if TYPE_CHECKING:
     from pharos.experiments.task import Task, TaskValues
@@ -121,6 +123,8 @@ class RunConfig:
         gamma: discount of values and returns; the agent's own discount is a hyperparameter.
         horizon: number of steps of an episode in values and returns; None: discounted values without a horizon.
         evaluation_interval: steps between evaluations of the policy.
+        sources: where a class, observation or agent of the user's own comes from, under "environment", "observation" and
+            "agent". Their names belong to the `id`; files and checksums do not.
     """
 
     environment: str
@@ -135,6 +139,7 @@ class RunConfig:
     gamma: float = 1.0
     horizon: int | None
     evaluation_interval: int
+    sources: Mapping[str, Source] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for name in ("steps", "evaluation_interval"):
@@ -152,12 +157,24 @@ class RunConfig:
         evaluation_interval: int | None = None,
         hyperparameters: Mapping[str, Any] | None = None,
     ) -> "RunConfig":
-        """The configuration of a run on a task; it is evaluated every hundredth of `steps` unless told otherwise."""
+        """The configuration of a run on a task; it is evaluated every hundredth of `steps` unless told otherwise.
+
+        Args:
+            agent: `module:Class` and `file.py:Class` are looked for in the current directory.
+        """
+        observation = task.observation
+        sources = {
+            "environment": source_of(type(task.env)),
+            "observation": observation.source if isinstance(observation, OwnObservation) else None,
+            "agent": agent_source(agent),
+        }
+        if sources["agent"] is not None:
+            agent = sources["agent"].name
         return RunConfig(
             environment=task.env.name,
             parameters=json.loads(json.dumps(task.env.parameters)),
             chance=task.chance,
-            observation=task.observation,
+            observation=str(observation),
             observation_options=dict(task.observation_options),
             agent=agent,
             hyperparameters=dict(hyperparameters or {}),
@@ -166,6 +183,7 @@ class RunConfig:
             gamma=task.gamma,
             horizon=task.horizon_steps,
             evaluation_interval=evaluation_interval or (max(1, steps // 100) if isinstance(steps, int) else 1),
+            sources={part: source for part, source in sources.items() if source is not None},
         )
 
     @staticmethod
@@ -176,19 +194,20 @@ class RunConfig:
             FileFormatError: an entry is missing, unknown or of another type.
         """
         known = [each.name for each in fields(RunConfig)]
-        missing = [name for name in known if name not in entry]
+        missing = [name for name in known if name not in entry and name != "sources"]
         unknown = [name for name in entry if name not in known]
         if missing or unknown:
             wrong = f"lacks {', '.join(missing)}" if missing else f"has the unknown entry {unknown[0]!r}"
             raise FileFormatError(f"the configuration of a run {wrong}; expected {', '.join(known)}")
         try:
-            return RunConfig(**{**entry, "chance": ChanceSetting.from_dict(entry["chance"])})
+            sources = {part: Source.from_dict(source) for part, source in entry.get("sources", {}).items()}
+            return RunConfig(**{**entry, "chance": ChanceSetting.from_dict(entry["chance"]), "sources": sources})
         except (ParameterError, AttributeError, TypeError) as error:
             raise FileFormatError(f"the configuration of a run is damaged: {error}") from error
 
     def to_dict(self) -> dict[str, Any]:
         """The `config` of a run.json, JSON-able."""
-        return {
+        entry = {
             "environment": self.environment,
             "parameters": dict(self.parameters),
             "chance": self.chance.to_dict(),
@@ -202,6 +221,9 @@ class RunConfig:
             "horizon": self.horizon,
             "evaluation_interval": self.evaluation_interval,
         }
+        if self.sources:
+            entry["sources"] = {part: source.to_dict() for part, source in self.sources.items()}
+        return entry
 
     @property
     def id(self) -> str:
@@ -213,32 +235,78 @@ class RunConfig:
         """Whether the agent learns a table over the states."""
         return agent_kind(self.agent).is_tabular
 
-    def make_environment(self) -> Environment:
+    def make_environment(self, *, trust: bool = False, strict: bool = False) -> Environment:
         """The environment.
 
+        Args:
+            trust: whether code of the user's own may be imported; what was imported before needs no trust.
+            strict: whether a file that has changed since is an error instead of a warning.
         Raises:
-            UnknownName, ParameterError: it does not exist, or not with these parameters.
+            UnknownName, ParameterError: it does not exist, or not with these parameters. UntrustedCode: see `trust`.
         """
-        return make(self.environment, **{name: as_tuples(value) for name, value in self.parameters.items()})
+        parameters = {name: as_tuples(value) for name, value in self.parameters.items()}
+        if "environment" in self.sources:
+            name = class_of(self.sources["environment"], trust=trust, strict=strict).name
+            return make(name, **parameters)
+        self._check_trust("environment", trust)
+        return make(self.environment, **parameters)
 
-    def task(self, values: "TaskValues | None" = None) -> "Task":
-        """What the agent learns; `values` at its start are not computed again where they are given."""
+    def task(self, values: "TaskValues | None" = None, *, trust: bool = False, strict: bool = False) -> "Task":
+        """What the agent learns.
+
+        Args:
+            values: at the start, which are not computed again where they are given.
+            trust, strict: as for `make_environment`.
+        """
         from pharos.experiments.task import Task
 
+        observation: str | OwnObservation = self.observation
+        if "observation" in self.sources:
+            observation = observation_of(self.sources["observation"], trust=trust, strict=strict)
+        else:
+            self._check_trust("observation", trust)
         return Task(
-            self.make_environment(),
+            self.make_environment(trust=trust, strict=strict),
             sticky=self.chance.sticky,
             random=self.chance.random,
-            observation=self.observation,
+            observation=observation,
             observation_options=dict(self.observation_options),
             gamma=self.gamma,
             horizon=self.horizon,
             values=values,
         )
 
+    def algorithm(self, *, trust: bool = False, strict: bool = False) -> "str | type":
+        """The agent: its name, or the class of the user's own.
+
+        Raises:
+            UntrustedCode: see `make_environment`.
+        """
+        if "agent" in self.sources:
+            return resolve(self.sources["agent"], trust=trust, strict=strict)
+        if not is_known(self.agent):
+            self._check_trust("agent", trust)
+        return self.agent
+
+    def _check_trust(self, part: str, trust: bool) -> None:
+        name = getattr(self, part)
+        if is_reference(name) and not trust:
+            raise UntrustedCode(
+                f"the {part} {name!r} is code, which is executed only if you trust it: add --trust (in Python: trust=True)"
+            )
+
 
 def run_id(config: Mapping[str, Any]) -> str:
-    """The digest of a run's `config`: XXH3 with 64 bits of its sorted JSON, 16 hexadecimal digits."""
+    """The digest of a run's `config`: XXH3 with 64 bits of its sorted JSON, 16 hexadecimal digits.
+
+    Of code of the user's own its name counts, not where it lies, so that the id is the same on every machine.
+    """
     import xxhash
 
+    sources = config.get("sources")
+    if isinstance(sources, Mapping):
+        names = {
+            part: source.get("name") if isinstance(source, Mapping) else source for part, source in sources.items()
+        }
+        config = {**config, "sources": names}
     return xxhash.xxh3_64_hexdigest(json.dumps(config, sort_keys=True, separators=(",", ":")).encode())

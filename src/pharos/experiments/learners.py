@@ -37,13 +37,17 @@ class Learner(Protocol):
 
 
 def make_learner(
-    config: RunConfig, task: Task, hyperparameters: dict[str, Any], tensorboard: Path | None = None
+    config: RunConfig,
+    algorithm: str | type,
+    task: Task,
+    hyperparameters: dict[str, Any],
+    tensorboard: Path | None = None,
 ) -> Learner:
-    """The learner of a run, with all its hyperparameters."""
+    """The learner of a run, with all its hyperparameters; `algorithm` as `RunConfig.algorithm` gives it."""
     if config.is_tabular:
         return Tabular(task, hyperparameters, config.steps, config.seed)
     logs = None if tensorboard is None else str(tensorboard)
-    return Deep(config.agent, task, hyperparameters, config.steps, config.seed, logs)
+    return Deep(algorithm, task, hyperparameters, config.steps, config.seed, logs)
 
 
 class Tabular:
@@ -76,14 +80,20 @@ class Deep:
     """A model of Stable-Baselines3."""
 
     def __init__(
-        self, name: str, task: Task, hyperparameters: dict[str, Any], steps: int, seed: int, tensorboard: str | None
+        self,
+        agent: str | type,
+        task: Task,
+        hyperparameters: dict[str, Any],
+        steps: int,
+        seed: int,
+        tensorboard: str | None,
     ):
         from pharos.agents.deep import DeepPolicy, check_hyperparameters, make_model
 
-        check_hyperparameters(name, hyperparameters)
+        check_hyperparameters(agent, hyperparameters)
         self.task, self.steps = task, steps
         env = vector_environment(task, int(hyperparameters.get("n_envs", 1)), seed)
-        self.model = make_model(name, env, hyperparameters, seed=seed, tensorboard=tensorboard)
+        self.model = make_model(agent, env, hyperparameters, seed=seed, tensorboard=tensorboard)
         self.agent = DeepPolicy(self.model)
         self.finished = (0, 0.0)  # episodes, and the sum of their returns
 

@@ -49,7 +49,7 @@ class Task:
     Attributes:
         env: the environment.
         sticky, random: chance, as in `pharos.sticky_actions` and `pharos.random_actions`; both: random ones come first.
-        observation, observation_options: what the agent sees.
+        observation, observation_options: what the agent sees, as `pharos.observe` takes it.
         previous_action: whether the agent also sees the previously executed action.
         gamma: discount of values and returns.
         horizon: number of steps of an episode in values and returns, as `Horizon.of` reads it; "default": the environment's

@@ -23,10 +23,11 @@ from pharos.agents import hyperparameters as hyperparameters_of
 from pharos.environments import Environment, make
 from pharos.errors import ParameterError
 from pharos.experiments import results as _results
-from pharos.experiments.config import RunConfig
+from pharos.experiments.config import RunConfig, run_id
 from pharos.experiments.evaluation import evaluate_agent
 from pharos.experiments.learners import Learner, make_learner
 from pharos.experiments.task import Task, TaskValues
+from pharos.observations import own_observation
 
 Progress = Callable[[int, int, Mapping[str, Any]], None]
 CHECKPOINT_SECONDS = 10.0
@@ -75,10 +76,11 @@ def train(
     """Train an agent, and measure the exact regret of its policy as it learns.
 
     Args:
-        agent: "q_learning", "dqn", "ppo", "a2c", or "module:Class" of an algorithm for Stable-Baselines3.
+        agent: "q_learning", "dqn", "ppo", "a2c", or "module:Class" or "file.py:Class" of an algorithm for Stable-Baselines3.
         environment: a name, with its `parameters` as keywords, or an Environment.
         steps: number of environment steps to learn from.
-        observation, observation_options: what the agent sees; tabular agents see the state's index.
+        observation, observation_options: what the agent sees, also "module:name" or "file.py:name"; tabular agents see the
+            index of the state.
         sticky, random: chance.
         gamma, horizon: setting of values and returns, see `Task`; the agent's own discount is a hyperparameter.
         evaluation_interval: steps between evaluations; None: a hundredth of `steps`.
@@ -90,11 +92,12 @@ def train(
         ParameterError: an option is wrong, or `out` holds another run. UnknownName: no such name; the nearest is suggested.
         MissingExtra: Stable-Baselines3 is not installed.
     """
+    seen = agent_kind(agent).observation(observation)
     task = Task(
         make(environment, **parameters) if isinstance(environment, str) else environment,
         sticky=sticky,
         random=random,
-        observation=agent_kind(agent).observation(observation),
+        observation=own_observation(seen) or seen,
         observation_options=dict(observation_options or {}),
         gamma=gamma,
         horizon=horizon,
@@ -145,17 +148,22 @@ def train_config(
     progress: Progress | None = None,
     *,
     values: TaskValues | None = None,
+    trust: bool = False,
+    strict: bool = False,
 ) -> TrainingResult:
     """Train as a configuration says, the `config` of a run.json or of a study; results go into `folder`.
 
     Args:
         values: at the start of the task, where they are known already.
+        trust: whether code that the configuration names may be imported: an environment, observation or agent of its own.
+        strict: whether a file of such code that has changed since is an error instead of a warning.
     Raises:
-        FileFormatError: it is not the configuration of a run. Else as `train`.
+        FileFormatError: it is not the configuration of a run. UntrustedCode: it names code. Else as `train`.
     """
     if not isinstance(config, RunConfig):
         config = RunConfig.from_dict(config)
-    return _run(config, config.task(values), Path(folder), False, progress)
+    task, algorithm = config.task(values, trust=trust, strict=strict), config.algorithm(trust=trust, strict=strict)
+    return _run(config, task, Path(folder), False, progress, algorithm)
 
 
 # One run ----------------------------------------------------------------------------------------------------------------
@@ -220,7 +228,12 @@ class _Curve:
 
 
 def _run(
-    config: RunConfig, task: Task, folder: Path | None, tensorboard: bool, progress: Progress | None
+    config: RunConfig,
+    task: Task,
+    folder: Path | None,
+    tensorboard: bool,
+    progress: Progress | None,
+    algorithm: str | type | None = None,
 ) -> TrainingResult:
     if tensorboard and (folder is None or config.is_tabular):
         raise ParameterError(
@@ -238,12 +251,12 @@ def _run(
     spent = 0.0
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
-        done = _finished(folder, entry)
+        done = _finished(folder, config)
         if done is not None:
             return done
     chosen = hyperparameters_of(config.agent, config.environment, config.observation, config.hyperparameters)
     logs = folder / "tensorboard" if folder is not None and tensorboard else None
-    learner = make_learner(config, task, chosen, logs)
+    learner = make_learner(config, algorithm or config.algorithm(), task, chosen, logs)
     curve = _Curve(task)
     checkpoint = None if folder is None else _Checkpoint(folder / "checkpoint", config.id)
     if folder is not None and checkpoint is not None:
@@ -284,16 +297,23 @@ def _run(
     return TrainingResult(entry, result, rows, learner.agent, folder, seconds)
 
 
-def _finished(folder: Path, config: Mapping[str, Any]) -> TrainingResult | None:
+def _finished(folder: Path, config: RunConfig) -> TrainingResult | None:
     """The result that lies there; None where there is none; ParameterError where it is that of another run."""
     if not (folder / "run.json").exists():
         return None
     record = _results.read_record(folder)
-    if record["config"] != json.loads(json.dumps(config)):
-        different = [key for key in config if record["config"].get(key) != json.loads(json.dumps(config[key]))]
+    stored = record["config"]
+    if run_id(stored) != config.id:
+        entry = json.loads(json.dumps(config.to_dict()))
+        different = [name for name in {**entry, **stored} if stored.get(name) != entry.get(name)]
         raise ParameterError(
             f"{folder}: holds a run with another {', '.join(different) or 'configuration'}; choose another folder, or delete it"
         )
+    for part, source in config.sources.items():
+        if stored["sources"][part].get("checksum") != source.checksum:
+            raise ParameterError(
+                f"{folder}: holds a run from before {source.file} was changed; choose another folder, or delete it"
+            )
     if record.get("status") != "finished":
         return None
     rows = _results.read_curve(folder).to_dict("records")

@@ -32,6 +32,7 @@ from pharos.experiments import results as _results
 from pharos.experiments.config import ChanceSetting
 from pharos.experiments.task import Task
 from pharos.experiments.train import train_on
+from pharos.observations import own_observation
 
 EVALUATIONS = 20  # of a run
 
@@ -146,9 +147,13 @@ def tune(
     if not seeds or trials < 1:
         raise ParameterError(f"{len(seeds)} seeds and {trials} trials; expected at least one of each")
     seen = agent_kind(agent).observation(observation)
+    own = own_observation(seen)
+    seen = str(own or seen)
     kinds = _checked_chances(chances, sticky, random)
     tasks = [
-        Task(each, sticky=kind.sticky, random=kind.random, observation=seen) for each in instances for kind in kinds
+        Task(each, sticky=kind.sticky, random=kind.random, observation=own or seen)
+        for each in instances
+        for kind in kinds
     ]
     config = {
         "agent": agent,

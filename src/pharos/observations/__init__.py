@@ -7,6 +7,7 @@ from pharos.observations.blocks import in_blocks
 from pharos.observations.complex_image import ComplexImage
 from pharos.observations.context import NO_ACTION, ObservationInContext
 from pharos.observations.observation import FunctionObservation, Observation, add_built_in, names, observe, register
+from pharos.observations.own import OwnObservation, imported, observation_of, own_observation
 from pharos.observations.rendered import RENDERERS, render, renderers
 from pharos.observations.simple_image import SimpleImage
 from pharos.observations.vector import Index, OneHot, Vector
@@ -26,11 +27,15 @@ __all__ = [
     "Observation",
     "ObservationInContext",
     "OneHot",
+    "OwnObservation",
     "SimpleImage",
     "Vector",
+    "imported",
     "in_blocks",
     "names",
+    "observation_of",
     "observe",
+    "own_observation",
     "register",
     "render",
     "renderers",

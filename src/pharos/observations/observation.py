@@ -1,13 +1,14 @@
 """What an observation is: a pure function of the state with a Gymnasium space, for one environment."""
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pharos.environments import Environment, make
 from pharos.errors import ParameterError, UnknownName
+from pharos.sources import is_reference
 
 if TYPE_CHECKING:
     import gymnasium
@@ -115,6 +116,16 @@ def register(name: str, function: Function, space: Any) -> None:
     _registered[name] = (function, space)
 
 
+def registered(name: str) -> tuple[Function, Any] | None:
+    """The (function, space) that a user registered under this name."""
+    return _registered.get(name)
+
+
+def is_built_in(name: str) -> bool:
+    """Whether the name is that of one of pharos' own observations."""
+    return name in _built_in
+
+
 def add_built_in(name: str, make: Callable[..., Observation]) -> None:
     """Put one of pharos' own among the known names; `make` takes the environment, and options as keywords."""
     _built_in[name] = make
@@ -127,8 +138,8 @@ def observe(
 
     Args:
         env: an Environment, or a name that `pharos.make` knows.
-        observation: a name (see `names`); a pair (function, Gymnasium space) as in `register`; or an Observation, which is
-            returned.
+        observation: a name (see `names`); "module:name" or "file.py:name" of the user's own; a pair (function, Gymnasium
+            space) as in `register`; or an Observation, which is returned.
         state_space: the built state space; "index" needs it.
         options: of the named observation, such as `grey=True`.
     Raises:
@@ -145,6 +156,8 @@ def observe(
             )
         made = observation
         known: list[str] = []
+    elif (own := _own(observation)) is not None:
+        made, known = _made(own.make, env, state_space, options)
     elif isinstance(observation, tuple) and len(observation) == 2 and callable(observation[0]):
         made, known = FunctionObservation(env, *observation), []
     elif not isinstance(observation, str):
@@ -154,17 +167,32 @@ def observe(
     elif observation in _registered:
         made, known = FunctionObservation(env, *_registered[observation], name=observation), []
     elif observation in _built_in:
-        maker = _built_in[observation]
-        parameters = inspect.signature(maker).parameters
-        known = [name for name, parameter in parameters.items() if parameter.kind is parameter.KEYWORD_ONLY]
-        space = {"state_space": state_space} if "state_space" in parameters else {}
-        made = maker(env, **space, **{name: value for name, value in options.items() if name in known})
+        made, known = _made(_built_in[observation], env, state_space, options)
     else:
         raise UnknownName("observation", observation, names())
     for option in options:
         if option not in known:
             raise UnknownName(f"option of observation {made.name!r}", option, known)
     return made
+
+
+def _made(
+    make: Callable[..., Observation], env: Environment, state_space: "StateSpace | None", options: Mapping[str, Any]
+) -> tuple[Observation, list[str]]:
+    """The observation, and the options that it knows: the keywords of `make`."""
+    parameters = inspect.signature(make).parameters
+    known = [name for name, parameter in parameters.items() if parameter.kind is parameter.KEYWORD_ONLY]
+    space = {"state_space": state_space} if "state_space" in parameters else {}
+    return make(env, **space, **{name: value for name, value in options.items() if name in known}), known
+
+
+def _own(observation: Any) -> Any:
+    """The user's own observation, where that is what `observation` names."""
+    from pharos.observations.own import OwnObservation, imported
+
+    if isinstance(observation, OwnObservation):
+        return observation
+    return imported(observation) if is_reference(observation) else None
 
 
 def _short(value: Any) -> str:

@@ -95,7 +95,8 @@ def train(config: Mapping[str, Any], folder: Path) -> None:
     from pharos.experiments import TaskValues, train_config
 
     values = _values.kept(config)
-    train_config(config, folder, values=None if values is None else TaskValues.from_dict(values))
+    known = None if values is None else TaskValues.from_dict(values)
+    train_config(config, folder, values=known, trust=True, strict=True)
 
 
 def prepare_instance(config: Mapping[str, Any]) -> None:
