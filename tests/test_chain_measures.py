@@ -179,7 +179,7 @@ def test_the_action_gap_is_as_regular_as_all_gaps_say(mdp, zeta):
     solution = pharos.value_iteration(mdp, 1e-9)
     found = hardness.action_gap_regularity(mdp, solution, zeta=zeta)
     gaps = []
-    reached = importlib.import_module("pharos.hardness.gaps").reachable(mdp)
+    reached = mdp.states_within()
     if not mdp.is_sticky:
         for s in range(mdp.num_states):
             if reached[s] and not mdp.terminal[s]:

@@ -13,6 +13,7 @@ import pharos
 from naive_mdp import augmented, optimal_values
 from pharos import hardness
 from pharos.errors import ParameterError, UndefinedMeasure
+from pharos.hardness.value_norm import certified_value_norm
 from pharos.mdp import TabularMDP, random_actions
 from strategies import deterministic_mdps, small_mdps
 from test_effective_horizon import key_corridor
@@ -37,8 +38,6 @@ def test_the_norm_is_that_of_the_explicit_matrices(mdp):
     v = optimal_values(P, R, mdp.gamma)
     over = np.append(np.repeat(mdp.terminal, mdp.num_actions + 1), True)
     met = reached(P, start) & ~over
-    if mdp.is_sticky and mdp.chance.chosen + mdp.chance.uniform == 0:
-        return  # pairs count as reachable by whatever is executed, although nothing can be chosen after the first step
     mean = P @ v
     variance = np.maximum((P * (v[None, None, :] - mean[:, :, None]) ** 2).sum(axis=2), 0)
     expected = math.sqrt(variance[met].max(initial=0.0))
@@ -107,3 +106,35 @@ def test_covering_needs_a_horizon():
         hardness.covering(mdp)
     with pytest.raises(ParameterError, match="whole number"):
         hardness.covering(mdp, horizon=-3)
+
+
+@pytest.mark.parametrize(("gamma", "value"), [(0.999, 1e5), (0.99, 1e6), (0.5, 1e9)])
+def test_large_values_that_lie_close_together_have_their_deviation(gamma, value):
+    """State 0 leads to 1 or 2 with probability 1/2 each; their values differ by 2 d, so the deviation is d."""
+    matrix = np.zeros((3, 1, 3))
+    matrix[0, 0, 1:] = 0.5
+    matrix[1, 0, 1] = matrix[2, 0, 2] = 1.0
+    deviation = 2.0**-10
+    rewards = [[0.0], [value * (1 - gamma)], [(value + 2 * deviation) * (1 - gamma)]]
+    mdp = TabularMDP.from_matrices(matrix, np.array(rewards), gamma=gamma)
+    solution = pharos.value_iteration(mdp, value * 1e-11 / (1 - gamma))
+    found = certified_value_norm(mdp, solution)
+    rounding = 4 * value * 2.0**-53 / (1 - gamma)  # of the rewards, which are what the MDP is
+    assert found.value == pytest.approx(deviation, abs=solution.error_bound + rounding)
+    assert found.lower - rounding <= deviation <= found.upper + rounding
+
+
+@settings(max_examples=100, deadline=None)
+@given(small_mdps(), st.sampled_from([1e-3, 1e-6]))
+def test_the_interval_holds_the_norm_however_coarse_the_values_are(mdp, tolerance):
+    P, R, start = augmented(mdp)
+    v = optimal_values(P, R, mdp.gamma)
+    over = np.append(np.repeat(mdp.terminal, mdp.num_actions + 1), True)
+    met = reached(P, start) & ~over
+    mean = P @ v
+    variance = np.maximum((P * (v[None, None, :] - mean[:, :, None]) ** 2).sum(axis=2), 0)
+    expected = math.sqrt(variance[met].max(initial=0.0))
+    found = certified_value_norm(mdp, pharos.value_iteration(mdp, tolerance))
+    assert (
+        found.lower - 1e-12 <= expected <= found.upper + 1e-12
+    )  # the rounding of the twin, whose values are below 200

@@ -1,19 +1,37 @@
-"""Suboptimality gaps: how much worse an action is than the best one. Source: Simchowitz and Jamieson (2019)."""
+"""Suboptimality gaps: how much worse an action is than the best one. Source: Simchowitz and Jamieson (2019).
+
+What is proven. Each value is within the solution's error bound of the true one, so a gap is known to twice that. A gap above the
+tie tolerance is a gap. Below it, a tie is proven where the best action and this one pay the same and lead to the same states, or
+where `ties` shows that equal values come from equal rewards for ever; else it may be a gap of any size, and its reciprocal anything.
+"""
 
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from pharos.errors import ParameterError, PrecisionError
+from pharos.hardness.interval import Certified
+from pharos.hardness.ties import TieProof, same_outcomes
+from pharos.kernels import ties
 from pharos.mdp import TabularMDP
 from pharos.solvers import Solution, value_iteration
 
-REGULARIZER = 0.1  # of Colosseum
-_BLOCK = 1 << 18  # states at once; fixed, so that sums do not depend on the machine
-_MEMORY = 8 * 2**30  # bytes for the values of every step, with a horizon
+# Of Colosseum.
+REGULARIZER = 0.1
+# Relative width up to which an interval counts as the value.
+NARROW = 1e-6
+# The default tie tolerance is this times the error bound of the values; more than 2, as a gap is known to twice the bound.
+ERRORS_PER_TIE = 2.5
+# States at once; fixed, so that sums do not depend on the machine.
+_BLOCK = 1 << 18
+# Bytes for the values of every step, with a horizon.
+_MEMORY = 8 * 2**30
+# Relative rounding of a gap, its reciprocal and sums of these: a few units each, and one for each block.
+_ROUNDING = 1e-12
+_UNIT = 2.0**-53
 
 
 @dataclass(frozen=True)
@@ -23,14 +41,18 @@ class Gaps:
     Attributes:
         sum_of_reciprocals: sum of 1 / gap over the states that can be reached and are not terminal, and the actions with
             gap > tie_tolerance. Unit: 1 / return.
-        lower, upper: the true sum lies between them, given that the actions counted as ties are ties: each gap is known up to
-            twice the error bound of the solution.
+        lower, upper: the true sum lies between them: each gap is known up to twice the error bound of the solution. `upper` is
+            infinite where ties are unresolved.
         regularized: sum of 1 / (gap + 0.1) over all states and actions, optimal ones and terminal states included, as
             Colosseum prints it.
         minimal: the smallest gap > tie_tolerance; infinite where there is none.
-        count, ties: how many gaps exceed tie_tolerance, and how many do not.
+        count, ties: how many gaps exceed tie_tolerance, and how many do not, the best actions among them.
+        unresolved: how many ties are not proven, so that they may be gaps smaller than the tolerance; with a `tie_tolerance`
+            of the caller's own, how many gaps are within their error of it.
+        small: how many gaps are computed as larger than 0, and no larger than the tolerance.
         histogram, edges: (B,) numbers of gaps in bins of a quarter of a decade, and their (B + 1,) edges.
         tie_tolerance: gaps up to it count as ties.
+        error: of a gap, at most; twice the error bound of the solution.
         conventions: what the values refer to.
     """
 
@@ -41,29 +63,71 @@ class Gaps:
     minimal: float
     count: int
     ties: int
+    unresolved: int
+    small: int
     histogram: np.ndarray
     edges: np.ndarray
     tie_tolerance: float
+    error: float
     conventions: dict[str, Any]
 
+    @property
+    def is_resolved(self) -> bool:
+        """Whether ties are ties, and the sum is known to a relative 1e-6."""
+        return not self.unresolved and self.upper - self.lower <= NARROW * self.upper
+
+    @property
+    def certified_sum(self) -> Certified:
+        """The sum of reciprocals, with its interval."""
+        return self._certified(self.sum_of_reciprocals, self.lower, self.upper)
+
+    @property
+    def certified_minimal(self) -> Certified:
+        """The smallest gap, with its interval: from 0 on where ties are unresolved."""
+        low, high = self.minimal * (1 - _ROUNDING) - self.error, self.minimal * (1 + _ROUNDING) + self.error
+        return self._certified(self.minimal, 0.0 if self.unresolved else max(low, 0.0), high)
+
+    @property
+    def certified_regularized(self) -> Certified:
+        """The regularized sum, with its interval: each 1 / (gap + 0.1) changes by a factor of at most 1 + error / 0.1."""
+        share = self.error / REGULARIZER
+        high = self.regularized / (1 - share) * (1 + _ROUNDING) if share < 1 else math.inf
+        low = self.regularized / (1 + share) * (1 - _ROUNDING)
+        return Certified(self.regularized, low, high, high - low <= NARROW * high)
+
+    def _certified(self, value: float, lower: float, upper: float) -> Certified:
+        exact = not self.unresolved and (lower == upper or upper - lower <= NARROW * upper)
+        note = ""
+        if self.unresolved:
+            note = (
+                f"{self.unresolved} of {self.ties} ties at a tolerance of {self.tie_tolerance:.2g} are not resolved: "
+                f"they may be smaller gaps"
+            )
+        extra = {"ties": self.ties, "unresolved_ties": self.unresolved, "tie_tolerance": self.tie_tolerance}
+        return Certified(value, lower, upper, exact, note, extra)
+
     def to_dict(self) -> dict[str, Any]:
-        """JSON-able; an infinite minimal gap is None."""
+        """JSON-able; what is infinite is None."""
         return {
             "sum_of_reciprocals": self.sum_of_reciprocals,
             "lower": self.lower,
-            "upper": self.upper,
+            "upper": self.upper if math.isfinite(self.upper) else None,
             "regularized": self.regularized,
             "minimal": self.minimal if math.isfinite(self.minimal) else None,
             "count": self.count,
             "ties": self.ties,
+            "unresolved": self.unresolved,
             "histogram": self.histogram.tolist(),
             "edges": self.edges.tolist(),
             "tie_tolerance": self.tie_tolerance,
+            "error": self.error,
         }
 
     def __str__(self) -> str:
+        ties = f", {self.unresolved} unresolved ties" if self.unresolved else ""
         return (
-            f"sum of reciprocal gaps {self.sum_of_reciprocals:.10g}, minimal gap {self.minimal:.6g}, {self.count} gaps"
+            f"sum of reciprocal gaps {self.sum_of_reciprocals:.10g}, minimal gap {self.minimal:.6g}, "
+            f"{self.count} gaps{ties}"
         )
 
 
@@ -78,51 +142,39 @@ def gaps(mdp: TabularMDP, solution: Solution | None = None, *, tie_tolerance: fl
     t = 1, ..., T and the states that can be reached at step t (Simchowitz and Jamieson's setting).
 
     Args:
-        solution: the optimal solution of `mdp`; None: solved here to an error of 1e-9.
-        tie_tolerance: gaps up to it count as ties. None: 2.5 times the error bound of the solution, and at least 1e-9.
+        solution: the optimal solution of `mdp`; None: solved here to an error of 1e-9, and where that leaves ties unresolved to
+            what 64-bit floats can reach.
+        tie_tolerance: gaps up to it count as ties. None: 2.5 times the error bound of the solution.
     Raises:
         ParameterError: `solution` belongs to another MDP or is not optimal.
         PrecisionError: tie_tolerance is not larger than twice the error bound, so that a tie could be counted as a gap.
-    Cost: one pass over the table, 30 to 60 ns a state; with a horizon T passes and 8 T S bytes.
+    Cost: one pass over the table, 30 to 60 ns a state, and another where ties are to be proven; with a horizon T passes and
+        8 T S bytes.
     Source: Simchowitz and Jamieson (2019), "Non-asymptotic gap-dependent regret bounds for tabular MDPs", section 2; the
         pharos paper, equation 2; regularized: Colosseum (Conserva and Rauber, 2022).
     """
-    solution = checked(mdp, solution)
-    tolerance = _tolerance(solution, tie_tolerance)
-    error = 2 * solution.error_bound
-    total = low = high = regularized = 0.0
-    minimal, count, ties = math.inf, 0, 0
-    histogram: dict[int, int] = {}
-    for gap, weight, counted in _weighted_gaps(mdp, solution):
-        regularized += float((weight[:, None] / (gap + REGULARIZER)).sum())
-        rows = np.broadcast_to((counted * weight)[:, None], gap.shape)
-        positive = (gap > tolerance) & (rows > 0)
-        chosen, times = gap[positive], rows[positive]
-        count += int(times.sum())
-        ties += int(rows.sum()) - int(times.sum())
-        if not chosen.size:
-            continue
-        total += float((times / chosen).sum())
-        low += float((times / (chosen + error)).sum())
-        high += float((times / (chosen - error)).sum())
-        minimal = min(minimal, float(chosen.min()))
-        bins, numbers = np.unique(np.floor(4 * np.log10(chosen)).astype(np.int64), return_inverse=True)
-        for bin_, number in zip(bins.tolist(), np.bincount(numbers, times).tolist(), strict=True):
-            histogram[bin_] = histogram.get(bin_, 0) + int(number)
-    first, last = (min(histogram), max(histogram)) if histogram else (0, -1)
-    return Gaps(
-        total,
-        low,
-        high,
-        regularized,
-        minimal,
-        count,
-        ties,
-        np.array([histogram.get(bin_, 0) for bin_ in range(first, last + 1)], np.int64),
-        10.0 ** (np.arange(first, last + 2) / 4),
-        tolerance,
-        _conventions(mdp, solution, tolerance),
-    )
+    if solution is None and tie_tolerance is None:
+        return resolved_gaps(mdp, checked(mdp, None))
+    return _summed(mdp, checked(mdp, solution), tie_tolerance)
+
+
+def resolved_gaps(mdp: TabularMDP, solution: Solution) -> Gaps:
+    """The gaps of a solution; of a more accurate one where ties are unresolved, or the sum is wide, and floats allow it."""
+    result = _summed(mdp, solution, None)
+    is_as_good = result.is_resolved or (result.unresolved and not result.small)
+    if is_as_good or solution.horizon is not None or mdp.gamma == 1.0:
+        return result
+    largest = max(float(solution.x.max(initial=0.0)), -float(solution.x.min(initial=0.0)))
+    largest += max(abs(mdp.reward_table.lowest), abs(mdp.reward_table.highest))
+    operations = 2 * mdp.num_actions + mdp.dynamics.operations + 16
+    least = operations * _UNIT * largest / (1 - mdp.gamma)
+    for tolerance in (least, 8 * least):
+        if tolerance < solution.error_bound / 2:
+            try:
+                return _summed(mdp, value_iteration(mdp, tolerance), None)
+            except PrecisionError:
+                continue
+    return result
 
 
 def sum_of_reciprocal_gaps(
@@ -147,20 +199,9 @@ def gaps_of_states(
 ) -> tuple[Iterator[tuple[np.ndarray, np.ndarray]], float, dict[str, Any]]:
     """(blocks of (gap (N, A), weight (N,): how often each row counts, 0 for none), tie tolerance, conventions)."""
     solution = checked(mdp, solution)
-    tolerance = _tolerance(solution, tie_tolerance)
-    blocks = ((gap, counted * weight) for gap, weight, counted in _weighted_gaps(mdp, solution))
+    tolerance = _tolerance(solution, tie_tolerance, _error(mdp, solution))
+    blocks = ((part.gap, part.counted) for part in _weighted_gaps(mdp, solution))
     return blocks, tolerance, _conventions(mdp, solution, tolerance)
-
-
-def _tolerance(solution: Solution, tie_tolerance: float | None) -> float:
-    error = 2 * solution.error_bound
-    tolerance = max(1e-9, 1.25 * error) if tie_tolerance is None else tie_tolerance
-    if not (isinstance(tolerance, int | float | np.floating) and math.isfinite(tolerance) and tolerance > error):
-        raise PrecisionError(
-            f"tie_tolerance is {tolerance!r}; expected more than twice the error bound of the solution, {error:.3g}: "
-            f"raise it, or solve with a smaller tolerance"
-        )
-    return float(tolerance)
 
 
 def checked(mdp: TabularMDP, solution: Solution | None) -> Solution:
@@ -180,6 +221,30 @@ def checked(mdp: TabularMDP, solution: Solution | None) -> Solution:
     return solution
 
 
+def _error(mdp: TabularMDP, solution: Solution) -> float:
+    """By how much a gap may be off: values of all steps are within the error bound of the solution.
+
+    With a horizon the bound is that of the first step. Where gamma is below 1, that of a later one may be larger: it is a sum of
+    discounted rounding errors, in proportion to the largest reward and value of its own steps.
+    """
+    error = 2 * solution.error_bound
+    if solution.horizon is None or mdp.gamma == 1.0 or solution.error_bound == 0.0:
+        return error
+    reward = max(abs(mdp.reward_table.lowest), abs(mdp.reward_table.highest))
+    steps = min(solution.horizon, 1 / (1 - mdp.gamma))
+    return error * steps * (1 + steps) if reward else error
+
+
+def _tolerance(solution: Solution, tie_tolerance: float | None, error: float) -> float:
+    tolerance = max(np.finfo(float).tiny, ERRORS_PER_TIE / 2 * error) if tie_tolerance is None else tie_tolerance
+    if not (isinstance(tolerance, int | float | np.floating) and math.isfinite(tolerance) and tolerance > error):
+        raise PrecisionError(
+            f"tie_tolerance is {tolerance!r}; expected more than twice the error bound of the solution, {error:.3g}: "
+            f"raise it, or solve with a smaller tolerance"
+        )
+    return float(tolerance)
+
+
 def _conventions(mdp: TabularMDP, solution: Solution, tolerance: float) -> dict[str, Any]:
     return {
         **solution.conventions(),
@@ -192,115 +257,224 @@ def _conventions(mdp: TabularMDP, solution: Solution, tolerance: float) -> dict[
 # Gaps and how often they count -------------------------------------------------------------------------------------------
 
 
-def _weighted_gaps(mdp: TabularMDP, solution: Solution) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """(gap (N, A), weight (N,), counted (N,) bool) of blocks of states: a gap stands for `weight` pairs; terminal: not counted."""
-    chance = mdp.chance
-    if solution.horizon is None:
-        values = [(solution.q_of(slice(None)) if mdp.transitions is not None else None, _visits(mdp))]
-        steps: Iterator[tuple[np.ndarray | None, tuple[np.ndarray, np.ndarray]]] = iter(values)
-    else:
-        steps = _steps(mdp, solution)
-    everywhere = solution.horizon is None and not mdp.is_sticky
-    for q, (later, first) in steps:
+def _summed(mdp: TabularMDP, solution: Solution, tie_tolerance: float | None) -> Gaps:
+    error = _error(mdp, solution)
+    tolerance = _tolerance(solution, tie_tolerance, error)
+    total = low = high = regularized = 0.0
+    minimal, count, num_ties = math.inf, 0, 0
+    histogram: dict[int, int] = {}
+    proof = _Ties(mdp, tolerance, error, tie_tolerance is not None)
+    for part in _weighted_gaps(mdp, solution):
+        gap = part.gap
+        regularized += float((part.weight[:, None] / (gap + REGULARIZER)).sum())
+        rows = np.broadcast_to(part.counted[:, None], gap.shape)
+        positive = (gap > tolerance) & (rows > 0)
+        chosen, times = gap[positive], rows[positive]
+        count += int(times.sum())
+        num_ties += int(rows.sum()) - int(times.sum())
+        proof.look_at(part)
+        if not chosen.size:
+            continue
+        total += float((times / chosen).sum())
+        low += float((times / (chosen + error)).sum())
+        high += float((times / (chosen - error)).sum())
+        minimal = min(minimal, float(chosen.min()))
+        bins, numbers = np.unique(np.floor(4 * np.log10(chosen)).astype(np.int64), return_inverse=True)
+        for bin_, number in zip(bins.tolist(), np.bincount(numbers, times).tolist(), strict=True):
+            histogram[bin_] = histogram.get(bin_, 0) + int(number)
+    unresolved = proof.unresolved(_weighted_gaps(mdp, solution))
+    first, last = (min(histogram), max(histogram)) if histogram else (0, -1)
+    return Gaps(
+        sum_of_reciprocals=total,
+        lower=low * (1 - _ROUNDING),
+        upper=high * (1 + _ROUNDING) if not unresolved else math.inf,
+        regularized=regularized,
+        minimal=minimal,
+        count=count,
+        ties=num_ties,
+        unresolved=unresolved,
+        small=proof.small,
+        histogram=np.array([histogram.get(bin_, 0) for bin_ in range(first, last + 1)], np.int64),
+        edges=10.0 ** (np.arange(first, last + 2) / 4),
+        tie_tolerance=tolerance,
+        error=error,
+        conventions=_conventions(mdp, solution, tolerance),
+    )
+
+
+class _Step(NamedTuple):
+    """A time step, or all where there is no horizon: x (S + 1, W), what follows it; which states count, how often."""
+
+    own: np.ndarray
+    next_x: np.ndarray
+    later: np.ndarray
+    first: np.ndarray
+
+
+class _Part(NamedTuple):
+    """Gaps of a block of states.
+
+    Attributes:
+        step: what they belong to. number: of that step.
+        states: (N,) indices. is_whole: whether they are a range.
+        rewards, following: (N, A), what executing an action pays, and the value of what follows.
+        gap: (N, A).
+        scale: the probability that the chosen action is executed, which each gap is multiplied by.
+        weight: (N,) how many pairs (state, previous action) a row stands for.
+        counted: (N,) the same; 0 for terminal states and those that cannot be reached.
+    """
+
+    step: _Step
+    number: int
+    states: np.ndarray
+    rewards: np.ndarray
+    following: np.ndarray
+    gap: np.ndarray
+    scale: float
+    weight: np.ndarray
+    counted: np.ndarray
+    is_whole: bool = True
+
+
+def _weighted_gaps(mdp: TabularMDP, solution: Solution) -> Iterator[_Part]:
+    """The gaps of all states, in blocks."""
+    chance, everywhere = mdp.chance, solution.horizon is None and not mdp.is_sticky
+    for number, step in enumerate(_steps(mdp, solution)):
         for start in range(0, mdp.num_states, _BLOCK):
             block = slice(start, min(start + _BLOCK, mdp.num_states))
-            executed = solution.q_of(block) if q is None else q[block]
+            states = np.arange(block.start, block.stop)
+            rewards = mdp.reward_table.rows(block)
+            following = mdp.dynamics.expected(step.next_x, block)
+            executed = rewards + mdp.gamma * following
             difference = executed.max(axis=1, keepdims=True) - executed
             live = ~np.asarray(mdp.terminal[block])
-            reached = later[block] > 0
-            yield chance.chosen * difference, later[block] + (everywhere & ~reached), live & reached
-            if first[block].any():
-                some = np.flatnonzero(first[block])
-                yield chance.first_chosen * difference[some], np.ones(some.size), live[some]
+            later = step.later[block]
+            weight = later + (everywhere & (later == 0))
+            part = (number, states, rewards, following)
+            gap = difference if chance.chosen == 1.0 else chance.chosen * difference
+            yield _Part(step, *part, gap, chance.chosen, weight, np.where(live, later, 0))
+            if step.first[block].any():
+                some = np.flatnonzero(step.first[block])
+                part = (number, states[some], rewards[some], following[some])
+                once = np.ones(some.size, np.int64)
+                gap = chance.first_chosen * difference[some]
+                yield _Part(step, *part, gap, chance.first_chosen, once, live[some] * once, False)
 
 
-def _visits(mdp: TabularMDP) -> tuple[np.ndarray, np.ndarray]:
-    """(later, first): how many times each state counts, and which start states count once more, without a previous action.
+def _steps(mdp: TabularMDP, solution: Solution) -> Iterator[_Step]:
+    """For each step t = 1, ..., T, or once: values, and how many times each state counts.
 
-    later (S,) int64: 1 for a reachable state, under sticky actions the number of actions by which it can be reached.
+    later (S,): 1 for a reachable state, under sticky actions the number of actions by which it can be reached; first (S,) bool:
+    start states, which count once more under sticky actions, without a previous action.
     """
-    reached = reachable(mdp)
     nothing = np.zeros(mdp.num_states, np.bool_)
-    if not mdp.is_sticky:
-        return reached.astype(np.int64), nothing
-    arrived = _arrivals(mdp, reached)
-    return arrived.sum(axis=1), _starts(mdp)
+    starts = nothing.copy()
+    starts[mdp.starts] = True
+    if solution.horizon is None:
+        if mdp.is_sticky:
+            yield _Step(solution.x, solution.x, mdp.pairs_within().sum(axis=1), starts)
+        else:
+            yield _Step(solution.x, solution.x, mdp.states_within().astype(np.int64), nothing)
+        return
+    all_steps = _all_steps(mdp, solution)
+    pairs = np.zeros((mdp.num_states, mdp.num_actions), np.bool_)
+    reached = starts
+    for step in range(1, solution.horizon + 1):
+        to_go = solution.horizon - step + 1
+        own, following = (_with_end(all_steps[n]) for n in (to_go, to_go - 1))
+        if mdp.is_sticky:
+            yield _Step(own, following, pairs.sum(axis=1), starts if step == 1 else nothing)
+            pairs = _pairs_after(mdp, pairs, step == 1)
+        else:
+            yield _Step(own, following, reached.astype(np.int64), nothing)
+            arrived = mdp.dynamics.arrivals(np.flatnonzero(reached & ~np.asarray(mdp.terminal)))
+            reached = np.asarray(arrived.any(axis=1))
 
 
-def _starts(mdp: TabularMDP) -> np.ndarray:
-    mask = np.zeros(mdp.num_states, np.bool_)
-    mask[mdp.start_states[mdp.start_probabilities > 0]] = True
-    return mask
+def _pairs_after(mdp: TabularMDP, pairs: np.ndarray, is_first: bool) -> np.ndarray:
+    """(S, A) bool: the pairs (state, previously executed action) one step after these, or after the start."""
+    live = ~np.asarray(mdp.terminal)
+    if is_first or mdp.chance.executes_any:
+        states = mdp.starts if is_first else np.flatnonzero(pairs.any(axis=1))
+        return mdp.dynamics.arrivals(states[live[states]])
+    states, actions = np.nonzero(pairs & live[:, None])  # every action is a repetition
+    outcomes = mdp.dynamics.outcomes(states, actions)
+    after = np.zeros((mdp.num_states + 1, mdp.num_actions), np.bool_)
+    after[outcomes.states, actions[outcomes.which]] = True
+    return after[:-1]
 
 
-def _arrivals(mdp: TabularMDP, reached: np.ndarray) -> np.ndarray:
-    """(S, A) bool: whether executing action a in some state of `reached` leads to s."""
-    result = np.zeros((mdp.num_states, mdp.num_actions), np.bool_)
-    live = np.flatnonzero(reached & ~np.asarray(mdp.terminal))
-    if mdp.next_states is None:
-        for action in range(mdp.num_actions):
-            assert mdp.transitions is not None
-            rows = mdp.transitions[live * mdp.num_actions + action]
-            result[rows.indices[rows.data > 0], action] = True
-        return result
-    for start in range(0, live.size, _BLOCK):
-        table = mdp.next_states[live[start : start + _BLOCK]]
-        for action in range(mdp.num_actions):
-            following = table[:, action]
-            result[following[following >= 0], action] = True
-    return result
-
-
-def reachable(mdp: TabularMDP) -> np.ndarray:
-    """(S,) bool: the states that can be reached from the start states, whatever is done."""
-    reached = _starts(mdp)
-    if mdp.next_states is not None:
-        from pharos.kernels.graph import mark_reachable
-
-        queue = np.empty(mdp.num_states, np.int32 if mdp.num_states < 2**31 else np.int64)
-        starts = np.flatnonzero(reached)
-        queue[: starts.size] = starts
-        mark_reachable(mdp.next_states, np.asarray(mdp.terminal), reached, queue, starts.size)
-        return reached
-    frontier = np.flatnonzero(reached & ~mdp.terminal)
-    while frontier.size:
-        arrived = np.zeros(mdp.num_states, np.bool_)
-        assert mdp.transitions is not None
-        rows = mdp.transitions[(frontier[:, None] * mdp.num_actions + np.arange(mdp.num_actions)).ravel()]
-        arrived[rows.indices[rows.data > 0]] = True
-        frontier = np.flatnonzero(arrived & ~reached & ~mdp.terminal)
-        reached |= arrived
-    return reached
-
-
-def _steps(mdp: TabularMDP, solution: Solution) -> Iterator[tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]]:
-    """For each step t = 1, ..., T: the values of executing (S, A), and how often states count, as in `_visits`."""
-    horizon = solution.horizon
-    assert horizon is not None
-    width = mdp.num_actions if mdp.is_sticky else 1
-    needed = 8 * (horizon + 1) * mdp.num_states * width
+def _all_steps(mdp: TabularMDP, solution: Solution) -> np.ndarray:
+    """(T + 1, S) or (T + 1, S, A), the values with every number of steps to go."""
+    needed = 8 * ((solution.horizon or 0) + 1) * mdp.num_states * mdp.width
     if solution.all_steps is None:
         if needed > _MEMORY:
             raise ParameterError(
-                f"gaps of {horizon} steps of {mdp.num_states} states need {needed / 2**30:.1f} GiB; expected at most "
+                f"gaps of {solution.horizon} steps of {mdp.num_states} states need {needed / 2**30:.1f} GiB; expected at most "
                 f"{_MEMORY / 2**30:.0f}: leave out the horizon, or make it or the space smaller"
             )
-        solution = value_iteration(mdp, horizon=horizon, keep_all=True)
-    all_steps = solution.all_steps
-    assert all_steps is not None
-    reached = _starts(mdp)
-    first = reached if mdp.is_sticky else np.zeros_like(reached)
-    later = np.zeros(mdp.num_states, np.int64) if mdp.is_sticky else reached.astype(np.int64)
-    for step in range(1, horizon + 1):
-        to_go = horizon - step + 1
-        q = _executed(mdp, all_steps[to_go - 1], solution.gamma)
-        yield q, (later, first)
-        arrived = _arrivals(mdp, reached)
-        first = np.zeros_like(first)
-        reached = np.asarray(arrived.any(axis=1))
-        later = arrived.sum(axis=1) if mdp.is_sticky else reached.astype(np.int64)
+        solution = value_iteration(mdp, horizon=solution.horizon, keep_all=True)
+    assert solution.all_steps is not None
+    return solution.all_steps
 
 
-def _executed(mdp: TabularMDP, v: np.ndarray, gamma: float) -> np.ndarray:
-    """(S, A), the values of executing each action once and then collecting `v`, (S,) or (S, A) by what was executed."""
-    return mdp.rewards + gamma * mdp.dynamics.expected(np.concatenate([v, np.zeros((1, *v.shape[1:]))]))
+def _with_end(values: np.ndarray) -> np.ndarray:
+    """(S + 1, W), from (S,) or (S, A)."""
+    return np.concatenate([values.reshape(len(values), -1), np.zeros((1, values[0].size))])
+
+
+# Ties --------------------------------------------------------------------------------------------------------------------
+
+
+class _Ties:
+    """Counts the ties that are not proven to be ties.
+
+    Attributes:
+        small: gaps that are computed as larger than 0, and no larger than the tolerance; of a tolerance that is part of what is
+            asked for, gaps that are within their error of it.
+        equal: gaps that are computed as 0, beyond the first of a state.
+    """
+
+    def __init__(self, mdp: TabularMDP, tolerance: float, error: float, is_definition: bool):
+        self.mdp, self.tolerance, self.error, self.is_definition = mdp, tolerance, error, is_definition
+        self.small = self.equal = 0
+        self.proof = TieProof(mdp)
+
+    def look_at(self, part: _Part) -> None:
+        """Take up the ties of a block."""
+        if part.scale == 0.0:
+            return  # nothing can be chosen: every action is worth the same
+        if self.is_definition:
+            near = np.abs(part.gap - self.tolerance) <= self.error
+            self.small += int((near.sum(axis=1) * part.counted).sum())
+            return
+        small, equal = ties.count(part.gap, part.counted, self.tolerance)
+        self.small += small
+        self.equal += equal
+        if not self.small:
+            own = part.step.own[part.states[0] : part.states[-1] + 1] if part.is_whole else part.step.own[part.states]
+            self.proof.look_at(part.number, own, part.rewards, part.following, part.gap, part.counted)
+
+    def unresolved(self, parts: Iterator[_Part]) -> int:
+        """How many are not proven; `parts` once more, where that is to be seen one by one."""
+        if self.is_definition or (not self.small and self.proof.holds):
+            return self.small
+        if self.small or not self.equal:
+            return self.small + self.equal
+        return self.equal - sum(self._alike(part) for part in parts)
+
+    def _alike(self, part: _Part) -> int:
+        """Equal gaps of a block between actions that have the same outcomes."""
+        if part.scale == 0.0:
+            return 0
+        zero = (part.gap == 0.0) & (part.counted > 0)[:, None]
+        several = np.flatnonzero(zero.sum(axis=1) > 1)
+        zero = zero[several]
+        best = zero.argmax(axis=1)
+        zero[np.arange(several.size), best] = False
+        row, action = np.nonzero(zero)
+        rows = several[row]
+        likely = part.following[rows, best[row]] == part.following[rows, action]
+        row, action, rows = row[likely], action[likely], rows[likely]
+        same = same_outcomes(self.mdp, part.states[rows], part.rewards[rows], best[row], action)
+        return int(part.counted[rows[same]].sum())

@@ -76,6 +76,31 @@ class Interval:
         return f"[{self.lower:.10g}, {self.upper:.10g}]"
 
 
+@dataclass(frozen=True)
+class Certified:
+    """A number and what is proven of it.
+
+    Attributes:
+        value: the number as computed.
+        lower, upper: the true one lies in [lower, upper].
+        exact: whether the interval is the value: its relative width is at most 1e-6, and no question is open.
+        note: why it is not exact; empty otherwise.
+        details: anything else worth knowing, JSON-able.
+    """
+
+    value: float
+    lower: float
+    upper: float
+    exact: bool
+    note: str = ""
+    details: Mapping[str, Any] = field(default_factory=dict)
+
+    def __str__(self) -> str:
+        if self.exact or not math.isfinite(self.upper):
+            return f"{self.value:.10g}"
+        return f"[{self.lower:.10g}, {self.upper:.10g}]"
+
+
 def conventions_of(mdp: TabularMDP, restart: bool) -> dict[str, Any]:
     """What the steps between states refer to."""
     return {

@@ -7,7 +7,7 @@ from functools import cached_property
 from typing import Any
 
 from pharos.errors import ParameterError, PrecisionError, UndefinedMeasure, UnknownName
-from pharos.hardness.gaps import Gaps, gaps
+from pharos.hardness.gaps import Gaps, resolved_gaps
 from pharos.hardness.interval import Budget, Progress
 from pharos.mdp import TabularMDP
 from pharos.solvers import Solution, value_iteration
@@ -36,7 +36,8 @@ class Problem:
     @cached_property
     def solution(self) -> Solution:
         """Optimal values."""
-        tolerance = self.tolerance
+        tolerance, rewards = self.tolerance, self.mdp.reward_table
+        largest = max(abs(rewards.lowest), abs(rewards.highest)) / max(1 - self.mdp.gamma, 2.0**-53)
         while True:
             try:
                 return value_iteration(
@@ -46,14 +47,14 @@ class Problem:
                     progress=lambda sweeps, bound: self.report("values", f"sweep {sweeps}, error at most {bound:.2g}"),
                 )
             except PrecisionError:
-                if tolerance > 1:
+                if tolerance > largest:
                     raise
                 tolerance *= 10
 
     @cached_property
     def gaps(self) -> Gaps:
         """Suboptimality gaps."""
-        return gaps(self.mdp, self.solution)
+        return resolved_gaps(self.mdp, self.solution)
 
     def episode(self, measure: str) -> int:
         """The horizon; UndefinedMeasure where there is none."""

@@ -1,10 +1,19 @@
-"""The environmental value norm. Source: Maillard, Mann and Mannor (2014), "How hard is my MDP? The distribution-norm to the rescue"."""
+"""The environmental value norm. Source: Maillard, Mann and Mannor (2014), "How hard is my MDP?"."""
+
+import math
 
 import numpy as np
 
-from pharos.hardness.gaps import _BLOCK, _arrivals, checked, reachable
-from pharos.mdp import TabularMDP
+from pharos.hardness.gaps import checked
+from pharos.hardness.interval import Certified
+from pharos.mdp import Chance, TabularMDP
 from pharos.solvers import Solution
+
+# States at once: values of all their outcomes are in memory.
+_BLOCK = 1 << 16
+_UNIT = 2.0**-53
+# Relative width up to which an interval counts as the value.
+_NARROW = 1e-6
 
 
 def environmental_value_norm(mdp: TabularMDP, solution: Solution | None = None) -> float:
@@ -19,63 +28,71 @@ def environmental_value_norm(mdp: TabularMDP, solution: Solution | None = None) 
         solution: the optimal solution of `mdp`; None: solved here to an error of 1e-9.
     Raises:
         ParameterError: `solution` belongs to another MDP or is not optimal.
+    Exactness: `certified_value_norm` returns the interval that follows from the error of the values.
     Cost: one pass over the table; 20 to 100 ns a state.
     Source: Maillard, Mann and Mannor (2014), definition 1. (Colosseum centres with the expectation of another state: a slip.)
     """
+    return certified_value_norm(mdp, solution).value
+
+
+def certified_value_norm(mdp: TabularMDP, solution: Solution | None = None) -> Certified:
+    """Return `environmental_value_norm` with its interval.
+
+    A standard deviation changes by no more than the values do. Every variance is a sum of squares of values less their mean, in
+    the row of one state, so that large values that lie close together lose no digits.
+    """
     solution = checked(mdp, solution)
     if mdp.is_deterministic:
-        return 0.0
-    live = np.flatnonzero(reachable(mdp) & ~np.asarray(mdp.terminal))
-    if mdp.transitions is not None:
-        return _general(mdp, solution, live)
-    arrived = _arrivals(mdp, reachable(mdp)) if mdp.is_sticky else None
-    chance, largest = mdp.chance, 0.0
-    starts = set(mdp.start_states.tolist())
-    assert mdp.next_states is not None
-    v = solution.v
-    for start in range(0, live.size, _BLOCK):
-        states = live[start : start + _BLOCK]
-        table = mdp.next_states[states]
-        values = v[table, np.arange(mdp.num_actions)] if mdp.is_sticky else v[table]
-        values = np.where(table >= 0, values, 0.0)
-        values = values - values.mean(axis=1, keepdims=True)
-        if not mdp.is_sticky:
-            largest = max(largest, float(_variance(values, chance.chosen, chance.uniform).max()))
+        return Certified(0.0, 0.0, 0.0, True)
+    live = ~np.asarray(mdp.terminal)
+    starts = np.zeros(mdp.num_states, np.bool_)
+    starts[mdp.starts] = True
+    pairs = mdp.pairs_within() if mdp.is_sticky else None
+    reached = mdp.states_within()
+    if pairs is not None:
+        reached = starts | pairs.any(axis=1)
+    states, largest = np.flatnonzero(reached & live), 0.0
+    for block in np.array_split(states, max(1, -(-states.size // _BLOCK))):
+        means, within = _outcomes(mdp, solution.x, block)
+        if pairs is None:
+            largest = max(largest, _largest_variance(mdp.chance, means, within))
             continue
-        first = np.isin(states, list(starts))
-        if first.any():
-            largest = max(largest, float(_variance(values[first], chance.first_chosen, chance.first_uniform).max()))
-        assert arrived is not None
+        first = starts[block]
+        largest = max(largest, _largest_variance(mdp.chance.first, means[first], within[first]))
         for previous in range(mdp.num_actions):
-            met = arrived[states, previous]
-            if met.any():
-                pulled = values[met][:, previous][:, None]
-                found = _variance(values[met], chance.chosen, chance.uniform, chance.previous, pulled)
-                largest = max(largest, float(found.max()))
-    return float(np.sqrt(max(largest, 0.0)))
+            met = pairs[block, previous]
+            largest = max(largest, _largest_variance(mdp.chance, means[met], within[met], previous))
+    value = math.sqrt(largest)
+    size = float(np.abs(solution.x).max(initial=0.0))
+    error = solution.error_bound + (3 * mdp.num_actions + mdp.dynamics.operations + 16) * _UNIT * size
+    lower, upper = max(0.0, value - error), value + error
+    return Certified(value, lower, upper, upper - lower <= _NARROW * upper or upper == 0.0)
 
 
-def _variance(
-    values: np.ndarray, chosen: float, uniform: float, previous: float = 0.0, pulled: np.ndarray | float = 0.0
-) -> np.ndarray:
-    """(N, A) variances: chosen x values[:, a] + previous x pulled + uniform x any of values."""
-    mean = chosen * values + previous * pulled + uniform * values.mean(axis=1, keepdims=True)
-    square = chosen * values**2 + previous * np.square(pulled) + uniform * (values**2).mean(axis=1, keepdims=True)
-    return square - mean**2
+def _outcomes(mdp: TabularMDP, x: np.ndarray, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """((N, A) mean less that of the row, (N, A) variance) of the value of what follows the execution of each action."""
+    means = mdp.dynamics.expected(x, states)
+    within = np.zeros_like(means)
+    if not mdp.dynamics.is_deterministic:
+        rows = np.repeat(states, mdp.num_actions)
+        actions = np.tile(np.arange(mdp.num_actions), states.size)
+        outcomes = mdp.dynamics.outcomes(rows, actions)
+        column = actions[outcomes.which] if x.shape[1] > 1 else 0
+        apart = x[outcomes.states, column] - means.ravel()[outcomes.which]
+        within = np.bincount(outcomes.which, outcomes.probabilities * apart**2, means.size).reshape(means.shape)
+    return means - means.mean(axis=1, keepdims=True), within
 
 
-def _general(mdp: TabularMDP, solution: Solution, live: np.ndarray) -> float:
-    from pharos.hardness.choices import choices_of
-
-    choices = choices_of(mdp, restart=False)
-    v = np.vstack([solution.v.reshape(mdp.num_states, -1), np.zeros((1, solution.v.size // mdp.num_states))])
-    column = np.clip(choices.previous, 0, v.shape[1] - 1) if mdp.is_sticky else 0
-    values = v[np.minimum(choices.underlying, mdp.num_states), column]
-    values[np.isin(choices.underlying, np.flatnonzero(mdp.terminal))] = 0.0
-    counted = np.isin(choices.underlying, live)
-    rows = (np.flatnonzero(counted)[:, None] * mdp.num_actions + np.arange(mdp.num_actions)).ravel()
-    matrix = choices.matrix[rows]
-    centre = values.mean()
-    mean = matrix @ (values - centre)
-    variance = matrix @ (values - centre) ** 2 - mean**2
-    return float(np.sqrt(max(0.0, variance.max(initial=0.0))))
+def _largest_variance(chance: Chance, means: np.ndarray, within: np.ndarray, previous: int | None = None) -> float:
+    """The largest variance of what follows a choice: within the outcomes of what is executed, and between their means."""
+    repeated = 0.0 if previous is None else means[:, previous : previous + 1]
+    mean = chance.chosen * means + chance.uniform * means.mean(axis=1, keepdims=True) + chance.previous * repeated
+    result = chance.chosen * (within + (means - mean) ** 2)
+    if chance.uniform:
+        centred = means - means.mean(axis=1, keepdims=True)
+        spread = (within + centred**2).mean(axis=1, keepdims=True)
+        result += chance.uniform * (spread + (mean - means.mean(axis=1, keepdims=True)) ** 2)
+    if chance.previous:
+        own = 0.0 if previous is None else within[:, previous : previous + 1]
+        result += chance.previous * (own + (repeated - mean) ** 2)
+    return float(result.max(initial=0.0))

@@ -17,5 +17,6 @@ __all__ = [
     "paths",
     "stepping",
     "tails",
+    "ties",
     "travel",
 ]
