@@ -14,7 +14,6 @@ import pharos
 from pharos.drawing import human
 from pharos.errors import MissingExtra, ParameterError
 from pharos.interaction import GymEnv
-from pharos.interaction.simulator import chance_weights
 from pharos.observations import observe
 
 SMALL = {
@@ -131,7 +130,9 @@ def test_the_executed_action_has_the_distribution_of_the_tabular_mdp(sticky, ran
     from scipy.stats import chi2
 
     chance = pharos.random_actions(pharos.sticky_actions(breakout.mdp(), sticky), random).chance
-    assert (chance.chosen, chance.previous, chance.uniform) == pytest.approx(chance_weights(sticky, random))
+    assert (chance.chosen, chance.previous, chance.uniform) == pytest.approx(
+        GymEnv(breakout.environment, sticky=sticky, random=random).simulator.chance
+    )
     counts = executed_counts(GymEnv(breakout.environment, sticky=sticky, random=random), 20_000, seed=3)
     statistic, freedom = 0.0, 0
     for previous in range(3):

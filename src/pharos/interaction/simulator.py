@@ -9,6 +9,8 @@ import numpy as np
 
 from pharos.environments import Environment, make, start_distribution
 from pharos.errors import ParameterError, RuleError, StateSpaceTooLarge
+from pharos.kernels.stepping import Setting
+from pharos.mdp import Chance
 from pharos.observations import NO_ACTION, ObservationInContext, observe
 from pharos.rules import stepping_rules
 from pharos.state_space import StateSpace, build, load
@@ -72,7 +74,7 @@ class Simulator:
             remaining_time=options.remaining_time,
             limit=self.limit,
         )
-        self.chance = chance_weights(options.sticky, options.random)
+        self.chance = _chance(options)
         self.has_chance = self.chance != (1.0, 0.0, 0.0)
         self.first_previous = _first_previous(options.initial_previous_action, self.env)
         states, probabilities = start_distribution(self.env)
@@ -82,6 +84,11 @@ class Simulator:
         components = self.env.components
         self.ranges = np.stack([components.low, components.high])
         self.rules = stepping_rules(self.env, self.start_states[0])
+
+    def setting(self, mode: int, ranges: np.ndarray, scale: np.ndarray, starts: np.ndarray) -> Setting:
+        """What the kernels of many environments take; `starts` are states, or their indices in a state space."""
+        limit = self.limit if self.limit is not None else 1 << 62
+        return Setting(ranges, scale, self.chance, limit, mode, self.first_previous, starts, self.start_cumulative)
 
     def drawn_start(self, rng: np.random.Generator) -> int:
         """Which of the start states; draws one number where there are several."""
@@ -123,18 +130,6 @@ class Simulator:
             f"{self.env.components.names[component]} out of its range {self.ranges[0, component]} to "
             f"{self.ranges[1, component]}; declare a wider range in variables(), or mend transition()"
         )
-
-
-def chance_weights(sticky: float, random: float) -> tuple[float, float, float]:
-    """(chosen, previous, uniform), the chance of `random_actions(sticky_actions(mdp, sticky), random)`.
-
-    Raises:
-        ParameterError: a probability is not in [0, 1].
-    """
-    for name, p in (("sticky", sticky), ("random", random)):
-        if isinstance(p, bool) or not isinstance(p, int | float) or not 0 <= p <= 1:
-            raise ParameterError(f"{name} is {p!r}; expected a probability in [0, 1]")
-    return (1 - random) * (1 - sticky), float(sticky), random * (1 - sticky)
 
 
 def split_options(options: Mapping[str, Any]) -> tuple[Interaction, dict[str, Any]]:
@@ -190,6 +185,13 @@ def spec_with_limit(spec: gymnasium.envs.registration.EnvSpec | None, limit: int
     wrap the environment in a second TimeLimit that knows nothing of `height=20` or `time_limit=None`.
     """
     return None if spec is None else replace(spec, max_episode_steps=limit)
+
+
+def _chance(options: Interaction) -> tuple[float, float, float]:
+    for name, p in (("sticky", options.sticky), ("random", options.random)):
+        if isinstance(p, bool) or not isinstance(p, int | float) or not 0 <= p <= 1:
+            raise ParameterError(f"{name} is {p!r}; expected a probability in [0, 1]")
+    return Chance.of(options.sticky, options.random).triple
 
 
 def _time_limit(limit: int | str | None, env: Environment) -> int | None:

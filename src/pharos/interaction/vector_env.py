@@ -17,7 +17,7 @@ from pharos.environments import Environment
 from pharos.errors import ParameterError
 from pharos.interaction.simulator import Simulator, spec_with_limit, split_options
 from pharos.interaction.walks import RulesWalk, TableWalk
-from pharos.kernels.stepping import DISABLED, SAME_STEP, first_outside
+from pharos.kernels.stepping import DISABLED, SAME_STEP, Batch, first_outside
 from pharos.observations import NO_ACTION
 
 _MODES = (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP, AutoresetMode.DISABLED)
@@ -80,9 +80,8 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         self._previous = np.full(n, NO_ACTION, np.int64)
         self._elapsed = np.zeros(n, np.int64)
         self._ended = np.zeros(n, np.bool_)
-        self._limit = simulator.limit if simulator.limit is not None else 1 << 62
         walk = RulesWalk if simulator.state_space is None else TableWalk
-        self._walk: Any = walk(simulator, n)
+        self._walk: Any = walk(simulator, n, self._mode)
 
     @property
     def environment(self) -> Environment:
@@ -147,11 +146,13 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         n = self.num_envs
         rewards, executed = np.empty(n), np.empty(n, np.int64)
         terminated, truncated = np.empty(n, np.bool_), np.empty(n, np.bool_)
-        self._walk.step(
-            (self._limit, self._mode, self.simulator.first_previous),
-            (self._rng, actions),
-            (self._previous, self._elapsed, self._ended, rewards, terminated, truncated, executed),
-        )
+        walk = self._walk
+        walk.step(
+            Batch(
+                self._rng, actions, walk.current, self._previous, self._elapsed, self._ended,
+                rewards, terminated, truncated, executed, walk.final, walk.vectors(),
+            )
+        )  # fmt: skip
         info = self._info(executed)
         if self._mode == SAME_STEP:
             done = terminated | truncated

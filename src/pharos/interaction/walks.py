@@ -1,4 +1,7 @@
-"""How the N states of a vector environment advance: by the rules, or by looking successors up in a built state space."""
+"""How the N states of a vector environment advance: by the rules, or by looking successors up in a built state space.
+
+Kernels get Setting and Batch as plain tuples: named ones cost Numba a microsecond a call more.
+"""
 
 from typing import Any
 
@@ -11,6 +14,7 @@ from pharos.observations import Index, in_blocks
 
 BLOCK = 4096  # steps that are worth a thread's while
 LARGEST_TABLE = 1 << 28  # bytes of observations that are computed beforehand
+_NO_VECTORS = np.empty((0, 0), np.float32)
 
 
 class RulesWalk:
@@ -18,7 +22,7 @@ class RulesWalk:
 
     name = "state"
 
-    def __init__(self, simulator: Simulator, num_envs: int):
+    def __init__(self, simulator: Simulator, num_envs: int, mode: int):
         self.simulator = simulator
         length = len(simulator.env.components)
         self.current = np.zeros((num_envs, length), np.int64)
@@ -26,9 +30,10 @@ class RulesWalk:
         self.final_elapsed = np.zeros(num_envs, np.int64)
         context: Any = simulator.context
         self._fused = context.is_plain and context.is_vector  # the compiled step writes the vectors as well
-        self._scale = context.observation.scale if self._fused else np.zeros(length)
         self._vector = np.empty((0, length), np.float32)
         self._step_many: Any = simulator.rules.step_many
+        scale = context.observation.scale if self._fused else np.zeros(length)
+        self._setting = tuple(simulator.setting(mode, simulator.ranges, scale, simulator.start_states))
 
     def states(self, rows: Any) -> np.ndarray:
         return self.current[rows].copy()
@@ -42,26 +47,27 @@ class RulesWalk:
         stepping.draw_starts(self.simulator.start_cumulative, rng, mask, chosen)
         self.current[mask] = self.simulator.start_states[chosen[mask]]
 
-    def step(self, setting: tuple, given: tuple, arrays: tuple) -> None:
-        simulator = self.simulator
+    def vectors(self) -> np.ndarray:
+        """Room for the vectors of the next step; without rows where the compiled step does not write them."""
         if self._fused:
             self._vector = np.empty(self.current.shape, np.float32)
-        self.final_elapsed[:] = arrays[1] + 1
+        return self._vector
+
+    def step(self, batch: stepping.Batch) -> None:
+        """Advance every environment."""
+        self.final_elapsed[:] = batch.elapsed + 1
+        parameters, setting, arrays = self.simulator.rules.parameters, self._setting, tuple(batch)
         faults: list[int] = []
 
         def run(first: int, last: int) -> None:
-            fault = self._step_many(
-                simulator.rules.parameters, simulator.ranges, self._scale, simulator.chance, *setting,
-                simulator.start_states, simulator.start_cumulative, *given, self.current, *arrays,
-                self.final, self._vector, first, last,
-            )  # fmt: skip
+            fault = self._step_many(parameters, setting, arrays, first, last)
             if fault >= 0:
                 faults.append(fault)
 
         in_blocks(run, len(self.current), BLOCK)
         if faults:
             i, component = divmod(min(faults), self.current.shape[1])
-            simulator.raise_fault(self.current[i], int(arrays[-1][i]), component)
+            self.simulator.raise_fault(self.current[i], int(batch.executed[i]), component)
 
     def observations(self, previous: np.ndarray, elapsed: np.ndarray) -> Any:
         if len(self._vector):
@@ -77,7 +83,7 @@ class TableWalk:
 
     name = "index"
 
-    def __init__(self, simulator: Simulator, num_envs: int):
+    def __init__(self, simulator: Simulator, num_envs: int, mode: int):
         self.simulator = simulator
         assert simulator.state_space is not None
         self.space = simulator.state_space
@@ -87,6 +93,7 @@ class TableWalk:
         self._successors = np.asarray(self.space.successors)
         self._rewards = np.ascontiguousarray(self.space.mdp().rewards, np.float64)
         self._starts = self.space.indices(simulator.start_states)
+        self._setting = tuple(simulator.setting(mode, np.zeros((2, 0), np.int64), np.zeros(0), self._starts))
         context: Any = simulator.context
         self._is_index = context.is_plain and isinstance(context.observation, Index)
         self._table: np.ndarray | None = None
@@ -106,16 +113,19 @@ class TableWalk:
         stepping.draw_starts(self.simulator.start_cumulative, rng, mask, chosen)
         self.current[mask] = self._starts[chosen[mask]]
 
-    def step(self, setting: tuple, given: tuple, arrays: tuple) -> None:
+    def vectors(self) -> np.ndarray:
+        """No room: tables know no vectors."""
+        return _NO_VECTORS
+
+    def step(self, batch: stepping.Batch) -> None:
+        """Advance every environment."""
         walk_table: Any = stepping.walk_table
-        self.final_elapsed[:] = arrays[1] + 1
-        simulator = self.simulator
+        self.final_elapsed[:] = batch.elapsed + 1
+
+        terminal, setting, arrays = self.space.terminal, self._setting, tuple(batch)
 
         def run(first: int, last: int) -> None:
-            walk_table(
-                self._successors, self._rewards, self.space.terminal, simulator.chance, *setting,
-                self._starts, simulator.start_cumulative, *given, self.current, *arrays, self.final, first, last,
-            )  # fmt: skip
+            walk_table(self._successors, self._rewards, terminal, setting, arrays, first, last)
 
         in_blocks(run, len(self.current), BLOCK)
 

@@ -1,8 +1,60 @@
 """Chance and the table walk of vector environments: loops over N environments, each with a stream of random numbers."""
 
+from typing import Any, NamedTuple
+
 from numba import float64, int64, njit, uint64
 
 NEXT_STEP, SAME_STEP, DISABLED = range(3)  # when an environment that has ended is reset
+
+
+class Setting(NamedTuple):
+    """What stays the same from step to step.
+
+    Attributes:
+        ranges: (2, D) int64, lowest and highest value of each component; (2, 0) on a table.
+        scale: (D,) float64, of the vectors that `step_many` writes.
+        chance: (chosen, previous, uniform), weights of the executed action.
+        limit: steps after which an episode is truncated.
+        mode: NEXT_STEP, SAME_STEP or DISABLED.
+        first_previous: the previous action on the first step of an episode, -1 for none.
+        starts, cumulative: (K, D) or (K,), the start states or their indices; (K,) cumulative sum of their probabilities.
+    """
+
+    ranges: Any
+    scale: Any
+    chance: tuple[float, float, float]
+    limit: int
+    mode: int
+    first_previous: int
+    starts: Any
+    cumulative: Any
+
+
+class Batch(NamedTuple):
+    """The arrays of N environments that a step reads and writes.
+
+    Attributes:
+        rng: (N,) uint64, a stream of random numbers each.
+        actions: (N,) int64, chosen.
+        states: (N, D) int64, or (N,) indices on a table.
+        previous, elapsed, ended: (N,) the previous action, steps of the episode so far, whether it is over.
+        rewards, terminated, truncated, executed: (N,) of this step; executed is -1 after a reset.
+        final: as states; the last state of an episode that was over and reset in the same step.
+        vector: (N, D) float32, the states as vectors; (0, D) where they are not wanted.
+    """
+
+    rng: Any
+    actions: Any
+    states: Any
+    previous: Any
+    elapsed: Any
+    ended: Any
+    rewards: Any
+    terminated: Any
+    truncated: Any
+    executed: Any
+    final: Any
+    vector: Any
 
 
 @njit(forceinline=True)
@@ -58,9 +110,10 @@ def first_outside(actions, num_actions):
 
 
 @njit(cache=True, nogil=True)
-def walk_table(successors, table_rewards, is_terminal, chance, limit, mode, first_previous, starts, cumulative, rng, actions,
-               index, previous, elapsed, ended, rewards, terminated, truncated, executed, final, first, last):  # fmt: skip
-    """One step of environments first .. last - 1 on a tabulated state space; arguments as in `step_many`, states as indices."""
+def walk_table(successors, table_rewards, is_terminal, setting, batch, first, last):
+    """One step of environments first .. last - 1 on a tabulated state space; as `step_many`, with indices for states."""
+    _, _, chance, limit, mode, first_previous, starts, cumulative = setting
+    rng, actions, index, previous, elapsed, ended, rewards, terminated, truncated, executed, final, _ = batch
     for i in range(first, last):
         rewards[i], terminated[i], truncated[i], executed[i] = 0.0, False, False, -1
         if ended[i]:

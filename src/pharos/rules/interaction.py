@@ -116,14 +116,14 @@ def step_many_kernel(compiler: Any, Parameters: Any, advance: Any, A: int) -> An
     """One step of many environments."""
 
     @compiler.kernel
-    def step_many(parameters, ranges, scale, chance, limit, mode, first_previous, starts, cumulative, rng, actions,
-                  states, previous, elapsed, ended, rewards, terminated, truncated, executed, final, vector, first, last):  # fmt: skip
+    def step_many(parameters, setting, batch, first, last):
         """One step of environments first .. last - 1; return -1, or i * D + c where component c of environment i left its range.
 
-        An environment that has `ended` is reset instead (the mode DISABLED never comes here with one); in the mode SAME_STEP it is
-        reset at once, and `final` gets its last state. starts (K, D), cumulative (K,): the start distribution; rng (N,) uint64;
-        states, final (N, D); vector (N, D) float32 as in `step_one`, (0, D) where it is not wanted; the others (N,).
+        An environment that has `ended` is reset instead (the mode DISABLED never comes here with one); in the mode SAME_STEP it
+        is reset at once, and `final` gets its last state. See `kernels.stepping` for Setting and Batch.
         """
+        ranges, scale, chance, limit, mode, first_previous, starts, cumulative = setting
+        rng, actions, states, previous, elapsed, ended, rewards, terminated, truncated, executed, final, vector = batch
         self = Parameters(*parameters)
         length = states.shape[1]
         following = np.empty(length, np.int64)

@@ -54,10 +54,9 @@ class InterpretedStepping:
     def is_terminal_one(self, parameters, state) -> bool:
         return bool(self.env.is_terminal(tuple(state.tolist())))
 
-    def step_many(
-        self, parameters, ranges, scale, chance, limit, mode, first_previous, starts, cumulative, rng, actions,
-        states, previous, elapsed, ended, rewards, terminated, truncated, executed, final, vector, first, last,
-    ) -> int:  # fmt: skip
+    def step_many(self, parameters, setting, batch, first, last) -> int:
+        ranges, scale, chance, limit, mode, first_previous, starts, cumulative = setting
+        rng, actions, states, previous, elapsed, ended, rewards, terminated, truncated, executed, final, vector = batch
         for i in range(first, last):
             rewards[i], terminated[i], truncated[i], executed[i] = 0.0, False, False, NO_ACTION
             restart = bool(ended[i])
