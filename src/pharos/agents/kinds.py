@@ -55,18 +55,19 @@ def is_known(name: str) -> bool:
     return not is_reference(name) or name.partition(":")[0].split(".")[0] in LIBRARIES
 
 
-def agent_source(name: str, folder: str | Path | None = None) -> Source | None:
-    """Where an agent of the user's own is, which is imported; None for all others.
+def agent_source(name: str, folder: str | Path | None = None, *, check: bool = True) -> Source | None:
+    """Where an agent of the user's own is; None for all others.
 
     Args:
         folder: relative files and modules are looked for there first; None: in the current directory.
+        check: whether it is imported, to see that it is a class.
     Raises:
         ParameterError: it cannot be imported, or is no class.
     """
     if is_known(name):
         return None
     source = find(name, folder)
-    if not isinstance(load(source), type):
+    if check and not isinstance(load(source), type):
         raise ParameterError(
             f"{name!r}: found {load(source)!r}; expected the class of an algorithm for Stable-Baselines3"
         )

@@ -21,7 +21,7 @@ from typing import Any
 from pharos.errors import ParameterError, StateSpaceLocked
 from pharos.study import values as _values
 from pharos.study import worker as _worker
-from pharos.study.specification import Run, Source, Specification, specification
+from pharos.study.specification import Run, Source, Specification, specification, study_name
 from pharos.study.worker import write_atomically
 
 ATTEMPTS = 3
@@ -82,9 +82,15 @@ def duration(seconds: float) -> str:
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
 
 
-def opened(source: Source, folder: str | os.PathLike | None = None) -> tuple[Specification, Path]:
-    """A study and where its results are: `folder`, else the source if that is a study's folder, else studies/NAME."""
-    study = specification(source)
+def opened(
+    source: Source, folder: str | os.PathLike | None = None, *, trust: bool | None = None
+) -> tuple[Specification, Path]:
+    """A study and where its results are: `folder`, else the source if that is a study's folder, else studies/NAME.
+
+    Args:
+        trust: as for `specification`.
+    """
+    study = specification(source, trust=trust)
     if folder is None and isinstance(source, str | Path) and Path(source, "study.yaml").is_file():
         folder = source
     return study, Path("studies", study.name) if folder is None else Path(folder)
@@ -202,10 +208,7 @@ def claim(study: Specification, folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     file = folder / "study.yaml"
     if file.exists():
-        try:
-            name = specification(file).name
-        except ParameterError:
-            name = None
+        name = study_name(file)
         if name is not None and name != study.name:
             raise ParameterError(f"{folder}: holds the study {name!r}, not {study.name!r}; choose another --out")
     import yaml

@@ -11,7 +11,10 @@
         agents: [dqn, ppo, q_learning]
         hyperparameters: {dqn: patient, ppo: {n_steps: 256}}
 
-A block is the product of its lists. Tabular agents see the index of the state whatever the block's observations are.
+A block is the product of its lists. Tabular agents see the index of the state whatever the block's observations are. Environments,
+observations and agents of one's own are named as module:Name or file.py:Name, and looked for in `folder`: that of the YAML file
+when not given. Such code is imported where the user names the YAML file, but never for the study.yaml of a folder of results or of
+a packed study, which somebody else may have written, unless it is trusted.
 """
 
 import json
@@ -23,15 +26,26 @@ from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any
 
-from pharos.agents import AGENTS, TABULAR_OBSERVATION, agent_kind
-from pharos.environments import as_tuples
-from pharos.errors import MissingExtra, ParameterError, UnknownName
+from pharos.agents import AGENTS, TABULAR_OBSERVATION, agent_kind, agent_source, hyperparameters, is_known
+from pharos.environments import as_tuples, imported, source_of
+from pharos.errors import MissingExtra, ParameterError, UnknownName, UntrustedCode
 from pharos.experiments import ChanceSetting, Horizon, RunConfig
+from pharos.observations import OwnObservation, own_observation
+from pharos.sources import is_reference
 from pharos.study.regression import MEASURES
 
 try:
     import yaml
-    from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, field_validator
+    from pydantic import (
+        BaseModel,
+        BeforeValidator,
+        ConfigDict,
+        Field,
+        PrivateAttr,
+        ValidationError,
+        ValidationInfo,
+        field_validator,
+    )
 except ImportError as error:
     raise MissingExtra("a study", str(error.name), "study") from error
 
@@ -108,18 +122,24 @@ class EnvironmentEntry(_Part):
 
     name: str
     parameters: dict[str, Any] = {}
+    _folder: Path | None = PrivateAttr(None)
+
+    def model_post_init(self, context: Any) -> None:
+        self._folder = (context or {}).get("folder")
 
     @cached_property
     def instance(self) -> Any:
         from pharos.environments import make
 
-        return make(self.name, **{name: as_tuples(value) for name, value in self.parameters.items()})
+        name = imported(self.name, self._folder).name if is_reference(self.name) else self.name
+        return make(name, **{name: as_tuples(value) for name, value in self.parameters.items()})
 
     @cached_property
     def label(self) -> str:
+        name = Path(self.name).name if is_reference(self.name) else self.name
         if not self.parameters:
-            return self.name
-        return f"{self.name}({', '.join(f'{name}={value}' for name, value in self.parameters.items())})"
+            return name
+        return f"{name}({', '.join(f'{name}={value}' for name, value in self.parameters.items())})"
 
 
 class ChanceEntry(_Part):
@@ -139,15 +159,26 @@ class ObservationEntry(_Part):
 
     name: str
     options: dict[str, Any] = {}
+    _folder: Path | None = PrivateAttr(None)
+
+    def model_post_init(self, context: Any) -> None:
+        self._folder = (context or {}).get("folder")
 
     @field_validator("name")
     @classmethod
-    def _known(cls, name: str) -> str:
+    def _known(cls, name: str, info: ValidationInfo) -> str:
         from pharos.observations import names
 
-        if name not in names():
+        if is_reference(name):
+            own_observation(name, (info.context or {}).get("folder"))
+        elif name not in names():
             raise UnknownName("observation", name, names())
         return name
+
+    @cached_property
+    def own(self) -> OwnObservation | None:
+        """The observation of one's own that is meant; None for one of pharos."""
+        return own_observation(self.name, self._folder)
 
 
 class Hardness(_Part):
@@ -208,6 +239,7 @@ class Specification(_Part):
 
     name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")
     description: str = ""
+    folder: str | None = None
     blocks: list[Block] = Field(min_length=1)
     seeds: Seeds = list(range(5))
     steps: Steps = 50_000
@@ -234,35 +266,41 @@ class Specification(_Part):
         for environment in block.environments:
             for chance in block.chance:
                 for agent in block.agents:
+                    agent_from = agent_source(agent, self.folder, check=False)
                     observations: Sequence[ObservationEntry] = block.observations
                     if agent_kind(agent).is_tabular:
                         observations = [ObservationEntry(name=TABULAR_OBSERVATION)]
                     for observation in observations:
+                        sources = {
+                            "environment": source_of(type(environment.instance)),
+                            "observation": None if observation.own is None else observation.own.source,
+                            "agent": agent_from,
+                        }
+                        seen = str(observation.own or observation.name)
                         for seed in block.seeds or self.seeds:
                             yield Run(
                                 RunConfig(
                                     environment=environment.instance.name,
                                     parameters=_jsonable(environment.instance.parameters),
                                     chance=chance.setting,
-                                    observation=observation.name,
+                                    observation=seen,
                                     observation_options=dict(observation.options),
-                                    agent=agent,
+                                    agent=agent if agent_from is None else agent_from.name,
                                     hyperparameters=self._hyperparameters(
-                                        block, agent, environment.instance.name, observation.name
+                                        block, agent, environment.instance.name, seen
                                     ),
                                     steps=steps,
                                     seed=seed,
                                     gamma=gamma,
                                     horizon=Horizon.of(horizon).steps(environment.instance),
                                     evaluation_interval=max(1, steps // evaluations),
+                                    sources={part: source for part, source in sources.items() if source is not None},
                                 ),
                                 environment.label,
                             )
 
     def _hyperparameters(self, block: Block, agent: str, environment: str, observation: str) -> dict[str, Any]:
         """All of them, those of the library's table included: when that changes, these are other runs."""
-        from pharos.agents.hyperparameters import hyperparameters
-
         given = block.hyperparameters.get(agent, {})
         own = self.hyperparameters[given] if isinstance(given, str) else given
         return hyperparameters(agent, environment, observation, own)
@@ -298,16 +336,19 @@ Source = str | Path | Mapping[str, Any] | Specification
 """What is taken for a study: a YAML file, a preset's name, a mapping, a Specification, or the folder of a study."""
 
 
-def specification(source: Source) -> Specification:
+def specification(source: Source, *, trust: bool | None = None) -> Specification:
     """The specification in a YAML file or a study's folder, of a preset by its name, or from a mapping.
 
+    Args:
+        trust: whether code that it names may be imported; None: unless it is the study.yaml of a folder of results.
     Raises:
         UnknownName: no such file or preset. ParameterError: something in it is wrong; the message names file, line and key.
+        UntrustedCode: it names code, and is not trusted.
     """
     if isinstance(source, Specification):
         return source
     if isinstance(source, Mapping):
-        return _validated(source, "specification", None)
+        return _validated(source, "specification", None, Path.cwd(), trust is not False)
     if str(source) in presets():
         file = resources.files("pharos.study").joinpath("presets", f"{source}.yaml")
         return parse(file.read_text(encoding="utf-8"), f"preset {source}")
@@ -316,7 +357,25 @@ def specification(source: Source) -> Specification:
         path = path / "study.yaml"
     if not path.is_file():
         raise UnknownName("study (no such file, and no such preset)", source, presets())
-    return parse(_text_of(path), str(path))
+    trusted = not _is_of_results(path) if trust is None else trust
+    return parse(_text_of(path), str(path), folder=path.absolute().parent, trust=trusted)
+
+
+def study_name(file: Path) -> str | None:
+    """The name in a YAML file of a study, which is not looked at otherwise; None where there is none."""
+    try:
+        data = yaml.load(_text_of(file), _Loader)
+    except (yaml.YAMLError, ParameterError, ValueError, RecursionError, OverflowError):
+        return None
+    name = data.get("name") if isinstance(data, dict) else None
+    return name if isinstance(name, str) else None
+
+
+def _is_of_results(path: Path) -> bool:
+    """Whether a YAML file is what a runner wrote beside its results, which may come from somebody else."""
+    return path.name == "study.yaml" and any(
+        (path.parent / name).exists() for name in ("runs", "partial", "status.json")
+    )
 
 
 def _text_of(path: Path) -> str:
@@ -328,8 +387,14 @@ def _text_of(path: Path) -> str:
         raise ParameterError(f"{path}: cannot be read ({error.strerror}); expected a YAML file") from error
 
 
-def parse(text: str, name: str = "specification") -> Specification:
-    """The specification in a text of YAML; `name` stands before the line number in messages."""
+def parse(text: str, name: str = "specification", *, folder: Path | None = None, trust: bool = False) -> Specification:
+    """The specification in a text of YAML.
+
+    Args:
+        name: stands before the line number in messages.
+        folder: where modules and files that it names are looked for; None: in the current directory.
+        trust: whether they may be imported.
+    """
     try:
         root = yaml.compose(text, _Loader)
         if root is None:
@@ -349,7 +414,7 @@ def parse(text: str, name: str = "specification") -> Specification:
         raise ParameterError(f"{name}: {' '.join(str(error).split())}") from error
     if not isinstance(data, dict):
         raise ParameterError(f"{name}:1: found {type(data).__name__}; expected a mapping with name and blocks")
-    return _validated(data, name, root)
+    return _validated(data, name, root, folder or Path.cwd(), trust)
 
 
 class _Loader(yaml.SafeLoader):
@@ -362,15 +427,38 @@ _Loader.add_implicit_resolver(
 )
 
 
-def _validated(data: Mapping[str, Any], name: str, root: Any) -> Specification:
+def _validated(data: Mapping[str, Any], name: str, root: Any, folder: Path, trust: bool) -> Specification:
+    references = [*_references(data)]
+    if references and not trust:
+        loc, reference = references[0]
+        raise UntrustedCode(
+            f"{_where(name, root, loc)}: {reference!r} is code, which is executed only if you trust it: add --trust "
+            f"(in Python: trust=True), or name your own YAML file"
+        )
+    if references:
+        written = data.get("folder")
+        folder = (folder / written if isinstance(written, str) else folder).resolve()
+        data = {**data, "folder": str(folder)}
     try:
-        found = Specification.model_validate(data)
+        found = Specification.model_validate(data, context={"folder": folder})
     except ValidationError as error:
         raise ParameterError(_messages(error, name, root)) from error
     wrong = [*_wrong(found)]
     if wrong:
         raise ParameterError("; ".join(f"{_where(name, root, loc)}: {message}" for loc, message in wrong))
     return found
+
+
+def _references(data: Mapping[str, Any]) -> Iterator[tuple[Loc, str]]:
+    """(where, name) of environments, observations and agents of one's own in data that may be anything."""
+    blocks = data.get("blocks")
+    for i, block in enumerate(blocks if isinstance(blocks, list) else ()):
+        for part in ("environments", "observations", "agents"):
+            entries = block.get(part) if isinstance(block, Mapping) else None
+            for j, entry in enumerate(entries if isinstance(entries, list) else ()):
+                name = entry.get("name") if isinstance(entry, Mapping) else entry
+                if isinstance(name, str) and is_reference(name) and not (part == "agents" and is_known(name)):
+                    yield ("blocks", i, part, j), name
 
 
 def _wrong(found: Specification) -> Iterator[tuple[Loc, str]]:
@@ -391,8 +479,12 @@ def _wrong(found: Specification) -> Iterator[tuple[Loc, str]]:
         if (block.horizon or found.horizon) == "none" and gamma == 1:
             yield ("blocks", i), "gamma is 1 and horizon is none, so values may be infinite; expected a gamma below 1"
         for j, agent in enumerate(block.agents):
-            if agent not in AGENTS and ":" not in agent:
-                yield ("blocks", i, "agents", j), str(UnknownName("agent", agent, AGENTS))
+            try:
+                if agent not in AGENTS and not is_reference(agent):
+                    raise UnknownName("agent", agent, AGENTS)
+                agent_source(agent, found.folder, check=False)
+            except ParameterError as error:
+                yield ("blocks", i, "agents", j), str(error)
         for agent, given in block.hyperparameters.items():
             loc = ("blocks", i, "hyperparameters", agent)
             if agent not in block.agents:
