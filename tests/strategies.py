@@ -8,6 +8,7 @@ from pharos.mdp import TabularMDP, random_actions, sticky_actions
 
 probabilities = st.sampled_from([0.0, 0.1, 0.25, 0.5, 1.0])
 gammas = st.sampled_from([0.0, 0.5, 0.9, 0.99])
+gammas_near_1 = st.sampled_from([0.9, 0.999, 0.9998, 1 - 1e-5, 1 - 1e-7])
 rewards_of_games = st.sampled_from([-1.0, 0.0, 0.1, 0.5, 1.0])
 
 
@@ -41,6 +42,14 @@ def general_mdps(draw, max_states: int = 5, max_actions: int = 3):
     matrix = (weights / weights.sum(axis=2, keepdims=True))[..., :num_states]
     paid = draw(hnp.arrays(np.float64, (num_states, num_actions), elements=rewards_of_games))
     return TabularMDP.from_matrices(matrix, paid, gamma=draw(gammas))
+
+
+@st.composite
+def hard_mdps(draw):
+    """MDPs whose values are hard on floats: gamma near 1, rewards that are no sums of powers of 2, values of 1e12 and more."""
+    mdp = draw(small_mdps(max_states=4))
+    scale = draw(st.sampled_from([0.7, 1.0, 1e-3, 1e12]))
+    return mdp.with_gamma(draw(gammas_near_1)).with_rewards(scale * mdp.rewards)
 
 
 @st.composite

@@ -12,7 +12,8 @@ from pharos.solvers import evaluate_policy, uniform_policy, uniform_value, value
 from pharos.solvers.fixed_point import Backup
 from strategies import deterministic_mdps, probabilities, small_mdps
 
-ROUNDING = 1e-9  # of the twins, which solve linear systems
+# Rounding of the twins, which solve linear systems in floats. Bounds are held against exact fractions in test_error_bounds.py.
+TWIN = 1e-9
 often = settings(max_examples=150, deadline=None)
 
 
@@ -28,7 +29,7 @@ def test_optimal_values_are_those_of_the_explicit_matrices(mdp):
     truth = naive_mdp.optimal_values(P, R, mdp.gamma)
     solution = value_iteration(mdp)
     assert solution.error_bound <= 1e-6
-    allowed = solution.error_bound + ROUNDING
+    allowed = solution.error_bound + TWIN
     assert np.abs(as_pairs(mdp, solution) - naive_mdp.by_state(mdp, truth)[:, :-1]).max() <= allowed
     assert abs(solution.value_at_start - start @ truth) <= allowed
 
@@ -39,7 +40,7 @@ def test_worst_values_are_those_of_the_explicit_matrices(mdp):
     P, R, start = naive_mdp.augmented(mdp)
     truth = naive_mdp.optimal_values(P, R, mdp.gamma, sign=-1)
     solution = worst_value(mdp)
-    allowed = solution.error_bound + ROUNDING
+    allowed = solution.error_bound + TWIN
     assert np.abs(as_pairs(mdp, solution) - naive_mdp.by_state(mdp, truth)[:, :-1]).max() <= allowed
     assert abs(solution.value_at_start - start @ truth) <= allowed
 
@@ -51,8 +52,8 @@ def test_values_with_a_horizon_are_those_of_backward_induction(mdp, horizon):
     truth = naive_mdp.finite_values(P, R, mdp.gamma, horizon)
     solution = value_iteration(mdp.with_horizon(horizon))
     assert solution.error_bound < 1e-10
-    assert np.abs(as_pairs(mdp, solution) - naive_mdp.by_state(mdp, truth)[:, :-1]).max() <= ROUNDING
-    assert abs(solution.value_at_start - start @ truth) <= ROUNDING
+    assert np.abs(as_pairs(mdp, solution) - naive_mdp.by_state(mdp, truth)[:, :-1]).max() <= TWIN
+    assert abs(solution.value_at_start - start @ truth) <= TWIN
 
 
 @often
@@ -67,7 +68,7 @@ def test_values_of_any_stochastic_policy_are_those_of_the_linear_system(mdp, dat
     everywhere = np.concatenate([pairs.reshape(-1, mdp.num_actions), np.eye(mdp.num_actions)[:1]])
     truth = naive_mdp.values_of(P, R, mdp.gamma, everywhere)
     solution = evaluate_policy(mdp, policy)
-    allowed = solution.error_bound + ROUNDING
+    allowed = solution.error_bound + TWIN
     assert np.abs(as_pairs(mdp, solution) - naive_mdp.by_state(mdp, truth)[:, :-1]).max() <= allowed
     assert abs(solution.value_at_start - start @ truth) <= allowed
 
@@ -81,7 +82,7 @@ def test_a_deterministic_policy_on_a_deterministic_mdp_is_evaluated_exactly(mdp,
     pairs = np.append(np.repeat(actions, mdp.num_actions + 1), 0)
     truth = naive_mdp.values_of(P, R, mdp.gamma, np.eye(mdp.num_actions)[pairs])
     assert exact.error_bound < 1e-10
-    assert np.abs(exact.v - naive_mdp.by_state(mdp, truth)[:, -1]).max() <= exact.error_bound + ROUNDING
+    assert np.abs(exact.v - naive_mdp.by_state(mdp, truth)[:, -1]).max() <= exact.error_bound + TWIN
 
 
 @often
@@ -141,7 +142,7 @@ def test_shifting_all_rewards_shifts_values_by_a_geometric_series(mdp, p):
     endless = TabularMDP.from_arrays(mdp.next_states, mdp.rewards, gamma=mdp.gamma)
     shifted = random_actions(endless.with_rewards(mdp.rewards + 1.0), p)
     one, two = value_iteration(random_actions(endless, p)), value_iteration(shifted)
-    assert np.abs(one.v + 1 / (1 - mdp.gamma) - two.v).max() <= one.error_bound + two.error_bound + ROUNDING
+    assert np.abs(one.v + 1 / (1 - mdp.gamma) - two.v).max() <= one.error_bound + two.error_bound + TWIN
 
 
 @often
@@ -177,7 +178,7 @@ def test_backups_contract_in_the_maximum_norm(mdp, seed):
 def test_a_finer_tolerance_moves_values_by_less_than_the_bounds(mdp):
     coarse, fine = value_iteration(mdp, 1e-2), value_iteration(mdp, 1e-9)
     assert np.abs(coarse.v - fine.v).max() <= coarse.error_bound + fine.error_bound
-    assert np.abs(coarse.q - fine.q).max() <= coarse.error_bound + fine.error_bound + ROUNDING
+    assert np.abs(coarse.q - fine.q).max() <= coarse.error_bound + fine.error_bound + TWIN
 
 
 def test_an_established_solver_finds_the_same_values():
@@ -190,7 +191,7 @@ def test_an_established_solver_finds_the_same_values():
     np.put_along_axis(dense, next_states[:, :, None], 1.0, axis=2)
     theirs = DiscreteDP(rewards, dense, 0.95).solve(method="policy_iteration").v
     ours = value_iteration(TabularMDP.from_arrays(next_states, rewards, gamma=0.95))
-    assert np.abs(theirs - ours.v).max() <= ours.error_bound + ROUNDING
+    assert np.abs(theirs - ours.v).max() <= ours.error_bound + TWIN
 
 
 def test_all_steps_are_the_values_for_every_number_of_steps_to_go():

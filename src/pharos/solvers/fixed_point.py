@@ -64,12 +64,14 @@ class Backup:
     def __call__(self, x: np.ndarray) -> np.ndarray:
         """T x, not in place."""
         out = np.empty_like(x)
-        self.mdp.dynamics.backup(self.equation, x, out)
+        with np.errstate(over="ignore", invalid="ignore"):
+            self.mdp.dynamics.backup(self.equation, x, out)
         return out
 
     def sweep(self, x: np.ndarray) -> float:
         """x = T x in place, from the last state to the first where that is possible; the largest change."""
-        return self.mdp.dynamics.sweep(self.equation, x)
+        with np.errstate(over="ignore", invalid="ignore"):  # the bound of values beyond floats is infinite
+            return self.mdp.dynamics.sweep(self.equation, x)
 
     def rounding(self, largest: float) -> float:
         """A bound on the rounding error of one backup of entries up to `largest`: each operation is off by half a unit."""
@@ -149,7 +151,8 @@ def chain_bound(mdp: TabularMDP, select: Selection, x: np.ndarray, successor: np
     if mdp.gamma == 1.0:
         bound = rounding * mdp.num_states
     else:
-        residual = np.abs(reward + mdp.gamma * x[successor, 0] - x[:-1, 0]).max(initial=0.0)
+        with np.errstate(over="ignore", invalid="ignore"):
+            residual = np.abs(reward + mdp.gamma * x[successor, 0] - x[:-1, 0]).max(initial=0.0)
         bound = (float(residual) + rounding) / (1 - mdp.gamma)
     if not math.isfinite(bound):
         raise _imprecise(mdp, bound, 0.0)

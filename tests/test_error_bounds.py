@@ -1,0 +1,193 @@
+"""The promise of solvers: every value is within `error_bound` of the true one. Held against exact fractions, without slack."""
+
+from dataclasses import replace
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import naive_exact
+from pharos import hardness
+from pharos.errors import DivergenceError, PrecisionError
+from pharos.mdp import TabularMDP, random_actions, sticky_actions
+from pharos.solvers import evaluate_policy, uniform_value, value_iteration, worst_value
+from strategies import hard_mdps
+
+often = settings(max_examples=150, deadline=None)
+
+
+def finest(solve, *arguments):
+    """The solution to the finest tolerance that 64-bit floats reach."""
+    for exponent in range(-13, 40):
+        try:
+            solution = solve(*arguments, 10.0**exponent)
+        except PrecisionError:
+            continue
+        assert solution.error_bound <= 10.0**exponent
+        return solution
+    raise AssertionError("no tolerance was met")
+
+
+def largest_error(solution, truth):
+    found = solution.v if solution.mdp.is_sticky else solution.v[:, None]
+    return naive_exact.largest_error(found, truth)
+
+
+@often
+@given(hard_mdps())
+def test_optimal_and_worst_values_are_within_their_bounds(mdp):
+    for solve, sign in ((value_iteration, 1), (worst_value, -1)):
+        solution, truth = finest(solve, mdp), naive_exact.extreme_values(mdp, sign)
+        assert largest_error(solution, truth) <= Fraction(solution.error_bound)
+        if mdp.is_sticky or not mdp.is_random:
+            action_values = naive_exact.action_values(mdp, truth)
+            assert naive_exact.largest_error(solution.q, action_values) <= Fraction(solution.error_bound)
+
+
+@often
+@given(hard_mdps())
+def test_values_of_uniform_play_are_within_their_bound(mdp):
+    solution = finest(uniform_value, mdp)
+    nothing = naive_exact.exact(np.zeros((mdp.num_states, 1, mdp.num_actions)))
+    assert largest_error(solution, naive_exact.values_of(solution.mdp, nothing)) <= Fraction(solution.error_bound)
+
+
+@often
+@given(hard_mdps(), st.integers(0, 2**32))
+def test_values_of_a_stochastic_policy_are_within_their_bound(mdp, seed):
+    shape = (mdp.num_states, mdp.num_actions + 1) if mdp.is_sticky else (mdp.num_states,)
+    policy = np.random.default_rng(seed).dirichlet(np.ones(mdp.num_actions), shape)
+    solution = finest(evaluate_policy, mdp, policy)
+    written_out = naive_exact.exact(policy if mdp.is_sticky else policy[:, None])
+    assert largest_error(solution, naive_exact.values_of(mdp, written_out)) <= Fraction(solution.error_bound)
+
+
+@often
+@given(hard_mdps(), st.integers(0, 2**32))
+def test_values_of_a_deterministic_policy_are_within_their_bound(mdp, seed):
+    actions = np.random.default_rng(seed).integers(mdp.num_actions, size=mdp.num_states)
+    solution = evaluate_policy(mdp, actions, 1e40)
+    written_out = naive_exact.exact(np.eye(mdp.num_actions)[actions])[:, None]
+    assert largest_error(solution, naive_exact.values_of(mdp, written_out)) <= Fraction(solution.error_bound)
+
+
+@pytest.mark.parametrize("gamma", [0.999, 0.9998, 1 - 1e-5, 1 - 1e-7])
+@pytest.mark.parametrize("solve", [value_iteration, worst_value, uniform_value])
+def test_the_bound_of_a_general_mdp_counts_the_rounding_of_its_values(solve, gamma):
+    one = TabularMDP.from_matrices(np.ones((1, 1, 1)), [[0.7]], gamma=gamma)
+    truth = Fraction(0.7) / (1 - Fraction(gamma))
+    solution = finest(lambda tolerance: solve(one, tolerance))
+    assert abs(Fraction(float(solution.v[0])) - truth) <= Fraction(solution.error_bound)
+
+
+def test_a_tolerance_beyond_floats_is_refused_for_matrices_as_for_tables():
+    for gamma, tolerance in ((0.999, 1e-12), (0.9998, 1e-10), (1 - 1e-7, 1e-5)):
+        for one in (
+            TabularMDP.from_matrices(np.ones((1, 1, 1)), [[0.7]], gamma=gamma),
+            TabularMDP.from_arrays([[0]], [[0.7]], gamma=gamma),
+        ):
+            with pytest.raises(PrecisionError, match="raise the tolerance"):
+                value_iteration(one, tolerance)
+
+
+def test_a_report_on_a_general_mdp_near_gamma_1_gives_no_value_with_a_false_bound():
+    one = TabularMDP.from_matrices(np.ones((1, 1, 1)), [[0.7]], gamma=0.9998)
+    problem = hardness.Problem(one)
+    truth = Fraction(0.7) / (1 - Fraction(0.9998))
+    assert abs(Fraction(float(problem.solution.v[0])) - truth) <= Fraction(problem.solution.error_bound)
+
+
+def test_rounding_adds_up_over_the_steps_of_a_horizon():
+    one = TabularMDP.from_arrays([[0]], [[0.1]], gamma=1.0, horizon=1000)
+    solution = value_iteration(one)
+    error = abs(Fraction(float(solution.v[0])) - 1000 * Fraction(0.1))
+    assert Fraction(1, 10**12) < error <= Fraction(solution.error_bound)
+
+
+def test_rounding_adds_up_along_a_path_at_gamma_1():
+    length = 1000
+    path = TabularMDP.from_arrays([[i + 1] for i in range(length - 1)] + [[-1]], np.full((length, 1), 0.1), gamma=1.0)
+    error = 1000 * Fraction(0.1) - Fraction(float(value_iteration(path).v[0]))
+    assert Fraction(1, 10**12) < abs(error) <= Fraction(value_iteration(path).error_bound)
+    by_matrix = TabularMDP.from_matrices(np.eye(length, k=1)[:, None], np.full((length, 1), 0.1), gamma=1.0)
+    assert abs(error) <= Fraction(value_iteration(by_matrix).error_bound)
+
+
+def test_rounding_counts_every_operation_of_a_backup():
+    actions = 300  # added up one after the other
+    rewards = np.random.default_rng(0).choice([0.1, 0.3, 0.7], size=(1, actions))
+    one = random_actions(TabularMDP.from_arrays(np.zeros((1, actions), int), rewards, gamma=0.5), 1.0)
+    mean = sum((Fraction(float(r)) for r in rewards[0]), Fraction(0)) / actions
+    solution = finest(value_iteration, one)
+    error = abs(Fraction(float(solution.v[0])) - mean * 2)
+    one_operation = Fraction(2.0**-53) * Fraction(float(rewards.max()) + float(solution.v[0])) * 2
+    assert one_operation < error <= Fraction(solution.error_bound)
+
+
+def test_long_cycles_that_nearly_cancel_are_within_the_bound():
+    length = 4001
+    rewards = np.where(np.arange(length) % 2, -0.7, 0.7)[:, None]
+    cycle = TabularMDP.from_arrays([[(i + 1) % length] for i in range(length)], rewards, gamma=1 - 1e-9)
+    solution = evaluate_policy(cycle, np.zeros(length, int))
+    gamma = Fraction(1 - 1e-9)
+    total = Fraction(0)
+    for reward in reversed(rewards[:, 0].tolist()):
+        total = Fraction(reward) + gamma * total
+        total = Fraction(total.numerator * 2**400 // total.denominator, 2**400)
+    truth = total / (1 - gamma**length)
+    assert abs(Fraction(float(solution.v[0])) - truth) <= Fraction(solution.error_bound)
+
+
+@pytest.mark.parametrize("kind", ["plain", "random", "sticky", "general"])
+def test_a_discount_near_1_is_answered_at_once(kind):
+    rng = np.random.default_rng(0)
+    table = TabularMDP.from_arrays(rng.integers(0, 6, (6, 3)), rng.random((6, 3)), gamma=0.999999)
+    mdp = {
+        "plain": table,
+        "random": random_actions(table, 0.1),
+        "sticky": sticky_actions(table, 0.25),
+        "general": TabularMDP.from_matrices(rng.dirichlet(np.ones(6), (6, 3)), rng.random((6, 3)), gamma=0.999999),
+    }[kind]
+    for solve in (value_iteration, worst_value, uniform_value):
+        solution = solve(mdp, 0.01)
+        assert solution.sweeps <= 200
+    solution = value_iteration(mdp, 0.01)
+    assert largest_error(solution, naive_exact.extreme_values(mdp)) <= Fraction(solution.error_bound) <= Fraction(0.01)
+    assert evaluate_policy(mdp, np.full((6, 3), 1 / 3), 0.01).sweeps <= 200
+    with pytest.raises(PrecisionError, match="raise the tolerance or lower gamma"):
+        value_iteration(mdp, 1e-6)
+
+
+def test_a_discount_of_1_up_to_the_last_bit_is_refused_at_once():
+    for ring in (
+        TabularMDP.from_arrays([[1], [0]], [[1.0], [0.0]], gamma=1 - 1.2e-16),
+        TabularMDP.from_matrices(np.array([[[0.0, 1.0]], [[1.0, 0.0]]]), [[1.0], [0.0]], gamma=1 - 1.2e-16),
+        random_actions(TabularMDP.from_arrays([[1], [0]], [[1.0], [0.0]], gamma=1 - 1.2e-16), 0.5),
+    ):
+        with pytest.raises(PrecisionError, match="lower gamma"):
+            value_iteration(ring)
+
+
+@pytest.mark.parametrize("solve", [value_iteration, worst_value, uniform_value])
+def test_values_beyond_the_largest_float_are_an_error(solve):
+    ring = TabularMDP.from_arrays([[1], [0]], [[1e308], [1e308]], gamma=0.99)
+    with pytest.raises(PrecisionError, match=r"1\.8e308"):
+        solve(ring, 1e300)
+    with pytest.raises(PrecisionError, match=r"1\.8e308"):
+        solve(ring, horizon=50)
+    with pytest.raises(PrecisionError, match=r"1\.8e308"):
+        evaluate_policy(ring, np.array([0, 0]))
+    with pytest.raises(PrecisionError, match=r"1\.8e308"):
+        evaluate_policy(ring, np.ones((2, 1)), horizon=50)
+
+
+def test_a_state_that_leads_to_itself_may_be_visited_again_at_gamma_1():
+    waits = TabularMDP.from_arrays([[0, -1]], [[0.0, 1.0]], gamma=1.0)
+    with pytest.raises(DivergenceError, match="again and again"):
+        value_iteration(waits)
+    by_matrix = TabularMDP.from_matrices(np.array([[[1.0], [0.0]]]), [[0.0, 1.0]], gamma=1.0)
+    with pytest.raises(DivergenceError, match="again and again"):
+        value_iteration(by_matrix)
+    assert value_iteration(replace(waits, gamma=0.9), 1e-9).v[0] == 1.0
