@@ -335,6 +335,8 @@ def read_json(path: str | os.PathLike, error: type[PharosError] = FileFormatErro
         return json.loads(data)
     except RecursionError:
         raise error(f"{path}: is no JSON that pharos reads: its lists or objects are nested too deep{advice}") from None
+    except UnicodeDecodeError as problem:
+        raise error(f"{path}: cannot be read as JSON: {problem}{advice}") from None
     except ValueError as problem:
         raise error(f"{path}: is no JSON, or was cut short: {' '.join(str(problem).split())}{advice}") from None
 

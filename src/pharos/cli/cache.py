@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from pharos.cli.common import Json, bytes_of, console, print_json, size_text
-from pharos.errors import PharosError, UnknownName
+from pharos.errors import PharosError, StateSpaceLocked, UnknownName
 
 app = typer.Typer(help="List or clear the cached state spaces.", no_args_is_help=False)
 
@@ -39,8 +39,7 @@ def clear(
     json: Json = False,
 ) -> None:
     """Delete cached state spaces (and, when no name is given, compiled rules). They are made again when needed."""
-    from pharos import paths
-    from pharos.state_space.files import lock
+    from pharos import paths, storage
 
     directory = paths.cache_directory()
     spaces = _spaces(directory)
@@ -52,7 +51,7 @@ def clear(
     for space in spaces:
         if not environments or space["environment"] in environments or space["name"] in environments:
             folder = Path(space["folder"])
-            with lock(folder):  # StateSpaceLocked while somebody builds there
+            with storage.lock(folder, StateSpaceLocked, "building"):
                 shutil.rmtree(folder)
             removed.append(space["folder"])
             freed += space["bytes"]
@@ -67,7 +66,7 @@ def clear(
 
 def _spaces(directory: Path) -> list[dict[str, Any]]:
     """Every cached state space, the largest first."""
-    from pharos.state_space.store import read_manifest
+    from pharos.state_space import read_manifest
 
     found = []
     for folder in sorted((directory / "spaces").glob("*")):

@@ -1,7 +1,5 @@
 """StateSpace: the folder on disk, read through memory maps. docs/format.md specifies it to the byte."""
 
-import hashlib
-import json
 import os
 from collections.abc import Sequence
 from functools import cached_property
@@ -11,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xxhash
 
-from pharos.environments import Environment, State, as_tuples, start_distribution
+from pharos.environments import Environment, State, as_tuples
 from pharos.errors import (
     ParameterError,
     StateSpaceCorrupted,
@@ -19,16 +17,45 @@ from pharos.errors import (
     StateSpaceIncomplete,
     StateSpaceMismatch,
 )
-from pharos.rules.layout import Layout, layout_of, pack, unpack
+from pharos.rules.layout import Layout, pack, unpack
+from pharos.state_space.manifest import (
+    AGAIN,
+    CHECKSUM_BYTES,
+    FORMAT_VERSION,
+    MANIFEST,
+    STATES,
+    SUCCESSORS,
+    TERMINAL,
+    WIDE_SUCCESSORS,
+    check_lengths,
+    digest_of,
+    identity_of,
+    read_manifest,
+    successors_name,
+)
 
 if TYPE_CHECKING:
     from pharos.mdp import TabularMDP
 
-FORMAT_VERSION = 1
-MANIFEST = "manifest.json"
-STATES, SUCCESSORS, TERMINAL = "states.bin", "successors.bin", "terminal.bin"
-WIDE_SUCCESSORS = "successors64.bin"  # in place of successors.bin beyond 2^31 states
-CHECKSUM_BYTES = 1 << 24  # a checksum covers this many bytes of a file
+__all__ = [
+    "CHECKSUM_BYTES",
+    "FORMAT_VERSION",
+    "MANIFEST",
+    "STATES",
+    "SUCCESSORS",
+    "TERMINAL",
+    "WIDE_SUCCESSORS",
+    "StateSpace",
+    "check_lengths",
+    "check_rules",
+    "digest_of",
+    "identity_of",
+    "load",
+    "read_manifest",
+    "successors_name",
+]
+
+_BLOCK_ENTRIES = 1 << 17
 
 
 class StateSpace:
@@ -59,12 +86,31 @@ class StateSpace:
 
     @cached_property
     def packed_states(self) -> np.ndarray:
-        """(S, W) uint64, read-only memory map."""
-        return self._map(STATES, "<u8", (self.num_states, self.layout.num_words))
+        """(S, W) uint64, read-only memory map.
+
+        Raises:
+            StateSpaceCorrupted: a component of a state is out of its range. The first access looks at all of them.
+        """
+        _check_states(self.folder / STATES, self.layout, self._stored_states)
+        return self._stored_states
 
     @cached_property
     def successors(self) -> np.ndarray:
-        """(S, A) int32 or int64, read-only memory map."""
+        """(S, A) int32 or int64, read-only memory map.
+
+        Raises:
+            StateSpaceCorrupted: one is no state, or a terminal state does not lead to itself. The first access looks at all.
+        """
+        path = self.folder / successors_name(self.manifest["arrays"])
+        _check_successors(path, self._stored_successors, self.terminal_bits, self.num_terminal_states)
+        return self._stored_successors
+
+    @cached_property
+    def _stored_states(self) -> np.ndarray:
+        return self._map(STATES, "<u8", (self.num_states, self.layout.num_words))
+
+    @cached_property
+    def _stored_successors(self) -> np.ndarray:
         name = successors_name(self.manifest["arrays"])
         return self._map(name, self.manifest["arrays"][name]["dtype"], (self.num_states, self.num_actions))
 
@@ -168,8 +214,8 @@ class StateSpace:
                 for number, expected in enumerate(entry["checksums"]):
                     if xxhash.xxh3_128_hexdigest(file.read(CHECKSUM_BYTES)) != expected:
                         raise StateSpaceCorrupted(
-                            f"{self.folder / name}: block {number} (bytes {number * CHECKSUM_BYTES} on) does not match its "
-                            f"checksum: the file was changed after it was written; delete the folder and build again"
+                            f"{self.folder / name}: block {number} (bytes {number * CHECKSUM_BYTES} on) does not match "
+                            f"its checksum: the file was changed after it was written; {AGAIN}"
                         )
 
     def _map(self, name: str, dtype: str, shape: tuple[int, ...]) -> np.ndarray:
@@ -210,54 +256,10 @@ def load(folder: str | os.PathLike, *, verify: bool = True, environment: Environ
     if verify:
         space.verify()
     if space.environment is not None:
-        check_rules(folder, space.environment, space.layout, space.packed_states, space.successors, space.terminal_bits)
+        _check_environment(folder, space.environment, manifest)
+        stored = space._stored_states, space._stored_successors, space.terminal_bits
+        check_rules(folder, space.environment, space.layout, *stored)
     return space
-
-
-def read_manifest(folder: Path) -> dict[str, Any] | None:
-    """The manifest of a folder, None where there is none; StateSpaceCorrupted where it is nonsense."""
-    try:
-        text = (folder / MANIFEST).read_text()
-    except (FileNotFoundError, NotADirectoryError):
-        return None
-    except (OSError, UnicodeDecodeError) as error:
-        raise StateSpaceCorrupted(f"{folder / MANIFEST}: cannot be read: {error}") from None
-    try:
-        manifest = json.loads(text)
-        if manifest.get("format") != "pharos state space":
-            raise ValueError("it is not the manifest of a pharos state space")
-        if manifest["format_version"] != FORMAT_VERSION:
-            raise StateSpaceMismatch(
-                f"{folder}: format version {manifest['format_version']}; this pharos reads version {FORMAT_VERSION}: build again"
-            )
-        if digest_of(manifest) != manifest["digest"]:
-            raise ValueError("it was changed after it was written")
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise StateSpaceCorrupted(f"{folder / MANIFEST}: {error}; delete the folder and build again") from None
-    return manifest
-
-
-def successors_name(arrays: dict[str, Any]) -> str:
-    """The file of successors: its name depends on the width of the indices."""
-    return WIDE_SUCCESSORS if WIDE_SUCCESSORS in arrays else SUCCESSORS
-
-
-def digest_of(manifest: dict[str, Any]) -> str:
-    """SHA-256 of a manifest without its own digest."""
-    content = {key: value for key, value in manifest.items() if key != "digest"}
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
-
-
-def check_lengths(folder: Path, manifest: dict[str, Any]) -> None:
-    """StateSpaceCorrupted where a file is missing or shorter than what was committed."""
-    for name, entry in manifest["arrays"].items():
-        path = folder / name
-        found = path.stat().st_size if path.exists() else None
-        if found is None or found < entry["bytes"] or (manifest["complete"] and found != entry["bytes"]):
-            raise StateSpaceCorrupted(
-                f"{path}: expected {entry['bytes']} bytes, found {'no such file' if found is None else found}: "
-                f"the file was truncated or replaced; delete the folder and build again"
-            )
 
 
 def check_rules(
@@ -265,39 +267,26 @@ def check_rules(
 ) -> None:
     """StateSpaceMismatch where the rules of `env` disagree with stored transitions, in 64 states spread over the file."""
     chosen = np.unique(np.linspace(0, len(successors) - 1, 64).astype(np.int64))
+    _check_range(folder / SUCCESSORS, successors[chosen], len(states), chosen)
     following = unpack(layout, states[successors[chosen].ravel()]).tolist()
+    _check_states(folder / STATES, layout, states[chosen])
+    _check_states(folder / STATES, layout, states[successors[chosen].ravel()])
     for n, (i, row) in enumerate(zip(chosen.tolist(), unpack(layout, states[chosen]).tolist(), strict=True)):
         state = tuple(row)
         stored = [tuple(row) for row in following[n * env.num_actions : (n + 1) * env.num_actions]]
-        ended = bool(env.is_terminal(state))
-        found = [state if ended else env.next_state(state, action) for action in range(env.num_actions)]
+        try:
+            ended = bool(env.is_terminal(state))
+            found = [state if ended else env.next_state(state, action) for action in range(env.num_actions)]
+        except Exception as error:
+            raise StateSpaceMismatch(
+                f"{folder}: was built with other rules: those of this {env.name} fail in state {state}: {error!r}; "
+                f"build in another folder"
+            ) from error
         if stored != found or ended != bool(bits[i // 8] >> (i % 8) & 1):
             raise StateSpaceMismatch(
                 f"{folder}: was built with other rules: from state {state} they lead to {stored}, those of this {env.name} to "
                 f"{found}; build in another folder, and raise `version` when you change rules"
             )
-
-
-def identity_of(env: Environment) -> dict[str, Any]:
-    """What makes a state space the state space of `env`: kept in the manifest and hashed into the cache's folder names."""
-    layout = layout_of(env.components)
-    return {
-        "environment": env.name,
-        "class": f"{type(env).__module__}:{type(env).__qualname__}",
-        "rules_version": env.version,
-        "parameters": json.loads(json.dumps(env.parameters)),
-        "actions": list(env.actions),
-        "layout": {
-            "names": list(env.components.names),
-            "low": env.components.low.tolist(),
-            "size": env.components.size.tolist(),
-            "bits": [int(mask).bit_length() for mask in layout.mask],
-            "word": layout.word.tolist(),
-            "shift": layout.shift.tolist(),
-            "num_words": layout.num_words,
-        },
-        "start": [[list(state), float(p)] for state, p in zip(*start_distribution(env), strict=True)],
-    }
 
 
 def _environment_of(folder: Path, manifest: dict[str, Any]) -> Environment | None:
@@ -309,7 +298,7 @@ def _environment_of(folder: Path, manifest: dict[str, Any]) -> Environment | Non
         return None
     try:
         env = cls(**{name: as_tuples(value) for name, value in manifest["parameters"].items()})
-    except (TypeError, ParameterError) as error:
+    except Exception as error:  # whatever a class does with parameters that are none of its own
         raise StateSpaceMismatch(
             f"{folder}: its parameters are not those of this pharos' {manifest['environment']}: {error}; build again"
         ) from error
@@ -320,3 +309,72 @@ def _environment_of(folder: Path, manifest: dict[str, Any]) -> Environment | Non
                 f"{folder}: {key} of {env.name} is {manifest[key]} in the folder and {found[key]} in this pharos; build again"
             )
     return env
+
+
+# What the files hold ----------------------------------------------------------------------------------------------------
+
+
+def _check_environment(folder: Path, env: Environment, manifest: dict[str, Any]) -> None:
+    """StateSpaceMismatch where the actions or the components of a state are not those of the environment."""
+    theirs = {"actions": list(env.actions), "names": list(env.components.names)}
+    stored = {"actions": manifest["actions"], "names": manifest["layout"]["names"]}
+    sizes = env.components.low.tolist(), env.components.size.tolist()
+    if theirs != stored or sizes != (manifest["layout"]["low"], manifest["layout"]["size"]):
+        raise StateSpaceMismatch(
+            f"{folder}: holds {manifest['environment']} with the actions {stored['actions']} and states of "
+            f"{stored['names']}, which are not those of {env}; choose another folder"
+        )
+
+
+def _check_successors(path: Path, successors: np.ndarray, terminal_bits: np.ndarray, num_terminal: int) -> None:
+    """StateSpaceCorrupted where an index is no state, or a terminal state does not lead to itself.
+
+    Cost: one pass over the successors, in blocks that fit into a processor's cache.
+    """
+    rows = max(8, _BLOCK_ENTRIES // successors.shape[1] // 8 * 8)
+    terminal = 0
+    for start in range(0, len(successors), rows):
+        block = np.asarray(successors[start : start + rows])
+        _check_range(path, block, len(successors), range(start, start + len(block)))
+        bits = terminal_bits[start // 8 : (start + rows) // 8]
+        if not bits.any():
+            continue
+        ended = np.flatnonzero(np.unpackbits(bits, count=len(block), bitorder="little"))
+        terminal += len(ended)
+        leaving = (block[ended] != start + ended[:, None]).any(axis=1)
+        if leaving.any():
+            raise StateSpaceCorrupted(
+                f"{path}: terminal state {start + int(ended[leaving.argmax()])} leads to another state; {AGAIN}"
+            )
+    if terminal != num_terminal:
+        raise StateSpaceCorrupted(
+            f"{path.with_name(TERMINAL)}: marks {terminal} terminal states; expected {num_terminal}; {AGAIN}"
+        )
+
+
+def _check_range(path: Path, block: np.ndarray, num_states: int, numbers: Sequence[int] | np.ndarray) -> None:
+    """StateSpaceCorrupted where an index is no state; the rows are those of the states with these numbers."""
+    if block.min() < 0 or block.max() >= num_states:
+        row, action = map(int, np.argwhere((block < 0) | (block >= num_states))[0])
+        raise StateSpaceCorrupted(
+            f"{path}: action {action} leads from state {numbers[row]} to state {block[row, action]}; "
+            f"expected 0 to {num_states - 1}; {AGAIN}"
+        )
+
+
+def _check_states(path: Path, layout: Layout, states: np.ndarray) -> None:
+    """StateSpaceCorrupted where a component of a packed state is out of its range."""
+    mask = layout.mask.astype(np.uint64)
+    narrow = [i for i in range(len(mask)) if int(mask[i]) + 1 != int(layout.size[i])]  # the others cannot be
+    if not narrow:
+        return
+    rows = max(1, _BLOCK_ENTRIES // 8)
+    for start in range(0, len(states), rows):
+        block = np.asarray(states[start : start + rows])
+        for i in narrow:
+            field = (block[:, int(layout.word[i])] >> layout.shift[i]) & mask[i]
+            if int(field.max()) >= int(layout.size[i]):
+                raise StateSpaceCorrupted(
+                    f"{path}: component {i} of state {start + int(field.argmax())} is {int(field.max())}; "
+                    f"expected less than {int(layout.size[i])}; {AGAIN}"
+                )

@@ -1,0 +1,184 @@
+"""The manifest of a state space: reading it, and checking what it says before anything is made of it."""
+
+import hashlib
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+from pharos import storage
+from pharos.environments import Environment, start_distribution
+from pharos.errors import StateSpaceCorrupted, StateSpaceError, StateSpaceMismatch
+from pharos.rules.layout import layout_of
+
+FORMAT, FORMAT_VERSION = "pharos state space", 1
+IMPORTED_FORMAT = "pharos mdp"
+"""What `pharos import` writes in place of it."""
+
+MANIFEST = "manifest.json"
+STATES, SUCCESSORS, TERMINAL = "states.bin", "successors.bin", "terminal.bin"
+WIDE_SUCCESSORS = "successors64.bin"
+"""In place of successors.bin beyond 2^31 states."""
+
+CHECKSUM_BYTES = 1 << 24
+"""A checksum covers this many bytes of a file."""
+
+AGAIN = "delete the folder and build again"
+
+
+def read_manifest(folder: Path) -> dict[str, Any] | None:
+    """Return the manifest of a folder; None where there is none.
+
+    Raises:
+        StateSpaceCorrupted: it is nonsense. StateSpaceMismatch: it is of another version of the format. StateSpaceError: it
+        belongs to something else, such as an imported MDP.
+    """
+    path = folder / MANIFEST
+    try:
+        manifest = storage.read_json(path, StateSpaceCorrupted, AGAIN)
+    except FileNotFoundError:
+        return None
+    if isinstance(manifest, dict) and manifest.get("format") == IMPORTED_FORMAT:
+        raise StateSpaceError(
+            f"{folder}: holds an imported MDP, a table without an environment; it can be solved, measured and exported "
+            f"(`pharos solve|hardness|export {folder}`, pharos.importers.load), but not built, trained on, played or drawn"
+        )
+    try:
+        if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
+            raise ValueError("it is not the manifest of a pharos state space")
+        if manifest["format_version"] != FORMAT_VERSION:
+            raise StateSpaceMismatch(
+                f"{folder}: format version {manifest['format_version']}; this pharos reads version {FORMAT_VERSION}: "
+                f"build again"
+            )
+        if digest_of(manifest) != manifest["digest"]:
+            raise ValueError("it was changed after it was written")
+        _check(manifest)
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
+        reason = f"lacks {error}" if isinstance(error, KeyError) else str(error)
+        raise StateSpaceCorrupted(f"{path}: {reason}; {AGAIN}") from None
+    return manifest
+
+
+def successors_name(arrays: dict[str, Any]) -> str:
+    """The file of successors: its name depends on the width of the indices."""
+    return WIDE_SUCCESSORS if WIDE_SUCCESSORS in arrays else SUCCESSORS
+
+
+def digest_of(manifest: dict[str, Any]) -> str:
+    """SHA-256 of a manifest without its own digest."""
+    content = {key: value for key, value in manifest.items() if key != "digest"}
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def check_lengths(folder: Path, manifest: dict[str, Any]) -> None:
+    """StateSpaceCorrupted where a file is missing or shorter than what was committed."""
+    for name, entry in manifest["arrays"].items():
+        path = folder / name
+        length = path.stat().st_size if path.exists() else None
+        if length is None or length < entry["bytes"] or (manifest["complete"] and length != entry["bytes"]):
+            raise StateSpaceCorrupted(
+                f"{path}: expected {entry['bytes']} bytes, found {'no such file' if length is None else length}: "
+                f"the file was truncated or replaced; {AGAIN}"
+            )
+
+
+def identity_of(env: Environment) -> dict[str, Any]:
+    """What makes a state space the state space of `env`: kept in the manifest and hashed into the cache's folder names."""
+    layout = layout_of(env.components)
+    return {
+        "environment": env.name,
+        "class": f"{type(env).__module__}:{type(env).__qualname__}",
+        "rules_version": env.version,
+        "parameters": json.loads(json.dumps(env.parameters)),
+        "actions": list(env.actions),
+        "layout": {
+            "names": list(env.components.names),
+            "low": env.components.low.tolist(),
+            "size": env.components.size.tolist(),
+            "bits": [int(mask).bit_length() for mask in layout.mask],
+            "word": layout.word.tolist(),
+            "shift": layout.shift.tolist(),
+            "num_words": layout.num_words,
+        },
+        "start": [[list(state), float(p)] for state, p in zip(*start_distribution(env), strict=True)],
+    }
+
+
+# What a manifest says ---------------------------------------------------------------------------------------------------
+
+
+def _check(manifest: dict[str, Any]) -> None:
+    """ValueError where a manifest, whoever wrote it, says what no state space can be."""
+    for name in ("num_states", "num_actions"):
+        _whole(manifest[name], name, 1)
+    for name in ("num_terminal_states", "depth", "num_expanded", "level_end"):
+        _whole(manifest[name], name, 0)
+    if not isinstance(manifest["complete"], bool) or not isinstance(manifest["environment"], str):
+        raise ValueError("complete or environment are of another type than they should be")
+    if not isinstance(manifest["parameters"], dict):
+        raise ValueError("parameters are no mapping")
+    if not isinstance(manifest["actions"], list) or len(manifest["actions"]) != manifest["num_actions"]:
+        raise ValueError("actions do not name each action")
+    _check_layout(manifest["layout"])
+    _check_start(manifest)
+    _check_arrays(manifest)
+
+
+def _check_layout(layout: dict[str, Any]) -> None:
+    words = _whole(layout["num_words"], "num_words", 1)
+    columns = [layout[name] for name in ("names", "low", "size", "bits", "word", "shift")]
+    if not all(isinstance(column, list) and len(column) == len(columns[0]) for column in columns):
+        raise ValueError("layout does not describe each component")
+    for name, low, size, bits, word, shift in zip(*columns, strict=True):
+        for number in (low, size, bits, word, shift):
+            _whole(number, f"layout of {name}", -(2**63))
+        if not (1 <= size <= 2**63 and low + size - 1 < 2**63 and bits == (size - 1).bit_length()):
+            raise ValueError(f"layout of {name}: {size} values from {low} on do not fit into {bits} bits")
+        if not (0 <= word < words and shift >= 0 and shift + bits <= 64):
+            raise ValueError(f"layout of {name}: lies outside of the words of a state")
+
+
+def _check_start(manifest: dict[str, Any]) -> None:
+    """Start states are the first ones, in their order."""
+    probabilities = []
+    for number, ((vector, probability), (index, again)) in enumerate(
+        zip(manifest["start"], manifest["initial"], strict=True)
+    ):
+        for value in (probability, again):
+            if not isinstance(value, float) or not 0 <= value <= 1:
+                raise ValueError(f"start state {number} has the probability {value!r}; expected a number from 0 to 1")
+        if index != number or probability != again or not isinstance(vector, list):
+            raise ValueError(f"initial: start state {number} has index {index!r}; expected start states first")
+        probabilities.append(probability)
+    if not probabilities or len(probabilities) > manifest["num_states"]:
+        raise ValueError(f"{len(probabilities)} start states among {manifest['num_states']}")
+    if abs(math.fsum(probabilities) - 1) > 1e-6:
+        raise ValueError(f"the start probabilities sum to {math.fsum(probabilities)}; expected 1")
+
+
+def _check_arrays(manifest: dict[str, Any]) -> None:
+    arrays, states = manifest["arrays"], manifest["num_states"]
+    width = 8 if successors_name(arrays) == WIDE_SUCCESSORS else 4
+    expected = {
+        STATES: ("<u8", 8 * states * manifest["layout"]["num_words"]),
+        successors_name(arrays): (f"<i{width}", width * states * manifest["num_actions"]),
+        TERMINAL: ("|u1", -(-states // 8)),
+    }
+    if set(arrays) != set(expected):
+        raise ValueError(f"arrays are {', '.join(arrays)}; expected {', '.join(expected)}")
+    for name, (dtype, length) in expected.items():
+        entry = arrays[name]
+        found = _whole(entry["bytes"], f"bytes of {name}", 0)
+        if entry["dtype"] != dtype or (manifest["complete"] and found != length):
+            raise ValueError(
+                f"{name}: {found} bytes of type {entry['dtype']}; expected {length} of type {dtype} for {states} states"
+            )
+        if len(entry["checksums"]) != -(-found // CHECKSUM_BYTES):
+            raise ValueError(f"{name}: {len(entry['checksums'])} checksums for {found} bytes")
+
+
+def _whole(value: Any, name: str, least: int) -> int:
+    if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= 2**63:
+        raise ValueError(f"{name} is {value!r}; expected a whole number of at least {least}")
+    return value
