@@ -12,7 +12,7 @@ import pytest
 import pharos
 from pharos.agents import hyperparameters
 from pharos.drawing import human, scenery_of, text_drawing
-from pharos.environments import catalog, classes
+from pharos.environments import catalog
 from pharos.errors import ParameterError, UnknownName
 from pharos.observations import render
 
@@ -110,6 +110,12 @@ def test_its_gymnasium_ids_follow_its_name_its_instances_and_the_version_of_its_
     assert gymnasium.make_vec("pharos/Corridor-short-v1", num_envs=2).reset()[0].shape == (2, 1)
 
 
+def test_a_class_does_not_take_the_id_of_another(corridor):
+    breakout = pharos.make("breakout")
+    pharos.environments.register(type("Breakout", (type(corridor),), {"name": "my_breakout", "version": 2}))
+    assert gymnasium.make("pharos/Breakout-v0").unwrapped.environment == breakout
+
+
 def test_all_its_looks_are_drawn(corridor):
     assert text_drawing(corridor, (1,)) == ".W..G"
     picture = human(corridor, (1,), cell=8)
@@ -158,10 +164,10 @@ def test_a_ground_or_shape_that_nobody_paints_is_named(corridor):
 
 
 def test_every_class_of_the_list_has_ids_a_colour_and_instances_that_can_be_made():
-    assert [place.partition(":")[2] for place in catalog.BUILT_IN] == [cls.__name__ for cls in classes().values()]
-    colors = [cls.look.color for cls in classes().values()]
+    assert [place.partition(":")[2] for place in catalog.BUILT_IN] == [cls.__name__ for cls in catalog._BUILT_IN.values()]
+    colors = [cls.look.color for cls in catalog._BUILT_IN.values()]
     assert len(set(colors)) == len(colors)
-    for cls in classes().values():
+    for cls in catalog._BUILT_IN.values():
         assert set(cls.paper_instances) <= set(cls.instances)
         for gymnasium_id, name in registration.ids_of(cls).items():
             assert gymnasium.spec(gymnasium_id).kwargs == {"environment": name}

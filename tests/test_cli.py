@@ -145,6 +145,51 @@ def test_list_names_every_environment_with_its_parameters(answer, pharos):
     assert "breakout" in shown and "brick_rows=2" in shown and "24x10x3" in shown
 
 
+@pytest.mark.parametrize("name", ["frozen_lake", "simple_grid", "freeway", "breakout"])
+def test_list_describes_one_class_parameter_by_parameter(answer, pharos, name):
+    described = answer("list", name)
+    assert described["name"] == name and "Actions" in described["rules"]
+    for each in described["parameters"].values():
+        assert each["meaning"] and each["values"] and "default" in each
+    shown = pharos("list", name).stdout
+    assert "values" in shown and all(parameter in shown for parameter in described["parameters"])
+
+
+def test_list_says_type_range_default_and_meaning(answer):
+    lake = answer("list", "frozen_lake/8x8")["parameters"]
+    assert lake["seed"]["values"] == "integer >= 0"
+    assert lake["frozen_probability"] == {
+        "default": 0.8,
+        "values": "number in [0, 1]",
+        "meaning": "of each tile of a random map to be ice, in (0, 1]; as in Gymnasium 0.8.",
+    }
+    assert answer("list", "freeway")["parameters"]["directions"]["values"] == "integers, each 1 (right) or -1 (left)"
+
+
+def test_an_unknown_environment_gets_the_classes_and_the_verb_that_lists_them(pharos):
+    done = pharos("build", "MiniGrid-Empty-5x5-v0")
+    assert (done.exit_code, done.stdout) == (2, "")
+    assert done.stderr.endswith(
+        "known: breakout, freeway, frozen_lake, simple_grid; `pharos list` shows their parameters and named instances\n"
+    )
+    assert "did you mean 'breakout'" in pharos("list", "brekout").stderr
+
+
+@pytest.mark.parametrize("name", ["slippery", "is_slippery"])
+def test_slippery_ice_is_found_where_it_is(pharos, name):
+    done = pharos("solve", "frozen_lake", f"{name}=true")
+    assert done.exit_code == 2
+    assert f"unknown parameter {name!r} of frozen_lake: slipping comes as random actions: --random 0.667" in done.stderr
+
+
+@pytest.mark.parametrize(("words", "expected"), [("pharos sol", "solve"), ("pharos solve --hor", "--horizon")])
+def test_the_shell_completes_verbs_and_options(monkeypatch, words, expected):
+    monkeypatch.setenv("_PHAROS_COMPLETE", "complete_bash")
+    monkeypatch.setenv("COMP_WORDS", words)
+    monkeypatch.setenv("COMP_CWORD", str(len(words.split()) - 1))
+    assert process().stdout.split() == [expected]
+
+
 def test_build_answers_with_the_keys_of_its_contract(answer, tmp_path):
     built = answer(
         "build", "simple_grid", "height=3", "width=5", "--out", tmp_path / "grid", "--memory", "1GiB", "--workers", 1

@@ -36,12 +36,12 @@ class ParameterError(PharosError, ValueError):
 
 
 class UnknownName(ParameterError):
-    """No such name; the message suggests the nearest one."""
+    """No such name; the message suggests the nearest one, or says what is known: all names, or `otherwise`."""
 
-    def __init__(self, kind: str, found: object, known: Iterable[str]):
+    def __init__(self, kind: str, found: object, known: Iterable[str], otherwise: str = ""):
         known = sorted(map(str, known))
         nearest = difflib.get_close_matches(str(found), known, n=1, cutoff=0.5)
-        hint = f"did you mean {nearest[0]!r}?" if nearest else f"known: {', '.join(known) or 'none'}"
+        hint = f"did you mean {nearest[0]!r}?" if nearest else otherwise or f"known: {', '.join(known) or 'none'}"
         super().__init__(f"unknown {kind} {str(found)!r}; {hint}")
 
 

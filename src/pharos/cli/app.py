@@ -86,7 +86,6 @@ def _command_of(error: Exception) -> str:
 app = typer.Typer(
     name="pharos",
     cls=_Group,
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
     context_settings={"help_option_names": ["-h", "--help"]},

@@ -1,32 +1,99 @@
-"""pharos list: the environments, their parameters and named instances."""
+"""pharos list: the environments, their parameters and named instances; or one of them, parameter by parameter."""
 
 import dataclasses
-from typing import Any
+import inspect
+import re
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
 
 from pharos.cli.common import Json, console, print_json
+from pharos.environments import classes, declared_parameters, imported, named_instances
+from pharos.errors import UnknownName
+
+if TYPE_CHECKING:
+    from pharos.environments import Environment
 
 
-def list_(json: Json = False) -> None:
-    """Show the environments, their parameters with defaults, and the named instances."""
-    from pharos.environments import classes, named_instances
-
-    instances = named_instances()
-    found = [
-        {
-            "name": name,
-            "description": _first_line(cls),
-            "actions": list(cls.actions),
-            "parameters": {field.name: _default(field) for field in dataclasses.fields(cls)},  # type: ignore[arg-type]
-            "instances": {
-                instance: dict(parameters) for instance, (owner, parameters) in instances.items() if owner == name
-            },
-        }
-        for name, cls in classes().items()
-    ]
-    if json:
-        print_json({"environments": found})
+def list_(
+    name: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="[ENVIRONMENT]", help="One class, or file.py:Class: its rules and parameters.", show_default=False
+        ),
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Show the environments with parameters and named instances; of one of them its rules, and what each parameter may be."""
+    if name is None:
+        described = [_overview(name, cls) for name, cls in classes().items()]
+        if json:
+            print_json({"environments": described})
+        else:
+            _print_all(described)
         return
-    _print(found)
+    cls = _class_called(name)
+    if json:
+        print_json({**_overview(cls.name, cls), "rules": inspect.getdoc(cls), "parameters": _parameters(cls)})
+    else:
+        _print_one(cls)
+
+
+def _class_called(name: str) -> type["Environment"]:
+    """The class of a name, of a named instance, or of module:Class."""
+    if name in classes():
+        return classes()[name]
+    if name in named_instances():
+        return classes()[named_instances()[name][0]]
+    if ":" in name:
+        return imported(name)
+    raise UnknownName("environment", name, classes())
+
+
+def _overview(name: str, cls: type["Environment"]) -> dict[str, Any]:
+    return {
+        "name": name,
+        "description": _first_line(cls),
+        "actions": list(cls.actions),
+        "parameters": {field.name: _default(field) for field in dataclasses.fields(cls)},  # type: ignore[arg-type]
+        "instances": {f"{name}/{instance}": dict(parameters) for instance, parameters in cls.instances.items()},
+    }
+
+
+def _parameters(cls: type["Environment"]) -> dict[str, dict[str, Any]]:
+    """Name -> default, what it may be, and what it means: the line under *Attributes* in the docstring of the class."""
+    declared, meanings = declared_parameters(cls), _meanings(cls)
+    return {
+        field.name: {
+            "default": _default(field),
+            "values": declared[field.name].text if field.name in declared else _annotation(field.type),
+            "meaning": meanings.get(field.name, ""),
+        }
+        for field in dataclasses.fields(cls)  # type: ignore[arg-type]
+    }
+
+
+def _meanings(cls: type["Environment"]) -> dict[str, str]:
+    """Name -> text, of entries such as `height, width: of the grid` in the section Attributes of the docstring."""
+    _, _, section = (inspect.getdoc(cls) or "").partition("Attributes:\n")
+    meanings: dict[str, str] = {}
+    names: list[str] = []
+    for line in section.splitlines():
+        entry = re.match(r"    (\w+(?:, \w+)*): (.*)", line)
+        if entry:
+            names = entry[1].split(", ")
+            meanings |= dict.fromkeys(names, entry[2])
+        elif not line.startswith("     "):
+            names = []
+        for name in () if entry else names:
+            meanings[name] += " " + line.strip()
+    return meanings
+
+
+def _annotation(annotation: Any) -> str:
+    text = annotation if isinstance(annotation, str) else getattr(annotation, "__name__", str(annotation))
+    words = {"int": "integer", "float": "number", "bool": "true or false", "str": "text"}
+    return words.get(text.removesuffix(" | None"), text)
 
 
 def _first_line(cls: type) -> str:
@@ -39,26 +106,46 @@ def _default(field: dataclasses.Field) -> Any:
     return field.default_factory() if field.default_factory is not dataclasses.MISSING else None
 
 
-def _print(found: list[dict[str, Any]]) -> None:
+def _text(value: Any) -> str:
+    return "none" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def _print_one(cls: type["Environment"]) -> None:
+    from rich.markup import escape
+    from rich.table import Table
+
+    to = console()
+    rules = (inspect.getdoc(cls) or "").partition("Attributes:\n")[0].rstrip()
+    to.print(f"[bold cyan]{cls.name}[/bold cyan]  {escape(rules)}\n", highlight=False)
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="bold")
+    for heading in ("parameter", "default", "values", "meaning"):
+        table.add_column(heading, overflow="fold")
+    for name, each in _parameters(cls).items():
+        table.add_row(*(escape(text) for text in (name, _text(each["default"]), each["values"], each["meaning"])))
+    to.print(table)
+    if cls.instances:
+        to.print(
+            "\nnamed instances  " + "  ".join(f"{cls.name}/{instance}" for instance in cls.instances), highlight=False
+        )
+
+
+def _print_all(described: list[dict[str, Any]]) -> None:
     from rich.markup import escape
     from rich.table import Table
 
     table = Table(box=None, pad_edge=False, padding=(0, 2, 1, 0), header_style="bold")
     table.add_column("environment", style="bold cyan", no_wrap=True)
     table.add_column("parameters and defaults", max_width=34)
-    table.add_column("named instances", overflow="fold", style="dim")
-    for each in found:
-        parameters = "\n".join(
-            f"{name}={'none' if value is None else value}" for name, value in each["parameters"].items()
-        )
+    table.add_column("what it is, and its named instances", overflow="fold")
+    for each in described:
+        parameters = "\n".join(f"{name}={_text(value)}" for name, value in each["parameters"].items())
         names = "  ".join(name.partition("/")[2] for name in each["instances"])
         about = escape(each["description"]) + (f"\n[dim]{each['name']}/[/dim] {names}" if names else "")
         table.add_row(each["name"], escape(parameters), about)
-    table.columns[2].header = "what it is, and its named instances"
-    table.columns[2].style = ""
     to = console()
     to.print(table)
     to.print(
+        "One of them, parameter by parameter: [cyan]pharos list breakout[/cyan]\n"
         "Build one: [cyan]pharos build breakout height=12 columns=8[/cyan]    "
         "or by name: [cyan]pharos build breakout/12x8x1[/cyan]"
     )

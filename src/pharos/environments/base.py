@@ -64,6 +64,7 @@ class Environment:
         paper_instances: tuple      those of them that stand in the tables of the pharos paper, in their order
         hyperparameters: dict       agent -> observation, or "default" for all -> values that suit the class; they go
                                     before those of agents/hyperparameters.yaml
+        foreign_parameters: dict    name that other libraries have -> what to do here instead; for the error message
         first_version: int          the `version` that the Gymnasium id pharos/ClassName-v0 stands for
 
     Parameters are the fields of the dataclass. `parameter(12, low=4)` as a default declares what they may be.
@@ -96,6 +97,7 @@ class Environment:
     instances: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
     paper_instances: ClassVar[tuple[str, ...]] = ()
     hyperparameters: ClassVar[Mapping[str, Mapping[str, Mapping[str, Any]]]] = {}
+    foreign_parameters: ClassVar[Mapping[str, str]] = {}
     first_version: ClassVar[int] = 1
 
     def __post_init__(self) -> None:

@@ -57,9 +57,14 @@ def make(name: str, **parameters: Any) -> Environment:
     elif class_name in classes():
         cls = classes()[class_name]
     else:
-        raise UnknownName("environment", name, [*classes(), *named_instances()])
+        shown = f"known: {', '.join(sorted(classes()))}; `pharos list` shows their parameters and named instances"
+        raise UnknownName("environment", name, list_environments(), shown)
     known = {field.name for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
     for parameter in parameters:
+        if parameter in cls.foreign_parameters:
+            raise ParameterError(
+                f"unknown parameter {parameter!r} of {class_name}: {cls.foreign_parameters[parameter]}"
+            )
         if parameter not in known:
             raise UnknownName(f"parameter of {class_name}", parameter, known)
     return cls(**{**defaults, **{name: as_tuples(value) for name, value in parameters.items()}})

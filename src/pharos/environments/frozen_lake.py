@@ -20,6 +20,9 @@ MAPS = {  # those of Gymnasium's FrozenLake-v1
     8: "SFFFFFFF/FFFFFFFF/FFFHFFFF/FFFFFHFF/FFFHFFFF/FHHFFFHF/FHFFHFHF/FFFHFFFG",
 }
 FROZEN_PROBABILITY = 0.8
+SLIPPING = (
+    "slipping comes as random actions: --random 0.667, random=2/3, random_actions(mdp, 2/3); see the class' docstring"
+)
 ATTEMPTS = 10_000
 
 
@@ -65,6 +68,7 @@ class FrozenLake(Environment):
     look = Look(ground="ice", color="#56B4E9")
     instances = {"4x4": {"size": 4}, "8x8": {"size": 8}}
     paper_instances = ("4x4", "8x8")
+    foreign_parameters = {"slippery": SLIPPING, "is_slippery": SLIPPING}
     hyperparameters = {
         # With a discount of 0.99 the goal of 8x8 is not found.
         "dqn": {

@@ -14,16 +14,18 @@ from pharos.environments import Environment, on_registration
 
 def ids_of(cls: type[Environment]) -> dict[str, str]:
     """Gymnasium id -> name that `pharos.make` knows, of a class and its named instances."""
-    version = f"v{cls.version - cls.first_version}"
+    version = f"v{max(0, cls.version - cls.first_version)}"
     name = cls.__name__
     instances = {f"pharos/{name}-{instance}-{version}": f"{cls.name}/{instance}" for instance in cls.instances}
     return {f"pharos/{name}-{version}": cls.name, **instances}
 
 
 def register_class(cls: type[Environment]) -> None:
-    """Register a class and its named instances; again, where an id is known already."""
+    """Register a class and its named instances. An id stays with the class that had it first."""
     for gymnasium_id, name in ids_of(cls).items():
-        _register(gymnasium_id, environment=name)
+        owner = registration.registry.get(gymnasium_id)
+        if owner is None or owner.kwargs.get("environment", "").partition("/")[0] == cls.name:
+            _register(gymnasium_id, environment=name)
 
 
 def _register(gymnasium_id: str, **arguments: str) -> None:
