@@ -164,7 +164,9 @@ def test_a_ground_or_shape_that_nobody_paints_is_named(corridor):
 
 
 def test_every_class_of_the_list_has_ids_a_colour_and_instances_that_can_be_made():
-    assert [place.partition(":")[2] for place in catalog.BUILT_IN] == [cls.__name__ for cls in catalog._BUILT_IN.values()]
+    assert [place.partition(":")[2] for place in catalog.BUILT_IN] == [
+        cls.__name__ for cls in catalog._BUILT_IN.values()
+    ]
     colors = [cls.look.color for cls in catalog._BUILT_IN.values()]
     assert len(set(colors)) == len(colors)
     for cls in catalog._BUILT_IN.values():
