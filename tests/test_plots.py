@@ -1,5 +1,8 @@
 """Plots: what is drawn is what the results say."""
 
+import importlib
+from dataclasses import dataclass
+
 import matplotlib
 import numpy as np
 import pytest
@@ -14,6 +17,7 @@ from pharos import hardness, plots
 from pharos.errors import FileFormatError, ParameterError
 from pharos.experiments import Task, read_curve, train
 from pharos.plots.plane import _label
+from pharos.plots.regret import _label as run_label
 from pharos.plots.style import thousands
 
 
@@ -96,13 +100,13 @@ def test_drawing_leaves_the_settings_of_matplotlib_alone(folders):
     assert dict(matplotlib.rcParams) == before
 
 
-def test_regret_that_cannot_be_normalised_is_drawn_in_units_of_return(tmp_path):
+def test_regret_that_cannot_be_normalised_is_drawn_in_units_of_return(tmp_path, monkeypatch):
     run = train("q_learning", "simple_grid", height=1, width=2, horizon=1, steps=200, out=tmp_path / "run")
     left, _ = plots.regret([run.folder]).axes
     assert left.get_ylabel() == "normalized regret"
     curve = read_curve(run.folder)
     curve["normalized_regret"] = np.nan  # as where playing at random is optimal
-    curve.to_parquet(run.folder / "curve.parquet")
+    monkeypatch.setattr(importlib.import_module("pharos.plots.regret"), "read_curve", lambda folder: curve)
     left, _ = plots.regret([run.folder]).axes
     assert left.get_ylabel() == "expected regret"
     np.testing.assert_allclose(lines(left)["q_learning"].get_ydata(), curve["expected_regret"])
@@ -201,3 +205,90 @@ def test_figures_are_written_by_their_ending(tmp_path, ending):
         plots.save(figure, tmp_path / "map.bmp")
     with pytest.raises(ParameterError, match="no such folder"):
         plots.save(figure, tmp_path / "nowhere" / "map.png")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Keys(pharos.Environment):
+    """A row of three cells with a key in the first one: the goal, on the right, opens with it."""
+
+    name = "keys"
+    actions = ("left", "right")
+
+    def variables(self):
+        return {"row": range(1), "column": range(3), "key": range(2)}
+
+    def initial_state(self):
+        return (0, 1, 0)
+
+    def transition(self, state, action, out):
+        out[1] = min(max(state[1] + 2 * action - 1, 0), 2)
+        if out[1] == 0:
+            out[2] = 1
+
+    def is_terminal(self, state):
+        return state[1] == 2 and state[2] == 1
+
+    def reward(self, state, action, next_state):
+        return 1.0 if next_state[1] == 2 and next_state[2] == 1 else 0.0
+
+    def grid(self):
+        return 1, 3
+
+
+def test_a_value_map_of_states_with_more_variables_is_a_slice():
+    space = pharos.build(Keys(), progress=False)
+    solution = pharos.value_iteration(space.mdp(gamma=0.5))
+    with pytest.raises(ParameterError, match=r"a state has row, column, key; .* such as --fix key=0"):
+        plots.value_map(space, solution)
+    for key, expected in ((0, [0.25, 0.125]), (1, [0.5, 1.0])):
+        shown = plots.value_map(space, solution, fix={"key": key}).axes[0].get_images()[0].get_array().filled(np.nan)[0]
+        cells = [1, 2] if key == 0 else [0, 1]
+        np.testing.assert_allclose(shown[cells], expected)
+    with pytest.raises(ParameterError, match="no state has key=7"):
+        plots.value_map(space, solution, fix={"key": 7})
+    with pytest.raises(ParameterError, match="unknown component of keys to fix 'kee'; did you mean 'key'"):
+        plots.value_map(space, solution, fix={"kee": 1})
+
+
+def test_a_value_map_frames_the_start():
+    space = pharos.build(pharos.make("simple_grid", height=2, width=3))
+    axis = plots.value_map(space, pharos.value_iteration(space.mdp())).axes[0]
+    (frame,) = [patch for patch in axis.patches if patch.get_width() == pytest.approx(0.92)]
+    assert frame.get_xy() == pytest.approx((-0.46, -0.46))
+
+
+def config_of(**other):
+    usual = {
+        "agent": "dqn",
+        "observation": "vector",
+        "environment": "frozen_lake",
+        "parameters": pharos.make("frozen_lake").parameters,
+        "chance": {"sticky": 0.0, "random": 0.0},
+        "steps": 20000,
+        "hyperparameters": {"gamma": 0.9, "batch_size": 32},
+    }
+    return {**usual, **other}
+
+
+def test_legends_have_no_empty_fields_and_say_units():
+    configs = [
+        config_of(),
+        config_of(agent="q_learning", observation="", environment="taxi", parameters={}, steps=300000),
+        config_of(parameters=pharos.make("frozen_lake/8x8").parameters, chance={"sticky": 0.25, "random": 0.0}),
+        config_of(parameters=pharos.make("frozen_lake", size=6, seed=3).parameters),
+        config_of(hyperparameters={"gamma": 0.99, "batch_size": 32}),
+    ]
+    labels = [run_label(config, configs) for config in configs]
+    assert labels == [
+        "dqn, vector, frozen_lake/4x4, no chance, 20k steps, gamma=0.9",
+        "q_learning, taxi, no chance, 300k steps, gamma=0.9",
+        "dqn, vector, frozen_lake/8x8, sticky=0.25, 20k steps, gamma=0.9",
+        "dqn, vector, frozen_lake size=6 seed=3, no chance, 20k steps, gamma=0.9",
+        "dqn, vector, frozen_lake/4x4, no chance, 20k steps, gamma=0.99",
+    ]
+
+
+def test_the_legend_of_regret_lies_below_the_curves(folders):
+    figure = plots.regret(folders)
+    assert [axis.get_legend() for axis in figure.axes] == [None, None]
+    assert len(figure.legends[0].get_texts()) == 3

@@ -14,6 +14,7 @@ from pharos.cli.common import (
     TargetArgument,
     check_format,
     describe_chance,
+    parse_parameters,
     parse_target,
     print_json,
     progress_line,
@@ -54,6 +55,10 @@ def value(
     gamma: Gamma = None,
     horizon: Horizon = None,
     random: Random = 0.0,
+    fix: Annotated[
+        list[str] | None,
+        typer.Option("--fix", metavar="NAME=VALUE", help="Draw the slice in which this variable has this value."),
+    ] = None,
     json: Json = False,
 ) -> None:
     """Draw the values and the actions of a policy over the cells of a grid."""
@@ -70,7 +75,7 @@ def value(
     if random:
         title += f", {describe_chance(0.0, random)}"
     facts = {"policy": policy, "value_at_start": solution.value_at_start, "gamma": mdp.gamma, "horizon": mdp.horizon}
-    _save(plots.value_map(goal.space(), solution, title=title), out, json, facts)
+    _save(plots.value_map(goal.space(), solution, fix=parse_parameters(fix), title=title), out, json, facts)
 
 
 @app.command()

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pharos.agents import agent_kind
+from pharos.environments import as_tuples, classes, make
 from pharos.errors import ParameterError
 from pharos.experiments import bootstrap_interval, read_curve, read_record
 from pharos.plots.style import COLORS, INK, figure, styled, thousands
@@ -63,7 +64,10 @@ def regret(
         axis.xaxis.set_major_formatter(thousands)
     right.yaxis.set_major_formatter(thousands)
     right.plot([], [], ":", color=INK, linewidth=1.2, label="at random")
-    right.legend(loc="upper left")
+    if axes is None:
+        left.figure.legend(*right.get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize=8)
+    else:
+        right.legend(loc="best")
     return left.figure
 
 
@@ -80,15 +84,45 @@ def _groups(folders: Sequence[str | os.PathLike]) -> dict[str, list[tuple[dict[s
 
 def _label(config: dict[str, Any], configs: list[dict[str, Any]]) -> str:
     """What tells this group of runs from the others."""
+
+    def differ(*keys: str) -> bool:
+        return any(len({json.dumps(other[key], sort_keys=True) for other in configs}) > 1 for key in keys)
+
     parts = [config["agent"]]
     if not agent_kind(config["agent"]).is_tabular:
         parts.append(config["observation"].replace("_", " "))
-    for key in ("environment", "parameters", "chance", "steps", "hyperparameters"):
-        if len({json.dumps(other[key], sort_keys=True) for other in configs}) > 1:
-            value = config[key]
-            text = " ".join(f"{k}={v}" for k, v in value.items() if v) if isinstance(value, dict) else str(value)
-            parts.append(text or "plain" if key == "chance" else text)
-    return ", ".join(parts)
+    if differ("environment", "parameters"):
+        parts.append(_instance(config["environment"], config["parameters"]))
+    if differ("chance"):
+        parts.append(" ".join(f"{name}={p:g}" for name, p in config["chance"].items() if p) or "no chance")
+    if differ("steps"):
+        parts.append(f"{thousands(config['steps'])} steps")
+    if differ("hyperparameters"):
+        own = config["hyperparameters"]
+        parts.append(" ".join(f"{name}={own[name]}" for name in own if _varies(name, configs)))
+    return ", ".join(part for part in parts if part)
+
+
+def _instance(environment: str, parameters: dict[str, Any]) -> str:
+    """`frozen_lake/8x8` where the instance has a name, else the class and what differs from its defaults."""
+    cls = classes().get(environment)
+    given = as_tuples(parameters)
+    if cls is None:
+        return " ".join([environment, *(f"{name}={value}" for name, value in given.items() if value not in (None, ()))])
+    for name in cls.instances:
+        if make(f"{environment}/{name}").parameters == given:
+            return f"{environment}/{name}"
+    usual = cls().parameters
+    return " ".join([environment, *(f"{name}={value}" for name, value in given.items() if value != usual.get(name))])
+
+
+def _varies(name: str, configs: list[dict[str, Any]]) -> bool:
+    """Whether a hyperparameter differs between runs of the same agent."""
+    by_agent: dict[str, set[str]] = {}
+    for config in configs:
+        value = json.dumps(config["hyperparameters"].get(name))
+        by_agent.setdefault(config["agent"], set()).add(value)
+    return any(len(values) > 1 for values in by_agent.values())
 
 
 def _aligned(runs: list[tuple[dict[str, Any], Any]], column: str) -> tuple[np.ndarray, np.ndarray]:
