@@ -116,6 +116,6 @@ def test_hyperparameters_out_of_range_are_refused(options, message):
 def test_unknown_hyperparameters_and_general_mdps_are_refused():
     with pytest.raises(UnknownName, match="did you mean 'learning_rate'"):
         QLearning(mdp_of("frozen_lake/4x4"), total_steps=10, learning_rat=0.1)
-    general = TabularMDP.from_matrices(np.ones((1, 1, 1)), np.ones((1, 1)))
+    general = TabularMDP.from_matrices(np.full((2, 1, 2), 0.5), np.ones((2, 1)))
     with pytest.raises(ParameterError, match="no table of next states"):
         QLearning(general, total_steps=10)

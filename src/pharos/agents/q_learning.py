@@ -47,7 +47,8 @@ class QLearning:
     def __init__(
         self, mdp: TabularMDP, *, total_steps: int, seed: int = 0, time_limit: int | None = None, **options: Any
     ):
-        if mdp.next_states is None:
+        table = mdp.dynamics.deterministic_table()
+        if table is None:
             raise ParameterError(
                 f"q_learning: {mdp} has no table of next states; expected an MDP with one next state a pair"
             )
@@ -56,6 +57,7 @@ class QLearning:
             from pharos.errors import UnknownName
 
             raise UnknownName("hyperparameter of q_learning", sorted(unknown)[0], DEFAULTS)
+        self._next_states = table
         self.mdp, self.options, self.seed = mdp, {**DEFAULTS, **options}, int(seed)
         self.total_steps = int(total_steps)
         self.limit = time_limit or mdp.horizon or 2**62
@@ -86,7 +88,7 @@ class QLearning:
         """Learn for so many more steps."""
         from pharos.kernels.learning import q_learning
 
-        mdp, options, chance = self.mdp, self.options, self.mdp.chance
+        mdp, options = self.mdp, self.options
         cumulative = np.cumsum(mdp.start_probabilities)
         cumulative[-1] = 1.0
         schedule = (
@@ -100,13 +102,13 @@ class QLearning:
             float(mdp.gamma),
         )
         q_learning(
-            mdp.next_states,
+            self._next_states,
             mdp.reward_table.table,
             mdp.reward_table.palette,
             np.asarray(mdp.terminal, np.bool_),
             mdp.start_states,
             cumulative,
-            (chance.chosen, chance.previous, chance.uniform, chance.first_chosen),
+            (*mdp.chance.triple, float(mdp.chance.first_chosen)),
             int(self.limit),
             schedule,
             self.q,

@@ -22,7 +22,7 @@ def bridge(mdp: TabularMDP, path: str | os.PathLike) -> Path:
         raise ParameterError(f"{path}: expected a name that ends in .npz")
     if not mdp.is_deterministic or len(mdp.start_states) != 1:
         raise ParameterError(f"{mdp}: BRIDGE's files hold deterministic MDPs with one start state; expected such a one")
-    table = np.array(mdp.next_states, np.int64)
+    table = np.array(mdp.dynamics.deterministic_table(), np.int64)
     inside = table >= 0
     table[inside & np.asarray(mdp.terminal)[table]] = -1
     order = np.arange(len(table))

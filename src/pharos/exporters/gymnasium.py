@@ -22,33 +22,22 @@ def gym_p(mdp: TabularMDP) -> dict[int, dict[int, list[Outcome]]]:
         raise ParameterError(
             "P tables have one row a state; under sticky actions the next state depends on the previous action"
         )
-    end, rewards, terminal = mdp.num_states, mdp.rewards, np.asarray(mdp.terminal)
-    chance, actions = mdp.chance, range(mdp.num_actions)
-
-    def executed(s: int, x: int) -> list[Outcome]:
-        reward = float(rewards[s, x])
-        if mdp.transitions is None:
-            assert mdp.next_states is not None
-            targets = [(1.0, int(mdp.next_states[s, x]))]
-        else:
-            row = mdp.transitions[s * mdp.num_actions + x]
-            targets = [(float(p), int(t)) for p, t in zip(row.data, row.indices, strict=True) if p > 0]
-            rest = 1.0 - sum(p for p, _ in targets)
-            targets += [(rest, -1)] if rest > 1e-12 else []
-        return [(p, end if t < 0 else t, reward, t < 0 or bool(terminal[t])) for p, t in targets]
-
+    end, num_actions, rewards, terminal = mdp.num_states, mdp.num_actions, mdp.rewards, np.asarray(mdp.terminal)
+    chosen, _, uniform = mdp.chance.triple
     table: dict[int, dict[int, list[Outcome]]] = {}
     for s in range(mdp.num_states):
-        table[s] = {}
-        for a in actions:
-            if terminal[s]:
-                table[s][a] = [(1.0, s, 0.0, True)]
-                continue
-            outcomes = [(chance.chosen * p, *rest) for p, *rest in executed(s, a)] if chance.chosen else []
-            if chance.uniform:
-                for x in actions:
-                    outcomes += [(chance.uniform / mdp.num_actions * p, *rest) for p, *rest in executed(s, x)]
-            table[s][a] = outcomes  # type: ignore[assignment]
-    if mdp.has_ends or mdp.transitions is not None:
-        table[end] = {a: [(1.0, end, 0.0, True)] for a in actions}
+        if terminal[s]:
+            table[s] = {a: [(1.0, s, 0.0, True)] for a in range(num_actions)}
+            continue
+        outcomes = mdp.dynamics.outcomes(np.full(num_actions, s), np.arange(num_actions))
+        executed: list[list[Outcome]] = [[] for _ in range(num_actions)]
+        for x, t, p in zip(*(each.tolist() for each in outcomes), strict=True):
+            executed[x].append((p, t, float(rewards[s, x]), t == end or bool(terminal[t])))
+        mixed = [(uniform / num_actions * p, t, r, e) for each in executed for p, t, r, e in each] if uniform else []
+        table[s] = {
+            a: ([(chosen * p, t, r, e) for p, t, r, e in executed[a]] if chosen else []) + mixed
+            for a in range(num_actions)
+        }
+    if mdp.has_ends:
+        table[end] = {a: [(1.0, end, 0.0, True)] for a in range(num_actions)}
     return table

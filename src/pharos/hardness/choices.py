@@ -126,40 +126,25 @@ def choices_of(mdp: TabularMDP, restart: bool) -> Choices:
 
 def outcomes_of(mdp: TabularMDP, terminal: np.ndarray) -> tuple[Any, bool]:
     """(S A, S + 1 or S) outcomes of executing actions, rows of terminal states empty; whether the end is among them."""
-    num_states, num_actions = mdp.num_states, mdp.num_actions
-    live = np.repeat(~terminal, num_actions)
-    if mdp.transitions is None:
-        assert mdp.next_states is not None
-        column = np.asarray(mdp.next_states).ravel().astype(np.int64)
-        ends = bool((column[live] < 0).any())
-        column = np.where(column < 0, num_states, column)
-        rows = np.flatnonzero(live)
-        data = np.ones(rows.size)
-        shape = (num_states * num_actions, num_states + ends)
-        return sparse.csr_matrix((data, (rows, column[rows])), shape=shape), ends
-    kept = sparse.diags(live.astype(np.float64)) @ mdp.transitions
-    kept.eliminate_zeros()
-    rest = np.where(live, 1 - np.asarray(kept.sum(axis=1)).ravel(), 0.0)
-    rest[rest < 1e-12] = 0.0
-    ends = bool(rest.any())
+    matrix = mdp.dynamics.matrix(~terminal)
+    ends = bool((matrix.indices == mdp.num_states).any())
     if not ends:
-        return sparse.csr_matrix(kept), False
-    return sparse.csr_matrix(sparse.hstack([kept, sparse.csr_matrix(rest[:, None])])), True
+        matrix = sparse.csr_matrix(
+            (matrix.data, matrix.indices, matrix.indptr), shape=(matrix.shape[0], mdp.num_states)
+        )
+    return matrix, ends
 
 
 def _weights(chance: Any, shape: tuple[int, int], owner: np.ndarray, previous: np.ndarray, live: np.ndarray) -> Any:
     """(N A, S A): the probability that choosing a in a node executes x in its state; previous (N,), A for none, -1 for any."""
     num_states, num_actions = shape
     node = np.flatnonzero(live)
-    n = np.repeat(node, num_actions * num_actions)
-    a = np.tile(np.repeat(np.arange(num_actions), num_actions), node.size)
-    x = np.tile(np.arange(num_actions), node.size * num_actions)
-    first = previous[n] == num_actions
-    data = np.where(first, chance.first_uniform, chance.uniform) / num_actions
-    data = data + (x == a) * np.where(first, chance.first_chosen, chance.chosen) + (x == previous[n]) * chance.previous
-    keep = data > 0
-    rows, columns = (n * num_actions + a)[keep], (owner[n] * num_actions + x)[keep]
-    return sparse.csr_matrix((data[keep], (rows, columns)), shape=(owner.size * num_actions, num_states * num_actions))
+    choice = np.tile(np.eye(num_actions), (node.size, 1))
+    data = chance.weights(choice, np.repeat(previous[node], num_actions))
+    n, x = np.nonzero(data)
+    rows = (node[:, None] * num_actions + np.arange(num_actions)).ravel()[n]
+    columns = np.repeat(owner[node], num_actions)[n] * num_actions + x
+    return sparse.csr_matrix((data[n, x], (rows, columns)), shape=(owner.size * num_actions, num_states * num_actions))
 
 
 def _restarts(

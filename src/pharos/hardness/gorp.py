@@ -214,7 +214,7 @@ def _completions(
 
 
 def _needs_one_outcome(name: str, mdp: TabularMDP) -> None:
-    if mdp.next_states is None or mdp.is_sticky or mdp.is_random:
+    if not mdp.is_deterministic:
         raise UndefinedMeasure(f"{name} is defined for deterministic MDPs: {mdp} has chance; take the MDP without it")
 
 

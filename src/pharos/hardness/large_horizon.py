@@ -17,7 +17,7 @@ _PARTS = 0.6  # of the memory of the machine
 
 def applies(mdp: TabularMDP) -> bool:
     """Whether the MDP has one next state for each state and action."""
-    return mdp.next_states is not None and not mdp.is_sticky and not mdp.is_random and mdp.num_actions <= 64
+    return mdp.is_deterministic and mdp.num_actions <= 64
 
 
 class LargeHorizon:
@@ -43,8 +43,9 @@ class LargeHorizon:
                 f"effective_horizon: {steps} steps of the {states} states that they can meet need {needed / 2**30:.1f} GiB, more than {room / 2**30:.1f}, "
                 f"{_PARTS:.0%} of this machine's memory; a smaller horizon or instance would define it"
             )
-        assert mdp.next_states is not None
-        self.next_states = np.ascontiguousarray(mdp.next_states)
+        table = mdp.dynamics.deterministic_table()
+        assert table is not None
+        self.next_states = np.ascontiguousarray(table)
         self.rewards = np.array(mdp.rewards)
         self.rewards[np.asarray(mdp.terminal)] = 0.0
         self.starts = [

@@ -196,7 +196,7 @@ class _Nodes:
 
         self.gamma, self.num_actions = mdp.gamma, mdp.num_actions
         self.table: np.ndarray | None
-        if mdp.next_states is not None and not mdp.is_sticky and not mdp.is_random:
+        if mdp.is_deterministic:
             choices, self.table = _states_and_the_end(mdp)
         else:
             choices = reachable(choices_of(mdp, restart=False))
@@ -255,10 +255,10 @@ class _Nodes:
 
 def _states_and_the_end(mdp: TabularMDP) -> tuple[Choices, np.ndarray]:
     """The states without chance, then the implicit end; and where each action leads. What has ended stays where it is."""
-    assert mdp.next_states is not None
+    next_states: Any = mdp.dynamics.deterministic_table()
     size = mdp.num_states
-    table = np.full((size + 1, mdp.num_actions), size, mdp.next_states.dtype)
-    table[:size] = mdp.next_states
+    table = np.full((size + 1, mdp.num_actions), size, next_states.dtype)
+    table[:size] = next_states
     table[table < 0] = size
     terminal = np.flatnonzero(mdp.terminal)
     table[terminal] = terminal[:, None]

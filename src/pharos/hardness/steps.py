@@ -137,17 +137,9 @@ def single_outcomes(matrix: Any, nodes: int, num_actions: int) -> np.ndarray | N
 
 def expected_rewards(mdp: TabularMDP, choices: Any) -> np.ndarray:
     """(N, A): the expected reward of choosing an action in a node."""
-    chance, num_actions = mdp.chance, mdp.num_actions
+    num_actions = mdp.num_actions
     paid = np.vstack([mdp.rewards, np.zeros((1, num_actions))])
     paid[:-1][np.asarray(mdp.terminal)] = 0.0
     executed = paid[np.minimum(choices.underlying, mdp.num_states)]
-    if not mdp.is_sticky and not mdp.is_random:
-        return executed
     mean = mean_of_actions(executed)[:, None]
-    if not mdp.is_sticky:
-        return chance.chosen * executed + chance.uniform * mean
-    previous = choices.previous
-    first = previous == num_actions
-    repeated = executed[np.arange(len(previous)), np.minimum(previous, num_actions - 1)][:, None]
-    later = chance.chosen * executed + chance.previous * repeated + chance.uniform * mean
-    return np.where(first[:, None], chance.first_chosen * executed + chance.first_uniform * mean, later)
+    return mdp.chance.chosen_values(executed, choices.previous if mdp.is_sticky else None, mean)

@@ -35,16 +35,8 @@ def save(mdp: TabularMDP, folder: str | os.PathLike, *, source: str = "") -> Pat
         "terminal": np.asarray(mdp.terminal),
         "start_states": mdp.start_states,
         "start_probabilities": mdp.start_probabilities,
+        **mdp.dynamics.arrays(),
     }
-    if mdp.transitions is None:
-        arrays["next_states"] = np.asarray(mdp.next_states)
-    else:
-        matrix = mdp.transitions
-        arrays |= {
-            "transitions_data": matrix.data,
-            "transitions_indices": matrix.indices,
-            "transitions_indptr": matrix.indptr,
-        }
     entries = {}
     for name, array in arrays.items():
         np.save(folder / f"{name}.npy", array, allow_pickle=False)

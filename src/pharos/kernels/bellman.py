@@ -102,26 +102,42 @@ def sticky_block(next_states, table, palette, gamma, weights, sign, v, out, acti
 
 
 @njit(cache=True, nogil=True)
-def policy_sweep(next_states, table, palette, gamma, weights, policy, v, q):
+def policy_sweep(next_states, table, palette, gamma, chosen, uniform, policy, v):
+    """v[s] = sum_a (chosen policy[s, a] + uniform / A) q(s, a), in place; policy (S, A): probabilities of choosing."""
+    num_states, num_actions = next_states.shape
+    each = uniform / num_actions
+    change = 0.0
+    for s in range(num_states - 1, -1, -1):
+        value = 0.0
+        for a in range(num_actions):
+            q = reward_at(table, palette, s, a) + gamma * v[next_states[s, a]]
+            value += (chosen * policy[s, a] + each) * q
+        change = max(change, abs(value - v[s]))
+        v[s] = value
+    return change
+
+
+@njit(cache=True, nogil=True)
+def sticky_policy_sweep(next_states, table, palette, gamma, weights, policy, v, q):
     """v[s, b] = sum_a (chosen policy[s, b, a] + uniform / A) q(s, a) + previous q(s, b), in place.
 
-    v (S + 1, W): W is A where `previous` > 0, else 1. policy (S, B, A): B is W, or 1 where the previous action does not
-    matter. q (A,) scratch.
+    v (S + 1, A). policy (S, B, A): B is A, or 1 where the previous action does not matter. q (A,) scratch.
     """
     num_states, num_actions = next_states.shape
     chosen, previous, uniform = weights
-    width = v.shape[1]
+    each = uniform / num_actions
+    looks_back = policy.shape[1] > 1
     change = 0.0
     for s in range(num_states - 1, -1, -1):
         for a in range(num_actions):
-            q[a] = reward_at(table, palette, s, a) + gamma * v[next_states[s, a], a if width > 1 else 0]
+            q[a] = reward_at(table, palette, s, a) + gamma * v[next_states[s, a], a]
         shared = 0.0
-        for b in range(width):
-            if b == 0 or policy.shape[1] > 1:
+        for b in range(num_actions):
+            if b == 0 or looks_back:
                 shared = 0.0
                 for a in range(num_actions):
-                    shared += (chosen * policy[s, b, a] + uniform / num_actions) * q[a]
-            value = shared + previous * q[b] if previous > 0.0 else shared
+                    shared += (chosen * policy[s, b, a] + each) * q[a]
+            value = shared + previous * q[b]
             change = max(change, abs(value - v[s, b]))
             v[s, b] = value
     return change

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from pharos.errors import ParameterError
-from pharos.mdp import TabularMDP
+from pharos.mdp.rewards import Rewards
+from pharos.mdp.tabular import TabularMDP
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,8 +54,8 @@ def minimize(mdp: TabularMDP, observations: Any = None) -> Minimization:
     Source: Givan, Dean and Greig (2003), "Equivalence notions and model minimization in Markov decision processes"; BRIDGE's
         consolidation (Laidlaw, Russell and Dragan 2023).
     """
-    table = mdp.reward_table
-    paid = table.table if len(table.palette) else table.table + 0.0  # -0.0 and 0.0 are one reward
+    rewards = mdp.reward_table
+    paid = rewards.table if len(rewards.palette) else rewards.table + 0.0  # -0.0 and 0.0 are one reward
     classes = _numbered(paid, np.asarray(mdp.terminal).astype(np.int64))
     if observations is not None:
         seen = np.asarray(observations)
@@ -63,7 +64,8 @@ def minimize(mdp: TabularMDP, observations: Any = None) -> Minimization:
             raise ParameterError(f"there are {found} observations; expected {mdp.num_states}, one for each state")
         rows = seen.reshape(mdp.num_states, -1)
         classes = _numbered(rows + 0.0 if seen.dtype.kind == "f" else rows, classes)
-    classes, rounds = _refined(mdp, classes) if mdp.next_states is not None else _refined_general(mdp, classes)
+    table = mdp.dynamics.deterministic_table()
+    classes, rounds = _refined_general(mdp, classes) if table is None else _refined(table, classes)
     _, representatives = np.unique(classes, return_index=True)
     return Minimization(_merged(mdp, classes, representatives), classes, representatives, rounds)
 
@@ -82,11 +84,11 @@ def _slots(rows: int) -> np.ndarray:
     return np.full(1 << max(3, (2 * rows - 1).bit_length()), -1, np.int32 if rows < 2**31 else np.int64)
 
 
-def _refined(mdp: TabularMDP, classes: np.ndarray) -> tuple[np.ndarray, int]:
+def _refined(table: np.ndarray, classes: np.ndarray) -> tuple[np.ndarray, int]:
     """(coarsest stable partition, rounds) of a table of next states."""
     from pharos.kernels import partition
 
-    table, states = mdp.next_states, mdp.num_states
+    states = len(table)
     small = np.int32 if states < 2**31 else np.int64
     slots, now = _slots(states), classes.astype(small)
     asked, used, new = np.arange(states, dtype=small), np.empty(states, small), np.empty(states, small)
@@ -106,7 +108,7 @@ def _refined_general(mdp: TabularMDP, classes: np.ndarray) -> tuple[np.ndarray, 
     """The same for transition probabilities."""
     rounds, count = 0, int(classes.max()) + 1
     while True:
-        reached = _to_classes(mdp, classes, count)
+        reached = mdp.dynamics.to_classes(classes, count)
         whole = np.rint(reached.data * 2.0**40).astype(np.int64)
         keep = whole > 0
         edges = np.concatenate([[0], np.cumsum(keep)])[reached.indptr]
@@ -124,35 +126,15 @@ def _refined_general(mdp: TabularMDP, classes: np.ndarray) -> tuple[np.ndarray, 
         count = len(known)
 
 
-def _to_classes(mdp: TabularMDP, classes: np.ndarray, count: int) -> Any:
-    """(S A, C) CSR, the probability of reaching each class; columns in order."""
-    from scipy import sparse
-
-    states = mdp.num_states
-    members = sparse.csr_matrix((np.ones(states), (np.arange(states), classes)), shape=(states, count))
-    reached = sparse.csr_matrix(mdp.transitions @ members)
-    reached.sort_indices()
-    return reached
-
-
 def _merged(mdp: TabularMDP, classes: np.ndarray, representatives: np.ndarray) -> TabularMDP:
     count = len(representatives)
     initial = np.zeros(count)
     np.add.at(initial, classes[mdp.start_states], mdp.start_probabilities)
     start: Any = int(initial.argmax()) if np.count_nonzero(initial) == 1 else initial / initial.sum()
-    rewards = mdp.reward_table.rows(representatives)
-    if mdp.next_states is not None:
-        table = np.asarray(mdp.next_states)[representatives].astype(np.int64)
-        smaller = TabularMDP.from_arrays(
-            np.where(table >= 0, classes[table], -1),
-            rewards,
-            gamma=mdp.gamma,
-            initial=start,
-            horizon=mdp.horizon,
-            terminal=np.asarray(mdp.terminal)[representatives],
-        )
-    else:
-        rows = (representatives[:, None] * mdp.num_actions + np.arange(mdp.num_actions)).ravel()
-        matrix = _to_classes(mdp, classes, count)[rows]
-        smaller = TabularMDP.from_matrices(matrix, rewards, gamma=mdp.gamma, initial=start, horizon=mdp.horizon)
-    return replace(smaller, chance=mdp.chance)
+    return replace(
+        mdp,
+        dynamics=mdp.dynamics.merged(classes, representatives),
+        reward_table=Rewards.from_array(mdp.reward_table.rows(representatives)),
+        terminal=np.asarray(mdp.terminal)[representatives],
+        folder=None,
+    ).with_initial(start)

@@ -105,6 +105,25 @@ class Chance:
             result = result + self.uniform * q.mean(axis=1, keepdims=True)
         return result + self.previous * q if self.previous else result
 
+    def chosen_values(
+        self, q: np.ndarray, previous: np.ndarray | None = None, mean: np.ndarray | None = None
+    ) -> np.ndarray:
+        """(N, A): the values of choosing each action, from those of executing it.
+
+        Args:
+            q: (N, A), the values of executing each action.
+            previous: (N,) previously executed actions, A where there is none; None: none anywhere that matters.
+            mean: (N, 1), the mean of q over actions, where it was added up already.
+        """
+        mean = q.mean(axis=1, keepdims=True) if mean is None else mean
+        later = self.chosen * q + self.uniform * mean if self.is_random else self.chosen * q
+        if previous is None:
+            return later
+        is_first = (previous == q.shape[1])[:, None]
+        repeated = q[np.arange(len(q)), np.minimum(previous, q.shape[1] - 1)][:, None]
+        later = self.chosen * q + self.previous * repeated + self.uniform * mean
+        return np.where(is_first, self.first_chosen * q + self.first_uniform * mean, later)
+
     def executed(self, mass: np.ndarray, chosen: np.ndarray) -> np.ndarray:
         """(N, A): how the mass of states executes the actions; the adjoint of `choice`.
 

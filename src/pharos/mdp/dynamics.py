@@ -117,6 +117,10 @@ class Dynamics(ABC):
     def merged(self, classes: np.ndarray, representatives: np.ndarray) -> "Dynamics":
         """The dynamics of classes (S,) of states, each behaving as its representative (C,)."""
 
+    @abstractmethod
+    def arrays(self) -> dict[str, np.ndarray]:
+        """What it is made of, by name, as files keep it."""
+
     def deterministic_table(self) -> np.ndarray | None:
         """(S, A) next states, -1 for the end, where each execution has one outcome; else None."""
         return None
@@ -183,6 +187,12 @@ class Dynamics(ABC):
         """(N, A): the smallest of x (S + 1,) over what executing an action may lead to."""
         return -self.largest(-np.asarray(x), states)
 
+    def leads_to(self, state: int) -> np.ndarray:
+        """(S, A) bool: whether executing an action may lead to a state."""
+        indicator = np.zeros(self.num_states + 1)
+        indicator[state] = 1.0
+        return self.expected(indicator) > 0
+
     def sample(self, states: np.ndarray, actions: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """(N,): a next state of each execution, -1 for the end. Draws nothing where each has one outcome."""
         outcomes = self.outcomes(np.asarray(states), np.asarray(actions))
@@ -238,8 +248,8 @@ class Dynamics(ABC):
         """(S A, C): the probability of coming to each class (S,) of states; columns in order."""
         from scipy import sparse
 
-        members = sparse.csr_matrix((np.ones(self.num_states), (np.arange(self.num_states), classes)))
-        members.resize(self.num_states + 1, count)
+        place = (np.arange(self.num_states), classes)
+        members = sparse.csr_matrix((np.ones(self.num_states), place), shape=(self.num_states + 1, count))
         result = sparse.csr_matrix(self.matrix() @ members)
         result.sort_indices()
         return result
@@ -271,6 +281,9 @@ class Table(Dynamics):
 
     def deterministic_table(self) -> np.ndarray:
         return self.next_states
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        return {"next_states": np.asarray(self.next_states)}
 
     def expected(self, x: np.ndarray, states: Any = slice(None)) -> np.ndarray:
         table = self.next_states[states]  # -1 reads the last row, which is the end's
@@ -331,7 +344,11 @@ class Table(Dynamics):
         tables = (self.next_states, rewards.table, rewards.palette, gamma)
         actions = bellman.actions_of(self.num_actions)
         if isinstance(select, PolicyTable):
-            return bellman.policy_sweep(*tables, chance.triple, select.later, x, np.empty(self.num_actions))
+            if chance.is_sticky:
+                scratch = np.empty(self.num_actions)
+                return bellman.sticky_policy_sweep(*tables, chance.triple, select.later, x, scratch)
+            weights = (float(chance.chosen), float(chance.uniform))
+            return bellman.policy_sweep(*tables, *weights, select.later[:, 0], x[:, 0])
         assert isinstance(select, Extreme)
         if chance.is_sticky:
             return bellman.sticky_sweep(*tables, chance.triple, select.sign, x, actions, np.empty(self.num_actions))
@@ -404,6 +421,11 @@ class Matrices(Dynamics):
             size = matrix.shape[0]
             self._columns_by_action = sparse.csr_matrix((matrix.data, columns, matrix.indptr), shape=(size, size))
         return self._columns_by_action
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        matrix = self.transitions
+        names = ("transitions_data", "transitions_indices", "transitions_indptr")
+        return dict(zip(names, (matrix.data, matrix.indices, matrix.indptr), strict=True))
 
     def deterministic_table(self) -> np.ndarray | None:
         if self._table is None and self.is_deterministic:

@@ -133,7 +133,6 @@ def _lengths(solution: "Solution") -> np.ndarray:
 
 def _reward_on_entering(mdp: Any, terminal: int) -> str:
     """The reward of the transitions that lead into a terminal state; empty where they differ or there are none."""
-    table = mdp.next_states
-    into = (table == terminal) & ~np.asarray(mdp.terminal)[:, None]
+    into = mdp.dynamics.leads_to(terminal) & ~np.asarray(mdp.terminal)[:, None]
     paid = np.unique(mdp.rewards[into])
     return f"{paid[0]:g}" if len(paid) == 1 else ""
