@@ -14,7 +14,7 @@ from pharos import Environment
 from pharos.hardness import diameter
 from pharos.interaction.gym_env import GymEnv
 from pharos.interaction.vector_env import make_vec
-from pharos.rules.compiled import _first_lines
+from pharos.rules import reason_of
 from pharos.rules.kernel_cache import private_folder
 
 
@@ -73,8 +73,8 @@ def test_the_reason_names_the_signature_that_is_missing():
         "No implementation of function Function(<class 'float'>) found for signature:\n \n >>> float(unicode_type)\n \n"
         'There are 2 candidates\n\nFile "coins.py", line 12:\n'
     )
-    assert "found for signature: float(unicode_type)" in _first_lines(message)
-    assert '(File "coins.py", line 12)' in _first_lines(message)
+    assert "found for signature: float(unicode_type)" in reason_of(ValueError(message))
+    assert '(File "coins.py", line 12)' in reason_of(ValueError(message))
 
 
 # The cache ---------------------------------------------------------------------------------------------------------------

@@ -22,6 +22,9 @@ from pharos.state_space import files as writing
 from table_worlds import TableWorld
 
 building = importlib.import_module("pharos.state_space.build")
+search = importlib.import_module("pharos.state_space.search")
+table = importlib.import_module("pharos.state_space.table")
+machine = importlib.import_module("pharos.state_space.memory")
 
 BREAKOUT = pharos.make("breakout", height=7, columns=5)  # 27,692 states; a frontier of hundreds
 NARROW = TableWorld(num_positions=5000, lows="-1000,0,7", sizes=f"{2**40},{2**30},1", num_starts=3, end_share=0.05)
@@ -31,8 +34,8 @@ fork = multiprocessing.get_context("fork")
 @pytest.fixture
 def small_blocks(monkeypatch):
     """Blocks so small that a build of 27,692 states goes through every path: narrow, wide, table growing, checkpoints."""
-    monkeypatch.setattr(building, "CHUNK", 512)
-    monkeypatch.setattr(building, "WIDE", 200)
+    monkeypatch.setattr(search, "CHUNK", 512)
+    monkeypatch.setattr(search, "WIDE", 200)
 
 
 def build(env, folder, **options) -> pharos.StateSpace:
@@ -62,16 +65,16 @@ def undisturbed(tmp_path_factory) -> dict[str, Path]:
 @pytest.mark.parametrize("workers", (1, 2, 3))
 @pytest.mark.parametrize(("chunk", "wide"), ((64, 8), (512, 100), (1 << 16, 1 << 13)))
 def test_files_do_not_depend_on_threads_or_blocks(env, workers, chunk, wide, tmp_path, undisturbed, monkeypatch):
-    monkeypatch.setattr(building, "CHUNK", chunk)
-    monkeypatch.setattr(building, "WIDE", wide)
+    monkeypatch.setattr(search, "CHUNK", chunk)
+    monkeypatch.setattr(search, "WIDE", wide)
     build(env, tmp_path / "space", workers=workers, checkpoint_seconds=0.01)
     assert_same_files(tmp_path / "space", undisturbed[env.name])
 
 
 @pytest.mark.parametrize("room", (1 << 16, 0))
 def test_a_table_that_threads_fill_together_gives_the_same_files(room, tmp_path, undisturbed, monkeypatch):
-    monkeypatch.setattr(building, "PARALLEL_FILL", 0)
-    monkeypatch.setattr(building, "LEFT_OVER", room)
+    monkeypatch.setattr(table, "PARALLEL_FILL", 0)
+    monkeypatch.setattr(table, "LEFT_OVER", room)
     with pytest.raises(StateSpaceTooLarge):
         build(BREAKOUT, tmp_path / "space", workers=2, max_states=20_000)
     build(BREAKOUT, tmp_path / "space", workers=3)
@@ -118,7 +121,7 @@ def _build_and_die_at(call: int, env, folder):
 
         return dying
 
-    append = building.GrowingFile.append
+    append = writing.GrowingFile.append
 
     def append_half(self, rows):
         nonlocal calls
@@ -129,12 +132,12 @@ def _build_and_die_at(call: int, env, folder):
         append(self, rows)
 
     os.fsync, os.replace, os.truncate = counted(os.fsync), counted(os.replace), counted(os.truncate)
-    building.GrowingFile.append = append_half
+    writing.GrowingFile.append = append_half
     build(env, folder, checkpoint_seconds=0.0)
 
 
 def test_a_build_that_dies_at_any_step_of_a_checkpoint_ends_in_the_same_files(tmp_path, undisturbed, monkeypatch):
-    monkeypatch.setattr(building, "CHUNK", 4096)
+    monkeypatch.setattr(search, "CHUNK", 4096)
     for call in range(1, 30):
         folder = tmp_path / f"space{call}"
         process = in_a_child(_build_and_die_at, call, BREAKOUT, folder)
@@ -201,7 +204,7 @@ class _InterruptAtLine:
     "ignore::pytest.PytestUnraisableExceptionWarning"
 )  # a file interrupted between open and with
 def test_an_interrupt_at_any_line_keeps_counts_and_files_together(tmp_path, undisturbed, monkeypatch):
-    monkeypatch.setattr(building, "CHUNK", 4096)
+    monkeypatch.setattr(search, "CHUNK", 4096)
     counter = _InterruptAtLine(-1)
     counter.build(BREAKOUT, tmp_path / "counted")
     num_lines = -1 - counter.left
@@ -232,8 +235,8 @@ def test_raising_max_states_goes_on_where_the_build_stopped(tmp_path, undisturbe
 @pytest.fixture
 def little_memory(monkeypatch):
     """Memory that holds nothing: the table is on disk at once, chunks have 1024 rows, and a part of the table is a few pages."""
-    monkeypatch.setattr(building, "available_memory", lambda: 0)
-    monkeypatch.setattr(building, "LEAST_MEMORY", 1 << 16)
+    monkeypatch.setattr(machine, "available_memory", lambda: 0)
+    monkeypatch.setattr(machine, "LEAST_MEMORY", 1 << 16)
 
 
 @pytest.mark.parametrize("env", (BREAKOUT, NARROW), ids=lambda env: env.name)
@@ -242,7 +245,7 @@ def little_memory(monkeypatch):
 def test_files_do_not_depend_on_where_the_table_is(
     env, workers, wide, tmp_path, undisturbed, little_memory, monkeypatch
 ):
-    monkeypatch.setattr(building, "WIDE", wide)
+    monkeypatch.setattr(search, "WIDE", wide)
     build(env, tmp_path / "space", workers=workers, checkpoint_seconds=0.01)
     assert_same_files(tmp_path / "space", undisturbed[env.name])
 
@@ -252,11 +255,13 @@ def test_files_do_not_depend_on_where_the_table_is(
 def test_the_table_moves_to_disk_in_the_middle_of_a_build(limit, chunk, tmp_path, monkeypatch):
     env = pharos.make("breakout", height=8, columns=6)  # 142,063 states: the table grows twice
     build(env, tmp_path / "undisturbed")
-    monkeypatch.setattr(building, "CHUNK", chunk)
-    monkeypatch.setattr(building, "LEAST_MEMORY", 1 << 16)
+    monkeypatch.setattr(search, "CHUNK", chunk)
+    monkeypatch.setattr(machine, "LEAST_MEMORY", 1 << 16)
     moved = []
-    spill = building._Builder._spill
-    monkeypatch.setattr(building._Builder, "_spill", lambda self, *args: (moved.append(self.count), spill(self, *args)))
+    spill = search.Search._spill
+    monkeypatch.setattr(
+        search.Search, "_spill", lambda self, *args: (moved.append(self.position.count), spill(self, *args))
+    )
     build(env, tmp_path / "space", memory=limit)
     assert len(moved) == 1 and (moved[0] > 1000) == (limit > 1 << 16)
     assert_same_files(tmp_path / "space", tmp_path / "undisturbed")
@@ -264,7 +269,7 @@ def test_the_table_moves_to_disk_in_the_middle_of_a_build(limit, chunk, tmp_path
 
 def test_memory_may_come_and_go_between_sessions(tmp_path, undisturbed, monkeypatch):
     folder = tmp_path / "space"
-    monkeypatch.setattr(building, "LEAST_MEMORY", 1 << 16)
+    monkeypatch.setattr(machine, "LEAST_MEMORY", 1 << 16)
     for limit, memory in ((3000, 1 << 16), (9000, None), (15_000, 1 << 16), (25_000, 1 << 20), (None, 1 << 16)):
         if limit:
             with pytest.raises(StateSpaceTooLarge):
@@ -290,7 +295,7 @@ def test_a_build_on_disk_killed_again_and_again_leaves_no_table_behind(tmp_path,
 
 
 def test_indices_widen_while_the_table_is_on_disk(widened, tmp_path, little_memory, monkeypatch):
-    monkeypatch.setattr(building, "INT32_STATES", 5000)
+    monkeypatch.setattr(search, "INT32_STATES", 5000)
     build(BREAKOUT, tmp_path / "space")
     wide, expected = pharos.load(tmp_path / "space"), pharos.load(widened)
     assert wide.successors.dtype == np.int64
@@ -298,7 +303,7 @@ def test_indices_widen_while_the_table_is_on_disk(widened, tmp_path, little_memo
 
 
 def test_interpreted_rules_are_enumerated_with_the_table_on_disk(tmp_path, undisturbed, little_memory, monkeypatch):
-    monkeypatch.setattr("pharos.rules.compiled.compiled_rules", lambda *args: None)
+    monkeypatch.setattr("pharos.rules.rules.compiled_or_none", lambda *args: None)
     build(BREAKOUT, tmp_path / "space")
     assert_same_files(tmp_path / "space", undisturbed["breakout"])
 
@@ -317,8 +322,8 @@ def _build_where_the_table_does_not_fit(env, folder):
 
 def test_a_disk_without_room_for_the_table_loses_nothing(tmp_path, monkeypatch):
     env = pharos.make("breakout", height=8, columns=6)
-    monkeypatch.setattr(building, "LEAST_MEMORY", 1 << 16)
-    monkeypatch.setattr(building, "CHUNK", 512)
+    monkeypatch.setattr(machine, "LEAST_MEMORY", 1 << 16)
+    monkeypatch.setattr(search, "CHUNK", 512)
     process = in_a_child(_build_where_the_table_does_not_fit, env, tmp_path / "space")
     process.join()
     assert process.exitcode == 7
@@ -349,7 +354,7 @@ def test_a_rule_that_fails_is_blamed_with_the_table_on_disk(tmp_path, little_mem
 @pytest.fixture
 def interpreted(monkeypatch):
     """Rules that are neither compiled nor traced: each state is asked."""
-    monkeypatch.setattr("pharos.rules.compiled.compiled_rules", lambda *args: None)
+    monkeypatch.setattr("pharos.rules.rules.compiled_or_none", lambda *args: None)
     monkeypatch.setattr("pharos.rules.traced.TracedRules.successors", lambda self, states: None)
 
 
@@ -416,8 +421,8 @@ def widened(tmp_path_factory) -> Path:
     """A build that passed the limit of 32-bit indices, lowered to 5000 states."""
     folder = tmp_path_factory.mktemp("widened") / "space"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(building, "CHUNK", 512)
-        patch.setattr(building, "INT32_STATES", 5000)
+        patch.setattr(search, "CHUNK", 512)
+        patch.setattr(search, "INT32_STATES", 5000)
         build(BREAKOUT, folder, workers=1)
     return folder
 
@@ -434,16 +439,16 @@ def test_beyond_32_bit_indices_only_the_width_of_the_successors_changes(widened,
 
 @pytest.mark.parametrize("limit", (3000, 25_000, 28_000))  # beyond 24,000 the table grows as well
 def test_indices_widen_while_threads_are_a_piece_ahead(limit, tmp_path, undisturbed, monkeypatch):
-    monkeypatch.setattr(building, "CHUNK", 512)
-    monkeypatch.setattr(building, "WIDE", 16)
-    monkeypatch.setattr(building, "INT32_STATES", limit)
-    widen, ahead = building._Builder._widen_indices, []
+    monkeypatch.setattr(search, "CHUNK", 512)
+    monkeypatch.setattr(search, "WIDE", 16)
+    monkeypatch.setattr(search, "INT32_STATES", limit)
+    widen, ahead = search.Search._widen_indices, []
 
     def noted(self, pool):
-        ahead.append(self.ahead)
+        ahead.append(self._ahead)
         widen(self, pool)
 
-    monkeypatch.setattr(building._Builder, "_widen_indices", noted)
+    monkeypatch.setattr(search.Search, "_widen_indices", noted)
     wide, narrow = build(BREAKOUT, tmp_path / "space", workers=2), pharos.load(undisturbed["breakout"])
     assert len(ahead) == 1 and ahead[0] is not None
     assert (wide.successors == narrow.successors).all()
@@ -452,7 +457,7 @@ def test_indices_widen_while_threads_are_a_piece_ahead(limit, tmp_path, undistur
 
 @pytest.mark.parametrize("limit", (1000, 4000, 6000, 20000))
 def test_a_build_that_widens_its_indices_resumes_to_the_same_files(limit, widened, tmp_path, small_blocks, monkeypatch):
-    monkeypatch.setattr(building, "INT32_STATES", 5000)
+    monkeypatch.setattr(search, "INT32_STATES", 5000)
     folder = tmp_path / "space"
     with pytest.raises(StateSpaceTooLarge):
         build(BREAKOUT, folder, max_states=limit)
@@ -461,8 +466,8 @@ def test_a_build_that_widens_its_indices_resumes_to_the_same_files(limit, widene
 
 
 def test_a_build_that_dies_while_it_widens_its_indices_resumes_to_the_same_files(widened, tmp_path, monkeypatch):
-    monkeypatch.setattr(building, "INT32_STATES", 5000)
-    monkeypatch.setattr(building, "CHUNK", 512)
+    monkeypatch.setattr(search, "INT32_STATES", 5000)
+    monkeypatch.setattr(search, "CHUNK", 512)
     start = tmp_path / "start"
     with pytest.raises(StateSpaceTooLarge):
         build(BREAKOUT, start, max_states=3000)

@@ -25,6 +25,7 @@ from pharos.errors import (
 from table_worlds import TableWorld, table_worlds
 
 building = importlib.import_module("pharos.state_space.build")
+search = importlib.import_module("pharos.state_space.search")
 
 SMALL = (
     pharos.make("simple_grid", height=5, width=3, penalties=(((1, 1), -1.0),)),
@@ -102,7 +103,7 @@ def test_load_gives_back_what_build_gave(breakout):
 
 
 def test_a_finished_folder_is_loaded_and_not_built_again(breakout, monkeypatch):
-    monkeypatch.setattr(building, "_Builder", None)
+    monkeypatch.setattr(search, "Search", None)
     again = build(breakout.environment, breakout.folder)
     assert (again.successors == breakout.successors).all()
 
@@ -153,7 +154,7 @@ def test_without_a_folder_the_users_cache_is_used(tmp_path, monkeypatch):
     env = pharos.make("simple_grid")
     space = pharos.build(env, progress=False)
     assert space.folder.parent == tmp_path / "spaces"
-    monkeypatch.setattr(building, "_Builder", None)
+    monkeypatch.setattr(search, "Search", None)
     assert pharos.build(env).folder == space.folder
     other = building.cached_folder(pharos.make("simple_grid", height=5))
     assert other != space.folder
@@ -242,7 +243,7 @@ def test_a_file_of_another_length_is_found(name, how, folder):
 
 @pytest.mark.parametrize("name", ("states.bin", "successors.bin", "terminal.bin"))
 def test_a_resumed_build_finds_a_flipped_bit(name, folder, monkeypatch):
-    monkeypatch.setattr(building, "CHUNK", 8)
+    monkeypatch.setattr(search, "CHUNK", 8)
     with pytest.raises(StateSpaceTooLarge):
         build(GRID, folder, max_states=30)
     content = bytearray((folder / name).read_bytes())
@@ -253,7 +254,7 @@ def test_a_resumed_build_finds_a_flipped_bit(name, folder, monkeypatch):
 
 
 def test_a_resumed_build_finds_a_truncated_file(folder, monkeypatch):
-    monkeypatch.setattr(building, "CHUNK", 8)
+    monkeypatch.setattr(search, "CHUNK", 8)
     with pytest.raises(StateSpaceTooLarge):
         build(GRID, folder, max_states=30)
     (folder / "successors.bin").write_bytes((folder / "successors.bin").read_bytes()[:-1])
@@ -359,7 +360,7 @@ def test_a_build_is_not_resumed_with_other_rules(folder, monkeypatch):
         def transition(self, state, action, out):
             out[0] = min(max(state[0] + 3 * action - 1, 0), self.length - 1)
 
-    monkeypatch.setattr(building, "CHUNK", 8)
+    monkeypatch.setattr(search, "CHUNK", 8)
     with pytest.raises(StateSpaceTooLarge):
         build(Walk(), folder, max_states=100)
     with pytest.raises(StateSpaceMismatch, match="was built with other rules"):
@@ -442,7 +443,7 @@ class DividesByZero(Walk):
 def test_a_rule_that_breaks_the_contract_is_named_with_state_and_action(
     env, expected, workers, wide, folder, monkeypatch
 ):
-    monkeypatch.setattr(building, "WIDE", wide)
+    monkeypatch.setattr(search, "WIDE", wide)
     with pytest.raises(RuleError, match=expected):
         build(env, folder, workers=workers)
 
@@ -461,7 +462,7 @@ def test_a_rule_that_writes_to_the_state_is_neither_compiled_nor_interpreted(fol
 
 
 def test_what_was_found_before_a_rule_failed_is_kept(folder, monkeypatch):
-    monkeypatch.setattr(building, "CHUNK", 64)
+    monkeypatch.setattr(search, "CHUNK", 64)
     with pytest.raises(RuleError):
         build(DividesByZero(), folder)
     assert building.read_manifest(folder)["num_expanded"] == 640
@@ -484,7 +485,7 @@ def test_rewards_are_those_of_the_stored_transitions(breakout):
 
 
 def test_rewards_are_replaced_without_a_new_build(breakout, monkeypatch):
-    monkeypatch.setattr(building, "_Builder", None)
+    monkeypatch.setattr(search, "Search", None)
 
     def only_the_second_action(self, state, action, next_state):
         return 2.5 * (action == 1) + (0 if next_state[0] else 1)

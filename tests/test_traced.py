@@ -184,7 +184,7 @@ def test_a_rule_that_is_not_a_function_of_the_state_is_not_traced():
 
 
 def test_a_rule_that_fails_is_blamed_as_ever(tmp_path, monkeypatch):
-    monkeypatch.setattr("pharos.rules.compiled.compiled_rules", lambda *args: None)
+    monkeypatch.setattr("pharos.rules.rules.compiled_or_none", lambda *args: None)
 
     def rule(state, action, out):
         out[state[0] % 4] = bump(state[state[0] % 4])
@@ -232,7 +232,7 @@ def test_tracing_ends_where_it_saves_nothing(monkeypatch):
 
 
 def test_files_do_not_depend_on_tracing(tmp_path, monkeypatch):
-    monkeypatch.setattr("pharos.rules.compiled.compiled_rules", lambda *args: None)
+    monkeypatch.setattr("pharos.rules.rules.compiled_or_none", lambda *args: None)
     env = pharos.make("breakout", height=7, columns=4)
     build(env, tmp_path / "traced", progress=False)
     monkeypatch.setattr(TracedRules, "successors", lambda self, states: None)
@@ -270,15 +270,15 @@ def test_any_rule_of_cases(cases, ends):
 def test_traced_rewards_are_those_of_every_transition(env, tmp_path, monkeypatch):
     space = build(env, tmp_path / "space", progress=False)
     expected = space.mdp().rewards
-    monkeypatch.setattr("pharos.rules.compiled.compiled_rules", lambda *args: None)
-    monkeypatch.setattr("pharos.mdp.rewards_of_space._interpreted_rewards", lambda *args: pytest.fail("not traced"))
+    monkeypatch.setattr("pharos.rules.rules.compiled_or_none", lambda *args: None)
+    monkeypatch.setattr("pharos.rules.interpreted.InterpretedRewards.block", lambda *args: pytest.fail("not traced"))
     np.testing.assert_array_equal(space.mdp().rewards, expected)
 
 
 def test_a_reward_that_cannot_be_traced_is_asked_for_everywhere(tmp_path, monkeypatch):
     env = pharos.make("breakout", height=7, columns=4)
     space = build(env, tmp_path / "space", progress=False)
-    monkeypatch.setattr("pharos.rules.compiled.compiled_rules", lambda *args: None)
+    monkeypatch.setattr("pharos.rules.rules.compiled_or_none", lambda *args: None)
 
     def counted(self, state, action, next_state):
         return float(state.count(0) + next_state[0] + (state == next_state))

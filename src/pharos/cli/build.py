@@ -35,7 +35,7 @@ def build(
 ) -> None:
     """Enumerate every state that can be reached, and its transitions, onto disk. The same command resumes."""
     from pharos import state_space
-    from pharos.state_space.build import cached_folder
+    from pharos.state_space import cached_folder
 
     env = parse_environment(environment, parameters)
     limit = parse_size(memory)
@@ -77,7 +77,7 @@ def build(
 
 def _is_there(folder: Path) -> bool:
     """Whether the finished state space lies there already."""
-    from pharos.state_space.store import read_manifest
+    from pharos.state_space import read_manifest
 
     manifest = read_manifest(folder)
     return manifest is not None and bool(manifest["complete"])

@@ -199,12 +199,5 @@ def _step_and_draw(simulator: Simulator) -> Any:
     observation = simulator.context.observation
     if not simulator.context.is_plain or not isinstance(observation, SimpleImage) or not observation.is_flat:
         return None
-    kernel = simulator.rules.step_and_draw_one
-    if kernel is None:
-        return None
     state, image = simulator.start_states[0], observation.one(simulator.start_states[0])
-    try:
-        kernel(simulator.rules.parameters, simulator.ranges, state, 0, state.copy(), observation.shades, image)
-    except Exception:  # draw() does not compile: the observation says so, when it is asked for
-        return None
-    return kernel
+    return simulator.rules.step_and_draw_one(simulator.ranges, state, 0, state.copy(), observation.shades, image)

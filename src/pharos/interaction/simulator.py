@@ -12,7 +12,7 @@ from pharos.errors import ParameterError, RuleError, StateSpaceTooLarge
 from pharos.kernels.stepping import Setting
 from pharos.mdp import Chance
 from pharos.observations import NO_ACTION, ObservationInContext, observe
-from pharos.rules import stepping_rules
+from pharos.rules import rules_of
 from pharos.state_space import StateSpace, build, load
 
 LARGEST_INDEX = (
@@ -83,7 +83,7 @@ class Simulator:
         self.start_cumulative[-1] = 1.0
         components = self.env.components
         self.ranges = np.stack([components.low, components.high])
-        self.rules = stepping_rules(self.env, self.start_states[0])
+        self.rules = rules_of(self.env).stepping
 
     def setting(self, mode: int, ranges: np.ndarray, scale: np.ndarray, starts: np.ndarray) -> Setting:
         """What the kernels of many environments take; `starts` are states, or their indices in a state space."""

@@ -13,6 +13,7 @@ __all__ = [
     "learning",
     "observation_kernels",
     "occupancy",
+    "packing",
     "partition",
     "paths",
     "stepping",

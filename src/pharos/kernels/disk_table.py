@@ -11,7 +11,7 @@ looked up, by bucket, each bucket in the order of candidates.
 import numpy as np
 from numba import int64, njit, uint64
 
-from pharos.kernels.hash_table import hash_of_row, prefetch, slot_of
+from pharos.kernels.hash_table import COUNT, DEPTH, FIRST, LEVEL_END, hash_of_row, prefetch, slot_of
 
 BUCKETS = 1 << 16
 _AHEAD = 16
@@ -95,11 +95,13 @@ def look_up(entries, keys, order, low, high, found, slots):
 
 
 @njit(cache=True, nogil=True)
-def number(keys, found, successors, states, first, count, appended, level_end, depth, progress):
-    """Number what is new in the order of candidates, into states[count - appended :]; row i of successors (rows, A) is state first + i.
+def number(keys, found, successors, states, appended, progress):
+    """Number what is new in the order of candidates, into states[count - appended :]; row i of successors (rows, A) is state
+    progress[FIRST] + i.
 
-    progress gets (first + rows, count, level_end, depth).
+    `progress` goes on by these rows.
     """
+    first, count, level_end, depth = progress[FIRST], progress[COUNT], progress[LEVEL_END], progress[DEPTH]
     rows, num_actions = successors.shape
     for i in range(rows):
         for a in range(num_actions):
@@ -115,7 +117,7 @@ def number(keys, found, successors, states, first, count, appended, level_end, d
         if first + i + 1 == level_end:
             level_end = count
             depth += 1
-    progress[0], progress[1], progress[2], progress[3] = first + rows, count, level_end, depth
+    progress[FIRST], progress[COUNT], progress[LEVEL_END], progress[DEPTH] = first + rows, count, level_end, depth
 
 
 @njit(cache=True, nogil=True)

@@ -14,6 +14,10 @@ from numba.core import cgutils
 intrinsic: Any = numba.extending.intrinsic  # whose types would hide those of the functions that it makes
 _BATCH = 32
 
+# Fields of `progress`, (5,) int64: where a search stands.
+# States expanded; states numbered; states up to the end of the current level; levels finished; 0 or 1 + a component at fault.
+FIRST, COUNT, LEVEL_END, DEPTH, FAULT = range(5)
+
 
 @intrinsic
 def prefetch(typing_context, array, index):
@@ -177,12 +181,13 @@ def slots_of(keys, capacity, out):
 
 
 @njit(cache=True, nogil=True)
-def insert_missing(table, states, keys, found, successors, first, count, level_end, depth, progress):
+def insert_missing(table, states, keys, found, successors, progress):
     """Number the successors that threads did not find, in order; the serial half of a wide frontier.
 
-    found (rows * A,): index, or -1 - slot from which to search on. Row i belongs to state first + i; successors (rows, A).
-    progress gets (first + rows, count, level_end, depth).
+    found (rows * A,): index, or -1 - slot from which to search on. Row i belongs to state progress[FIRST] + i; successors (rows, A).
+    `progress` goes on by these rows.
     """
+    first, count, level_end, depth = progress[FIRST], progress[COUNT], progress[LEVEL_END], progress[DEPTH]
     capacity = table.shape[0]
     words = states.shape[1]
     rows, num_actions = successors.shape
@@ -216,4 +221,4 @@ def insert_missing(table, states, keys, found, successors, first, count, level_e
         if first + i + 1 == level_end:
             level_end = count
             depth += 1
-    progress[0], progress[1], progress[2], progress[3] = first + rows, count, level_end, depth
+    progress[FIRST], progress[COUNT], progress[LEVEL_END], progress[DEPTH] = first + rows, count, level_end, depth

@@ -3,6 +3,7 @@
 from pharos.mdp.chance import Chance, random_actions, sticky_actions
 from pharos.mdp.dynamics import BellmanEquation, Dynamics, Matrices, Outcomes, Play, Table
 from pharos.mdp.rewards import Rewards
+from pharos.mdp.rewards_of_space import rewards_of_space
 from pharos.mdp.selection import BEST, WORST, Extreme, PolicyTable, Selection
 from pharos.mdp.tabular import TabularMDP
 
@@ -22,5 +23,6 @@ __all__ = [
     "Table",
     "TabularMDP",
     "random_actions",
+    "rewards_of_space",
     "sticky_actions",
 ]

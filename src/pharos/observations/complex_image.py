@@ -149,7 +149,7 @@ def _sprite_image(name: str, layer: Layer, value: int, scenery: Scenery) -> np.n
 
 
 def _compose(planes, picture, top, left, sprite, place, color, keep, out) -> None:
-    """The twin of the kernel for one state: what `interaction_template.draw_complex` does after drawing."""
+    """The twin of the kernel for one state: what `interaction.draw_complex` does after drawing."""
     out[:] = picture
     for layer, plane in enumerate(planes):
         for row, column in np.argwhere(plane):

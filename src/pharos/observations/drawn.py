@@ -18,7 +18,7 @@ def num_values(layer: Layer) -> int:
 
 
 class Drawing:
-    """Runs a drawing kernel of `interaction_template.py` on batches of states; a twin in Python where Numba cannot compile it.
+    """Runs a drawing kernel of rules/interaction.py on batches of states; a twin in Python where Numba cannot compile it.
 
     Attributes:
         env: the environment; rows, columns: of its grid. `block` frames are worth a thread's while.
@@ -60,17 +60,15 @@ class Drawing:
     def _planes(self) -> np.ndarray:
         return np.empty(self._shape, np.uint8)  # zeroed by the kernel
 
-    def _function(self, states: np.ndarray, out: np.ndarray, tables: tuple[Any, ...]) -> Callable[..., None]:
-        from pharos.rules.compiled import InteractionRules, _first_lines, _warn_once
+    def __getstate__(self) -> dict[str, Any]:
+        """Without the compiled kernel, which the next call makes ready."""
+        return {**self.__dict__, "_compiled": None}
 
-        try:
-            rules = InteractionRules(self.env)
-            kernel = getattr(rules.kernels, self._kernel)
-            kernel(rules.parameters, states, 0, 0, self._planes(), *tables, out)
-        except Exception as error:  # Numba raises its own errors, and others from inside of it
-            _warn_once(type(self.env), "draw", _first_lines(str(error)) or type(error).__name__)
-            return self._interpret
-        return lambda *arguments: kernel(rules.parameters, *arguments)
+    def _function(self, states: np.ndarray, out: np.ndarray, tables: tuple[Any, ...]) -> Callable[..., None]:
+        from pharos.rules import rules_of
+
+        nothing = (states, 0, 0, self._planes(), *tables, out)
+        return rules_of(self.env).drawing(self._kernel, self._interpret, *nothing)
 
     def _interpret(self, states, first, last, planes, *tables_and_out) -> None:
         for n in range(first, last):

@@ -78,7 +78,7 @@ def _shades(env: Environment, covering: bool) -> np.ndarray:
 
 
 def _paint(planes: np.ndarray, shades: np.ndarray, covering: bool, out: np.ndarray) -> None:
-    """The twin of the kernel for one state: what `interaction_template.draw_simple` does after drawing."""
+    """The twin of the kernel for one state: what `interaction.draw_simple` does after drawing."""
     size = out.shape[1] // planes.shape[1]
     for layer, plane in enumerate(planes):
         shade = shades[layer, plane].repeat(size, axis=0).repeat(size, axis=1)

@@ -1,5 +1,53 @@
-"""The rules of an environment at three speeds: compiled, traced and interpreted."""
+"""The rules of an environment at three speeds: compiled, traced and interpreted. `rules_of(env)` gives the fastest.
 
-from pharos.rules.stepping import CompiledStepping, InterpretedStepping, stepping_rules
+Only what loads no Numba is imported at once; the rest is when it is asked for.
+"""
 
-__all__ = ["CompiledStepping", "InterpretedStepping", "stepping_rules"]
+from typing import TYPE_CHECKING, Any
+
+from pharos.rules.fingerprint import fingerprint_of_rules
+from pharos.rules.layout import Layout, layout_of, pack, unpack
+
+if TYPE_CHECKING:
+    from pharos.rules.compiled import CompiledDrawing, CompiledExploration
+    from pharos.rules.compiler import reason_of
+    from pharos.rules.interpreted import refused_reward
+    from pharos.rules.rules import Rules, not_compiled, rules_of
+    from pharos.rules.stepping import InterpretedStepping
+
+_LAZY = {
+    "CompiledDrawing": "compiled",
+    "CompiledExploration": "compiled",
+    "InterpretedStepping": "stepping",
+    "Rules": "rules",
+    "not_compiled": "rules",
+    "reason_of": "compiler",
+    "refused_reward": "interpreted",
+    "rules_of": "rules",
+}
+
+__all__ = [
+    "CompiledDrawing",
+    "CompiledExploration",
+    "InterpretedStepping",
+    "Layout",
+    "Rules",
+    "fingerprint_of_rules",
+    "layout_of",
+    "not_compiled",
+    "pack",
+    "reason_of",
+    "refused_reward",
+    "rules_of",
+    "unpack",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _LAZY:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from importlib import import_module
+
+    value = getattr(import_module(f"pharos.rules.{_LAZY[name]}"), name)
+    globals()[name] = value
+    return value

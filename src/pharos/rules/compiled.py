@@ -1,278 +1,160 @@
-"""Rules in Python -> kernels compiled by Numba, once per class of environments, cached on disk across processes.
+"""The compiled engine: rules run by Numba, inside of the kernels that search, step and draw.
 
-Numba's own file cache knows a function by its file and does not see changes in what the function calls. So kernels that call a
-user's rules (`exploration.py`, `interaction.py`) are cached under a fingerprint of the rules (`fingerprint.py`) and of the code
-around them: edited rules get another file, unchanged ones are found compiled. The parameters of an instance are arguments, not
-constants: all instances of a class share one compilation.
+Each class makes its kernels ready when it is made, by calling them with no work to do, and raises Numba's error where it cannot.
 """
 
-import hashlib
-import types as python_types
-import warnings
-from collections import namedtuple
-from collections.abc import Callable, Iterable
-from functools import cache
-from pathlib import Path
 from typing import Any
 
-import numba
 import numpy as np
-from numba.extending import overload
 
 from pharos.environments import Environment
-from pharos.rules.exploration import Exploration, exploration
-from pharos.rules.fingerprint import closure_of, function_text, mentioned_names, names_in, plain_function
-from pharos.rules.interaction import Interaction, interaction
-from pharos.rules.kernel_cache import cache_of_kernel
+from pharos.errors import RuleError
+from pharos.kernels.hash_table import COUNT, FAULT, FIRST
+from pharos.rules.compiler import exploration_kernels, interaction_kernels, numeric_attributes, type_text
+from pharos.rules.interpreted import InterpretedRewards, blame
+from pharos.rules.layout import Layout
 
-RULES = ("transition", "is_terminal", "reward", "draw")
-_HERE = Path(__file__).parent
-_KERNELS = _HERE.parent / "kernels"
-_MACHINERY = (
-    *(_HERE / name for name in ("compiled.py", "exploration.py", "interaction.py", "packed_view.py")),
-    *(_KERNELS / name for name in ("hash_table.py", "stepping.py")),
-)
+_SUSPECTS = 16  # states of which a kernel cannot say in which one a rule failed
 
 
-class CompiledRules:
-    """The rules of one environment instance, ready to be called from compiled code, on packed states.
+class _Compiled:
+    """The parameters and the kernels of one environment."""
 
-    Attributes:
-        parameters: tuple of the numeric attributes of the instance that its rules mention, the first argument of every kernel.
-        kernels: of `exploration.py`, compiled for these rules and for states of `num_words` words.
-    """
-
-    def __init__(self, env: Environment, num_words: int):
+    def __init__(self, env: Environment, layout: Layout):
         names, self.parameters = numeric_attributes(env)
-        self.num_words, self.num_actions = num_words, env.num_actions
-        self.kernels = exploration_kernels(type(env), names, num_words, env.num_actions)
+        self.env, self.layout = env, layout
+        self.kernels = exploration_kernels(type(env), names, layout.num_words, env.num_actions)
 
 
-def compiled_rules(
-    env: Environment, num_words: int, kernels: Iterable[str] = ("explore", "rewards_of")
-) -> CompiledRules | None:
-    """The compiled rules of `env`; None, after one warning for each class, where Numba cannot compile one of `kernels`.
+class CompiledExploration(_Compiled):
+    """See `rules.Exploration`. Threads may share the work: the kernels release Python's lock."""
+
+    is_compiled = True
+
+    def __init__(self, env: Environment, layout: Layout):
+        super().__init__(env, layout)
+        states = np.empty((1, layout.num_words), np.uint64)
+        rows = (np.empty((1, env.num_actions), np.int32), np.empty(1, np.uint8))
+        self.explore(states, *rows, np.full(1 << 16, -1, np.int32), 0, 0, 0, np.zeros(5, np.int64))
+
+    def threads(self, workers: int) -> int:
+        return workers
+
+    def explore(self, states, successors, terminal, table, base, last, room, progress) -> None:
+        failure: Exception | None = None
+        try:
+            self.kernels.explore(
+                self.parameters, self.layout.tables, states, successors, terminal, table, base, last, room, progress
+            )
+        except Exception as error:  # of the rules, such as a division by zero
+            failure = error
+        if failure or progress[FAULT]:
+            first, count = int(progress[FIRST]), int(progress[COUNT])
+            blame(self.env, self.layout, states[first : min(first + _SUSPECTS, count)], failure)
+
+    def expand_and_find(self, states, start, stop, base, keys, found, terminal, table) -> None:
+        progress = np.zeros(5, np.int64)
+        failure: Exception | None = None
+        try:
+            self._expand(states, start, stop, base, keys, found, terminal, table, progress)
+        except Exception as error:
+            failure = error
+        if failure or progress[FAULT]:
+            first = int(progress[FIRST])
+            blame(self.env, self.layout, states[first : min(first + _SUSPECTS, stop)], failure)
+
+    def _expand(self, *arrays: Any) -> None:
+        self.kernels.expand_and_find(self.parameters, self.layout.tables, *arrays)
+
+    def component_at_fault(self, states, i: int, keys, terminal) -> int | None:
+        """Expand state i alone, its successors to its rows of keys; the component that it leaves, or None.
+
+        The number of components stands for one that does not exist.
+        """
+        progress, found = np.zeros(5, np.int64), np.empty(len(keys), np.int64)
+        self._expand(states, i, i + 1, 0, keys, found, terminal, np.full(64, -1, np.int32), progress)
+        return int(progress[FAULT]) - 1 if progress[FAULT] else None
+
+    def close(self) -> None:
+        """Nothing to end."""
+
+
+class CompiledRewards(_Compiled):
+    """See `rules.Rewards`."""
+
+    def __init__(self, env: Environment, layout: Layout):
+        super().__init__(env, layout)
+        states = np.empty((1, layout.num_words), np.uint64)
+        successors, terminal = np.empty((1, env.num_actions), np.int32), np.empty(1, np.bool_)
+        for array in (states, successors, terminal):
+            array.flags.writeable = False  # as they come out of a StateSpace
+        self._rewards_of(states, successors, terminal, 0, 0)
+
+    def threads(self, workers: int) -> int:
+        return workers
+
+    def block(self, states, successors, terminal, start: int, stop: int) -> np.ndarray:
+        try:
+            return self._rewards_of(states, successors, terminal, start, stop)
+        except Exception as error:  # of the rule, such as a division by zero: name the state
+            out = InterpretedRewards(self.env, self.layout).block(states, successors, terminal, start, stop)
+            if np.isfinite(out).all():
+                raise RuleError(f"{self.env}: compiled, reward raises {error!r}; interpreted it does not") from error
+            return out
+
+    def _rewards_of(self, states, successors, terminal, start: int, stop: int) -> np.ndarray:
+        out = np.empty((stop - start, self.env.num_actions))
+        self.kernels.rewards_of(self.parameters, self.layout.tables, states, successors, terminal, start, stop, out)
+        return out
+
+
+class CompiledStepping:
+    """See `rules.Stepping`: the kernels of interaction.py for one environment."""
+
+    is_compiled = True
+
+    def __init__(self, env: Environment, layout: Layout | None = None):
+        names, self.parameters = numeric_attributes(env)
+        self.env = env
+        kernels = interaction_kernels(type(env), names, env.num_actions)
+        self.step_one, self.step_many = kernels.step_one, kernels.step_many
+        self.is_terminal_one = kernels.is_terminal_one
+        self._step_and_draw_one = kernels.step_and_draw_one
+        state = np.array(env.initial_states()[0][0], np.int64)
+        ranges = np.stack([env.components.low, env.components.high])
+        self.step_one(self.parameters, ranges, np.zeros(0), state, 0, state.copy(), np.empty(0, np.float32))
+
+    def __reduce__(self):
+        return CompiledStepping, (self.env,)
+
+    def step_and_draw_one(self, *arguments: Any) -> Any:
+        """The kernel that steps and draws, made ready for these arguments; None where `draw` does not compile."""
+        try:
+            self._step_and_draw_one(self.parameters, *arguments)
+        except Exception:  # Numba raises its own errors, and others from inside of it
+            return None
+        return self._step_and_draw_one
+
+
+class CompiledDrawing:
+    """See `rules.Drawing`.
 
     Args:
-        kernels: "explore" needs the rules transition and is_terminal, "rewards_of" the rule reward.
-    """
-    compiled = CompiledRules(env, num_words)
-    for kernel in kernels:
-        error = _compilation_error(compiled, kernel)
-        if error:
-            _warn_once(type(env), kernel, error)
-            return None
-    return compiled
-
-
-class InteractionRules:
-    """The rules of one environment instance, compiled for states that are rows of int64: stepping and drawing.
-
-    Attributes:
-        parameters: as in CompiledRules.
-        kernels: of `interaction.py`.
+        kernel: its name in interaction.py. arguments: those of the first call, for no states.
     """
 
-    def __init__(self, env: Environment):
+    is_compiled = True
+
+    def __init__(self, env: Environment, kernel: str, *arguments: Any):
         names, self.parameters = numeric_attributes(env)
-        self.kernels = interaction_kernels(type(env), names, env.num_actions)
+        self._kernel = getattr(interaction_kernels(type(env), names, env.num_actions), kernel)
+        self(*arguments)
+
+    def __call__(self, *arguments: Any) -> None:
+        self._kernel(self.parameters, *arguments)
 
 
-def numeric_attributes(env: Environment) -> tuple[tuple[str, ...], tuple[Any, ...]]:
-    """What compiled rules see as `self`: names and values of the numbers, tuples of numbers and arrays that they mention."""
-    known = set(dir(type(env))) | set(vars(env))
-    names = sorted(known & mentioned_names(getattr(type(env), rule) for rule in RULES))
-    found = {name: getattr(env, name) for name in names if not name.startswith("__")}
-    numeric = {name: _plain(value) for name, value in found.items() if _is_numeric(value)}
-    return tuple(numeric), tuple(numeric.values())
-
-
-def _is_numeric(value: Any) -> bool:
-    if isinstance(value, np.ndarray):
-        return value.dtype.kind in "biuf"
-    if isinstance(value, tuple):
-        return bool(value) and all(_is_numeric(item) for item in value)
-    return isinstance(value, bool | int | float | np.number)
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, np.ndarray):
-        return np.ascontiguousarray(value)
-    if isinstance(value, np.number):
-        return value.item()
-    return value
-
-
-@cache
-def exploration_kernels(
-    cls: type[Environment], names: tuple[str, ...], num_words: int, num_actions: int
-) -> Exploration:
-    """The kernels of `exploration.py` for the rules of a class that mention the attributes `names`."""
-    compiler, rules, parameters = _compiler_of(cls, names, num_words, num_actions)
-    return exploration(compiler, rules, parameters, num_words, num_actions)
-
-
-@cache
-def interaction_kernels(cls: type[Environment], names: tuple[str, ...], num_actions: int) -> Interaction:
-    """The kernels of `interaction.py`."""
-    compiler, rules, parameters = _compiler_of(cls, names, 0, num_actions)
-    return interaction(compiler, rules, parameters, num_actions)
-
-
-def _compiler_of(cls: type[Environment], names: tuple[str, ...], *numbers: int) -> tuple["Compiler", dict, type]:
-    """What a maker needs: the compiler, the compiled rules by their names, and the class of `self`."""
-    rule_compiler = _RuleCompiler()
-    rules = {rule: rule_compiler.compiled(getattr(cls, rule)) for rule in RULES}
-    texts = [function_text(getattr(cls, rule), {}) for rule in RULES]
-    key = (_machinery(), texts, names, numbers, numba.__version__)
-    digest = hashlib.sha256(repr(key).encode()).hexdigest()[:20]
-    return Compiler(f"{cls.__name__.lower()}_{digest}"), rules, namedtuple("Parameters", names)
-
-
-@cache
-def _machinery() -> tuple[str, ...]:
-    return tuple(path.read_text() for path in _MACHINERY)
-
-
-class Compiler:
-    """Compiles the inner functions of the makers, under a name that is theirs for these rules alone.
-
-    The name goes into the symbols of the machine code: code of several classes of environments, compiled in several processes, is
-    loaded into one.
-    """
-
-    def __init__(self, name: str):
-        self.name = name
-
-    def inlined(self, function: Callable) -> Any:
-        """A function that becomes part of its callers."""
-        return numba.njit(forceinline=True)(self._named(function))
-
-    def function(self, function: Callable) -> Any:
-        """A function that kernels call."""
-        return numba.njit(nogil=True)(self._named(function))
-
-    def kernel(self, function: Callable) -> Any:
-        """A function that Python calls; the compiled form is kept on disk."""
-        kernel = numba.njit(nogil=True)(self._named(function))
-        kernel._cache = cache_of_kernel(f"{self.name}.{function.__name__}")
-        return kernel
-
-    def _named(self, function: Any) -> Any:
-        function.__qualname__ = f"{self.name}.{function.__name__}"
-        return function
-
-
-class _RuleCompiler:
-    """Compiles a rule and, recursively, the plain functions that it mentions by a global name."""
-
-    def __init__(self):
-        self._done: dict[Any, Any] = {}
-
-    def compiled(self, function: Any) -> Any:
-        function = plain_function(function)
-        if not isinstance(function, python_types.FunctionType):
-            return function  # Numba will say what it thinks of it
-        if function in self._done:
-            return self._done[function]
-        self._done[function] = function  # a function that calls itself keeps its interpreted self, which Numba refuses
-        reached = {name: function.__globals__.get(name) for name in names_in(function.__code__)}
-        replaced = {**function.__globals__, **self._compiled_among(reached)}
-        cells = {
-            name: python_types.CellType(value) for name, value in self._compiled_among(closure_of(function)).items()
-        }
-        free = zip(function.__code__.co_freevars, function.__closure__ or (), strict=True)
-        closure = tuple(cells.get(name, cell) for name, cell in free)
-        clone = python_types.FunctionType(
-            function.__code__, replaced, function.__name__, function.__defaults__, closure or None
-        )
-        clone.__kwdefaults__ = function.__kwdefaults__
-        clone.__qualname__, clone.__module__ = function.__qualname__, __name__
-        self._done[function] = numba.njit(forceinline=True)(clone)
-        return self._done[function]
-
-    def _compiled_among(self, values: dict[str, Any]) -> dict[str, Any]:
-        functions = {name: plain_function(value) for name, value in values.items()}
-        return {n: self.compiled(f) for n, f in functions.items() if isinstance(f, python_types.FunctionType)}
-
-
-@overload(float)
-def _float_of_truth(value):
-    """`float(x == y)`, the most natural reward of 0 or 1, which Numba does not know."""
-    if isinstance(value, numba.types.Boolean):
-        return lambda value: 1.0 if value else 0.0
-    return None
-
-
-# Rules that do not compile -----------------------------------------------------------------------------------------------
-
-_known: dict[tuple, str] = {}  # (kernels, types of the parameters, kernel) -> why it does not compile; "" where it does
-_warned: set[tuple[type, str]] = set()
-
-
-def _compilation_error(compiled: CompiledRules, kernel: str) -> str:
-    """Compile a kernel, by calling it with no work to do; "" where that works."""
-    key = (compiled.kernels, tuple(map(_type_text, compiled.parameters)), kernel)
-    if key in _known:
-        return _known[key]
-    try:
-        _CALLS[kernel](compiled)
-    except Exception as error:  # Numba raises its own errors, and others from inside of it
-        found = _first_lines(str(error)) or type(error).__name__
-    else:
-        found = ""
-    _known[key] = found
-    return found
-
-
-def _type_text(value: Any) -> str:
-    try:
-        return str(numba.typeof(value))
-    except Exception:  # Numba has no type for it, such as an integer of more than 64 bits
-        return repr(value)
-
-
-def _call_explore(compiled: CompiledRules) -> None:
-    table, layout = np.full(1 << 16, -1, np.int32), _empty_layout()
-    rows = (np.empty((1, compiled.num_actions), np.int32), np.empty(1, np.uint8))
-    states = np.empty((1, compiled.num_words), np.uint64)
-    compiled.kernels.explore(compiled.parameters, layout, states, *rows, table, 0, 0, 0, np.zeros(5, np.int64))
-
-
-def _call_rewards_of(compiled: CompiledRules) -> None:
-    states = np.empty((1, compiled.num_words), np.uint64)
-    successors = np.empty((1, compiled.num_actions), np.int32)
-    terminal = np.empty(1, np.bool_)
-    for array in (states, successors, terminal):
-        array.flags.writeable = False  # as they come out of a StateSpace
-    out = np.empty((0, compiled.num_actions))
-    compiled.kernels.rewards_of(compiled.parameters, _empty_layout(), states, successors, terminal, 0, 0, out)
-
-
-_CALLS = {"explore": _call_explore, "rewards_of": _call_rewards_of}
-
-
-def _empty_layout() -> tuple[np.ndarray, ...]:
-    return (np.zeros((1, 4), np.int64),)
-
-
-def _warn_once(cls: type, kernel: str, error: str) -> None:
-    if (cls, kernel) in _warned:
-        return
-    _warned.add((cls, kernel))
-    warnings.warn(
-        f"{cls.__name__}: Numba cannot compile its rules, so they run interpreted, up to 100 times slower: {error}",
-        RuntimeWarning,
-        stacklevel=5,
-    )
-
-
-def _first_lines(message: str) -> str:
-    """What went wrong and in which line, out of Numba's long message."""
-    lines = [line.strip() for line in message.splitlines() if line.strip()]
-    start = next((i for i, line in enumerate(lines) if not line.startswith(("Failed in", "During:"))), 0)
-    what = lines[start] if lines else ""
-    if what.endswith("for signature:"):  # the useful words stand below
-        what += "".join(f" {line.removeprefix('>>>').strip()}" for line in lines[start + 1 : start + 2])
-    where = [line for line in lines if line.startswith("File ") and str(_HERE) not in line]
-    return what + (f" ({where[-1].rstrip(':')})" if where else "")
+def signature_of(env: Environment) -> tuple:
+    """Instances with equal signatures share one compilation, and the reason why there is none."""
+    _, parameters = numeric_attributes(env)
+    return (type(env), env.num_actions, tuple(map(type_text, parameters)))

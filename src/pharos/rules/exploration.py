@@ -1,6 +1,6 @@
 """Makers of the kernels that enumerate states: they call the rules of one class, on packed states.
 
-Each maker is an ordinary function that returns compiled ones (see `compiled.Compiler`). What the inner functions take from it
+Each maker is an ordinary function that returns compiled ones (see `compiler.Compiler`). What the inner functions take from it
 are constants for Numba: the rules; `Parameters`, what the rules see as `self`; W words a state; A actions.
 `layout` is a tuple of one table (D, 4): where component i of a state sits (layout.py).
 """
@@ -10,14 +10,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import int64
 
-from pharos.kernels.hash_table import mixed, prefetch, seen, slot_of
+from pharos.kernels.hash_table import COUNT, DEPTH, FAULT, FIRST, LEVEL_END, mixed, prefetch, seen, slot_of
 from pharos.rules.packed_view import fault, get_word, packed_view, read_only_view, set_word
 
 BATCH = 16  # states expanded before their successors are looked up: enough look-ups to hide the memory's latency
-FIRST, COUNT, LEVEL_END, DEPTH, FAULT = range(5)  # fields of `progress`
 
 
-class Exploration(NamedTuple):
+class ExplorationKernels(NamedTuple):
     """The compiled kernels; see the makers below."""
 
     explore: Any
@@ -33,12 +32,12 @@ class Words(NamedTuple):
     same: Any
 
 
-def exploration(compiler: Any, rules: Any, Parameters: Any, W: int, A: int) -> Exploration:
+def exploration(compiler: Any, rules: Any, Parameters: Any, W: int, A: int) -> ExplorationKernels:
     """The kernels of a class of environments whose states take W words and which has A actions."""
     words = words_functions(compiler, W)
     expand = expand_function(compiler, rules, Parameters, words, W, A)
     prefetch_states = prefetch_function(compiler, A)
-    return Exploration(
+    return ExplorationKernels(
         explore=explore_kernel(compiler, expand, prefetch_states, words, W, A),
         expand_and_find=expand_and_find_kernel(compiler, expand, prefetch_states, words, A),
         rewards_of=rewards_of_kernel(compiler, rules, Parameters, words, W, A),

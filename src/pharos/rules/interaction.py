@@ -12,7 +12,7 @@ from numba import int64
 from pharos.kernels.stepping import SAME_STEP, drawn_start, executed_action
 
 
-class Interaction(NamedTuple):
+class InteractionKernels(NamedTuple):
     """The compiled kernels; see the makers below."""
 
     step_one: Any
@@ -24,11 +24,11 @@ class Interaction(NamedTuple):
     draw_planes: Any
 
 
-def interaction(compiler: Any, rules: Any, Parameters: Any, A: int) -> Interaction:
+def interaction(compiler: Any, rules: Any, Parameters: Any, A: int) -> InteractionKernels:
     """The kernels of a class of environments with A actions."""
     advance = advance_function(compiler, rules)
     draw_flat = draw_flat_function(compiler, rules)
-    return Interaction(
+    return InteractionKernels(
         step_one=step_one_kernel(compiler, Parameters, advance),
         step_and_draw_one=step_and_draw_one_kernel(compiler, Parameters, advance, draw_flat),
         step_many=step_many_kernel(compiler, Parameters, advance, A),

@@ -1,4 +1,4 @@
-"""Rules called in Python: where Numba cannot compile them, and to name the state in which compiled ones failed."""
+"""The interpreted engine: rules called in Python, where Numba cannot compile them, and to name the state in which they failed."""
 
 import multiprocessing
 import numbers
@@ -6,17 +6,110 @@ import os
 import signal
 import sys
 import warnings
-from functools import cached_property
 from multiprocessing.connection import Connection
+from typing import NoReturn
 
 import numpy as np
 
 from pharos.environments import Environment
 from pharos.errors import RuleError
-from pharos.rules.traced import WORTH_TRACING, TracedRules
+from pharos.kernels.hash_table import COUNT, FIRST, find, insert_missing, slots_of
+from pharos.kernels.packing import pack_rows, unpack_rows
+from pharos.rules.layout import Layout, unpack
 
+BLOCK = 4096  # states whose successors are Python objects at a time
 _MOST_FILES = 1 << 16
 _SHARE = 64  # states that are worth sending to another process
+
+
+class InterpretedExploration:
+    """See `rules.Exploration`. One thread asks; the rules themselves run in as many processes as there are workers."""
+
+    is_compiled = False
+
+    def __init__(self, env: Environment, layout: Layout, workers: int = 1):
+        self.env, self.layout = env, layout
+        self._interpreters = Interpreters(env, workers)
+
+    def threads(self, workers: int) -> int:
+        return 1
+
+    def explore(self, states, successors, terminal, table, base, last, room, progress) -> None:
+        first, count, num_actions = int(progress[FIRST]), int(progress[COUNT]), self.env.num_actions
+        stop = min(last, count, first + min(BLOCK, (room - count) // num_actions))
+        keys = np.empty(((stop - first) * num_actions, self.layout.num_words), np.uint64)
+        found = np.empty(len(keys), np.int64)
+        self.expand_and_find(states, first, stop, first, keys, found, terminal[first - base : stop - base], table)
+        insert_missing(table, states, keys, found, successors[first - base : stop - base], progress)
+
+    def expand_and_find(self, states, start, stop, base, keys, found, terminal, table) -> None:
+        for first in range(start, stop, BLOCK):
+            last = min(first + BLOCK, stop)
+            rows = slice(first - base, last - base)
+            part = slice(rows.start * self.env.num_actions, rows.stop * self.env.num_actions)
+            self._expand(states[first:last], keys[part], terminal[rows])
+            find(table, states, keys[part], found[part])
+        size = (stop - base) * self.env.num_actions
+        missing = np.flatnonzero(found[:size] < 0)
+        slots = np.empty(len(missing), np.int64)
+        slots_of(keys[missing], len(table), slots)
+        found[missing] = -1 - slots
+
+    def _expand(self, states: np.ndarray, keys: np.ndarray, terminal: np.ndarray) -> None:
+        """Successors of packed states to keys, packed; terminal states lead to themselves."""
+        layout = self.layout
+        unpacked = np.empty((len(states), len(layout.word)), np.int64)
+        unpack_rows(layout.word, layout.shift, layout.mask, layout.low, states, unpacked)
+        following, terminal[:] = self._successors(unpacked)
+        keys[:] = 0
+        pack_rows(layout.word, layout.shift, layout.low, following, keys)
+
+    def _successors(self, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return self._interpreters.successors(states)
+
+    def close(self) -> None:
+        """End the processes."""
+        self._interpreters.close()
+
+
+class InterpretedRewards:
+    """See `rules.Rewards`."""
+
+    def __init__(self, env: Environment, layout: Layout):
+        self.env, self.layout = env, layout
+
+    def threads(self, workers: int) -> int:
+        return 1
+
+    def block(self, states, successors, terminal, start: int, stop: int) -> np.ndarray:
+        out = np.zeros((stop - start, self.env.num_actions))
+        rows = list(map(tuple, unpack(self.layout, states[start:stop]).tolist()))
+        going = np.flatnonzero(~np.asarray(terminal[start:stop])).tolist()
+        with np.errstate(all="ignore"):  # what is not finite is reported
+            for a in range(self.env.num_actions):
+                following = list(map(tuple, unpack(self.layout, states[successors[start:stop, a]]).tolist()))
+                for i in going:
+                    try:
+                        out[i, a] = self.env.reward(rows[i], a, following[i])
+                    except Exception as error:
+                        raise refused_reward(self.env, rows[i], a, f"raises {error!r}") from error
+        return out
+
+
+def refused_reward(env: Environment, state: tuple[int, ...], action: int, why: str) -> RuleError:
+    """The error for a reward that is none."""
+    return RuleError(f"{env}: reward of action {env.actions[action]!r} in state {state} {why}")
+
+
+def blame(env: Environment, layout: Layout, suspects: np.ndarray, failure: BaseException | None) -> NoReturn:
+    """Compiled rules failed or left the declared ranges in one of some packed states: name the first where they do interpreted."""
+    rows = unpack(layout, suspects).tolist()
+    interpreted_successors(env, rows)
+    raise RuleError(
+        f"{env}: compiled rules {f'raise {failure!r}' if failure else 'read or write outside of the declared ranges'} "
+        f"in one of the states from {tuple(rows[0])} to {tuple(rows[-1])}, interpreted they do not; "
+        f"run pharos.check_environment to find out why"
+    ) from failure
 
 
 def interpreted_successors(env: Environment, rows: list[list[int]]) -> tuple[np.ndarray, np.ndarray]:
@@ -136,16 +229,8 @@ class Interpreters:
             theirs.close()
             self._connections.append(ours)
 
-    @cached_property
-    def _traced(self) -> TracedRules:
-        """Made where it is needed: compiled rules never are interpreted."""
-        return TracedRules(self.env)
-
     def successors(self, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """As `interpreted_successors` of states (N, D) int64; where they are many, traced, or shared between the processes."""
-        traced = self._traced.successors(states) if len(states) >= WORTH_TRACING else None
-        if traced is not None:
-            return traced
+        """As `interpreted_successors` of states (N, D) int64, shared between the processes where they are many."""
         shares = min(len(self._connections) + 1, len(states) // _SHARE)
         if shares < 2:
             return interpreted_successors(self.env, states.tolist())

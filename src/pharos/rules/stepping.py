@@ -1,44 +1,27 @@
-"""The rules of one environment for interaction: states are rows of int64; compiled, or run by Python where Numba cannot.
-
-Both classes offer the same functions, those of `interaction_template.py`, where their arguments are described.
-"""
+"""The interpreted engine of interaction: the functions of interaction.py, where their arguments are described, in plain Python."""
 
 from typing import Any
 
 import numpy as np
 
 from pharos.environments import Environment
+from pharos.kernels.stepping import SAME_STEP
 
 NO_ACTION = -1  # the previous action on the first step of an episode
-SAME_STEP = 1  # kernels.stepping.SAME_STEP, without loading Numba
-
-
-class CompiledStepping:
-    """The kernels of `interaction_template.py` for one environment.
-
-    Attributes:
-        parameters: the first argument of every kernel.
-    """
-
-    def __init__(self, env: Environment):
-        from pharos.rules.compiled import InteractionRules
-
-        rules = InteractionRules(env)
-        self.parameters: Any = rules.parameters
-        self.step_one = rules.kernels.step_one
-        self.step_and_draw_one = rules.kernels.step_and_draw_one
-        self.step_many = rules.kernels.step_many
-        self.is_terminal_one = rules.kernels.is_terminal_one
 
 
 class InterpretedStepping:
-    """The same functions in plain Python, 30 to 100 times slower: for rules that Numba cannot compile, and as a witness."""
+    """See `rules.Stepping`: 30 to 100 times slower than the compiled one, and its witness in tests."""
 
+    is_compiled = False
     parameters: Any = None
-    step_and_draw_one: Any = None
 
     def __init__(self, env: Environment):
         self.env = env
+
+    def step_and_draw_one(self, *arguments: Any) -> Any:
+        """None: steps and drawings are two calls."""
+        return None
 
     def step_one(self, parameters, ranges, scale, state, action, following, vector) -> tuple[float, int]:
         before = tuple(state.tolist())
@@ -98,25 +81,6 @@ class InterpretedStepping:
         if u < stay + stick:
             return previous
         return min(int((u - stay - stick) / uniform * self.env.num_actions), self.env.num_actions - 1)
-
-
-def stepping_rules(env: Environment, state: np.ndarray) -> CompiledStepping | InterpretedStepping:
-    """The compiled rules of `env`; interpreted ones, after one warning for each class, where Numba cannot compile them.
-
-    Args:
-        state: (D,) int64, any state: the rules are compiled by one step from it.
-    """
-    from pharos.rules.compiled import _first_lines, _warn_once
-
-    try:
-        rules = CompiledStepping(env)
-        ranges = np.stack([env.components.low, env.components.high])
-        following, vector = np.empty_like(state), np.empty(0, np.float32)
-        rules.step_one(rules.parameters, ranges, np.zeros(0), state, 0, following, vector)
-        return rules
-    except Exception as error:  # Numba raises its own errors, and others from inside of it
-        _warn_once(type(env), "step_one", _first_lines(str(error)) or type(error).__name__)
-        return InterpretedStepping(env)
 
 
 def _uniform_number(rng: np.ndarray, i: int) -> float:

@@ -1,4 +1,4 @@
-"""Rules in Python, called once for each way through them.
+"""The traced engine: rules in Python, called once for each way through them.
 
 A rule is a pure function of the state, and most rules look at a few components of it. So a call is traced: what it read, in which order
 and with which values, and what it wrote. The traces of a rule are a tree (decisions.py), and a state that comes to a leaf of it need
@@ -16,6 +16,9 @@ from typing import Any
 import numpy as np
 
 from pharos.environments import Environment
+from pharos.rules import decisions
+from pharos.rules.interpreted import InterpretedExploration, InterpretedRewards
+from pharos.rules.layout import Layout, unpack
 
 WORTH_TRACING = 64  # states at a time
 MOST_VALUES = 1 << 16  # of a component that a tree branches on
@@ -23,6 +26,35 @@ MOST_CHILDREN = 1 << 26
 ASKED = 64  # calls before the rest is tried again
 FAIR_TRIAL = 20_000  # calls before tracing may be found useless
 WORTH = 3  # transitions for each call
+
+
+class TracedExploration(InterpretedExploration):
+    """See `rules.Exploration`: trees answer where they can, the interpreted rules elsewhere."""
+
+    def __init__(self, env: Environment, layout: Layout, workers: int = 1):
+        super().__init__(env, layout, workers)
+        self._traced = TracedRules(env)
+
+    def _successors(self, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        answer = self._traced.successors(states) if len(states) >= WORTH_TRACING else None
+        return super()._successors(states) if answer is None else answer
+
+
+class TracedRewards(InterpretedRewards):
+    """See `rules.Rewards`: trees answer where they can, the interpreted rule elsewhere."""
+
+    def __init__(self, env: Environment, layout: Layout):
+        super().__init__(env, layout)
+        self._traced = TracedReward(env)
+
+    def block(self, states, successors, terminal, start: int, stop: int) -> np.ndarray:
+        answer = None
+        if self._traced.is_on and stop - start >= WORTH_TRACING:
+            led = np.asarray(successors[start:stop])
+            following = unpack(self.layout, states[led.ravel()]).reshape(*led.shape, -1)
+            going = np.flatnonzero(~np.asarray(terminal[start:stop]))
+            answer = self._traced.rewards(unpack(self.layout, states[start:stop]), following, going)
+        return super().block(states, successors, terminal, start, stop) if answer is None else answer
 
 
 class _Untraceable(Exception):
@@ -38,8 +70,6 @@ class _Traced:
     """
 
     def __init__(self, env: Environment, roots: int, copies: int = 1):
-        from pharos.rules import decisions
-
         self._kernels: Any = decisions
         components = env.components
         self.env, self.num_actions = env, env.num_actions
@@ -166,16 +196,12 @@ class _Trees:
 
     def knows(self, low: np.ndarray, root: int, state: np.ndarray) -> bool:
         """Whether a state comes to a leaf."""
-        from pharos.rules.decisions import leaf_of
-
-        return leaf_of(self._component, self._first_child, self._children, low, root, state) >= 0
+        return decisions.leaf_of(self._component, self._first_child, self._children, low, root, state) >= 0
 
     def add(self, node: int, read: list[tuple[int, int, int]], written: dict[int, int], says: float) -> None:
         """A leaf below `node`, on the way of what was read: (component, which of its values, how many it has)."""
-        from pharos.rules.decisions import LEAF, UNKNOWN
-
         for component, value, size in read:
-            if self._component[node] == UNKNOWN:
+            if self._component[node] == decisions.UNKNOWN:
                 self._component[node], self._first_child[node] = component, self._num_children
                 self._num_children += size
                 if size > MOST_VALUES or self._num_children > MOST_CHILDREN:
@@ -190,11 +216,11 @@ class _Trees:
                 self._component = _grown(self._component, self._nodes, -1)
                 self._first_child = _grown(self._first_child, self._nodes, -1)
             node = int(self._children[child])
-        if self._component[node] != UNKNOWN:
+        if self._component[node] != decisions.UNKNOWN:
             raise _Untraceable
         leaf = self._leaves
         self._leaves += 1
-        self._component[node] = LEAF - leaf
+        self._component[node] = decisions.LEAF - leaf
         self._says, self._first_write = _grown(self._says, self._leaves, 0), _grown(self._first_write, leaf + 2, 0)
         first = int(self._first_write[leaf])
         self._first_write[leaf + 1] = first + len(written)

@@ -1,7 +1,8 @@
 """Enumerating states onto disk, and reading them back."""
 
-from pharos.state_space.build import BuildProgress, build
+from pharos.state_space.build import build, cached_folder
 from pharos.state_space.manifest import read_manifest
+from pharos.state_space.progress import BuildProgress
 from pharos.state_space.store import StateSpace, load
 
-__all__ = ["BuildProgress", "StateSpace", "build", "load", "read_manifest"]
+__all__ = ["BuildProgress", "StateSpace", "build", "cached_folder", "load", "read_manifest"]

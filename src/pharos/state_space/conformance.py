@@ -407,32 +407,24 @@ def _note_unseen_values(env: Environment, states: list[State], complete: bool, n
 
 def _check_compiled(env: Environment, check: _InterpretedCheck, states: list[State], notes: list[str]) -> bool:
     """Run the compiled rules on the same states; False, and a note, where Numba cannot compile them."""
-    from pharos.rules.compiled import compiled_rules
-    from pharos.rules.layout import layout_of, pack, unpack
+    from pharos.rules import CompiledExploration, not_compiled, pack, rules_of, unpack
 
-    layout = layout_of(env.components)
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", RuntimeWarning)
-        rules = compiled_rules(env, layout.num_words)
-    if rules is None:
-        why = str(caught[-1].message) if caught else "Numba cannot compile its rules, so they run interpreted"
-        notes.append(why)
+    rules = rules_of(env)
+    layout = rules.layout
+    if reason := rules.reason_not_compiled():
+        notes.append(not_compiled(reason))
         return False
     num_states, num_actions = len(states), env.num_actions
     packed = pack(layout, np.array(states, np.int64))
     keys = np.zeros((num_states * num_actions, layout.num_words), np.uint64)
-    found = np.empty(num_states * num_actions, np.int64)
     terminal = np.zeros(num_states, np.uint8)
-    table = np.full(64, -1, np.int32)
+    exploration = CompiledExploration(env, layout)
     for i in range(num_states):  # one by one, to know the state of a fault
-        progress = np.zeros(6, np.int64)
-        rules.kernels.expand_and_find(
-            rules.parameters, layout.tables, packed, i, i + 1, 0, keys, found, terminal, table, progress
-        )
-        if progress[4]:
+        component = exploration.component_at_fault(packed, i, keys, terminal)
+        if component is not None:
             names = (*env.components.names, "a component that does not exist")
             raise RuleError(
-                f"{check._where('transition or is_terminal', states[i])}: compiled, it reads or writes {names[progress[4] - 1]} "
+                f"{check._where('transition or is_terminal', states[i])}: compiled, it reads or writes {names[component]} "
                 f"outside its declared range; interpreted it does not: are there values in between that are not allowed?"
             )
         if bool(terminal[i]) != check.terminal[states[i]]:
@@ -443,8 +435,7 @@ def _check_compiled(env: Environment, check: _InterpretedCheck, states: list[Sta
     following = unpack(layout, keys)
     every = np.concatenate([packed, keys])
     successors = np.arange(num_states, num_states + len(keys), dtype=np.int32).reshape(num_states, num_actions)
-    rewards = np.empty((num_states, num_actions))
-    rules.kernels.rewards_of(rules.parameters, layout.tables, every, successors, terminal, 0, num_states, rewards)
+    rewards = rules.rewards.block(every, successors, terminal.view(np.bool_), 0, num_states)
     for i, state in enumerate(states):
         for action in range(num_actions if not terminal[i] else 0):
             successor = tuple(following[i * num_actions + action].tolist())
@@ -464,17 +455,13 @@ def _check_compiled(env: Environment, check: _InterpretedCheck, states: list[Sta
 
 
 def _check_compiled_drawings(check: _InterpretedCheck, states: list[State], notes: list[str]) -> None:
-    from numba.core.errors import NumbaError
-
-    from pharos.rules.compiled import InteractionRules
+    from pharos.rules import CompiledDrawing, reason_of
 
     planes = np.zeros((len(states), *check.drawings[states[0]].shape), np.uint8)
     try:
-        rules = InteractionRules(check.env)
-        rules.kernels.draw_planes(rules.parameters, np.array(states, np.int64), planes)
-    except NumbaError as error:
-        reason = next((line.strip() for line in str(error).splitlines()[1:] if line.strip()), "")
-        notes.append(f"Numba cannot compile draw, so drawing runs interpreted: {reason}")
+        CompiledDrawing(check.env, "draw_planes", np.array(states, np.int64), planes)
+    except Exception as error:  # Numba raises its own errors, and others from inside of it
+        notes.append(f"Numba cannot compile draw, so drawing runs interpreted: {reason_of(error)}")
         return
     for state, drawn in zip(states, planes, strict=True):
         if (drawn != check.drawings[state]).any():

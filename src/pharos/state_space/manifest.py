@@ -6,10 +6,14 @@ import math
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from pharos import storage
-from pharos.environments import Environment, start_distribution
+from pharos.environments import Environment, State, start_distribution
 from pharos.errors import StateSpaceCorrupted, StateSpaceError, StateSpaceMismatch
-from pharos.rules.layout import layout_of
+from pharos.rules import Layout, layout_of
+
+Starts = tuple[list[State], np.ndarray]
 
 FORMAT, FORMAT_VERSION = "pharos state space", 1
 IMPORTED_FORMAT = "pharos mdp"
@@ -83,9 +87,14 @@ def check_lengths(folder: Path, manifest: dict[str, Any]) -> None:
             )
 
 
-def identity_of(env: Environment) -> dict[str, Any]:
-    """What makes a state space the state space of `env`: kept in the manifest and hashed into the cache's folder names."""
-    layout = layout_of(env.components)
+def identity_of(env: Environment, layout: Layout | None = None, starts: Starts | None = None) -> dict[str, Any]:
+    """What makes a state space the state space of `env`: kept in the manifest and hashed into the cache's folder names.
+
+    Args:
+        layout, starts: of `env`, where they are known already.
+    """
+    layout = layout_of(env.components) if layout is None else layout
+    starts = start_distribution(env) if starts is None else starts
     return {
         "environment": env.name,
         "class": f"{type(env).__module__}:{type(env).__qualname__}",
@@ -101,7 +110,7 @@ def identity_of(env: Environment) -> dict[str, Any]:
             "shift": layout.shift.tolist(),
             "num_words": layout.num_words,
         },
-        "start": [[list(state), float(p)] for state, p in zip(*start_distribution(env), strict=True)],
+        "start": [[list(state), float(p)] for state, p in zip(*starts, strict=True)],
     }
 
 

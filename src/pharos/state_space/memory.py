@@ -4,6 +4,7 @@ import contextlib
 from collections.abc import Iterator
 from pathlib import Path
 
+LEAST_MEMORY = 1 << 24  # bytes that a build needs
 _PROC, _GROUPS = Path("/proc"), Path("/sys/fs/cgroup")
 
 

@@ -17,7 +17,7 @@ from pharos.errors import (
     StateSpaceIncomplete,
     StateSpaceMismatch,
 )
-from pharos.rules.layout import Layout, pack, unpack
+from pharos.rules import Layout, pack, unpack
 from pharos.state_space.manifest import (
     AGAIN,
     CHECKSUM_BYTES,
@@ -202,8 +202,7 @@ class StateSpace:
                 reward(self, state, action, next_state) in place of the environment's.
         Cost: the rewards of all S A transitions, 20 to 50 ns each on one core; nothing is built again.
         """
-        from pharos.mdp import TabularMDP
-        from pharos.mdp.rewards_of_space import rewards_of_space
+        from pharos.mdp import TabularMDP, rewards_of_space
 
         return TabularMDP.from_space(self, rewards_of_space(self, rewards), gamma)
 

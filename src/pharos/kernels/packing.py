@@ -1,4 +1,4 @@
-"""Packing states into words and back, compiled: a few states at a time, where NumPy would take a call for each component."""
+"""Packing states into words and back: a few states at a time, where NumPy (rules/layout.py) would take a call for each component."""
 
 import numpy as np
 from numba import njit
@@ -14,7 +14,7 @@ def pack_rows(word, shift, low, states, packed):
 
 @njit(cache=True, nogil=True)
 def unpack_rows(word, shift, mask, low, packed, states):
-    """The other way round."""
+    """states (N, D) int64 = components of packed (N, W); the inverse of `pack_rows`."""
     for n in range(len(packed)):
         for i in range(len(word)):
             states[n, i] = np.int64((packed[n, word[i]] >> shift[i]) & mask[i]) + low[i]

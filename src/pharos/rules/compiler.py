@@ -1,0 +1,181 @@
+"""Rules in Python -> kernels compiled by Numba, once per class of environments, cached on disk across processes.
+
+Numba's own file cache knows a function by its file and does not see changes in what the function calls. So kernels that call a
+user's rules (`exploration.py`, `interaction.py`) are cached under a fingerprint of the rules (`fingerprint.py`) and of the code
+around them: edited rules get another file, unchanged ones are found compiled. The parameters of an instance are arguments, not
+constants: all instances of a class share one compilation.
+"""
+
+import hashlib
+import os
+import types as python_types
+from collections import namedtuple
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numba
+import numpy as np
+from numba.extending import overload
+
+from pharos.environments import Environment
+from pharos.rules.exploration import ExplorationKernels, exploration
+from pharos.rules.fingerprint import closure_of, function_text, mentioned_names, names_in, plain_function
+from pharos.rules.interaction import InteractionKernels, interaction
+from pharos.rules.kernel_cache import cache_of_kernel
+
+RULES = ("transition", "is_terminal", "reward", "draw")
+_HERE = Path(__file__).parent
+_KERNELS = _HERE.parent / "kernels"
+_MACHINERY = (
+    *(_HERE / name for name in ("compiler.py", "exploration.py", "interaction.py", "packed_view.py")),
+    *(_KERNELS / name for name in ("hash_table.py", "stepping.py")),
+)
+
+
+def numeric_attributes(env: Environment) -> tuple[tuple[str, ...], tuple[Any, ...]]:
+    """What compiled rules see as `self`: names and values of the numbers, tuples of numbers and arrays that they mention."""
+    known = set(dir(type(env))) | set(vars(env))
+    names = sorted(known & mentioned_names(getattr(type(env), rule) for rule in RULES))
+    found = {name: getattr(env, name) for name in names if not name.startswith("__")}
+    numeric = {name: _plain(value) for name, value in found.items() if _is_numeric(value)}
+    return tuple(numeric), tuple(numeric.values())
+
+
+def _is_numeric(value: Any) -> bool:
+    if isinstance(value, np.ndarray):
+        return value.dtype.kind in "biuf"
+    if isinstance(value, tuple):
+        return bool(value) and all(_is_numeric(item) for item in value)
+    return isinstance(value, bool | int | float | np.number)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        return np.ascontiguousarray(value)
+    if isinstance(value, np.number):
+        return value.item()
+    return value
+
+
+@cache
+def exploration_kernels(
+    cls: type[Environment], names: tuple[str, ...], num_words: int, num_actions: int
+) -> ExplorationKernels:
+    """The kernels of `exploration.py` for the rules of a class that mention the attributes `names`."""
+    compiler, rules, parameters = _compiler_of(cls, names, num_words, num_actions)
+    return exploration(compiler, rules, parameters, num_words, num_actions)
+
+
+@cache
+def interaction_kernels(cls: type[Environment], names: tuple[str, ...], num_actions: int) -> InteractionKernels:
+    """The kernels of `interaction.py`."""
+    compiler, rules, parameters = _compiler_of(cls, names, 0, num_actions)
+    return interaction(compiler, rules, parameters, num_actions)
+
+
+def _compiler_of(cls: type[Environment], names: tuple[str, ...], *numbers: int) -> tuple["Compiler", dict, type]:
+    """What a maker needs: the compiler, the compiled rules by their names, and the class of `self`."""
+    rule_compiler = _RuleCompiler()
+    rules = {rule: rule_compiler.compiled(getattr(cls, rule)) for rule in RULES}
+    texts = [function_text(getattr(cls, rule), {}) for rule in RULES]
+    key = (_machinery(), texts, names, numbers, numba.__version__)
+    digest = hashlib.sha256(repr(key).encode()).hexdigest()[:20]
+    return Compiler(f"{cls.__name__.lower()}_{digest}"), rules, namedtuple("Parameters", names)
+
+
+@cache
+def _machinery() -> tuple[str, ...]:
+    return tuple(path.read_text() for path in _MACHINERY)
+
+
+class Compiler:
+    """Compiles the inner functions of the makers, under a name that is theirs for these rules alone.
+
+    The name goes into the symbols of the machine code: code of several classes of environments, compiled in several processes, is
+    loaded into one.
+    """
+
+    def __init__(self, name: str):
+        self.name = name
+
+    def inlined(self, function: Callable) -> Any:
+        """A function that becomes part of its callers."""
+        return numba.njit(forceinline=True)(self._named(function))
+
+    def function(self, function: Callable) -> Any:
+        """A function that kernels call."""
+        return numba.njit(nogil=True)(self._named(function))
+
+    def kernel(self, function: Callable) -> Any:
+        """A function that Python calls; the compiled form is kept on disk."""
+        kernel: Any = numba.njit(nogil=True)(self._named(function))
+        kernel._cache = cache_of_kernel(f"{self.name}.{function.__name__}")
+        return kernel
+
+    def _named(self, function: Any) -> Any:
+        function.__qualname__ = f"{self.name}.{function.__name__}"
+        return function
+
+
+class _RuleCompiler:
+    """Compiles a rule and, recursively, the plain functions that it mentions by a global name."""
+
+    def __init__(self):
+        self._done: dict[Any, Any] = {}
+
+    def compiled(self, function: Any) -> Any:
+        function = plain_function(function)
+        if not isinstance(function, python_types.FunctionType):
+            return function  # Numba will say what it thinks of it
+        if function in self._done:
+            return self._done[function]
+        self._done[function] = function  # a function that calls itself keeps its interpreted self, which Numba refuses
+        reached = {name: function.__globals__.get(name) for name in names_in(function.__code__)}
+        replaced = {**function.__globals__, **self._compiled_among(reached)}
+        cells = {
+            name: python_types.CellType(value) for name, value in self._compiled_among(closure_of(function)).items()
+        }
+        free = zip(function.__code__.co_freevars, function.__closure__ or (), strict=True)
+        closure = tuple(cells.get(name, cell) for name, cell in free)
+        clone = python_types.FunctionType(
+            function.__code__, replaced, function.__name__, function.__defaults__, closure or None
+        )
+        clone.__kwdefaults__ = function.__kwdefaults__
+        clone.__qualname__, clone.__module__ = function.__qualname__, __name__
+        self._done[function] = numba.njit(forceinline=True)(clone)
+        return self._done[function]
+
+    def _compiled_among(self, values: dict[str, Any]) -> dict[str, Any]:
+        functions = {name: plain_function(value) for name, value in values.items()}
+        return {n: self.compiled(f) for n, f in functions.items() if isinstance(f, python_types.FunctionType)}
+
+
+@overload(float)
+def _float_of_truth(value):
+    """`float(x == y)`, the most natural reward of 0 or 1, which Numba does not know."""
+    if isinstance(value, numba.types.Boolean):
+        return lambda value: 1.0 if value else 0.0
+    return None
+
+
+def type_text(value: Any) -> str:
+    """The Numba type of a parameter, as text."""
+    try:
+        return str(numba.typeof(value))
+    except Exception:  # Numba has no type for it, such as an integer of more than 64 bits
+        return repr(value)
+
+
+def reason_of(error: BaseException) -> str:
+    """What went wrong and in which line, out of Numba's long message."""
+    message = str(error) or type(error).__name__
+    lines = [line.strip() for line in message.splitlines() if line.strip()]
+    start = next((i for i, line in enumerate(lines) if not line.startswith(("Failed in", "During:"))), 0)
+    what = lines[start] if lines else ""
+    if what.endswith("for signature:"):  # the useful words stand below
+        what += "".join(f" {line.removeprefix('>>>').strip()}" for line in lines[start + 1 : start + 2])
+    ours = (os.path.join("rules", "exploration.py"), os.path.join("rules", "interaction.py"))
+    where = [line for line in lines if line.startswith("File ") and not any(file in line for file in ours)]
+    return what + (f" ({where[-1].rstrip(':')})" if where else "")

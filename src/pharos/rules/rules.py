@@ -1,0 +1,198 @@
+"""The rules of one environment, behind one interface: `rules_of(env)`.
+
+Three engines run them, the first that can:
+
+    compiled     by Numba, inside of the loops that search, step and draw (compiled.py)
+    traced       in Python, once for each way through a rule (traced.py)
+    interpreted  in Python, state by state (interpreted.py, stepping.py)
+
+Here stands, once, what happens where Numba cannot compile a rule: one warning for each class of environments and use, and the next
+engine. Whatever the engine, a rule that fails is a RuleError that names the state and the action.
+"""
+
+import warnings
+from collections.abc import Callable
+from functools import cached_property
+from typing import Any, Protocol, TypeVar
+
+import numpy as np
+
+from pharos.environments import Environment
+from pharos.rules.compiled import (
+    CompiledDrawing,
+    CompiledExploration,
+    CompiledRewards,
+    CompiledStepping,
+    signature_of,
+)
+from pharos.rules.compiler import reason_of
+from pharos.rules.layout import Layout, layout_of
+from pharos.rules.stepping import InterpretedStepping
+from pharos.rules.traced import TracedExploration, TracedRewards
+
+Engine = TypeVar("Engine")
+
+
+class Exploration(Protocol):
+    """Successors of packed states, looked up in a table of states (kernels/hash_table.py). See exploration.py for the arrays.
+
+    Raises:
+        RuleError: a rule failed, or left the declared ranges.
+    """
+
+    is_compiled: bool
+
+    def threads(self, workers: int) -> int:
+        """How many threads may call `expand_and_find` at a time, of `workers`."""
+
+    def explore(
+        self,
+        states: np.ndarray,
+        successors: np.ndarray,
+        terminal: np.ndarray,
+        table: np.ndarray,
+        base: int,
+        last: int,
+        room: int,
+        progress: np.ndarray,
+    ) -> None:
+        """Breadth-first search: expand and number states in order until `last`, until `room` is used up, or for a while."""
+
+    def expand_and_find(
+        self,
+        states: np.ndarray,
+        start: int,
+        stop: int,
+        base: int,
+        keys: np.ndarray,
+        found: np.ndarray,
+        terminal: np.ndarray,
+        table: np.ndarray,
+    ) -> None:
+        """Successors of states [start, stop) to keys, and their indices to found; -1 - slot where the table has none."""
+
+    def close(self) -> None:
+        """End the processes that run rules, if there are any."""
+
+
+class Rewards(Protocol):
+    """Rewards of stored transitions of packed states."""
+
+    def threads(self, workers: int) -> int:
+        """How many threads may call `block` at a time, of `workers`."""
+
+    def block(
+        self, states: np.ndarray, successors: np.ndarray, terminal: np.ndarray, start: int, stop: int
+    ) -> np.ndarray:
+        """(stop - start, A) float64, of states [start, stop); 0 in terminal states.
+
+        Raises:
+            RuleError: the rule raised an exception.
+        """
+
+
+class Stepping(Protocol):
+    """Steps of one environment and of many; states are rows of int64. See interaction.py for the arrays.
+
+    Attributes:
+        parameters: the first argument of each function.
+    """
+
+    is_compiled: bool
+    parameters: Any
+
+    def step_one(self, *arguments: Any) -> Any:
+        """(reward, code) of one step."""
+
+    def step_many(self, *arguments: Any) -> Any:
+        """One step of many environments; -1, or which component of which left its range."""
+
+    def is_terminal_one(self, *arguments: Any) -> Any:
+        """Whether a state is terminal."""
+
+    def step_and_draw_one(self, *arguments: Any) -> Any:
+        """The function that steps and draws, of these arguments after the parameters; None where there is none."""
+
+
+class Rules:
+    """The rules of one environment, each use at the highest speed that they allow; nothing is compiled before it is used.
+
+    Attributes:
+        env: the environment. layout: where its components sit in packed states.
+        exploration: for building state spaces.
+        rewards: for the rewards of built ones.
+        stepping: for interaction.
+    """
+
+    def __init__(self, env: Environment, workers: int = 1):
+        self.env, self._workers = env, workers
+        self.layout: Layout = layout_of(env.components)
+
+    @cached_property
+    def exploration(self) -> Exploration:
+        compiled = compiled_or_none(CompiledExploration, self.env, self.layout)
+        return TracedExploration(self.env, self.layout, self._workers) if compiled is None else compiled
+
+    @cached_property
+    def rewards(self) -> Rewards:
+        compiled = compiled_or_none(CompiledRewards, self.env, self.layout)
+        return TracedRewards(self.env, self.layout) if compiled is None else compiled
+
+    @cached_property
+    def stepping(self) -> Stepping:
+        compiled = compiled_or_none(CompiledStepping, self.env)
+        return InterpretedStepping(self.env) if compiled is None else compiled
+
+    def drawing(self, kernel: str, interpreted: Callable[..., None], *arguments: Any) -> Callable[..., None]:
+        """A function that draws states.
+
+        Args:
+            kernel: its name in interaction.py.
+            interpreted: what runs where Numba does not compile it.
+            arguments: of a first call, for no states, which compiles it.
+        """
+        compiled = compiled_or_none(CompiledDrawing, self.env, kernel, *arguments)
+        return interpreted if compiled is None else compiled
+
+    def reason_not_compiled(self) -> str:
+        """Why Numba does not compile the rules of exploration and rewards; "" where it does. Warns of nothing."""
+        return "".join(_reason(engine, self.env, self.layout)[1] for engine in (CompiledExploration, CompiledRewards))
+
+
+def rules_of(env: Environment, *, workers: int = 1) -> Rules:
+    """The rules of `env`.
+
+    Args:
+        workers: processes that share the work of rules that Numba cannot compile (cost only).
+    """
+    return Rules(env, workers)
+
+
+_reasons: dict[tuple, str] = {}  # (engine, signature) -> why Numba does not compile it
+_warned: set[tuple[type, Any]] = set()
+
+
+def compiled_or_none(engine: Callable[..., Engine], env: Environment, *arguments: Any) -> Engine | None:
+    """The compiled engine; None, after one warning for each class, where Numba cannot compile it."""
+    compiled, reason = _reason(engine, env, *arguments)
+    if reason and (type(env), engine) not in _warned:
+        _warned.add((type(env), engine))
+        warnings.warn(f"{type(env).__name__}: {not_compiled(reason)}", RuntimeWarning, stacklevel=5)
+    return compiled
+
+
+def not_compiled(reason: str) -> str:
+    """The sentence that says so."""
+    return f"Numba cannot compile its rules, so they run interpreted, up to 100 times slower: {reason}"
+
+
+def _reason(engine: Callable[..., Engine], env: Environment, *arguments: Any) -> tuple[Engine | None, str]:
+    """The engine, or why there is none."""
+    key: tuple = (engine, type(env), repr(env))
+    try:
+        key = (engine, signature_of(env), tuple(each for each in arguments if isinstance(each, str)))
+        if key not in _reasons:
+            return engine(env, *arguments), ""
+    except Exception as error:  # Numba raises its own errors, and others from inside of it
+        _reasons[key] = reason_of(error)
+    return None, _reasons[key]

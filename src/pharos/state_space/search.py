@@ -1,0 +1,318 @@
+"""The search: breadth-first, in the order of discovery, by one thread or by several.
+
+While the frontier is wide, threads compute successors and look up those that the table has, a piece ahead of the one thread that
+numbers the new ones in order: so states are numbered as one thread would number them. While it is narrow (Freeway: 148 thousand
+levels of 9 states) one thread does everything. Where memory ends, the table goes to disk, and states stay in their file. docs/decisions
+has the measurements.
+"""
+
+import time
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from pharos.environments import Environment
+from pharos.errors import StateSpaceTooLarge
+from pharos.rules import rules_of
+from pharos.state_space import memory as machine
+from pharos.state_space.journal import Journal, Position
+from pharos.state_space.plan import Plan
+from pharos.state_space.progress import BuildProgress, Progress
+from pharos.state_space.table import INT32_STATES, MemoryTable, SpilledTable
+from pharos.workers import usable_workers
+
+# States expanded between two looks at the clock; a multiple of 8, so that terminal bits fill whole bytes.
+CHUNK = 1 << 16
+# Successors of a chunk, where there are very many actions.
+CHUNK_SUCCESSORS = 1 << 26
+# Pieces of a chunk: threads expand one while the one before is numbered.
+PIECES = 4
+# A frontier of this many states is worth sharing between threads.
+WIDE = 1 << 13
+# States that one thread expands before it looks at the width of the frontier again.
+NARROW = 2048
+# A table that holds nothing, where the slot of a state is its bucket.
+_NOTHING = np.full(1 << 16, -1, np.int32)
+
+
+@dataclass(frozen=True)
+class Options:
+    """What `build` was asked for; see there."""
+
+    max_states: int | None
+    memory: int | None
+    workers: int | None
+    checkpoint_seconds: float
+
+
+@dataclass
+class Piece:
+    """A piece of a wide frontier: what threads write, for the one that numbers the states."""
+
+    keys: np.ndarray
+    found: np.ndarray
+    terminal: np.ndarray
+    first: int = 0
+    stop: int = 0
+    futures: list[Future] = field(default_factory=list)
+
+
+class Search:
+    """One run of a build, from the start states or the last checkpoint to the end."""
+
+    def __init__(self, plan: Plan, journal: Journal, options: Options, report: Progress):
+        self.plan, self.journal, self.options, self.report = plan, journal, options, report
+        self.env: Environment = plan.env
+        self.num_actions, self.num_words = plan.env.num_actions, plan.layout.num_words
+        self.workers = usable_workers(options.workers)
+        self.rules = rules_of(plan.env, workers=self.workers).exploration
+        self.threads = self.rules.threads(self.workers)
+        self.chunk = min(CHUNK, max(8, CHUNK_SUCCESSORS // self.num_actions // 8 * 8))
+        self.position = Position()
+        margin = 32 * self.num_actions + len(self.plan.starts[0])
+        self.table = MemoryTable(self.num_words, margin, options.memory)
+        self.spilled: SpilledTable | None = None
+        self._ahead: Piece | None = None  # expanded by threads, not numbered yet
+        self._spare: list[Piece] = []
+        self._blocks: list[tuple[np.ndarray, np.ndarray]] = []  # rows of successors and terminal bits, used in turn
+        self._began = time.perf_counter()
+
+    def run(self, manifest: dict[str, Any] | None) -> None:
+        """Search to the end; where that fails, what is in the files is committed, and the same command resumes."""
+        try:
+            self.position = self.journal.open(manifest)
+            self._take_stored_states()
+            with ThreadPoolExecutor(self.workers) as pool, self.journal.writing():
+                if self.spilled is None:
+                    self._grow_table(pool)
+                while self.position.first < self.position.count:
+                    if self.spilled is None:
+                        self._expand_chunk(pool)
+                    else:
+                        self._expand_chunk_on_disk(pool, self.spilled)
+                    if time.perf_counter() - self.journal.last_checkpoint >= self.options.checkpoint_seconds:
+                        self.journal.checkpoint(complete=False)
+                self.journal.checkpoint(complete=True)
+        except BaseException:
+            self.journal.commit_after_failure()
+            raise
+        finally:
+            self.journal.close()
+            self.rules.close()
+            self.spilled = None
+            self.table.release()
+        self._report(finished=True)
+
+    def _take_stored_states(self) -> None:
+        stored = self.journal.stored_states(self.position.count)
+        if self.table.fits(self.position.count, self.journal.index_dtype):
+            self.table.states[: self.position.count] = stored
+        else:
+            self._spill(stored)
+
+    # The table in memory -------------------------------------------------------------------------------------------------
+
+    def _expand_chunk(self, pool: ThreadPoolExecutor) -> None:
+        """Expand up to a chunk of states, then append their rows to the files."""
+        position, table = self.position, self.table
+        if self._needs_wide_indices(self.chunk * self.num_actions + 32 * self.num_actions):
+            self._widen_indices(pool)
+            if self.spilled:
+                return
+        base, last = position.first, position.first + self.chunk
+        successors, terminal = self._block()
+        while position.first < min(last, position.count):
+            if self._ahead is None and table.is_full(position.count):
+                self._grow_table(pool)
+                if self.spilled:
+                    position.first -= (position.first - base) % 8  # what is appended has whole bytes of terminal bits
+                    break
+            is_wide = self.threads > 1 and min(last, position.count) - position.first >= WIDE
+            if self._ahead or is_wide:
+                self._expand_wide(pool, successors, terminal, base)
+            else:
+                self._expand_narrow(successors, terminal, base, last)
+            self._check_size()
+        rows = position.first - base
+        position.terminals += int(terminal[:rows].sum())
+        states = table.states[self.journal.appended : position.count]
+        self.journal.append(states, successors[:rows], terminal[:rows], position)
+        self._report()
+
+    def _block(self) -> tuple[np.ndarray, np.ndarray]:
+        """Room for the rows of a chunk; the journal lets two chunks wait, so the third one back is written."""
+        if len(self._blocks) == 3 and self._blocks[0][0].dtype == self.journal.index_dtype:
+            self._blocks.append(self._blocks.pop(0))
+        else:
+            rows = np.empty((self.chunk, self.num_actions), self.journal.index_dtype)
+            self._blocks = [*self._blocks, (rows, np.empty(self.chunk, np.uint8))][-3:]
+        return self._blocks[-1]
+
+    def _expand_narrow(self, successors: np.ndarray, terminal: np.ndarray, base: int, last: int) -> None:
+        """One thread does everything; with several it looks at the width of the frontier again after a while."""
+        position, table = self.position, self.table
+        stop = min(last, max(position.first + NARROW, position.count)) if self.threads > 1 else last
+        progress = position.progress()
+        self.rules.explore(table.states, successors, terminal, table.slots, base, stop, table.room, progress)
+        position.take(progress)
+
+    def _expand_wide(self, pool: ThreadPoolExecutor, successors: np.ndarray, terminal: np.ndarray, base: int) -> None:
+        """Number the successors of the piece that threads have expanded, while they expand the next one."""
+        position = self.position
+        piece = self._ahead or self._expand_ahead(pool, position.first, position.first - base)
+        assert piece is not None
+        self._ahead = None
+        wait(piece.futures)
+        for future in piece.futures:
+            future.result()
+        rows = piece.stop - piece.first
+        row = piece.first - base
+        if position.count - piece.stop >= WIDE:
+            next_row = (row + rows) % self.chunk
+            self._ahead = self._expand_ahead(pool, piece.stop, next_row, reserved=rows * self.num_actions)
+        progress = position.progress()
+        self.table.find_or_number(piece.keys, piece.found, successors[row : row + rows], progress)
+        terminal[row : row + rows] = piece.terminal[:rows]
+        self._spare.append(piece)
+        position.take(progress)
+
+    def _expand_ahead(self, pool: ThreadPoolExecutor, first: int, row: int, reserved: int = 0) -> Piece | None:
+        """Let threads expand a piece of the frontier, from state `first`, in row `row` of its chunk.
+
+        None where the table has no room left beside `reserved` other states: it grows while nobody reads it.
+        """
+        table, most = self.table, -(-self.chunk // PIECES)
+        room = (table.room - self.position.count - reserved) // self.num_actions
+        rows = min(most, self.chunk - row, self.position.count - first, room)
+        if rows < 1:
+            return None
+        piece = self._spare.pop() if self._spare else self._new_piece(most)
+        cuts = [first + rows * i // self.threads for i in range(self.threads + 1)]
+        piece.first, piece.stop = first, first + rows
+        arrays = (first, piece.keys, piece.found, piece.terminal, table.slots)
+        piece.futures = [
+            pool.submit(self.rules.expand_and_find, table.states, cuts[i], cuts[i + 1], *arrays)
+            for i in range(self.threads)
+        ]
+        return piece
+
+    def _new_piece(self, rows: int) -> Piece:
+        keys = np.empty((rows * self.num_actions, self.num_words), np.uint64)
+        return Piece(keys, np.empty(len(keys), np.int64), np.empty(rows, np.uint8))
+
+    def _grow_table(self, pool: ThreadPoolExecutor) -> None:
+        """A larger table; on disk where memory is not enough."""
+        if self.table.fits(self.position.count, self.journal.index_dtype):
+            self.table.grow(self.position.count, self.journal.index_dtype, pool, self.workers)
+        else:
+            self._spill()
+
+    def _needs_wide_indices(self, successors: int) -> bool:
+        """Whether as many more states may be more than int32 can number."""
+        starts = len(self.plan.starts[0])
+        return self.journal.index_dtype.itemsize == 4 and self.position.count + successors + starts > INT32_STATES
+
+    def _widen_indices(self, pool: ThreadPoolExecutor) -> None:
+        """From int32 to int64 indices, in the file and in the table."""
+        self.journal.finish_writes()
+        if self._ahead:  # its slots are those of the old table: it is expanded again
+            wait(self._ahead.futures)
+            self._ahead = None
+        self.journal.widen(self.position)
+        if self.spilled is None:
+            self._grow_table(pool)
+
+    # The table on disk ---------------------------------------------------------------------------------------------------
+
+    def _spill(self, stored: np.ndarray | None = None) -> None:
+        """Go on with the table on disk, filled from the one in memory, or from the states of the last checkpoint."""
+        memory = self.options.memory
+        if memory is None:
+            memory = max(machine.LEAST_MEMORY, machine.available_memory() // 2)
+        count = self.position.count
+        spilled = SpilledTable(self.journal.path, self.num_words, self.num_actions, memory, count)
+        if stored is not None:
+            spilled.fill(stored)
+        elif len(self.table.slots):
+            spilled.take_over(self.table)
+        else:
+            spilled.fill(self.table.states[:count])
+        self.spilled = spilled
+
+    def _expand_chunk_on_disk(self, pool: ThreadPoolExecutor, spilled: SpilledTable) -> None:
+        """Successors of a chunk are looked up in the order of the table, many at once, and then numbered."""
+        position = self.position
+        if self._needs_wide_indices(spilled.rows * self.num_actions):
+            self._widen_indices(pool)
+        self.journal.finish_writes()
+        if len(self.table.states):
+            self.table.release()
+            self._blocks, self._spare = [], []
+        base, last = position.first, position.first + spilled.rows
+        successors, terminal = spilled.successors(self.journal.index_dtype), spilled.terminal
+        spilled.appended = self.journal.appended
+        while position.first < min(last, position.count):
+            first, rows = position.first, min(last, position.count) - position.first
+            size = rows * self.num_actions
+            part = slice(first - base, first - base + rows)
+            keys, found = spilled.keys[:size], spilled.found[:size]
+            self._expand_rows(pool, self._states(spilled, first, first + rows), keys, found, terminal[part])
+            progress = position.progress()
+            spilled.find_or_number(keys, found, successors[part], progress)
+            position.take(progress)
+            self._check_size()
+        rows = position.first - base
+        position.terminals += int(terminal[:rows].sum())
+        states = spilled.states[: position.count - self.journal.appended]
+        self.journal.append(states, successors[:rows], terminal[:rows], position)
+        self._report()
+
+    def _expand_rows(
+        self, pool: ThreadPoolExecutor, states: np.ndarray, keys: np.ndarray, found: np.ndarray, terminal: np.ndarray
+    ) -> None:
+        """Successors of states to keys; to found -1 - bucket, or in terminal states their own row."""
+        threads = self.threads if len(states) >= WIDE else 1
+        cuts = [len(states) * i // threads for i in range(threads + 1)]
+        arrays = (0, keys, found, terminal, _NOTHING)
+        if threads == 1:
+            self.rules.expand_and_find(states, 0, len(states), *arrays)
+            return
+        futures = [
+            pool.submit(self.rules.expand_and_find, states, cuts[i], cuts[i + 1], *arrays) for i in range(threads)
+        ]
+        wait(futures)
+        for future in futures:
+            future.result()
+
+    def _states(self, spilled: SpilledTable, start: int, stop: int) -> np.ndarray:
+        """States [start, stop): from their file, and those that are not in it yet."""
+        states = np.empty((stop - start, self.num_words), np.uint64)
+        in_file = max(0, min(stop, spilled.appended) - start)
+        if in_file:
+            self.journal.read_states(start, states[:in_file])
+        states[in_file:] = spilled.states[start + in_file - spilled.appended : stop - spilled.appended]
+        return states
+
+    # Limits and reports --------------------------------------------------------------------------------------------------
+
+    def _check_size(self) -> None:
+        check_size(self.env, self.position.count, self.position.count - self.position.first, self.options.max_states)
+
+    def _report(self, finished: bool = False) -> None:
+        at, seconds = self.position, time.perf_counter() - self._began
+        self.report(BuildProgress(at.count, at.first, at.depth, seconds, finished, self.spilled is not None))
+
+
+def check_size(env: Environment, count: int, left: int, max_states: int | None) -> None:
+    """StateSpaceTooLarge where there are more than `max_states` states, of which `left` are not expanded."""
+    if max_states is None or count <= max_states:
+        return
+    if left == 0:
+        raise StateSpaceTooLarge(
+            f"{env} has {count} states, more than max_states={max_states}; raise it or choose a smaller instance"
+        )
+    raise StateSpaceTooLarge(
+        f"{env} passed max_states={max_states}, {left} left to expand; raise it or choose a smaller instance"
+    )

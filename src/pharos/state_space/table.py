@@ -1,0 +1,154 @@
+"""The table of states of a search: in memory beside all states, or on disk. Both number states by `find_or_number`."""
+
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+
+from pharos.kernels import disk_table as disk_kernels
+from pharos.kernels.hash_table import fill, fill_more, fill_range, insert_missing
+from pharos.state_space import memory as machine
+from pharos.state_space.disk_table import DiskTable
+from pharos.state_space.memory_map import huge_pages, reserved_states, reserved_table
+
+LOAD = 0.5  # the table in memory grows beyond this share of used slots
+PARALLEL_FILL = 1 << 16  # states that are worth sharing between threads when the table grows
+LEFT_OVER = 1 << 12  # states that may pass the end of a part of the table, which are a handful
+INT32_STATES = 2**31 - 1
+
+
+class MemoryTable:
+    """All states, and a table of their indices.
+
+    Attributes:
+        states: (capacity, W) uint64, in the order of discovery.
+        slots: index of a state, or -1; see kernels/hash_table.py.
+    """
+
+    def __init__(self, num_words: int, margin: int, memory: int | None):
+        """
+        Args:
+            margin: states that a kernel may add between two looks at the room.
+            memory: bytes that states and table may take; None for as much as there is.
+        """
+        self.states = reserved_states(num_words)
+        self.slots = np.empty(0, np.int32)
+        self._space = reserved_table()
+        self._margin, self._memory = margin, memory
+
+    @property
+    def room(self) -> int:
+        """States that table and array of states can hold."""
+        return min(int(len(self.slots) * LOAD), len(self.states))
+
+    def is_full(self, count: int) -> bool:
+        """Whether the table must grow before a kernel goes on from `count` states."""
+        return count + self._margin > self.room
+
+    def fits(self, count: int, dtype: np.dtype) -> bool:
+        """Whether memory holds a table with room for about twice as many states, and the states."""
+        if count + self._margin > len(self.states):
+            return False
+        slots = self._slots_for(count)
+        needed = slots * dtype.itemsize + int(slots * LOAD) * self.states.shape[1] * 8
+        return needed <= (self._memory if self._memory is not None else machine.available_memory())
+
+    def grow(self, count: int, dtype: np.dtype, pool: ThreadPoolExecutor, workers: int) -> None:
+        """A table with room for about twice as many states, filled from the array of states."""
+        slots = self._slots_for(count)
+        self.slots = np.empty(0, dtype)  # free the old one first, where it cannot grow in its place
+        if self._space.nbytes < slots * dtype.itemsize:
+            self._space = huge_pages(slots, dtype)
+        self.slots = self._space.view(dtype)[:slots]
+        if workers == 1 or count < PARALLEL_FILL:
+            self._fill(count)
+            return
+        cuts = [slots * i // workers for i in range(workers + 1)]
+        left_over = np.empty((workers, LEFT_OVER), np.int64)
+
+        def fill_part(i: int) -> int:
+            self.slots[cuts[i] : cuts[i + 1]].fill(-1)
+            return fill_range(self.slots, self.states, count, cuts[i], cuts[i + 1], left_over[i])
+
+        left = [*pool.map(fill_part, range(workers))]
+        if max(left) > left_over.shape[1]:  # only where a bad hash crowds the end of a part
+            self._fill(count)
+            return
+        for i, over in enumerate(left):
+            fill_more(self.slots, self.states, left_over[i, :over])
+
+    def find_or_number(self, keys: np.ndarray, found: np.ndarray, successors: np.ndarray, progress: np.ndarray) -> None:
+        """Number the successors that are new, in their order.
+
+        Args:
+            keys: (rows * A, W) uint64, successors. found: (rows * A,), their indices, or -1 - slot from which to search on.
+            successors: (rows, A), gets the indices. progress: see kernels/hash_table.py; goes on by these rows.
+        """
+        insert_missing(self.slots, self.states, keys, found, successors, progress)
+
+    def release(self) -> None:
+        """Give the memory back, also where a traceback keeps this table alive."""
+        self.states, self.slots = self.states[:0].copy(), self.slots[:0].copy()
+        self._space = self._space[:0].copy()
+
+    def _fill(self, count: int) -> None:
+        self.slots.fill(-1)
+        fill(self.slots, self.states, count)
+
+    def _slots_for(self, count: int) -> int:
+        slots = 1 << 16
+        while slots * LOAD < 1.4 * count + self._margin:
+            slots *= 2
+        return slots
+
+
+class SpilledTable:
+    """The table on disk, and memory for a chunk of the frontier.
+
+    Attributes:
+        rows: of a chunk: as many as half of the memory holds; the table takes a quarter at a time.
+        states: those that the chunk numbers and that are not in the file yet. terminal: of its rows. keys, found: of its candidates.
+        appended: states that are in the file; the first of `states` has this number.
+    """
+
+    def __init__(self, path: Path, num_words: int, num_actions: int, memory: int, count: int):
+        self.rows = rows_of_chunk(memory, num_words, num_actions)
+        candidates = self.rows * num_actions
+        self.states, self.keys = (np.empty((candidates, num_words), np.uint64) for _ in range(2))
+        self.found, self._slots = np.empty(candidates, np.int64), np.empty(candidates, np.int64)
+        self._order = np.empty(candidates, np.int32)
+        self.terminal = np.empty(self.rows, np.uint8)
+        self.appended = count
+        self._successors = np.empty((0, num_actions), np.int32)
+        self._table = DiskTable(path, num_words, memory // 4, 2 * count)
+
+    def fill(self, states: np.ndarray) -> None:
+        """Enter states (N, W), numbered from 0 on, into the empty table, a chunk at a time."""
+        for start in range(0, len(states), self.rows):
+            self._table.fill(np.array(states[start : start + self.rows], np.uint64), start)
+
+    def take_over(self, table: MemoryTable) -> None:
+        """Enter the states of the table in memory into the empty one."""
+        self._table.take_over(table.slots, table.states)
+
+    def successors(self, dtype: np.dtype) -> np.ndarray:
+        """(rows, A), of the chunk."""
+        if len(self._successors) != self.rows or self._successors.dtype != dtype:
+            self._successors = np.empty((self.rows, self._successors.shape[1]), dtype)
+        return self._successors
+
+    def find_or_number(self, keys: np.ndarray, found: np.ndarray, successors: np.ndarray, progress: np.ndarray) -> None:
+        """As `MemoryTable.find_or_number`; found: -1 - bucket, or the own row of a terminal state."""
+        first, count = int(progress[0]), int(progress[1])
+        self._table.grow(count + len(keys))
+        looked_up = self._table.look_up(keys, found, first, self._order, self._slots)
+        disk_kernels.number(keys, found, successors, self.states, self.appended, progress)
+        self._table.settle(looked_up, found, self._order, self._slots)
+
+
+def rows_of_chunk(memory: int, num_words: int, num_actions: int) -> int:
+    """Rows of which half of the memory holds the candidates: a multiple of 8, so that terminal bits fill whole bytes."""
+    candidate = 2 * 8 * num_words + 8 + 8 + 8 + 4  # words here and as a state, found, slots, a successor, order
+    bytes_of_a_row = num_actions * candidate + 8 * num_words + 1
+    rows = max(memory // 2 // bytes_of_a_row // 1024, 1) * 1024
+    return max(8, min(rows, INT32_STATES // num_actions // 8 * 8))
