@@ -1,10 +1,11 @@
-"""Steps per second beside EnvPool, MinAtar and gymnax, in one process and one run. A peer that is not installed is left out.
+"""Steps per second beside EnvPool, MinAtar and gymnax, in one process and one run; those installed.
 
     pip install envpool minatar gymnax; python benchmarks/peers.py [--seconds S]
 
-Vector environments have 1,024 copies and random actions drawn beforehand. gymnax runs on the CPU, once called for each step as the
-others are, and once for 64 steps inside one compiled loop, with actions drawn inside, its fastest use. Images are of cells with a
-channel for each kind of thing, in pharos ("simple_image"), MinAtar and gymnax alike. The peers' boards have 10 x 10 cells.
+Vector environments have 1,024 copies and random actions drawn beforehand. gymnax runs on the CPU, once called for each
+step as the others are, and once for 64 steps inside one compiled loop, with actions drawn inside, its fastest use.
+Images are of cells with a channel for each kind of thing, in pharos ("simple_image"), MinAtar and gymnax alike. The
+peers' boards have 10 x 10 cells.
 """
 
 import argparse

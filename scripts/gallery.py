@@ -86,8 +86,8 @@ def main() -> None:
     lines = [
         "# Gallery",
         "",
-        "Made by `python scripts/gallery.py`. In each row, from the left: the drawing for people, the complex image at its",
-        "natural size and at 84 x 84 pixels, and the planes of the simple image, one for each layer; below it, the",
+        "Made by `python scripts/gallery.py`. In each row, from the left: the drawing for people, the complex image at",
+        "its natural size and at 84 x 84 pixels, and the planes of the simple image, one for each layer; below it, the",
         "observations that are numbers. What agents learnt, at play beside the optimal policy and a random one:",
         "[large-runs.md](large-runs.md).",
         "",

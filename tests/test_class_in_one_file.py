@@ -1,4 +1,4 @@
-"""A class of environments in one file has everything: looks, named instances, Gymnasium ids, hyperparameters, a colour."""
+"""A class of environments in one file has everything: looks, named instances, Gymnasium ids, hyperparameters."""
 
 import importlib
 import itertools

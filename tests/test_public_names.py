@@ -91,7 +91,7 @@ def test_imports_point_to_what_comes_before():
 
 
 def test_nobody_imports_another_packages_modules():
-    """`from pharos.mdp import TabularMDP`, a name that the package announces; never `from pharos.mdp.tabular import ...`."""
+    """`from pharos.mdp import TabularMDP`, an announced name; never `from pharos.mdp.tabular import TabularMDP`."""
     inside = set()
     for path, name, is_announced in imports():
         part = name.split(".")[1]
@@ -121,7 +121,7 @@ def before(part: str, other: str) -> bool:
 
 @functools.cache
 def imports() -> list[tuple[str, str, bool]]:
-    """(file, what it imports of pharos, whether its package announces that) of all imports, those for type checkers included."""
+    """(file, what it imports of pharos, whether its package announces that); those for type checkers included."""
     found = []
     for file in sorted(SOURCE.rglob("*.py")):
         path = file.relative_to(SOURCE).as_posix()

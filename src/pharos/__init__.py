@@ -1,13 +1,14 @@
 """pharos: principled reinforcement-learning benchmarking.
 
 In the order of the data flow: an Environment (`make`) is enumerated into a StateSpace (`build`, `load`), which is a
-TabularMDP with its rewards (`StateSpace.mdp`), to which chance can be added (`sticky_actions`, `random_actions`), which is
-solved (`value_iteration`, `evaluate_policy`) and measured (`hardness`).
+TabularMDP with its rewards (`StateSpace.mdp`), to which chance can be added (`sticky_actions`, `random_actions`), which
+is solved (`value_iteration`, `evaluate_policy`) and measured (`hardness`).
 
-Interaction goes another way from the same Environment: `gymnasium.make("pharos/Breakout-v0", observation="simple_image")`.
+Interaction goes another way from the same Environment:
+`gymnasium.make("pharos/Breakout-v0", observation="simple_image")`.
 
-Importing pharos loads nothing heavy: every name below is imported when it is first used. Gymnasium alone is loaded at once, so
-that its registry knows the environments.
+Importing pharos loads nothing heavy: every name below is imported when it is first used. Gymnasium alone is loaded at
+once, so that its registry knows the environments.
 """
 
 import importlib

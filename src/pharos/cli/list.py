@@ -24,7 +24,7 @@ def list_(
     ] = None,
     json: Json = False,
 ) -> None:
-    """Show the environments with parameters and named instances; of one of them its rules, and what each parameter may be."""
+    """Show the environments with their parameters and instances; of one of them its rules and parameters in full."""
     if name is None:
         described = [_overview(name, cls) for name, cls in classes().items()]
         if json:

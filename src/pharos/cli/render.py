@@ -116,7 +116,7 @@ def _captions(env: "Environment", played: Sequence[tuple]) -> list[str]:
     return lines
 
 
-# Shared with `play` and `evaluate` ---------------------------------------------------------------------------------------
+# Shared with `play` and `evaluate` ----------------------------------------------------------------------------------
 
 
 def environment_of(target: Target) -> "Environment":

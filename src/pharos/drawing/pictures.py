@@ -1,7 +1,7 @@
 """Pictures of states for people, and pictures written to files.
 
-Everything is made from what an environment declares: `draw` says what is where (one plane of cells for each layer), `layers`
-and `look` say how it looks.
+Everything is made from what an environment declares: `draw` says what is where (one plane of cells for each layer),
+`layers` and `look` say how it looks.
 """
 
 import os
@@ -24,7 +24,7 @@ HEIGHT, WIDTH = 720, 960  # pixels that a picture takes at most, where its cells
 CELLS = (8, 16, 24, 32, 40, 48, 64)  # pixels of a cell; multiples of 8, so that sprites of 8 x 8 stay sharp
 NIGHT, INK = (16, 18, 24), (226, 228, 232)
 
-# States -> pictures -----------------------------------------------------------------------------------------------------
+# States -> pictures -------------------------------------------------------------------------------------------------
 
 
 def human(env: Environment, state: Sequence[int], *, cell: int | None = None) -> np.ndarray:
@@ -51,7 +51,7 @@ def human(env: Environment, state: Sequence[int], *, cell: int | None = None) ->
     return np.rint(canvas).astype(np.uint8)
 
 
-# Pictures -> files ------------------------------------------------------------------------------------------------------
+# Pictures -> files --------------------------------------------------------------------------------------------------
 
 
 def image(picture: np.ndarray, caption: str = "") -> "Image":
@@ -112,7 +112,7 @@ def _fitting_cell(rows: int, columns: int) -> int:
     return fits[-1] if fits else CELLS[0]
 
 
-# Episodes ---------------------------------------------------------------------------------------------------------------
+# Episodes -----------------------------------------------------------------------------------------------------------
 
 Policy = Callable[[State], int]
 

@@ -19,7 +19,7 @@ def ground_of(ground: str | Ground) -> Ground:
 
 
 def scenery_of(env: Environment) -> Scenery:
-    """The scenery of complex images of `env`: that of its class, or square cells on the ground of pictures for people."""
+    """The scenery of complex images: that of the class, or square cells on the ground of pictures for people."""
     return env.look.scenery or Scenery(cell=(16, 16), margin=(0, 0, 0, 0), ground=env.look.ground)
 
 
@@ -29,7 +29,7 @@ def inside(picture: np.ndarray, margin: Margin) -> np.ndarray:
     return picture[top : len(picture) - bottom, left : picture.shape[1] - right]
 
 
-# Of pictures for people: cells are square, and margins even ----------------------------------------------------------------
+# Of pictures for people: cells are square, and margins even ---------------------------------------------------------
 
 
 def _plain(picture: np.ndarray, cell: tuple[int, int], margin: Margin) -> None:
@@ -77,7 +77,7 @@ def _ice(picture: np.ndarray, cell: tuple[int, int], margin: Margin) -> None:
     court[scratch] = (206, 229, 243)
 
 
-# Of complex images ---------------------------------------------------------------------------------------------------------
+# Of complex images --------------------------------------------------------------------------------------------------
 
 ASPHALT, PAVEMENT, KERB, WHITE, YELLOW = (142, 142, 142), (170, 170, 170), (96, 96, 96), (214, 214, 214), (210, 210, 64)
 WALL = (142, 142, 142)
@@ -116,4 +116,4 @@ GROUNDS: dict[str, Ground] = {
     "asphalt": _asphalt,
     "walls": _walls,
 }
-"""Name of a ground -> function that paints it. Classes of environments choose by name, or bring a function of their own."""
+"""Name of a ground -> function that paints it. Classes choose by name, or bring a function of their own."""

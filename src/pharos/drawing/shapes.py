@@ -1,4 +1,4 @@
-"""Shapes of things: tiles (cell, cell, 4) of red, green and blue in 0 to 255, and in [0, 1] how much they cover the ground."""
+"""Shapes of things: tiles (cell, cell, 4) of red, green, blue in 0 to 255, and in [0, 1] how much they cover."""
 
 from collections.abc import Sequence
 from functools import cache
@@ -24,7 +24,7 @@ def tile(name: str, layer: Layer, value: int, cell: int) -> np.ndarray:
 
 
 def shape_of(name: str, layer: Layer) -> Shape:
-    """The function that draws a layer: its own, or the one in SHAPES that it names or that is called like it, or a block."""
+    """The function that draws a layer: its own, the one in SHAPES that it names, the one called like it, or a block."""
     if layer.shape is None:
         return SHAPES.get(name, block)
     if not isinstance(layer.shape, str):
@@ -191,4 +191,4 @@ SHAPES: dict[str, Shape] = {
     "paddle": _bar,
     "car": _car,
 }
-"""Name of a shape, or of a layer that looks like it unless told otherwise -> function (colour, pixels, glyph) -> tile."""
+"""Name of a shape, and of layers that look like it by default -> function (colour, pixels, glyph) -> tile."""

@@ -1,4 +1,4 @@
-"""Environments: the contract of a class (`Environment`, `Layer`), the built-in classes, and the catalogue of their names."""
+"""Environments: the contract of a class (`Environment`, `Layer`), the built-in classes, the catalogue of names."""
 
 from pharos.environments.base import Components, Environment, State, start_distribution
 from pharos.environments.breakout import Breakout

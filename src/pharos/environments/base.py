@@ -80,12 +80,12 @@ class Environment:
         transition(self, state, action, out)        `out` holds a copy of `state`: write what changes
         is_terminal(self, state) -> bool            the episode has ended in `state`
         reward(self, state, action, next_state)     the reward of a transition, a float
-        draw(self, state, planes)                   planes (L, rows, columns) uint8, zero: write 1, 2, ... where things are
+        draw(self, state, planes)                   planes (L, rows, columns) uint8, zero: write 1, 2, ... at things
 
-    In compiled rules `self` offers the numeric fields of the dataclass and the numeric properties of the class (numbers,
-    tuples of numbers, arrays), under the same names; it has no methods. Call module-level functions instead: pharos
-    compiles those that a rule mentions. Rules never change `state`, and use neither chance, time nor anything global that
-    varies.
+    In compiled rules `self` offers the numeric fields of the dataclass and the numeric properties of the class
+    (numbers, tuples of numbers, arrays), under the same names; it has no methods. Call module-level functions instead:
+    pharos compiles those that a rule mentions. Rules never change `state`, and use neither chance, time nor anything
+    global that varies.
     """
 
     name: ClassVar[str]
@@ -104,7 +104,7 @@ class Environment:
         check_parameters(self)
         self.validate()
 
-    # What an instance is -------------------------------------------------------------------------------------------------
+    # What an instance is --------------------------------------------------------------------------------------------
 
     def validate(self) -> None:
         """Raise ParameterError where parameters do not go together; each has been checked against its declaration."""
@@ -125,7 +125,7 @@ class Environment:
         """(rows, columns) of the drawing."""
         raise NotImplementedError(f"{type(self).__name__} must define grid() to be drawn")
 
-    # The rules -----------------------------------------------------------------------------------------------------------
+    # The rules ------------------------------------------------------------------------------------------------------
 
     def transition(self, state, action, out) -> None:
         """Write into `out`, a copy of `state`, what `action` changes."""
@@ -143,7 +143,7 @@ class Environment:
         """Write 1, 2, ... into planes (L, rows, columns) uint8 where the thing of each layer is."""
         raise NotImplementedError(f"{type(self).__name__} must define draw() to be drawn")
 
-    # Derived -------------------------------------------------------------------------------------------------------------
+    # Derived --------------------------------------------------------------------------------------------------------
 
     @property
     def num_actions(self) -> int:
@@ -166,8 +166,8 @@ class Environment:
             for index, values in _flattened(declared):
                 if not isinstance(values, range) or values.step != 1 or not values:
                     raise ParameterError(
-                        f"{self}: variable {variable!r} is declared as {values!r}; expected a non-empty range with step 1, "
-                        f"or a nested sequence of such ranges"
+                        f"{self}: variable {variable!r} is declared as {values!r}; "
+                        f"expected a non-empty range with step 1, or a nested sequence of such ranges"
                     )
                 if values.start < -(2**63) or values.stop > 2**63 or values.stop - values.start >= 2**63:
                     raise ParameterError(
@@ -185,7 +185,7 @@ class Environment:
         return Components(tuple(names), slices, low, size)
 
     def next_state(self, state: Sequence[int], action: int) -> State:
-        """The state after `action` in `state`, interpreted: for reading, testing and drawing. Works on terminal states too."""
+        """The state after `action` in `state`, terminal ones included; interpreted: for reading, testing, drawing."""
         out = list(state)
         self.transition(tuple(state), action, out)
         return tuple(int(value) for value in out)

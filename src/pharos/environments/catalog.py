@@ -1,7 +1,7 @@
 """The catalogue of environments that `pharos.make` knows: classes by name, and their named instances.
 
-BUILT_IN is the only list of environments: everything else about a class stands in its own file. A user's own class joins the
-catalogue with `register`.
+BUILT_IN is the only list of environments: everything else about a class stands in its own file. A user's own class
+joins the catalogue with `register`.
 """
 
 import dataclasses
@@ -59,14 +59,14 @@ def make(name: str, **parameters: Any) -> Environment:
     else:
         shown = f"known: {', '.join(sorted(classes()))}; `pharos list` shows their parameters and named instances"
         raise UnknownName("environment", name, list_environments(), shown)
-    known = {field.name for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
+    names = {field.name for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
     for parameter in parameters:
         if parameter in cls.foreign_parameters:
             raise ParameterError(
                 f"unknown parameter {parameter!r} of {class_name}: {cls.foreign_parameters[parameter]}"
             )
-        if parameter not in known:
-            raise UnknownName(f"parameter of {class_name}", parameter, known)
+        if parameter not in names:
+            raise UnknownName(f"parameter of {class_name}", parameter, names)
     return cls(**{**defaults, **{name: as_tuples(value) for name, value in parameters.items()}})
 
 
@@ -121,7 +121,8 @@ def source_of(cls: type[Environment]) -> Source | None:
 def _known_class(source: Source, cls: Any) -> type[Environment]:
     if not isinstance(cls, type) or not issubclass(cls, Environment):
         raise ParameterError(
-            f"{source.name!r}: found {cls!r}; expected 'module:Class' or 'file.py:Class' of a subclass of pharos.Environment"
+            f"{source.name!r}: found {cls!r}; "
+            f"expected 'module:Class' or 'file.py:Class' of a subclass of pharos.Environment"
         )
     return cls if cls in _BUILT_IN.values() else register(cls)
 

@@ -37,10 +37,10 @@ class FrozenLake(Environment):
     Limit    25 steps for each cell of the longer side: 100 on the 4x4 map and 200 on the 8x8 map, as in Gymnasium.
     Ours     the ice is not slippery here: slips come from outside, as random or sticky actions. Gymnasium's slippery
              ice executes the chosen action or one of the two perpendicular ones, 1/3 each, and never the opposite
-             one. No `random_actions(p)` expresses that, because it executes each action with at least p / 4: Gymnasium's
-             law is 4/3 of the uniform law minus 1/3 of the opposite action, which would be p = 4/3. The nearest, p = 2/3,
-             differs by 1/6 in the probability of an action. Only under the uniform policy (its states, its value) are
-             the two the same, for every p.
+             one. No `random_actions(p)` expresses that, because it executes each action with at least p / 4:
+             Gymnasium's law is 4/3 of the uniform law minus 1/3 of the opposite action, which would be p = 4/3. The
+             nearest, p = 2/3, differs by 1/6 in the probability of an action. Only under the uniform policy (its
+             states, its value) are the two the same, for every p.
     Source   Gymnasium FrozenLake-v1 (Brockman et al., 2016); the pharos paper, section 3.3.
 
     Attributes:
@@ -186,8 +186,8 @@ def _random_tiles(size: int, seed: int, frozen_probability: float) -> np.ndarray
         if _has_a_way(tiles):
             return tiles
     raise ParameterError(
-        f"FrozenLake: none of {ATTEMPTS} random maps with size={size}, frozen_probability={frozen_probability} has a way "
-        f"to the goal; raise frozen_probability"
+        f"FrozenLake: none of {ATTEMPTS} random maps with size={size}, frozen_probability={frozen_probability} "
+        f"has a way to the goal; raise frozen_probability"
     )
 
 

@@ -1,7 +1,7 @@
 """How a class of environments looks: the layers of things, the ground below them, and the screen of complex images.
 
-These are declarations; `pharos.drawing` paints from them. Wherever a name of a ground or a shape is expected, a function of one's
-own may stand.
+These are declarations; `pharos.drawing` paints from them. Wherever a name of a ground or a shape is expected, a
+function of one's own may stand.
 """
 
 from collections.abc import Callable, Mapping
@@ -22,7 +22,7 @@ Ground = Callable[[np.ndarray, tuple[int, int], Margin], None]
 """Function(picture (H, W, 3) float64, (height, width) of a cell, margin) that paints what lies below all layers."""
 
 Shape = Callable[[np.ndarray, int, str], np.ndarray]
-"""Function(color (3,) float64, pixels of a cell, glyph) -> (cell, cell, 4): red, green, blue and, in [0, 1], the cover."""
+"""Function(color (3,) float64, pixels of a cell, glyph) -> (cell, cell, 4): red, green, blue, cover in [0, 1]."""
 
 
 @dataclass(frozen=True)
@@ -32,11 +32,11 @@ class Layer:
     Attributes:
         glyph: one character for text drawings; several, one for each value 1, 2, ... on the plane.
         color: (red, green, blue), 0 to 255; or several, one for each value on the plane.
-        sprite: rows of text, '#' where the sprite has the colour and '.' where the ground shows through; digits 1-9 pick
-            shades from light to dark; several sprites, one for each value on the plane. None draws a full cell.
-        shape: how pictures for people draw it, in place of the sprite: a name in `pharos.drawing.SHAPES`, or a function (see
-            `Shape`). None: the sprite, or else the shape that is called like the layer ("ball", "agent", "holes", "goal",
-            "paddle"), or else a block.
+        sprite: rows of text, '#' where the sprite has the colour and '.' where the ground shows through; digits 1-9
+            pick shades from light to dark; several sprites, one for each value on the plane. None draws a full cell.
+        shape: how pictures for people draw it, in place of the sprite: a name in `pharos.drawing.SHAPES`, or a function
+            (see `Shape`). None: the sprite, or else the shape that is called like the layer ("ball", "agent", "holes",
+            "goal", "paddle"), or else a block.
     """
 
     glyph: str | tuple[str, ...]

@@ -22,7 +22,8 @@ class Kind:
 
     Attributes:
         text: how a value is written on the command line, such as "row,column".
-        checked: function(environment, name of the parameter, value) -> the value as it is stored; raises ParameterError.
+        checked: function(environment, name of the parameter, value) -> the value as it is stored; raises
+            ParameterError.
     """
 
     text: str
@@ -93,7 +94,7 @@ def parameter(default: Any, *, low: Any = None, high: Any = None, kind: type | K
 
 
 def declared_parameters(cls: type) -> dict[str, Parameter]:
-    """Name -> what `parameter` declared for the fields of a class; a subclass that gives another default keeps the declaration."""
+    """Name -> what `parameter` declared. A subclass that gives another default keeps the declaration."""
     declared: dict[str, Parameter] = {}
     for base in reversed(cls.__mro__):
         for name, field in vars(base).get("__dataclass_fields__", {}).items():
@@ -103,7 +104,7 @@ def declared_parameters(cls: type) -> dict[str, Parameter]:
 
 
 def check_parameters(env: Any) -> None:
-    """Check and store the declared parameters of an environment that is being made; ParameterError names the first wrong one."""
+    """Check and store the parameters of an environment being made; ParameterError names the first wrong one."""
     declared = declared_parameters(type(env))
     for name in sorted(declared, key=lambda name: declared[name].is_bounded_by_others):
         store(env, name, declared[name].checked(env, name, getattr(env, name)))
@@ -115,7 +116,7 @@ def store(env: Any, name: str, value: Any) -> Any:
     return value
 
 
-# Kinds -------------------------------------------------------------------------------------------------------------------
+# Kinds --------------------------------------------------------------------------------------------------------------
 
 
 def integers(expected: str, allowed: Callable[[int], bool]) -> Kind:

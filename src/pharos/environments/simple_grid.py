@@ -60,7 +60,8 @@ class SimpleGrid(Environment):
     instances = INSTANCES
     paper_instances = tuple(INSTANCES)
     hyperparameters = {
-        # Returns of three steps: without them one seed in five, with vectors, stays with the decoy of 8x8 (docs/agents.md).
+        # Returns of three steps: without them one seed in five, with vectors, stays with the decoy of 8x8
+        # (docs/agents.md).
         "dqn": {
             "default": {
                 "gamma": 0.95,

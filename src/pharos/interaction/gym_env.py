@@ -1,7 +1,8 @@
 """Environment + observation + chance -> gymnasium.Env.
 
-`import pharos` registers pharos/SimpleGrid-v0, pharos/FrozenLake-v0, pharos/Freeway-v0 and pharos/Breakout-v0 with Gymnasium:
-`gymnasium.make("pharos/Breakout-v0", height=12, observation="simple_image", sticky=0.25)`. No state space needs to be built.
+`import pharos` registers pharos/SimpleGrid-v0, pharos/FrozenLake-v0, pharos/Freeway-v0 and pharos/Breakout-v0 with
+Gymnasium: `gymnasium.make("pharos/Breakout-v0", height=12, observation="simple_image", sticky=0.25)`. No state space
+needs to be built.
 """
 
 import operator
@@ -20,17 +21,18 @@ from pharos.observations import NO_ACTION, Index, SimpleImage
 class GymEnv(gymnasium.Env):
     """An environment of pharos as a Gymnasium environment.
 
-    Actions are 0 .. A-1, named by `action_names`. `info` has "state" (D,) int64, "executed_action" (-1 after reset), and
-    "index" where a state space was given. `reset(options={"state": ...})` starts in any state. Chance draws one number from
-    `np_random` a step.
+    Actions are 0 .. A-1, named by `action_names`. `info` has "state" (D,) int64, "executed_action" (-1 after reset),
+    and "index" where a state space was given. `reset(options={"state": ...})` starts in any state. Chance draws one
+    number from `np_random` a step.
 
     Args:
         environment: a name that `pharos.make` knows, or an Environment.
-        render_mode: None; "ansi", text; "rgb_array", the picture for people, (H, W, 3) uint8; or "human", a window with that picture,
-            drawn anew at each step, 15 a second at most (needs `pip install 'pharos[play]'`).
+        render_mode: None; "ansi", text; "rgb_array", the picture for people, (H, W, 3) uint8; or "human", a window with
+            that picture, drawn anew at each step, 15 a second at most (needs `pip install 'pharos[play]'`).
         options: see `Interaction`, and the parameters of the environment, such as `height=12`.
     Raises:
-        ParameterError: an option or parameter is wrong. MissingExtra: render_mode is "human" and pygame is not installed.
+        ParameterError: an option or parameter is wrong. MissingExtra: render_mode is "human" and pygame is not
+            installed.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array", "ansi"], "render_fps": 15}
@@ -81,7 +83,7 @@ class GymEnv(gymnasium.Env):
 
     @property
     def spec(self) -> Any:  # type: ignore[override]
-        """Gymnasium's specification, with the limit of this instance as `max_episode_steps`; None unless made by an id."""
+        """Gymnasium's specification, with the limit of this instance; None unless it was made by an id."""
         return self._spec
 
     @spec.setter

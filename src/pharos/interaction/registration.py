@@ -1,8 +1,9 @@
-"""Registers the environments with Gymnasium; run by `import pharos`. The entry points are strings: nothing heavy is loaded.
+"""Registers the environments with Gymnasium; run by `import pharos`. Entry points are strings: nothing heavy is loaded.
 
-`gymnasium.make("pharos/Breakout-v0", height=12)` makes an instance of a class, "pharos/Breakout-12x8x1-v0" a named instance, and
-`gymnasium.make("pharos/Environment-v0", environment="breakout/12x10x1")` any environment that `pharos.make` knows. Without
-`import pharos`: "pharos:pharos/Breakout-v0". Classes of one's own are registered as `pharos.environments.register` meets them.
+`gymnasium.make("pharos/Breakout-v0", height=12)` makes an instance of a class, "pharos/Breakout-12x8x1-v0" a named
+instance, and `gymnasium.make("pharos/Environment-v0", environment="breakout/12x10x1")` any environment that
+`pharos.make` knows. Without `import pharos`: "pharos:pharos/Breakout-v0". Classes of one's own are registered as
+`pharos.environments.register` meets them.
 
 The version of an id rises with the rules: it is `version - first_version` of the class.
 """

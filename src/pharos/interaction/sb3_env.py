@@ -1,4 +1,4 @@
-"""Many environments for Stable-Baselines3: its VecEnv over the native vector environment, without a Python loop of steps."""
+"""Many environments for Stable-Baselines3: its VecEnv over the native vector environment, without a loop in Python."""
 
 import time
 from collections.abc import Mapping
@@ -34,9 +34,9 @@ class SB3VecEnv(VecEnv):
         self._began = time.perf_counter()
 
     def reset(self) -> Any:
-        given = [seed is not None for seed in self._seeds]
+        seeds = None if all(seed is None for seed in self._seeds) else list(self._seeds)
         options = {"state": self._options[0]["state"]} if "state" in (self._options[0] or {}) else None
-        observations, _ = self.env.reset(seed=list(self._seeds) if any(given) else None, options=options)
+        observations, _ = self.env.reset(seed=seeds, options=options)
         self._reset_seeds()
         self._reset_options()
         self._returns[:] = 0
@@ -105,7 +105,8 @@ def make_sb3_vec(
     Args:
         env: a name that `pharos.make` knows, or an Environment.
         seed: of the first reset; environment i is seeded with seed + i.
-        options: the rest of `pharos.interaction.gym_env.Interaction`, and the parameters of the environment where `env` is a name.
+        options: the rest of `pharos.interaction.Interaction`, and the parameters of the environment where `env`
+            is a name.
     Raises:
         ParameterError: an option or parameter is wrong.
     """

@@ -1,4 +1,4 @@
-"""An environment made ready for interaction: the options that single and vector environments share, and what they make."""
+"""An environment made ready for interaction: the options that single and vector environments share."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -28,15 +28,15 @@ class Interaction:
         observation: a name (`pharos.observations.names()`), a pair (function, Gymnasium space), or an Observation.
         observation_options: of the named observation, such as {"grey": True}.
         sticky: probability that the previously executed action is executed again.
-        random: probability that the action is replaced by one uniform over all; with both, the choice is replaced first and
-            then may stick: the chance of `random_actions(sticky_actions(mdp, sticky), random)`.
-        initial_previous_action: what sticks on the first step. None: nothing, the chosen action is executed (as in Gymnasium's
-            StickyAction); the Arcade Learning Environment starts with its action "noop".
+        random: probability that the action is replaced by one uniform over all; with both, the choice is replaced first
+            and then may stick: the chance of `random_actions(sticky_actions(mdp, sticky), random)`.
+        initial_previous_action: what sticks on the first step. None: nothing, the chosen action is executed (as in
+            Gymnasium's StickyAction); the Arcade Learning Environment starts with its action "noop".
         previous_action: whether the agent sees the previously executed action.
         remaining_time: whether the agent sees the share of the time limit that is left.
         time_limit: steps after which an episode is truncated; "default" for that of the class, None for no limit.
-        space: the built state space of the environment, or its folder; adds "index" to info. The observation "index" needs
-            it: where none is given, it is taken from the user's cache, or built.
+        space: the built state space of the environment, or its folder; adds "index" to info. The observation "index"
+            needs it: where none is given, it is taken from the user's cache, or built.
     """
 
     observation: Any = "vector"
@@ -134,9 +134,9 @@ class Simulator:
 
 def split_options(options: Mapping[str, Any]) -> tuple[Interaction, dict[str, Any]]:
     """The options of interaction, and the rest: parameters of the environment."""
-    known = Interaction.__dataclass_fields__
-    interaction = Interaction(**{name: value for name, value in options.items() if name in known})
-    return interaction, {name: value for name, value in options.items() if name not in known}
+    fields = Interaction.__dataclass_fields__
+    interaction = Interaction(**{name: value for name, value in options.items() if name in fields})
+    return interaction, {name: value for name, value in options.items() if name not in fields}
 
 
 def _environment(environment: Environment | str, parameters: Mapping[str, Any]) -> Environment:
@@ -181,8 +181,8 @@ def _indexed(env: Environment) -> StateSpace:
 def spec_with_limit(spec: gymnasium.envs.registration.EnvSpec | None, limit: int | None) -> Any:
     """The specification of an environment that truncates its episodes itself, with its true limit.
 
-    The registry says None, because the limit depends on the arguments of `gymnasium.make`: with a number there, Gymnasium would
-    wrap the environment in a second TimeLimit that knows nothing of `height=20` or `time_limit=None`.
+    The registry says None, because the limit depends on the arguments of `gymnasium.make`: with a number there,
+    Gymnasium would wrap the environment in a second TimeLimit that knows nothing of `height=20` or `time_limit=None`.
     """
     return None if spec is None else replace(spec, max_episode_steps=limit)
 

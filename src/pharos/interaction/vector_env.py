@@ -1,7 +1,8 @@
 """Many environments in one: a native Gymnasium vector environment, whose N states advance by one compiled call.
 
-`make_vec("breakout", 1024, observation="vector", sticky=0.25)`, or `gymnasium.make_vec("pharos/Breakout-v0", num_envs=1024)`.
-Chance is drawn inside the loop, from one stream of random numbers for each environment.
+`make_vec("breakout", 1024, observation="vector", sticky=0.25)`, or
+`gymnasium.make_vec("pharos/Breakout-v0", num_envs=1024)`. Chance is drawn inside the loop, from one stream of random
+numbers for each environment.
 """
 
 from collections.abc import Mapping, Sequence
@@ -26,15 +27,15 @@ _MODES = (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP, AutoresetMode.DISABL
 class VectorEnv(gymnasium.vector.VectorEnv):
     """`num_envs` copies of one environment as a Gymnasium vector environment.
 
-    With `space` the built state space is walked as a table, and the rules are not run: `info` has "index" (N,) in place of
-    "state" (N, D). It always has "executed_action" (N,), -1 after a reset. Arrays are fresh at every step.
+    With `space` the built state space is walked as a table, and the rules are not run: `info` has "index" (N,) in place
+    of "state" (N, D). It always has "executed_action" (N,), -1 after a reset. Arrays are fresh at every step.
 
     Args:
         environment: a name that `pharos.make` knows, or an Environment.
         num_envs: N.
-        autoreset_mode: of Gymnasium. NEXT_STEP: the step after the end of an episode resets and ignores its action. SAME_STEP:
-            the last step resets too; the last observation is in info["final_obs"]. DISABLED: the caller resets with
-            `options={"reset_mask": mask}`.
+        autoreset_mode: of Gymnasium. NEXT_STEP: the step after the end of an episode resets and ignores its action.
+            SAME_STEP: the last step resets too; the last observation is in info["final_obs"]. DISABLED: the caller
+            resets with `options={"reset_mask": mask}`.
         seed: of the first reset, where that is given none.
         max_episode_steps: another name of `time_limit`, as `gymnasium.make_vec` calls it.
         render_mode: None; or "rgb_array": `render()` returns a picture of each environment.
@@ -90,7 +91,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
 
     @property
     def spec(self) -> Any:  # type: ignore[override]
-        """Gymnasium's specification, with the limit of this instance as `max_episode_steps`; None unless made by an id."""
+        """Gymnasium's specification, with the limit of this instance; None unless it was made by an id."""
         return self._spec
 
     @spec.setter
@@ -121,7 +122,8 @@ class VectorEnv(gymnasium.vector.VectorEnv):
 
         Args:
             seed: environment i is seeded with seed + i, or with seed[i].
-            options: {"reset_mask": (N,) bool} resets these environments alone; {"state": (D,) or (N, D)} says where they start.
+            options: {"reset_mask": (N,) bool} resets these environments alone; {"state": (D,) or (N, D)} says where
+            they start.
         """
         options = options or {}
         mask = self._checked_mask(options.get("reset_mask"))
@@ -220,19 +222,19 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         return mask
 
     def _checked_actions(self, actions: Any) -> np.ndarray:
-        found = np.asarray(actions)
-        if found.shape != (self.num_envs,) or found.dtype.kind not in "iu":
+        chosen = np.asarray(actions)
+        if chosen.shape != (self.num_envs,) or chosen.dtype.kind not in "iu":
             raise ParameterError(
-                f"{self.environment}: actions have shape {found.shape} and dtype {found.dtype}; "
+                f"{self.environment}: actions have shape {chosen.shape} and dtype {chosen.dtype}; "
                 f"expected ({self.num_envs},) integers"
             )
-        found = np.ascontiguousarray(found, np.int64)
-        i = first_outside(found, len(self.action_names))
+        chosen = np.ascontiguousarray(chosen, np.int64)
+        i = first_outside(chosen, len(self.action_names))
         if i >= 0:
             raise ParameterError(
-                f"{self.environment}: action {found[i]} of environment {i}; expected 0 to {len(self.action_names) - 1}"
+                f"{self.environment}: action {chosen[i]} of environment {i}; expected 0 to {len(self.action_names) - 1}"
             )
-        return found
+        return chosen
 
 
 def make_vec(name_or_env: Environment | str, num_envs: int = 1, **options: Any) -> VectorEnv:
@@ -247,7 +249,7 @@ def _rows_of(batch: Any, number: int) -> list[Any]:
 
 
 def _checked_mode(mode: AutoresetMode | str) -> AutoresetMode:
-    for known in _MODES:
-        if mode in (known, known.value, known.name):
-            return known
-    raise ParameterError(f"autoreset_mode is {mode!r}; expected one of {', '.join(known.name for known in _MODES)}")
+    for each in _MODES:
+        if mode in (each, each.value, each.name):
+            return each
+    raise ParameterError(f"autoreset_mode is {mode!r}; expected one of {', '.join(each.name for each in _MODES)}")

@@ -41,7 +41,7 @@ class RulesWalk:
     def restart(self, mask: np.ndarray, rng: Any, state: Any) -> None:
         self._vector = self._vector[:0]
         if state is not None:
-            self.current[mask] = _given_states(self.simulator, state, len(mask))[mask]
+            self.current[mask] = _states_of(self.simulator, state, len(mask))[mask]
             return
         chosen = np.zeros(len(mask), np.int64)
         stepping.draw_starts(self.simulator.start_cumulative, rng, mask, chosen)
@@ -106,8 +106,8 @@ class TableWalk:
 
     def restart(self, mask: np.ndarray, rng: Any, state: Any) -> None:
         if state is not None:
-            given = _given_states(self.simulator, state, len(mask))
-            self.current[mask] = self.space.indices(given[mask])
+            states = _states_of(self.simulator, state, len(mask))
+            self.current[mask] = self.space.indices(states[mask])
             return
         chosen = np.zeros(len(mask), np.int64)
         stepping.draw_starts(self.simulator.start_cumulative, rng, mask, chosen)
@@ -143,7 +143,7 @@ class TableWalk:
         return self.simulator.context(self.space.states(index), previous, elapsed)
 
 
-def _given_states(simulator: Simulator, state: Any, num_envs: int) -> np.ndarray:
+def _states_of(simulator: Simulator, state: Any, num_envs: int) -> np.ndarray:
     """(N, D) from one state or N of them, checked."""
     rows = np.asarray(state)
     if rows.ndim == 1:

@@ -1,6 +1,7 @@
 """What an agent sees: pure functions of the state with a Gymnasium space, chosen at the moment of interaction.
 
-`observe(env, "vector")` gives one; calling it with states (N, D) gives N observations. Nothing is stored with the states.
+`observe(env, "vector")` gives one; calling it with states (N, D) gives N observations. Nothing is stored with the
+states.
 """
 
 from pharos.observations.blocks import in_blocks

@@ -18,11 +18,12 @@ LUMINANCE = (0.299, 0.587, 0.114)  # ITU-R BT.601, as in Pillow and OpenCV
 class ComplexImage(Observation):
     """A colour picture (height, width, 3) uint8 of all layers, with sprites.
 
-    The picture is composed at the size asked for: ground and sprites are scaled once, by averaging areas, to whole pixels of
-    each cell, so that a frame costs a few microseconds. Shows what `draw` declares, as simple images do.
+    The picture is composed at the size asked for: ground and sprites are scaled once, by averaging areas, to whole
+    pixels of each cell, so that a frame costs a few microseconds. Shows what `draw` declares, as simple images do.
 
     Args:
-        size: (height, width) in pixels, (84, 84) as agents of Atari games see; or "natural", as large as the sprites are.
+        size: (height, width) in pixels, (84, 84) as agents of Atari games see; or "natural", as large as the sprites
+            are.
         grey: one channel of luminance instead of three of colour.
         channels_first: (C, height, width).
     Raises:
@@ -70,7 +71,8 @@ class ComplexImage(Observation):
             valid = False
         if not valid:
             raise ParameterError(
-                f"complex_image of {self.env}: size is {size!r}; expected 'natural' or (height, width) of 1 to {LARGEST} pixels"
+                f"complex_image of {self.env}: size is {size!r}; "
+                f"expected 'natural' or (height, width) of 1 to {LARGEST} pixels"
             )
         return int(height), int(width)
 

@@ -1,4 +1,4 @@
-"""An observation together with what a pure function of the state cannot see: the previous action, the remaining time."""
+"""An observation with what a pure function of the state cannot see: the previous action, the remaining time."""
 
 from typing import Any
 
@@ -12,11 +12,11 @@ NO_ACTION = -1  # the previous action on the first step of an episode
 
 
 class ObservationInContext:
-    """What the agent gets: an observation of the state, with the previous executed action and the remaining time if wanted.
+    """What the agent gets: an observation of the state; with the previous action, the remaining time where wanted.
 
-    Without either, the observation itself. A `vector` is extended: one entry for each action (1 for the previous one, all 0 on
-    the first step), then the remaining time. Any other observation becomes a Dict of "observation", "previous_action"
-    (Discrete(A + 1), A on the first step) and "remaining_time" (Box (1,)).
+    Without either, the observation itself. A `vector` is extended: one entry for each action (1 for the previous one,
+    all 0 on the first step), then the remaining time. Any other observation becomes a Dict of "observation",
+    "previous_action" (Discrete(A + 1), A on the first step) and "remaining_time" (Box (1,)).
     The remaining time is (limit - elapsed) / limit, in [0, 1].
 
     Attributes:

@@ -18,7 +18,7 @@ def num_values(layer: Layer) -> int:
 
 
 class Drawing:
-    """Runs a drawing kernel of rules/interaction.py on batches of states; a twin in Python where Numba cannot compile it.
+    """Runs a drawing kernel of the rules on batches of states; a twin in Python where Numba cannot compile it.
 
     Attributes:
         env: the environment; rows, columns: of its grid. `block` frames are worth a thread's while.

@@ -48,12 +48,12 @@ class Observation:
 class FunctionObservation(Observation):
     """A user's function(env, states) with its Gymnasium space, checked at every call.
 
-    The function gets the environment and states (N, D) int64, and returns an array (N, *space.shape). Its numbers are converted
-    to the space's dtype where that keeps their kind (float64 to float32, integers to floats).
+    The function gets the environment and states (N, D) int64, and returns an array (N, *space.shape). Its numbers are
+    converted to the space's dtype where that keeps their kind (float64 to float32, integers to floats).
 
     Raises:
-        ParameterError: the result has another shape, or a dtype that does not fit; for the start states also where a value lies
-        outside the space.
+        ParameterError: the result has another shape, or a dtype that does not fit; for the start states also where a
+            value lies outside the space.
     """
 
     def __init__(self, env: Environment, function: Function, space: Any, *, name: str | None = None):
@@ -65,8 +65,8 @@ class FunctionObservation(Observation):
         self.space = space(env) if callable(space) else space
         if not isinstance(self.space, spaces.Box | spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary):
             raise ParameterError(
-                f"observation {self.name!r}: its space is {self.space!r}; "
-                f"expected a Box, Discrete, MultiDiscrete or MultiBinary of Gymnasium, or a function that gives one for env"
+                f"observation {self.name!r}: its space is {self.space!r}; expected a Box, Discrete, MultiDiscrete or "
+                f"MultiBinary of Gymnasium, or a function that gives one for env"
             )
         starts = np.array([state for state, _ in env.initial_states()], np.int64)
         for state, observation in zip(starts, self(starts), strict=True):
@@ -138,8 +138,8 @@ def observe(
 
     Args:
         env: an Environment, or a name that `pharos.make` knows.
-        observation: a name (see `names`); "module:name" or "file.py:name" of the user's own; a pair (function, Gymnasium
-            space) as in `register`; or an Observation, which is returned.
+        observation: a name (see `names`); "module:name" or "file.py:name" of the user's own; a pair (function,
+            Gymnasium space) as in `register`; or an Observation, which is returned.
         state_space: the built state space; "index" needs it.
         options: of the named observation, such as `grey=True`.
     Raises:
@@ -162,7 +162,8 @@ def observe(
         made, known = FunctionObservation(env, *observation), []
     elif not isinstance(observation, str):
         raise ParameterError(
-            f"observation is {observation!r}; expected one of {', '.join(names())}, or a pair (function, Gymnasium space)"
+            f"observation is {observation!r}; "
+            f"expected one of {', '.join(names())}, or a pair (function, Gymnasium space)"
         )
     elif observation in _registered:
         made, known = FunctionObservation(env, *_registered[observation], name=observation), []

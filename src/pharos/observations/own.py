@@ -1,7 +1,7 @@
 """Observations of the user's own, named as `module:name` or `file.py:name` like environments and agents.
 
-The name is that of an entry that the module registers, of a pair (function, Gymnasium space), or of a subclass of `Observation`,
-which is called with the environment and the options.
+The name is that of an entry that the module registers, of a pair (function, Gymnasium space), or of a subclass of
+`Observation`, which is called with the environment and the options.
 """
 
 from collections.abc import Callable
@@ -82,8 +82,8 @@ def _observation(source: Source, value: Any) -> OwnObservation:
     entry = registered(name)
     if entry is None:
         raise ParameterError(
-            f"{source.name!r}: found {value!r}; expected the name of a pair (function, Gymnasium space), of a subclass of "
-            f"Observation, or of what the file registers with pharos.observations.register"
+            f"{source.name!r}: found {value!r}; expected the name of a pair (function, Gymnasium space), of a subclass "
+            f"of Observation, or of what the file registers with pharos.observations.register"
         )
     return OwnObservation(name, partial(_of_function, name, *entry), source)
 

@@ -21,11 +21,12 @@ def render(env: Environment, state: Sequence[int], observation: str = "human", *
     """Return the picture of `state` under an observation, (H, W, 3) uint8.
 
     Args:
-        observation: "human", another of RENDERERS, or an observation whose values are images; planes stand side by side.
+        observation: "human", another of RENDERERS, or an observation whose values are images; planes stand side by
+            side.
         options: of the observation, such as `size="natural"` of "complex_image".
     Raises:
-        UnknownName: no observation or option of this name. ParameterError: `state` is none of the environment's, or cannot be
-            drawn; the observation is no image.
+        UnknownName: no observation or option of this name. ParameterError: `state` is none of the environment's, or
+            cannot be drawn; the observation is no image.
     """
     if observation in RENDERERS:
         if options:

@@ -13,13 +13,15 @@ DARKEST = 128  # of the shades of things on a plane of their own
 class SimpleImage(Observation):
     """One plane for each layer of the environment, channel first: (L, rows k, columns k) uint8, 0 where nothing is.
 
-    A layer with one kind of thing shows it as 255; one with several (such as cars of several colours) in even shades from 255
-    down to 128. Shows where things are, not where they go: directions and timers that `draw` leaves out cannot be seen.
+    A layer with one kind of thing shows it as 255; one with several (such as cars of several colours) in even shades
+    from 255 down to 128. Shows where things are, not where they go: directions and timers that `draw` leaves out cannot
+    be seen.
 
     Args:
-        grey: one plane (1, rows k, columns k) for all things, each in a shade of its own, later layers over earlier ones.
-        scale: k, pixels on each side of a cell. None: 1, or more where there are more planes than rows or columns, because
-            Stable-Baselines3 takes the smallest dimension for the channels.
+        grey: one plane (1, rows k, columns k) for all things, each in a shade of its own, later layers over earlier
+            ones.
+        scale: k, pixels on each side of a cell. None: 1, or more where there are more planes than rows or columns,
+            because Stable-Baselines3 takes the smallest dimension for the channels.
     Attributes:
         shades: (L, 256) uint8, the shade of every value on the plane of every layer.
         is_flat: a pixel is a cell, and each layer has a plane of its own.
@@ -42,7 +44,8 @@ class SimpleImage(Observation):
             raise ParameterError(f"simple_image: scale is {scale!r}; expected an integer of at least 1")
         if planes > min(rows, columns) * scale:
             raise ParameterError(
-                f"simple_image of {env}: {planes} planes ({', '.join(env.layers)}) of {rows * scale} x {columns * scale} pixels "
+                f"simple_image of {env}: {planes} planes ({', '.join(env.layers)}) "
+                f"of {rows * scale} x {columns * scale} pixels "
                 f"would be taken for an image of {min(rows, columns) * scale} channels; "
                 f"use scale={-(-planes // min(rows, columns))} or grey=True"
             )
@@ -63,7 +66,7 @@ class SimpleImage(Observation):
 
 
 def _shades(env: Environment, covering: bool) -> np.ndarray:
-    """(L, 256) uint8, the shade of every value on the plane of every layer; values beyond the declared ones look like the last."""
+    """(L, 256) uint8, the shade of every value of every layer; values beyond the declared ones look like the last."""
     shades = np.zeros((len(env.layers), 256), np.uint8)
     counts = [num_values(layer) for layer in env.layers.values()]
     before = np.cumsum(counts) - counts

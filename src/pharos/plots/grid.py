@@ -28,9 +28,9 @@ def value_map(
 ) -> "Figure":
     """Draw V over the cells of a grid, with an arrow for each action that the policy may take.
 
-    Arrows are those of all optimal actions for an optimal solution; for a given policy as long as their probability. A dot
-    stands where every action is as good. Terminal cells are grey and outside of the colours' range; the number is the reward
-    of getting there. A frame marks the cell where episodes start.
+    Arrows are those of all optimal actions for an optimal solution; for a given policy as long as their probability. A
+    dot stands where every action is as good. Terminal cells are grey and outside of the colours' range; the number is
+    the reward of getting there. A frame marks the cell where episodes start.
 
     Args:
         space: of an environment whose states have a row and a column, such as simple_grid and frozen_lake.
@@ -93,7 +93,8 @@ def _cells(space: "StateSpace", fix: Mapping[str, int]) -> tuple[np.ndarray, np.
             raise UnknownName(f"component of {environment} to fix", name, others)
     if not {"row", "column"} <= set(names):
         raise ParameterError(
-            f"{environment}: a state has {', '.join(names[:4])}; expected row and column alone, or others beside them to fix"
+            f"{environment}: a state has {', '.join(names[:4])}; "
+            f"expected row and column alone, or others beside them to fix"
         )
     free = [name for name in others if name not in fix]
     if free:
@@ -117,15 +118,15 @@ def _cells(space: "StateSpace", fix: Mapping[str, int]) -> tuple[np.ndarray, np.
 
 
 def _range_of(values: np.ndarray) -> tuple[float, float]:
-    known = values[~np.isnan(values)]
-    return (float(known.min()), float(known.max())) if known.size else (0.0, 0.0)
+    numbers = values[~np.isnan(values)]
+    return (float(numbers.min()), float(numbers.max())) if numbers.size else (0.0, 0.0)
 
 
 def _lengths(solution: "Solution") -> np.ndarray:
     """(S, A) in [0, 1]: which actions the policy takes, and how often."""
     if solution.kind == "policy":
-        given = np.asarray(solution.policy)
-        return np.eye(solution.mdp.num_actions)[given] if given.ndim == 1 else np.nan_to_num(given)
+        policy = np.asarray(solution.policy)
+        return np.eye(solution.mdp.num_actions)[policy] if policy.ndim == 1 else np.nan_to_num(policy)
     sign, tolerance = (-1 if solution.kind == "worst" else 1), max(1e-9, 2 * solution.error_bound)
     q = sign * solution.q
     return (q >= q.max(axis=1, keepdims=True) - tolerance).astype(np.float64)

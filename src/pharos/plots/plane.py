@@ -25,7 +25,8 @@ def hardness_plane(
     """Draw instances by two measures on logarithmic axes; a diameter that is an interval is drawn as a bar.
 
     Args:
-        reports: name of an instance, such as "breakout/12x8x1", to its report. One colour for each class before the slash.
+        reports: name of an instance, such as "breakout/12x8x1", to its report. One colour for each class before the
+            slash.
         visitation, estimation: names of measures in the reports.
         axes: where to draw; None for a new figure.
     Raises:

@@ -9,7 +9,9 @@ import numpy as np
 
 from pharos.drawing import NIGHT, image, save_gif
 from pharos.errors import ParameterError
+from pharos.interaction import GymEnv
 from pharos.observations import render as render_state
+from pharos.policies import PolicyAnswers
 
 if TYPE_CHECKING:
     from pharos.environments import State
@@ -30,12 +32,14 @@ def policies(
 ) -> Path:
     """Write an episode of each agent, side by side, with the return so far below.
 
-    All start in the same state and meet the same chance as far as they act alike. For the best policy give that of a discounted
-    solution: with many undiscounted steps to go, a policy that waits is as good as one that goes straight to the goal.
+    All start in the same state and meet the same chance as far as they act alike. For the best policy give that of a
+    discounted solution: with many undiscounted steps to go, a policy that waits is as good as one that goes straight
+    to the goal.
 
     Args:
         task: environment, chance, and what the agents see.
-        agents: label -> what `experiments.evaluate_agent` takes: a table (S,) or (S, A), a model, or a function of observations.
+        agents: label -> what `experiments.evaluate_agent` takes: a table (S,) or (S, A), a model, or a function of
+            observations.
         path: of the .gif.
         steps: at most; None for the time limit of the task.
         observation: how states are drawn, "human" or an observation that is an image.
@@ -74,8 +78,6 @@ def _beside(parts: Sequence[np.ndarray]) -> np.ndarray:
 
 def _episode(task: "Task", agent: Any, steps: int, seed: int) -> list[tuple["State", float]]:
     """[(state, return so far)] from the start to the end of one episode, as `GymEnv` plays it."""
-    from pharos.interaction import GymEnv
-
     env = GymEnv(task.env, **task.interaction)
     choose = _chooser(task, agent, np.random.default_rng(seed))
     seen, info = env.reset(seed=seed)
@@ -91,8 +93,6 @@ def _episode(task: "Task", agent: Any, steps: int, seed: int) -> list[tuple["Sta
 
 def _chooser(task: "Task", agent: Any, rng: np.random.Generator) -> Callable[[Any, "State"], int]:
     """A function (observation, state) -> action."""
-    from pharos.policies import PolicyAnswers
-
     if hasattr(agent, "policy_table"):
         agent = agent.policy_table()
     if isinstance(agent, np.ndarray):

@@ -25,11 +25,11 @@ def regret(
     resamples: int = 1000,
     axes: Sequence[Any] | None = None,
 ) -> "Figure":
-    """Draw the regret of runs over their steps; runs that differ in the seed alone become one line with a bootstrap interval.
+    """Draw the regret of runs over their steps; runs that differ in the seed alone are one line with an interval.
 
-    Left, the normalized expected regret of the policy learnt so far: 0 is optimal, 1 is playing at random (in units of return where
-    playing at random is optimal in one of the tasks). Right, the cumulative realised regret of all episodes played, exploration
-    included; a dotted line is what playing at random would have cost in as many episodes.
+    Left, the normalized expected regret of the policy learnt so far: 0 is optimal, 1 is playing at random (in units of
+    return where playing at random is optimal in one of the tasks). Right, the cumulative realised regret of all
+    episodes played, exploration included; a dotted line is what playing at random would have cost in as many episodes.
 
     Args:
         folders: of finished runs, on any number of tasks.
@@ -73,13 +73,13 @@ def regret(
 
 def _groups(folders: Sequence[str | os.PathLike]) -> dict[str, list[tuple[dict[str, Any], Any]]]:
     """label -> [(record, curve)]: the runs that differ in the seed alone."""
-    found: dict[str, list[tuple[dict[str, Any], Any]]] = {}
+    groups: dict[str, list[tuple[dict[str, Any], Any]]] = {}
     for folder in folders:
         record = read_record(folder)
         key = json.dumps({**record["config"], "seed": None}, sort_keys=True)
-        found.setdefault(key, []).append((record, read_curve(folder)))
-    configs = [runs[0][0]["config"] for runs in found.values()]
-    return {_label(config, configs): runs for config, runs in zip(configs, found.values(), strict=True)}
+        groups.setdefault(key, []).append((record, read_curve(folder)))
+    configs = [runs[0][0]["config"] for runs in groups.values()]
+    return {_label(config, configs): runs for config, runs in zip(configs, groups.values(), strict=True)}
 
 
 def _label(config: dict[str, Any], configs: list[dict[str, Any]]) -> str:
