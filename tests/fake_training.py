@@ -73,6 +73,16 @@ def train(config, folder):
     (folder / "run.json").write_text(json.dumps(record))
 
 
+def hold(config, folder):
+    """Never end, and hold a semaphore, as Stable-Baselines3 does by way of tqdm."""
+    import multiprocessing
+
+    semaphore = multiprocessing.get_context("spawn").RLock()
+    (folder / "held").write_text(str(semaphore))
+    while True:
+        time.sleep(0.1)
+
+
 def results(folder):
     """The result of every run in a study's folder, by id."""
     return {file.parent.name: json.loads(file.read_text()) for file in Path(folder).glob("runs/*/run.json")}

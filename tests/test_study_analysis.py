@@ -279,3 +279,59 @@ def test_instances_are_those_blocks_of_the_papers_tables_that_print_their_parame
         renamed = {"lane length": "lane_length", "n cars": "num_cars", "player speed": "player_speed"}
         renamed["extra paddle width"] = "extra_paddle_width"
         assert {renamed.get(name, name): value for name, value in words.items()}.items() <= ours.items()
+
+
+def test_kept_hardness_that_was_edited_cut_or_swapped_is_measured_again(tmp_path):
+    block = {"environments": ["frozen_lake/4x4", "frozen_lake/8x8"], "agents": ["q_learning"], "seeds": 1}
+    spec = study.specification({"name": "a", "hardness": {"measures": ["diameter"]}, "blocks": [block]})
+    expected = list(study.hardness_table(spec, tmp_path)["diameter"])
+    one, two = sorted((tmp_path / "hardness").glob("*.json"))
+    texts = one.read_text(), two.read_text()
+    one.write_text(texts[1]), two.write_text(texts[0])
+    assert list(study.hardness_table(spec, tmp_path)["diameter"]) == expected
+    for file in (one, two):
+        file.write_text(
+            file.read_text().replace('"value": 7.0', '"value": 9.0').replace('"value": 15.0', '"value": 9.0')
+        )
+    assert list(study.hardness_table(spec, tmp_path)["diameter"]) == expected
+    one.write_text(texts[0][:80])
+    assert list(study.hardness_table(spec, tmp_path)["diameter"]) == expected
+
+
+def test_runs_with_estimates_say_so_with_the_half_width_of_their_regret(done, tmp_path):
+    import shutil
+
+    spec, folder = done
+    shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
+    run = spec.runs[0]
+    file = tmp_path / "runs" / run.id / "curve.parquet"
+    curve = pd.read_parquet(file)
+    estimated = np.arange(len(curve)) % 2 == 0
+    curve.assign(exact=~estimated, error_bound=0.25).to_parquet(file)
+    rows = study.table(spec, tmp_path)
+    row = rows[rows["id"] == run.id].iloc[0]
+    between, last = np.diff(curve["episodes"]), curve["episodes"].iloc[-1]
+    assert not row["exact"]
+    assert row["half_width"] == pytest.approx((between * 0.25 * estimated[:-1]).sum() / last / 0.9)
+    assert rows[rows["id"] != run.id]["exact"].all() and (rows[rows["id"] != run.id]["half_width"] == 0).all()
+    cells = study.cells(rows)
+    assert cells["exact"].tolist().count(False) == 1
+    cell = cells[~cells["exact"]].iloc[0]
+    assert cell["half_width"] == pytest.approx(row["half_width"] / 3)  # three seeds
+
+
+def test_records_of_absurd_numbers_are_damaged(done, tmp_path):
+    import json
+    import shutil
+
+    spec, folder = done
+    shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
+    for run, change in zip(
+        spec.runs, ({"seconds": 1e308}, {"regret": -1e300}, {"seconds": -1}, {"regret": True}), strict=False
+    ):
+        file = tmp_path / "runs" / run.id / "run.json"
+        record = json.loads(file.read_text())
+        record["seconds"] = change.get("seconds", record["seconds"])
+        record["result"]["cumulative_regret"] = change.get("regret", 1.0)
+        file.write_text(json.dumps(record))
+    assert len(study.table(spec, tmp_path)) == len(spec.runs) - 4

@@ -4,8 +4,13 @@ import json
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
+
+import fake_training
+from pharos import study
+from pharos.errors import UnknownName
 
 SPECIFICATION = """\
 name: lake
@@ -80,3 +85,15 @@ def test_a_study_with_failed_runs_ends_with_exit_code_1_and_says_where_to_look(f
     assert done.returncode == 1
     assert done.stdout == "wrong: 0 of 2 runs finished, 2 failed\n"
     assert "2 x " in done.stderr and "learning_rat" in done.stderr and "--retry-failed" in done.stderr
+
+
+def test_a_study_is_found_by_its_name_after_it_was_run(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    block = {"environments": ["frozen_lake/4x4"], "agents": ["q_learning"], "seeds": 1}
+    spec = study.specification({"name": "lake", "steps": 10, "evaluations": 1, "blocks": [block]})
+    study.run(spec, runner=fake_training.train)
+    assert study.status("lake").finished == 1 and study.status("lake").folder == "studies/lake"
+    assert study.specification("lake").name == "lake"
+    assert study.report("lake").html == Path("studies/lake/report/report.html")
+    with pytest.raises(UnknownName, match="did you mean 'lake'"):
+        study.status("lakes")

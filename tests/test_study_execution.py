@@ -13,7 +13,7 @@ import pytest
 
 import fake_training
 from pharos import study
-from pharos.errors import ParameterError
+from pharos.errors import ParameterError, PharosError
 from pharos.study import execution as _execution
 from pharos.study import worker as _worker
 from pharos.study.execution import shard_of
@@ -269,3 +269,132 @@ def test_a_result_that_was_complete_when_its_process_was_killed_is_kept(tmp_path
     study.run(spec, tmp_path, runner=raise_always)
     assert study.status(spec, tmp_path).finished == 1
     assert log.read_text().split() == [id]
+
+
+# Damage, and processes that die ----------------------------------------------------------------------------------------
+
+
+def cut(file):
+    file.write_bytes(file.read_bytes()[:300])
+
+
+def no_run(file):
+    file.write_text('{"hello": [1, 2]}')
+
+
+def of_text(file):
+    record = json.loads(file.read_text())
+    record["result"]["cumulative_regret"] = "=cmd"
+    file.write_text(json.dumps(record))
+
+
+DAMAGES = {
+    "a cut record": ("run.json", cut),
+    "a cut curve": ("curve.parquet", cut),
+    "a foreign record": ("run.json", no_run),
+    "a foreign curve": ("curve.parquet", lambda file: file.write_bytes(b"PAR1 is the beginning and the end PAR1")),
+    "no curve": ("curve.parquet", Path.unlink),
+    "a record of text": ("run.json", of_text),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_one_damaged_run_is_a_line_and_does_not_stop_the_others(tmp_path, log, damage):
+    spec = specification()
+    out = tmp_path / "out"
+    study.run(spec, out, runner=fake_training.train, workers=2)
+    bad = spec.runs[1].id
+    name, change = DAMAGES[damage]
+    change(out / "runs" / bad / name)
+    assert bad not in set(study.table(spec, out)["id"]) and len(study.table(spec, out)) == 5
+    assert set(study.curves(spec, out)["id"]) == {run.id for run in spec.runs} - {bad}
+    now = study.status(spec, out)
+    if damage not in ("a foreign curve", "a record of text"):  # which only reading them whole shows
+        assert (now.finished, now.missing) == (5, 1)
+        assert list(now.damaged) == [bad] and "\n" not in now.damaged[bad] and name in now.damaged[bad]
+        assert str(now).startswith("fake: 5 of 6 runs finished, 1 damaged")
+        log.write_text("")
+        assert study.run(spec, out, runner=fake_training.train, workers=2).finished == 6
+        assert log.read_text().split() == [bad]
+        assert study.status(spec, out).damaged == {}
+    report = study.report(spec, out)
+    assert len(report.notes) > 0 and report.html.is_file()
+
+
+def test_a_file_in_the_place_of_a_run_and_foreign_files_beside_it_stop_nothing(tmp_path, log):
+    spec = specification()
+    (tmp_path / "runs").mkdir()
+    (tmp_path / "runs" / spec.runs[0].id).write_text("what is this?")
+    (tmp_path / "runs" / "README").write_text("notes")
+    (tmp_path / "status-old.json").write_text('["no status"]')
+    assert "is a file" in study.status(spec, tmp_path).damaged[spec.runs[0].id]
+    assert study.run(spec, tmp_path, runner=fake_training.train, workers=2).finished == 6
+
+
+def test_the_process_that_forks_workers_is_begun_again_when_it_dies(tmp_path, log, monkeypatch):
+    from multiprocessing.forkserver import _forkserver
+
+    monkeypatch.setenv("PHAROS_FAKE_SECONDS", "0.3")
+    spec = specification(seeds=4)
+    killed = []
+
+    def kill(status):
+        if len(killed) < 4 and _forkserver._forkserver_pid not in (None, *killed):
+            killed.append(_forkserver._forkserver_pid)
+            os.kill(_forkserver._forkserver_pid, signal.SIGKILL)
+
+    end = study.run(spec, tmp_path / "out", runner=fake_training.train, workers=2, progress=kill)
+    assert len(killed) == 4 and (end.finished, end.failed) == (8, 0)
+
+
+def test_a_runner_whose_starts_always_fail_gives_up_in_one_line(tmp_path, log, monkeypatch):
+    monkeypatch.setattr(_execution, "BUSY_SECONDS", 0.0)
+    monkeypatch.setattr(_execution.Execution, "_worker", lambda *_: (_ for _ in ()).throw(EOFError()))
+    with pytest.raises(PharosError, match="the process that starts runs died 11 times in a row"):
+        study.run(specification(), tmp_path / "out", runner=fake_training.train, workers=2)
+
+
+def without_flock(monkeypatch):
+    import errno
+    import fcntl
+
+    def flock(*_):
+        raise OSError(errno.ENOSYS, "Function not implemented")
+
+    monkeypatch.setattr(fcntl, "flock", flock)
+
+
+def test_where_locks_are_not_supported_runs_and_instances_are_no_longer_taken_for_held(tmp_path, log, monkeypatch):
+    without_flock(monkeypatch)
+    run = specification().runs[0]
+    assert _worker.attempt(fake_training.train, run.config, run.id, tmp_path) == "finished"
+    sent = []
+    _execution._unless_locked(lambda config: sent.append(config), run.config, sent.append)
+    assert sent == [run.config]
+
+
+def test_a_run_that_another_process_holds_is_busy_and_says_so_of_training(tmp_path, log):
+    from pharos.errors import FolderLocked, StateSpaceLocked
+    from pharos.storage import lock
+
+    run = specification().runs[0]
+    place = tmp_path / "locks" / run.id
+    place.mkdir(parents=True)
+    with lock(place, FolderLocked, "training"):
+        assert _worker.attempt(fake_training.train, run.config, run.id, tmp_path) == "busy"
+    assert not issubclass(FolderLocked, StateSpaceLocked)
+
+
+@pytest.mark.parametrize("sent", (signal.SIGINT, signal.SIGTERM))
+def test_an_interrupted_study_leaves_no_warning_of_semaphores(tmp_path, log, sent):
+    (tmp_path / "fake.yaml").write_text(json.dumps(specification().model_dump(mode="json", exclude_unset=True)))
+    code = "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); from pharos.cli import main; "
+    code += "import fake_training, pharos.study.execution as e; e.run.__kwdefaults__['runner'] = fake_training.hold; "
+    code += "sys.argv = ['pharos', 'study', 'run', 'fake.yaml', '--workers', '2']; main()"
+    place = {"cwd": tmp_path, "env": {**os.environ, "PYTHONPATH": os.pathsep.join([str(TESTS), *sys.path])}}
+    process = subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.PIPE, text=True, **place)
+    wait_for(lambda: len([*(tmp_path / "studies/fake/partial").glob("*/held")]) == 2)
+    process.send_signal(sent)
+    _, errors = process.communicate(timeout=30)
+    assert process.returncode == (130 if sent == signal.SIGINT else 143)
+    assert "resource_tracker" not in errors and "Traceback" not in errors, errors

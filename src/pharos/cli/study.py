@@ -1,6 +1,7 @@
 """pharos study: a grid of training runs from a YAML file: show it, run it, see how far it is, report on it."""
 
 import contextlib
+import signal
 import sys
 import time
 from collections import Counter
@@ -113,7 +114,7 @@ def run(
         )
         _print_jobs([str(job.job_id) for job in jobs], json)
         return
-    with _progress() as progress:
+    with _progress() as progress, _termination():
         if on == "ray":
             end = study.run_on_ray(
                 spec,
@@ -226,6 +227,10 @@ def _answer(status: Any, json: bool) -> None:
         print(f"{status.missing} runs missing; `pharos study run` goes on from there")
     for error, count in Counter(status.errors.values()).most_common(5):
         complain(f"{count} x {error}")
+    for problem in list(status.damaged.values())[:5]:
+        complain(problem)
+    if status.damaged:
+        complain(f"{len(status.damaged)} damaged, counted as missing; `pharos study run` executes them again")
     if status.errors:
         complain(f"logs: {status.folder}/runs/{next(iter(status.errors))}/log.txt; repeat with --retry-failed")
 
@@ -255,6 +260,20 @@ def _progress() -> Iterator[Callable[[Any], None]]:
             bar.update(task, total=status.total, completed=status.finished + status.failed, description=str(status))
 
         yield show
+
+
+@contextlib.contextmanager
+def _termination() -> Iterator[None]:
+    """SIGTERM ends the runs before it ends this process."""
+
+    def leave(*_: Any) -> None:
+        sys.exit(128 + signal.SIGTERM)
+
+    before = signal.signal(signal.SIGTERM, leave)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def _steps(runs) -> list[int]:

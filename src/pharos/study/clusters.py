@@ -15,8 +15,9 @@ from pharos.study import worker as _worker
 from pharos.study.execution import (
     ATTEMPTS,
     STATUS_SECONDS,
+    Execution,
+    Options,
     Status,
-    _Execution,
     claim,
     opened,
     processors,
@@ -114,18 +115,8 @@ def run_on_ray(
     study, place = opened(source, folder)
     place = place.absolute()
     claim(study, place)
-    execution = _Execution(
-        study,
-        place,
-        shard_of(study.runs, shard),
-        "status.json",
-        retry_failed,
-        resume,
-        None,
-        processors(),
-        progress,
-        runner,
-    )
+    options = Options(retry_failed=retry_failed, resume=resume, workers=processors(), progress=progress, runner=runner)
+    execution = Execution(study, place, shard_of(study.runs, shard), options)
     ours = not ray.is_initialized()
     if ours:
         ray.init(address=address, log_to_driver=False, include_dashboard=False if address is None else None)
@@ -144,13 +135,13 @@ def _attempt(runner: _worker.Runner, config: Mapping[str, Any], id: str, folder:
     return end
 
 
-def _follow(ray: Any, remote: Any, execution: _Execution) -> Status:
+def _follow(ray: Any, remote: Any, execution: Execution) -> Status:
     """Start every run, and await them one by one; one whose process died too often has failed."""
     started: dict[Any, Run] = {}
     while execution.pending:
         _, run = execution.pending.popleft()
-        how = (run.id in execution.again, execution.resume)
-        arguments = (execution.runner, dict(run.config), run.id, str(execution.folder), *how)
+        how = (run.id in execution.repeated, execution.options.resume)
+        arguments = (execution.options.runner, dict(run.config), run.id, str(execution.folder), *how)
         started[remote.remote(*arguments)] = run
     while started:
         for reference in ray.wait(list(started), num_returns=1, timeout=STATUS_SECONDS)[0]:

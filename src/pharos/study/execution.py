@@ -12,88 +12,30 @@ import shutil
 import socket
 import time
 from collections import defaultdict, deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from multiprocessing import connection
 from pathlib import Path
 from typing import Any
 
-from pharos.errors import ParameterError, StateSpaceLocked
+from pharos.errors import FileFormatError, ParameterError, PharosError, StateSpaceLocked
+from pharos.storage import replace_json
 from pharos.study import values as _values
 from pharos.study import worker as _worker
-from pharos.study.specification import Run, Source, Specification, specification, study_name
-from pharos.study.worker import write_atomically
+from pharos.study.specification import Run, Source, Specification
+from pharos.study.status import Status, claim, duration, opened, status
+
+__all__ = ["Execution", "Options", "Status", "claim", "duration", "opened", "processors", "run", "shard_of", "status"]
 
 ATTEMPTS = 3
 STATUS_SECONDS = 2.0
 BUSY_SECONDS = 0.5
-OTHERS_SECONDS = 20.0  # between two looks at what other runners have finished in the same folder
-
-
-@dataclass(frozen=True)
-class Status:
-    """How far a study is.
-
-    Attributes:
-        name, folder: of the study.
-        total, finished, failed, running: numbers of runs; those in `running` are started and not over.
-        errors: of the failed runs, by id.
-        elapsed, remaining: seconds since this runner began, and until the end as far as one can tell (None: not yet).
-        preparing: what is built or solved before the runs; empty otherwise.
-    """
-
-    name: str
-    folder: str
-    total: int
-    finished: int
-    failed: int
-    running: int
-    errors: Mapping[str, str]
-    elapsed: float = 0.0
-    remaining: float | None = None
-    preparing: str = ""
-
-    @property
-    def missing(self) -> int:
-        """Runs that are not over."""
-        return self.total - self.finished - self.failed
-
-    def to_dict(self) -> dict[str, Any]:
-        """JSON-able."""
-        return {**asdict(self), "missing": self.missing}
-
-    def __str__(self) -> str:
-        if self.preparing:
-            return f"{self.name}: {self.preparing}"
-        text = f"{self.name}: {self.finished} of {self.total} runs finished"
-        if self.failed:
-            text += f", {self.failed} failed"
-        if self.running:
-            text += f", {self.running} running"
-        if self.missing and self.remaining is not None:
-            text += f", about {duration(self.remaining)} left"
-        return text
-
-
-def duration(seconds: float) -> str:
-    """`40 s`, `12 min`, `3.5 h`."""
-    if seconds < 90:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
-
-
-def opened(
-    source: Source, folder: str | os.PathLike | None = None, *, trust: bool | None = None
-) -> tuple[Specification, Path]:
-    """A study and where its results are: `folder`, else the source if that is a study's folder, else studies/NAME.
-
-    Args:
-        trust: as for `specification`.
-    """
-    study = specification(source, trust=trust)
-    if folder is None and isinstance(source, str | Path) and Path(source, "study.yaml").is_file():
-        folder = source
-    return study, Path("studies", study.name) if folder is None else Path(folder)
+# Between two looks at what other runners have finished in the same folder
+OTHERS_SECONDS = 20.0
+TERMINATION_SECONDS = 5.0
+# How often in a row the process that forks workers is begun again, and what multiprocessing says of a worker whose server is gone
+LOST_SERVERS = 10
+SERVER_LOST = 255
 
 
 def train(config: Mapping[str, Any], folder: Path) -> None:
@@ -163,9 +105,16 @@ def run(
         raise ParameterError(f"workers is {workers}; expected at least 1")
     claim(study, place)
     name = "status.json" if shard is None else f"status-{str(shard).replace('/', '-of-')}.json"
-    execution = _Execution(
-        study, place, runs, name, retry_failed, resume, timeout, workers or processors(), progress, runner
+    options = Options(
+        retry_failed=retry_failed,
+        resume=resume,
+        timeout=timeout,
+        workers=workers or processors(),
+        progress=progress,
+        runner=runner,
+        status_file=name,
     )
+    execution = Execution(study, place, runs, options)
     if prepare is None and runner is train:
         prepare = prepare_instance
     if prepare is not None:
@@ -173,48 +122,17 @@ def run(
     return execution.run()
 
 
-def status(source: Source, folder: str | os.PathLike | None = None) -> Status:
-    """How far a study is, from its files; `remaining` is what its runners last said."""
-    study, place = opened(source, folder)
-    states = {run.id: _worker.read_record(place / "runs" / run.id) for run in study.runs}
-    errors = {id: str(record.get("error")) for id, record in states.items() if record and record["status"] == "failed"}
-    finished = sum(1 for record in states.values() if record and record["status"] == "finished")
-    running, remaining = 0, None
-    for file in sorted(place.glob("status*.json")):
-        with contextlib.suppress(ValueError, OSError):
-            said = json.loads(file.read_text(encoding="utf-8"))
-            if _lives(said):
-                running += said["running"]
-                if said["remaining"] is not None:
-                    remaining = max(remaining or 0.0, said["remaining"])
-    return Status(study.name, str(place), len(states), finished, len(errors), running, errors, 0.0, remaining)
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """How the runs of a study are executed; see `run`."""
 
-
-def _lives(said: Mapping[str, Any]) -> bool:
-    """Whether the runner that wrote a status file is there: told exactly on its own machine, by the file's age elsewhere."""
-    if said["host"] != socket.gethostname():
-        return time.time() - said["updated"] < 60
-    try:
-        os.kill(said["process"], 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        pass
-    return time.time() - said["updated"] < 60
-
-
-def claim(study: Specification, folder: Path) -> None:
-    """Write the specification into the folder, so that it can be reported on alone; refuse a folder of another study."""
-    folder.mkdir(parents=True, exist_ok=True)
-    file = folder / "study.yaml"
-    if file.exists():
-        name = study_name(file)
-        if name is not None and name != study.name:
-            raise ParameterError(f"{folder}: holds the study {name!r}, not {study.name!r}; choose another --out")
-    import yaml
-
-    text = yaml.safe_dump(study.model_dump(mode="json", exclude_unset=True), sort_keys=False, width=120)
-    write_atomically(file, text)
+    retry_failed: bool = False
+    resume: bool = False
+    timeout: float | None = None
+    workers: int
+    progress: Callable[[Status], None] | None = None
+    runner: _worker.Runner = train
+    status_file: str = "status.json"
 
 
 def processors() -> int:
@@ -222,36 +140,24 @@ def processors() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-class _Execution:
+class Execution:
     """The loop that starts, awaits and counts worker processes."""
 
-    def __init__(
-        self,
-        study: Specification,
-        folder: Path,
-        runs: Sequence[Run],
-        status_name: str,
-        retry_failed: bool,
-        resume: bool,
-        timeout: float | None,
-        workers: int,
-        progress: Callable[[Status], None] | None,
-        runner: _worker.Runner,
-    ):
-        self.study, self.folder, self.runs, self.workers = study, folder, runs, workers
-        self.timeout, self.runner, self.tell, self.resume = timeout, runner, progress, resume
-        self.status_file = folder / status_name
+    def __init__(self, study: Specification, folder: Path, runs: Sequence[Run], options: Options):
+        self.study, self.folder, self.runs, self.options = study, folder, runs, options
         self.began = time.monotonic()
-        self.told, self.looked = -1e9, time.monotonic()
+        self.last_report, self.last_listing = -1e9, time.monotonic()
         self.finished: dict[str, float] = {}
         self.errors: dict[str, str] = {}
-        self.again: set[str] = set()
+        self.damaged: dict[str, str] = {}
+        self.repeated: set[str] = set()
         self.pending: deque[tuple[float, Run]] = deque()
         self.running: dict[int, tuple[Any, Run, float]] = {}
         self.kills: dict[str, int] = defaultdict(int)
+        self.lost_servers = 0
         self.seconds_per_step: dict[tuple, tuple[float, int]] = {}
         for run in runs:
-            if not self.note(run, retry_failed):
+            if not self.note(run, options.retry_failed):
                 self.pending.append((0.0, run))
 
     def prepare(self, prepare: Callable[[Mapping[str, Any]], Any]) -> None:
@@ -263,44 +169,46 @@ class _Execution:
             instances.setdefault(key, run)
         todo = list(instances.values())
         while todo:
-            receiver, sender = multiprocessing.get_context("spawn").Pipe(duplex=False)
-            process = multiprocessing.get_context("spawn").Process(
-                target=_prepare_all, args=(prepare, [run.config for run in todo], sender)
-            )
-            process.start()
-            sender.close()
-            done = 0
-            try:
-                while done < len(todo):
-                    run = todo[done]
-                    self.report(f"preparing {run.instance}, {run.chance} ({len(instances) - len(todo) + done + 1} of {len(instances)})")  # fmt: skip
-                    if receiver.poll(STATUS_SECONDS):
-                        receiver.recv()
-                        done += 1
-            except EOFError:
-                done += 1  # the process died at this one
-            except KeyboardInterrupt:
-                process.terminate()
-                raise
-            finally:
-                receiver.close()
-            process.join()
-            del todo[:done]
+            del todo[: self._prepare(prepare, todo, len(instances))]
+
+    def _prepare(self, prepare: Callable[[Mapping[str, Any]], Any], todo: Sequence[Run], total: int) -> int:
+        """Prepare instances in a process of their own; how many are done, the one at which it died included."""
+        context = multiprocessing.get_context("spawn")
+        receiver, sender = context.Pipe(duplex=False)
+        process = context.Process(target=_prepare_all, args=(prepare, [run.config for run in todo], sender))
+        process.start()
+        sender.close()
+        done, waits_for = 0, ""
+        try:
+            while done < len(todo):
+                run = todo[done]
+                number = total - len(todo) + done + 1
+                self.report(f"preparing {run.instance}, {run.chance} ({number} of {total}){waits_for}")
+                if receiver.poll(STATUS_SECONDS):
+                    message = receiver.recv()
+                    waits_for = f"; {message}" if message else ""
+                    done += not message
+        except EOFError:
+            done += 1
+        except BaseException:
+            _end([process])
+            raise
+        finally:
+            receiver.close()
+        process.join()
+        return done
 
     def run(self) -> Status:
-        context = _context(self.runner is train)
+        context = _context(self.options.runner is train)
         try:
             while self.pending or self.running:
-                if time.monotonic() - self.looked >= OTHERS_SECONDS:
+                if time.monotonic() - self.last_listing >= OTHERS_SECONDS:
                     self._look_around()
                 self._start(context)
                 self.report()
                 self._await()
         except BaseException:
-            for process, _, _ in self.running.values():
-                process.terminate()
-            for process, _, _ in self.running.values():
-                process.join(10)
+            _end([process for process, _, _ in self.running.values()])
             self.running.clear()
             self.report(final=True)
             raise
@@ -309,34 +217,53 @@ class _Execution:
 
     def _look_around(self) -> None:
         """Count what other runners have finished: one listing of the folder."""
-        self.looked = time.monotonic()
+        self.last_listing = time.monotonic()
         with contextlib.suppress(OSError):
             there = set(os.listdir(self.folder / "runs"))
             self.pending = deque(
                 (due, run)
                 for due, run in self.pending
-                if run.id not in there or run.id in self.again or not self.note(run)
+                if run.id not in there or run.id in self.repeated or not self.note(run)
             )
 
     def _start(self, context: Any) -> None:
         for _ in range(len(self.pending)):
-            if len(self.running) >= self.workers:
+            if len(self.running) >= self.options.workers:
                 return
             due, run = self.pending.popleft()
             if due > time.monotonic():
                 self.pending.append((due, run))
                 continue
-            if self.note(run, run.id in self.again):
+            if self.note(run, run.id in self.repeated):
                 continue
-            again = run.id in self.again
-            where = (run.id, self.folder.absolute(), again, self.resume)
-            arguments = (self.runner, dict(run.config), *where, dict(os.environ))
-            process = context.Process(target=_worker.main, args=arguments, name=run.id)
-            process.start()
+            try:
+                process = self._worker(context, run)
+            except (EOFError, ConnectionError) as error:
+                self._server_lost(error)
+                self.pending.appendleft((due, run))
+                return
             self.running[process.sentinel] = (process, run, time.monotonic())
 
+    def _server_lost(self, error: Exception) -> None:
+        """The process that forks workers is gone: wait a little, and the next start begins another."""
+        self.lost_servers += 1
+        if self.lost_servers > LOST_SERVERS:
+            raise PharosError(
+                f"the process that starts runs died {self.lost_servers} times in a row ({_worker.describe(error)}); "
+                f"was there memory enough?"
+            ) from error
+        time.sleep(BUSY_SECONDS)
+
+    def _worker(self, context: Any, run: Run) -> Any:
+        where = (run.id, self.folder.absolute(), run.id in self.repeated, self.options.resume)
+        arguments = (self.options.runner, dict(run.config), *where, dict(os.environ))
+        process = context.Process(target=_worker.main, args=arguments, name=run.id)
+        with _one_thread():
+            process.start()
+        return process
+
     def _await(self) -> None:
-        waiting = BUSY_SECONDS if self.pending and len(self.running) < self.workers else STATUS_SECONDS / 2
+        waiting = BUSY_SECONDS if self.pending and len(self.running) < self.options.workers else STATUS_SECONDS / 2
         if not self.running:
             time.sleep(BUSY_SECONDS)
             return
@@ -347,11 +274,14 @@ class _Execution:
             process.close()
             if code == _worker.EXIT_BUSY:
                 self.pending.append((time.monotonic() + BUSY_SECONDS, run))
-            elif not self.note(run, code != 0 and run.id in self.again):
+            elif code == SERVER_LOST and not self.note(run) and self.lost_servers < LOST_SERVERS:
+                self.lost_servers += 1  # the worker may well live: the next attempt waits for it
+                self.pending.append((time.monotonic() + BUSY_SECONDS, run))
+            elif not self.note(run, code != 0 and run.id in self.repeated):
                 self._killed(run, code)
-        if self.timeout is not None:
+        if self.options.timeout is not None:
             for process, run, started in self.running.values():
-                if time.monotonic() - started > self.timeout:
+                if time.monotonic() - started > self.options.timeout:
                     self.kills[run.id] = ATTEMPTS
                     process.kill()
 
@@ -362,7 +292,7 @@ class _Execution:
             self.pending.append((0.0, run))
             return
         if self.kills[run.id] > ATTEMPTS:
-            error = f"took longer than {self.timeout:g} s"
+            error = f"took longer than {self.options.timeout:g} s"
         else:
             how = f"by signal {-code}" if code < 0 else f"with exit code {code}"
             error = f"its process ended {how}, {ATTEMPTS} times; was there memory enough?"
@@ -373,14 +303,20 @@ class _Execution:
         self.note(run, False)
 
     def note(self, run: Run, again: bool = False) -> bool:
-        """Read the run's result, if it is over; False where it has to be executed."""
-        record = _worker.read_record(self.folder / "runs" / run.id)
+        """Read the run's result, if it is over; False where it has to be executed, a damaged one again."""
+        try:
+            record = _worker.read_record(self.folder / "runs" / run.id)
+        except FileFormatError as error:
+            self.damaged[run.id] = str(error)
+            return False
         if record is None or (record["status"] != "finished" and again):
             if record is not None:
-                self.again.add(run.id)
+                self.repeated.add(run.id)
             return False
+        self.damaged.pop(run.id, None)
         if record["status"] == "finished":
             self.finished[run.id] = record["seconds"]
+            self.lost_servers = 0
             self.errors.pop(run.id, None)
             seconds, steps = self.seconds_per_step.get(run.kind, (0.0, 0))
             self.seconds_per_step[run.kind] = (seconds + record["seconds"], steps + run.config["steps"])
@@ -398,28 +334,56 @@ class _Execution:
         for _, run, started in self.running.values():
             needed = run.config["steps"] * pace.get(run.kind, usual)
             seconds += max(0.0, needed - (time.monotonic() - started))
-        return seconds / self.workers
+        return seconds / self.options.workers
 
     def report(self, preparing: str = "", *, final: bool = False) -> Status:
         now = Status(
-            self.study.name,
-            str(self.folder),
-            len(self.runs),
-            len(self.finished),
-            len(self.errors),
-            len(self.running),
-            dict(self.errors),
-            time.monotonic() - self.began,
-            self._remaining(),
-            preparing,
+            name=self.study.name,
+            folder=str(self.folder),
+            total=len(self.runs),
+            finished=len(self.finished),
+            failed=len(self.errors),
+            running=len(self.running),
+            errors=dict(self.errors),
+            elapsed=time.monotonic() - self.began,
+            remaining=self._remaining(),
+            preparing=preparing,
+            damaged=dict(self.damaged),
         )
-        if self.tell is not None:
-            self.tell(now)
-        if final or time.monotonic() - self.told > STATUS_SECONDS:
-            self.told = time.monotonic()
-            said = {**now.to_dict(), "updated": time.time(), "process": os.getpid(), "host": socket.gethostname()}
-            write_atomically(self.status_file, json.dumps(said, indent=1) + "\n")
+        if self.options.progress is not None:
+            self.options.progress(now)
+        if final or time.monotonic() - self.last_report > STATUS_SECONDS:
+            self.last_report = time.monotonic()
+            record = {**now.to_dict(), "updated": time.time(), "process": os.getpid(), "host": socket.gethostname()}
+            replace_json(self.folder / self.options.status_file, record, durable=False)
         return now
+
+
+@contextlib.contextmanager
+def _one_thread() -> Iterator[None]:
+    """What starts here, and whatever it forks, uses one thread, unless the user's variables say otherwise.
+
+    Numba reads its variable when it is loaded, which is before any line of the new process.
+    """
+    added = [name for name in _worker.THREAD_VARIABLES if name not in os.environ]
+    os.environ.update(dict.fromkeys(added, "1"))
+    try:
+        yield
+    finally:
+        for name in added:
+            del os.environ[name]
+
+
+def _end(processes: Sequence[Any]) -> None:
+    """End processes cleanly; at once those that take too long."""
+    for process in processes:
+        process.terminate()
+    latest = time.monotonic() + TERMINATION_SECONDS
+    for process in processes:
+        process.join(max(0.0, latest - time.monotonic()))
+        if process.is_alive():
+            process.kill()
+            process.join()
 
 
 def _context(warm: bool) -> Any:
@@ -434,20 +398,25 @@ def _context(warm: bool) -> Any:
 def _prepare_all(
     prepare: Callable[[Mapping[str, Any]], Any], configs: Iterable[Mapping[str, Any]], sender: Any
 ) -> None:
+    """Prepare instances one after the other; send "" after each, and why where it waits."""
+    _worker.end_cleanly()
     _worker.end_with_parent()
     for config in configs:
         with contextlib.suppress(Exception):  # the runs of this instance will fail with the same error, and say so
-            _unless_locked(prepare, config)
-        sender.send(True)
+            _unless_locked(prepare, config, sender.send)
+        sender.send("")
 
 
-def _unless_locked(prepare: Callable[[Mapping[str, Any]], Any], config: Mapping[str, Any]) -> None:
+def _unless_locked(
+    prepare: Callable[[Mapping[str, Any]], Any], config: Mapping[str, Any], tell: Callable[[str], None]
+) -> None:
     """Prepare an instance; where another process is building it, wait for that one."""
     while True:
         try:
             prepare(config)
             return
-        except StateSpaceLocked:
+        except StateSpaceLocked as error:
+            tell(str(error))
             time.sleep(STATUS_SECONDS)
 
 

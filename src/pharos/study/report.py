@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pharos.storage import replace_file
 from pharos.study import analysis as _analysis
 from pharos.study import figures as _figures
 from pharos.study import tables as _table
@@ -24,7 +25,6 @@ from pharos.study.findings import findings
 from pharos.study.latex import returns_table, tables_of
 from pharos.study.regression import Fit
 from pharos.study.specification import Source, Specification
-from pharos.study.worker import write_atomically
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -90,7 +90,7 @@ def report(
     pictures = _pictures(study)
     tables = _write_tables(target / "tables", rows, cells, measured, found, comparison, estimates, said)
     page = _page(study, now, rows, cells, measured, found, comparison, estimates, said, figures, pictures)
-    write_atomically(target / "report.html", page)
+    replace_file(target / "report.html", page)
     notes = [*dict.fromkeys(note for models in found for note in models.notes)]
     drawn = [
         target / "figures" / f"{name}.{kind}" for name, images in figures.items() if images for kind in ("png", "pdf")

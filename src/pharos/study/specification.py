@@ -49,6 +49,8 @@ try:
 except ImportError as error:
     raise MissingExtra("a study", str(error.name), "study") from error
 
+STUDIES = "studies"
+STUDY_FILE = "study.yaml"
 # Bounds on a specification, so that every mistake is told at once
 MOST_RUNS = 1_000_000
 MOST_NODES = 1_000_000
@@ -337,7 +339,7 @@ Source = str | Path | Mapping[str, Any] | Specification
 
 
 def specification(source: Source, *, trust: bool | None = None) -> Specification:
-    """The specification in a YAML file or a study's folder, of a preset by its name, or from a mapping.
+    """The specification in a YAML file or a study's folder, of a preset or a study in `studies` by its name, or from a mapping.
 
     Args:
         trust: whether code that it names may be imported; None: unless it is the study.yaml of a folder of results.
@@ -354,11 +356,26 @@ def specification(source: Source, *, trust: bool | None = None) -> Specification
         return parse(file.read_text(encoding="utf-8"), f"preset {source}")
     path = Path(source)
     if path.is_dir():
-        path = path / "study.yaml"
+        path = path / STUDY_FILE
+    if not path.is_file() and (named := study_folder(source)) is not None:
+        path = named / STUDY_FILE
     if not path.is_file():
-        raise UnknownName("study (no such file, and no such preset)", source, presets())
+        raise UnknownName("study (no such file, and no such preset)", source, [*presets(), *_studies_here()])
     trusted = not _is_of_results(path) if trust is None else trust
     return parse(_text_of(path), str(path), folder=path.absolute().parent, trust=trusted)
+
+
+def study_folder(source: str | Path) -> Path | None:
+    """The folder of a study that is named by its folder, or by its name as one of the folder `studies` here."""
+    if Path(source, STUDY_FILE).is_file():
+        return Path(source)
+    if Path(source).is_file() or str(source) in presets() or not Path(STUDIES, source, STUDY_FILE).is_file():
+        return None
+    return Path(STUDIES, source)
+
+
+def _studies_here() -> list[str]:
+    return [file.parent.name for file in Path(STUDIES).glob(f"*/{STUDY_FILE}")]
 
 
 def study_name(file: Path) -> str | None:
@@ -373,9 +390,7 @@ def study_name(file: Path) -> str | None:
 
 def _is_of_results(path: Path) -> bool:
     """Whether a YAML file is what a runner wrote beside its results, which may come from somebody else."""
-    return path.name == "study.yaml" and any(
-        (path.parent / name).exists() for name in ("runs", "partial", "status.json")
-    )
+    return path.name == STUDY_FILE and any((path.parent / name).exists() for name in ("runs", "partial", "status.json"))
 
 
 def _text_of(path: Path) -> str:

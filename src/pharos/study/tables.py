@@ -6,18 +6,20 @@ A cell is one agent on one instance under one kind of chance with one observatio
 import json
 import os
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pharos.errors import ParameterError, UnknownName
+from pharos import experiments
+from pharos.errors import FileFormatError, ParameterError, UnknownName
 from pharos.experiments import ChanceSetting
+from pharos.storage import is_intact, read_json, replace_json, sealed
 from pharos.study import worker as _worker
 from pharos.study.execution import opened
 from pharos.study.specification import Run, Source, Specification
-from pharos.study.worker import write_atomically
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -25,52 +27,100 @@ if TYPE_CHECKING:
     from pharos.mdp import TabularMDP
 
 CELL = ["environment", "instance", "chance", "agent", "observation"]
-WIDEST = 2  # a proven interval enters as one number if its upper end is at most so many times its lower end
-LAST = 0.1  # part of the evaluations at the end over which the return is averaged
+# A proven interval enters as one number if its upper end is at most so many times its lower end
+WIDEST = 2
+# Part of the evaluations at the end over which the return is averaged
+LAST = 0.1
+NUMBERS = ("cumulative_regret", "normalized_regret", "final_value", "value_optimal", "value_uniform")
+"""What the result of a run says at least, numbers or null."""
+POINTS = ("step", "episodes", "value", "cumulative_expected_regret", "normalized_regret", "mean_return")
+# Numbers beyond this are no results, and no figure can hold them
+LARGEST = 1e100
 
 
-def table(source: Source, folder: str | os.PathLike | None = None) -> "pd.DataFrame":
-    """One row a finished run.
+@dataclass(frozen=True)
+class FinishedRuns:
+    """What is finished of a study.
 
-    Returns:
-        Columns `id`, `environment` (class), `instance`, `chance`, `agent`, `observation`, `seed`, `steps`, `seconds`; the result
-        of the run (`cumulative_regret`, `normalized_regret`, `value_optimal`, ...); and `return`, the mean return of the
-        training episodes in the last tenth of the run, undiscounted.
+    Attributes:
+        runs: a row for each run; see `table`.
+        points: a row for each evaluation; see `curves`.
+        damaged: what is wrong with results that cannot be read, by id.
+    """
+
+    runs: "pd.DataFrame"
+    points: "pd.DataFrame"
+    damaged: Mapping[str, str]
+
+
+def finished_runs(study: Specification, place: Path) -> FinishedRuns:
+    """Read every finished run of a study once; one that cannot be read is named and left out.
+
     Raises:
         ParameterError: no run is finished.
     """
     import pandas as pd
 
-    study, place = opened(source, folder)
-    rows = []
+    rows, points, damaged = [], [], {}
     for run in study.runs:
-        record = _worker.read_record(place / "runs" / run.id)
-        if record is None or record["status"] != "finished":
+        try:
+            record = _worker.read_record(place / "runs" / run.id)
+            if record is None or record["status"] != _worker.FINISHED:
+                continue
+            curve = read_curve(place, run.id)
+            row = {"id": run.id, **_described(run), "seconds": float(record["seconds"])}
+            row |= _result_of(record, place / "runs" / run.id) | {"return": _last_return(curve)}
+            row["exact"], row["half_width"] = _exactness(curve, row)
+        except FileFormatError as error:
+            damaged[run.id] = str(error)
             continue
-        described = {"id": run.id, **_described(run), "seconds": record["seconds"]}
-        result = {
-            name: float("nan") if value is None else value
-            for name, value in record["result"].items()
-            if not isinstance(value, dict)
-        }
-        rows.append(described | result | {"return": _last_return(read_curve(place, run.id))})
+        rows.append(row)
+        points.append(curve.assign(id=run.id, **_described(run)))
     if not rows:
-        raise ParameterError(f"{place}: no run of {study.name!r} is finished; execute `pharos study run` first")
-    return pd.DataFrame(rows)
+        raise ParameterError(
+            f"{place}: no run of {study.name!r} is finished; execute `pharos study run` first"
+            + (f" ({len(damaged)} damaged: {next(iter(damaged.values()))})" if damaged else "")
+        )
+    return FinishedRuns(pd.DataFrame(rows), pd.concat(points, ignore_index=True), damaged)
+
+
+def table(source: Source, folder: str | os.PathLike | None = None) -> "pd.DataFrame":
+    """One row a finished run; runs whose files are damaged are left out.
+
+    Returns:
+        Columns `id`, `environment` (class), `instance`, `chance`, `agent`, `observation`, `seed`, `steps`, `seconds`; the result
+        of the run (`cumulative_regret`, `normalized_regret`, `value_optimal`, ...); `return`, the mean return of the training
+        episodes in the last tenth of the run, undiscounted; `exact`, whether every value behind the regret is computed; and
+        `half_width`, by how much `normalized_regret` may at worst be wrong where some are estimated, 0 where none is.
+    Raises:
+        ParameterError: no run is finished.
+    """
+    return finished_runs(*opened(source, folder)).runs
 
 
 def curves(source: Source, folder: str | os.PathLike | None = None) -> "pd.DataFrame":
     """One row an evaluation of a finished run: the columns of curve.parquet, and those that describe the run."""
-    import pandas as pd
+    return finished_runs(*opened(source, folder)).points
 
-    study, place = opened(source, folder)
-    parts = []
-    for run in study.runs:
-        if _worker.read_status(place, run.id) == "finished":
-            parts.append(read_curve(place, run.id).assign(id=run.id, **_described(run)))
-    if not parts:
-        raise ParameterError(f"{place}: no run of {study.name!r} is finished; execute `pharos study run` first")
-    return pd.concat(parts, ignore_index=True)
+
+def _result_of(record: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """The entries of a result that are one number or text each; NaN for null."""
+    result = {name: value for name, value in record["result"].items() if not isinstance(value, dict | list)}
+    for name in NUMBERS:
+        value = result.get(name, "nothing")
+        if isinstance(value, bool) or not isinstance(value, int | float | None) or abs(value or 0) > LARGEST:
+            raise FileFormatError(f"{folder / 'run.json'}: {name} is {str(value)[:30]}; expected a number below 1e100")
+    return {name: float("nan") if value is None else value for name, value in result.items()}
+
+
+def _exactness(curve: "pd.DataFrame", row: Mapping[str, Any]) -> tuple[bool, float]:
+    """Whether a curve has no estimate; by how much its normalised regret may be wrong if every estimate errs alike."""
+    if "exact" not in curve or bool(curve["exact"].all()) or "error_bound" not in curve:
+        return bool("exact" not in curve or curve["exact"].all()), 0.0
+    episodes = curve["episodes"].to_numpy(float)
+    bound = curve["error_bound"].where(~curve["exact"].astype(bool), 0.0).to_numpy(float)
+    scale = episodes[-1] * (row["value_optimal"] - row["value_uniform"])
+    return False, float((np.diff(episodes) * bound[:-1]).sum() / scale) if scale > 0 else float("nan")
 
 
 def cells(rows: "pd.DataFrame", measures: "pd.DataFrame | None" = None) -> "pd.DataFrame":
@@ -78,8 +128,8 @@ def cells(rows: "pd.DataFrame", measures: "pd.DataFrame | None" = None) -> "pd.D
 
     Returns:
         Columns of the cell; `seeds`; `steps` (the most, where runs differ); means of `cumulative_regret`, `normalized_regret`,
-        `final_value`, `value_optimal`, `return`; `return_deviation` over seeds (population, as 0.00 is printed for equal runs; NaN for
-        one seed); and the measures.
+        `final_value`, `value_optimal`, `return`; `return_deviation` over seeds (population, as 0.00 is printed for equal runs;
+        NaN for one seed); `exact`, whether all runs are; the mean of `half_width`; and the measures.
     """
     values = ["cumulative_regret", "normalized_regret", "final_value", "value_optimal", "return"]
     groups = rows.groupby(CELL, sort=False)
@@ -87,17 +137,24 @@ def cells(rows: "pd.DataFrame", measures: "pd.DataFrame | None" = None) -> "pd.D
     means.insert(0, "seeds", groups.size())
     means.insert(1, "steps", groups["steps"].max())
     means["return_deviation"] = groups["return"].std(ddof=0).where(groups.size() > 1)
-    found = means.reset_index()
+    if {"exact", "half_width"} <= {*rows}:
+        means["exact"], means["half_width"] = groups["exact"].all(), groups["half_width"].mean()
+    means = means.reset_index()
     if measures is None:
-        return found
-    return found.merge(measures, on=["environment", "instance", "chance"], how="left")
+        return means
+    return means.merge(measures, on=["environment", "instance", "chance"], how="left")
 
 
 def read_curve(folder: Path, id: str) -> "pd.DataFrame":
-    """The curve of one run."""
-    from pharos import experiments
+    """The curve of one run.
 
-    return experiments.read_curve(folder / "runs" / id, columns=("step", "episodes", "mean_return"))
+    Raises:
+        FileFormatError: it cannot be read, is not that of its record, or has no evaluation.
+    """
+    curve = experiments.read_curve(folder / "runs" / id, columns=POINTS)
+    if len(curve) == 0 or any(curve[name].dtype.kind not in "iufb" for name in POINTS):
+        raise FileFormatError(f"{folder / 'runs' / id}: its curve has no evaluation, or words in place of numbers")
+    return curve
 
 
 def _last_return(curve: "pd.DataFrame") -> float:
@@ -185,16 +242,25 @@ def _measured(study: Specification, place: Path, config: Mapping[str, Any]) -> d
     asked["gamma"] = study.hardness.gamma
     key = xxhash.xxh3_64_hexdigest(json.dumps(asked, sort_keys=True).encode())
     file = place / "hardness" / f"{key}.json"
-    kept: dict[str, Any] = {**asked, "measures": {}, "num_states": None}
-    if file.is_file():
-        kept = json.loads(file.read_text(encoding="utf-8"))
-    missing = [name for name in study.hardness.measures if name not in kept["measures"]]
+    stored = _stored(file, asked) or {**asked, "measures": {}, "num_states": None}
+    missing = [name for name in study.hardness.measures if name not in stored["measures"]]
     if missing:
-        kept, found = _measure(study, config, missing, kept)
+        stored, all_measures = _measure(study, config, missing, stored)
         file.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(file, json.dumps(kept, indent=1) + "\n")
-        return found
-    return kept
+        replace_json(file, sealed(stored))
+        return all_measures
+    return stored
+
+
+def _stored(file: Path, asked: Mapping[str, Any]) -> dict[str, Any] | None:
+    """What was measured before; None where there is nothing, or not what was written there."""
+    try:
+        stored = read_json(file)
+    except (FileNotFoundError, FileFormatError):
+        return None
+    if not isinstance(stored, dict) or not is_intact(stored) or not isinstance(stored.get("measures"), dict):
+        return None
+    return stored if all(stored.get(name) == value for name, value in asked.items()) else None
 
 
 def _measure(

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pharos.study.worker import write_atomically
+from pharos.storage import replace_json
 
 if TYPE_CHECKING:
     from pharos.experiments import Task
@@ -32,7 +32,7 @@ def solve(config: Mapping[str, Any]) -> dict[str, Any]:
         values = TaskValues(task.reference, task.return_range).to_dict()
         file = _file(config)
         file.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(file, json.dumps({"task": _key(config), "values": values}, indent=1) + "\n")
+        replace_json(file, {"task": _key(config), "values": values})
     return values
 
 

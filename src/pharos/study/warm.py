@@ -1,18 +1,12 @@
 """Loaded once by the process from which the workers of a study are forked: a run then starts in milliseconds.
 
 Everything a run imports, and a few steps of training, which makes PyTorch and Stable-Baselines3 load what they load late.
-One thread only: a process with threads must not be forked.
+One thread only, by the variables with which it is started: a process with threads must not be forked.
 """
 
 import contextlib
 import importlib
-import os
 import warnings
-
-from pharos.study.worker import THREAD_VARIABLES
-
-for _name in THREAD_VARIABLES:
-    os.environ.setdefault(_name, "1")
 
 
 def _load() -> None:

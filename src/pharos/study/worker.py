@@ -21,25 +21,64 @@ from pathlib import Path
 from typing import Any
 
 from pharos import experiments, storage
-from pharos.errors import FolderLocked, PharosError
+from pharos.errors import FileFormatError, FolderLocked, PharosError
 
 FINISHED, FAILED, BUSY = "finished", "failed", "busy"
 EXIT_BUSY = 75
 PARENT_GONE = 76
+PARQUET = b"PAR1"
+# Seconds in a record that no run can take: ten thousand years
+LONGEST = 3e11
+CLEAN_SECONDS = 2.0
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
 
 Runner = Callable[[Mapping[str, Any], Path], Any]
 
 
 def read_status(folder: Path, id: str) -> str | None:
-    """`finished` or `failed`; None where the run has no folder yet."""
-    record = read_record(folder / "runs" / id)
-    return None if record is None else str(record.get("status"))
+    """`finished` or `failed`; None where the run has no folder yet, or a damaged record."""
+    try:
+        record = read_record(folder / "runs" / id)
+    except FileFormatError:
+        return None
+    return None if record is None else str(record["status"])
 
 
 def read_record(folder: Path) -> dict[str, Any] | None:
-    """What run.json of one run says; None where there is none; ResultCorrupted where it was cut short or changed."""
-    return experiments.read_record(folder) if (folder / "run.json").exists() else None
+    """What run.json of one run says; None where there is none.
+
+    Raises:
+        FileFormatError: it cannot be read, was cut short or changed, or is not the record of a run that is over.
+    """
+    file = folder / "run.json"
+    if not file.exists():
+        if folder.exists() and not folder.is_dir():
+            raise FileFormatError(f"{folder}: is a file; expected the folder of a run")
+        return None
+    record = experiments.read_record(folder)
+    if record.get("status") not in (FINISHED, FAILED):
+        raise FileFormatError(f"{file}: is not the record of a run that is over")
+    seconds = record.get("seconds")
+    if isinstance(seconds, bool) or not isinstance(seconds, int | float) or not 0 <= seconds < LONGEST:
+        raise FileFormatError(f"{file}: seconds are {str(seconds)[:20]}; expected how long the run took")
+    if record["status"] == FINISHED:
+        if not isinstance(record.get("result"), dict):
+            raise FileFormatError(f"{file}: is of a finished run, but has no result")
+        _check_curve(folder / "curve.parquet")
+    return record
+
+
+def _check_curve(file: Path) -> None:
+    """Refuse a file that is not there, or whose beginning or end is not that of a Parquet file: it was cut short."""
+    try:
+        with open(file, "rb") as data:
+            start = data.read(len(PARQUET))
+            data.seek(-len(PARQUET), os.SEEK_END)
+            end = data.read()
+    except OSError as error:
+        raise FileFormatError(f"{file}: cannot be read ({error.strerror})") from None
+    if not start == end == PARQUET:
+        raise FileFormatError(f"{file}: is no Parquet file, or was cut short")
 
 
 def attempt(
@@ -53,7 +92,7 @@ def attempt(
     holder = folder / "locks" / id
     holder.mkdir(parents=True, exist_ok=True)
     try:
-        with storage.lock(holder):
+        with storage.lock(holder, FolderLocked, "training"):
             return _attempt(runner, config, id, folder, again, resume)
     except FolderLocked:
         return BUSY
@@ -103,27 +142,28 @@ def publish(partial: Path, folder: Path, id: str) -> None:
     place = runs / id
     if place.exists():
         old = folder / "partial" / f"{id}.failed"
-        if old.exists():
-            shutil.rmtree(old)
+        _remove(old)
         os.rename(place, old)
         os.rename(partial, place)
-        shutil.rmtree(old)
+        _remove(old)
     else:
         os.rename(partial, place)
     storage.sync(runs)
 
 
-def write_atomically(file: Path, text: str) -> None:
-    """Replace a file in one step."""
-    storage.replace_file(file, text)
+def _remove(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
 
 
 def _is_complete(partial: Path) -> bool:
     try:
         record = read_record(partial)
-    except ValueError:  # cut short
+    except FileFormatError:  # cut short
         return False
-    return record is not None and record.get("status") == FINISHED and (partial / "curve.parquet").exists()
+    return record is not None and record["status"] == FINISHED
 
 
 @contextlib.contextmanager
@@ -170,15 +210,28 @@ def main(
     }  # Numba refuses that they change
     os.environ.clear()
     os.environ.update({**environment, **threads})
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    end_cleanly()
     end_with_parent()
     use_one_thread()
     if attempt(runner, config, id, folder, again=again, resume=resume) == BUSY:
         sys.exit(EXIT_BUSY)
 
 
+def end_cleanly() -> None:
+    """Leave interrupts to the process that started this one; on SIGTERM, end by way of what has to be given back.
+
+    A process that SIGTERM kills leaves its semaphores behind, of which Python then warns.
+    """
+
+    def leave(*_: Any) -> None:
+        sys.exit(128 + signal.SIGTERM)
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, leave)
+
+
 def end_with_parent() -> None:
-    """End this process at once when the one that started it is gone, however it went."""
+    """End this process when the one that started it is gone, however it went: cleanly, and if that takes long, at once."""
     from multiprocessing import connection, parent_process
 
     parent = parent_process()
@@ -187,6 +240,9 @@ def end_with_parent() -> None:
 
     def watch() -> None:
         connection.wait([parent.sentinel])
+        if signal.getsignal(signal.SIGTERM) not in (signal.SIG_DFL, signal.SIG_IGN):
+            os.kill(os.getpid(), signal.SIGTERM)
+            time.sleep(CLEAN_SECONDS)
         os._exit(PARENT_GONE)
 
     threading.Thread(target=watch, daemon=True, name="watch").start()

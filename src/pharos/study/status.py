@@ -1,0 +1,155 @@
+"""How far a study is, told by the files in its folder."""
+
+import contextlib
+import json
+import os
+import socket
+import time
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from pharos.errors import FileFormatError, ParameterError
+from pharos.storage import replace_file
+from pharos.study import worker as _worker
+from pharos.study.specification import (
+    STUDIES,
+    STUDY_FILE,
+    Source,
+    Specification,
+    specification,
+    study_folder,
+    study_name,
+)
+
+
+@dataclass(frozen=True)
+class Status:
+    """How far a study is.
+
+    Attributes:
+        name, folder: of the study.
+        total, finished, failed, running: numbers of runs; those in `running` are started and not over.
+        errors: of the failed runs, by id.
+        damaged: what is wrong with results that cannot be read, by id; such runs count as missing, and are executed again.
+        elapsed, remaining: seconds since this runner began, and until the end as far as one can tell (None: not yet).
+        preparing: what is built or solved before the runs; empty otherwise.
+    """
+
+    name: str
+    folder: str
+    total: int
+    finished: int
+    failed: int
+    running: int
+    errors: Mapping[str, str]
+    elapsed: float = 0.0
+    remaining: float | None = None
+    preparing: str = ""
+    damaged: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def missing(self) -> int:
+        """Runs that are not over."""
+        return self.total - self.finished - self.failed
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able."""
+        return {**asdict(self), "missing": self.missing}
+
+    def __str__(self) -> str:
+        if self.preparing:
+            return f"{self.name}: {self.preparing}"
+        text = f"{self.name}: {self.finished} of {self.total} runs finished"
+        if self.failed:
+            text += f", {self.failed} failed"
+        if self.damaged:
+            text += f", {len(self.damaged)} damaged"
+        if self.running:
+            text += f", {self.running} running"
+        if self.missing and self.remaining is not None:
+            text += f", about {duration(self.remaining)} left"
+        return text
+
+
+def duration(seconds: float) -> str:
+    """`40 s`, `12 min`, `3.5 h`."""
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
+
+
+def opened(
+    source: Source, folder: str | os.PathLike | None = None, *, trust: bool | None = None
+) -> tuple[Specification, Path]:
+    """A study and where its results are: `folder`; else the source, if it is a study's folder; else studies/NAME.
+
+    Args:
+        trust: as for `specification`.
+    """
+    if folder is None and isinstance(source, str | Path):
+        folder = study_folder(source)
+    study = specification(source, trust=trust)
+    return study, Path(STUDIES, study.name) if folder is None else Path(folder)
+
+
+def status(source: Source, folder: str | os.PathLike | None = None) -> Status:
+    """How far a study is, from its files; `remaining` is what its runners last said."""
+    study, place = opened(source, folder)
+    errors, damaged, finished = {}, {}, 0
+    for run in study.runs:
+        try:
+            record = _worker.read_record(place / "runs" / run.id)
+        except FileFormatError as error:
+            damaged[run.id] = str(error)
+            continue
+        if record is not None and record["status"] == _worker.FAILED:
+            errors[run.id] = str(record.get("error"))
+        finished += record is not None and record["status"] == _worker.FINISHED
+    running, remaining = 0, None
+    for file in sorted(place.glob("status*.json")):
+        with contextlib.suppress(ValueError, OSError, KeyError, TypeError):
+            said = json.loads(file.read_text(encoding="utf-8"))
+            if _lives(said):
+                running += said["running"]
+                if said["remaining"] is not None:
+                    remaining = max(remaining or 0.0, said["remaining"])
+    return Status(
+        name=study.name,
+        folder=str(place),
+        total=len(study.runs),
+        finished=finished,
+        failed=len(errors),
+        running=running,
+        errors=errors,
+        remaining=remaining,
+        damaged=damaged,
+    )
+
+
+def _lives(said: Mapping[str, Any]) -> bool:
+    """Whether the runner that wrote a status file is there: told exactly on its own machine, by the file's age elsewhere."""
+    if said["host"] != socket.gethostname():
+        return time.time() - said["updated"] < 60
+    try:
+        os.kill(said["process"], 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        pass
+    return time.time() - said["updated"] < 60
+
+
+def claim(study: Specification, folder: Path) -> None:
+    """Write the specification into the folder, so that it can be reported on alone; refuse a folder of another study."""
+    folder.mkdir(parents=True, exist_ok=True)
+    file = folder / STUDY_FILE
+    if file.exists():
+        name = study_name(file)
+        if name is not None and name != study.name:
+            raise ParameterError(f"{folder}: holds the study {name!r}, not {study.name!r}; choose another --out")
+    import yaml
+
+    text = yaml.safe_dump(study.model_dump(mode="json", exclude_unset=True), sort_keys=False, width=120)
+    replace_file(file, text)
