@@ -127,7 +127,7 @@ class EnvironmentEntry(_Part):
     _folder: Path | None = PrivateAttr(None)
 
     def model_post_init(self, context: Any) -> None:
-        self._folder = (context or {}).get("folder")
+        self._folder = (context or {}).get("folder") if is_reference(self.name) else None
 
     @cached_property
     def instance(self) -> Any:
@@ -164,7 +164,7 @@ class ObservationEntry(_Part):
     _folder: Path | None = PrivateAttr(None)
 
     def model_post_init(self, context: Any) -> None:
-        self._folder = (context or {}).get("folder")
+        self._folder = (context or {}).get("folder") if is_reference(self.name) else None
 
     @field_validator("name")
     @classmethod
