@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from pharos import experiments, storage
-from pharos.errors import FileFormatError, FolderLocked, PharosError
+from pharos.errors import FileFormatError, FolderLocked, PharosError, ResultCorrupted
 
 FINISHED, FAILED, BUSY = "finished", "failed", "busy"
 EXIT_BUSY = 75
@@ -48,7 +48,7 @@ def read_record(folder: Path) -> dict[str, Any] | None:
     """What run.json of one run says; None where there is none.
 
     Raises:
-        FileFormatError: it cannot be read, was cut short or changed, or is not the record of a run that is over.
+        FileFormatError: it is not the record of a run that is over. ResultCorrupted: it was cut short or changed.
     """
     file = folder / "run.json"
     if not file.exists():
@@ -78,7 +78,7 @@ def _check_curve(file: Path) -> None:
     except OSError as error:
         raise FileFormatError(f"{file}: cannot be read ({error.strerror})") from None
     if not start == end == PARQUET:
-        raise FileFormatError(f"{file}: is no Parquet file, or was cut short")
+        raise ResultCorrupted(f"{file}: is no Parquet file, or was cut short")
 
 
 def attempt(
