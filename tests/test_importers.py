@@ -7,6 +7,7 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 import pytest
+import xxhash
 from hypothesis import given, settings
 from typer.testing import CliRunner
 
@@ -288,3 +289,209 @@ def test_matrices_are_mdps():
     assert isinstance(mdp, TabularMDP)
     assert pharos.value_iteration(mdp, 1e-9).v == pytest.approx([1.5, 0.5])
     assert hardness.diameter(sticky_actions(mdp, 0.5)).upper == pytest.approx(2.0)
+
+
+# Damage and harm --------------------------------------------------------------------------------------------------------
+
+
+def edited_manifest(folder, **changes):
+    """Change the manifest of a folder; its digest stays."""
+    path = folder / "manifest.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+
+
+@pytest.fixture
+def imported(tmp_path):
+    return importers.save(importers.bridge(CORRIDOR, horizon=100), tmp_path / "imported")
+
+
+@pytest.mark.parametrize(
+    "changes", [{"gamma": 0.99}, {"horizon": 99}, {"horizon": None}, {"source": "elsewhere"}, {"arrays": 0.5}]
+)
+def test_every_entry_of_a_manifest_counts(changes, imported):
+    edited_manifest(imported, **changes)
+    with pytest.raises(FileFormatError, match=r"manifest\.json: was changed after it was written; import it again"):
+        importers.load(imported)
+
+
+def test_folders_of_older_versions_are_read(imported):
+    expected = importers.load(imported)
+    path = imported / "manifest.json"
+    manifest = json.loads(path.read_text())
+    del manifest["digest"]
+    path.write_text(json.dumps(manifest))
+    same(importers.load(imported), expected)
+    for changes, message in (
+        ({"arrays": 0.5}, "arrays is 0.5; expected a checksum for each array"),
+        ({"arrays": {"../secret": "0"}}, "its arrays are ../secret"),
+        ({"num_states": 10**15}, "rewards have shape"),
+        ({"gamma": "high"}, "damaged"),
+        ({"gamma": 7}, "damaged: gamma is 7"),
+        ({"horizon": 0.5}, "damaged: horizon is 0.5"),
+        ({"format_version": 2}, "format version 2; this pharos reads version 1"),
+    ):
+        path.write_text(json.dumps(manifest | changes))
+        with pytest.raises(FileFormatError, match=message) as caught:
+            importers.load(imported)
+        assert str(imported) in str(caught.value) and "\n" not in str(caught.value)
+
+
+def resealed(folder):
+    """Make the checksums of an older folder right, as somebody would who means harm."""
+    path = folder / "manifest.json"
+    manifest = json.loads(path.read_text())
+    manifest.pop("digest", None)
+    for name in manifest["arrays"]:
+        manifest["arrays"][name] = xxhash.xxh3_128_hexdigest((folder / f"{name}.npy").read_bytes())
+    path.write_text(json.dumps(manifest))
+
+
+@pytest.mark.parametrize(
+    ("name", "array"),
+    [
+        ("next_states", np.full((168, 6), 168)),
+        ("next_states", np.full((168, 6), -2)),
+        ("next_states", np.zeros((168, 6))),
+        ("next_states", np.zeros((168, 5), int)),
+        ("rewards", np.full((168, 6), np.nan)),
+        ("rewards", np.array([["a"]])),
+        ("terminal", np.ones(168, bool)),
+        ("start_states", np.array([-1])),
+        ("start_states", np.array([168])),
+        ("start_states", np.array([0.5])),
+        ("start_probabilities", np.array([1e30])),
+        ("start_probabilities", np.array([np.nan])),
+    ],
+)
+def test_arrays_with_right_checksums_and_wrong_content_are_refused(name, array, imported):
+    np.save(imported / f"{name}.npy", array)
+    resealed(imported)
+    with pytest.raises(FileFormatError) as caught:
+        importers.load(imported)
+    assert str(imported) in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("transitions_indices", lambda array: array + 1),
+        ("transitions_indices", lambda array: array - 1),
+        ("transitions_indptr", lambda array: array * 3),
+        ("transitions_indptr", lambda array: array[::-1].copy()),
+        ("transitions_data", lambda array: array + np.nan),
+        ("transitions_data", lambda array: array[:-1]),
+    ],
+)
+def test_matrices_with_right_checksums_and_wrong_content_are_refused(name, change, tmp_path):
+    folder = importers.save(importers.matrices(np.full((3, 2, 3), 1 / 3), np.ones((3, 2))), tmp_path / "imported")
+    np.save(folder / f"{name}.npy", change(np.load(folder / f"{name}.npy")))
+    resealed(folder)
+    with pytest.raises(FileFormatError) as caught:
+        importers.load(folder)
+    assert "\n" not in str(caught.value)
+
+
+def test_an_array_header_that_promises_more_than_there_is_ends_in_one_line(imported):
+    path = imported / "rewards.npy"
+    path.write_bytes(path.read_bytes().replace(b"(168, 6), ", b"(10**9,6),").replace(b"'<f8'", b"'<f8'"))
+    for data in (path.read_bytes(), path.read_bytes()[:40], b"", b"\x93NUMPY\x01\x00\x10\x00" + b"(" * 16):
+        path.write_bytes(data)
+        resealed(imported)
+        with pytest.raises(FileFormatError, match=r"rewards\.npy: cannot be read") as caught:
+            importers.load(imported)
+        assert "\n" not in str(caught.value)
+
+
+def test_no_bit_of_a_compressed_file_of_bridge_ends_in_a_traceback(tmp_path):
+    data, expected = CORRIDOR.read_bytes(), importers.bridge(CORRIDOR, horizon=100)
+    file = tmp_path / "damaged.npz"
+    rng = np.random.default_rng(0)
+    refused = 0
+    headers = np.concatenate([np.arange(60), np.arange(len(data) - 250, len(data))])
+    for place in (*headers.tolist(), *rng.choice(len(data), 200).tolist()):
+        damaged = bytearray(data)
+        damaged[place] ^= 1 << int(rng.integers(8))
+        file.write_bytes(damaged)
+        try:
+            same(importers.bridge(file, horizon=100), expected)
+        except FileFormatError as error:
+            refused += 1
+            assert str(file) in str(error) and "\n" not in str(error)
+    assert refused > 50
+
+
+def test_a_name_with_a_horizon_beyond_reason_is_refused_at_once(tmp_path):
+    file = tmp_path / "a_1000000000_fs3.npz"
+    np.savez(file, transitions=np.array([[-1, 0]]), rewards=np.array([[1.0, 0.0]]))
+    with pytest.raises(ParameterError, match="its name says 1000000000 steps; expected at most 100000"):
+        importers.bridge(file)
+
+
+class Fickle(gymnasium.Env):
+    """Chance that is not in the table: now and then an action leads elsewhere, or pays something else."""
+
+    P = {s: {a: [(1.0, (s + a) % 5, 0.0, False)] for a in range(2)} for s in range(5)}
+
+    def __init__(self, what="nothing"):
+        self.what = what
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.s = 0
+        return 0, {}
+
+    def step(self, action):
+        _, following, reward, ended = self.P[self.s][action][0]
+        if self.s == 3 and action == 1 and self.np_random.random() < 0.1:
+            following = 2 if self.what == "state" else following
+            reward = 1.0 if self.what == "reward" else reward
+            ended = self.what == "end"
+        self.s = following
+        return following, reward, ended, False, {}
+
+
+def test_chance_that_is_not_in_the_table_is_noticed():
+    assert importers.gymnasium(Fickle()).num_states == 5
+    for what in ("state", "reward", "end"):
+        with pytest.raises(FileFormatError, match=r"in state 3, action 1 led to state . with reward .*does not hold"):
+            importers.gymnasium(Fickle(what))
+    with pytest.raises(FileFormatError, match=r"fickle_passenger=True.*is another MDP"):
+        importers.gymnasium(gymnasium.make("Taxi-v4", fickle_passenger=True))
+
+
+def test_an_environment_that_is_imported_is_left_as_it_was():
+    env = gymnasium.make("Taxi-v4")
+    env.reset(seed=3)
+    state, rng = env.unwrapped.s, env.unwrapped.np_random.bit_generator.state
+    importers.gymnasium(env)
+    assert env.unwrapped.s == state and env.unwrapped.np_random.bit_generator.state == rng
+
+
+@pytest.mark.parametrize("start", [[0.5] * 5, [1.0], [np.nan, 1, 0, 0, 0], "start"])
+def test_a_start_that_is_no_distribution_is_refused(start):
+    env = Fickle()
+    env.initial_state_distrib = start
+    with pytest.raises(FileFormatError, match="initial_state_distrib is no distribution"):
+        importers.gymnasium(env)
+
+
+# A table is no environment ----------------------------------------------------------------------------------------------
+
+
+def test_a_table_is_not_trained_on_or_stepped():
+    mdp = importers.bridge(CORRIDOR, horizon=100)
+    with pytest.raises(
+        ParameterError, match=r"a table without an environment.*not trained on; expected an Environment"
+    ):
+        pharos.train("q_learning", mdp, steps=10)
+    with pytest.raises(ParameterError, match="expected a name or a pharos Environment, and a table of an MDP has no"):
+        pharos.make_vec(mdp, 2)
+
+
+@pytest.mark.parametrize("verb", [["train", "--agent", "q_learning", "--steps", 10], ["render"], ["play"], ["build"]])
+def test_commands_that_need_an_environment_say_what_an_imported_folder_can_do(verb, imported, tmp_path):
+    out = ["--out", tmp_path / "out.png"] if verb[0] == "render" else []
+    done = run(verb[0], imported, *verb[1:], *out)
+    assert done.exit_code in (1, 2)
+    assert "delete" not in done.stderr and "Traceback" not in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1

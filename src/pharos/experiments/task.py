@@ -70,6 +70,13 @@ class Task:
     def __post_init__(self) -> None:
         if isinstance(self.env, str):
             raise ParameterError(f"env is {self.env!r}; expected an Environment: use Task.of")
+        if isinstance(self.env, TabularMDP):
+            raise ParameterError(
+                f"env is {self.env!r}, a table without an environment, which can be solved and measured but not trained on; "
+                f"expected an Environment"
+            )
+        if not isinstance(self.env, Environment):
+            raise ParameterError(f"env is {self.env!r}; expected an Environment, or its name")
         object.__setattr__(self, "horizon", Horizon.of(self.horizon).steps(self.env))
         if self.horizon is None and self.gamma >= 1:
             raise ParameterError(

@@ -2,7 +2,6 @@
 
 import os
 import re
-import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +10,8 @@ from pharos.errors import FileFormatError, ParameterError
 from pharos.mdp import TabularMDP
 
 MINIGRID_STEPS = 100
+LARGEST_HORIZON = 100_000
+"""In the name of a file: those of BRIDGE say 8 to 200, and values take time for each step."""
 
 
 def bridge(path: str | os.PathLike, horizon: int | None = None) -> TabularMDP:
@@ -75,8 +76,13 @@ def _members(path: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:
             return {name: stored[name] for name in names}
     except FileNotFoundError:
         raise ParameterError(f"{path}: no such file") from None
-    except (OSError, ValueError, EOFError, AttributeError, zipfile.BadZipFile) as error:
-        raise FileFormatError(f"{path}: cannot be read as npz without unpickling: {error}") from None
+    except FileFormatError:
+        raise
+    except (
+        Exception
+    ) as error:  # of zipfile, zlib, lzma, struct, NumPy and the parser of array headers: each has its own
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise FileFormatError(f"{path}: cannot be read as npz without unpickling: {reason}") from None
 
 
 def _horizon(path: Path, given: int | None) -> int:
@@ -89,6 +95,11 @@ def _horizon(path: Path, given: int | None) -> int:
         )
     if named is not None and given is not None and named != given:
         raise ParameterError(f"{path}: horizon {given} contradicts its name, which says {named}; leave it out")
+    if given is None and named is not None and named > LARGEST_HORIZON:
+        raise ParameterError(
+            f"{path}: its name says {named} steps; expected at most {LARGEST_HORIZON}: give a horizon (`--horizon T`) and "
+            f"another name"
+        )
     return int(named if given is None else given)  # type: ignore[arg-type]
 
 

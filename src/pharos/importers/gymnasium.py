@@ -1,11 +1,17 @@
 """MDPs from Gymnasium's `P` tables and from matrices."""
 
+import copy
 from typing import Any
 
 import numpy as np
 
 from pharos.errors import FileFormatError
 from pharos.mdp import TabularMDP
+
+SAMPLED_STEPS = 10_000
+"""Steps of the environment that are held against its table; an episode of them ends after SAMPLED_EPISODE."""
+
+SAMPLED_EPISODE = 200
 
 
 def gymnasium(env: Any, *, gamma: float = 0.99, horizon: int | None = None) -> TabularMDP:
@@ -15,11 +21,14 @@ def gymnasium(env: Any, *, gamma: float = 0.99, horizon: int | None = None) -> T
         env: a Gymnasium environment, wrapped or not, or a table P[s][a] = [(probability, next state, reward, terminated), ...].
             The start distribution is `initial_state_distrib` where there is one, else state 0.
         gamma, horizon: of the MDP; Gymnasium's time limit is not taken over.
+            An environment is stepped, as a copy where it can be copied: some have chance that is not in their table, such as
+            Taxi with `fickle_passenger=True`.
     Returns:
         A table of next states where every action has one outcome, else a general MDP. A transition that terminates ends the
         episode after its reward, wherever it leads.
     Raises:
-        FileFormatError: there is no table, states or actions are missing, or probabilities do not sum to 1.
+        FileFormatError: there is no table, states or actions are missing, probabilities do not sum to 1, or the environment
+        does what its table does not say.
     """
     inner = getattr(env, "unwrapped", env)
     table = getattr(inner, "P", inner)
@@ -43,7 +52,9 @@ def gymnasium(env: Any, *, gamma: float = 0.99, horizon: int | None = None) -> T
                 if not ended:
                     entries.append((s * actions + a, following, p))
                     next_states[s, a] = following
-    start = np.asarray(getattr(inner, "initial_state_distrib", np.eye(states)[0]), np.float64)
+    start = _start(env, inner, states)
+    if hasattr(inner, "step") and hasattr(inner, "reset"):
+        _compare_with_steps(env, inner, rows)
     initial: Any = int(start.argmax()) if start.max() == 1 else start / start.sum()
     if single:
         return TabularMDP.from_arrays(next_states, rewards, gamma=gamma, initial=initial, horizon=horizon)
@@ -72,6 +83,63 @@ def _checked(env: Any, s: int, a: int, outcomes: list, states: int) -> dict[tupl
     if abs(total - 1) > 1e-6:
         raise FileFormatError(f"{env}: the probabilities of P[{s}][{a}] sum to {total}; expected 1")
     return found
+
+
+def _start(env: Any, inner: Any, states: int) -> np.ndarray:
+    """(S,) the start distribution: `initial_state_distrib`, or state 0."""
+    try:
+        start = np.asarray(getattr(inner, "initial_state_distrib", np.eye(states)[0]), np.float64)
+    except (TypeError, ValueError) as error:
+        raise FileFormatError(f"{env}: initial_state_distrib is no distribution: {error}") from None
+    if start.shape != (states,) or not np.isfinite(start).all() or (start < 0).any() or abs(start.sum() - 1) > 1e-6:
+        raise FileFormatError(f"{env}: initial_state_distrib is no distribution over the {states} states of P")
+    return start
+
+
+def _compare_with_steps(env: Any, inner: Any, rows: list[list[list]]) -> None:
+    """FileFormatError where the environment, stepped, does what its table does not say.
+
+    Each state's actions are tried in turn, so that few steps try many of them.
+    """
+    inner = _copy(inner)
+    outcomes = [
+        [{(int(t), float(r), bool(ended)) for p, t, r, ended in options if p > 0} for options in row] for row in rows
+    ]
+    tries = np.zeros((len(rows), len(rows[0])), np.int64)
+    rng = np.random.default_rng(0)
+    state = None
+    for step in range(SAMPLED_STEPS):
+        if state is None or step % SAMPLED_EPISODE == 0:
+            state = _state_number(inner.reset(seed=0 if step == 0 else None)[0], len(rows))
+        if state is None:  # what is observed is no number of a state: nothing to compare
+            return
+        least = np.flatnonzero(tries[state] == tries[state].min())
+        action = int(least[rng.integers(len(least))])
+        tries[state, action] += 1
+        observation, reward, ended, _, _ = inner.step(action)
+        following = _state_number(observation, len(rows))
+        if (following, float(reward), bool(ended)) not in outcomes[state][action]:
+            raise FileFormatError(
+                f"{env}: in state {state}, action {action} led to state {following} with reward {reward}, which its table "
+                f"P[{state}][{action}] does not hold; its chance is not in the table (as that of Taxi with "
+                f"fickle_passenger=True), so the table is another MDP: switch that chance off"
+            )
+        state = None if ended else following
+
+
+def _copy(inner: Any) -> Any:
+    try:
+        return copy.deepcopy(inner)
+    except Exception:  # a window, a generator of its own: whatever cannot be copied is stepped itself
+        return inner
+
+
+def _state_number(observation: Any, states: int) -> int | None:
+    try:
+        number = int(observation)
+    except (TypeError, ValueError):
+        return None
+    return number if 0 <= number < states and number == observation else None
 
 
 def matrices(P: Any, R: Any, *, gamma: float = 0.99, initial: Any = 0, horizon: int | None = None) -> TabularMDP:

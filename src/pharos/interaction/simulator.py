@@ -10,7 +10,7 @@ import numpy as np
 from pharos.environments import Environment, make, start_distribution
 from pharos.errors import ParameterError, RuleError, StateSpaceTooLarge
 from pharos.kernels.stepping import Setting
-from pharos.mdp import Chance
+from pharos.mdp import Chance, TabularMDP
 from pharos.observations import NO_ACTION, ObservationInContext, observe
 from pharos.rules import rules_of
 from pharos.state_space import StateSpace, build, load
@@ -149,7 +149,8 @@ def _environment(environment: Environment | str, parameters: Mapping[str, Any]) 
             )
         env = environment
     else:
-        raise ParameterError(f"environment is {environment!r}; expected a name or a pharos Environment")
+        table = ", and a table of an MDP has no environment to step" if isinstance(environment, TabularMDP) else ""
+        raise ParameterError(f"environment is {environment!r}; expected a name or a pharos Environment{table}")
     clashes = sorted(set(env.parameters) & set(Interaction.__dataclass_fields__))
     if clashes:
         raise ParameterError(
