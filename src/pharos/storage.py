@@ -88,6 +88,24 @@ def replace_json(path: str | os.PathLike, value: Any, *, durable: bool = True) -
     replace_file(path, json_text(value) + "\n", durable=durable)
 
 
+def replace_array(path: str | os.PathLike, array: Any) -> None:
+    """Replace a file by an array as .npy, in one step; see `replacing`.
+
+    NumPy writes to a real file by C's `fwrite` and does not notice a full disk at its end, so it gets no real file here.
+    """
+    import numpy as np
+
+    with replacing(path) as file:
+        np.lib.format.write_array(_Writer(file), np.asanyarray(array), allow_pickle=False)
+
+
+class _Writer:
+    """Something to write to, and nothing else."""
+
+    def __init__(self, file: BinaryIO):
+        self.write = file.write
+
+
 def sync(path: Path) -> None:
     """Wait until a file, or the list of files of a folder, is on the disk."""
     is_folder = path.is_dir()

@@ -38,14 +38,14 @@ def export(
         raise UnknownName("format", format, ENDINGS)
     check_format(out, (ENDINGS[format],))
     mdp = parse_target(target, parameters).mdp(gamma=gamma, random=random)
-    from pharos import exporters
+    from pharos import exporters, storage
 
     if format == "bridge":
         exporters.bridge(mdp, out)
     elif format == "drn":
         exporters.drn(mdp, out)
     else:
-        out.write_text(json_module.dumps(exporters.gym_p(mdp)) + "\n")
+        storage.replace_file(out, json_module.dumps(exporters.gym_p(mdp)) + "\n")
     answer = {"format": format, "file": out, "bytes": out.stat().st_size, "num_states": mdp.num_states}
     if json:
         print_json(answer)

@@ -54,7 +54,7 @@ def render(
     json: Json = False,
 ) -> None:
     """Draw a state (PNG) or an episode (GIF, or the state after --steps as PNG); in the terminal without --out."""
-    from pharos import drawing, observations
+    from pharos import drawing, observations, storage
 
     goal = parse_target(target, parameters)
     suffix = check_format(out, (".png", ".gif", ".txt")) if out else ""
@@ -76,7 +76,7 @@ def render(
         print_in_color(env, last)
     elif out is not None and suffix == ".txt":
         frames = [drawing.text_drawing(env, each) for each, _, _ in played]
-        out.write_text("\n\n".join(frames) + "\n")
+        storage.replace_file(out, "\n\n".join(frames) + "\n")
     elif out is not None and suffix == ".gif":
         shown = played if len(played) > 1 else [played[0]]
         pictures = [observations.render(env, each, observation, **options) for each, _, _ in shown]

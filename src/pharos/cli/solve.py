@@ -106,7 +106,10 @@ def save(path: Path, solution: Any) -> None:
     """Write the policy (.npy), or values and policy (.npz)."""
     import numpy as np
 
+    from pharos import storage
+
     if path.suffix.lower() == ".npy":
-        np.save(path, solution.policy)
-    else:
-        np.savez_compressed(path, v=solution.v, policy=solution.policy)
+        storage.replace_array(path, solution.policy)
+        return
+    with storage.replacing(path) as file:
+        np.savez_compressed(file, v=solution.v, policy=solution.policy)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pharos import storage
 from pharos.drawing.planes import planes_of
 from pharos.drawing.scenery import ground_of, inside
 from pharos.drawing.shapes import tile
@@ -72,7 +73,8 @@ def image(picture: np.ndarray, caption: str = "") -> "Image":
 def save_png(path: str | os.PathLike, picture: np.ndarray, *, caption: str = "", at_least: int = 0) -> Path:
     """Write a picture as PNG; small ones are enlarged by a whole factor to `at_least` pixels on their longer side."""
     path = Path(path)
-    image(_enlarged(picture, at_least), caption).save(path, format="PNG", optimize=True)
+    with storage.replacing(path) as file:
+        image(_enlarged(picture, at_least), caption).save(file, format="PNG", optimize=True)
     return path
 
 
@@ -98,7 +100,8 @@ def save_gif(
     frames = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
     milliseconds = [max(20, round(1000 / frames_per_second))] * len(frames)
     milliseconds[-1] += 1000
-    frames[0].save(path, format="GIF", save_all=True, append_images=frames[1:], duration=milliseconds, loop=0)
+    with storage.replacing(path) as file:
+        frames[0].save(file, format="GIF", save_all=True, append_images=frames[1:], duration=milliseconds, loop=0)
     return path
 
 

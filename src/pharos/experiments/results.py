@@ -222,10 +222,4 @@ def _expected_checksums(folder: Path) -> dict[str, str]:
 
 def write_policy(folder: Path, policy: Any) -> None:
     """Replace policy.npy: what a tabular agent has learnt, as `pharos evaluate --policy` takes it."""
-    import io
-
-    import numpy as np
-
-    sink = io.BytesIO()
-    np.save(sink, policy, allow_pickle=False)
-    storage.replace_file(folder / POLICY, sink.getvalue())
+    storage.replace_array(folder / POLICY, policy)

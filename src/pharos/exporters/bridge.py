@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from pharos import storage
 from pharos.errors import ParameterError
 from pharos.mdp import TabularMDP
 
@@ -30,5 +31,6 @@ def bridge(mdp: TabularMDP, path: str | os.PathLike) -> Path:
     order[[0, start]] = order[[start, 0]]
     table = np.where(table[order] >= 0, order[table[order]], -1)
     rewards = mdp.rewards[order].astype(np.float32)
-    np.savez_compressed(path, transitions=np.asfortranarray(table), rewards=rewards)
+    with storage.replacing(path) as file:
+        np.savez_compressed(file, transitions=np.asfortranarray(table), rewards=rewards)
     return path

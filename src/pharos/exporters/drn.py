@@ -1,11 +1,13 @@
 """Storm's explicit format DRN: https://www.stormchecker.org/documentation/background/drn.html"""
 
+import io
 import os
 from pathlib import Path
 from typing import TextIO
 
 import numpy as np
 
+from pharos import storage
 from pharos.errors import ParameterError
 from pharos.exporters.gymnasium import gym_p
 from pharos.mdp import TabularMDP
@@ -28,19 +30,20 @@ def drn(mdp: TabularMDP, path: str | os.PathLike) -> Path:
     end = mdp.num_states
     table.setdefault(end, {a: [(1.0, end, 0.0, True)] for a in range(mdp.num_actions)})
     absorbing = {s for s in range(end) if mdp.terminal[s]} | {end}
-    with open(path, "w", encoding="ascii") as file:
-        several = len(mdp.start_states) > 1
-        file.write("@type: MDP\n@parameters\n\n@reward_models\nreward\n")
-        file.write(f"@nr_states\n{end + 1 + several}\n@nr_choices\n{(end + 1) * mdp.num_actions + several}\n@model\n")
-        if several:
-            file.write("state 0 [0] init\n\taction start [0]\n")
-            for s, p in zip(mdp.start_states, mdp.start_probabilities, strict=True):
-                file.write(f"\t\t{int(s) + 1} : {float(p)!r}\n")
-        for s in range(end + 1):
-            init = " init" if not several and s == int(mdp.start_states[0]) else ""
-            file.write(f"state {s + several} [0]{init}{' terminal' if s in absorbing else ''}\n")
-            for a in range(mdp.num_actions):
-                _choice(file, table[s][a], a, s in absorbing, mdp.gamma, s, end, several)
+    file = io.StringIO()
+    several = len(mdp.start_states) > 1
+    file.write("@type: MDP\n@parameters\n\n@reward_models\nreward\n")
+    file.write(f"@nr_states\n{end + 1 + several}\n@nr_choices\n{(end + 1) * mdp.num_actions + several}\n@model\n")
+    if several:
+        file.write("state 0 [0] init\n\taction start [0]\n")
+        for s, p in zip(mdp.start_states, mdp.start_probabilities, strict=True):
+            file.write(f"\t\t{int(s) + 1} : {float(p)!r}\n")
+    for s in range(end + 1):
+        init = " init" if not several and s == int(mdp.start_states[0]) else ""
+        file.write(f"state {s + several} [0]{init}{' terminal' if s in absorbing else ''}\n")
+        for a in range(mdp.num_actions):
+            _choice(file, table[s][a], a, s in absorbing, mdp.gamma, s, end, several)
+    storage.replace_file(path, file.getvalue())
     return path
 
 

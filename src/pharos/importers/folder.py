@@ -44,8 +44,7 @@ def save(mdp: TabularMDP, folder: str | os.PathLike, *, source: str = "") -> Pat
     checksums = {}
     for name, array in arrays.items():
         path = folder / f"{name}.npy"
-        with storage.replacing(path) as file:
-            np.save(file, array, allow_pickle=False)
+        storage.replace_array(path, array)
         checksums[name] = storage.digest_of_file(path)
     manifest = {
         "format": FORMAT,

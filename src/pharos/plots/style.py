@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
+from pharos import storage
 from pharos.errors import MissingExtra, ParameterError
 
 if TYPE_CHECKING:
@@ -80,7 +81,8 @@ def save(figure: "Figure", path: str | os.PathLike) -> Path:
         raise ParameterError(f"{path}: expected a name that ends in .png, .pdf or .svg")
     if not path.parent.is_dir():
         raise ParameterError(f"{path.parent}: no such folder")
-    figure.savefig(path, dpi=160)
+    with storage.replacing(path) as file:
+        figure.savefig(file, dpi=160, format=path.suffix.lower()[1:])
     return path
 
 
