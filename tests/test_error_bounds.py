@@ -1,4 +1,7 @@
-"""The promise of solvers: every value is within `error_bound` of the true one. Held against exact fractions, without slack."""
+"""The promise of solvers: every value is within `error_bound` of the true one.
+
+Held against exact fractions, without slack.
+"""
 
 from dataclasses import replace
 from fractions import Fraction

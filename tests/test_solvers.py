@@ -12,7 +12,8 @@ from pharos.solvers import evaluate_policy, uniform_policy, uniform_value, value
 from pharos.solvers.fixed_point import Backup
 from strategies import deterministic_mdps, probabilities, small_mdps
 
-# Rounding of the twins, which solve linear systems in floats. Bounds are held against exact fractions in test_error_bounds.py.
+# Rounding of the twins, which solve linear systems in floats. Bounds are held against exact fractions in
+# test_error_bounds.py.
 TWIN = 1e-9
 often = settings(max_examples=150, deadline=None)
 

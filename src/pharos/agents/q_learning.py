@@ -24,19 +24,22 @@ DEFAULTS: dict[str, Any] = {
 class QLearning:
     """Watkins' Q-learning with epsilon-greedy exploration on the table of an MDP.
 
-        Q(s, a) += alpha (r + gamma max_b Q(s', b) - Q(s, a)), and no next value where the episode ended in a terminal state
+        Q(s, a) += alpha (r + gamma max_b Q(s', b) - Q(s, a)), and no next value where the episode ended in a terminal
+        state
 
-    An episode that the time limit cuts off is not an end of that kind: the next value is used. Under chance the update belongs
+    An episode that the time limit cuts off is not an end of that kind: the next value is used. Under chance the update
+        belongs
     to the chosen action, as the agent does not know which one was executed.
 
     Args:
         mdp: the MDP, with chance; its horizon is the time limit of episodes.
         total_steps: over which exploration is scheduled.
         seed: of all random numbers; the same seed gives the same table, whatever the pieces that `learn` is called in.
-        learning_rate: alpha, in (0, 1]; with visits_exponent w > 0, alpha = max(learning_rate, n^-w) at the n-th update of a pair.
+        learning_rate: alpha, in (0, 1]; with visits_exponent w > 0, alpha = max(learning_rate, n^-w) at the n-th update
+            of a pair.
         gamma: discount of the agent.
-        exploration_initial_eps, exploration_final_eps, exploration_fraction: epsilon goes from the first to the second over this
-            share of total_steps, then stays; exploration_schedule: "linear" or "exponential".
+        exploration_initial_eps, exploration_final_eps, exploration_fraction: epsilon goes from the first to the second
+            over this share of total_steps, then stays; exploration_schedule: "linear" or "exponential".
         initial_q: every entry at the start; larger than any value: optimistic.
         sees_previous_action: a row for each (state, previously executed action) instead of for each state.
     Raises:
@@ -121,7 +124,9 @@ class QLearning:
         return self
 
     def policy_table(self) -> np.ndarray:
-        """The greedy policy: (S,) actions, the first among equals; (S, A + 1, A) probabilities where previous actions are seen.
+        """The greedy policy: (S,) actions, the first among equals.
+
+        (S, A + 1, A) probabilities where previous actions are seen.
 
         In the second form [s, b] is the policy after executing b, b = A standing for no previous action.
         """
@@ -165,7 +170,8 @@ def _check(options: dict[str, Any]) -> None:
         )
     if options["exploration_schedule"] not in ("linear", "exponential"):
         raise ParameterError(
-            f"q_learning: exploration_schedule is {options['exploration_schedule']!r}; expected 'linear' or 'exponential'"
+            f"q_learning: exploration_schedule is {options['exploration_schedule']!r}; expected 'linear' or "
+            "'exponential'"
         )
     if options["exploration_schedule"] == "exponential" and not (
         options["exploration_initial_eps"] > 0 and options["exploration_final_eps"] > 0

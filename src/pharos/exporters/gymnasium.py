@@ -11,8 +11,8 @@ Outcome = tuple[float, int, float, bool]
 def gym_p(mdp: TabularMDP) -> dict[int, dict[int, list[Outcome]]]:
     """Return P[s][a] = [(probability, next state, reward, terminated), ...], as Gymnasium's toy texts have it.
 
-    The implicit end becomes one more state S, where there is one. Random actions are written out as outcomes; rewards of a choice
-    with several outcomes are those of what is executed.
+    The implicit end becomes one more state S, where there is one. Random actions are written out as outcomes; rewards
+    of a choice with several outcomes are those of what is executed.
 
     Raises:
         ParameterError: under sticky actions the state is a pair, which this table has no room for.

@@ -56,8 +56,8 @@ def action_gap_regularity(
 
         g(s) = V*(s) - max over a with V*(s) - Q*(s, a) > tie_tolerance of Q*(s, a)
 
-    s is uniform over the states that `gaps` counts: those that can be reached and are not terminal; under sticky actions pairs with
-    the previously executed action; with a horizon the states of every step.
+    s is uniform over the states that `gaps` counts: those that can be reached and are not terminal; under sticky
+    actions pairs with the previously executed action; with a horizon the states of every step.
 
     Args:
         solution: the optimal solution of `mdp`; None: solved here to an error of 1e-9.
@@ -67,7 +67,8 @@ def action_gap_regularity(
         ParameterError: zeta is negative or no number; PrecisionError: as for `gaps`.
     Exactness: gaps are known up to twice the error bound of the solution.
     Cost: as `gaps`, and a sort.
-    Source: Farahmand (2011), "Action-gap phenomenon in reinforcement learning", assumption A1, for any number of actions.
+    Source: Farahmand (2011), "Action-gap phenomenon in reinforcement learning", assumption A1, for any number of
+        actions.
     """
     if isinstance(zeta, bool) or not isinstance(zeta, int | float | np.floating) or not 0 <= zeta < math.inf:
         raise ParameterError(f"zeta is {zeta!r}; expected a finite number, at least 0")

@@ -1,7 +1,8 @@
 """An MDP with chance, written out: nodes, choices and where they may lead.
 
-Nodes. Without sticky actions the states, and the implicit end. Under sticky actions the pairs (state, previously executed
-action) that can be reached, and the start states without a previous action; a target is a state, reached with any previous action.
+Nodes. Without sticky actions the states, and the implicit end. Under sticky actions the pairs (state, previously
+executed action) that can be reached, and the start states without a previous action; a target is a state, reached with
+any previous action.
 """
 
 import math
@@ -70,7 +71,10 @@ class Choices:
 
     @cached_property
     def crude_upper(self) -> float:
-        """Proven, and far too large: a shortest path of at most H edges succeeds with probability q^H or more; H / q^H."""
+        """Proven, and far too large: a shortest path of at most H edges succeeds with probability q^H or more.
+
+        So the expected time is at most H / q^H.
+        """
         if not self.is_connected:
             return math.inf
         size = len(self.underlying)
@@ -136,7 +140,10 @@ def outcomes_of(mdp: TabularMDP, terminal: np.ndarray) -> tuple[Any, bool]:
 
 
 def _weights(chance: Any, shape: tuple[int, int], owner: np.ndarray, previous: np.ndarray, live: np.ndarray) -> Any:
-    """(N A, S A): the probability that choosing a in a node executes x in its state; previous (N,), A for none, -1 for any."""
+    """(N A, S A): the probability that choosing a in a node executes x in its state.
+
+    previous (N,): A for none, -1 where it does not matter.
+    """
     num_states, num_actions = shape
     node = np.flatnonzero(live)
     choice = np.tile(np.eye(num_actions), (node.size, 1))

@@ -1,4 +1,7 @@
-"""Covering: how long random play takes to see everything. Source: Laidlaw, Russell and Dragan (2023), appendix; Even-Dar and Mansour (2003)."""
+"""Covering: how long random play takes to see everything. Source: Laidlaw, Russell and Dragan (2023), appendix.
+
+The bound on the covering length: Even-Dar and Mansour (2003).
+"""
 
 import math
 from dataclasses import dataclass, field
@@ -18,7 +21,8 @@ class Covering:
     Attributes:
         omega_max: min over the pairs (s, a) that can be met of max over t of mu_t(s, a).
         omega_sum: the same with the sum over t.
-        length_bound: ln(2 S A) / omega_max, episodes after which random play has covered all pairs with probability 1/2.
+        length_bound: ln(2 S A) / omega_max, episodes after which random play has covered all pairs with probability
+            1/2.
         num_states: S, the states that can be met.
         conventions: horizon and exploration policy.
     """
@@ -45,10 +49,11 @@ class Covering:
 def covering(mdp: TabularMDP, *, horizon: int | None = None) -> Covering:
     """Return how rarely random play meets the rarest state and action.
 
-        mu_t(s, a) = P(s_t = s, a_t = a) for uniform play from the start;  L <= ln(2 S A) / min over s, a of max over t of mu_t(s, a)
+        mu_t(s, a) = P(s_t = s, a_t = a) for uniform play from the start;  L <= ln(2 S A) / min over s, a of max over t
+        of mu_t(s, a)
 
-    Pairs run over the states that can be met within T steps and are not terminal; under sticky actions over pairs (state,
-    previously executed action), and a start without one.
+    Pairs run over the states that can be met within T steps and are not terminal; under sticky actions over pairs
+    (state, previously executed action), and a start without one.
 
     Args:
         horizon: T; None: that of the MDP.
@@ -74,7 +79,7 @@ def covering(mdp: TabularMDP, *, horizon: int | None = None) -> Covering:
 
 
 def _occupied(mdp: TabularMDP, steps: int) -> tuple[np.ndarray, np.ndarray]:
-    """(max over t, sum over t) of the probability of each node that is met under uniform play and not terminal, one entry a node."""
+    """(max over t, sum over t) of the probability of each node that uniform play meets and that is not terminal."""
     walk = Walk(mdp, None, steps)
     largest, total = np.zeros((mdp.num_states, walk.width)), np.zeros((mdp.num_states, walk.width))
     alone = np.zeros((0, 1))  # under sticky actions a start has no previous action: nodes of their own

@@ -1,7 +1,7 @@
 """The effective horizon: how far ahead one must look. Source: Laidlaw, Russell and Dragan (2023); stochastic: (2024).
 
-Undiscounted episodes of T steps, time-indexed. All quantities live on the nodes that can be met: states, or under sticky actions
-pairs (state, previously executed action) and the starts without one.
+Undiscounted episodes of T steps, time-indexed. All quantities live on the nodes that can be met: states, or under
+sticky actions pairs (state, previously executed action) and the starts without one.
 """
 
 import math
@@ -25,15 +25,17 @@ class EffectiveHorizon:
 
     Attributes:
         value: the effective horizon by the simple bound, H = min over k of k + log_A m_k, at most T.
-        k_min: smallest k for which acting greedily in Q^k is optimal, Q^1 being the value of the exploration policy (uniform).
+        k_min: smallest k for which acting greedily in Q^k is optimal, Q^1 being the value of the exploration policy
+            (uniform).
         effective_planning_window: the same from Q^1 = r: how many rewards ahead one must see.
-        ks, ms, gaps, vars: for each k that was tried and does not fail: k, the samples m_k, and gap and variance bound where m_k is
-            attained.
+        ks, ms, gaps, vars: for each k that was tried and does not fail: k, the samples m_k, and gap and variance bound
+            where m_k is attained.
         tight: a tighter bound by GORP's failure probability, where it was asked for; else None.
         greedy_returns: J_k for k = 1, ..., 5: return of the policy greedy in Q^k, ties broken adversarially.
         optimal_return, random_return, worst_return: from the start.
-        num_states: number of states that can be met at some step; under sticky actions, as BRIDGE counts, of pairs (state,
-            previously executed action), the implicit end with every action among them, and a start with the first action.
+        num_states: number of states that can be met at some step; under sticky actions, as BRIDGE counts, of pairs
+            (state, previously executed action), the implicit end with every action among them, and a start with the
+            first action.
         conventions: horizon, exploration, chance, tie tolerance.
     """
 
@@ -81,19 +83,19 @@ def effective_horizon(mdp: TabularMDP, *, horizon: int | None = None, tight: int
         var^1 = (Q^e - Q^w)(Q* - Q^w),  var^{k+1}_t(s, a) = max over s', b of var^k_{t+1}(s', b)
         m_k = max over states met of max(1, ceil(16 max_a var^k / gap_k^2 ln(2 T A^k))),  H = min_k k + log_A m_k
 
-    gap_k is the difference between the largest Q^k and the largest Q^k of an action that is not optimal; states met are those
-    that actions better than all of the latter lead to. k fails where that difference is exactly 0.
+    gap_k is the difference between the largest Q^k and the largest Q^k of an action that is not optimal; states met are
+    those that actions better than all of the latter lead to. k fails where that difference is exactly 0.
 
     Args:
         horizon: T; None: that of the MDP.
         tight: the largest k for which the tight bound of `gorp_bound` is computed as well; 0: none.
     Raises:
-        UndefinedMeasure: there is no horizon, or the table of all steps does not fit into memory: 8 GiB under chance, else 60 % of
-            that of the machine.
-    Cost: a pass over T x nodes x A for every k that is tried, of those that can be met within T steps. Memory 40 bytes for each of them
-        under chance; 17 bytes for each of T x S without.
-    Source: Laidlaw, Russell and Dragan (2023), "Bridging RL theory and practice with the effective horizon", theorem 5.4 and
-        appendix C; sticky actions: Laidlaw et al. (2024).
+        UndefinedMeasure: there is no horizon, or the table of all steps does not fit into memory: 8 GiB under chance,
+            else 60 % of that of the machine.
+    Cost: a pass over T x nodes x A for every k that is tried, of those that can be met within T steps. Memory 40 bytes
+        for each of them under chance; 17 bytes for each of T x S without.
+    Source: Laidlaw, Russell and Dragan (2023), "Bridging RL theory and practice with the effective horizon", theorem
+        5.4 and appendix C; sticky actions: Laidlaw et al. (2024).
     """
     steps = steps_of("effective_horizon", mdp, horizon)
     mdp = mdp.within(steps)

@@ -1,7 +1,10 @@
-"""Greedy over random policy (GORP), and how many samples it needs. Source: Laidlaw, Russell and Dragan (2023), appendix C.
+"""Greedy over random policy (GORP), and how many samples it needs.
 
-In round t, GORP plays each sequence of k actions m times, goes on at random to the end of the episode, and takes the first action
-of the sequence with the best mean return. H_k = k + log_A m, where m makes it fail with probability at most 1/2.
+Source: Laidlaw, Russell and Dragan (2023), appendix C.
+
+In round t, GORP plays each sequence of k actions m times, goes on at random to the end of the episode, and takes the
+first action of the sequence with the best mean return. H_k = k + log_A m, where m makes it fail with probability at
+most 1/2.
 """
 
 import math
@@ -27,7 +30,8 @@ class GorpBound:
     """How many samples GORP needs.
 
     Attributes:
-        value: the effective horizon by this bound, the smallest H_k; infinite where no number of samples is proven to do.
+        value: the effective horizon by this bound, the smallest H_k; infinite where no number of samples is proven to
+            do.
         ks, ms, values: k, the samples m for each sequence, and H_k = k + log_A m; m is None where H_k is infinite.
         failure_probabilities: the bound on the probability of failure at m, at most 1/2.
         proven: whether every method is proven. `binomial` is not, where all returns of a node may be 0 at once.
@@ -67,23 +71,26 @@ def gorp_bound(
         F_t(s) = max over p of sum_sequences p(sequence) f(first action),  low <= p <= high,  sum p = 1
         f(a) = 1 where a is not optimal in (t, s), else F_{t+1}(next state),  F_T of an optimal action 0
 
-    [low, high] encloses the probability that a sequence has the best mean of m samples. Of all methods the smallest F counts,
-    node by node. The maximum is a fractional knapsack: the largest f first. m is found by bisection, to 1 %.
+    [low, high] encloses the probability that a sequence has the best mean of m samples. Of all methods the smallest F
+    counts, node by node. The maximum is a fractional knapsack: the largest f first. m is found by bisection, to 1 %.
 
     Args:
         horizon: T; None: that of the MDP.
         max_k: k = 1, ..., max_k are tried.
-        methods: of `binomial` (as BRIDGE has it: k = 1, returns 0 or R, m up to 10^6; 100 cells by quantiles, without the outcome
-            that all samples are 0, which is given to every sequence only in so far as the bounds do not add up to 1),
-            `berry_esseen` (with the moments of the return distribution) and `bernstein`, both for up to 100 sequences,
-            `bennett`; `exact` (returns 0 or R, any k, m up to 10^6: the probabilities themselves).
-            The first four are BRIDGE's, and the default. With `exact` instead of `binomial` the bound is proven, and far smaller.
+        methods: of `binomial` (as BRIDGE has it: k = 1, returns 0 or R, m up to 10^6; 100 cells by quantiles, without
+            the outcome that all samples are 0, which is given to every sequence only in so far as the bounds do not add
+            up to 1), `berry_esseen` (with the moments of the return distribution) and `bernstein`, both for up to 100
+            sequences, `bennett`; `exact` (returns 0 or R, any k, m up to 10^6: the probabilities themselves).
+            The first four are BRIDGE's, and the default. With `exact` instead of `binomial` the bound is proven, and
+            far smaller.
     Raises:
-        UndefinedMeasure: the MDP has chance or several outcomes: GORP's sequences of actions then lead nowhere in particular.
+        UndefinedMeasure: the MDP has chance or several outcomes: GORP's sequences of actions then lead nowhere in
+            particular.
         ParameterError: an option is wrong.
-    Cost: for each of about 15 values of m a pass over the nodes that optimal play can meet, A^2k 100 tails for each. KeyCorridor
-        (168 states, T = 100, k = 1) takes 20 s; only `exact` and `bennett` 4 s.
-    Source: Laidlaw, Russell and Dragan (2023), "Bridging RL theory and practice with the effective horizon", appendix C.
+    Cost: for each of about 15 values of m a pass over the nodes that optimal play can meet, A^2k 100 tails for each.
+        KeyCorridor (168 states, T = 100, k = 1) takes 20 s; only `exact` and `bennett` 4 s.
+    Source: Laidlaw, Russell and Dragan (2023), "Bridging RL theory and practice with the effective horizon", appendix
+        C.
     """
     steps, names = steps_of("gorp_bound", mdp, horizon), tuple(methods)
     if isinstance(max_k, bool) or not isinstance(max_k, int | np.integer) or max_k < 1:
@@ -297,7 +304,7 @@ def _knapsack(lower: np.ndarray, upper: np.ndarray, f: np.ndarray) -> np.ndarray
 
 
 class _Tails:
-    """Bounds (lower, upper), each (n, A^k), on the probability that a sequence has the best mean return, for some nodes of a step.
+    """Bounds (lower, upper), each (n, A^k), on the probability that a sequence has the best mean return, at some nodes.
 
     Each method takes m and which nodes to answer for, and returns None where it does not apply.
     """
@@ -369,7 +376,7 @@ class _Tails:
         return lower, upper
 
     def binomial(self, m: int, todo: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-        """Cells between quantiles, as BRIDGE cuts them: by the normal distribution from m = 30 on, and without the outcome 0."""
+        """Cells between quantiles, as BRIDGE cuts them: by the normal distribution from m = 30, without outcome 0."""
         from scipy.special import bdtr, ndtri
 
         if self.k > 1 or m > MOST_BINOMIAL or not self.search.two_valued:
@@ -401,7 +408,7 @@ class _Tails:
         return result[0], result[1]
 
     def exact(self, m: int, todo: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-        """The probabilities: a sequence wins with x successes if those before it have less, and those after it no more."""
+        """A sequence wins with x successes if those before it have less, and those after it no more."""
         from scipy.special import bdtr
 
         if m > MOST_BINOMIAL or not self.search.two_valued:

@@ -1,7 +1,8 @@
-"""The effective horizon of deterministic MDPs of millions of states: the same numbers as in effective_horizon, compiled.
+"""The effective horizon of deterministic MDPs of millions of states: the numbers of effective_horizon, compiled.
 
-Q^k_t(s, a) = r(s, a) + W^{k-1}_{t+1}(next state) with W^0 = V of uniform play and W^k_t(s) = max_a Q^k_t(s, a): one number a state and
-step is kept instead of one for each action, and each k overwrites the one before, as step t needs only step t + 1 of it.
+Q^k_t(s, a) = r(s, a) + W^{k-1}_{t+1}(next state) with W^0 = V of uniform play and W^k_t(s) = max_a Q^k_t(s, a): one
+number a state and step is kept instead of one for each action, and each k overwrites the one before, as step t needs
+only step t + 1 of it.
 """
 
 import math
@@ -40,7 +41,8 @@ class LargeHorizon:
         needed = (16 + bits(0).itemsize) * steps * states
         if needed > (room := _room()):
             raise UndefinedMeasure(
-                f"effective_horizon: {steps} steps of the {states} states that they can meet need {needed / 2**30:.1f} GiB, more than {room / 2**30:.1f}, "
+                f"effective_horizon: {steps} steps of the {states} states that they can meet need "
+                f"{needed / 2**30:.1f} GiB, more than {room / 2**30:.1f}, "
                 f"{_PARTS:.0%} of this machine's memory; a smaller horizon or instance would define it"
             )
         table = mdp.dynamics.deterministic_table()

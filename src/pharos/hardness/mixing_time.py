@@ -115,7 +115,10 @@ def _merged(chain: Any, underlying: np.ndarray, ended: np.ndarray) -> Any:
 
 
 def _too_many(nodes: int) -> str:
-    return f"mixing_time: {nodes} nodes are more than the {MOST_NODES} whose matrix fits; a smaller instance would define it"
+    return (
+        f"mixing_time: {nodes} nodes are more than the {MOST_NODES} whose matrix fits; a smaller instance "
+        f"would define it"
+    )
 
 
 def _period(chain: Any) -> int:

@@ -73,17 +73,18 @@ def occupancy(
     visits(s, a) r(s, a) over executed actions.
 
     Args:
-        policy: as for `evaluate_policy`: (S,) actions, (S, A) probabilities, under sticky actions also one for each previous
-            action; None: uniform.
-        horizon: T, steps t = 0, ..., T - 1; None: that of the MDP; where it has none, until what is left is within `tolerance`.
+        policy: as for `evaluate_policy`: (S,) actions, (S, A) probabilities, under sticky actions also one for each
+            previous action; None: uniform.
+        horizon: T, steps t = 0, ..., T - 1; None: that of the MDP; where it has none, until what is left is within
+            `tolerance`.
         executed: whether a_t is the action that is executed, after chance; otherwise the one that the policy chooses.
         keep_all: whether to keep mu_t for all t, with a horizon.
         tolerance: of the sum of all visits, without a horizon.
     Raises:
         UndefinedMeasure: gamma is 1 and there is no horizon, so that visits may be infinite.
         ParameterError: the policy or an option is wrong, or all steps would take more than 8 GiB.
-    Cost: O(S A) a step and O(S A) memory; without a horizon about ln(1 / tolerance) / (1 - gamma) steps. 100 steps on the 2.4 million
-        states of `breakout/12x8x1` take 0.8 s.
+    Cost: O(S A) a step and O(S A) memory; without a horizon about ln(1 / tolerance) / (1 - gamma) steps. 100 steps on
+        the 2.4 million states of `breakout/12x8x1` take 0.8 s.
     Source: Puterman (1994), section 6.9; Laidlaw, Russell and Dragan (2023) for mu_t.
     """
     walk = Walk(mdp, policy, horizon)
@@ -124,16 +125,18 @@ def discounted_visits(mdp: TabularMDP, policy: Any = None, *, tolerance: float =
 
         d(s) = sum over t of gamma^t P(s_t = s),   t = 0, 1, ...
 
-    As `occupancy(...).states`, but without `largest`, so that mass may go on many steps in one pass over states in breadth-first
-    order.
+    As `occupancy(...).states`, but without `largest`, so that mass may go on many steps in one pass over states in
+    breadth-first order.
 
     Args:
         policy, tolerance: as for `occupancy`.
     Returns:
-        (S,) float64, and the bound; it is above `tolerance` only where all that is left has less than 1e-280 in each state.
+        (S,) float64, and the bound; it is above `tolerance` only where all that is left has less than 1e-280 in each
+        state.
     Raises:
         UndefinedMeasure: gamma is 1. ParameterError: the policy is wrong.
-    Cost: O(S A) a pass; at most ln(1 / tolerance) / (1 - gamma) passes, in breadth-first order a tenth of them and fewer.
+    Cost: O(S A) a pass; at most ln(1 / tolerance) / (1 - gamma) passes, in breadth-first order a tenth of them and
+        fewer.
     """
     walk = Walk(mdp if mdp.horizon is None else mdp.with_horizon(None), policy, None)
     visits, waiting = walk.after_the_start()
@@ -164,7 +167,10 @@ def support(mdp: TabularMDP, policy: Any = None) -> np.ndarray:
 
 
 class Walk:
-    """Distributions of a policy's states, one step after the other; pairs (state, previous action) under sticky actions."""
+    """Distributions of a policy's states, one step after the other.
+
+    Pairs (state, previous action) under sticky actions.
+    """
 
     def __init__(self, mdp: TabularMDP, policy: Any, horizon: int | None):
         steps = mdp.horizon if horizon is None else horizon
@@ -182,7 +188,9 @@ class Walk:
         self.width = mdp.width
 
     def after_the_start(self) -> tuple[np.ndarray, np.ndarray]:
-        """((S,), (S, W)): under sticky actions where play starts, and where it is a step later; else nothing, and where it starts.
+        """((S,), (S, W)): under sticky actions where play starts, and where it is a step later.
+
+        Otherwise nothing, and where it starts.
 
         That is where the rules of later steps hold. Without states where play ends.
         """
@@ -197,7 +205,10 @@ class Walk:
         return started, now
 
     def distributions(self) -> Iterator[tuple["Nodes", float]]:
-        """(distribution, probability that play goes on) at t = 0, 1, ...; T of them with a horizon. Overwritten by later ones."""
+        """(distribution, probability that play goes on) at t = 0, 1, ...; T of them with a horizon.
+
+        Each is overwritten by later ones.
+        """
         states = self.mdp.num_states
         start = np.zeros((states, 1))
         np.add.at(start[:, 0], self.mdp.start_states, self.mdp.start_probabilities)

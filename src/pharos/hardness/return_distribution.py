@@ -61,11 +61,11 @@ def return_distribution(mdp: TabularMDP, policy: Any = None, *, horizon: int | N
         policy: as for `evaluate_policy`; None: uniform.
         horizon: T; None: that of the MDP.
     Raises:
-        UndefinedMeasure: there is no horizon, or there are so many different returns that a table of states by returns does not
-            fit into 8 GiB.
+        UndefinedMeasure: there is no horizon, or there are so many different returns that a table of states by returns
+            does not fit into 8 GiB.
         ParameterError: the policy or the horizon is wrong.
-    Exactness: exact; returns within 1e-9 of each other count as one. Of general MDPs the reward r(s, a) is paid as it is, even
-        where it is an expectation.
+    Exactness: exact; returns within 1e-9 of each other count as one. Of general MDPs the reward r(s, a) is paid as it
+        is, even where it is an expectation.
     Cost: T passes over S A K, where K returns are possible; two tables of S A K.
     Source: Bellemare, Dabney and Rowland (2023), "Distributional reinforcement learning", chapter 2.
     """
@@ -81,7 +81,7 @@ def return_distribution(mdp: TabularMDP, policy: Any = None, *, horizon: int | N
 
 
 def central_moments(mdp: TabularMDP, steps: int) -> tuple[np.ndarray, np.ndarray]:
-    """(T, S + 1) variance and third absolute central moment of what is still to come under uniform play, at steps t = 0, ...
+    """(T, S + 1) variance and third absolute central moment of the return to come under uniform play, at t = 0, ...
 
     State S is the end. Not under sticky actions.
     """
@@ -96,7 +96,9 @@ def central_moments(mdp: TabularMDP, steps: int) -> tuple[np.ndarray, np.ndarray
 
 
 def _backward(mdp: TabularMDP, policy: Any, steps: int) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray | None]]:
-    """For t = T - 1, ..., 0: returns (K,); (S + 1, W, K) their probabilities from t on, W being A previous actions or 1.
+    """For t = T - 1, ..., 0: the possible returns (K,), and their probabilities.
+
+    These are (S + 1, W, K), from t on, W being A previous actions or 1.
 
     Under sticky actions also (S + 1, 1, K), as if no action had been executed before, for the last of them.
     """
@@ -112,7 +114,8 @@ def _backward(mdp: TabularMDP, policy: Any, steps: int) -> Iterator[tuple[np.nda
         following = sums[np.concatenate([[True], np.diff(sums) > SAME])]
         if 8 * states * num_actions * len(following) * 3 > MEMORY:
             raise UndefinedMeasure(
-                f"return_distribution: {len(following)} returns are possible in {steps - t} steps from {states} states, more than "
+                f"return_distribution: {len(following)} returns are possible in {steps - t} steps from {states} "
+                "states, more than "
                 f"{MEMORY / 2**30:.0f} GiB hold; a smaller horizon or instance would define it"
             )
         executed = np.zeros((states, num_actions, len(following)))

@@ -1,4 +1,4 @@
-"""The effective horizon of discounted MDPs without time: one value a state, so that it is within reach of millions of states.
+"""The effective horizon of discounted MDPs without time: one value a state, so that millions of states are feasible.
 
 pharos's own variant of Laidlaw, Russell and Dragan's (2023) measure; `effective_horizon` is theirs.
 """
@@ -24,10 +24,11 @@ class StationaryHorizon:
 
     Attributes:
         value: min over k of k + log_A m_k, at most `steps`.
-        k_min: smallest k for which acting greedily in Q^k is optimal, Q^1 being the value of uniform play; `steps` where none is.
+        k_min: smallest k for which acting greedily in Q^k is optimal, Q^1 being the value of uniform play; `steps`
+            where none is.
         effective_planning_window: the same from Q^1 = r.
-        ks, ms, gaps, vars: for each k that was tried and does not fail: k, the samples m_k, and gap and variance bound where m_k is
-            attained.
+        ks, ms, gaps, vars: for each k that was tried and does not fail: k, the samples m_k, and gap and variance bound
+            where m_k is attained.
         conventions: gamma, steps, tie tolerance, slack of comparisons.
     """
 
@@ -72,24 +73,25 @@ def stationary_effective_horizon(
         var^1 = (Q^e - Q^w)(Q* - Q^w),  var^{k+1}(s, a) = gamma^2 max over s', b of var^k(s', b)
         m_k = max over states met of max(1, ceil(16 max_a var^k / gap_k^2 ln(2 T A^k))),  H = min_k k + log_A m_k
 
-    As `effective_horizon`, but for values that do not depend on the step: in place of T steps there are states, and T, the time
-    limit, only counts the decisions. Where an MDP ends by itself within T steps, each state at one depth, both are the same for
-    gamma = 1.
+    As `effective_horizon`, but for values that do not depend on the step: in place of T steps there are states, and T,
+    the time limit, only counts the decisions. Where an MDP ends by itself within T steps, each state at one depth, both
+    are the same for gamma = 1.
 
     Args:
         solution: the optimal solution of `mdp`; None: solved here.
         steps: T; None: the MDP's horizon, else ceil(1 / (1 - gamma)).
-        tie_tolerance: an action is optimal if its value is within it of the best; None: 2.5 times the largest error of the values,
-            at least 1e-9.
+        tie_tolerance: an action is optimal if its value is within it of the best; None: 2.5 times the largest error of
+            the values, at least 1e-9.
         tolerance: largest error of the values; a larger one is used where floats cannot reach it.
         progress: called with a line on how far it is.
     Raises:
         UndefinedMeasure: gamma is 1.
-        ParameterError: an option is wrong, or `solution` is not of this MDP. PrecisionError: tie_tolerance is not above twice the error.
-    Exactness: Q^k is known up to an error; what differs by less than `slack`, four times that, counts as equal, which makes k fail
-        rather than pass.
-    Cost: three solutions, then a backup and a walk over the states met for each k. breakout/12x8x1 (2.4 million states) takes
-        about ten seconds.
+        ParameterError: an option is wrong, or `solution` is not of this MDP. PrecisionError: tie_tolerance is not above
+            twice the error.
+    Exactness: Q^k is known up to an error; what differs by less than `slack`, four times that, counts as equal, which
+        makes k fail rather than pass.
+    Cost: three solutions, then a backup and a walk over the states met for each k. breakout/12x8x1 (2.4 million states)
+        takes about ten seconds.
     Source: pharos; after Laidlaw, Russell and Dragan (2023), theorem 5.4.
     """
     if mdp.gamma == 1.0:
@@ -106,7 +108,8 @@ def stationary_effective_horizon(
     tie = max(1e-9, 1.25 * floor) if tie_tolerance is None else float(tie_tolerance)
     if not tie > floor:
         raise PrecisionError(
-            f"tie_tolerance is {tie_tolerance!r}; expected more than twice the error of the values, {floor:.3g}: raise it, or "
+            f"tie_tolerance is {tie_tolerance!r}; expected more than twice the error of the values, "
+            f"{floor:.3g}: raise it, or "
             f"solve with a smaller tolerance"
         )
     slack = max(1e-12, 2 * floor)
@@ -163,7 +166,7 @@ class _Known:
 
 
 class _Ahead:
-    """Action values r + gamma value(next), where each action leads to one node: worked out only where they are asked for."""
+    """Action values r + gamma value(next), where each action leads to one node: computed where they are asked for."""
 
     def __init__(self, nodes: "_Nodes", value: np.ndarray):
         self.nodes, self.value = nodes, value
@@ -184,11 +187,12 @@ class _Ahead:
 
 
 class _Nodes:
-    """Values of optimal, worst and uniform play on the nodes that can be met: states, or pairs with the previous action.
+    """Values of optimal, worst and uniform play on nodes that can be met: states, or pairs with the previous action.
 
     Attributes:
         rewards, best, worst, explored: (N, A) of choosing an action. error: the largest error of any of them.
-        table: (N, A), the only node that an action leads to, where that is so everywhere; else None, and matrix (N A, N) says.
+        table: (N, A), the only node that an action leads to, where that is so everywhere; else None, and matrix (N A,
+            N) says.
     """
 
     def __init__(self, mdp: TabularMDP, solution: Solution | None, tolerance: float, tell: Callable[[str], None]):
@@ -235,7 +239,10 @@ class _Nodes:
         return each.reshape(self.rewards.shape).max(axis=1)
 
     def closure(self, actions: Callable[[np.ndarray], np.ndarray | None]) -> np.ndarray | None:
-        """The nodes met from the start by the actions (n, A) bool that are named for nodes (n,); None where it says None."""
+        """The nodes that can be met from the start by some actions; None where `actions` answers None.
+
+        actions: from nodes (n,) to (n, A) bool, the actions that are taken there.
+        """
         met = np.zeros(self.num_nodes, np.bool_)
         met[self.starts] = True
         nodes = self.starts
@@ -254,7 +261,10 @@ class _Nodes:
 
 
 def _states_and_the_end(mdp: TabularMDP) -> tuple[Choices, np.ndarray]:
-    """The states without chance, then the implicit end; and where each action leads. What has ended stays where it is."""
+    """The states without chance, then the implicit end; and where each action leads.
+
+    What has ended stays where it is.
+    """
     next_states: Any = mdp.dynamics.deterministic_table()
     size = mdp.num_states
     table = np.full((size + 1, mdp.num_actions), size, next_states.dtype)

@@ -1,7 +1,7 @@
 """Values of every step of an episode of T steps, under optimal, worst and exploring play: what planning measures share.
 
-Undiscounted and time-indexed, on the nodes of `choices`: states, or under sticky actions pairs (state, previously executed
-action) and the starts without one. Source: Laidlaw, Russell and Dragan (2023).
+Undiscounted and time-indexed, on the nodes of `choices`: states, or under sticky actions pairs (state, previously
+executed action) and the starts without one. Source: Laidlaw, Russell and Dragan (2023).
 """
 
 from typing import Any
@@ -44,7 +44,8 @@ class Steps:
         needed = 40 * steps * size * mdp.num_actions
         if needed > MEMORY:
             raise UndefinedMeasure(
-                f"effective_horizon: {steps} steps of the {size} nodes that they can meet need {needed / 2**30:.1f} GiB, "
+                f"effective_horizon: {steps} steps of the {size} nodes that they can meet need "
+                f"{needed / 2**30:.1f} GiB, "
                 f"more than {MEMORY / 2**30:.0f}; a smaller horizon or instance would define it"
             )
         choices = choices_of(mdp, restart=False)

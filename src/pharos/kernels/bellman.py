@@ -1,10 +1,11 @@
 """Bellman backups in place, over flat arrays. mdp/dynamics.py says what they mean, solvers/ proves their bounds.
 
-Common arguments: next_states (S, A), -1 where the episode ends; table, palette: see mdp/rewards.py; v (S + 1,) float64, under
+Common arguments: next_states (S, A), -1 where the episode ends; table, palette: see mdp/rewards.py; v (S + 1,) float64,
+    under
 sticky actions (S + 1, A) by the previously executed action, with row S 0, so that index -1 reads 0; weights: (chosen,
-previous, uniform); sign: 1 maximises, -1 minimises; actions: a tuple of A zeros, whose length the compiler knows, so that the
-loops over actions are unrolled (a third faster). Each sweep goes from the last state to the first and returns the largest
-change of an entry.
+previous, uniform); sign: 1 maximises, -1 minimises; actions: a tuple of A zeros, whose length the compiler knows, so
+that the loops over actions are unrolled (a third faster). Each sweep goes from the last state to the first and returns
+the largest change of an entry.
 """
 
 import numpy as np
@@ -76,7 +77,10 @@ def _sticky_values(next_states, table, palette, gamma, sign, v, actions, q, s):
 
 @njit(cache=True, nogil=True)
 def sticky_sweep(next_states, table, palette, gamma, weights, sign, v, actions, q):
-    """v[s, b] = chosen max_a q(s, a) + previous q(s, b) + uniform mean_a q(s, a), in place. v (S + 1, A); q (A,) scratch."""
+    """v[s, b] = chosen max_a q(s, a) + previous q(s, b) + uniform mean_a q(s, a), in place.
+
+    v (S + 1, A); q (A,) scratch.
+    """
     chosen, previous, uniform = weights
     change = 0.0
     for s in range(len(next_states) - 1, -1, -1):
@@ -147,8 +151,8 @@ def sticky_policy_sweep(next_states, table, palette, gamma, weights, policy, v, 
 def chain_values(successor, reward, gamma, v, order):
     """Exact values on the graph of a deterministic policy: successor (S,), -1 ends; reward (S,); v gets the values.
 
-    Every walk runs into the end, into a state already done, or into a new cycle, whose value is the geometric series of its
-    rewards. order (S,) is scratch. Returns a state on a cycle whose value is infinite (gamma = 1), or -1.
+    Every walk runs into the end, into a state already done, or into a new cycle, whose value is the geometric series of
+    its rewards. order (S,) is scratch. Returns a state on a cycle whose value is infinite (gamma = 1), or -1.
     """
     num_states = len(successor)
     mark = np.zeros(num_states, np.int64)  # 0 new, i + 1 on the walk at place i, -1 done

@@ -1,8 +1,9 @@
 """Distributions of states, pushed one step forward over a table of next states.
 
-next_states (S, A), -1 where the episode ends; live (S,) bool: states that play goes on in; now, after (S, W) float64: the
-distribution over states, W = 1, or over pairs (state, previously executed action), W = A, where `previous` > 0; policy (S, B, A)
-probabilities, B = 1 or, for policies that look at the previous action, A; weights: (chosen, previous, uniform).
+next_states (S, A), -1 where the episode ends; live (S,) bool: states that play goes on in; now, after (S, W) float64:
+the distribution over states, W = 1, or over pairs (state, previously executed action), W = A, where `previous` > 0;
+policy (S, B, A) probabilities, B = 1 or, for policies that look at the previous action, A; weights: (chosen, previous,
+uniform).
 """
 
 import numpy as np
@@ -27,7 +28,10 @@ def _executed(policy, weights, now, s, a, mass):
 
 @njit(cache=True, nogil=True)
 def push(next_states, live, policy, weights, now, after):
-    """after = the distribution one step later, without what has ended. Returns what goes on: the sum over live states."""
+    """after = the distribution one step later, without what has ended.
+
+    Returns what goes on: the sum over live states.
+    """
     after[:] = 0.0
     sticky = weights[1] > 0.0
     for s in range(len(next_states)):
@@ -54,8 +58,8 @@ def push(next_states, live, policy, weights, now, after):
 def settle(next_states, live, policy, weights, gamma, least, waiting, visits):
     """Count what waits in a state as a visit, and let it go on; from the first state to the last, in place.
 
-    waiting (S, W): discounted mass that has come and has not gone on. visits (S,): sum over t of gamma^t P(s_t = s), as far as it has
-    gone on. Masses below `least` stay. Returns what waits in the end.
+    waiting (S, W): discounted mass that has come and has not gone on. visits (S,): sum over t of gamma^t P(s_t = s), as
+    far as it has gone on. Masses below `least` stay. Returns what waits in the end.
     """
     num_actions = next_states.shape[1]
     sticky = weights[1] > 0.0

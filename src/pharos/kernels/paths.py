@@ -6,7 +6,9 @@ from numba import njit
 
 @njit(cache=True, nogil=True)
 def longest_path_of_table(next_states, live):
-    """Edges of the longest path of a table of next states (S, A), -1 for none, rows of live (S,) bool alone; -1: a cycle.
+    """Edges of the longest path of a table of next states (S, A), -1 for none, from live (S,) states alone.
+
+    Returns -1 where there is a cycle.
 
     Cost: two passes over the table; 24 bytes a state.
     """
@@ -44,7 +46,10 @@ def longest_path_of_table(next_states, live):
 
 @njit(cache=True, nogil=True)
 def longest_path(first, following, num_states):
-    """As `longest_path_of_table`: the successors of s are following[first[s] : first[s + 1]]; num_states and more are none."""
+    """As `longest_path_of_table`: the successors of s are following[first[s] : first[s + 1]].
+
+    Entries of num_states and more lead to nothing.
+    """
     waiting = np.zeros(num_states, np.int64)
     for i in range(len(following)):
         if following[i] < num_states:

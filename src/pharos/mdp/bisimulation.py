@@ -1,7 +1,9 @@
 """Bisimulation: states that no sequence of actions can tell apart, merged. Source: Givan, Dean and Greig (2003).
 
-Two states are bisimilar if they pay the same reward for every action and lead to bisimilar states. The coarsest such partition is found
-by refinement: start from terminal flag, rewards and, if wanted, observations; split classes by the classes that their states lead to,
+Two states are bisimilar if they pay the same reward for every action and lead to bisimilar states. The coarsest such
+partition is found
+by refinement: start from terminal flag, rewards and, if wanted, observations; split classes by the classes that their
+    states lead to,
 until nothing splits (Moore 1956; Kanellakis and Smolka 1990).
 """
 
@@ -40,19 +42,21 @@ class Minimization:
 def minimize(mdp: TabularMDP, observations: Any = None) -> Minimization:
     """Return the smallest MDP that cannot be told from this one.
 
-    V(s) = V(class of s) for every policy that depends on classes, under sticky and random actions too, because both act on executed
-    actions. Terminal states are not merged with others, as they restart.
+    V(s) = V(class of s) for every policy that depends on classes, under sticky and random actions too, because both act
+    on executed actions. Terminal states are not merged with others, as they restart.
 
     Args:
-        observations: (S, ...) one for each state: states that look different stay apart. None: rewards alone tell them apart.
+        observations: (S, ...) one for each state: states that look different stay apart. None: rewards alone tell them
+            apart.
     Raises:
         ParameterError: there is not one observation for each state.
-    Exactness: exact for tables of next states. In general MDPs the probabilities of reaching a class are compared after rounding to
-        2^-40, so that the order of additions does not split classes.
-    Cost: O(S A) to find whose next states changed, in each round, and O(A) for each such state; rounds are at most the number of
-        steps that tell two states apart. About 40 bytes a state. Of general MDPs a pass over all transitions in each round.
-    Source: Givan, Dean and Greig (2003), "Equivalence notions and model minimization in Markov decision processes"; BRIDGE's
-        consolidation (Laidlaw, Russell and Dragan 2023).
+    Exactness: exact for tables of next states. In general MDPs the probabilities of reaching a class are compared after
+        rounding to 2^-40, so that the order of additions does not split classes.
+    Cost: O(S A) to find whose next states changed, in each round, and O(A) for each such state; rounds are at most the
+        number of steps that tell two states apart. About 40 bytes a state. Of general MDPs a pass over all transitions
+        in each round.
+    Source: Givan, Dean and Greig (2003), "Equivalence notions and model minimization in Markov decision processes";
+        BRIDGE's consolidation (Laidlaw, Russell and Dragan 2023).
     """
     rewards = mdp.reward_table
     paid = rewards.table if len(rewards.palette) else rewards.table + 0.0  # -0.0 and 0.0 are one reward

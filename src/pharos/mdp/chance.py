@@ -77,7 +77,10 @@ class Chance:
 
     @property
     def executes_any(self) -> bool:
-        """Whether any action can be executed after any other, by some choice; false where every step repeats the first."""
+        """Whether any action can be executed after any other, by some choice.
+
+        False where every step repeats the first.
+        """
         return self.chosen > 0 or self.uniform > 0
 
     @property
@@ -98,7 +101,8 @@ class Chance:
 
         Args:
             q: (N, A, ...), the values of executing each action.
-            value: (N, 1, ...), the value of the chosen action; (N, A, ...) where the choice depends on the previous action.
+            value: (N, 1, ...), the value of the chosen action; (N, A, ...) where the choice depends on the previous
+                action.
         """
         result = self.chosen * value
         if self.uniform:

@@ -1,7 +1,8 @@
 """Rewards of all transitions, held exactly and compactly.
 
 Games pay few different rewards: up to 256 distinct values are kept as one byte for each transition and a palette of
-float64, an eighth of the memory of (S, A) float64 and an eighth of what a sweep has to stream; more are kept as float64.
+float64, an eighth of the memory of (S, A) float64 and an eighth of what a sweep has to stream; more are kept as
+float64.
 """
 
 from dataclasses import dataclass, field

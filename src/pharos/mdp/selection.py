@@ -92,9 +92,9 @@ class PolicyTable:
         """From what users write.
 
         Args:
-            policy: (S,) integers, an action for each state; or (S, A) probabilities. Under sticky actions also (S, A + 1)
-                integers or (S, A + 1, A) probabilities, for each previously executed action and, last, for none; or a
-                function from an array of state indices to any of these; None: uniform.
+            policy: (S,) integers, an action for each state; or (S, A) probabilities. Under sticky actions also (S, A +
+                1) integers or (S, A + 1, A) probabilities, for each previously executed action and, last, for none; or
+                a function from an array of state indices to any of these; None: uniform.
         Raises:
             ParameterError: the shape is wrong, or rows are not probabilities.
         """

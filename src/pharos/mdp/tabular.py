@@ -8,9 +8,10 @@ import numpy as np
 
 from pharos.errors import ParameterError
 from pharos.mdp.chance import Chance
-from pharos.mdp.dynamics import Dynamics, Matrices, Table
-from pharos.mdp.matrices import expected_rewards, transitions_of
+from pharos.mdp.dynamics import Dynamics
+from pharos.mdp.matrices import Matrices, expected_rewards, transitions_of
 from pharos.mdp.rewards import Rewards
+from pharos.mdp.table import Table
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
@@ -27,7 +28,8 @@ class TabularMDP:
     Attributes:
         dynamics: what executing an action does; solvers and measures ask it, whatever it is stored as.
         reward_table: the rewards, compactly; `rewards` is the same as (S, A) float64.
-        terminal: (S,) bool, the terminal states: they lead to themselves with reward 0 (or are whole rows of -1, reward 0).
+        terminal: (S,) bool, the terminal states: they lead to themselves with reward 0 (or are whole rows of -1, reward
+            0).
         gamma: discount, in [0, 1].
         horizon: number of steps T after which an episode ends, or None.
         start_states, start_probabilities: the start distribution.
@@ -49,7 +51,7 @@ class TabularMDP:
         _check_gamma(self.gamma)
         _check_horizon(self.horizon)
 
-    # Making one ----------------------------------------------------------------------------------------------------------
+    # Making one -----------------------------------------------------------------------------------------------------
 
     @staticmethod
     def from_arrays(
@@ -69,21 +71,24 @@ class TabularMDP:
             gamma: discount, in [0, 1].
             initial: a start state, a sequence of equally likely ones (fewer than S), or (S,) probabilities.
             horizon: number of steps of an episode, or None.
-            terminal: (S,) bool, the terminal states, whose rows must lead to themselves (or be -1) with reward 0; None: the
-                states whose whole row is -1 with reward 0.
+            terminal: (S,) bool, the terminal states, whose rows must lead to themselves (or be -1) with reward 0; None:
+                the states whose whole row is -1 with reward 0.
         Raises:
-            ParameterError: a shape, an index, a reward, gamma or the start distribution is wrong; the first such entry is named.
+            ParameterError: a shape, an index, a reward, gamma or the start distribution is wrong; the first such entry
+                is named.
         """
         table = np.asarray(next_states)
         if table.ndim != 2 or table.size == 0 or table.dtype.kind not in "iu":
             raise ParameterError(
-                f"next_states has shape {table.shape} and type {table.dtype}; expected integers of shape (states, actions)"
+                f"next_states has shape {table.shape} and type {table.dtype}; expected integers of shape "
+                "(states, actions)"
             )
         outside = (table < -1) | (table >= len(table))
         if outside.any():
             s, a = map(int, np.argwhere(outside)[0])
             raise ParameterError(
-                f"next_states[{s}, {a}] is {table[s, a]}; expected a state from 0 to {len(table) - 1}, or -1 for the end"
+                f"next_states[{s}, {a}] is {table[s, a]}; expected a state from 0 to {len(table) - 1}, or -1 "
+                "for the end"
             )
         reward_table = _rewards_of_shape(rewards, table.shape)
         dtype = np.int32 if len(table) < 2**31 else np.int64
@@ -96,7 +101,8 @@ class TabularMDP:
             own = np.arange(len(table), dtype=dtype)[:, None]
             if mask.shape != (len(table),) or (mask & ~(((table == own) | (table == -1)).all(axis=1) & silent)).any():
                 raise ParameterError(
-                    f"terminal has shape {mask.shape}; expected ({len(table)},), true only where a state leads to itself "
+                    f"terminal has shape {mask.shape}; expected ({len(table)},), true only where a state leads "
+                    "to itself "
                     f"(or to -1) with reward 0 by every action"
                 )
         states, probabilities = _start(initial, len(table))
@@ -109,8 +115,8 @@ class TabularMDP:
         """A general MDP from transition probabilities.
 
         Args:
-            P: (S, A, S) array of probabilities P[s, a, t]; or a sparse (S A, S) matrix with rows s A + a; or a list of A
-                sparse (S, S) matrices. A row that sums to less than 1 ends the episode with the rest.
+            P: (S, A, S) array of probabilities P[s, a, t]; or a sparse (S A, S) matrix with rows s A + a; or a list of
+                A sparse (S, S) matrices. A row that sums to less than 1 ends the episode with the rest.
             R: expected rewards (S, A); or (S,) for every action alike; or (S, A, S), dense P only, averaged over P.
             gamma, initial, horizon: as in `from_arrays`.
         Raises:
@@ -139,7 +145,7 @@ class TabularMDP:
             folder=space.folder,
         )
 
-    # What it is ----------------------------------------------------------------------------------------------------------
+    # What it is -----------------------------------------------------------------------------------------------------
 
     @property
     def num_states(self) -> int:
@@ -153,12 +159,17 @@ class TabularMDP:
 
     @property
     def next_states(self) -> np.ndarray | None:
-        """(S, A) int32 or int64, where each action leads; -1: the episode ends. None where that is not how they are stored."""
+        """(S, A) int32 or int64, where each action leads; -1: the episode ends.
+
+        None where that is not how they are stored.
+        """
         return getattr(self.dynamics, "next_states", None)
 
     @property
     def transitions(self) -> "csr_matrix | None":
-        """(S A, S) sparse probabilities with rows s A + a; what a row lacks to 1 is the probability that the episode ends.
+        """(S A, S) sparse probabilities with rows s A + a.
+
+        What a row lacks to 1 is the probability that the episode ends.
 
         None where that is not how they are stored.
         """
@@ -203,7 +214,7 @@ class TabularMDP:
         """Whether some transition ends the episode without a next state."""
         return self.dynamics.has_ends
 
-    # What can be met ---------------------------------------------------------------------------------------------------
+    # What can be met ------------------------------------------------------------------------------------------------
 
     @property
     def starts(self) -> np.ndarray:
@@ -211,13 +222,14 @@ class TabularMDP:
         return np.unique(self.start_states[self.start_probabilities > 0])
 
     def states_within(self, steps: int | None = None) -> np.ndarray:
-        """(S,) bool: the states that can be met within `steps` steps (None: any number) from a start, by any actions."""
+        """(S,) bool: the states that some actions lead to within `steps` steps (None: any number) from a start."""
         return self.dynamics.reachable(self.starts, steps)
 
     def pairs_within(self, steps: int | None = None) -> np.ndarray:
         """(S, A) bool: the pairs (state, previously executed action) that can be met within `steps` steps from a start.
 
-        Which actions can be executed after which, chance says: where every action is a repetition, those of the first step
+        Which actions can be executed after which, chance says: where every action is a repetition, those of the first
+            step
         go on. Start states without a previous action are not among them.
         """
         if self.chance.executes_any:
@@ -244,7 +256,7 @@ class TabularMDP:
             level += 1
         return met[:-1]
 
-    # Variants ------------------------------------------------------------------------------------------------------------
+    # Variants -------------------------------------------------------------------------------------------------------
 
     def with_gamma(self, gamma: float) -> "TabularMDP":
         """The same MDP with another discount."""
@@ -271,8 +283,10 @@ class TabularMDP:
     def within(self, steps: int) -> "TabularMDP":
         """The same MDP with only those states that can be met within `steps` steps from a start; they keep their order.
 
-        Both agree on every episode of at most `steps` steps from the start: values there, returns, effective horizon. Of
-        states that take all the steps to reach, only that they exist is right: what leads out of the set does not any more.
+        Both agree on every episode of at most `steps` steps from the start: values there, returns, effective horizon.
+        Of
+        states that take all the steps to reach, only that they exist is right: what leads out of the set does not any
+            more.
 
         Returns:
             This MDP where all of its states are met; else one without a folder, as its states have other numbers.

@@ -1,14 +1,15 @@
 """The fixed point of a Bellman equation, with an error bound that is proven and met.
 
-Sweeps go in place and in reverse order of discovery: breadth-first search numbers a state before those that it leads to, so
+Sweeps go in place and in reverse order of discovery: breadth-first search numbers a state before those that it leads
+    to, so
 a sweep from the last state to the first carries values back along whole paths. 20 to 40 sweeps solve games that take a
 thousand plain ones. Where sweeps are slow, because gamma is near 1, policy iteration gives a better x to go on from.
 
-The bound. Let T be the backup, a contraction with factor rho, x* its fixed point, and let one sweep in place change entries
-by at most d, with rounding errors of at most e an entry. Every new entry is a backup of entries that are old or already new,
-so it is within rho max(|x_old - x*|, |x_new - x*|) + e of x*. With D = |x_new - x*| in the maximum norm and
-|x_old - x*| <= D + d, D <= rho (D + d) + e, hence D <= (rho d + e) / (1 - rho). Nothing is assumed of x_old: it may be a
-guess. rho is gamma times the largest sum of probabilities, which is 1 up to the rounding of what was given.
+The bound. Let T be the backup, a contraction with factor rho, x* its fixed point, and let one sweep in place change
+entries by at most d, with rounding errors of at most e an entry. Every new entry is a backup of entries that are old or
+already new, so it is within rho max(|x_old - x*|, |x_new - x*|) + e of x*. With D = |x_new - x*| in the maximum norm
+and |x_old - x*| <= D + d, D <= rho (D + d) + e, hence D <= (rho d + e) / (1 - rho). Nothing is assumed of x_old: it may
+be a guess. rho is gamma times the largest sum of probabilities, which is 1 up to the rounding of what was given.
 
 Values that follow from x are as accurate: q = r + gamma E x has an error of at most rho D + e <= D.
 """
@@ -53,7 +54,8 @@ class Backup:
         is_exact = select.mass == 1.0 and mdp.dynamics.mass == 1.0 and not chance.is_sticky and not chance.is_random
         mass = 1.0 if is_exact else max(1.0, executed * mdp.dynamics.mass) * (1 + 8 * _UNIT)
         self.factor = mdp.gamma * mass
-        # q: a product and a sum; the mean over actions; a product and a sum for each of three weights, and their rounding
+        # q: a product and a sum; the mean over actions; a product and a sum for each of three weights, and their
+        # rounding
         self.operations = mdp.num_actions + 12 + select.operations(mdp.num_actions) + mdp.dynamics.operations
         self.largest_reward = max(abs(mdp.reward_table.lowest), abs(mdp.reward_table.highest))
 
@@ -74,7 +76,7 @@ class Backup:
             return self.mdp.dynamics.sweep(self.equation, x)
 
     def rounding(self, largest: float) -> float:
-        """A bound on the rounding error of one backup of entries up to `largest`: each operation is off by half a unit."""
+        """A bound on the rounding error of one backup of entries up to `largest`: half a unit for each operation."""
         return self.operations * (_UNIT * (self.largest_reward + largest) + 2.0**-1074)
 
 
@@ -117,7 +119,7 @@ def fixed_point(
 def backward_induction(
     mdp: TabularMDP, select: Selection, horizon: int, keep_all: bool = False
 ) -> tuple[FixedPoint, np.ndarray, np.ndarray | None]:
-    """(values with `horizon` steps to go, x with one step less, (T + 1, S + 1, W) with every number of steps where all are kept).
+    """(values with `horizon` steps to go, x with one step less, all steps (T + 1, S + 1, W) where they are kept).
 
     Raises:
         PrecisionError: values are too large for 64-bit floats.
@@ -144,8 +146,8 @@ def backward_induction(
 def chain_bound(mdp: TabularMDP, select: Selection, x: np.ndarray, successor: np.ndarray, reward: np.ndarray) -> float:
     """The error of values x on the functional graph of a deterministic policy.
 
-    gamma < 1: |x - x*| <= |T x - x| / (1 - gamma), with the rounding of T x. gamma = 1: what does not end goes round in cycles
-    of value 0, and rounding errors add up along at most S steps.
+    gamma < 1: |x - x*| <= |T x - x| / (1 - gamma), with the rounding of T x. gamma = 1: what does not end goes round in
+    cycles of value 0, and rounding errors add up along at most S steps.
     """
     rounding = Backup(mdp, select).rounding(largest_of(x))
     if mdp.gamma == 1.0:
@@ -174,7 +176,8 @@ def _without_cycles(backup: Backup, tolerance: float, progress: Callable[[int, f
     longest = mdp.dynamics.longest_path(~np.asarray(mdp.terminal))
     if longest < 0:
         raise DivergenceError(
-            f"{mdp}: gamma is 1, there is no horizon, and some states can be visited again and again, so the value may be "
+            f"{mdp}: gamma is 1, there is no horizon, and some states can be visited again and again, so the "
+            "value may be "
             f"infinite; give a horizon (the environment's time limit, say), or gamma < 1"
         )
     x, sweeps = backup.zeros(), 0
@@ -194,7 +197,8 @@ def _without_cycles(backup: Backup, tolerance: float, progress: Callable[[int, f
 def _imprecise(mdp: TabularMDP, bound: float, tolerance: float) -> PrecisionError:
     if not math.isfinite(bound):
         return PrecisionError(
-            f"{mdp}: 64-bit floats give no bound at gamma = {mdp.gamma!r}: values pass 1.8e308, or probabilities sum to "
+            f"{mdp}: 64-bit floats give no bound at gamma = {mdp.gamma!r}: values pass 1.8e308, or "
+            "probabilities sum to "
             f"1 / gamma or more; lower gamma or the rewards"
         )
     return PrecisionError(

@@ -22,18 +22,18 @@ def evaluate_policy(
 ) -> Solution:
     """The values of a policy over states; `pharos.evaluate_policy` also takes policies that see observations.
 
-    V(s) = sum_a pi(a | s) q(s, a), q(s, a) = r(s, a) + gamma E V(next); chance acts between what the policy chooses and what
-    is executed, see `random_actions` and `sticky_actions`.
+    V(s) = sum_a pi(a | s) q(s, a), q(s, a) = r(s, a) + gamma E V(next); chance acts between what the policy chooses and
+    what is executed, see `random_actions` and `sticky_actions`.
 
     Args:
         policy: (S,) integers, an action for each state; or (S, A) probabilities. Under sticky actions also (S, A + 1)
-            integers or (S, A + 1, A) probabilities, for each previously executed action and, last, for none; or a function
-            from an array of state indices to either; or an agent with such a `policy_table()`.
+            integers or (S, A + 1, A) probabilities, for each previously executed action and, last, for none; or a
+            function from an array of state indices to either; or an agent with such a `policy_table()`.
         tolerance: every value is within this of the true one, proven.
         horizon: number of steps to go, instead of the MDP's own.
     Returns:
-        A Solution of kind "policy". A deterministic policy on a deterministic MDP is evaluated on its functional graph, in
-        O(S), exactly up to rounding, whatever the tolerance.
+        A Solution of kind "policy". A deterministic policy on a deterministic MDP is evaluated on its functional graph,
+        in O(S), exactly up to rounding, whatever the tolerance.
     Raises:
         ParameterError: the policy has the wrong shape, or its rows are not probabilities.
         DivergenceError: gamma is 1, there is no horizon, and the value is or may be infinite.
@@ -67,7 +67,8 @@ def _on_its_graph(mdp: TabularMDP, select: PolicyTable, began: float) -> Solutio
     x[:-1, 0], infinite = chain_values(mdp.gamma, successor, reward)
     if infinite >= 0:
         raise DivergenceError(
-            f"{mdp}: gamma is 1, there is no horizon, and the policy goes round in a cycle through state {infinite} that pays; "
+            f"{mdp}: gamma is 1, there is no horizon, and the policy goes round in a cycle through state "
+            f"{infinite} that pays; "
             f"give a horizon, or gamma < 1"
         )
     bound = chain_bound(mdp, select, x, successor, reward)

@@ -22,11 +22,12 @@ class Solution:
         sweeps, seconds: what it took.
         horizon: of the values: those of the first step, with all steps to go; or None.
         select: what is chosen: the best action, the worst one, or what a policy says.
-        x: (S + 1, W) float64, values of (state, previously executed action), W = A under sticky actions, else 1; row S, the
-            end, is 0.
+        x: (S + 1, W) float64, values of (state, previously executed action), W = A under sticky actions, else 1; row S,
+            the end, is 0.
         next_x: the values of next states: x, or with a horizon those with one step less to go.
         all_steps: with a horizon, where they were kept: (T + 1, S), or (T + 1, S, A), row t with t steps to go.
-    Under sticky actions values belong to pairs: `v` is (S, A), the value of (state, previously executed action), and `q` is
+    Under sticky actions values belong to pairs: `v` is (S, A), the value of (state, previously executed action), and
+        `q` is
     (S, A), the value of executing an action. Otherwise `v` is (S,), and `q` (S, A) is the value of choosing an action.
     """
 

@@ -24,11 +24,11 @@ def value_iteration(
     V*(s) = max_a q(s, a), q(s, a) = r(s, a) + gamma E V*(next); with chance, see `random_actions` and `sticky_actions`.
 
     Args:
-        tolerance: every value is within this of the optimal one, proven; in units of return. With a horizon values are exact
-            up to rounding, whatever the tolerance.
+        tolerance: every value is within this of the optimal one, proven; in units of return. With a horizon values are
+            exact up to rounding, whatever the tolerance.
         horizon: number of steps to go, instead of the MDP's own; backward induction then, without keeping the steps.
-        keep_all: with a horizon, keep the values of every step as `all_steps`, (T + 1, S), under sticky actions (T + 1, S, A):
-            row t has t steps to go.
+        keep_all: with a horizon, keep the values of every step as `all_steps`, (T + 1, S), under sticky actions (T + 1,
+            S, A): row t has t steps to go.
         progress: called after each sweep with its number and the bound so far.
     Returns:
         A Solution of kind "optimal".
@@ -49,7 +49,7 @@ def worst_value(mdp: TabularMDP, tolerance: float = 1e-6, *, horizon: int | None
 
 
 def uniform_value(mdp: TabularMDP, tolerance: float = 1e-6, *, horizon: int | None = None) -> Solution:
-    """The values of the uniformly random policy: nothing is left to choose when every action is replaced by a uniform one."""
+    """The values of the uniformly random policy: every action is replaced by a uniform one, so nothing is chosen."""
     return solution_of(random_actions(mdp, 1.0), BEST, tolerance, horizon)
 
 
