@@ -22,6 +22,9 @@ from pharos.cli.common import (
     progress_line,
 )
 
+# What the column "exact" says of each kind of certificate.
+PROVEN = {"exact": "yes", "interval": "interval", "float64": "float64"}
+
 
 def hardness(
     target: TargetArgument,
@@ -115,17 +118,20 @@ def _print(title: str, report: Any, chance: str, definitions: bool) -> None:
     if definitions:
         table.add_column("definition", overflow="fold")
         table.add_column("source", overflow="fold", style="dim")
+    notes = []
     for result in report.results.values():
-        value = f"[dim]{escape(result.undefined)}[/dim]" if result.undefined else escape(result.text)
-        exact = "" if result.undefined else "yes" if result.exact else "interval"
+        value = "[dim]undefined[/dim]" if result.undefined else escape(result.text)
+        exact = "" if result.undefined else PROVEN[result.certificate.kind]
         row = [result.name, value, exact, "kept" if result.kept else f"{result.seconds:.2f}"]
         table.add_row(*row, *((escape(result.definition), escape(result.source)) if definitions else ()))
+        if note := result.undefined or result.certificate.note:
+            notes.append(note if note.startswith(result.name) else f"{result.name}: {note}")
     to = console()
     to.print(f"[bold]{escape(title)}[/bold]", soft_wrap=True)
     horizon = "none" if conventions["horizon"] is None else conventions["horizon"]
     to.print(
-        f"{conventions['num_states']:,} states x {conventions['num_actions']} actions, discount {conventions['gamma']:g}, "
-        f"horizon {horizon}, chance: {chance}",
+        f"{conventions['num_states']:,} states x {conventions['num_actions']} actions, "
+        f"discount {conventions['gamma']:g}, horizon {horizon}, chance: {chance}",
         style="dim",
         soft_wrap=True,
     )
@@ -133,3 +139,5 @@ def _print(title: str, report: Any, chance: str, definitions: bool) -> None:
     error = conventions.get("error_bound")
     if error is not None and math.isfinite(error):
         to.print(f"values are within {error:.2g} of the optimal ones (proven)", style="dim", soft_wrap=True)
+    for note in notes:
+        to.print(escape(note), style="dim", soft_wrap=True)

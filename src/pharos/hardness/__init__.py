@@ -12,7 +12,7 @@ from pharos.hardness.diameter import diameter, start_eccentricity, start_eccentr
 from pharos.hardness.effective_horizon import EffectiveHorizon, effective_horizon
 from pharos.hardness.gaps import Gaps, gaps, minimal_gap, sum_of_reciprocal_gaps
 from pharos.hardness.gorp import GorpBound, GorpRuns, gorp_bound, run_gorp
-from pharos.hardness.interval import Budget, Interval, Progress
+from pharos.hardness.interval import Budget, Certificate, Certified, Interval, Progress
 from pharos.hardness.mismatch import distribution_mismatch
 from pharos.hardness.mixing_time import MixingTime, mixing_time
 from pharos.hardness.occupancy import Occupancy, occupancy
@@ -25,6 +25,8 @@ from pharos.hardness.value_norm import environmental_value_norm
 __all__ = [
     "ActionGapRegularity",
     "Budget",
+    "Certificate",
+    "Certified",
     "Covering",
     "EffectiveHorizon",
     "Gaps",

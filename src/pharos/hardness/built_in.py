@@ -1,21 +1,39 @@
 """The measures that pharos registers, in the order of a report."""
 
+import math
 from typing import Any
 
+from pharos.errors import UndefinedMeasure
 from pharos.hardness.action_gap import action_gap_regularity
 from pharos.hardness.covering import covering
-from pharos.hardness.diameter import diameter, start_eccentricity
+from pharos.hardness.diameter import diameter, start_eccentricity_interval
 from pharos.hardness.effective_horizon import effective_horizon
 from pharos.hardness.gorp import gorp_bound
+from pharos.hardness.interval import Certified
 from pharos.hardness.mismatch import distribution_mismatch
 from pharos.hardness.mixing_time import mixing_time
 from pharos.hardness.registry import Problem, register
 from pharos.hardness.stationary_horizon import stationary_effective_horizon
-from pharos.hardness.value_norm import environmental_value_norm
+from pharos.hardness.value_norm import certified_value_norm
 
 
 def _diameter(problem: Problem) -> Any:
-    return diameter(problem.mdp, restart=problem.restart, budget=problem.budget, progress=problem.squeezing("diameter"))
+    reporter = problem.interval_reporter("diameter")
+    return diameter(problem.mdp, restart=problem.restart, budget=problem.budget, progress=reporter)
+
+
+def _start_eccentricity(problem: Problem) -> Certified:
+    interval = start_eccentricity_interval(problem.mdp, restart=problem.restart, budget=problem.budget)
+    if not interval.exact and math.isinf(interval.upper):
+        raise UndefinedMeasure(f"start_eccentricity: at least {interval.lower:.6g}; {interval.note}")
+    return Certified(interval.upper, interval.lower, interval.upper, interval.exact, interval.note)
+
+
+def _minimal_gap(problem: Problem) -> Certified:
+    result = problem.gaps.certified_minimal
+    if not result.exact and math.isinf(result.value):
+        raise UndefinedMeasure(f"minimal_gap: there is none, or {result.note}")
+    return result
 
 
 register(
@@ -24,52 +42,52 @@ register(
     definition="max over s != s' of min over policies of E[steps from s to s']",
     source="Jaksch, Ortner and Auer (2010), definition 1; the pharos paper, equation 1",
     complexity="visitation",
-    version=1,
+    version=2,
     depends="structure",
 )
 register(
     "start_eccentricity",
-    lambda problem: start_eccentricity(problem.mdp, restart=problem.restart, budget=problem.budget),
+    _start_eccentricity,
     definition="max over s' of min over policies of E[steps from the start to s']",
     source="the pharos paper, equation 1, read literally",
     complexity="visitation",
-    version=1,
+    version=2,
     depends="structure",
 )
 register(
     "sum_of_reciprocal_gaps",
-    lambda problem: problem.gaps.sum_of_reciprocals,
+    lambda problem: problem.gaps.certified_sum,
     definition="sum of 1 / (V*(s) - Q*(s, a)) over reachable s and actions that are not optimal",
     source="Simchowitz and Jamieson (2019); the pharos paper, equation 2",
     complexity="estimation",
-    version=1,
+    version=2,
     depends="values",
 )
 register(
     "sum_of_reciprocal_gaps_regularized",
-    lambda problem: problem.gaps.regularized,
+    lambda problem: problem.gaps.certified_regularized,
     definition="sum of 1 / (V*(s) - Q*(s, a) + 0.1) over all s and a",
     source="Conserva and Rauber (2022), as in Colosseum",
     complexity="estimation",
-    version=1,
+    version=2,
     depends="values",
 )
 register(
     "minimal_gap",
-    lambda problem: problem.gaps.minimal,
+    _minimal_gap,
     definition="the smallest V*(s) - Q*(s, a) > 0 over reachable s",
     source="Simchowitz and Jamieson (2019)",
     complexity="estimation",
-    version=1,
+    version=2,
     depends="values",
 )
 register(
     "environmental_value_norm",
-    lambda problem: environmental_value_norm(problem.mdp, problem.solution),
+    lambda problem: certified_value_norm(problem.mdp, problem.solution),
     definition="max over s, a of the standard deviation of V*(s') under p(. | s, a)",
     source="Maillard, Mann and Mannor (2014), definition 1",
     complexity="estimation",
-    version=1,
+    version=2,
     depends="values",
 )
 register(
@@ -96,7 +114,7 @@ register(
     definition="smallest c with P(0 < V*(s) - best Q*(s, a) that is not optimal <= t) <= c t for all t, s uniform",
     source="Farahmand (2011), assumption A1",
     complexity="estimation",
-    version=1,
+    version=2,
     depends="values",
     on_request=True,
 )
@@ -106,14 +124,15 @@ register(
     definition="max over s of d*(s) / d(s), discounted visits of the optimal and of the uniform policy",
     source="Kakade and Langford (2002); Agarwal et al. (2021), section 4.2",
     complexity="visitation",
-    version=1,
+    version=2,
     depends="values",
     on_request=True,
 )
 register(
     "mixing_time",
     lambda problem: mixing_time(problem.mdp, restart=problem.restart),
-    definition="min t with max over s of the total variation of P^t(s, .) to the stationary distribution <= 1/4; uniform play",
+    definition="min t with max over s of the total variation of P^t(s, .) to the stationary distribution <= 1/4; "
+    "uniform play",
     source="Kearns and Singh (2002); Levin, Peres and Wilmer (2009), section 4.5",
     complexity="visitation",
     version=1,

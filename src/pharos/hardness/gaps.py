@@ -7,7 +7,7 @@ where `ties` shows that equal values come from equal rewards for ever; else it m
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,7 +16,7 @@ from pharos.errors import ParameterError, PrecisionError
 from pharos.hardness.interval import Certified
 from pharos.hardness.ties import TieProof, same_outcomes
 from pharos.kernels import ties
-from pharos.mdp import TabularMDP
+from pharos.mdp import BEST, BellmanEquation, TabularMDP
 from pharos.solvers import Solution, value_iteration
 
 # Of Colosseum.
@@ -32,6 +32,9 @@ _MEMORY = 8 * 2**30
 # Relative rounding of a gap, its reciprocal and sums of these: a few units each, and one for each block.
 _ROUNDING = 1e-12
 _UNIT = 2.0**-53
+# Sweeps at most, after the solution, until values settle; and sweeps that change values by no more than rounding.
+_SWEEPS = 200
+_AT_REST = 8
 
 
 @dataclass(frozen=True)
@@ -142,8 +145,8 @@ def gaps(mdp: TabularMDP, solution: Solution | None = None, *, tie_tolerance: fl
     t = 1, ..., T and the states that can be reached at step t (Simchowitz and Jamieson's setting).
 
     Args:
-        solution: the optimal solution of `mdp`; None: solved here to an error of 1e-9, and where that leaves ties unresolved to
-            what 64-bit floats can reach.
+        solution: the optimal solution of `mdp`; None: solved here to an error of 1e-9, and where that leaves ties unresolved
+            to what 64-bit floats can reach.
         tie_tolerance: gaps up to it count as ties. None: 2.5 times the error bound of the solution.
     Raises:
         ParameterError: `solution` belongs to another MDP or is not optimal.
@@ -160,21 +163,40 @@ def gaps(mdp: TabularMDP, solution: Solution | None = None, *, tie_tolerance: fl
 
 def resolved_gaps(mdp: TabularMDP, solution: Solution) -> Gaps:
     """The gaps of a solution; of a more accurate one where ties are unresolved, or the sum is wide, and floats allow it."""
-    result = _summed(mdp, solution, None)
-    is_as_good = result.is_resolved or (result.unresolved and not result.small)
-    if is_as_good or solution.horizon is not None or mdp.gamma == 1.0:
+    if solution.horizon is not None or mdp.gamma == 1.0:
+        return _summed(mdp, solution, None)
+    settled = _settled(mdp, solution) if TieProof(mdp).holds else solution  # else ties cannot be proven that way
+    result = _summed(mdp, settled, None)
+    if result.is_resolved or settled is not solution:
         return result
-    largest = max(float(solution.x.max(initial=0.0)), -float(solution.x.min(initial=0.0)))
-    largest += max(abs(mdp.reward_table.lowest), abs(mdp.reward_table.highest))
+    settled = _settled(mdp, solution)
+    return _summed(mdp, settled, None) if settled.error_bound < solution.error_bound else result
+
+
+def _settled(mdp: TabularMDP, solution: Solution) -> Solution:
+    """The solution after more sweeps, until values do not change, or by no more than rounding.
+
+    The bound is that of `pharos.solvers`: (rho change + rounding) / (1 - rho). Values that do not change at all make proofs of
+    ties possible, as equal states then have equal floats.
+    """
+    equation = BellmanEquation(mdp.reward_table, mdp.gamma, mdp.chance, BEST)
     operations = 2 * mdp.num_actions + mdp.dynamics.operations + 16
-    least = operations * _UNIT * largest / (1 - mdp.gamma)
-    for tolerance in (least, 8 * least):
-        if tolerance < solution.error_bound / 2:
-            try:
-                return _summed(mdp, value_iteration(mdp, tolerance), None)
-            except PrecisionError:
-                continue
-    return result
+    rho = mdp.gamma * max(1.0, mdp.dynamics.mass) * (1 + 16 * _UNIT)
+    if rho >= 1:
+        return solution
+    largest_reward = max(abs(mdp.reward_table.lowest), abs(mdp.reward_table.highest))
+    x, bound, at_rest = solution.x.copy(), solution.error_bound, 0
+    sweeps = 0
+    while sweeps < _SWEEPS:
+        sweeps += 1
+        change = mdp.dynamics.sweep(equation, x)
+        largest = max(float(x.max(initial=0.0)), -float(x.min(initial=0.0)))
+        rounding = operations * _UNIT * (largest_reward + largest + change)
+        bound = min(bound, (rho * change + rounding) / (1 - rho) * (1 + _ROUNDING))
+        at_rest += change <= rounding
+        if change == 0.0 or at_rest == _AT_REST:
+            break
+    return replace(solution, x=x, next_x=x, error_bound=bound, sweeps=solution.sweeps + sweeps)
 
 
 def sum_of_reciprocal_gaps(

@@ -96,9 +96,55 @@ class Certified:
     details: Mapping[str, Any] = field(default_factory=dict)
 
     def __str__(self) -> str:
-        if self.exact or not math.isfinite(self.upper):
+        if self.exact:
             return f"{self.value:.10g}"
+        if not math.isfinite(self.upper):
+            return f"at least {self.lower:.10g}"
+        if self.lower == 0.0:
+            return f"at most {self.upper:.10g}"
         return f"[{self.lower:.10g}, {self.upper:.10g}]"
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """What is proven of a measure.
+
+    Attributes:
+        kind: "exact", proven to be the value (counted, or to a relative width of 1e-6 and less); "interval", proven to contain
+            the value; "float64", computed in 64-bit floats without a bound of the error.
+        lower, upper: of the interval; None for "float64", and for results that are more than one number.
+        note: why it is not exact; empty otherwise.
+        details: anything else worth knowing, JSON-able: ties, for measures of gaps.
+    """
+
+    kind: str
+    lower: float | None = None
+    upper: float | None = None
+    note: str = ""
+    details: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether the value is proven."""
+        return self.kind == "exact"
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able; infinite ends are None."""
+        ends = {
+            name: end if end is not None and math.isfinite(end) else None
+            for name, end in (("lower", self.lower), ("upper", self.upper))
+        }
+        return {"kind": self.kind, **ends, "note": self.note, **self.details}
+
+
+def certificate_of(outcome: Any) -> Certificate:
+    """What a measure's result says of itself: by `exact`, `lower`, `upper` and `note`, where it has them."""
+    if not hasattr(outcome, "exact"):
+        return Certificate("float64")
+    kind = "exact" if outcome.exact else "interval"
+    lower, upper = getattr(outcome, "lower", None), getattr(outcome, "upper", None)
+    note = getattr(outcome, "note", "")
+    return Certificate(kind, lower, upper, note, dict(getattr(outcome, "details", {})))
 
 
 def conventions_of(mdp: TabularMDP, restart: bool) -> dict[str, Any]:

@@ -47,7 +47,7 @@ class Problem:
                     progress=lambda sweeps, bound: self.report("values", f"sweep {sweeps}, error at most {bound:.2g}"),
                 )
             except PrecisionError:
-                if tolerance > largest:
+                if tolerance > largest or not math.isfinite(largest):
                     raise
                 tolerance *= 10
 
@@ -63,21 +63,22 @@ class Problem:
         return self.horizon
 
     def report(self, what: str, line: str) -> None:
-        """Say how far one is."""
+        """Report progress."""
         if self.progress is not None:
             self.progress(what, line)
 
-    def squeezing(self, what: str) -> Callable[[Progress], None]:
-        """A callback for measures that squeeze an interval."""
+    def interval_reporter(self, what: str) -> Callable[[Progress], None]:
+        """A callback for measures that narrow an interval down."""
 
-        def tell(progress: Progress) -> None:
+        def show(progress: Progress) -> None:
             upper = f"{progress.upper:.6g}" if math.isfinite(progress.upper) and progress.upper < 2**31 - 1 else "?"
             self.report(
                 what,
-                f"between {progress.lower:.6g} and {upper}, {progress.searches} searches, {progress.candidates:,} states open",
+                f"between {progress.lower:.6g} and {upper}, {progress.searches} searches, "
+                f"{progress.candidates:,} states open",
             )
 
-        return tell
+        return show
 
     @property
     def _is_small(self) -> bool:
@@ -91,13 +92,15 @@ class Measure:
 
     Attributes:
         name: key of the result.
-        function: Problem -> a number, or an object with `to_dict()`; UndefinedMeasure where it does not exist.
+        function: Problem -> a number, or an object with `to_dict()`; UndefinedMeasure where it does not exist. What is proven of
+            it the result says itself, by attributes `exact`, `lower`, `upper`, `note`; a plain number says nothing, and the
+            report says so: "float64". `Certified` is a number that has them.
         definition: formula, in a line.
         source: who defined it.
         complexity: "visitation", "estimation", "planning" or "other".
         version: goes up when the function's results change, so that kept ones are not used; None: never keep results.
-        depends: on what results depend, beside the transitions, chance and start: "structure" (nothing else), "values" (rewards,
-            gamma), "episodes" (rewards, horizon), "all".
+        depends: on what results depend, beside the transitions, chance and start: "structure" (nothing else), "values"
+            (rewards, gamma), "episodes" (rewards, horizon), "all".
         on_request: only part of a report where it is named, or where all are asked for.
     """
 
@@ -125,11 +128,13 @@ def register(
     depends: str = "all",
     on_request: bool = False,
 ) -> Measure:
-    """Make a measure part of every report: `register("density", lambda p: (p.mdp.rewards != 0).mean(), definition="...")`.
+    """Make a measure part of every report.
+
+        register("density", lambda p: float((p.mdp.rewards != 0).mean()), definition="share of transitions that pay")
 
     Args:
-        function: takes a `Problem` (`.mdp`, `.solution`, `.gaps`, `.horizon`, `.budget`) and returns a number, or an object with
-            `to_dict()`.
+        function: takes a `Problem` (`.mdp`, `.solution`, `.gaps`, `.horizon`, `.budget`) and returns a number, a `Certified`
+            number, or an object with `to_dict()`; see `Measure`.
         definition, source: printed beside the value.
         version: give one to keep results beside the state space, and raise it when the function changes.
         depends, on_request: see `Measure`.
@@ -142,7 +147,16 @@ def register(
         )
     if name in _MEASURES and _MEASURES[name].source != "the user" and source == "the user":
         raise ParameterError(f"{name!r} is a measure of pharos; choose another name")
-    _MEASURES[name] = Measure(name, function, definition, source, complexity, version, depends, on_request)
+    _MEASURES[name] = Measure(
+        name=name,
+        function=function,
+        definition=definition,
+        source=source,
+        complexity=complexity,
+        version=version,
+        depends=depends,
+        on_request=on_request,
+    )
     return _MEASURES[name]
 
 

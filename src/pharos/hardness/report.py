@@ -1,23 +1,18 @@
 """All measures of an MDP in one table, with definitions and sources; kept beside the state space."""
 
-import contextlib
-import json
 import math
-import os
 import time
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
-from pathlib import Path
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
-from pharos.errors import ParameterError, UndefinedMeasure
-from pharos.hardness.interval import Budget
+from pharos.errors import ParameterError, PrecisionError, UndefinedMeasure
+from pharos.hardness.interval import Budget, Certificate, Certified, certificate_of
 from pharos.hardness.registry import Measure, Problem, chosen
+from pharos.hardness.results_file import ResultsFile
 from pharos.mdp import TabularMDP
-
-KEPT = "hardness.json"
 
 
 @dataclass(frozen=True)
@@ -28,22 +23,27 @@ class Result:
         name, definition, source, complexity: of the measure.
         value: a number, or what the measure's result says of itself as a dictionary; None where it is undefined.
         text: the value for people.
-        exact: False for an interval that is not the exact value.
         undefined: why there is no value, and what would define it; empty where there is one.
         seconds: time that it took, when it was computed.
-        kept: whether it was found beside the state space, not computed now.
+        kept: whether it stood beside the state space, and was not computed now.
+        certificate: what is proven of it.
     """
 
     name: str
     definition: str
     source: str
     complexity: str
-    value: Any
-    text: str
-    exact: bool
-    undefined: str
-    seconds: float
+    value: Any = None
+    text: str = ""
+    undefined: str = ""
+    seconds: float = 0.0
     kept: bool = False
+    certificate: Certificate = field(default_factory=lambda: Certificate("float64"))
+
+    @property
+    def exact(self) -> bool:
+        """Whether the value is proven; see `certificate`."""
+        return self.certificate.is_exact
 
 
 @dataclass(frozen=True)
@@ -64,11 +64,15 @@ class Report:
         return self.results[name]
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-able: `measures`, `conventions`, `seconds`, and under `undefined` why some measures are None."""
+        """JSON-able: `measures`, `conventions`, `seconds`; what is proven of each under `certificates`, and under `undefined`
+        why some are None."""
         return {
             "measures": {name: _finite(result.value) for name, result in self.results.items()},
             "conventions": dict(self.conventions),
             "undefined": {name: result.undefined for name, result in self.results.items() if result.undefined},
+            "certificates": {
+                name: result.certificate.to_dict() for name, result in self.results.items() if not result.undefined
+            },
             "infinite": [name for name, result in self.results.items() if _infinite(result.value)],
             "details": {
                 name: {
@@ -135,43 +139,34 @@ def report(
     wanted = chosen(measures)
     problem = Problem(mdp, horizon, tolerance, restart, Budget.of(budget), progress)
     conventions = _conventions(problem)
-    store = _Kept(mdp, conventions) if keep else None
-    results = {measure.name: _measured(measure, problem, store) for measure in wanted}
+    file = ResultsFile(mdp, conventions) if keep else None
+    results = {measure.name: _measured(measure, problem, file) for measure in wanted}
     if "solution" in vars(problem):
         conventions["error_bound"] = problem.solution.error_bound
     return Report(results, conventions, time.perf_counter() - began)
 
 
-def _measured(measure: Measure, problem: Problem, store: "_Kept | None") -> Result:
-    if store is not None and (kept := store.get(measure, problem.budget)) is not None:
-        return kept
+def _measured(measure: Measure, problem: Problem, file: ResultsFile | None) -> Result:
+    empty = Result(measure.name, measure.definition, measure.source, measure.complexity)
+    entry = None if file is None else file.get(measure, problem.budget)
+    if entry is not None:
+        return replace(empty, **entry, kept=True)
     began = time.perf_counter()
     problem.report(measure.name, "")
-    value: Any = None
-    exact, text, undefined = True, "", ""
     try:
         outcome = measure.function(problem)
-        value, text = _plain(outcome), _text(outcome)
-        exact = bool(getattr(outcome, "exact", True))
-    except UndefinedMeasure as error:
-        undefined = str(error)
-    result = Result(
-        measure.name,
-        measure.definition,
-        measure.source,
-        measure.complexity,
-        value,
-        text,
-        exact,
-        undefined,
-        time.perf_counter() - began,
-    )
-    if store is not None and not undefined:
-        store.put(measure, result, problem.budget)
+    except (UndefinedMeasure, PrecisionError) as error:
+        return replace(empty, undefined=str(error), seconds=time.perf_counter() - began)
+    certificate, seconds = certificate_of(outcome), time.perf_counter() - began
+    result = replace(empty, value=_plain(outcome), text=_text(outcome), certificate=certificate, seconds=seconds)
+    if file is not None:
+        file.put(measure, result.value, result.text, certificate, seconds, problem.budget)
     return result
 
 
 def _plain(value: Any) -> Any:
+    if isinstance(value, Certified):
+        return value.value
     if hasattr(value, "to_dict"):
         return value.to_dict()
     if hasattr(value, "tolist"):
@@ -223,78 +218,3 @@ def _conventions(problem: Problem) -> dict[str, Any]:
         "num_states": mdp.num_states,
         "num_actions": mdp.num_actions,
     }
-
-
-# Keeping results beside the state space ---------------------------------------------------------------------------------
-
-
-_DEPENDS = {
-    "structure": ("chance", "restart"),
-    "values": ("chance", "gamma", "horizon_of_values", "tolerance"),
-    "episodes": ("chance", "horizon"),
-}
-
-
-class _Kept:
-    """Results in `hardness.json` of the state space's folder, each under a digest of all that it depends on."""
-
-    def __init__(self, mdp: TabularMDP, conventions: Mapping[str, Any]):
-        self.path = None if mdp.folder is None else Path(mdp.folder) / KEPT
-        self.mdp, self.conventions = mdp, dict(conventions)
-
-    def get(self, measure: Measure, budget: Budget) -> Result | None:
-        """The kept result; None where there is none, or one that a larger budget could improve on."""
-        found = None if self.path is None or measure.version is None else self._read().get(self._key(measure))
-        try:
-            if found is None or (not found["exact"] and budget.exceeds(Budget(**found["budget"]))):
-                return None
-            told = (found["value"], str(found["text"]), bool(found["exact"]), "", float(found["seconds"]))
-        except (KeyError, TypeError, ValueError):  # not written by pharos
-            return None
-        return Result(measure.name, measure.definition, measure.source, measure.complexity, *told, kept=True)
-
-    def put(self, measure: Measure, result: Result, budget: Budget) -> None:
-        """Keep a result. A folder that cannot be written to (another's, or a full disk) keeps nothing."""
-        if self.path is None or measure.version is None:
-            return
-        entry = {
-            "measure": measure.name,
-            "value": result.value,
-            "text": result.text,
-            "exact": result.exact,
-            "seconds": result.seconds,
-            "budget": {"seconds": budget.seconds, "searches": budget.searches},
-        }
-        try:
-            text = json.dumps({"format": 1, "results": {**self._read(), self._key(measure): entry}}, indent=1)
-        except TypeError:  # a user's measure that JSON cannot hold
-            return
-        partial = self.path.with_name(f"{KEPT}.{os.getpid()}")
-        with contextlib.suppress(OSError):
-            partial.write_text(text)
-            os.replace(partial, self.path)
-
-    def _key(self, measure: Measure) -> str:
-        """Name, version, and a digest of conventions and rewards; transitions do not change within a folder."""
-        keys = _DEPENDS.get(measure.depends, tuple(sorted(self.conventions)))
-        conventions = json.dumps({key: self.conventions[key] for key in keys}, sort_keys=True)
-        return f"{measure.name}/{measure.version}/{self._digest_of(conventions, measure.depends != 'structure')}"
-
-    def _digest_of(self, conventions: str, with_rewards: bool) -> str:
-        import xxhash
-
-        mdp = self.mdp
-        digest = xxhash.xxh3_128(conventions.encode())
-        arrays = [mdp.start_states, mdp.start_probabilities]
-        for array in [*arrays, *([mdp.reward_table.table, mdp.reward_table.palette] if with_rewards else [])]:
-            digest.update(np.ascontiguousarray(array).data)
-        return digest.hexdigest()
-
-    def _read(self) -> dict[str, Any]:
-        if self.path is None:
-            return {}
-        try:
-            stored = json.loads(self.path.read_text())
-            return dict(stored["results"]) if stored["format"] == 1 else {}
-        except (OSError, ValueError, KeyError, TypeError):
-            return {}

@@ -223,7 +223,7 @@ def _chosen(names: Sequence[str], own: Mapping[str, Any], plain: Mapping[str, An
             notes.append(f"{name}: without chance, because {mine.get('why') or 'there is none with it'}")
         if used.get("value") is None:
             notes.append(f"{name}: none, because {used.get('why') or 'it is undefined'}")
-        elif not used.get("exact", True):
+        elif not used.get("exact", True) and used["lower"] < used["upper"]:
             notes.append(f"{name}: geometric mean of the proven interval {used['lower']:g} to {used['upper']:g}")
     return {**row, "notes": "; ".join(notes)}
 
