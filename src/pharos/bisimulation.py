@@ -1,5 +1,5 @@
-"""The public name of `pharos.mdp.bisimulation`."""
+"""The public name of what merges states: `pharos.bisimulation.minimize(mdp)`."""
 
-from pharos.mdp.bisimulation import Minimization, minimize
+from pharos.mdp import Minimization, minimize
 
 __all__ = ["Minimization", "minimize"]

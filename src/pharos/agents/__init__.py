@@ -1,16 +1,22 @@
 """Agents: tabular Q-learning, and algorithms of Stable-Baselines3. `pharos.experiments.train` trains them on a task."""
 
+from pharos.agents.deep import algorithm, check_hyperparameters, make_model
 from pharos.agents.hyperparameters import hyperparameters
 from pharos.agents.kinds import AGENTS, TABULAR_OBSERVATION, AgentKind, agent_kind, agent_source, is_known
+from pharos.agents.q_learning import DEFAULTS as Q_LEARNING_DEFAULTS
 from pharos.agents.q_learning import QLearning
 
 __all__ = [
     "AGENTS",
+    "Q_LEARNING_DEFAULTS",
     "TABULAR_OBSERVATION",
     "AgentKind",
     "QLearning",
     "agent_kind",
     "agent_source",
+    "algorithm",
+    "check_hyperparameters",
     "hyperparameters",
     "is_known",
+    "make_model",
 ]

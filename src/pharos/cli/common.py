@@ -164,7 +164,7 @@ class Target:
     @property
     def is_imported(self) -> bool:
         """Whether it is an imported MDP: a file, or a folder that `pharos import` wrote. It has a gamma and a horizon of its own."""
-        from pharos.importers.folder import is_folder
+        from pharos.importers import is_folder
 
         return self.path is not None and (self.path.is_file() or is_folder(self.path))
 

@@ -8,11 +8,12 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from pharos.agents import QLearning
+from pharos.agents import QLearning, check_hyperparameters, make_model
 from pharos.errors import FileFormatError
 from pharos.experiments import results
 from pharos.experiments.config import RunConfig
 from pharos.experiments.task import Task
+from pharos.policies import DeepPolicy
 
 AtPoint = Callable[[int, int, float], dict[str, Any]]
 """at_point(steps, finished episodes, sum of their returns) -> row of the curve."""
@@ -88,8 +89,6 @@ class Deep:
         seed: int,
         tensorboard: str | None,
     ):
-        from pharos.agents.deep import DeepPolicy, check_hyperparameters, make_model
-
         check_hyperparameters(agent, hyperparameters)
         self.task, self.steps = task, steps
         env = vector_environment(task, int(hyperparameters.get("n_envs", 1)), seed)
@@ -160,7 +159,7 @@ _COUNTERS = ("num_timesteps", "_n_updates", "_n_calls", "_episode_num")
 
 def vector_environment(task: Task, num_envs: int, seed: int) -> Any:
     """The environment of a task for Stable-Baselines3, all copies advanced by one compiled call."""
-    from pharos.interaction.sb3_env import make_sb3_vec
+    from pharos.interaction import make_sb3_vec
 
     return make_sb3_vec(task.env, num_envs, seed=seed, **task.interaction)
 

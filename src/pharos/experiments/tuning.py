@@ -22,10 +22,9 @@ from pathlib import Path
 from typing import Any
 
 from pharos import storage
-from pharos.agents import agent_kind
+from pharos.agents import Q_LEARNING_DEFAULTS as Q_LEARNING
+from pharos.agents import agent_kind, algorithm
 from pharos.agents import hyperparameters as hyperparameters_of
-from pharos.agents.deep import algorithm
-from pharos.agents.q_learning import DEFAULTS as Q_LEARNING
 from pharos.environments import Environment, make
 from pharos.errors import MissingExtra, ParameterError
 from pharos.experiments import results as _results

@@ -4,8 +4,18 @@ Nothing here unpickles: files hold plain arrays and JSON, or are refused.
 """
 
 from pharos.importers.bridge import bridge, bridge_screens
-from pharos.importers.folder import load, save
+from pharos.importers.folder import is_folder, load, save
 from pharos.importers.gymnasium import gymnasium, matrices
 from pharos.importers.minigrid import minigrid, minigrid_grids
 
-__all__ = ["bridge", "bridge_screens", "gymnasium", "load", "matrices", "minigrid", "minigrid_grids", "save"]
+__all__ = [
+    "bridge",
+    "bridge_screens",
+    "gymnasium",
+    "is_folder",
+    "load",
+    "matrices",
+    "minigrid",
+    "minigrid_grids",
+    "save",
+]

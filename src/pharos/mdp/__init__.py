@@ -1,5 +1,6 @@
-"""Tabular MDPs: dynamics, rewards, the chance that can be added, and what is chosen."""
+"""Tabular MDPs: dynamics, rewards, the chance that can be added, what is chosen, and states merged."""
 
+from pharos.mdp.bisimulation import Minimization, minimize
 from pharos.mdp.chance import Chance, random_actions, sticky_actions
 from pharos.mdp.dynamics import BellmanEquation, Dynamics, Outcomes, Play
 from pharos.mdp.matrices import Matrices
@@ -17,6 +18,7 @@ __all__ = [
     "Dynamics",
     "Extreme",
     "Matrices",
+    "Minimization",
     "Outcomes",
     "Play",
     "PolicyTable",
@@ -24,6 +26,7 @@ __all__ = [
     "Selection",
     "Table",
     "TabularMDP",
+    "minimize",
     "random_actions",
     "rewards_of_space",
     "sticky_actions",

@@ -57,7 +57,7 @@ def _file(config: Mapping[str, Any]) -> Path:
 def _key(config: Mapping[str, Any]) -> dict[str, Any]:
     """What the values depend on: parameters, rules by their code, start states, chance and setting."""
     from pharos.environments import start_distribution
-    from pharos.rules.fingerprint import fingerprint_of_rules
+    from pharos.rules import fingerprint_of_rules
 
     env = task_of(config).env
     states, probabilities = start_distribution(env)
