@@ -5,8 +5,10 @@ import json
 import math
 import multiprocessing
 import os
+import shutil
 import signal
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -117,6 +119,32 @@ def test_a_run_that_died_goes_on_from_its_last_checkpoint(agent, tmp_path):
     if agent == "q_learning":
         short(agent, tmp_path / "whole")
         assert (tmp_path / "run" / "curve.parquet").read_bytes() == (tmp_path / "whole" / "curve.parquet").read_bytes()
+
+
+@pytest.mark.parametrize(("moved", "goes_on_from"), [("checkpoint.old", 200), ("checkpoint", 200), ("nothing", 300)])
+def test_a_run_killed_while_it_replaces_its_checkpoint_loses_one_interval(moved, goes_on_from, tmp_path, monkeypatch):
+    """Killed before the older checkpoint is moved aside, before the newer one takes its place, or right after that."""
+    run = tmp_path / "run"
+    replace, remove = os.replace, shutil.rmtree
+
+    def dying(source, target):
+        if Path(target).name == moved and (run / "checkpoint.partial" / "curve.json").exists() and third:
+            raise Killed
+        replace(source, target)
+
+    third: list[int] = []
+    with monkeypatch.context() as patch, pytest.raises(Killed):
+        patch.setattr(os, "replace", dying)
+        patch.setattr(shutil, "rmtree", lambda path, **options: None if third else remove(path, **options))
+        short("q_learning", run, progress=lambda done, *_: third.append(done) if done == 300 else kill_at(400)(done))
+    assert (run / "checkpoint.old").exists() == (moved != "checkpoint.old")
+    assert (run / "checkpoint").exists() == (moved != "checkpoint")
+    steps = []
+    short("q_learning", run, progress=lambda done, *_: steps.append(done))
+    assert steps == list(range(goes_on_from + 100, 401, 100))
+    short("q_learning", tmp_path / "whole")
+    assert (run / "curve.parquet").read_bytes() == (tmp_path / "whole" / "curve.parquet").read_bytes()
+    assert not list(run.glob("checkpoint*"))
 
 
 @pytest.mark.parametrize("ended", [False, True])

@@ -292,7 +292,8 @@ def _run(
         learner.publish(folder)
         _results.write_curve(folder, curve.rows)
         _results.write_record(folder, {**record, "status": "finished", "seconds": seconds, "result": result})
-        shutil.rmtree(folder / "checkpoint", ignore_errors=True)
+        for leftover in folder.glob("checkpoint*"):  # of kills in the middle of replacing one, too
+            shutil.rmtree(leftover, ignore_errors=True)
     rows = [{name: row[name] for name in _results.COLUMNS} for row in curve.rows]
     return TrainingResult(entry, result, rows, learner.agent, folder, seconds)
 
