@@ -53,6 +53,9 @@ Sticky = Annotated[
 Random = Annotated[
     float, typer.Option("--random", min=0, max=1, help="Probability that a uniformly random action is executed.")
 ]
+Trust = Annotated[
+    bool, typer.Option("--trust", help="Execute code that received files name: classes, observations and agents.")
+]
 MaxStates = Annotated[
     int | None, typer.Option("--max-states", min=1, help="Stop with an error beyond this many states.")
 ]

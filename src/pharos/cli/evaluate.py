@@ -16,6 +16,7 @@ from pharos.cli.common import (
     Sticky,
     TargetArgument,
     Tolerance,
+    Trust,
     Workers,
     describe_chance,
     parse_size,
@@ -53,12 +54,14 @@ def evaluate(
     memory: Memory = None,
     workers: Workers = None,
     max_states: MaxStates = None,
+    trust: Trust = False,
     json: Json = False,
 ) -> None:
     """Evaluate a policy exactly, and say where it stands: regret 0 is optimal, 1 is as bad as playing at random."""
     limit = parse_size(memory)
-    given = None if policy in POLICIES else read_policy(policy)
-    mdp = parse_target(target, parameters).mdp(
+    goal = parse_target(target, parameters)
+    given = None if policy in POLICIES else read_policy(policy, trust=trust)
+    mdp = goal.mdp(
         gamma=gamma, horizon=horizon, sticky=sticky, random=random, memory=limit, workers=workers, max_states=max_states
     )
     with progress_line("evaluating"):
@@ -119,9 +122,11 @@ def solution_of(mdp: "TabularMDP", policy: str, given: "Given | None", tolerance
     return {"optimal": value_iteration, "uniform": uniform_value, "worst": worst_value}[policy](mdp, tolerance)
 
 
-def read_policy(name: str) -> "Given":
+def read_policy(name: str, *, trust: bool = False) -> "Given":
     """The policy in a file: .npy, or `policy` of .npz; or what a finished run has learnt, in the folder of the run.
 
+    Args:
+        trust: whether code that the run names may be imported; what the command names itself is imported before.
     Returns:
         The policy, and how `pharos.evaluate_policy` is to take it.
     Raises:
@@ -133,7 +138,7 @@ def read_policy(name: str) -> "Given":
     if path.is_dir():
         from pharos.experiments import load_agent
 
-        task, agent = load_agent(path)
+        task, agent = load_agent(path, trust=trust)
         if isinstance(agent, np.ndarray):
             return agent, {}
         return agent, {"observation": task.observation, "observation_options": task.observation_options}

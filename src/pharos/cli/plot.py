@@ -12,6 +12,7 @@ from pharos.cli.common import (
     Parameters,
     Random,
     TargetArgument,
+    Trust,
     check_format,
     describe_chance,
     parse_parameters,
@@ -59,12 +60,13 @@ def value(
         list[str] | None,
         typer.Option("--fix", metavar="NAME=VALUE", help="Draw the slice in which this variable has this value."),
     ] = None,
+    trust: Trust = False,
     json: Json = False,
 ) -> None:
     """Draw the values and the actions of a policy over the cells of a grid."""
     check_format(out, FIGURES)
-    given = None if policy in POLICIES else read_policy(policy)
     goal = parse_target(target, parameters)
+    given = None if policy in POLICIES else read_policy(policy, trust=trust)
     mdp = goal.mdp(gamma=gamma, horizon=horizon, random=random)
     from pharos import plots
     from pharos.cli.evaluate import solution_of
@@ -120,6 +122,7 @@ def policies(
     steps: Annotated[int, typer.Option("--steps", min=1, help="At most.")] = 200,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Of chance and of random actions.")] = 0,
     gamma: Annotated[float, typer.Option("--gamma", min=0, max=1, help="Discount of the best policy.")] = 0.99,
+    trust: Trust = False,
     json: Json = False,
 ) -> None:
     """Draw an episode of what runs have learnt on one task, beside the best policy and a random one, as a GIF."""
@@ -130,7 +133,7 @@ def policies(
     from pharos.experiments import load_agent
     from pharos.solvers import value_iteration
 
-    loaded = {folder.name: load_agent(folder) for folder in runs}
+    loaded = {folder.name: load_agent(folder, trust=trust) for folder in runs}
     tasks = [task for task, _ in loaded.values()]
     seeing = [
         task for task, agent in loaded.values() if not isinstance(agent, np.ndarray)

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 import typer
 
-from pharos.cli.common import Json, complain, console, parse_parameters, print_json, progress_line
+from pharos.cli.common import Json, Trust, complain, console, parse_parameters, print_json, progress_line
 from pharos.errors import UnknownName
 
 app = typer.Typer(help="Run a grid of training runs, and make the paper's figures and tables of it.")
@@ -28,11 +28,11 @@ LINE_SECONDS = 30.0
 
 
 @app.command("show")
-def show(spec: SpecArgument, json: Json = False) -> None:
+def show(spec: SpecArgument, trust: Trust = False, json: Json = False) -> None:
     """Print the grid: which instances, chances, observations and agents, and how many runs."""
     from pharos.study import specification
 
-    study = specification(spec)
+    study = specification(spec, trust=trust or None)
     runs = study.runs
     if json:
         rows = [{"id": run.id, "instance": run.instance, "config": run.config} for run in runs]
@@ -94,6 +94,7 @@ def run(
     address: Annotated[
         str | None, typer.Option("--address", help="With --on ray: of the cluster; one is started when not given.")
     ] = None,
+    trust: Trust = False,
     json: Json = False,
 ) -> None:
     """Execute the runs that are missing. Interrupt it at any time: the same command goes on from there."""
@@ -101,10 +102,11 @@ def run(
 
     if on not in ("local", "slurm", "ray"):
         raise UnknownName("place to run on", on, ("local", "slurm", "ray"))
+    opened, place = study.opened(spec, out, trust=trust or Path(spec).is_file() or None)
     if on == "slurm":
         jobs = study.submit(
-            spec,
-            out,
+            opened,
+            place,
             shards=shards or 8,
             parameters=parse_parameters(slurm),
             retry_failed=retry_failed,
@@ -117,8 +119,8 @@ def run(
     with _progress() as progress, _termination():
         if on == "ray":
             end = study.run_on_ray(
-                spec,
-                out,
+                opened,
+                place,
                 address=address,
                 shard=shard,
                 retry_failed=retry_failed,
@@ -127,8 +129,8 @@ def run(
             )
         else:
             end = study.run(
-                spec,
-                out,
+                opened,
+                place,
                 shard=shard,
                 retry_failed=retry_failed,
                 resume=resume,
@@ -151,11 +153,11 @@ def _print_jobs(jobs: list[str], json: bool) -> None:
 
 
 @app.command("status")
-def status(spec: SpecArgument, out: Out = None, json: Json = False) -> None:
+def status(spec: SpecArgument, out: Out = None, trust: Trust = False, json: Json = False) -> None:
     """How many runs are finished, running, missing and failed, and why."""
     from pharos import study
 
-    _answer(study.status(spec, out), json)
+    _answer(study.status(*study.opened(spec, out, trust=trust or None)), json)
 
 
 @app.command("report")
@@ -165,13 +167,14 @@ def report(
     to: Annotated[
         Path | None, typer.Option("--to", metavar="DIR", help="Where to write; DIR/report of the study when not given.")
     ] = None,
+    trust: Trust = False,
     json: Json = False,
 ) -> None:
     """Make the figures and tables of the finished runs: one HTML file, PNG, PDF, CSV and LaTeX."""
     from pharos import study
 
     with progress_line("report") as tell:
-        written = study.report(spec, out, out=to, progress=tell)
+        written = study.report(*study.opened(spec, out, trust=trust or None), out=to, progress=tell)
     if json:
         files = {"figures": list(map(str, written.figures)), "tables": list(map(str, written.tables))}
         print_json({"html": str(written.html), **files, "notes": written.notes})
@@ -186,12 +189,13 @@ def pack(
     spec: SpecArgument,
     to: Annotated[Path, typer.Option("--to", metavar="FILE", help="The Parquet file to write.")],
     out: Out = None,
+    trust: Trust = False,
     json: Json = False,
 ) -> None:
     """Put the finished runs into one Parquet file, to keep, publish or carry; without what the agents learnt."""
     from pharos import study
 
-    number = study.pack(spec, out, file=to)
+    number = study.pack(*study.opened(spec, out, trust=trust or None), file=to)
     if json:
         print_json({"file": str(to), "runs": number})
         return
@@ -206,12 +210,13 @@ def unpack(
         typer.Option(metavar="SPEC", help="Another study, which gets those of the runs that it has as well."),
     ] = None,
     out: Out = None,
+    trust: Trust = False,
     json: Json = False,
 ) -> None:
     """Put packed runs into a study's folder; `pharos study run FOLDER` goes on with those that are missing."""
     from pharos import study
 
-    folder, number = study.unpack(file, out, into=into)
+    folder, number = study.unpack(file, out, into=into, trust=trust)
     if json:
         print_json({"folder": str(folder), "added": number})
         return

@@ -13,7 +13,7 @@ from pharos.study.analysis import (
 )
 from pharos.study.archive import pack, unpack
 from pharos.study.clusters import run_on_ray, submit
-from pharos.study.execution import Status, run, status
+from pharos.study.execution import Status, opened, run, status
 from pharos.study.findings import findings
 from pharos.study.paper import paper_regressions, paper_returns
 from pharos.study.regression import Fit, aggregate_r_squared, fit, fit_models, leave_one_class_out_r_squared
@@ -45,6 +45,7 @@ __all__ = [
     "leave_one_class_out_r_squared",
     "mean_curve",
     "models",
+    "opened",
     "pack",
     "paper_agreement",
     "paper_instance",

@@ -15,7 +15,7 @@ from pharos.errors import FileFormatError, ParameterError, ResultCorrupted
 from pharos.experiments import run_id
 from pharos.study import worker as _worker
 from pharos.study.execution import claim, opened
-from pharos.study.specification import Source, Specification, parse
+from pharos.study.specification import Source, parse
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -63,7 +63,11 @@ def pack(source: Source, folder: str | os.PathLike | None = None, *, file: str |
 
 
 def unpack(
-    file: str | os.PathLike, folder: str | os.PathLike | None = None, *, into: Source | None = None
+    file: str | os.PathLike,
+    folder: str | os.PathLike | None = None,
+    *,
+    into: Source | None = None,
+    trust: bool = False,
 ) -> tuple[Path, int]:
     """Put the runs of a packed study into a folder, where `run` goes on with those that are missing and `report` reports on all.
 
@@ -71,19 +75,22 @@ def unpack(
         file: written by `pack`.
         folder: of the study; studies/NAME in the current directory when not given. Runs that it has stay as they are.
         into: another study, which gets those of the runs that it has as well; None: the packed one.
+        trust: whether code that the packed study names may be imported; `into` is read in its place.
     Returns:
         The folder, and how many runs were added.
     Raises:
         FileFormatError: not such a file, or a run in it is not one of its study. ParameterError: the folder holds another study.
+        UntrustedCode: the packed study names code, and is not trusted.
     """
     file = Path(file)
-    study, table, digests = _read(file)
-    target, place = opened(study if into is None else into, folder)
-    configs, wanted = {run.id: run.config for run in study.runs}, {run.id for run in target.runs}
+    text, table, digests = _read(file)
+    packed = parse(text, str(file), trust=trust) if into is None else into
+    target, place = opened(packed, folder, trust=trust or None)
+    wanted = {run.id for run in target.runs}
     runs = []
     for row in _rows(file, table):
         id, record = row.pop("id"), row.pop("record")
-        run = id, _checked(file, id, record, configs), _curve(file, id, row, table.schema)
+        run = id, _checked(file, id, record, wanted if into is None else None), _curve(file, id, row, table.schema)
         if digests is not None and digests["runs"].get(id) != _digest(id, record, run[2]):
             raise ResultCorrupted(f"{file}: run {id} was changed after it was packed; {_AGAIN}")
         runs.append(run)
@@ -94,8 +101,8 @@ def unpack(
     return place, added
 
 
-def _read(file: Path) -> tuple[Specification, "pa.Table", dict[str, Any] | None]:
-    """The study, its runs, and the digests of both; None in place of digests where an older version packed it."""
+def _read(file: Path) -> tuple[str, "pa.Table", dict[str, Any] | None]:
+    """The study in YAML, its runs, and the digests of both; None in place of digests where an older version packed it."""
     if not file.exists():
         raise ParameterError(f"{file}: no such file")
     table = experiments.read_table(file, _AGAIN)
@@ -116,7 +123,7 @@ def _read(file: Path) -> tuple[Specification, "pa.Table", dict[str, Any] | None]
             raise ValueError("its study, or the list of its runs, was changed after it was packed")
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise ResultCorrupted(f"{file}: its description cannot be read: {error}; {_AGAIN}") from None
-    return parse(text, str(file)), table, digests
+    return text, table, digests
 
 
 def _rows(file: Path, table: "pa.Table") -> list[dict[str, Any]]:
@@ -131,8 +138,8 @@ def _digest(id: str, record: str, curve: "pa.Table") -> str:
     return storage.digest_of_json([id, record, experiments.digest_of_curve(curve)])
 
 
-def _checked(file: Path, id: str, record: str, configs: dict[str, Any]) -> dict[str, Any]:
-    """The record of a run, which must be a finished run of the study."""
+def _checked(file: Path, id: str, record: str, ids: set[str] | None) -> dict[str, Any]:
+    """The record of a run, which must be finished, and one of `ids`."""
     try:
         found = json.loads(record)
         config, status = found["config"], found["status"]
@@ -140,7 +147,7 @@ def _checked(file: Path, id: str, record: str, configs: dict[str, Any]) -> dict[
             raise ValueError("it was changed after it was written")
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise ResultCorrupted(f"{file}: the record of run {id} cannot be read: {error}; {_AGAIN}") from None
-    if id not in configs or run_id(config) != id:
+    if (ids is not None and id not in ids) or run_id(config) != id:
         raise FileFormatError(f"{file}: run {id} is not one of the study, or its configuration was changed")
     if status != _worker.FINISHED:
         raise FileFormatError(f"{file}: run {id} is {status!r}; expected finished runs")

@@ -25,7 +25,7 @@ from pharos.study.execution import (
     shard_of,
     train,
 )
-from pharos.study.specification import Run, Source
+from pharos.study.specification import Run, Source, specification
 
 
 def submit(
@@ -86,7 +86,7 @@ def _has_work(runs: Iterable[Run], place: Path, retry_failed: bool) -> bool:
 
 def run_shard(folder: str, shard: str, options: dict[str, Any]) -> dict[str, Any]:
     """What a job does: its part of the study whose specification stands in the folder."""
-    return run(folder, folder, shard=shard, **options).to_dict()
+    return run(specification(folder, trust=True), folder, shard=shard, **options).to_dict()
 
 
 def run_on_ray(

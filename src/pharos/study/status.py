@@ -13,6 +13,7 @@ from typing import Any
 from pharos.errors import FileFormatError, ParameterError
 from pharos.storage import replace_file
 from pharos.study import worker as _worker
+from pharos.study.own_code import warn_of_changes
 from pharos.study.specification import (
     STUDIES,
     STUDY_FILE,
@@ -91,7 +92,9 @@ def opened(
     if folder is None and isinstance(source, str | Path):
         folder = study_folder(source)
     study = specification(source, trust=trust)
-    return study, Path(STUDIES, study.name) if folder is None else Path(folder)
+    place = Path(STUDIES, study.name) if folder is None else Path(folder)
+    warn_of_changes(study, place)
+    return study, place
 
 
 def status(source: Source, folder: str | os.PathLike | None = None) -> Status:

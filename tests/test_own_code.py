@@ -1,0 +1,339 @@
+"""Environments, observations and agents of one's own, as a user has them: files in a folder, commands in fresh processes."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+
+import pytest
+from typer.testing import CliRunner
+
+import pharos
+from pharos import sources, study
+from pharos.cli import app
+from pharos.environments import catalog
+from pharos.errors import FileFormatError, ParameterError, UntrustedCode
+from pharos.experiments import RunConfig, load_agent, read_record, run_id, train
+from pharos.sources import Source
+
+TAXI = """
+from dataclasses import dataclass
+from pharos.environments import SimpleGrid
+
+@dataclass(frozen=True, kw_only=True)
+class Taxi(SimpleGrid):
+    name = "taxi"
+"""
+CORNER = """
+import numpy as np
+from gymnasium import spaces
+from pharos.observations import register
+
+def corner(env, states):
+    return (states[:, :2] == 0).astype(np.float32)
+
+register("corner", corner, spaces.Box(0, 1, (2,), np.float32))
+pair = (corner, spaces.Box(0, 1, (2,), np.float32))
+"""
+LEARNER = """
+from stable_baselines3 import A2C
+
+class Learner(A2C):
+    pass
+"""
+STUDY = """
+name: own
+steps: 60
+evaluations: 2
+seeds: 1
+blocks:
+  - environments: ["code/taxi_of_mine.py:Taxi"]
+    agents: [q_learning]
+  - environments: [{name: "taxi_module:Taxi", parameters: {height: 3}}]
+    observations: ["corners:corner", "code/corners_file.py:pair"]
+    agents: ["learner_module:Learner"]
+"""
+
+
+@pytest.fixture(scope="module")
+def lab(tmp_path_factory):
+    """A folder with code, a study that names it, and where two workers have run that from yet another folder."""
+    folder = tmp_path_factory.mktemp("lab")
+    (folder / "code").mkdir()
+    (folder / "elsewhere").mkdir()
+    (folder / "code" / "taxi_of_mine.py").write_text(TAXI)
+    (folder / "taxi_module.py").write_text(TAXI.replace('"taxi"', '"taxi_of_module"'))
+    (folder / "corners.py").write_text(CORNER)
+    (folder / "code" / "corners_file.py").write_text(CORNER.replace("register(", "# register("))
+    (folder / "learner_module.py").write_text(LEARNER)
+    (folder / "own.yaml").write_text(STUDY)
+    done = command("study", "run", "../own.yaml", "--out", "results", "--workers", 2, cwd=folder / "elsewhere")
+    assert (done.returncode, done.stdout) == (0, "own: 3 of 3 runs finished\n"), done.stderr
+    return folder
+
+
+def command(*words, cwd):
+    """Run pharos in a process of its own."""
+    line = [sys.executable, "-m", "pharos", *map(str, words)]
+    return subprocess.run(line, cwd=cwd, capture_output=True, text=True, timeout=300, env=dict(os.environ))
+
+
+def here(*words):
+    """Run pharos in this process."""
+    return CliRunner().invoke(app, [str(word) for word in words])
+
+
+def runs_of(lab):
+    records = [read_record(folder) for folder in (lab / "elsewhere" / "results" / "runs").iterdir()]
+    return {record["config"]["observation"]: record for record in records}
+
+
+def test_a_study_keeps_where_its_code_comes_from(lab):
+    records = runs_of(lab)
+    assert set(records) == {"index", "corner", "pair"}
+    found = {part: Source.from_dict(entry) for part, entry in records["pair"]["config"]["sources"].items()}
+    assert {part: source.name for part, source in found.items()} == {
+        "environment": "taxi_module:Taxi",
+        "observation": "corners_file.py:pair",
+        "agent": "learner_module:Learner",
+    }
+    assert found["observation"].file == str((lab / "code" / "corners_file.py").resolve())
+    assert not any(source.is_changed for source in found.values())
+    assert records["index"]["config"]["environment"] == "taxi"
+
+
+def test_a_shard_of_one_worker_finds_nothing_missing(lab):
+    done = command(
+        "study", "run", "own.yaml", "--out", lab / "elsewhere" / "results", "--shard", "1/2", "--workers", 1, cwd=lab
+    )
+    assert (done.returncode, done.stdout) == (0, "own: 2 of 2 runs finished\n"), done.stderr
+
+
+@pytest.mark.parametrize("observation", ["index", "pair"])
+def test_what_was_learnt_on_ones_own_environment_is_evaluated(lab, observation):
+    record = runs_of(lab)[observation]
+    run = lab / "elsewhere" / "results" / "runs" / record["id"]
+    target = ["code/taxi_of_mine.py:Taxi"] if observation == "index" else ["taxi_module:Taxi", "height=3", "--trust"]
+    done = command("evaluate", *target, "--policy", run, "--horizon", record["config"]["horizon"], "--json", cwd=lab)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["value_at_start"] == pytest.approx(record["result"]["final_value"], abs=1e-6)
+
+
+def test_what_was_learnt_is_drawn_where_it_is_trusted(lab):
+    run = lab / "elsewhere" / "results" / "runs" / runs_of(lab)["corner"]["id"]
+    refused = command("plot", "policies", run, "--out", "a.gif", cwd=lab)
+    assert refused.returncode == 2 and "add --trust" in refused.stderr and not (lab / "a.gif").exists()
+    done = command("plot", "policies", run, "--out", "a.gif", "--steps", 3, "--trust", cwd=lab)
+    assert done.returncode == 0 and (lab / "a.gif").stat().st_size > 0, done.stderr
+
+
+def test_a_run_can_be_read_in_python(lab, monkeypatch):
+    monkeypatch.setattr(catalog, "_REGISTERED", {})
+    record = runs_of(lab)["index"]
+    run = lab / "elsewhere" / "results" / "runs" / record["id"]
+    task, agent = load_agent(run, trust=True)
+    assert (task.env.name, len(agent)) == ("taxi", task.space.num_states)
+    again, _ = load_agent(run)  # it was imported, so it needs no trust
+    assert again.env == task.env
+
+
+def test_changed_code_is_told(lab, tmp_path, monkeypatch):
+    copy = tmp_path / "lab"
+    shutil.copytree(lab, copy)
+    results = copy / "elsewhere" / "results"
+    (copy / "code" / "taxi_of_mine.py").write_text(TAXI + "\n# changed\n")
+    (copy / "own.yaml").write_text(STUDY[: STUDY.index("  - environments: [{")])
+    with pytest.warns(UserWarning, match=r"taxi_of_mine.py has changed since 1 runs in .* were trained with it"):
+        assert study.status(copy / "own.yaml", results).finished == 1
+    run = results / "runs" / runs_of(lab)["index"]["id"]
+    with pytest.warns(UserWarning, match=r"taxi_of_mine.py has changed since taxi_of_mine.py:Taxi was written down"):
+        load_agent(run, trust=True)
+
+
+def test_a_file_that_changes_between_the_study_and_its_worker_fails_the_run(tmp_path):
+    (tmp_path / "shifting.py").write_text(TAXI)
+    config = config_of(tmp_path / "shifting.py")
+    (tmp_path / "shifting.py").write_text(TAXI.replace('"taxi"', '"taxi" ""'))
+    sources._LOADED.clear()
+    with pytest.raises(ParameterError, match=r"shifting\.py has changed since"):
+        RunConfig.from_dict(config).task(trust=True, strict=True)
+
+
+def config_of(file, **options):
+    """The configuration of a run on the class in a file."""
+    task = pharos.experiments.Task.of(f"{file}:Taxi", observation="index")
+    return json.loads(json.dumps(RunConfig.of_task(task, "q_learning", steps=10, **options).to_dict()))
+
+
+def test_the_id_of_a_run_depends_on_the_name_of_its_code_not_on_where_it_is(tmp_path):
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "placed.py").write_text(TAXI)
+    one, other = (config_of(tmp_path / name / "placed.py") for name in ("a", "b"))
+    assert one != other and run_id(one) == run_id(other)
+    assert run_id(one) != run_id(
+        {**one, "sources": {"environment": {**one["sources"]["environment"], "name": "c.py:Taxi"}}}
+    )
+    assert run_id(one) == RunConfig.from_dict(one).id
+
+
+def test_a_changed_file_is_another_run_for_its_folder(tmp_path):
+    file = tmp_path / "edited.py"
+    file.write_text(TAXI)
+    train("q_learning", f"{file}:Taxi", steps=20, out=tmp_path / "run")
+    assert train("q_learning", f"{file}:Taxi", steps=20, out=tmp_path / "run").agent is None
+    file.write_text(TAXI + "\n# changed\n")
+    with pytest.raises(ParameterError, match=r"holds a run from before .*edited.py was changed"):
+        train("q_learning", f"{file}:Taxi", steps=20, out=tmp_path / "run")
+
+
+@pytest.mark.parametrize("reference", ["corners:corner", "corners.py:corner", "corners.py:pair"])
+def test_an_observation_of_ones_own_has_a_path(tmp_path, monkeypatch, reference):
+    (tmp_path / "corners.py").write_text(CORNER)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delitem(sys.modules, "corners", raising=False)
+    env = pharos.make("frozen_lake/4x4")
+    assert pharos.observe(env, reference)(pharos.build(env).states()[:1]).tolist() == [[1.0, 1.0]]
+    result = train("q_learning", env, steps=10)
+    assert "sources" not in result.config
+    with pytest.raises(ParameterError, match="unknown option"):
+        pharos.observe(env, reference, grey=True)
+    monkeypatch.delitem(sys.modules, "corners", raising=False)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("nothing.py:corner", "there is no file"),
+        ("no_such_module:corner", "No module named"),
+        ("corners.py:edge", "expected the name of a pair"),
+        ("corners.py:vector", "built-in observation"),
+    ],
+)
+def test_a_path_that_leads_to_no_observation_is_refused_in_one_line(tmp_path, monkeypatch, name, message):
+    (tmp_path / "corners.py").write_text(CORNER)
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ParameterError, match=message) as error:
+        pharos.observe(pharos.make("frozen_lake/4x4"), name)
+    assert "\n" not in str(error.value)
+
+
+# Received files ---------------------------------------------------------------------------------------------------------
+
+CANARY = "from pathlib import Path\nPath(__file__).with_suffix('.executed').touch()\n"
+
+
+@pytest.fixture
+def received(tmp_path, monkeypatch):
+    """A finished run, a study's folder and a packed study, each naming code that leaves a mark where it is executed."""
+    monkeypatch.setattr(catalog, "_REGISTERED", {})
+    monkeypatch.setattr(sources, "_LOADED", {})
+    monkeypatch.setattr(sources, "_MODULES", {})
+    monkeypatch.chdir(tmp_path)
+    spec = tmp_path / "sent.yaml"
+    spec.write_text(
+        'name: sent\nsteps: 20\nevaluations: 1\nseeds: 1\nblocks:\n  - {environments: ["canary.py:Taxi"], agents: [q_learning]}\n'
+    )
+    (tmp_path / "canary.py").write_text(TAXI)
+    (tmp_path / "canary_module.py").write_text(TAXI)
+    study.run(spec, tmp_path / "got", workers=1)
+    study.pack(spec, tmp_path / "got", file=tmp_path / "got.parquet")
+    run = next((tmp_path / "got" / "runs").iterdir())
+    for name in ("canary", "canary_module"):
+        (tmp_path / f"{name}.py").write_text(CANARY + TAXI)
+    monkeypatch.setattr(sources, "_LOADED", {})
+    monkeypatch.setattr(sources, "_MODULES", {})
+    monkeypatch.setattr(catalog, "_REGISTERED", {})
+    yield run
+    assert "canary_module" not in sys.modules
+
+
+def executed(folder):
+    return sorted(path.name for path in folder.glob("*.executed"))
+
+
+COMMANDS = [
+    ("study", "show", "got"),
+    ("study", "status", "got"),
+    ("study", "report", "got"),
+    ("study", "run", "got"),
+    ("study", "pack", "got", "--to", "again.parquet"),
+    ("study", "status", "got/study.yaml"),
+    ("study", "unpack", "got.parquet", "--out", "new"),
+    ("evaluate", "frozen_lake/4x4", "--policy", "RUN"),
+    ("plot", "value", "frozen_lake/4x4", "--policy", "RUN", "--out", "value.png"),
+    ("plot", "policies", "RUN", "--out", "policies.gif"),
+]
+
+
+@pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
+def test_received_files_execute_nothing(received, tmp_path, words):
+    done = here(*(received if word == "RUN" else word for word in words))
+    assert done.exit_code == 2, done.output
+    assert "executed only if you trust it: add --trust" in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert executed(tmp_path) == []
+
+
+@pytest.mark.filterwarnings("ignore:.*has changed since")
+@pytest.mark.parametrize(
+    "words", [("study", "status", "got"), ("plot", "policies", "RUN", "--steps", "2", "--out", "policies.gif")]
+)
+def test_what_is_trusted_is_executed(received, tmp_path, words):
+    done = here(*(received if word == "RUN" else word for word in words), "--trust")
+    assert done.exit_code == 0, done.output
+    assert executed(tmp_path) == ["canary.executed"]
+
+
+def test_regret_is_drawn_without_any_code(received, tmp_path):
+    assert here("plot", "regret", received, "--out", "regret.png").exit_code == 0
+    assert executed(tmp_path) == []
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"environment": "canary.py:Taxi", "sources": {}},
+        {"environment": "canary_module:Taxi", "sources": {}},
+        {"observation": "canary_module:Taxi", "sources": {}},
+        {"agent": "canary_module:Taxi", "sources": {}},
+        {"sources": {"environment": {"name": "canary_module:Taxi", "file": "canary_module.py", "checksum": ""}}},
+        {"sources": {"observation": {"name": "canary.py:Taxi", "file": "canary.py", "checksum": ""}}},
+        {"sources": {"agent": {"name": "canary.py:Taxi", "file": "canary.py", "checksum": ""}}},
+    ],
+)
+def test_the_configuration_of_a_received_run_executes_nothing(received, tmp_path, change):
+    config = {**read_record(received)["config"], "environment": "frozen_lake", "parameters": {"size": 4}, **change}
+    with pytest.raises(UntrustedCode, match="add --trust"):
+        found = RunConfig.from_dict(config)
+        found.task()
+        found.algorithm()
+    assert executed(tmp_path) == []
+
+
+@pytest.mark.parametrize("entry", [{"name": "canary.py:Taxi"}, 3, {"name": "canary", "file": "", "checksum": ""}, [1]])
+def test_a_damaged_source_is_no_source(received, entry):
+    config = {**read_record(received)["config"], "sources": {"environment": entry}}
+    with pytest.raises(FileFormatError, match=r"source of a class|damaged"):
+        RunConfig.from_dict(config)
+
+
+@pytest.mark.filterwarnings("ignore:.*has changed since")
+def test_the_target_that_a_command_names_is_trusted(received, tmp_path):
+    done = here("evaluate", "canary.py:Taxi", "--policy", received, "--horizon", 5, "--json")
+    assert done.exit_code == 0, done.output
+    assert executed(tmp_path) == ["canary.executed"]
+
+
+def test_a_study_is_unpacked_into_ones_own_without_trust(received, tmp_path):
+    done = here("study", "unpack", "got.parquet", "--into", "sent.yaml", "--out", "new", "--json")
+    assert done.exit_code == 0, done.output
+    assert json.loads(done.stdout)["added"] == 1
+
+
+def test_algorithms_of_known_libraries_need_no_trust():
+    config = RunConfig(
+        environment="frozen_lake", agent="stable_baselines3:SAC", steps=1, horizon=1, evaluation_interval=1
+    )
+    assert config.algorithm() == "stable_baselines3:SAC"
