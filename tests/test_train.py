@@ -5,8 +5,11 @@ import json
 import math
 import multiprocessing
 import os
+import re
 import shutil
 import signal
+import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -145,6 +148,28 @@ def test_a_run_killed_while_it_replaces_its_checkpoint_loses_one_interval(moved,
     short("q_learning", tmp_path / "whole")
     assert (run / "curve.parquet").read_bytes() == (tmp_path / "whole" / "curve.parquet").read_bytes()
     assert not list(run.glob("checkpoint*"))
+
+
+@pytest.mark.parametrize("agent", ["dqn", "ppo"])
+def test_a_resumed_agent_does_not_repeat_its_first_random_numbers(agent, tmp_path):
+    import torch
+
+    task = Task.of("simple_grid/4x4-plain", observation="vector")
+    hyperparameters = SMALL if agent == "dqn" else {"n_steps": 16, "batch_size": 16}
+
+    def random_numbers(resumed):
+        learner = Deep(agent, task, hyperparameters, 400, 1, None)
+        if resumed:
+            learner.load(tmp_path)
+        drawn = (torch.rand(4).tolist(), np.random.rand(4).tolist())
+        return (*drawn, [learner.model.action_space.sample() for _ in range(32)])
+
+    learner = Deep(agent, task, hyperparameters, 400, 1, None)
+    learner.learn([64], lambda *_: {"value": 0.0, "expected_regret": 0.0, "mean_return": 0.0})
+    learner.save(tmp_path)
+    first, again, resumed, same = (random_numbers(each) for each in (False, False, True, True))
+    assert first == again and resumed == same
+    assert all(before != after for before, after in zip(first, resumed, strict=True))
 
 
 @pytest.mark.parametrize("ended", [False, True])
@@ -288,3 +313,32 @@ def test_a_folder_that_is_no_run_is_said_to_be_none(tmp_path):
     (tmp_path / "curve.parquet").write_bytes(b"PAR1")
     with pytest.raises(FileFormatError, match="cannot be read"):
         read_curve(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("missing", "message"),
+    [
+        ("torch", None),
+        ("stable_baselines3", None),
+        ("yaml", "pip install .*[study]"),
+        ("pyarrow", "pip install .*[study]"),
+    ],
+)
+def test_tabular_agents_need_no_deep_learning(missing, message, tmp_path):
+    """In a process in which a package is not installed."""
+    code = f"""
+import sys
+sys.modules[{missing!r}] = None
+import pharos
+try:
+    result = pharos.train("q_learning", "frozen_lake/4x4", steps=200, out={str(tmp_path / "run")!r})
+    print("torch" in sys.modules and {missing!r} != "torch", len(result.curve))
+except pharos.errors.MissingExtra as error:
+    print(error)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300)
+    if message is None:
+        assert done.stdout == "False 101\n", done.stderr
+    else:
+        assert re.search(message.replace("[", r"\["), done.stdout), done.stderr
+        assert not (tmp_path / "run").exists()

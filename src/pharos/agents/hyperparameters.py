@@ -41,7 +41,7 @@ def _read(path: Path) -> dict[str, Any]:
     try:
         import yaml
     except ImportError as error:
-        raise MissingExtra("reading hyperparameters", "pyyaml", "agents") from error
+        raise MissingExtra("reading hyperparameters", "pyyaml", "study") from error
     try:
         table = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, yaml.YAMLError) as error:

@@ -66,12 +66,19 @@ def write_record(folder: Path, record: Mapping[str, Any]) -> None:
     storage.replace_json(folder / RECORD, storage.sealed(record))
 
 
+def require_pyarrow() -> None:
+    """Raise MissingExtra where curves cannot be written, before a run begins."""
+    try:
+        import pyarrow  # noqa: F401
+    except ImportError as error:
+        raise MissingExtra("writing results", "pyarrow", "study") from error
+
+
 def write_curve(folder: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     """Replace curve.parquet in one step, with checksums of its pages; the same rows give the same bytes."""
-    try:
-        import pyarrow as pa
-    except ImportError as error:
-        raise MissingExtra("writing results", "pyarrow", "agents") from error
+    require_pyarrow()
+    import pyarrow as pa
+
     schema = pa.schema([(name, pa.type_for_alias(dtype)) for name, dtype in COLUMNS.items()])
     columns = [pa.array([row[name] for row in rows], schema.field(name).type) for name in COLUMNS]
     write_table(folder / CURVE, pa.Table.from_arrays(columns, schema=schema))

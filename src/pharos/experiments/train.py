@@ -250,11 +250,13 @@ def _run(
     }
     spent = 0.0
     if folder is not None:
-        folder.mkdir(parents=True, exist_ok=True)
+        _results.require_pyarrow()
         done = _finished(folder, config)
         if done is not None:
             return done
     chosen = hyperparameters_of(config.agent, config.environment, config.observation, config.hyperparameters)
+    if folder is not None:
+        folder.mkdir(parents=True, exist_ok=True)
     logs = folder / "tensorboard" if folder is not None and tensorboard else None
     learner = make_learner(config, algorithm or config.algorithm(), task, chosen, logs)
     curve = _Curve(task)
