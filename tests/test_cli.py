@@ -1,14 +1,16 @@
 """The command line: what it answers, in JSON and for people, and how it fails."""
 
+import io
 import json
 import os
 import subprocess
 import sys
 
 import pytest
+from rich.console import Console
 from typer.testing import CliRunner
 
-from pharos.cli import app
+from pharos.cli import app, common
 from pharos.cli.common import parse_parameters, parse_size, parse_value
 from pharos.errors import ParameterError
 
@@ -188,6 +190,14 @@ def test_the_shell_completes_verbs_and_options(monkeypatch, words, expected):
     monkeypatch.setenv("COMP_WORDS", words)
     monkeypatch.setenv("COMP_CWORD", str(len(words.split()) - 1))
     assert process().stdout.split() == [expected]
+
+
+def test_a_progress_bar_says_what_happens_before_anything_is_counted(monkeypatch):
+    screen = Console(file=io.StringIO(), force_terminal=True, width=120)
+    monkeypatch.setattr(common, "console", lambda stderr=False: screen)
+    with common.progress_bar("training", 20_000, "loading, building, compiling, first evaluation"):
+        pass
+    assert "0/20000" in screen.file.getvalue() and "first evaluation" in screen.file.getvalue()
 
 
 def test_build_answers_with_the_keys_of_its_contract(answer, tmp_path):

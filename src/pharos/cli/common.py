@@ -275,8 +275,12 @@ def progress_line(what: str) -> Iterator[Callable[[str], None]]:
 
 
 @contextlib.contextmanager
-def progress_bar(what: str, total: int) -> Iterator[Callable[[int, str], None] | None]:
-    """A bar on standard error, on a terminal: call it with how much is done and a text. None elsewhere."""
+def progress_bar(what: str, total: int, before: str = "") -> Iterator[Callable[[int, str], None] | None]:
+    """A bar on standard error, on a terminal: call it with how much is done and a text. None elsewhere.
+
+    Args:
+        before: what happens until the first call.
+    """
     screen = console(stderr=True)
     if not screen.is_terminal:
         yield None
@@ -285,7 +289,7 @@ def progress_bar(what: str, total: int) -> Iterator[Callable[[int, str], None] |
 
     columns = (BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[text]}"), TimeRemainingColumn())
     with Progress(*columns, console=screen, transient=True) as bar:
-        task = bar.add_task(what, total=total, text="")
+        task = bar.add_task(what, total=total, text=before)
         yield lambda done, text: bar.update(task, completed=done, text=text)
 
 

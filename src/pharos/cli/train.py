@@ -80,7 +80,7 @@ def train(
         seen = agent_kind(agent).observation(observation)
         given = hyperparameters_of(agent, env.name, seen, given, table=table)
 
-    with progress_bar("training", steps) as show:
+    with progress_bar("training", steps, "loading, building, compiling, first evaluation") as show:
         result = learn(
             agent,
             env,
