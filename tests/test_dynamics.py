@@ -152,6 +152,9 @@ def test_compiled_backups_and_moves_are_those_of_the_formulas(mdp, seed):
         mdp.dynamics.backup(equation, x, fast)
         Dynamics.backup(Listed.of(mdp), equation, x, slow)
         np.testing.assert_allclose(fast, slow, atol=1e-12)
+        swept = x.copy()
+        assert Dynamics.sweep(Listed.of(mdp), equation, swept) == np.abs(slow - x).max()
+        assert (swept == slow).all()
     live = ~np.asarray(mdp.terminal)
     for play, width in (
         (Play(live, policy.later, mdp.chance), mdp.width),

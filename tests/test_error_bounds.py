@@ -119,14 +119,32 @@ def test_rounding_adds_up_along_a_path_at_gamma_1():
 
 
 def test_rounding_counts_every_operation_of_a_backup():
-    actions = 300  # added up one after the other
-    rewards = np.random.default_rng(0).choice([0.1, 0.3, 0.7], size=(1, actions))
-    one = random_actions(TabularMDP.from_arrays(np.zeros((1, actions), int), rewards, gamma=0.5), 1.0)
-    mean = sum((Fraction(float(r)) for r in rewards[0]), Fraction(0)) / actions
-    solution = finest(value_iteration, one)
-    error = abs(Fraction(float(solution.v[0])) - mean * 2)
-    one_operation = Fraction(2.0**-53) * Fraction(float(rewards.max()) + float(solution.v[0])) * 2
-    assert one_operation < error <= Fraction(solution.error_bound)
+    actions = 300  # whose values are added up one after the other
+    one = TabularMDP.from_arrays(np.zeros((1, actions), int), np.full((1, actions), 0.1), gamma=0.0)
+    solution = uniform_value(one, 1e-9)
+    error = abs(Fraction(float(solution.v[0])) - Fraction(0.1))
+    assert 2 * Fraction(2.0**-53) < error <= Fraction(solution.error_bound)
+    solution = evaluate_policy(one, np.full((1, actions), 1 / actions), 1e-9)
+    error = abs(Fraction(float(solution.v[0])) - Fraction(0.1) * Fraction(1 / actions) * actions)
+    assert error <= Fraction(solution.error_bound)
+
+
+def test_probabilities_that_sum_to_more_than_1_over_gamma_give_no_false_bound():
+    grows = TabularMDP.from_matrices(np.full((1, 1, 1), 1 + 9e-10), [[1.0]], gamma=1 - 1e-10)
+    with pytest.raises(PrecisionError, match="1 / gamma"):  # the value is infinite
+        value_iteration(grows, 1e30)
+
+
+@pytest.mark.parametrize("actions", [65, 1001])
+def test_any_number_of_actions_is_solved(actions):
+    rewards = np.arange(float(actions))[None].repeat(2, axis=0)
+    mdp = TabularMDP.from_arrays(np.full((2, actions), 1), rewards, gamma=0.5)
+    for chosen in (mdp, sticky_actions(mdp, 0.25), random_actions(mdp, 0.0)):
+        solution = value_iteration(chosen)
+        assert abs(solution.value_at_start - 2 * (actions - 1)) <= solution.error_bound
+    worst = worst_value(mdp)
+    assert np.abs(worst.v).max() <= worst.error_bound
+    assert abs(uniform_value(mdp).v[0] - (actions - 1)) <= 1e-6
 
 
 def test_long_cycles_that_nearly_cancel_are_within_the_bound():
