@@ -24,12 +24,12 @@ DEFAULTS: dict[str, Any] = {
 class QLearning:
     """Watkins' Q-learning with epsilon-greedy exploration on the table of an MDP.
 
-        Q(s, a) += alpha (r + gamma max_b Q(s', b) - Q(s, a)), and no next value where the episode ended in a terminal
-        state
+        Q(s, a) += alpha (r + gamma max_b Q(s', b) - Q(s, a))
+
+    There is no next value where the episode ended in a terminal state.
 
     An episode that the time limit cuts off is not an end of that kind: the next value is used. Under chance the update
-        belongs
-    to the chosen action, as the agent does not know which one was executed.
+    belongs to the chosen action, as the agent does not know which one was executed.
 
     Args:
         mdp: the MDP, with chance; its horizon is the time limit of episodes.

@@ -14,7 +14,7 @@ def bridge(mdp: TabularMDP, path: str | os.PathLike) -> Path:
     """Write an MDP as BRIDGE does: npz with `transitions` int64 (S, A) and `rewards` float32 (S, A).
 
     States keep their numbers, unless the start is not 0: it then changes places with 0. Transitions into terminal
-        states become -1.
+    states become -1.
 
     Raises:
         ParameterError: the MDP has chance or several start states, which the form cannot say; or the name does not end

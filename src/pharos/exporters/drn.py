@@ -17,9 +17,8 @@ def drn(mdp: TabularMDP, path: str | os.PathLike) -> Path:
     """Write an MDP for Storm, with a reward model "reward" on actions and labels "init" and "terminal".
 
     Discounting is written out: with gamma < 1 every step ends the episode with probability 1 - gamma, so that Storm's
-        expected total
-    reward `Rmax=? [F "terminal"]` is the discounted value. Several start states become choices of one more, first
-    state.
+    expected total reward `Rmax=? [F "terminal"]` is the discounted value. Several start states become choices of one
+    more, first state.
 
     Raises:
         ParameterError: sticky actions (see `gym_p`); or the name does not end in .drn.

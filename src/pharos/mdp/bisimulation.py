@@ -1,10 +1,8 @@
 """Bisimulation: states that no sequence of actions can tell apart, merged. Source: Givan, Dean and Greig (2003).
 
 Two states are bisimilar if they pay the same reward for every action and lead to bisimilar states. The coarsest such
-partition is found
-by refinement: start from terminal flag, rewards and, if wanted, observations; split classes by the classes that their
-    states lead to,
-until nothing splits (Moore 1956; Kanellakis and Smolka 1990).
+partition is found by refinement: start from terminal flag, rewards and, if wanted, observations; split classes by the
+classes that their states lead to, until nothing splits (Moore 1956; Kanellakis and Smolka 1990).
 """
 
 from dataclasses import dataclass, replace

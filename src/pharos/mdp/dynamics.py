@@ -5,8 +5,7 @@ chance of choosing, no policy and no terminal states; a `BellmanEquation` brings
 wanted.
 
 A way of storing transitions is one class: `Table` (table.py) and `Matrices` (matrices.py). It needs the methods that
-    are
-abstract here and four attributes; the rest follows from these, and is overridden where the representation allows
+are abstract here and four attributes; the rest follows from these, and is overridden where the representation allows
 something faster, as `Table` does. docs/decisions/0008-one-operator.md says why, and where the next class goes.
 
 States are numbered 0 .. S - 1; S stands for the end of an episode, which has no value and no successors.

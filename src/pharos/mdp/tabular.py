@@ -229,8 +229,7 @@ class TabularMDP:
         """(S, A) bool: the pairs (state, previously executed action) that can be met within `steps` steps from a start.
 
         Which actions can be executed after which, chance says: where every action is a repetition, those of the first
-            step
-        go on. Start states without a previous action are not among them.
+        step go on. Start states without a previous action are not among them.
         """
         if self.chance.executes_any:
             if steps == 0:
@@ -284,9 +283,8 @@ class TabularMDP:
         """The same MDP with only those states that can be met within `steps` steps from a start; they keep their order.
 
         Both agree on every episode of at most `steps` steps from the start: values there, returns, effective horizon.
-        Of
-        states that take all the steps to reach, only that they exist is right: what leads out of the set does not any
-            more.
+        Of states that take all the steps to reach, only that they exist is right: what leads out of the set does not
+        any more.
 
         Returns:
             This MDP where all of its states are met; else one without a folder, as its states have other numbers.

@@ -1,9 +1,9 @@
 """The fixed point of a Bellman equation, with an error bound that is proven and met.
 
 Sweeps go in place and in reverse order of discovery: breadth-first search numbers a state before those that it leads
-    to, so
-a sweep from the last state to the first carries values back along whole paths. 20 to 40 sweeps solve games that take a
-thousand plain ones. Where sweeps are slow, because gamma is near 1, policy iteration gives a better x to go on from.
+to, so a sweep from the last state to the first carries values back along whole paths. 20 to 40 sweeps solve games that
+take a thousand plain ones. Where sweeps are slow, because gamma is near 1, policy iteration gives a better x to go on
+from.
 
 The bound. Let T be the backup, a contraction with factor rho, x* its fixed point, and let one sweep in place change
 entries by at most d, with rounding errors of at most e an entry. Every new entry is a backup of entries that are old or
