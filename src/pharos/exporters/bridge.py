@@ -7,9 +7,10 @@ import numpy as np
 
 from pharos import storage
 from pharos.errors import ParameterError
-from pharos.mdp import TabularMDP
+from pharos.mdp import TabularMDP, takes_mdp
 
 
+@takes_mdp
 def bridge(mdp: TabularMDP, path: str | os.PathLike) -> Path:
     """Write an MDP as BRIDGE does: npz with `transitions` int64 (S, A) and `rewards` float32 (S, A).
 

@@ -10,9 +10,10 @@ import numpy as np
 from pharos import storage
 from pharos.errors import ParameterError
 from pharos.exporters.gymnasium import gym_p
-from pharos.mdp import TabularMDP
+from pharos.mdp import TabularMDP, takes_mdp
 
 
+@takes_mdp
 def drn(mdp: TabularMDP, path: str | os.PathLike) -> Path:
     """Write an MDP for Storm, with a reward model "reward" on actions and labels "init" and "terminal".
 

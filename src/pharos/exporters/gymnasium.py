@@ -3,11 +3,12 @@
 import numpy as np
 
 from pharos.errors import ParameterError
-from pharos.mdp import TabularMDP
+from pharos.mdp import TabularMDP, takes_mdp
 
 Outcome = tuple[float, int, float, bool]
 
 
+@takes_mdp
 def gym_p(mdp: TabularMDP) -> dict[int, dict[int, list[Outcome]]]:
     """Return P[s][a] = [(probability, next state, reward, terminated), ...], as Gymnasium's toy texts have it.
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from pharos.errors import ParameterError
 from pharos.hardness.gaps import gaps_of_states
-from pharos.mdp import TabularMDP
+from pharos.mdp import TabularMDP, takes_mdp
 from pharos.solvers import Solution
 
 
@@ -49,6 +49,7 @@ class ActionGapRegularity:
         return f"P(0 < gap <= t) <= {self.constant:.6g} t^{self.zeta:g}"
 
 
+@takes_mdp
 def action_gap_regularity(
     mdp: TabularMDP, solution: Solution | None = None, *, zeta: float = 1.0, tie_tolerance: float | None = None
 ) -> ActionGapRegularity:

@@ -6,11 +6,12 @@ import numpy as np
 
 from pharos.errors import ParameterError
 from pharos.hardness.choices import choices_of
-from pharos.mdp import TabularMDP
+from pharos.mdp import TabularMDP, takes_mdp
 
 _BLOCK = 256  # targets at a time
 
 
+@takes_mdp
 def colosseum_diameter(mdp: TabularMDP, *, horizon: int | None = None) -> float:
     """Return Colosseum's episodic diameter: max over e and s of d_e(s) = min over h of the positive ET_e(h, s).
 

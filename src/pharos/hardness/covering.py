@@ -11,7 +11,7 @@ import numpy as np
 
 from pharos.errors import ParameterError, UndefinedMeasure
 from pharos.hardness.occupancy import Walk
-from pharos.mdp import TabularMDP
+from pharos.mdp import TabularMDP, takes_mdp
 
 
 @dataclass(frozen=True)
@@ -46,6 +46,7 @@ class Covering:
         return f"omega {self.omega_max:.6g} (sum {self.omega_sum:.6g}), length at most {self.length_bound:.6g} episodes"
 
 
+@takes_mdp
 def covering(mdp: TabularMDP, *, horizon: int | None = None) -> Covering:
     """Return how rarely random play meets the rarest state and action.
 

@@ -13,13 +13,14 @@ import numpy as np
 from pharos.errors import ParameterError, UndefinedMeasure
 from pharos.hardness.interval import Budget, Interval, Progress, Spending, conventions_of
 from pharos.hardness.stochastic_diameter import stochastic_diameter, stochastic_start_eccentricity
-from pharos.mdp import TabularMDP
+from pharos.mdp import TabularMDP, takes_mdp
 
 _WIDE = 1024  # nodes of a layer, beyond which layers are not narrow
 _WORDS = (1, 8)  # widths of searches from many nodes, in words of 64 sources
 _BATCH_MEMORY = 2**31  # bytes
 
 
+@takes_mdp
 def diameter(
     mdp: TabularMDP,
     *,
@@ -61,6 +62,7 @@ def diameter(
     return _Sweep(graph, spending, conventions_of(mdp, restart)).interval()
 
 
+@takes_mdp
 def start_eccentricity(
     mdp: TabularMDP, *, restart: bool = True, tolerance: float = 1e-6, budget: Budget | float | None = None
 ) -> float:
@@ -90,6 +92,7 @@ def start_eccentricity(
     return interval.upper
 
 
+@takes_mdp
 def start_eccentricity_interval(
     mdp: TabularMDP, *, restart: bool = True, tolerance: float = 1e-6, budget: Budget | float | None = None
 ) -> Interval:

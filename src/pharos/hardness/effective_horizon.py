@@ -13,7 +13,7 @@ import numpy as np
 from pharos.hardness.gorp import gorp_bound
 from pharos.hardness.large_horizon import LargeHorizon, applies
 from pharos.hardness.steps import TIE, Steps, steps_of
-from pharos.mdp import TabularMDP
+from pharos.mdp import TabularMDP, takes_mdp
 
 COMPILED = 2**26  # bytes of the table of all steps from which on it is not written out
 GREEDY_RETURNS = 5
@@ -76,6 +76,7 @@ class EffectiveHorizon:
         return f"{self.value:.6g} (k_min {self.k_min}, window {self.effective_planning_window})"
 
 
+@takes_mdp
 def effective_horizon(mdp: TabularMDP, *, horizon: int | None = None, tight: int = 0) -> EffectiveHorizon:
     """Return the effective horizon of an MDP, and what it is made of.
 

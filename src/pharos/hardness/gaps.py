@@ -16,7 +16,7 @@ from pharos.errors import ParameterError, PrecisionError
 from pharos.hardness.interval import Certified
 from pharos.hardness.ties import TieProof, same_outcomes
 from pharos.kernels import ties
-from pharos.mdp import BEST, BellmanEquation, TabularMDP
+from pharos.mdp import BEST, BellmanEquation, TabularMDP, takes_mdp
 from pharos.solvers import Solution, value_iteration
 
 # Of Colosseum.
@@ -134,6 +134,7 @@ class Gaps:
         )
 
 
+@takes_mdp
 def gaps(mdp: TabularMDP, solution: Solution | None = None, *, tie_tolerance: float | None = None) -> Gaps:
     """Return the suboptimality gaps of an MDP, summed up.
 
@@ -199,6 +200,7 @@ def _settled(mdp: TabularMDP, solution: Solution) -> Solution:
     return replace(solution, x=x, next_x=x, error_bound=bound, sweeps=solution.sweeps + sweeps)
 
 
+@takes_mdp
 def sum_of_reciprocal_gaps(
     mdp: TabularMDP, solution: Solution | None = None, *, tie_tolerance: float | None = None, regularized: bool = False
 ) -> float:
@@ -211,6 +213,7 @@ def sum_of_reciprocal_gaps(
     return result.regularized if regularized else result.sum_of_reciprocals
 
 
+@takes_mdp
 def minimal_gap(mdp: TabularMDP, solution: Solution | None = None, *, tie_tolerance: float | None = None) -> float:
     """Return the smallest gap(s, a) that is no tie; infinite where all actions are optimal everywhere. As `gaps` says."""
     return gaps(mdp, solution, tie_tolerance=tie_tolerance).minimal

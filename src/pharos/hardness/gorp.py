@@ -17,7 +17,7 @@ import numpy as np
 from pharos.errors import ParameterError, UndefinedMeasure
 from pharos.hardness.return_distribution import central_moments
 from pharos.hardness.steps import TIE, Steps, steps_of
-from pharos.mdp import TabularMDP
+from pharos.mdp import TabularMDP, takes_mdp
 
 METHODS = ("binomial", "berry_esseen", "bernstein", "bennett", "exact")
 MOST_SAMPLES = 10**100
@@ -63,6 +63,7 @@ class GorpBound:
         return f"{self.value:.6g} (m = {', '.join('infinite' if m is None else f'{m:,}' for m in self.ms)})"
 
 
+@takes_mdp
 def gorp_bound(
     mdp: TabularMDP, *, horizon: int | None = None, max_k: int = 1, methods: Sequence[str] = METHODS[:4]
 ) -> GorpBound:
@@ -159,6 +160,7 @@ class GorpRuns:
         return f"{self.success_rate:.3g} of {len(self.returns)} runs optimal, {self.timesteps:,} steps each"
 
 
+@takes_mdp
 def run_gorp(
     mdp: TabularMDP, *, k: int = 1, m: int = 1, horizon: int | None = None, runs: int = 1, seed: int = 0
 ) -> GorpRuns:

@@ -10,10 +10,11 @@ from pharos.errors import UndefinedMeasure
 from pharos.hardness.gaps import checked
 from pharos.hardness.interval import Interval
 from pharos.hardness.occupancy import discounted_visits, support
-from pharos.mdp import TabularMDP
+from pharos.mdp import TabularMDP, takes_mdp
 from pharos.solvers import Solution
 
 
+@takes_mdp
 def distribution_mismatch(
     mdp: TabularMDP, policy: Any = None, solution: Solution | None = None, *, tolerance: float = 1e-9
 ) -> Interval:

@@ -9,7 +9,7 @@ from scipy import sparse
 from scipy.sparse import csgraph
 
 from pharos.errors import ParameterError, UndefinedMeasure
-from pharos.mdp import PolicyTable, TabularMDP
+from pharos.mdp import PolicyTable, TabularMDP, takes_mdp
 
 MOST_NODES = 4096
 ROUNDING = 1e-12  # of a distance, that a tie with epsilon is one
@@ -48,6 +48,7 @@ class MixingTime:
         return f"infinite (period {self.period})" if self.period else "infinite (several recurrent classes)"
 
 
+@takes_mdp
 def mixing_time(
     mdp: TabularMDP, policy: Any = None, *, epsilon: float = 0.25, restart: bool = True, lazy: bool = False
 ) -> MixingTime:

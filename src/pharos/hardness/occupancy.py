@@ -9,7 +9,7 @@ import numpy as np
 
 from pharos.errors import ParameterError, UndefinedMeasure
 from pharos.kernels import occupancy as kernels
-from pharos.mdp import Chance, Play, PolicyTable, TabularMDP
+from pharos.mdp import Chance, Play, PolicyTable, TabularMDP, takes_mdp
 
 _MEMORY = 8 << 30  # bytes that all steps together may take
 _LEAST = 1e-280  # mass that is not worth a step: smaller numbers lose their digits, and take a hundred times longer
@@ -56,6 +56,7 @@ class Occupancy:
         return f"{int((self.visits > 0).sum())} pairs visited, {self.visits.sum():.6g} steps in all"
 
 
+@takes_mdp
 def occupancy(
     mdp: TabularMDP,
     policy: Any = None,

@@ -12,7 +12,7 @@ from pharos.errors import ParameterError, PrecisionError, UndefinedMeasure
 from pharos.hardness.interval import Budget, Certificate, Certified, certificate_of
 from pharos.hardness.registry import Measure, Problem, chosen
 from pharos.hardness.results_file import ResultsFile
-from pharos.mdp import TabularMDP
+from pharos.mdp import TabularMDP, takes_mdp
 
 
 @dataclass(frozen=True)
@@ -103,6 +103,7 @@ class Report:
         )
 
 
+@takes_mdp
 def report(
     mdp: TabularMDP,
     measures: str | Iterable[str] | None = None,

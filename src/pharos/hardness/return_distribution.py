@@ -8,7 +8,7 @@ import numpy as np
 
 from pharos.errors import UndefinedMeasure
 from pharos.hardness.steps import MEMORY, steps_of
-from pharos.mdp import PolicyTable, TabularMDP
+from pharos.mdp import PolicyTable, TabularMDP, takes_mdp
 
 SAME = 1e-9  # returns closer than this are one return
 
@@ -54,6 +54,7 @@ class ReturnDistribution:
         return f"mean {self.mean:.6g}, deviation {self.variance**0.5:.6g}, {len(self.returns)} returns"
 
 
+@takes_mdp
 def return_distribution(mdp: TabularMDP, policy: Any = None, *, horizon: int | None = None) -> ReturnDistribution:
     """Return the distribution of r_1 + ... + r_T under a policy, from the start, under every kind of chance.
 

@@ -14,7 +14,7 @@ import numpy as np
 from pharos.errors import ParameterError, PrecisionError, UndefinedMeasure
 from pharos.hardness.choices import Choices, choices_of, reachable
 from pharos.hardness.steps import expected_rewards, single_outcomes
-from pharos.mdp import TabularMDP
+from pharos.mdp import TabularMDP, takes_mdp
 from pharos.solvers import Solution, uniform_value, value_iteration, worst_value
 
 
@@ -58,6 +58,7 @@ class StationaryHorizon:
         return f"{self.value:.6g} (k_min {self.k_min}, window {self.effective_planning_window})"
 
 
+@takes_mdp
 def stationary_effective_horizon(
     mdp: TabularMDP,
     solution: Solution | None = None,

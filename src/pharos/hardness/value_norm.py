@@ -6,7 +6,7 @@ import numpy as np
 
 from pharos.hardness.gaps import checked
 from pharos.hardness.interval import Certified
-from pharos.mdp import Chance, TabularMDP
+from pharos.mdp import Chance, TabularMDP, takes_mdp
 from pharos.solvers import Solution
 
 # States at once: values of all their outcomes are in memory.
@@ -16,6 +16,7 @@ _UNIT = 2.0**-53
 _NARROW = 1e-6
 
 
+@takes_mdp
 def environmental_value_norm(mdp: TabularMDP, solution: Solution | None = None) -> float:
     """Return the largest standard deviation of the value of the next state.
 

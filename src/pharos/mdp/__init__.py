@@ -1,5 +1,6 @@
 """Tabular MDPs: dynamics, rewards, the chance that can be added, what is chosen, and states merged."""
 
+from pharos.mdp.arguments import takes_mdp
 from pharos.mdp.bisimulation import Minimization, minimize
 from pharos.mdp.chance import Chance, random_actions, sticky_actions
 from pharos.mdp.dynamics import BellmanEquation, Dynamics, Outcomes, Play
@@ -30,4 +31,5 @@ __all__ = [
     "random_actions",
     "rewards_of_space",
     "sticky_actions",
+    "takes_mdp",
 ]

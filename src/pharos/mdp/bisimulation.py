@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from pharos.errors import ParameterError
+from pharos.mdp.arguments import takes_mdp
 from pharos.mdp.rewards import Rewards
 from pharos.mdp.tabular import TabularMDP
 
@@ -37,6 +38,7 @@ class Minimization:
         return len(self.representatives)
 
 
+@takes_mdp
 def minimize(mdp: TabularMDP, observations: Any = None) -> Minimization:
     """Return the smallest MDP that cannot be told from this one.
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pharos.errors import ParameterError
+from pharos.mdp.arguments import takes_mdp
 
 if TYPE_CHECKING:
     from pharos.mdp.tabular import TabularMDP
@@ -173,6 +174,7 @@ class Chance:
         }
 
 
+@takes_mdp
 def random_actions(mdp: "TabularMDP", p: float) -> "TabularMDP":
     """The MDP in which, with probability p, the executed action is uniform over all A actions.
 
@@ -187,6 +189,7 @@ def random_actions(mdp: "TabularMDP", p: float) -> "TabularMDP":
     return replace(mdp, chance=mdp.chance.with_random(p))
 
 
+@takes_mdp
 def sticky_actions(mdp: "TabularMDP", p: float) -> "TabularMDP":
     """The MDP in which, with probability p, the previously executed action is executed again.
 

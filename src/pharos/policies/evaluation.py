@@ -13,7 +13,7 @@ import numpy as np
 
 from pharos import solvers
 from pharos.errors import DivergenceError, ParameterError
-from pharos.mdp import PolicyTable, TabularMDP
+from pharos.mdp import PolicyTable, TabularMDP, takes_mdp
 from pharos.policies.asking import Answers, PolicyAnswers, Sight, TableAnswers
 from pharos.policies.estimation import estimate
 from pharos.policies.policy import Model, Policy, PolicyLike, TabularAgent
@@ -81,6 +81,7 @@ def evaluate_seeing(
     return Evaluation(value, False, width, len(answers.rows), episodes)
 
 
+@takes_mdp
 def evaluate_policy(
     mdp: TabularMDP,
     policy: PolicyLike,

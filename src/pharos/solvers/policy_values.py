@@ -6,13 +6,14 @@ from typing import Any
 import numpy as np
 
 from pharos.errors import DivergenceError
-from pharos.mdp import PolicyTable, TabularMDP
+from pharos.mdp import PolicyTable, TabularMDP, takes_mdp
 from pharos.solvers.fixed_point import chain_bound
 from pharos.solvers.policy_iteration import chain, chain_values
 from pharos.solvers.solution import Solution
 from pharos.solvers.values import check_tolerance, checked_horizon, solution_of
 
 
+@takes_mdp
 def evaluate_policy(
     mdp: TabularMDP,
     policy: Any,
@@ -55,6 +56,7 @@ def evaluate_policy(
     return solution_of(mdp, select, tolerance, horizon)
 
 
+@takes_mdp
 def uniform_policy(mdp: TabularMDP) -> np.ndarray:
     """(S, A) probabilities, all 1 / A."""
     return np.full((mdp.num_states, mdp.num_actions), 1 / mdp.num_actions)

@@ -6,11 +6,12 @@ from collections.abc import Callable
 import numpy as np
 
 from pharos.errors import ParameterError
-from pharos.mdp import BEST, WORST, Selection, TabularMDP, random_actions
+from pharos.mdp import BEST, WORST, Selection, TabularMDP, random_actions, takes_mdp
 from pharos.solvers.fixed_point import backward_induction, fixed_point
 from pharos.solvers.solution import Solution
 
 
+@takes_mdp
 def value_iteration(
     mdp: TabularMDP,
     tolerance: float = 1e-6,
@@ -43,11 +44,13 @@ def value_iteration(
     return solution_of(mdp, BEST, tolerance, horizon, keep_all, progress)
 
 
+@takes_mdp
 def worst_value(mdp: TabularMDP, tolerance: float = 1e-6, *, horizon: int | None = None) -> Solution:
     """The values of the worst policy: as `value_iteration`, minimising."""
     return solution_of(mdp, WORST, tolerance, horizon)
 
 
+@takes_mdp
 def uniform_value(mdp: TabularMDP, tolerance: float = 1e-6, *, horizon: int | None = None) -> Solution:
     """The values of the uniformly random policy: every action is replaced by a uniform one, so nothing is chosen."""
     return solution_of(random_actions(mdp, 1.0), BEST, tolerance, horizon)

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from pharos import paths, storage
-from pharos.environments import Environment
+from pharos.environments import Environment, make
 from pharos.errors import ParameterError, StateSpaceMismatch
 from pharos.state_space import memory as machine
 from pharos.state_space.files import lock
@@ -35,7 +35,7 @@ CHECKPOINT_SECONDS = 15.0
 
 
 def build(
-    env: Environment,
+    env: Environment | str,
     folder: str | os.PathLike | None = None,
     *,
     max_states: int | None = None,
@@ -47,7 +47,7 @@ def build(
     """Enumerate the states of `env` that can be reached from its start states, and their transitions.
 
     Args:
-        env: the environment.
+        env: the environment, or its name, such as "frozen_lake/4x4".
         folder: where to write; None for the user's cache, keyed by environment, parameters and rules. A folder that holds
             the finished state space is loaded; one that holds part of it is resumed, with the same result.
         max_states: StateSpaceTooLarge when there are more.
@@ -71,6 +71,12 @@ def build(
     from pharos.state_space.journal import Journal
     from pharos.state_space.search import Options, Search, check_size  # loads Numba
 
+    if isinstance(env, str):
+        env = make(env)
+    if not isinstance(env, Environment):
+        raise ParameterError(
+            f"build: found {env!r}; expected an Environment: write pharos.make(name, **parameters), or a name"
+        )
     if max_states is not None and max_states < 1:
         raise ParameterError(f"max_states is {max_states}; expected at least 1")
     if memory is not None and memory < machine.LEAST_MEMORY:
