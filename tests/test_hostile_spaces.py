@@ -167,6 +167,17 @@ def test_every_block_of_a_file_is_verified(tmp_path, monkeypatch):
     pharos.load(folder)
 
 
+def test_changed_rules_are_noticed_in_each_of_64_states(folder):
+    original = np.fromfile(folder / "successors.bin", "<i4").reshape(1658, 3)
+    for state in np.unique(np.linspace(0, 1657, 64).astype(int)).tolist():
+        successors = original.copy()
+        successors[state] = (successors[state] + 1) % 1658
+        successors.tofile(folder / "successors.bin")
+        sealed(folder)
+        with pytest.raises(StateSpaceMismatch, match="was built with other rules"):
+            pharos.load(folder)
+
+
 def test_checksums_left_out_are_missed(folder):
     manifest = json.loads((folder / "manifest.json").read_text())
     manifest["arrays"]["successors.bin"]["checksums"] = []

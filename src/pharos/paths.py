@@ -6,7 +6,7 @@ from pathlib import Path
 
 
 def cache_directory() -> Path:
-    """The folder of cached state spaces and compiled rules: PHAROS_CACHE_DIR, or the platform's cache folder / pharos."""
+    """The folder of cached state spaces and compiled rules: PHAROS_CACHE_DIR, else `pharos` in the user's cache."""
     if chosen := os.environ.get("PHAROS_CACHE_DIR"):
         return Path(chosen).expanduser()
     if sys.platform == "darwin":

@@ -1,8 +1,9 @@
 """Files that are there whole or not at all: replacement in one step, locks, JSON, digests. Knows no format of pharos.
 
-Every writer of pharos replaces files by `replacing`, `replace_file` or `replace_json`: whoever reads, and whatever happens to the
-machine, finds the old file or the new one. A new file is written beside the old one under a name that holds the host, the process
-and a random number, so that two machines that share a file system never write to the same file.
+Every writer of pharos replaces files by `replacing`, `replace_file` or `replace_json`: whoever reads, and whatever
+happens to the machine, finds the old file or the new one. A new file is written beside the old one under a name that
+holds the host, the process and a random number, so that two machines that share a file system never write to the same
+file.
 """
 
 import contextlib
@@ -40,7 +41,7 @@ _UNSUPPORTED = (errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOTSUP, err
 _LEFTOVER_SECONDS = 86400.0
 
 
-# Replacing files --------------------------------------------------------------------------------------------------------
+# Replacing files ------------------------------------------------------------------------------------------------------
 
 
 @contextlib.contextmanager
@@ -48,7 +49,8 @@ def replacing(path: str | os.PathLike, *, durable: bool = True) -> Iterator[Bina
     """Open a file for writing that takes the place of `path` when the block ends, and never where it raises.
 
     Args:
-        path: where a symbolic link stands, the file it leads to is replaced; what is no file (a pipe, a device) is written to.
+        path: where a symbolic link stands, the file it leads to is replaced; what is no file (a pipe, a device) is
+            written to.
         durable: the new file is on the disk before it has its name, and the name before this returns.
     Raises:
         OSError: the file cannot be written; an older one of that name is then as it was.
@@ -91,7 +93,8 @@ def replace_json(path: str | os.PathLike, value: Any, *, durable: bool = True) -
 def replace_array(path: str | os.PathLike, array: Any) -> None:
     """Replace a file by an array as .npy, in one step; see `replacing`.
 
-    NumPy writes to a real file by C's `fwrite` and does not notice a full disk at its end, so it gets no real file here.
+    NumPy writes to a real file by C's `fwrite` and does not notice a full disk at its end, so it gets no real file
+    here.
     """
     import numpy as np
 
@@ -134,7 +137,7 @@ def is_temporary(name: str) -> bool:
 
 
 def remove_leftovers(path: Path) -> None:
-    """Remove unfinished replacements of `path`: of processes of this machine that are gone, and those older than a day."""
+    """Remove unfinished replacements of `path` by processes of this machine that are gone, or older than a day."""
     for leftover in path.parent.iterdir():
         if not is_temporary(leftover.name) or not leftover.name.startswith(_temporary_prefix(path)):
             continue
@@ -179,20 +182,22 @@ def _is_alive(process: int) -> bool:
     return text.rpartition(")")[2].split()[0] not in ("Z", "X")  # it is over, but its parent has not asked yet
 
 
-# Locks ------------------------------------------------------------------------------------------------------------------
+# Locks ----------------------------------------------------------------------------------------------------------------
 
 
 @contextlib.contextmanager
 def lock(folder: Path, error: type[PharosError] = FolderLocked, activity: str = "at work") -> Iterator[None]:
     """Hold a folder for this process: by `flock` on its file `lock`, so that a process that is killed holds nothing.
 
-    Where the file system has no such locks (ENOSYS, ENOLCK, EOPNOTSUPP: Lustre without `-o flock`, some network file systems),
-    the folder is held by a file `lock.claim` that only one process can make. It says who made it. One whose process is gone is
-    removed by the next process of the same machine; from another machine nobody can tell, so the error names the file.
+    Where the file system has no such locks (ENOSYS, ENOLCK, EOPNOTSUPP: Lustre without `-o flock`, some network file
+    systems), the folder is held by a file `lock.claim` that only one process can make. It says who made it. One whose
+    process is gone is removed by the next process of the same machine; from another machine nobody can tell, so the
+    error names the file.
 
     Args:
         folder: exists.
-        error, activity: raised where another process holds the folder: "another process (process 7) is `activity` there".
+        error, activity: raised where another process holds the folder: "another process (process 7) is `activity`
+            there".
     Raises:
         ParameterError: the folder cannot be written to, or cannot be locked at all.
     """
@@ -311,7 +316,7 @@ def _text(path: Path) -> str | None:
         return None
 
 
-# JSON and digests -------------------------------------------------------------------------------------------------------
+# JSON and digests -----------------------------------------------------------------------------------------------------
 
 
 def json_text(value: Any) -> str:
@@ -386,6 +391,9 @@ def sealed(record: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def is_intact(record: Mapping[str, Any]) -> bool:
-    """Whether a record says what it said when it was sealed; True for one without a digest, as older versions wrote them."""
+    """Whether a record says what it said when it was sealed.
+
+    True for one without a digest, as older versions wrote them.
+    """
     content = {key: value for key, value in record.items() if key != DIGEST}
     return DIGEST not in record or record[DIGEST] == digest_of_json(content)

@@ -1,4 +1,7 @@
-"""The result of a run on disk: run.json and curve.parquet, each written whole or not at all, with digests; nothing is pickled."""
+"""The result of a run on disk: run.json and curve.parquet, each written whole or not at all, with digests.
+
+Nothing is pickled.
+"""
 
 import os
 import re
@@ -58,8 +61,8 @@ def versions() -> dict[str, str]:
 def write_record(folder: Path, record: Mapping[str, Any]) -> None:
     """Replace run.json in one step; numbers that JSON cannot say are null.
 
-    The record gets a `digest` of all that it says; that of a finished run also `checksums` of the other files of the run, which
-    are written before it: of `curve.parquet` (see `digest_of_curve`), and of what the agent has learnt.
+    The record gets a `digest` of all that it says; that of a finished run also `checksums` of the other files of the
+    run, which are written before it: of `curve.parquet` (see `digest_of_curve`), and of what the agent has learnt.
     """
     if record.get("status") == "finished":
         record = {**record, "checksums": _checksums(folder)}
@@ -88,8 +91,8 @@ def read_record(folder: str | os.PathLike) -> dict[str, Any]:
     """Return what run.json says.
 
     Raises:
-        FileFormatError: there is none, or it is not of a run. ResultCorrupted: it was cut short or changed after it was written,
-        or the folder has the name of another run.
+        FileFormatError: there is none, or it is not of a run. ResultCorrupted: it was cut short or changed after it was
+        written, or the folder has the name of another run.
     """
     path = Path(folder) / RECORD
     try:
@@ -125,8 +128,8 @@ def read_curve_table(folder: str | os.PathLike, columns: Iterable[str] = tuple(C
     Args:
         columns: those that must be there.
     Raises:
-        FileFormatError: there are none, or columns are missing. ResultCorrupted: the file was cut short or changed after it was
-        written, or is that of another run.
+        FileFormatError: there are none, or columns are missing. ResultCorrupted: the file was cut short or changed
+        after it was written, or is that of another run.
     """
     path = Path(folder) / CURVE
     table = read_table(path)
@@ -186,8 +189,8 @@ def read_table(path: Path, advice: str = AGAIN) -> "pa.Table":
 def digest_of_curve(table: "pa.Table") -> str:
     """XXH3-128 of what a curve says, whatever the order of its columns or the version of Parquet that holds it.
 
-    For each column, by name: its name, type and number of rows, and its values as little-endian int64, float64 (NaN where there
-    is none) or bytes of truth; of other types as JSON.
+    For each column, by name: its name, type and number of rows, and its values as little-endian int64, float64 (NaN
+    where there is none) or bytes of truth; of other types as JSON.
     """
     import numpy as np
     import xxhash

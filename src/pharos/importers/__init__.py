@@ -1,4 +1,4 @@
-"""MDPs from elsewhere: BRIDGE's files, any `P` table of Gymnasium, transition matrices, MiniGrid; and folders that keep them.
+"""MDPs from elsewhere: BRIDGE's files, Gymnasium's `P` tables, matrices, MiniGrid; and folders that keep them.
 
 Nothing here unpickles: files hold plain arrays and JSON, or are refused.
 """

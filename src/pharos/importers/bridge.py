@@ -21,21 +21,24 @@ def bridge(path: str | os.PathLike, horizon: int | None = None) -> TabularMDP:
         path: npz with `transitions` (S, A) integers and `rewards` (S, A); other members are not read.
         horizon: T; None: what the name says: `<rom>_<T>_fs<k>` for Atari and Procgen, 100 for MiniGrid.
     Raises:
-        FileFormatError: no npz, a member is missing, pickled, of the wrong shape, or holds an index or reward out of range.
+        FileFormatError: no npz, a member is missing, pickled, of the wrong shape, or holds an index or reward out of
+            range.
         ParameterError: no horizon can be told, or the one given contradicts the name.
-    Source: BRIDGE, https://doi.org/10.5281/zenodo.10966777, its data card; horizons are load-bearing: states first met at depth T are
-        coded as terminal.
+    Source: BRIDGE, https://doi.org/10.5281/zenodo.10966777, its data card. The horizon matters: states that are first
+        met at depth T are coded as terminal.
     """
     path = Path(path)
     arrays = _members(path, ("transitions", "rewards"))
     transitions, rewards = arrays["transitions"], arrays["rewards"]
     if transitions.ndim != 2 or transitions.dtype.kind not in "iu" or not transitions.size:
         raise FileFormatError(
-            f"{path}: transitions have shape {transitions.shape} and type {transitions.dtype}; expected integers (states, actions)"
+            f"{path}: transitions have shape {transitions.shape} and type {transitions.dtype}; "
+            f"expected integers (states, actions)"
         )
     if rewards.shape != transitions.shape or rewards.dtype.kind not in "iuf":
         raise FileFormatError(
-            f"{path}: rewards have shape {rewards.shape} and type {rewards.dtype}; expected numbers of shape {transitions.shape}"
+            f"{path}: rewards have shape {rewards.shape} and type {rewards.dtype}; "
+            f"expected numbers of shape {transitions.shape}"
         )
     steps = _horizon(path, horizon)
     try:
@@ -55,8 +58,8 @@ def bridge_screens(path: str | os.PathLike) -> np.ndarray:
     screens, mapping = arrays["screens"], arrays["screen_mapping"]
     if screens.ndim != 4 or screens.dtype != np.uint8 or mapping.shape != (len(arrays["transitions"]),):
         raise FileFormatError(
-            f"{path}: screens have shape {screens.shape}, screen_mapping {mapping.shape}; expected (screens, height, width, 3) uint8 "
-            f"and one number a state"
+            f"{path}: screens have shape {screens.shape}, screen_mapping {mapping.shape}; "
+            f"expected (screens, height, width, 3) uint8 and one number a state"
         )
     if mapping.dtype.kind not in "iu" or (mapping < 0).any() or (mapping >= len(screens)).any():
         raise FileFormatError(
@@ -71,7 +74,8 @@ def _members(path: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:
             missing = [name for name in names if name not in stored.files]
             if missing:
                 raise FileFormatError(
-                    f"{path}: lacks {', '.join(missing)}; found {', '.join(stored.files) or 'nothing'}: expected a file of BRIDGE"
+                    f"{path}: lacks {', '.join(missing)}; found {', '.join(stored.files) or 'nothing'}: "
+                    f"expected a file of BRIDGE"
                 )
             return {name: stored[name] for name in names}
     except FileNotFoundError:
@@ -97,8 +101,8 @@ def _horizon(path: Path, given: int | None) -> int:
         raise ParameterError(f"{path}: horizon {given} contradicts its name, which says {named}; leave it out")
     if given is None and named is not None and named > LARGEST_HORIZON:
         raise ParameterError(
-            f"{path}: its name says {named} steps; expected at most {LARGEST_HORIZON}: give a horizon (`--horizon T`) and "
-            f"another name"
+            f"{path}: its name says {named} steps; expected at most {LARGEST_HORIZON}: "
+            f"give a horizon (`--horizon T`) and another name"
         )
     return int(named if given is None else given)  # type: ignore[arg-type]
 

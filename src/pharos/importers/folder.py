@@ -26,7 +26,8 @@ def save(mdp: TabularMDP, folder: str | os.PathLike, *, source: str = "") -> Pat
         folder: made where it is not there; an MDP that lies there is replaced, file by file and the manifest last.
         source: where the MDP comes from, for people.
     Raises:
-        ParameterError: the folder holds something else, or the MDP has sticky or random actions (add them after loading).
+        ParameterError: the folder holds something else, or the MDP has sticky or random actions (add them after
+            loading).
     """
     folder = Path(folder)
     if mdp.is_sticky or mdp.is_random:

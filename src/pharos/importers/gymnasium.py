@@ -18,17 +18,17 @@ def gymnasium(env: Any, *, gamma: float = 0.99, horizon: int | None = None) -> T
     """Return the MDP of an environment with a `P` table, such as FrozenLake, Taxi or CliffWalking.
 
     Args:
-        env: a Gymnasium environment, wrapped or not, or a table P[s][a] = [(probability, next state, reward, terminated), ...].
-            The start distribution is `initial_state_distrib` where there is one, else state 0.
+        env: a Gymnasium environment, wrapped or not, or a table P[s][a] = [(probability, next state, reward,
+            terminated), ...]. The start distribution is `initial_state_distrib` where there is one, else state 0.
         gamma, horizon: of the MDP; Gymnasium's time limit is not taken over.
-            An environment is stepped, as a copy where it can be copied: some have chance that is not in their table, such as
-            Taxi with `fickle_passenger=True`.
+            An environment is stepped, as a copy where it can be copied: some have chance that is not in their table,
+            such as Taxi with `fickle_passenger=True`.
     Returns:
-        A table of next states where every action has one outcome, else a general MDP. A transition that terminates ends the
-        episode after its reward, wherever it leads.
+        A table of next states where every action has one outcome, else a general MDP. A transition that terminates ends
+        the episode after its reward, wherever it leads.
     Raises:
-        FileFormatError: there is no table, states or actions are missing, probabilities do not sum to 1, or the environment
-        does what its table does not say.
+        FileFormatError: there is no table, states or actions are missing, probabilities do not sum to 1, or the
+        environment does what its table does not say.
     """
     inner = getattr(env, "unwrapped", env)
     table = getattr(inner, "P", inner)
@@ -37,7 +37,8 @@ def gymnasium(env: Any, *, gamma: float = 0.99, horizon: int | None = None) -> T
         rows = [[list(table[s][a]) for a in range(actions)] for s in range(states)]
     except (TypeError, KeyError, IndexError) as error:
         raise FileFormatError(
-            f"{env}: has no table P[s][a] with states 0, 1, ... and the same actions everywhere ({type(error).__name__}: {error})"
+            f"{env}: has no table P[s][a] with states 0, 1, ... and the same actions everywhere "
+            f"({type(error).__name__}: {error})"
         ) from None
     next_states = np.full((states, actions), -1, np.int64)
     rewards = np.zeros((states, actions))
@@ -120,8 +121,8 @@ def _compare_with_steps(env: Any, inner: Any, rows: list[list[list]]) -> None:
         following = _state_number(observation, len(rows))
         if (following, float(reward), bool(ended)) not in outcomes[state][action]:
             raise FileFormatError(
-                f"{env}: in state {state}, action {action} led to state {following} with reward {reward}, which its table "
-                f"P[{state}][{action}] does not hold; its chance is not in the table (as that of Taxi with "
+                f"{env}: in state {state}, action {action} led to state {following} with reward {reward}, which its "
+                f"table P[{state}][{action}] does not hold; its chance is not in the table (as that of Taxi with "
                 f"fickle_passenger=True), so the table is another MDP: switch that chance off"
             )
         state = None if ended else following

@@ -1,4 +1,7 @@
-"""MiniGrid: the states of the real environments, enumerated by playing them. Source: Chevalier-Boisvert et al. (2023), "Minigrid & Miniworld"."""
+"""MiniGrid: the states of the real environments, enumerated by playing them.
+
+Source: Chevalier-Boisvert et al. (2023), "Minigrid & Miniworld".
+"""
 
 import io
 import pickle
@@ -43,20 +46,24 @@ def minigrid(
     max_states: int = 1_000_000,
     remember_carried: bool = False,
 ) -> TabularMDP:
-    """Return the MDP of a MiniGrid environment, by stepping the environment itself from every state that can be reached.
+    """Return the MDP of a MiniGrid environment, by stepping the environment from every state that can be reached.
 
-    A state is all that the environment keeps, without the number of steps: grid, objects and what they contain, position, direction,
-    what is carried, and which object is which. Rewards do not shrink with time: what pays more than 0 pays 1, as in BRIDGE. A
-    transition that terminates the episode is -1. State 0 is the start, and states are numbered in the order of their discovery.
+    A state is all that the environment keeps, without the number of steps: grid, objects and what they contain,
+    position, direction, what is carried, and which object is which. Rewards do not shrink with time: what pays more
+    than 0 pays 1, as in BRIDGE. A transition that terminates the episode is -1. State 0 is the start, and states are
+    numbered in the order of their discovery.
 
     Args:
-        env: an environment or its name, such as "MiniGrid-KeyCorridorS3R1-v0". An environment given is reset and left somewhere.
+        env: an environment or its name, such as "MiniGrid-KeyCorridorS3R1-v0". An environment given is reset and left
+            somewhere.
         seed: of the reset that draws the layout.
-        actions: those of the MDP, in their order; None: all of the environment, without `done` where it never does anything.
+        actions: those of the MDP, in their order; None: all of the environment, without `done` where it never does
+            anything.
         gamma, horizon: of the MDP; 100 steps are those of BRIDGE. The environment's own time limit is not taken over.
         max_states: more are an error.
-        remember_carried: each object knows whether it has ever been carried, as in BRIDGE, whose states keep that for rewards of
-            progress; so a key put back where it was is another state, though nothing that can happen from there is different.
+        remember_carried: each object knows whether it has ever been carried, as in BRIDGE, whose states keep that for
+            rewards of progress; so a key put back where it was is another state, though nothing that can happen from
+            there is different.
     Raises:
         MissingExtra: the package minigrid is not installed.
         ParameterError: there is no such environment, it is none of MiniGrid, or an action is none of its own.
@@ -79,8 +86,8 @@ def minigrid_grids(
 ) -> np.ndarray:
     """Return what one sees of each state of `minigrid` with the same arguments, (S, width, height, 3) uint8.
 
-    The whole grid as MiniGrid encodes it (type, colour, condition), with the agent where it stands, its direction as condition: the
-    image of MiniGrid's FullyObsWrapper. What is carried is not to be seen.
+    The whole grid as MiniGrid encodes it (type, colour, condition), with the agent where it stands, its direction as
+    condition: the image of MiniGrid's FullyObsWrapper. What is carried is not to be seen.
 
     Args, errors and cost: as of `minigrid`.
     """
@@ -172,7 +179,8 @@ class _Driver:
             self.env.carrying.has_been_carried = True
         if rng.bit_generator.state != before:
             raise RuleError(
-                f"{self.name}: draws random numbers in state {state} by action {action}; expected one outcome of each action"
+                f"{self.name}: draws random numbers in state {state} by action {action}; "
+                f"expected one outcome of each action"
             )
         return (1.0 if reward > 0 else float(reward)), bool(terminated)
 

@@ -12,7 +12,7 @@ import xxhash
 
 from pharos import storage
 from pharos.errors import DiskFull, StateSpaceCorrupted, StateSpaceLocked
-from pharos.state_space.store import CHECKSUM_BYTES, MANIFEST, digest_of
+from pharos.state_space.manifest import AGAIN, CHECKSUM_BYTES, MANIFEST, digest_of
 
 
 class GrowingFile:
@@ -45,7 +45,7 @@ class GrowingFile:
             self._note(memoryview(block))
         if self.entry()["checksums"] != committed["checksums"] or self.bytes != committed["bytes"]:
             raise StateSpaceCorrupted(
-                f"{self.path}: does not match the checksums of its last checkpoint: it was changed; delete the folder and build again"
+                f"{self.path}: does not match the checksums of its last checkpoint: it was changed; {AGAIN}"
             )
 
     def append(self, rows: np.ndarray) -> None:

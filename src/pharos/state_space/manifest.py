@@ -34,8 +34,8 @@ def read_manifest(folder: Path) -> dict[str, Any] | None:
     """Return the manifest of a folder; None where there is none.
 
     Raises:
-        StateSpaceCorrupted: it is nonsense. StateSpaceMismatch: it is of another version of the format. StateSpaceError: it
-        belongs to something else, such as an imported MDP.
+        StateSpaceCorrupted: it is nonsense. StateSpaceMismatch: it is of another version of the format.
+        StateSpaceError: it belongs to something else, such as an imported MDP.
     """
     path = folder / MANIFEST
     try:
@@ -45,7 +45,8 @@ def read_manifest(folder: Path) -> dict[str, Any] | None:
     if isinstance(manifest, dict) and manifest.get("format") == IMPORTED_FORMAT:
         raise StateSpaceError(
             f"{folder}: holds an imported MDP, a table without an environment; it can be solved, measured and exported "
-            f"(`pharos solve|hardness|export {folder}`, pharos.importers.load), but not built, trained on, played or drawn"
+            f"(`pharos solve|hardness|export {folder}`, pharos.importers.load), but not built, trained on, played or "
+            f"drawn"
         )
     try:
         if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
@@ -114,7 +115,7 @@ def identity_of(env: Environment, layout: Layout | None = None, starts: Starts |
     }
 
 
-# What a manifest says ---------------------------------------------------------------------------------------------------
+# What a manifest says -------------------------------------------------------------------------------------------------
 
 
 def _check(manifest: dict[str, Any]) -> None:

@@ -66,8 +66,10 @@ class StateSpace:
     Attributes:
         environment: the environment, with its parameters; None for a folder whose class pharos does not know.
         folder: where the files are.
-        num_states, num_actions, num_terminal_states, depth: S, A, terminal states, largest distance from the start states.
-        successors: (S, A) int32 (int64 beyond 2^31 states), index of the next state; terminal states lead to themselves.
+        num_states, num_actions, num_terminal_states, depth: S, A, terminal states, largest distance from the start
+            states.
+        successors: (S, A) int32 (int64 beyond 2^31 states), index of the next state; terminal states lead to
+            themselves.
         packed_states: (S, W) uint64, see docs/format.md.
         start_states, start_probabilities: indices and probabilities of the start states.
     """
@@ -99,7 +101,8 @@ class StateSpace:
         """(S, A) int32 or int64, read-only memory map.
 
         Raises:
-            StateSpaceCorrupted: one is no state, or a terminal state does not lead to itself. The first access looks at all.
+            StateSpaceCorrupted: one is no state, or a terminal state does not lead to itself. The first access looks at
+                all.
         """
         path = self.folder / successors_name(self.manifest["arrays"])
         _check_successors(path, self._stored_successors, self.terminal_bits, self.num_terminal_states)
@@ -159,7 +162,10 @@ class StateSpace:
         return bool(self.terminal_bits[i // 8] >> (i % 8) & 1)
 
     def index(self, state: Sequence[int]) -> int:
-        """The number of a state; ParameterError where it is not reachable. The first call indexes all states, in O(S)."""
+        """The number of a state.
+
+        ParameterError where it is not reachable. The first call indexes all states, in O(S).
+        """
         return int(self.indices(np.array([tuple(state)]))[0])
 
     def indices(self, states: np.ndarray) -> np.ndarray:
@@ -198,8 +204,8 @@ class StateSpace:
 
         Args:
             gamma: discount, in [0, 1].
-            rewards: None for the environment's own, computed from the stored transitions; an (S, A) array; or a function
-                reward(self, state, action, next_state) in place of the environment's.
+            rewards: None for the environment's own, computed from the stored transitions; an (S, A) array; or a
+                function reward(self, state, action, next_state) in place of the environment's.
         Cost: the rewards of all S A transitions, 20 to 50 ns each on one core; nothing is built again.
         """
         from pharos.mdp import TabularMDP, rewards_of_space
@@ -237,8 +243,9 @@ def load(folder: str | os.PathLike, *, verify: bool = True, environment: Environ
         verify: compare every file with its checksums (one read of the files, several GB/s); False trusts their lengths.
         environment: whose state space it is; None for what the manifest says, where pharos knows its class.
     Raises:
-        StateSpaceError: there is no state space; StateSpaceIncomplete: its build did not finish; StateSpaceCorrupted: a file
-        is missing, truncated or changed; StateSpaceMismatch: the rules of the environment are not those it was built with.
+        StateSpaceError: there is no state space; StateSpaceIncomplete: its build did not finish; StateSpaceCorrupted: a
+        file is missing, truncated or changed; StateSpaceMismatch: the rules of the environment are not those it was
+        built with.
     """
     folder = Path(folder)
     manifest = read_manifest(folder)
@@ -264,7 +271,7 @@ def load(folder: str | os.PathLike, *, verify: bool = True, environment: Environ
 def check_rules(
     folder: Path, env: Environment, layout: Layout, states: np.ndarray, successors: np.ndarray, bits: np.ndarray
 ) -> None:
-    """StateSpaceMismatch where the rules of `env` disagree with stored transitions, in 64 states spread over the file."""
+    """StateSpaceMismatch where the rules of `env` disagree with the stored transitions of 64 states."""
     chosen = np.unique(np.linspace(0, len(successors) - 1, 64).astype(np.int64))
     _check_range(folder / SUCCESSORS, successors[chosen], len(states), chosen)
     following = unpack(layout, states[successors[chosen].ravel()]).tolist()
@@ -275,16 +282,16 @@ def check_rules(
         stored = [tuple(row) for row in following[n * env.num_actions : (n + 1) * env.num_actions]]
         try:
             ended = bool(env.is_terminal(state))
-            found = [state if ended else env.next_state(state, action) for action in range(env.num_actions)]
+            outcomes = [state if ended else env.next_state(state, action) for action in range(env.num_actions)]
         except Exception as error:
             raise StateSpaceMismatch(
                 f"{folder}: was built with other rules: those of this {env.name} fail in state {state}: {error!r}; "
                 f"build in another folder"
             ) from error
-        if stored != found or ended != bool(bits[i // 8] >> (i % 8) & 1):
+        if stored != outcomes or ended != bool(bits[i // 8] >> (i % 8) & 1):
             raise StateSpaceMismatch(
-                f"{folder}: was built with other rules: from state {state} they lead to {stored}, those of this {env.name} to "
-                f"{found}; build in another folder, and raise `version` when you change rules"
+                f"{folder}: was built with other rules: from state {state} they lead to {stored}, those of this "
+                f"{env.name} to {outcomes}; build in another folder, and raise `version` when you change rules"
             )
 
 
@@ -299,18 +306,20 @@ def _environment_of(folder: Path, manifest: dict[str, Any]) -> Environment | Non
         env = cls(**{name: as_tuples(value) for name, value in manifest["parameters"].items()})
     except Exception as error:  # whatever a class does with parameters that are none of its own
         raise StateSpaceMismatch(
-            f"{folder}: its parameters are not those of this pharos' {manifest['environment']}: {error}; build again"
+            f"{folder}: its parameters are not those of this pharos' {manifest['environment']}: "
+            f"{' '.join(str(error).split())}; build again"
         ) from error
-    found = identity_of(env)
+    identity = identity_of(env)
     for key in ("rules_version", "parameters", "actions", "layout", "start"):
-        if found[key] != manifest[key]:
+        if identity[key] != manifest[key]:
             raise StateSpaceMismatch(
-                f"{folder}: {key} of {env.name} is {manifest[key]} in the folder and {found[key]} in this pharos; build again"
+                f"{folder}: {key} of {env.name} is {manifest[key]} in the folder and {identity[key]} in this pharos; "
+                f"build again"
             )
     return env
 
 
-# What the files hold ----------------------------------------------------------------------------------------------------
+# What the files hold --------------------------------------------------------------------------------------------------
 
 
 def _check_environment(folder: Path, env: Environment, manifest: dict[str, Any]) -> None:

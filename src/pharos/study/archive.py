@@ -1,4 +1,4 @@
-"""The finished runs of a study in one Parquet file, to be kept, published or carried to another machine; without the agents."""
+"""The finished runs of a study, without their agents, in one Parquet file to keep, publish or carry elsewhere."""
 
 import contextlib
 import json
@@ -29,9 +29,9 @@ _AGAIN = "fetch or pack it again"
 def pack(source: Source, folder: str | os.PathLike | None = None, *, file: str | os.PathLike) -> int:
     """Write the finished runs of a study into one Parquet file; return how many.
 
-    A row for each run: `id`; `record`, its run.json; and for each column of curve.parquet a list. Among the metadata of the file
-    are the specification, its digest, and a digest of each run. What agents learnt stays in the folder: some hundred kilobytes a
-    run, where a row takes two.
+    A row for each run: `id`; `record`, its run.json; and for each column of curve.parquet a list. Among the metadata of
+    the file are the specification, its digest, and a digest of each run. What agents learnt stays in the folder: some
+    hundred kilobytes a run, where a row takes two.
 
     Raises:
         ParameterError: no run is finished. OSError: the file cannot be written; an older one then stays as it was.
@@ -69,7 +69,7 @@ def unpack(
     into: Source | None = None,
     trust: bool = False,
 ) -> tuple[Path, int]:
-    """Put the runs of a packed study into a folder, where `run` goes on with those that are missing and `report` reports on all.
+    """Put the runs of a packed study into a folder, for `run` to go on with and for `report` to report on.
 
     Args:
         file: written by `pack`.
@@ -79,8 +79,8 @@ def unpack(
     Returns:
         The folder, and how many runs were added.
     Raises:
-        FileFormatError: not such a file, or a run in it is not one of its study. ParameterError: the folder holds another study.
-        UntrustedCode: the packed study names code, and is not trusted.
+        FileFormatError: not such a file, or a run in it is not one of its study. ParameterError: the folder holds
+            another study. UntrustedCode: the packed study names code, and is not trusted.
     """
     file = Path(file)
     text, table, digests = _read(file)
