@@ -1,5 +1,9 @@
 """Simple and complex images: compiled frames against their interpreted twins, spaces, layers that show, options, errors."""
 
+import copy
+import pickle
+import subprocess
+import sys
 import warnings
 
 import numpy as np
@@ -137,3 +141,36 @@ def test_wrong_options_are_refused_in_one_line(env):
         observe(env, "complex_image", size=84)
     with pytest.raises(ParameterError, match="leave less than one"):
         observe(env, "complex_image", size=(2, 2))
+
+
+@pytest.mark.parametrize("name", ("simple_image", "complex_image"))
+@pytest.mark.parametrize(
+    "copied", (lambda env: pickle.loads(pickle.dumps(env)), copy.deepcopy), ids=("pickle", "deepcopy")
+)
+def test_an_environment_with_images_is_copied_as_it_stands(name, copied):
+    env = GymEnv("freeway", num_cars=6, lane_length=5, observation=name)
+    env.reset(seed=0)
+    for action in (0, 1, 0):
+        env.step(action)
+    other = copied(env)
+    for action in (0, 0, 2, 1):
+        mine, theirs = env.step(action), other.step(action)
+        np.testing.assert_array_equal(mine[0], theirs[0])
+        assert mine[1:4] == theirs[1:4]
+    np.testing.assert_array_equal(env.reset(seed=1)[0], other.reset(seed=1)[0])
+
+
+def test_a_copy_in_another_process_compiles_nothing_anew(tmp_path):
+    env = GymEnv("freeway", num_cars=6, lane_length=5, observation="simple_image")
+    env.reset(seed=0)
+    env.step(0)
+    (tmp_path / "env").write_bytes(pickle.dumps(env))
+    code = (
+        "import pickle, sys\n"
+        f"env = pickle.load(open({str(tmp_path / 'env')!r}, 'rb'))\n"
+        "env.step(0)\n"
+        "kernels = env._step_one, env._step_and_draw\n"
+        "print(sum(sum(kernel.stats.cache_misses.values()) for kernel in kernels))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (0, "0\n"), done.stderr

@@ -294,6 +294,13 @@ def test_a_build_on_disk_killed_again_and_again_leaves_no_table_behind(tmp_path,
     assert_same_files(folder, undisturbed["breakout"])
 
 
+@pytest.mark.parametrize("num_actions", (2, 1000, 3_000_000, 10**8))
+@pytest.mark.parametrize("memory", (1 << 16, 1 << 24, 1 << 34))
+def test_a_chunk_has_whole_bytes_of_terminal_bits_and_candidates_that_int32_can_number(num_actions, memory):
+    rows = table.rows_of_chunk(memory, 2, num_actions)
+    assert rows >= 8 and rows % 8 == 0 and rows * num_actions < 2**31
+
+
 def test_indices_widen_while_the_table_is_on_disk(widened, tmp_path, little_memory, monkeypatch):
     monkeypatch.setattr(search, "INT32_STATES", 5000)
     build(BREAKOUT, tmp_path / "space")
@@ -607,6 +614,40 @@ def test_a_disk_that_is_full_at_any_point_loses_nothing(
         assert (building.read_manifest(folder) or {"num_expanded": 0})["num_expanded"] >= kept
     build(BREAKOUT, folder)
     assert_same_files(folder, undisturbed["breakout"])
+
+
+@pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="files are known by their descriptors")
+def test_data_are_on_the_disk_before_the_manifest_speaks_of_them(tmp_path, small_blocks, monkeypatch):
+    folder = tmp_path / "space"
+    calls = []
+    fsync, replace, append = os.fsync, os.replace, writing.GrowingFile.append
+
+    def noted_fsync(descriptor):
+        calls.append(("sync", Path(os.readlink(f"/proc/self/fd/{descriptor}"))))
+        fsync(descriptor)
+
+    def noted_replace(source, target):
+        calls.append(("replace", Path(target)))
+        replace(source, target)
+
+    def noted_append(self, rows):
+        append(self, rows)
+        calls.append(("append", self.path))
+
+    monkeypatch.setattr(os, "fsync", noted_fsync)
+    monkeypatch.setattr(os, "replace", noted_replace)
+    monkeypatch.setattr(writing.GrowingFile, "append", noted_append)
+    build(BREAKOUT, folder, checkpoint_seconds=0.0)
+    commits = [i for i, call in enumerate(calls) if call == ("replace", folder / "manifest.json")]
+    assert len(commits) > 5
+    for commit in commits:
+        before = calls[:commit]
+        for name in DATA:
+            appended = [i for i, call in enumerate(before) if call == ("append", folder / name)]
+            assert ("sync", folder / name) in before[appended[-1] :] if appended else True, name
+        kind, path = before[-1]  # the new manifest itself
+        assert kind == "sync" and path.parent == folder and storage.is_temporary(path.name)
+        assert calls[commit + 1] == ("sync", folder)  # its name
 
 
 def _hold(env, folder, ready, release):

@@ -355,6 +355,28 @@ def test_a_folder_of_other_rules_is_refused_even_with_the_same_version(other, fo
         build(other, folder)
 
 
+@dataclass(frozen=True, kw_only=True)
+class OneOtherState(Walk):
+    """The same rules, but for one state."""
+
+    changed: int = 0
+
+    @property
+    def parameters(self):
+        return {"length": self.length}
+
+    def transition(self, state, action, out):
+        out[0] = min(max(state[0] + 2 * action - 1, 0), self.length - 1) if state[0] != self.changed else 0
+
+
+@pytest.mark.parametrize("sample", (1, 2, 31, 62))
+def test_each_of_64_states_spread_over_the_file_is_checked(sample, folder):
+    build(Walk(), folder)
+    state = int(np.linspace(0, 999, 64)[sample])
+    with pytest.raises(StateSpaceMismatch, match=rf"was built with other rules: from state \({state},\) they lead to"):
+        pharos.load(folder, environment=OneOtherState(changed=state))
+
+
 def test_a_build_is_not_resumed_with_other_rules(folder, monkeypatch):
     class OtherStart(Walk):
         def transition(self, state, action, out):

@@ -76,6 +76,14 @@ class GymEnv(gymnasium.Env):
         self._is_index = simulator.context.is_plain and isinstance(observation, Index)
         self._successors = simulator.state_space.successors if simulator.state_space is not None else None
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Without compiled functions: where the copy is made they are taken from the cache, not compiled anew."""
+        return {**self.__dict__, "_step_one": None, "_step_and_draw": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._step_one, self._step_and_draw = self.simulator.rules.step_one, _step_and_draw(self.simulator)
+
     @property
     def environment(self) -> Environment:
         """The environment without chance, time limit and observation."""

@@ -35,6 +35,14 @@ class RulesWalk:
         scale = context.observation.scale if self._fused else np.zeros(length)
         self._setting = tuple(simulator.setting(mode, simulator.ranges, scale, simulator.start_states))
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Without compiled functions, as in GymEnv."""
+        return {**self.__dict__, "_step_many": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._step_many = self.simulator.rules.step_many
+
     def states(self, rows: Any) -> np.ndarray:
         return self.current[rows].copy()
 

@@ -10,6 +10,7 @@ Here stands, once, what happens where Numba cannot compile a rule: one warning f
 engine. Whatever the engine, a rule that fails is a RuleError that names the state and the action.
 """
 
+import contextlib
 import warnings
 from collections.abc import Callable
 from functools import cached_property
@@ -27,8 +28,6 @@ from pharos.rules.compiled import (
 )
 from pharos.rules.compiler import reason_of
 from pharos.rules.layout import Layout, layout_of
-from pharos.rules.stepping import InterpretedStepping
-from pharos.rules.traced import TracedExploration, TracedRewards
 
 Engine = TypeVar("Engine")
 
@@ -131,17 +130,29 @@ class Rules:
     @cached_property
     def exploration(self) -> Exploration:
         compiled = compiled_or_none(CompiledExploration, self.env, self.layout)
-        return TracedExploration(self.env, self.layout, self._workers) if compiled is None else compiled
+        if compiled is not None:
+            return compiled
+        from pharos.rules.traced import TracedExploration  # which few need: its kernels take milliseconds to load
+
+        return TracedExploration(self.env, self.layout, self._workers)
 
     @cached_property
     def rewards(self) -> Rewards:
         compiled = compiled_or_none(CompiledRewards, self.env, self.layout)
-        return TracedRewards(self.env, self.layout) if compiled is None else compiled
+        if compiled is not None:
+            return compiled
+        from pharos.rules.traced import TracedRewards
+
+        return TracedRewards(self.env, self.layout)
 
     @cached_property
     def stepping(self) -> Stepping:
         compiled = compiled_or_none(CompiledStepping, self.env)
-        return InterpretedStepping(self.env) if compiled is None else compiled
+        if compiled is not None:
+            return compiled
+        from pharos.rules.stepping import InterpretedStepping
+
+        return InterpretedStepping(self.env)
 
     def drawing(self, kernel: str, interpreted: Callable[..., None], *arguments: Any) -> Callable[..., None]:
         """A function that draws states.
@@ -168,7 +179,8 @@ def rules_of(env: Environment, *, workers: int = 1) -> Rules:
     return Rules(env, workers)
 
 
-_reasons: dict[tuple, str] = {}  # (engine, signature) -> why Numba does not compile it
+# (engine, class) -> signature -> why Numba does not compile it
+_reasons: dict[tuple[Any, type], dict[Any, str]] = {}
 _warned: set[tuple[type, Any]] = set()
 
 
@@ -187,12 +199,18 @@ def not_compiled(reason: str) -> str:
 
 
 def _reason(engine: Callable[..., Engine], env: Environment, *arguments: Any) -> tuple[Engine | None, str]:
-    """The engine, or why there is none."""
-    key: tuple = (engine, type(env), repr(env))
+    """The engine and "", or None and why there is none; what failed to compile once is not tried again."""
+    failed = _reasons.setdefault((engine, type(env)), {})
     try:
-        key = (engine, signature_of(env), tuple(each for each in arguments if isinstance(each, str)))
-        if key not in _reasons:
+        key: Any = (signature_of(env), *(each for each in arguments if isinstance(each, str))) if failed else None
+        if key not in failed:
             return engine(env, *arguments), ""
     except Exception as error:  # Numba raises its own errors, and others from inside of it
-        _reasons[key] = reason_of(error)
-    return None, _reasons[key]
+        return None, _note(failed, env, arguments, reason_of(error))
+    return None, failed[key]
+
+
+def _note(failed: dict[Any, str], env: Environment, arguments: tuple, reason: str) -> str:
+    with contextlib.suppress(Exception):  # of a parameter that cannot be asked for: it is asked for again
+        failed[signature_of(env), *(each for each in arguments if isinstance(each, str))] = reason
+    return reason
