@@ -60,9 +60,9 @@ def shown(env, state):
     return beside(
         {
             "for people": render(env, state),
-            "complex_image, natural": render(env, state, "complex_image", size="natural"),
-            "complex_image": render(env, state, "complex_image"),
-            "simple_image: " + ", ".join(env.layers): render(env, state, "simple_image"),
+            "natural size": render(env, state, "complex_image", size="natural"),
+            "84 x 84": render(env, state, "complex_image"),
+            "planes: " + ", ".join(env.layers): render(env, state, "simple_image"),
         }
     )
 
