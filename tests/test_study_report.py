@@ -173,3 +173,177 @@ def test_the_command_prints_where_the_report_is(written, tmp_path):
     status = subprocess.run([*command[:4], "status", str(written[0])], capture_output=True, text=True)
     assert status.stdout.splitlines()[0] == "lakes: 28 of 30 runs finished, 1 failed"
     assert "ValueError: <no>" in status.stderr
+
+
+# A study of one's own --------------------------------------------------------------------------------------------------
+
+
+def report_of(tmp_path, name="own", change=None, **block):
+    block = {"environments": ["frozen_lake/4x4", "frozen_lake/8x8"], "observations": ["vector", "simple_image"]} | block
+    hardness = {"measures": ["diameter", "sum_of_reciprocal_gaps"], "budget": 5}
+    spec = study.specification(
+        {"name": name, "steps": 400, "evaluations": 4, "seeds": 2, "hardness": hardness, "blocks": [block]}
+    )
+    for run in spec.runs:
+        _worker.attempt(fake_training.train, run.config, run.id, tmp_path)
+    if change is not None:
+        change(spec)
+    report = study.report(spec, tmp_path)
+    return report, read(report.html.read_text())
+
+
+def test_a_study_without_dqn_says_nothing_false_and_has_no_empty_section(tmp_path):
+    report, page = report_of(tmp_path, agents=["ppo", "q_learning"], chance=["plain", {"sticky": 0.25}])
+    text = " ".join(page.text)
+    assert "is known for no instance" not in text and "dqn" not in text
+    assert page.headings == [
+        "Summary", "Regret", "Vector against image", "Hardness and regret", "Hardness of the instances", "Returns", "Instances",
+        "Each instance", "How it was made",
+    ]  # fmt: skip
+    assert "the paper prints" not in text and "Findings" not in text
+    assert "Cumulative regret of PPO" in text and "costs PPO more regret" in text
+    names = {file.stem for file in report.figures}
+    assert {"representations_ppo", "single_model_cumulative", "regret_by_task_frozen_lake"} <= names
+    assert any(file.name == "coefficients_cumulative_regret.csv" for file in report.tables)
+    assert not any("findings" in file.name or "paper" in file.name for file in report.tables)
+
+
+def test_each_agent_that_sees_observations_has_models(tmp_path):
+    report, page = report_of(tmp_path, agents=["ppo", "a2c"], environments=["frozen_lake/4x4"])
+    text = " ".join(page.text)
+    assert "Cumulative regret of PPO" in text and "Cumulative regret of a2c" in text
+    assert {"representations_ppo", "representations_a2c"} <= {file.stem for file in report.figures}
+    assert {"coefficients_cumulative_regret.csv", "coefficients_cumulative_regret_a2c.csv"} <= {
+        file.name for file in report.tables
+    }
+
+
+def test_what_has_no_run_is_not_measured_and_the_cost_is_told_beforehand(tmp_path):
+    block = {"environments": ["frozen_lake/4x4", "frozen_lake/8x8"], "agents": ["q_learning"]}
+    spec = study.specification({"name": "half", "hardness": {"measures": ["diameter"], "budget": 7}, "blocks": [block]})
+    run = spec.runs[0]
+    _worker.attempt(fake_training.train, run.config, run.id, tmp_path)
+    told = []
+    study.report(spec, tmp_path, progress=told.append)
+    assert [line for line in told if "hardness of" in line] == [
+        "hardness of 1 instances and kinds of chance: at most 7 s, and building",
+        "hardness of frozen_lake/4x4, plain",
+    ]
+    assert len(list(tmp_path.glob("hardness/*.json"))) == 1
+    assert len(study.hardness_table(spec, tmp_path)) == 2
+
+
+def test_curves_of_each_kind_of_chance_have_a_line_for_each_seed():
+    import pandas as pd
+
+    from pharos.study.figures import regret_curves
+
+    columns = ["instance", "chance", "agent", "observation", "id", "step", "cumulative_expected_regret"]
+    rows = [
+        ("a", chance, "ppo", "vector", f"{chance}{seed}", step, seed + step)
+        for chance in ("plain", "sticky 0.25")
+        for seed in range(3)
+        for step in (1, 2)
+    ]
+    figure = regret_curves(pd.DataFrame(rows, columns=columns), by=["instance", "chance"], seeds=True)
+    axes = [axis for axis in figure.axes if axis.get_visible()]
+    assert [axis.get_title() for axis in axes] == ["a, plain", "a, sticky 0.25"]
+    assert [len(axis.lines) for axis in axes] == [1 + 3, 1 + 3]
+
+
+def test_estimated_regret_is_marked_and_its_half_width_stands_in_the_summary(tmp_path):
+    def estimate(spec):
+        import pandas as pd
+
+        run = spec.runs[0]
+        file = tmp_path / "runs" / run.id / "curve.parquet"
+        pd.read_parquet(file).assign(exact=False, error_bound=0.05).to_parquet(file)
+
+    report, page = report_of(tmp_path, change=estimate, agents=["ppo"])
+    text = " ".join(page.text)
+    assert "The regret of 1 run of 8 is estimated by playing" in text and "PPO on frozen lake (1)" in text
+    assert "≈ 0." in text
+    runs = next(file for file in report.tables if file.name == "runs.csv").read_text().splitlines()
+    cells = next(file for file in report.tables if file.name == "cells.csv").read_text().splitlines()
+    for lines in (runs, cells):
+        exact = lines[0].split(",").index("exact")
+        assert [line.split(",")[exact] for line in lines[1:]].count("False") == 1
+        assert "half_width" in lines[0].split(",")
+
+
+def test_damaged_runs_are_named_in_the_report_and_absurd_numbers_do_not_stop_it(tmp_path):
+    def damage(spec):
+        for run, change in zip(spec.runs, ({"seconds": 1e308}, {"cumulative_regret": -1e300}), strict=False):
+            file = tmp_path / "runs" / run.id / "run.json"
+            record = json.loads(file.read_text())
+            record["seconds"] = change.pop("seconds", 0.5)
+            record["result"] |= change
+            file.write_text(json.dumps(record))
+
+    report, page = report_of(tmp_path, change=damage, agents=["ppo"])
+    assert "Damaged, counted as missing:" in " ".join(page.text)
+    assert any("seconds are 1e+308" in note for note in report.notes)
+    assert any("cumulative_regret is -1e+300" in note for note in report.notes)
+
+
+def test_texts_that_a_spreadsheet_would_run_are_escaped_and_numbers_stay_numbers():
+    import pandas as pd
+
+    from pharos.study.report.files import spreadsheet_safe
+
+    texts = ["=HYPERLINK(1)", "+1+cmd", "-1+cmd", "@SUM(A1)", "\tx", "\rx", "plain", "-5", None]
+    data = pd.DataFrame({"=cmd|calc": texts, "number": [-1.5] * 9})
+    safe = spreadsheet_safe(data)
+    assert list(safe.columns) == ["'=cmd|calc", "number"]
+    assert safe.iloc[:, 0].tolist()[:8] == [*("'" + text for text in texts[:6]), "plain", "-5"]
+    assert (safe["number"] == -1.5).all() and safe["number"].dtype == float
+
+
+def test_received_records_reach_the_tables_without_formulas(tmp_path):
+    def inject(spec):
+        file = tmp_path / "runs" / spec.runs[0].id / "run.json"
+        record = json.loads(file.read_text())
+        record["result"] |= {"=cmd|' /C calc'!A0": 1.0, "note": "=HYPERLINK(0)"}
+        file.write_text(json.dumps(record))
+
+    report, _ = report_of(tmp_path, change=inject, agents=["ppo"])
+    text = next(file for file in report.tables if file.name == "runs.csv").read_text()
+    assert "'=cmd" in text and "'=HYPERLINK" in text
+    assert ",=" not in text and "\n=" not in text
+
+
+def test_the_page_escapes_whatever_a_study_says(tmp_path):
+    block = {"environments": ["frozen_lake/4x4"], "agents": ["q_learning"], "seeds": 1}
+    spec = study.specification(
+        {"name": "x", "description": "<script>alert(1)</script>", "blocks": [block], "steps": 10}
+    )
+    _worker.attempt(fake_training.train, spec.runs[0].config, spec.runs[0].id, tmp_path)
+    page = study.report(spec, tmp_path).html.read_text()
+    assert "<script" not in page and "&lt;script&gt;" in page
+
+
+def test_states_that_share_an_image_are_counted(tmp_path):
+    import numpy as np
+
+    from pharos import build, make, observe
+    from pharos.study.aliasing import aliasing
+
+    env = make("breakout", height=7, columns=4, brick_rows=1)
+    space = build(env, progress=False)
+    image = aliasing(space, observe(env, "simple_image"))
+    assert (image.num_states, image.num_observations) == (1658, 1068)
+    assert round(100 * image.share, 1) == 62.5
+    assert aliasing(space, observe(env, "vector")).share == 0
+    pixels = observe(env, "simple_image")(space.states())
+    _, counts = np.unique(pixels.reshape(len(pixels), -1), axis=0, return_counts=True)
+    assert image.num_sharing == counts[counts > 1].sum()
+
+
+def test_a_report_says_which_images_hide_something(tmp_path):
+    small = {"name": "breakout", "parameters": {"height": 7, "columns": 4, "brick_rows": 1}}
+    report, page = report_of(tmp_path, agents=["ppo"], environments=[small, "frozen_lake/4x4"])
+    text = " ".join(page.text)
+    assert "States that share an observation" in page.headings and "62.5 %" in text
+    assert len(list(tmp_path.glob("aliasing/*.json"))) == 4
+    aliasing = next(file for file in report.tables if file.name == "aliasing.csv").read_text()
+    assert ",1658,1068,0.62" in aliasing and ",1658,1658,0.0" in aliasing

@@ -46,6 +46,10 @@ class Models:
     class_alone: float | None = None
     agent: str = "dqn"
 
+    def suffix(self, first: str) -> str:
+        """What the names of this agent's files end with; nothing for the first agent of a study."""
+        return "" if self.agent == first else "_" + "".join(c if c.isalnum() else "_" for c in self.agent)
+
     def get(self, model: str, subset: str) -> Fit | None:
         """One of the fits."""
         return next((found for found in self.fits if (found.model, found.subset) == (model, subset)), None)

@@ -24,6 +24,7 @@ CHANCE_MARKERS = {"plain": "o", "random": "^", "sticky": "s"}
 LINES = {"q_learning": "-", "dqn": "-", "ppo": "--"}
 NAMES = {"q_learning": "tabular Q-learning", "dqn": "DQN", "ppo": "PPO"}
 OBSERVATIONS = {TABULAR_OBSERVATION: "", VECTOR: "vector", IMAGE: "image"}
+OTHER_IMAGE = "complex_image"
 DPI = 120
 
 
@@ -42,7 +43,17 @@ def style(dark: bool) -> dict[str, Any]:
 def label(agent: str, observation: str) -> str:
     """`DQN, image`, `tabular Q-learning`."""
     seen = OBSERVATIONS.get(observation, observation)
-    return f"{NAMES.get(agent, agent)}, {seen}" if seen else NAMES.get(agent, agent)
+    return f"{agent_name(agent)}, {seen}" if seen else agent_name(agent)
+
+
+def agent_name(agent: str) -> str:
+    """`DQN`; of an algorithm from a module or a file, the name of its class."""
+    return NAMES.get(agent, agent.rpartition(":")[2])
+
+
+def slug(name: str) -> str:
+    """A name as part of a file's name."""
+    return "".join(c if c.isalnum() else "_" for c in name)
 
 
 def title(name: str) -> str:
@@ -57,20 +68,28 @@ def class_color(name: str, names: Sequence[str]) -> str:
     return own.get(name) or MORE_COLORS[others.index(name) % len(MORE_COLORS)]
 
 
-def regret_curves(points: "pd.DataFrame", *, by: str = "environment") -> "Figure":
-    """Cumulative expected regret by steps: a panel for each class (or instance), a line for each agent and observation.
+def regret_curves(
+    points: "pd.DataFrame", *, by: str | list[str] = "environment", seeds: bool = False, resamples: int = 500
+) -> "Figure":
+    """Cumulative expected regret by steps: a panel for each class (or instance, or task), a line for each agent and observation.
 
-    The mean over instances and kinds of chance, with its 95 % bootstrap interval over runs. The paper's figure 2.
+    The mean over instances and kinds of chance, with its 95 % bootstrap interval over runs; with `seeds` a thin line for each run
+    as well. The paper's figure 2.
     """
-    groups = list(points.groupby(by, sort=False))
+    groups = [
+        (name if isinstance(name, str) else ", ".join(map(str, name)), part)
+        for name, part in points.groupby(by, sort=False)
+    ]
     figure, axes = _panels(len(groups), 3.3, 2.7)
     for axis, (name, part) in zip(axes, groups, strict=False):
         for (agent, observation), lines in part.groupby(["agent", "observation"], sort=True):
             steps, tasks = _tasks(lines)
-            mean, lower, upper = mean_curve(tasks)
+            mean, lower, upper = mean_curve(tasks, resamples=resamples)
             color = OBSERVATION_COLORS.get(observation, MORE_COLORS[0])
             axis.plot(steps, mean, LINES.get(agent, ":"), color=color, lw=1.6, label=label(agent, observation))
             axis.fill_between(steps, lower, upper, color=color, alpha=0.18, lw=0)
+            for run in np.concatenate(tasks) if seeds else ():
+                axis.plot(steps, run, LINES.get(agent, ":"), color=color, lw=0.5, alpha=0.5)
         axis.set_title(title(str(name)))
         axis.set_xlabel("steps")
         axis.set_ylim(bottom=min(0.0, axis.get_ylim()[0]))
@@ -95,24 +114,47 @@ def _tasks(lines: "pd.DataFrame") -> tuple[np.ndarray, list[np.ndarray]]:
     return by_run.columns.to_numpy(), tasks
 
 
-def representations(cells: "pd.DataFrame", *, agent: str = "dqn") -> "Figure | None":
+def pairs_of(cells: "pd.DataFrame", agents: Sequence[str]) -> list[tuple[str, str]]:
+    """(agent, image) where some task has cells of the agent with that image and with a vector."""
+    pairs = []
+    for agent in agents:
+        own = cells[cells["agent"] == agent]
+        wide = own.pivot_table(index=["instance", "chance"], columns="observation", values="normalized_regret")
+        for seen in (IMAGE, OTHER_IMAGE):
+            if {seen, VECTOR} <= set(wide.columns) and len(wide[[seen, VECTOR]].dropna()):
+                pairs.append((agent, seen))
+    return pairs
+
+
+def representations_figure(agent: str, seen: str) -> str:
+    """The name of the figure of `representations`."""
+    parts = ["representations", *([] if agent == "dqn" else [slug(agent)]), *([] if seen == IMAGE else [slug(seen)])]
+    return "_".join(parts)
+
+
+def agents_figure(one: str, two: str) -> str:
+    """The name of the figure of two agents."""
+    return "agents" if (one, two) == ("dqn", "ppo") else f"agents_{slug(one)}_{slug(two)}"
+
+
+def representations(cells: "pd.DataFrame", *, agent: str = "dqn", seen: str = IMAGE) -> "Figure | None":
     """Normalised regret with a vector against that with an image, a point for each task. The paper's figure 3."""
     wide = cells[cells["agent"] == agent].pivot_table(
         index=["environment", "instance", "chance"], columns="observation", values="normalized_regret"
     )
-    if not {IMAGE, VECTOR} <= set(wide.columns):
+    if not {seen, VECTOR} <= set(wide.columns):
         return None
-    wide = wide[[IMAGE, VECTOR]].dropna().reset_index()
+    wide = wide[[seen, VECTOR]].dropna().reset_index()
     names = list(dict.fromkeys(wide["environment"]))
     figure, (axis,) = _panels(1, 4.6, 4.2)
     for (environment, chance), part in wide.groupby(["environment", wide["chance"].str.split().str[0]], sort=True):
         marker = CHANCE_MARKERS.get(chance, "D")
         color = class_color(environment, names)
-        axis.scatter(part[IMAGE], part[VECTOR], s=34, color=color, marker=marker, alpha=0.85, lw=0)
-    low, high = min(0.0, wide[[IMAGE, VECTOR]].min().min()), max(1.0, wide[[IMAGE, VECTOR]].max().max())
+        axis.scatter(part[seen], part[VECTOR], s=34, color=color, marker=marker, alpha=0.85, lw=0)
+    low, high = min(0.0, wide[[seen, VECTOR]].min().min()), max(1.0, wide[[seen, VECTOR]].max().max())
     axis.plot([low, high], [low, high], ":", color="#888888", lw=1.2)
-    axis.set(xlabel=f"normalised regret of {NAMES.get(agent, agent)} with an image", aspect="equal")
-    axis.set_ylabel(f"normalised regret of {NAMES.get(agent, agent)} with a vector")
+    axis.set(xlabel=f"normalised regret of {agent_name(agent)} with an image", aspect="equal")
+    axis.set_ylabel(f"normalised regret of {agent_name(agent)} with a vector")
     for name in names:
         axis.scatter([], [], color=class_color(name, names), label=title(name))
     for chance in dict.fromkeys(wide["chance"].str.split().str[0]):
@@ -159,28 +201,37 @@ def agents_against_each_other(cells: "pd.DataFrame", value: str, agents: tuple[s
         axis.scatter(
             part[agents[0]], part[agents[1]], s=28, color=color, alpha=0.8, lw=0, label=title(str(environment))
         )
-    axis.set_xlabel(f"{REGRETS.get(value, value)} of {NAMES.get(agents[0], agents[0])}")
-    axis.set_ylabel(f"{REGRETS.get(value, value)} of {NAMES.get(agents[1], agents[1])}")
+    axis.set_xlabel(f"{REGRETS.get(value, value)} of {agent_name(agents[0])}")
+    axis.set_ylabel(f"{REGRETS.get(value, value)} of {agent_name(agents[1])}")
     axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
     return figure
 
 
 def all_figures(
-    rows: "pd.DataFrame", points: "pd.DataFrame", cells: "pd.DataFrame", found: Sequence[Models]
+    points: "pd.DataFrame", cells: "pd.DataFrame", models: Sequence[Models], agents: Sequence[str]
 ) -> dict[str, Callable[[], "Figure | None"]]:
-    """Name -> function that draws it."""
+    """Name -> function that draws it; fits are drawn for the first agent."""
     drawn: dict[str, Callable[[], Figure | None]] = {
         "regret": lambda: regret_curves(points),
         "regret_by_instance": lambda: regret_curves(points, by="instance"),
-        "representations": lambda: representations(cells),
     }
-    for models in found:
-        name = models.regret.removesuffix("_regret")
+    for environment, part in points.groupby("environment", sort=False):
+        by_task = partial(regret_curves, part, by=["instance", "chance"], seeds=True, resamples=200)
+        drawn[f"regret_by_task_{slug(str(environment))}"] = by_task
+    for agent, seen in pairs_of(cells, agents):
+        drawn[representations_figure(agent, seen)] = partial(representations, cells, agent=agent, seen=seen)
+    for each in models:
+        if each.agent != models[0].agent:
+            continue
+        name = each.regret.removesuffix("_regret")
         kinds = {"single": "single_model", "representation": "representation_models", "class": "class_models"}
         for kind, file in kinds.items():
-            fits = [fit for fit in models.fits if fit.model == kind]
-            drawn[f"{file}_{name}"] = partial(_fits, fits, REGRETS[models.regret])
-    drawn["agents"] = lambda: agents_against_each_other(cells, "normalized_regret", ("dqn", "ppo"))
+            fits = [fit for fit in each.fits if fit.model == kind]
+            drawn[f"{file}_{name}"] = partial(_fits, fits, REGRETS[each.regret])
+    for i, one in enumerate(agents):
+        for two in agents[i + 1 :]:
+            both = partial(agents_against_each_other, cells, "normalized_regret", (one, two))
+            drawn[agents_figure(one, two)] = both
     return drawn
 
 

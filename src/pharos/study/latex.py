@@ -1,5 +1,6 @@
-"""The tables of a study in LaTeX, in the paper's layout (packages booktabs, multirow, makecell)."""
+"""The tables of a study in LaTeX, in the paper's layout (packages booktabs, multirow), by pandas' Styler."""
 
+import re
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -10,85 +11,89 @@ from pharos.study.analysis import IMAGE, VECTOR, Models
 if TYPE_CHECKING:
     import pandas as pd
 
-COLUMNS = (("ppo", IMAGE), ("ppo", VECTOR), ("dqn", IMAGE), ("dqn", VECTOR))  # as the paper orders them
+# As the paper orders them
+COLUMNS = (("ppo", IMAGE), ("ppo", VECTOR), ("dqn", IMAGE), ("dqn", VECTOR))
+TITLES = {"ppo": "PPO", "dqn": "DQN", IMAGE: "IMAGE", VECTOR: "MINIMAL"}
 CHANCES = {"plain": "None", "random": "random", "sticky": "stick"}
 
 
-def tables_of(cells: "pd.DataFrame", measured: "pd.DataFrame", found: Sequence[Models]) -> dict[str, str]:
-    """Name -> LaTeX: the returns of each class, hardness, and the fits for each kind of regret."""
+def tables_of(cells: "pd.DataFrame", measured: "pd.DataFrame", models: Sequence[Models]) -> dict[str, str]:
+    """Name -> LaTeX: the returns of each class, hardness, and the fits for each agent and kind of regret."""
     tables = {
         f"returns_{environment}": returns_table(cells, environment)
         for environment in dict.fromkeys(cells["environment"])
     }
     tables["hardness"] = hardness_table(measured)
-    for models in found:
-        tables[f"models_{models.regret}"] = models_table(models)
+    for each in models:
+        tables[f"models_{each.regret}{each.suffix(models[0].agent)}"] = models_table(each)
     return tables
 
 
 def returns_table(cells: "pd.DataFrame", environment: str) -> str:
     """The table of one class as in appendix C: PPO and DQN, IMAGE and MINIMAL (the vector), three lines an instance."""
+    import pandas as pd
+
     part = cells[cells["environment"] == environment]
-    values = {
-        (row["instance"], row["chance"], row["agent"], row["observation"]): (row["return"], row["return_deviation"])
-        for row in part.to_dict("records")
-    }
-    lines = [
-        r"\begin{tabular}{llcccc}",
-        r"\toprule",
-        r" & & \multicolumn{2}{c}{PPO} & \multicolumn{2}{c}{DQN} \\",
-        r"\makecell[l]{environment\\parameter} & randomization & IMAGE & MINIMAL & IMAGE & MINIMAL \\",
-        r"\midrule",
-    ]
-    instances = list(dict.fromkeys(part["instance"]))
-    for instance in instances:
-        chances = list(dict.fromkeys(part.loc[part["instance"] == instance, "chance"]))
-        for i, chance in enumerate(chances):
-            name = rf"\multirow[c]{{{len(chances)}}}{{*}}{{{{\small {escape(instance)}}}}}" if i == 0 else ""
-            entries = (_entry(values.get((instance, chance, *column))) for column in COLUMNS)
-            kind = CHANCES.get(chance.split()[0], chance) if "," not in chance else chance
-            lines.append(f"{name} & {escape(kind)} & {' & '.join(entries)} \\\\")
-        lines.append(r"\cline{1-6}" if instance != instances[-1] else r"\bottomrule")
-    return "\n".join([*lines, r"\end{tabular}", ""])
+    rows: dict[tuple[str, str], dict[tuple[str, str], str]] = {}
+    for row in part.to_dict("records"):
+        kind = row["chance"] if "," in row["chance"] else CHANCES.get(row["chance"].split()[0], row["chance"])
+        name = rf"{{\small {escape(row['instance'])}}}"
+        entries = rows.setdefault((name, escape(kind)), {})
+        entries[row["agent"], row["observation"]] = _entry(row["return"], row["return_deviation"])
+    columns = pd.MultiIndex.from_tuples([(TITLES[agent], TITLES[seen]) for agent, seen in COLUMNS])
+    index = pd.MultiIndex.from_tuples(list(rows), names=["instance", "randomization"])
+    data = [[entries.get(column, "--") for column in COLUMNS] for entries in rows.values()]
+    return _latex(pd.DataFrame(data, index, columns), "llcccc", multirow_align="c", clines="skip-last;data")
 
 
 def hardness_table(measured: "pd.DataFrame") -> str:
     """The measures of each instance under each kind of chance."""
     names = [name for name in measured.columns if name not in ("environment", "instance", "chance", "notes")]
-    lines = [
-        rf"\begin{{tabular}}{{ll{'r' * len(names)}}}",
-        r"\toprule",
-        " & ".join(["instance", "chance", *(escape(name.replace("_", " ")) for name in names)]) + r" \\",
-        r"\midrule",
-    ]
-    for row in measured.to_dict("records"):
-        numbers = ("--" if row[name] is None or not np.isfinite(row[name]) else f"{row[name]:.6g}" for name in names)
-        lines.append(" & ".join([escape(row["instance"]), escape(row["chance"]), *numbers]) + r" \\")
-    return "\n".join([*lines, r"\bottomrule", r"\end{tabular}", ""])
+    texts = measured[["instance", "chance"]].map(escape)
+    numbers = measured[names].map(lambda x: "--" if x is None or not np.isfinite(x) else f"{x:.6g}")
+    table = texts.join(numbers).rename(columns=lambda name: escape(name.replace("_", " ")))
+    return _latex(table, "ll" + "r" * len(names), is_indexed=False)
 
 
 def models_table(models: Models) -> str:
     """The fits: rows, R2 within and outside the sample."""
-    lines = [
-        r"\begin{tabular}{llrrrr}",
-        r"\toprule",
-        r"model & of & rows & $R^2$ & adjusted & outside \\",
-        r"\midrule",
-    ]
+    import pandas as pd
+
+    names = ["model", "of", "rows", "$R^2$", "adjusted", "outside"]
+    lines = []
     for fit in models.fits:
         numbers = (f"{value:.2f}" for value in (fit.r_squared, fit.adjusted_r_squared, fit.cross_validated_r_squared))
-        lines.append(" & ".join([fit.model, escape(fit.subset), str(fit.num_rows), *numbers]) + r" \\")
-    return "\n".join([*lines, r"\bottomrule", r"\end{tabular}", ""])
+        lines.append([fit.model, escape(fit.subset), str(fit.num_rows), *numbers])
+    return _latex(pd.DataFrame(lines, columns=names), "llrrrr", is_indexed=False)
 
 
 def escape(text: str) -> str:
     """Text as LaTeX prints it."""
-    for letter in "&%$#_{}":
-        text = text.replace(letter, "\\" + letter)
-    return text
+    special = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
+    return "".join(special.get(letter, "\\" + letter if letter in "&%$#_{}" else letter) for letter in text)
 
 
-def _entry(value: tuple[float, float] | None) -> str:
-    if value is None or not np.isfinite(value[0]):
+def _latex(
+    data: "pd.DataFrame",
+    column_format: str,
+    *,
+    is_indexed: bool = True,
+    multirow_align: str = "c",
+    clines: str | None = None,
+) -> str:
+    """A frame of LaTeX texts as a tabular."""
+    styler = data.style if is_indexed else data.style.hide(axis="index")
+    text = styler.to_latex(
+        hrules=True,
+        column_format=column_format,
+        multicol_align="c",
+        multirow_align=multirow_align,
+        clines=clines,
+    )
+    return re.sub(r" +", " ", text)
+
+
+def _entry(mean: float, deviation: float) -> str:
+    if not np.isfinite(mean):
         return "--"
-    return rf"${value[0]:.2f}$" if np.isnan(value[1]) else rf"${value[0]:.2f} \pm {value[1]:.2f}$"
+    return rf"${mean:.2f}$" if np.isnan(deviation) else rf"${mean:.2f} \pm {deviation:.2f}$"

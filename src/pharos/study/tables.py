@@ -5,7 +5,7 @@ A cell is one agent on one instance under one kind of chance with one observatio
 
 import json
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
     from pharos.mdp import TabularMDP
 
+PLAIN = {"sticky": 0.0, "random": 0.0}
 CELL = ["environment", "instance", "chance", "agent", "observation"]
 # A proven interval enters as one number if its upper end is at most so many times its lower end
 WIDEST = 2
@@ -183,16 +184,23 @@ def _described(run: Run) -> dict[str, Any]:
 
 
 def hardness_table(
-    source: Source, folder: str | os.PathLike | None = None, *, progress: Callable[[str], None] | None = None
+    source: Source,
+    folder: str | os.PathLike | None = None,
+    *,
+    progress: Callable[[str], None] | None = None,
+    tasks: Container[tuple[str, str]] | None = None,
 ) -> "pd.DataFrame":
     """The measures of every instance under every kind of chance; computed once, and kept in the folder `hardness`.
 
+    Args:
+        tasks: (instance, chance) of those that are wanted; None for all.
     Returns:
         Columns `environment`, `instance`, `chance`; each measure as a number; `num_states`; and `notes`: where a measure is
         undefined or unknown, where it is the geometric mean of a proven interval (whose ends differ by a factor of at most two),
         and where it is that of the instance without chance, because the measure does not exist, or cannot be computed within
         the budget, under this chance.
-    Cost: a state space and a report of hardness for each row, each measure at most the budget of the specification.
+    Cost: a state space and a report of hardness for each row, each measure at most the budget of the specification;
+        `hardness_cost` tells beforehand.
     """
     import pandas as pd
 
@@ -200,16 +208,31 @@ def hardness_table(
     rows: dict[tuple[str, str], dict[str, Any]] = {}
     for run in study.runs:
         key = (run.instance, run.chance)
-        if key in rows:
+        if key in rows or (tasks is not None and key not in tasks):
             continue
         if progress is not None:
             progress(f"hardness of {run.instance}, {run.chance}")
-        plain = {**run.config, "chance": {"sticky": 0.0, "random": 0.0}}
+        plain = {**run.config, "chance": PLAIN}
         own = _measured(study, place, run.config)
         without = _measured(study, place, plain) if run.chance != "plain" else own
         rows[key] = {"environment": run.config["environment"], "instance": run.instance, "chance": run.chance}
         rows[key] |= _chosen(study.hardness.measures, own, without)
     return pd.DataFrame(list(rows.values()))
+
+
+def hardness_cost(study: Specification, place: Path, tasks: Container[tuple[str, str]]) -> tuple[int, float]:
+    """How many instances and kinds of chance `hardness_table` has to measure, and the seconds that this takes at most.
+
+    Building the state spaces comes on top.
+    """
+    missing: dict[Path, int] = {}
+    for run in study.runs:
+        if (run.instance, run.chance) in tasks:
+            for config in (run.config, {**run.config, "chance": PLAIN}):
+                asked, file = _asked(study, place, config)
+                stored = _stored(file, asked) or {"measures": {}}
+                missing[file] = sum(name not in stored["measures"] for name in study.hardness.measures)
+    return sum(number > 0 for number in missing.values()), sum(missing.values()) * study.hardness.budget
 
 
 def _chosen(names: Sequence[str], own: Mapping[str, Any], plain: Mapping[str, Any]) -> dict[str, Any]:
@@ -235,13 +258,18 @@ def _usable(measure: dict[str, Any]) -> dict[str, Any]:
     return {"value": None, "why": f"only {measure['lower']:g} to {measure['upper']:g} is proven within the budget"}
 
 
-def _measured(study: Specification, place: Path, config: Mapping[str, Any]) -> dict[str, Any]:
+def _asked(study: Specification, place: Path, config: Mapping[str, Any]) -> tuple[dict[str, Any], Path]:
+    """What the measures of a run's task depend on, and the file that keeps them."""
     import xxhash
 
     asked = {name: config[name] for name in ("environment", "parameters", "chance", "horizon")}
     asked["gamma"] = study.hardness.gamma
     key = xxhash.xxh3_64_hexdigest(json.dumps(asked, sort_keys=True).encode())
-    file = place / "hardness" / f"{key}.json"
+    return asked, place / "hardness" / f"{key}.json"
+
+
+def _measured(study: Specification, place: Path, config: Mapping[str, Any]) -> dict[str, Any]:
+    asked, file = _asked(study, place, config)
     stored = _stored(file, asked) or {**asked, "measures": {}, "num_states": None}
     missing = [name for name in study.hardness.measures if name not in stored["measures"]]
     if missing:

@@ -1,0 +1,13 @@
+"""The report of a study: one HTML file that needs nothing else, its figures as PNG and PDF, its tables as CSV and LaTeX.
+
+results.py    everything a report is made of, read and computed once: `Results`
+sections.py   what each section says; a section that has nothing to say is left out
+page.py       the HTML page, by the templates beside it
+files.py      the tables, and `report`, which writes it all
+"""
+
+from pharos.study.report.files import StudyReport, report
+from pharos.study.report.page import number
+from pharos.study.report.results import Results, coefficients, results_of
+
+__all__ = ["Results", "StudyReport", "coefficients", "number", "report", "results_of"]

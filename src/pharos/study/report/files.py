@@ -1,0 +1,116 @@
+"""Makes a report: the page, the figures and the tables."""
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pharos.storage import replace_file
+from pharos.study.figures import all_figures, save
+from pharos.study.latex import tables_of
+from pharos.study.report.page import render
+from pharos.study.report.results import Results, coefficients, results_of
+from pharos.study.report.sections import sections_of
+from pharos.study.specification import Source
+from pharos.study.status import opened
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+FORMULA = ("=", "+", "-", "@", "\t", "\r")
+
+
+@dataclass(frozen=True)
+class StudyReport:
+    """What was written.
+
+    Attributes:
+        html: the file to open.
+        figures, tables: other files.
+        notes: what is left out of the report, and why.
+    """
+
+    html: Path
+    figures: Sequence[Path]
+    tables: Sequence[Path]
+    notes: Sequence[str]
+
+
+def report(
+    source: Source,
+    folder: str | os.PathLike | None = None,
+    *,
+    out: str | os.PathLike | None = None,
+    progress: Callable[[str], None] | None = None,
+    trust: bool | None = None,
+) -> StudyReport:
+    """Make the paper's figures and tables of the runs that are finished.
+
+    Args:
+        source: YAML file, preset, mapping, Specification, the folder of a study, or the name of one in `studies`.
+        folder: of the results; None for that folder, or studies/NAME.
+        out: folder to write to; None for `report` in the folder of the study.
+        progress: called with what is being done.
+        trust: whether code that the study names may be imported; as for `specification`.
+    Raises:
+        ParameterError: no run is finished.
+    Cost: the measures of hardness of what has finished runs, once, each at most its budget; then seconds.
+    """
+    tell = progress or (lambda _: None)
+    study, place = opened(source, folder, trust=trust)
+    results = results_of(study, place, tell)
+    target = Path(out) if out is not None else place / "report"
+    target.mkdir(parents=True, exist_ok=True)
+    figures = {}
+    for name, draw in all_figures(results.points, results.cells, results.models, results.agents).items():
+        tell(f"drawing {name}")
+        figures[name] = save(draw, target / "figures" / name)
+    tables = _write_tables(target / "tables", results)
+    tell("drawing instances")
+    page = render(f"Study {study.name}", study.description, sections_of(results, figures))
+    replace_file(target / "report.html", page)
+    drawn = [
+        target / "figures" / f"{name}.{kind}" for name, images in figures.items() if images for kind in ("png", "pdf")
+    ]
+    return StudyReport(target / "report.html", drawn, tables, results.notes)
+
+
+def _write_tables(folder: Path, results: Results) -> list[Path]:
+    folder.mkdir(parents=True, exist_ok=True)
+    tables = {"runs": results.runs, "cells": results.cells, "hardness": results.hardness}
+    tables |= {"aliasing": results.aliasing, "intervals": results.intervals}
+    if results.comparison is not None and results.findings is not None:
+        tables |= {"paper_returns": results.comparison.returns, "paper_regressions": results.comparison.regressions}
+        tables["findings"] = results.findings
+    first = results.models[0].agent
+    for models in results.models:
+        tables[f"coefficients_{models.regret}{models.suffix(first)}"] = coefficients(models)
+    written = []
+    for name, data in tables.items():
+        replace_file(folder / f"{name}.csv", spreadsheet_safe(data).to_csv(index=False))
+        written.append(folder / f"{name}.csv")
+    for name, text in tables_of(results.cells, results.hardness, results.models).items():
+        replace_file(folder / f"{name}.tex", text)
+        written.append(folder / f"{name}.tex")
+    return written
+
+
+def spreadsheet_safe(data: "pd.DataFrame") -> "pd.DataFrame":
+    """The same table, in which no text begins as a formula of a spreadsheet does; numbers stay numbers."""
+    safe = data.rename(columns=_no_formula)
+    for name in safe.columns:
+        if safe[name].dtype.kind not in "fiub":
+            safe[name] = safe[name].map(_no_formula)
+    return safe
+
+
+def _no_formula(value: Any) -> Any:
+    """Text that a spreadsheet would run gets an apostrophe, which spreadsheets take for "this is text"."""
+    if not isinstance(value, str) or not value.startswith(FORMULA):
+        return value
+    try:
+        float(value)
+    except ValueError:
+        return "'" + value
+    return value

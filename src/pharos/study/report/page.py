@@ -1,0 +1,121 @@
+"""The HTML page: data as the templates want them, and the rendering. Templates escape whatever they print."""
+
+import base64
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    import jinja2
+    import pandas as pd
+
+    from pharos.study.report.sections import Section
+
+Figures = Mapping[str, Mapping[str, bytes] | None]
+# A column of texts up to this long is not broken over lines
+SHORT = 30
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of a table: its title, and its kind: n of numbers, s of short texts, t of texts."""
+
+    title: str
+    kind: str
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table whose cells are texts."""
+
+    caption: str
+    columns: Sequence[Column]
+    rows: Sequence[Sequence[str]]
+
+
+@dataclass(frozen=True)
+class Image:
+    """A figure for light and for dark pages, as data URLs; its name is that of its file."""
+
+    name: str
+    caption: str
+    light: str
+    dark: str
+
+
+def render(title: str, description: str, sections: "Sequence[Section]") -> str:
+    """The page as text."""
+    return _templates().get_template("page.html.j2").render(title=title, description=description, sections=sections)
+
+
+@cache
+def _templates() -> "jinja2.Environment":
+    try:
+        import jinja2
+    except ImportError as error:
+        from pharos.errors import MissingExtra
+
+        raise MissingExtra("the report of a study", "jinja2", "study") from error
+    return jinja2.Environment(
+        loader=jinja2.PackageLoader("pharos.study.report"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        keep_trailing_newline=True,
+    )
+
+
+def image(figures: Figures, name: str, caption: str) -> Image | None:
+    """A figure with its caption; None where it was not drawn."""
+    drawn = figures.get(name)
+    return None if not drawn else Image(name, caption, data_url(drawn["light"]), data_url(drawn["dark"]))
+
+
+def data_url(png: bytes) -> str:
+    """A picture as a URL that holds it."""
+    return "data:image/png;base64," + base64.b64encode(png).decode()
+
+
+def table(data: "pd.DataFrame", caption: str = "", *, digits: int = 3) -> Table:
+    """A frame as a table: numbers short and to the right, whole ones without digits."""
+    columns, digits_of = [], []
+    for name in data.columns:
+        is_number = data[name].dtype.kind in "fiu"
+        longest = data[name].astype(str).str.len().max() if len(data) else 0
+        kind = "n" if is_number else "s" if longest <= SHORT else "t"
+        columns.append(Column(str(name).replace("_", " "), kind))
+        digits_of.append(0 if is_number and _is_whole(data[name].to_numpy(float)) else digits)
+    rows = [
+        [_cell(value, places) for value, places in zip(line, digits_of, strict=True)]
+        for line in data.itertuples(index=False)
+    ]
+    return Table(caption, columns, rows)
+
+
+def _is_whole(values: np.ndarray) -> bool:
+    finite = values[np.isfinite(values)]
+    return bool((finite == np.round(finite)).all())
+
+
+def _cell(value: Any, digits: int) -> str:
+    if value is None or (isinstance(value, float) and not np.isfinite(value)):
+        return "–"
+    if isinstance(value, bool | np.bool_):
+        return "yes" if value else "no"
+    if isinstance(value, float | np.floating):
+        return number(float(value), digits)
+    if isinstance(value, int | np.integer):
+        return f"{value:,}"
+    return str(value)
+
+
+def number(value: float, digits: int = 3) -> str:
+    """A number for people: digits after the point, thousands separated, small and huge ones with a power of ten."""
+    if digits > 0 and value != 0 and not 10.0**-digits <= abs(value) < 1e7:
+        return f"{value:.{max(1, digits - 1)}e}"
+    if abs(value) >= 1000:
+        return f"{value:,.0f}"
+    return f"{value:.{digits}f}"

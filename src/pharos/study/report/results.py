@@ -1,0 +1,127 @@
+"""Everything that a report is made of, in one object."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pharos.agents import TABULAR_OBSERVATION
+from pharos.study.aliasing import aliasing_table
+from pharos.study.analysis import REGRETS, Comparison, Models, compare, intervals, models
+from pharos.study.findings import findings
+from pharos.study.specification import Specification
+from pharos.study.status import Status, duration, status
+from pharos.study.tables import cells, finished_runs, hardness_cost, hardness_table, paper_instance
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+PAPER_AGENTS = ("dqn", "ppo")
+
+
+@dataclass(frozen=True)
+class Results:
+    """What is known of a study.
+
+    Attributes:
+        study, status: what was to be run, and how far it is.
+        runs, points: a row for each finished run, and for each of its evaluations.
+        damaged: what is wrong with results that cannot be read, by id.
+        hardness: a row for each instance and kind of chance that has finished runs.
+        aliasing: a row for each instance and observation that was counted.
+        cells: means over seeds, with hardness.
+        models: of each agent that sees observations, for both kinds of regret; the first agent's first.
+        intervals: of the normalised regret of each class, agent and observation.
+        comparison, findings: beside the paper; None where the study is not the paper's.
+    """
+
+    study: Specification
+    status: Status
+    runs: "pd.DataFrame"
+    points: "pd.DataFrame"
+    damaged: Mapping[str, str]
+    hardness: "pd.DataFrame"
+    aliasing: "pd.DataFrame"
+    cells: "pd.DataFrame"
+    models: Sequence[Models]
+    intervals: "pd.DataFrame"
+    comparison: Comparison | None
+    findings: "pd.DataFrame | None"
+
+    @property
+    def agents(self) -> list[str]:
+        """Agents that see observations, DQN first; those that see the index of the state have no models."""
+        return observing_agents(self.runs)
+
+    @property
+    def notes(self) -> list[str]:
+        """What is left out of the report, and why."""
+        return list(dict.fromkeys([*self.damaged.values(), *(note for each in self.models for note in each.notes)]))
+
+
+def results_of(study: Specification, place: Path, progress: Callable[[str], None] = lambda _: None) -> Results:
+    """Read the results of a study, and compute what its report says of them.
+
+    Only instances and kinds of chance that have finished runs are measured.
+
+    Raises:
+        ParameterError: no run is finished.
+    """
+    progress("reading results")
+    done = finished_runs(study, place)
+    tasks = set(zip(done.runs["instance"], done.runs["chance"], strict=True))
+    number, seconds = hardness_cost(study, place, tasks)
+    if number:
+        progress(f"hardness of {number} instances and kinds of chance: at most {duration(seconds)}, and building")
+    hardness = hardness_table(study, place, progress=progress, tasks=tasks)
+    sizes = dict(zip(hardness["instance"], hardness["num_states"].astype(float), strict=True))
+    aliasing = aliasing_table(study, place, sizes, progress)
+    table = cells(done.runs, hardness)
+    progress("fitting models")
+    agents = observing_agents(done.runs) or [PAPER_AGENTS[0]]
+    fitted = [
+        models(table, agent=agent, regret=regret, measures=study.hardness.predictors)
+        for agent in agents
+        for regret in REGRETS
+    ]
+    of_the_paper = is_of_the_paper(study)
+    return Results(
+        study=study,
+        status=status(study, place),
+        runs=done.runs,
+        points=done.points,
+        damaged=done.damaged,
+        hardness=hardness,
+        aliasing=aliasing,
+        cells=table,
+        models=fitted,
+        intervals=intervals(done.runs),
+        comparison=compare(table, study.runs, fitted[: len(REGRETS)]) if of_the_paper else None,
+        findings=findings(table, fitted[0]) if of_the_paper else None,
+    )
+
+
+def observing_agents(runs: "pd.DataFrame") -> list[str]:
+    """The agents of a study that see observations, those of the paper first."""
+    seen = list(dict.fromkeys(runs.loc[runs["observation"] != TABULAR_OBSERVATION, "agent"]))
+    return sorted(seen, key=lambda agent: PAPER_AGENTS.index(agent) if agent in PAPER_AGENTS else len(PAPER_AGENTS))
+
+
+def is_of_the_paper(study: Specification) -> bool:
+    """Whether every instance is one of the paper's appendix C, and its agents are there."""
+    agents = {run.config["agent"] for run in study.runs}
+    return set(PAPER_AGENTS) <= agents and all(
+        paper_instance(run.config["environment"], run.config["parameters"]) is not None for run in study.runs
+    )
+
+
+def coefficients(models: Models) -> "pd.DataFrame":
+    """All coefficients of all fits: one row each."""
+    import pandas as pd
+
+    parts = [
+        fit.coefficients.reset_index(names="predictor").assign(model=fit.model, subset=fit.subset)
+        for fit in models.fits
+    ]
+    columns = ["model", "subset", "predictor", "estimate", "standard_error", "p_value", "lower", "upper"]
+    return pd.concat(parts)[columns] if parts else pd.DataFrame(columns=columns)

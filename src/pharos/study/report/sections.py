@@ -1,0 +1,434 @@
+"""What each section of the page says; None where it has nothing to say. Texts only: the templates make HTML of them."""
+
+import io
+import platform
+import time
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pharos.study.analysis import IMAGE, REGRETS, VECTOR, Models, agreement, paper_agreement
+from pharos.study.figures import agent_name, agents_figure, label, pairs_of, representations_figure, slug, title
+from pharos.study.latex import returns_table
+from pharos.study.regression import Fit
+from pharos.study.report.page import Figures, data_url, image, table
+from pharos.study.report.results import Results, coefficients
+from pharos.study.specification import Specification
+from pharos.study.status import duration
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+PICTURE_PIXELS = 220
+
+
+@dataclass(frozen=True)
+class Section:
+    """A section of the page: its title, the template that prints it, and what that needs, by name."""
+
+    title: str
+    template: str
+    context: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def anchor(self) -> str:
+        """Where links lead to."""
+        return self.title.lower().replace(" ", "-")
+
+    def __getitem__(self, name: str) -> Any:
+        return self.context[name]
+
+
+def sections_of(results: Results, figures: Figures) -> list[Section]:
+    """The sections of the page, in order; those that have something to say."""
+    left_out: list[str] = []
+    sections = [
+        _summary(results),
+        _findings(results),
+        _regret(results, figures),
+        _representations(results, figures, left_out),
+        _aliasing(results),
+        _models(results, figures, left_out),
+        _agreement(results, figures, left_out),
+        _hardness(results),
+        _returns(results),
+        _beside(results),
+        _instances(results.study),
+        _each_instance(results, figures),
+        _made(results, left_out),
+    ]
+    return [section for section in sections if section is not None]
+
+
+def _section(name: str, template: str, **context: Any) -> Section:
+    return Section(name, f"{template}.html.j2", context)
+
+
+def _many(count: int, one: str, several: str | None = None) -> str:
+    return f"{count:,} {one if count == 1 else several or one + 's'}"
+
+
+def _summary(results: Results) -> Section:
+    now, runs = results.status, results.runs
+    failed = f", {now.failed} failed" if now.failed else ""
+    lines = [
+        f"{now.finished:,} of {now.total:,} runs are finished{failed}: {_many(runs['instance'].nunique(), 'instance')} of "
+        f"{_many(runs['environment'].nunique(), 'class', 'classes')}, {_many(runs['chance'].nunique(), 'kind')} of chance, "
+        f"{_many(runs['agent'].nunique(), 'agent')}, {_many(runs['seed'].nunique(), 'seed')}; "
+        f"{int(runs['steps'].sum()):,} steps, which took one processor {duration(runs['seconds'].sum())}."
+    ]
+    if (estimated := _estimated(runs)) is not None:
+        lines.append(estimated)
+    main = results.models[0].get("single", "all")
+    if main is not None:
+        printed = "; the paper prints 0.09" if results.comparison is not None else ""
+        lines.append(
+            f"One linear model of {agent_name(results.models[0].agent)}'s cumulative regret over all classes and representations "
+            f"explains R² = {main.r_squared:.2f} of it ({main.cross_validated_r_squared:.2f} for tasks it has not seen){printed}."
+        )
+    if results.comparison is not None:
+        returns = results.comparison.returns
+        known = int(returns["ours"].notna().sum())
+        lines.append(f"{known} of the {len(returns)} returns that the paper prints have their counterpart here.")
+    missing = (
+        f"{_many(now.missing, 'run')} missing: every number below is of the runs that are there." if now.missing else ""
+    )
+    errors = [f"{count} × {error}" for error, count in Counter(now.errors.values()).items()]
+    damaged = list({**now.damaged, **results.damaged}.values())
+    return _section("Summary", "summary", lines=lines, missing=missing, errors=errors, damaged=damaged)
+
+
+def _estimated(runs: "pd.DataFrame") -> str | None:
+    """Which regret is an estimate, and how wrong it may be."""
+    estimates = runs[~runs["exact"].astype(bool)]
+    if len(estimates) == 0:
+        return None
+    groups = estimates.groupby(["environment", "agent"], sort=True).size()
+    of = ", ".join(f"{agent_name(agent)} on {title(name)} ({count})" for (name, agent), count in groups.items())
+    return (
+        f"The regret of {_many(len(estimates), 'run')} of {len(runs):,} is estimated by playing, because the policy reaches too "
+        f"many states for an exact value: {of}. Their normalised regret may be off by up to ± {estimates['half_width'].max():.4f} "
+        f"if all errors of a run add up; tables mark them by ≈. All other regret is exact."
+    )
+
+
+def _findings(results: Results) -> Section | None:
+    if results.findings is None:
+        return None
+    decided = results.findings[results.findings["verdict"] != "no data"]
+    if len(decided) == 0:
+        return None
+    counts = ", ".join(f"{number} {verdict}" for verdict, number in decided["verdict"].value_counts().items())
+    return _section(
+        "Findings of the paper",
+        "findings",
+        counts=f"{len(decided)} of {len(results.findings)} can be looked at here: {counts}.",
+        table=table(
+            decided,
+            "What the paper says in words, and the same from these runs. Undecided: not significant at 0.05; no correction for the "
+            "number of tests. Every test counts a task once. How each is tested: docs/study.md.",
+        ),
+    )
+
+
+def _regret(results: Results, figures: Figures) -> Section:
+    estimates = results.intervals
+    exact = results.runs.groupby(["environment", "agent", "observation"])["exact"].all()
+    keys = zip(estimates["environment"], estimates["agent"], estimates["observation"], strict=True)
+    marks = ["" if exact[key] else "≈ " for key in keys]
+    shown = estimates.assign(
+        iqm=[f"{mark}{value:.3f}" for mark, value in zip(marks, estimates["iqm"], strict=True)],
+        interval=[
+            f"{low:.3f} to {high:.3f}" if np.isfinite(low) else "one run a task"
+            for low, high in zip(estimates["lower"], estimates["upper"], strict=True)
+        ],
+    )
+    columns = ["environment", "agent", "observation", "tasks", "runs", "iqm", "interval"]
+    return _section(
+        "Regret",
+        "regret",
+        figure=image(
+            figures,
+            "regret",
+            "Cumulative regret by steps (lower is better), the mean over instances and kinds of chance with the 95 % bootstrap "
+            "interval over seeds. The paper's figure 2.",
+        ),
+        table=table(
+            shown[columns],
+            "Interquartile mean of the normalised regret (0: optimal from the first episode on; 1: as bad as acting at random) and "
+            "its 95 % stratified bootstrap interval. With few seeds such intervals are too narrow. ≈: some values are estimated.",
+        ),
+    )
+
+
+def _representations(results: Results, figures: Figures, left_out: list[str]) -> Section | None:
+    parts = []
+    for agent, seen in pairs_of(results.cells, results.agents):
+        wide = results.cells[results.cells["agent"] == agent].pivot_table(
+            index=["environment", "instance", "chance"], columns="observation", values="normalized_regret"
+        )
+        wide = wide[[seen, VECTOR]].dropna()
+        harder = (wide[seen] > wide[VECTOR]).groupby(level="environment").agg(["sum", "size"])
+        lines = [
+            f"{title(str(name))}: the {title(seen) if seen != IMAGE else 'image'} costs {agent_name(agent)} more regret in "
+            f"{row['sum']} of {row['size']} tasks"
+            for name, row in harder.iterrows()
+        ]
+        caption = (
+            f"Normalised regret of {agent_name(agent)} that sees a vector against that of {agent_name(agent)} that sees an image, "
+            f"a point for each instance and kind of chance. Below the dotted line the image is harder."
+        )
+        if results.comparison is not None and agent == "dqn":
+            caption += " The paper's figure 3."
+        parts.append({"figure": image(figures, representations_figure(agent, seen), caption), "lines": lines})
+    if not parts:
+        left_out.append(
+            "Vector against image: there are no cells of DQN with both a vector and an image, nor of another agent."
+        )
+        return None
+    paper = ""
+    if results.comparison is not None:
+        paper = "The paper finds the image harder in simple grid and frozen lake, the vector harder in freeway and breakout."
+    return _section("Vector against image", "representations", parts=parts, paper=paper)
+
+
+def _aliasing(results: Results) -> Section | None:
+    shared = results.aliasing[results.aliasing["share"] > 0]
+    if len(shared) == 0:
+        return None
+    shown = shared.assign(share=[f"{100 * share:.1f} %" for share in shared["share"]])
+    return _section(
+        "States that share an observation",
+        "aliasing",
+        text="These observations do not tell every state: an agent that remembers nothing cannot act differently in states that look "
+        "alike, and learns from targets that mix them. Regret is measured against the optimal policy of the states. So where "
+        "vectors and images are compared, a part of the difference may be this.",
+        table=table(
+            shown,
+            "Reachable states, different observations among them, and the share of states that look like another.",
+        ),
+    )
+
+
+def _models(results: Results, figures: Figures, left_out: list[str]) -> Section | None:
+    if not results.agents:
+        left_out.append("Hardness and regret: tabular agents, which see the state itself, have no models.")
+        return None
+    return _section(
+        "Hardness and regret", "models", parts=[_models_of(models, results, figures) for models in results.models]
+    )
+
+
+def _models_of(models: Models, results: Results, figures: Figures) -> dict[str, Any]:
+    import pandas as pd
+
+    paper = results.comparison is not None and models.agent == "dqn"
+    what = REGRETS[models.regret]
+    heading = f"{what.capitalize()} of {agent_name(models.agent)}"
+    fits = pd.DataFrame([_line(fit) for fit in models.fits])
+    caption = (
+        "Ordinary least squares, section 4.3 of the paper: equations 7 (single), 8 (representation) and 9 (class). R² outside is "
+        "for each task by the model fitted on the others; the condition number is that of the standardised predictors, above 30 the "
+        "coefficients cannot be told apart; influence is the largest Cook's distance. Significant: p < 0.05, a task counted once."
+    )
+    values = {
+        "class and representation alone, without measures": models.class_alone,
+        "representation models together": models.representation_r_squared,
+        "class models together": models.class_r_squared,
+        "classes that the model has not seen": models.leave_one_class_out,
+    }
+    suffix = models.suffix(results.models[0].agent)
+    drawn = []
+    for kind, number in (("single_model", 4), ("representation_models", 5), ("class_models", 6)):
+        text = f"Fitted against actual {what}, {kind.replace('_', ' ')}."
+        text += f" The paper's figure {number}." if paper else ""
+        drawn.append(image(figures, f"{kind}_{models.regret.removesuffix('_regret')}{suffix}", text))
+    return {
+        "title": heading,
+        "table": table(fits, caption) if models.fits else None,
+        "together": [f"R² of {name}: {value:.2f}" for name, value in values.items() if value is not None],
+        "figures": [each for each in drawn if each is not None],
+        "coefficients": table(coefficients(models), digits=4) if models.fits else None,
+        "notes": list(models.notes),
+    }
+
+
+def _line(fit: Fit) -> dict[str, Any]:
+    significant = [
+        _predictor(str(name)) for name, p in fit.coefficients["p_value"].items() if p < 0.05 and name != "Intercept"
+    ]
+    return {
+        "model": fit.model,
+        "of": fit.subset,
+        "rows": fit.num_rows,
+        "R²": fit.r_squared,
+        "adjusted": fit.adjusted_r_squared,
+        "outside": fit.cross_validated_r_squared,
+        "condition": fit.condition_number,
+        "influence": float(np.nanmax(fit.influence)) if np.isfinite(fit.influence).any() else float("nan"),
+        "significant": ", ".join(significant) or "none",
+        "left out": ", ".join(fit.dropped),
+    }
+
+
+def _predictor(name: str) -> str:
+    """`np.log(diameter)` -> `log diameter`, `C(environment)[T.freeway]` -> `freeway`."""
+    if name.startswith("C("):
+        return name.split("[T.")[1].rstrip("]")
+    return name.replace("np.log(", "log ").rstrip(")")
+
+
+def _agreement(results: Results, figures: Figures, left_out: list[str]) -> Section | None:
+    lines, drawn = [], []
+    for i, one in enumerate(results.agents):
+        for two in results.agents[i + 1 :]:
+            for value in ("return", "normalized_regret", "cumulative_regret"):
+                if (pair := agreement(results.cells, value, (one, two))) is not None:
+                    names = f"{agent_name(one)} and {agent_name(two)}, {REGRETS.get(value, value)}"
+                    lines.append(f"{names}: r = {pair[0]:.2f} over {pair[1]} cells")
+            caption = f"Normalised regret of {agent_name(two)} against that of {agent_name(one)}."
+            drawn.append(image(figures, agents_figure(one, two), caption))
+    if not lines:
+        left_out.append(
+            "Agreement of agents: there are fewer than three cells that both DQN and PPO have, or two other agents."
+        )
+        return None
+    text = "Pearson correlation of agents over instances, kinds of chance and observations"
+    if results.comparison is not None:
+        text += "; the paper prints 0.81 for DQN and PPO, and the returns that it prints in appendix C give "
+        text += f"{paper_agreement():.2f}"
+    return _section(
+        "Agreement of agents",
+        "agreement",
+        text=text + ".",
+        lines=lines,
+        figures=[each for each in drawn if each is not None],
+    )
+
+
+def _hardness(results: Results) -> Section:
+    counted = results.aliasing
+    complete = ""
+    if len(counted) and not (counted["share"] > 0).any():
+        complete = "No two states share an observation, on any instance and for any observation that was counted."
+    return _section(
+        "Hardness of the instances",
+        "hardness",
+        table=table(
+            results.hardness,
+            "The tabular measures of each instance under each kind of chance, as they enter the models; notes say where one is of the "
+            "instance without chance, or stands for a proven interval.",
+        ),
+        complete=complete,
+    )
+
+
+def _returns(results: Results) -> Section:
+    """Returns of each class; those of the paper's agents in LaTeX below."""
+    parts = []
+    for environment in dict.fromkeys(results.cells["environment"]):
+        part = results.cells[results.cells["environment"] == environment]
+        latex = returns_table(results.cells, environment) if set(part["agent"]) & {"dqn", "ppo"} else ""
+        parts.append({"title": title(environment), "table": table(_wide_returns(part)), "latex": latex})
+    return _section("Returns", "returns", parts=parts)
+
+
+def _wide_returns(part: "pd.DataFrame") -> "pd.DataFrame":
+    import pandas as pd
+
+    lines: dict[tuple[str, str], dict[str, Any]] = {}
+    columns = sorted(
+        {(row.agent, row.observation) for row in part.itertuples()}, key=lambda key: (key[0] != "ppo", *key)
+    )
+    for row in part.to_dict("records"):
+        line = lines.setdefault(
+            (row["instance"], row["chance"]), {"instance": row["instance"], "chance": row["chance"]}
+        )
+        deviation = f" ± {row['return_deviation']:.2f}" if row["seeds"] > 1 else ""
+        line[label(row["agent"], row["observation"])] = f"{row['return']:.2f}{deviation}"
+    names = [label(*key) for key in columns]
+    return pd.DataFrame(list(lines.values()), columns=["instance", "chance", *names]).fillna("")
+
+
+def _beside(results: Results) -> Section | None:
+    """Our numbers beside those of the paper, where there are both."""
+    if results.comparison is None:
+        return None
+    ours = [name for name in results.comparison.regressions.columns if name.startswith("ours_")]
+    fits = results.comparison.regressions.dropna(subset=ours, how="all")
+    fits = fits.drop(columns=["r_squared", "significant_predictors_as_printed"])
+    fits = fits.rename(columns={name: name.replace("_", ", ") for name in fits.columns})
+    returns = results.comparison.returns[results.comparison.returns["ours"].notna()]
+    if len(fits) == len(returns) == 0:
+        return None
+    text = (
+        f"Returns: {len(returns)} of {len(results.comparison.returns)} printed values have one of ours; the difference is "
+        f"{returns['difference'].mean():+.2f} in the mean, and {returns['difference'].abs().median():.2f} in the middle case. The "
+        f"paper trains 50 thousand steps on grids and lakes, else 600 thousand; it prints no rewards, discounts, probabilities of "
+        f"chance, or what of a run its returns are means of: differences are to be expected."
+    )
+    caption = "R² and correlation: printed, ours, and the difference, for both kinds of regret."
+    return _section(
+        "Beside the paper",
+        "beside",
+        regressions=table(fits, caption) if len(fits) else None,
+        text=text if len(returns) else "",
+        title_of_returns=f"All {len(returns)} values",
+        returns=table(returns.drop(columns=["parameters_as_printed"]), digits=2),
+    )
+
+
+def _instances(study: Specification) -> Section | None:
+    pictures = [{"name": name, "data": data_url(png)} for name, png in _pictures(study).items()]
+    return _section("Instances", "instances", pictures=pictures) if pictures else None
+
+
+def _pictures(study: Specification) -> dict[str, bytes]:
+    """Instance -> PNG of its start state; environments that draw nothing are left out."""
+    from PIL import Image
+
+    from pharos.drawing import human
+    from pharos.environments import start_distribution
+    from pharos.errors import PharosError
+
+    pictures: dict[str, bytes] = {}
+    for run in study.runs:
+        if run.instance in pictures:
+            continue
+        try:
+            environment = run.configuration.make_environment()
+            picture = Image.fromarray(human(environment, start_distribution(environment)[0][0], cell=16))
+        except PharosError:
+            continue
+        picture.thumbnail((PICTURE_PIXELS * 2, PICTURE_PIXELS * 2))
+        buffer = io.BytesIO()
+        picture.save(buffer, format="PNG", optimize=True)
+        pictures[run.instance] = buffer.getvalue()
+    return pictures
+
+
+def _each_instance(results: Results, figures: Figures) -> Section:
+    parts = []
+    for environment in dict.fromkeys(results.runs["environment"]):
+        caption = (
+            f"Cumulative regret on each instance of {title(environment)} under each kind of chance: the mean, its 95 % bootstrap "
+            f"interval, and thin a line for each seed."
+        )
+        drawn = image(figures, f"regret_by_task_{slug(environment)}", caption)
+        parts.append({"title": f"{title(environment)}, each kind of chance and each seed", "figure": drawn})
+    text = "Cumulative regret on each instance, all kinds of chance together."
+    return _section("Each instance", "each_instance", figure=image(figures, "regret_by_instance", text), parts=parts)
+
+
+def _made(results: Results, left_out: Sequence[str]) -> Section:
+    import yaml
+
+    import pharos
+
+    made = time.strftime("%Y-%m-%d %H:%M", time.gmtime())
+    facts = f"pharos {pharos.__version__}, Python {platform.python_version()}, {made} UTC"
+    text = yaml.safe_dump(results.study.model_dump(mode="json", exclude_unset=True), sort_keys=False, width=100)
+    return _section("How it was made", "made", facts=facts, left_out=list(left_out), specification=text)
