@@ -58,9 +58,22 @@ def test_another_seed_agent_or_observation_shares_them(config):
     assert _values.kept({**config, "seed": 7, "agent": "dqn", "observation": "vector", "steps": 9}) == found
 
 
+@pytest.mark.parametrize(
+    "change", [lambda text: text.replace("0.", "0.1", 1), lambda text: text[:40], lambda text: "[" * 9999]
+)
+def test_stored_values_that_were_changed_are_solved_again(change, config):
+    values = _values.solve(config)
+    file = _values._file(config)
+    text = file.read_text()
+    start = text.index('"values"')
+    file.write_text(text[:start] + change(text[start:]) if "values" in change(text) else change(text))
+    assert _values.kept(config) is None
+    assert _values.solve(config) == values == _values.kept(config)
+
+
 def test_values_of_other_rules_are_not_taken(config, monkeypatch):
     _values.solve(config)
-    monkeypatch.setattr("pharos.rules.fingerprint.fingerprint_of_rules", lambda env, names: "other")
+    monkeypatch.setattr("pharos.rules.fingerprint_of_rules", lambda env, names: "other")
     assert _values.kept(config) is None
 
 

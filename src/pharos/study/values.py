@@ -9,7 +9,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pharos.storage import replace_json
+from pharos.errors import FileFormatError
+from pharos.storage import is_intact, read_json, replace_json, sealed
 
 if TYPE_CHECKING:
     from pharos.experiments import Task
@@ -32,17 +33,19 @@ def solve(config: Mapping[str, Any]) -> dict[str, Any]:
         values = TaskValues(task.reference, task.return_range).to_dict()
         file = _file(config)
         file.parent.mkdir(parents=True, exist_ok=True)
-        replace_json(file, {"task": _key(config), "values": values})
+        replace_json(file, sealed({"task": _key(config), "values": values}))
     return values
 
 
 def kept(config: Mapping[str, Any]) -> dict[str, Any] | None:
-    """What `solve` found before for these rules."""
+    """The stored values for these rules; None where there are none, or where the file was changed."""
     try:
-        said = json.loads(_file(config).read_text(encoding="utf-8"))
-    except (FileNotFoundError, ValueError):
+        stored = read_json(_file(config))
+    except (FileNotFoundError, FileFormatError):
         return None
-    return said["values"] if said.get("task") == _key(config) else None
+    if not isinstance(stored, dict) or not is_intact(stored) or stored.get("task") != _key(config):
+        return None
+    return stored.get("values")
 
 
 def _file(config: Mapping[str, Any]) -> Path:
