@@ -1,8 +1,9 @@
 """Code of the user's own: a class or a function that is named as `module:Name` or `file.py:Name`.
 
-A name in a command or a script of the user is trusted: `load(find(name))` imports it. A name in a file that somebody else may have
-written (a run.json, a study's folder, a packed study) is not: `resolve` returns what this process has already imported under that
-name, and imports nothing by itself unless it is told to trust the file.
+A name in a command or a script of the user is trusted: `load(find(name))` imports it. A name in a file that somebody
+    else may have
+written (a run.json, a study's folder, a packed study) is not: `resolve` returns what this process has already imported
+under that name, and imports nothing by itself unless it is told to trust the file.
 """
 
 import importlib
@@ -147,7 +148,8 @@ def resolve(source: Source, *, trust: bool = False, strict: bool = False) -> Any
         return loaded[1]
     if not trust:
         raise UntrustedCode(
-            f"{source} is code, which is executed only if you trust it: add --trust (in Python: trust=True), or name it yourself"
+            f"{source} is code, which is executed only if you trust it: add --trust (in Python: trust=True), "
+            f"or name it yourself"
         )
     now = source
     if not Path(source.file).is_file():

@@ -1,8 +1,8 @@
 """Algorithms of Stable-Baselines3 on tasks of pharos: the same network everywhere, apart from what extracts features.
 
-Vectors go through one hidden layer, images through one convolution and one hidden layer (the network of MinAtar: Young and
-Tian, 2019), both to 128 features; then follows one hidden layer. So a difference between observations is one between
-representations, not between networks (the pharos paper, section 4.2).
+Vectors go through one hidden layer, images through one convolution and one hidden layer (the network of MinAtar: Young
+and Tian, 2019), both to 128 features; then follows one hidden layer. So a difference between observations is one
+between representations, not between networks (the pharos paper, section 4.2).
 """
 
 import importlib
@@ -31,7 +31,7 @@ ALGORITHMS = {"dqn": "stable_baselines3:DQN", "ppo": "stable_baselines3:PPO", "a
 
 
 def algorithm(agent: str | type) -> type:
-    """The class of an algorithm: "dqn", "ppo", "a2c", or "module:Class" or "file.py:Class" for any other; or a class itself.
+    """The class of an algorithm: "dqn", "ppo", "a2c", "module:Class" or "file.py:Class"; or a class itself.
 
     Raises:
         UnknownName: no such name or class. ParameterError: no such module or file.
@@ -63,7 +63,8 @@ def check_hyperparameters(agent: str | type, hyperparameters: Mapping[str, Any])
     """Refuse hyperparameters that the algorithm lacks, and values that it would accept silently or fail with late.
 
     Raises:
-        UnknownName: with the nearest name that it has. ParameterError: a number out of its range, or something else for one.
+        UnknownName: with the nearest name that it has. ParameterError: a number out of its range, or something else for
+            one.
     """
     name = _title(agent)
     taken = inspect.signature(algorithm(agent)).parameters
@@ -83,7 +84,7 @@ def _title(agent: str | type) -> str:
 
 
 def _expected(name: str, value: Any) -> str | None:
-    """What a hyperparameter should be where `value` is not that; schedules and other things than numbers and words pass."""
+    """What a hyperparameter should be where `value` is not that; schedules and the like pass."""
     if not isinstance(value, int | float | str):
         return None
     number = value if not isinstance(value, bool | str) else math.nan
@@ -119,9 +120,11 @@ def make_model(
     Args:
         agent: as for `algorithm`.
         env: a VecEnv of Stable-Baselines3.
-        hyperparameters: of the algorithm; `net_arch` for the layers after the features; `n_envs` and `n_timesteps` are left out.
+        hyperparameters: of the algorithm; `net_arch` for the layers after the features; `n_envs` and `n_timesteps` are
+            left out.
     Raises:
-        ParameterError: the algorithm does not know a hyperparameter (`check_hyperparameters` says so better), or does not fit the environment.
+        ParameterError: the algorithm does not know a hyperparameter (`check_hyperparameters` says so better), or does
+            not fit the environment.
     """
     import torch
 

@@ -1,7 +1,7 @@
 """Hyperparameters for every agent, class of environments and observation, in RL Zoo's convention.
 
-hyperparameters.yaml has those of each agent; a class of environments declares what suits it better (`Environment.hyperparameters`).
-A table of one's own holds both.
+hyperparameters.yaml has those of each agent; a class of environments declares what suits it better
+(`Environment.hyperparameters`). A table of one's own holds both.
 """
 
 from collections.abc import Mapping
@@ -22,8 +22,8 @@ def hyperparameters(
 
     Args:
         given: go before all others.
-        table: a YAML that says all of it (agent, then "default" or the class, then "default" or the observation), such as one that
-            `pharos tune` wrote; None for what pharos and the class declare.
+        table: a YAML that says all of it (agent, then "default" or the class, then "default" or the observation), such
+            as one that `pharos tune` wrote; None for what pharos and the class declare.
     Raises:
         ParameterError: the table has another form. MissingExtra: PyYAML is not installed.
     """

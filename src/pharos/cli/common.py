@@ -60,11 +60,11 @@ MaxStates = Annotated[
     int | None, typer.Option("--max-states", min=1, help="Stop with an error beyond this many states.")
 ]
 
-# Parameters -------------------------------------------------------------------------------------------------------------
+# Parameters -----------------------------------------------------------------------------------------------------------
 
 
 def parse_parameters(words: Iterable[str] | None) -> dict[str, Any]:
-    """`["height=12", "speeds=1,2"]` -> `{"height": 12, "speeds": (1, 2)}`; ParameterError where one is not name=value."""
+    """`["height=12", "speeds=1,2"]` -> `{"height": 12, "speeds": (1, 2)}`; ParameterError: not name=value."""
     parameters: dict[str, Any] = {}
     for word in words or ():
         name, sign, text = word.partition("=")
@@ -77,7 +77,7 @@ def parse_parameters(words: Iterable[str] | None) -> dict[str, Any]:
 
 
 def parse_value(text: str) -> Any:
-    """A value as Python or JSON writes it: 1, 0.5, true, null, [[1,1],-1], (1,2), 1,2,3; lists become tuples; else text."""
+    """A value as Python or JSON writes it: 1, true, null, [[1,1],-1], (1,2), 1,2,3; lists become tuples; else text."""
     words = {"true": True, "false": False, "null": None, "none": None}
     if text.lower() in words:
         return words[text.lower()]
@@ -102,7 +102,7 @@ def parse_size(text: str | None, option: str = "--memory") -> int | None:
     return int(float(match[1]) * _UNITS[match[2] or ""])
 
 
-# TARGET -----------------------------------------------------------------------------------------------------------------
+# TARGET ---------------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -149,7 +149,7 @@ class Target:
         random: float = 0.0,
         **building: Any,
     ) -> "TabularMDP":
-        """The tabular MDP, with chance; `gamma` None stands for 0.99, or 1 with a horizon. `building` as for `space`."""
+        """The tabular MDP, with chance; `gamma` None is 0.99, or 1 with a horizon. `building` as for `space`."""
         from pharos.experiments import ChanceSetting
 
         chance = ChanceSetting(sticky, random)
@@ -159,14 +159,14 @@ class Target:
         space = self.space(**building)
         if space.environment is None:
             raise ParameterError(
-                f"{self.text}: pharos does not know the class {space.manifest['class']} of this environment, so not its "
-                f"rewards; name it as module:Class instead of its folder"
+                f"{self.text}: pharos does not know the class {space.manifest['class']} of this environment, "
+                f"so not its rewards; name it as module:Class instead of its folder"
             )
         return chance.of(space.mdp(gamma=discount(gamma, horizon)).with_horizon(horizon))
 
     @property
     def is_imported(self) -> bool:
-        """Whether it is an imported MDP: a file, or a folder that `pharos import` wrote. It has a gamma and a horizon of its own."""
+        """Whether it is an imported MDP, a file or a folder, which has a gamma and a horizon of its own."""
         from pharos.importers import is_folder
 
         return self.path is not None and (self.path.is_file() or is_folder(self.path))
@@ -192,7 +192,8 @@ def parse_target(text: str, words: Iterable[str] | None = None) -> Target:
     """The target that a command names.
 
     Raises:
-        UnknownName: no such environment, class or parameter. ParameterError: no such folder or file, a parameter is wrong.
+        UnknownName: no such environment, class or parameter. ParameterError: no such folder or file, a parameter is
+            wrong.
     """
     parameters = parse_parameters(words)
     from pharos.environments import list_environments, make
@@ -215,7 +216,7 @@ def parse_target(text: str, words: Iterable[str] | None = None) -> Target:
 
 
 def parse_environment(text: str, words: Iterable[str] | None = None) -> "Environment":
-    """Like `parse_target`, for commands that need an environment: a folder stands for the environment it was built from."""
+    """Like `parse_target`, where an environment is needed: a folder stands for the one that it was built from."""
     target = parse_target(text, words)
     if target.environment is not None:
         return target.environment
@@ -225,7 +226,7 @@ def parse_environment(text: str, words: Iterable[str] | None = None) -> "Environ
     return environment
 
 
-# Answers ----------------------------------------------------------------------------------------------------------------
+# Answers --------------------------------------------------------------------------------------------------------------
 
 
 def print_json(answer: Mapping[str, Any]) -> None:
@@ -262,7 +263,7 @@ def console(*, stderr: bool = False) -> "Console":
 
 @contextlib.contextmanager
 def progress_line(what: str) -> Iterator[Callable[[str], None]]:
-    """A line on standard error that says how far one is, on a terminal; nothing elsewhere. Gone at the end."""
+    """Report progress in a line on standard error, on a terminal; removed at the end."""
     if not sys.stderr.isatty():
         yield lambda _: None
         return

@@ -43,7 +43,7 @@ def evaluate(
         str,
         typer.Option(
             "--policy",
-            help="optimal, uniform, worst; FILE.npy: actions (S,), probabilities (S, A); or the folder of a finished run.",
+            help="optimal, uniform, worst; FILE.npy: actions (S,), probabilities (S, A); or a finished run's folder.",
         ),
     ] = "uniform",
     gamma: Gamma = None,
@@ -130,7 +130,8 @@ def read_policy(name: str, *, trust: bool = False) -> "Given":
     Returns:
         The policy, and how `pharos.evaluate_policy` is to take it.
     Raises:
-        UnknownName: neither a policy nor a file. FileFormatError: the file holds no such array, or the folder no such run.
+        UnknownName: neither a policy nor a file. FileFormatError: the file holds no such array, or the folder no such
+            run.
     """
     import numpy as np
 

@@ -51,7 +51,7 @@ def tune(
         typer.Option(
             "--chance",
             metavar="plain|NAME=P,...",
-            help="One of several kinds of chance, each for every instance: --chance plain --chance random=0.1 --chance sticky=0.25.",
+            help="A kind of chance, for every instance: --chance plain --chance random=0.1 --chance sticky=0.25.",
         ),
     ] = None,
     json: Json = False,

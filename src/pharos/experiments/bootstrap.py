@@ -21,12 +21,12 @@ def bootstrap_interval(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return both ends of the percentile bootstrap interval of a statistic of several samples.
 
-    Each sample is resampled with replacement by itself: a stratified bootstrap, in which a sample of one observation stays
-    as it is.
+    Each sample is resampled with replacement by itself: a stratified bootstrap, in which a sample of one observation
+    stays as it is.
 
     Args:
-        samples: arrays (..., N), N observations each; N may differ. The other axes are drawn together, such as all points
-            of a curve, and are alike in all samples.
+        samples: arrays (..., N), N observations each; N may differ. The other axes are drawn together, such as all
+            points of a curve, and are alike in all samples.
         statistic: `statistic(*samples, axis=-1)`, vectorised over all other axes.
         confidence, resamples, seed: of the bootstrap.
     Returns:
@@ -34,7 +34,8 @@ def bootstrap_interval(
     Raises:
         ParameterError: there is no sample, or one is empty or has an entry that is not finite.
     Cost: `resamples` times the statistic, in batches.
-    Source: Efron and Tibshirani (1993), An introduction to the bootstrap, section 13.3; computed by scipy.stats.bootstrap.
+    Source: Efron and Tibshirani (1993), An introduction to the bootstrap, section 13.3; computed by
+        scipy.stats.bootstrap.
     """
     from scipy import stats
 

@@ -1,7 +1,7 @@
 """A callback of Stable-Baselines3 that stops at chosen steps, and counts the returns of finished episodes.
 
-Algorithms that learn from whole rollouts, such as PPO, take the steps of their last rollout although fewer are left; episodes that
-end after the last point are not counted.
+Algorithms that learn from whole rollouts, such as PPO, take the steps of their last rollout although fewer are left;
+episodes that end after the last point are not counted.
 """
 
 from typing import Any
@@ -11,7 +11,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 
 class AtPoints(BaseCallback):
-    """Calls at_point(steps, episodes, sum of returns) when the number of steps passes each of `points`, and logs what it returns.
+    """Calls at_point(steps, episodes, sum of returns) whenever `points` are passed, and logs what it returns.
 
     Args:
         gamma: discount of returns.

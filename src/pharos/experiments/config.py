@@ -1,8 +1,8 @@
 """The configuration of a run: everything that determines its result, as run.json keeps it.
 
-`RunConfig` is what `train`, `tune`, studies and the command line make of their options, and what a stored run is read back
-into. Its `id` names the run: the same configuration has the same id on every machine. Beside it stand the two settings that
-a run shares with values and measures of hardness: `ChanceSetting` and `Horizon`.
+`RunConfig` is what `train`, `tune`, studies and the command line make of their options, and what a stored run is read
+back into. Its `id` names the run: the same configuration has the same id on every machine. Beside it stand the two
+settings that a run shares with values and measures of hardness: `ChanceSetting` and `Horizon`.
 """
 
 import json
@@ -75,7 +75,8 @@ class Horizon:
     """The number of steps of an episode in values and returns: a number, the environment's time limit, or none.
 
     Attributes:
-        value: a number of steps; "limit": the time limit of the environment; "none": discounted values without a horizon.
+        value: a number of steps; "limit": the time limit of the environment; "none": discounted values without a
+            horizon.
     """
 
     value: int | str = "limit"
@@ -123,8 +124,8 @@ class RunConfig:
         gamma: discount of values and returns; the agent's own discount is a hyperparameter.
         horizon: number of steps of an episode in values and returns; None: discounted values without a horizon.
         evaluation_interval: steps between evaluations of the policy.
-        sources: where a class, observation or agent of the user's own comes from, under "environment", "observation" and
-            "agent". Their names belong to the `id`; files and checksums do not.
+        sources: where a class, observation or agent of the user's own comes from, under "environment", "observation"
+            and "agent". Their names belong to the `id`; files and checksums do not.
     """
 
     environment: str
@@ -292,7 +293,8 @@ class RunConfig:
         name = getattr(self, part)
         if is_reference(name) and not trust:
             raise UntrustedCode(
-                f"the {part} {name!r} is code, which is executed only if you trust it: add --trust (in Python: trust=True)"
+                f"the {part} {name!r} is code, which is executed only if you trust it: "
+                f"add --trust (in Python: trust=True)"
             )
 
 

@@ -19,8 +19,8 @@ def evaluate_agent(
 
     Args:
         agent: has `policy_table()` (S,), (S, A) or as `pharos.evaluate_policy` takes it; or
-            `action_probabilities(observations)` -> (N, A); or is a model of Stable-Baselines3; or an array like the table; or
-            a function of observations that returns (N, A) probabilities or (N,) actions.
+            `action_probabilities(observations)` -> (N, A); or is a model of Stable-Baselines3; or an array like the
+            table; or a function of observations that returns (N, A) probabilities or (N,) actions.
         deterministic: whether the most probable action is taken (the first among equals) instead of one at random.
         max_states: how many states (pairs, where previous actions matter) the policy may reach for an exact value.
         episodes, seed: of the estimate beyond that.

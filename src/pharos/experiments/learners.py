@@ -1,4 +1,4 @@
-"""What learns in a run: the table of Q-learning, or a model of Stable-Baselines3; each can be stored and goes on from there."""
+"""What learns in a run: the table of Q-learning, or a model of Stable-Baselines3; each can be stored and resumed."""
 
 import contextlib
 import json
@@ -150,7 +150,8 @@ def _said_to_be_damaged(folder: Path) -> Iterator[None]:
     except Exception as error:  # torch and NumPy have many
         first = str(error).split(". ")[0].splitlines()  # torch goes on with advice that is not ours
         raise FileFormatError(
-            f"{folder}: cannot be resumed from: {first[0] if first else type(error).__name__}; delete the folder to start anew"
+            f"{folder}: cannot be resumed from: {first[0] if first else type(error).__name__}; "
+            f"delete the folder to start anew"
         ) from error
 
 

@@ -14,8 +14,8 @@ def load_agent(folder: str | os.PathLike, *, trust: bool = False) -> tuple[Task,
     """The task of a finished run, and what it learnt, as `evaluate_agent` and `pharos.evaluate_policy` take it.
 
     Args:
-        trust: whether code that the run names may be imported: an environment, observation or agent of its own. What this
-            process has imported already, such as the environment that a command names, needs no trust.
+        trust: whether code that the run names may be imported: an environment, observation or agent of its own. What
+            this process has imported already, such as the environment that a command names, needs no trust.
     Returns:
         The task, and (S,) actions of tabular agents, else the policy of the model.
     Raises:

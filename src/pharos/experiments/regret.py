@@ -1,7 +1,7 @@
 """Regret: what is lost by not having played the optimal policy from the first episode on.
 
-Episode k starts in s0 and is played with policy pi_k; V* and V^pi are values from the start, in the same setting (discount, horizon,
-chance) as the returns.
+Episode k starts in s0 and is played with policy pi_k; V* and V^pi are values from the start, in the same setting
+(discount, horizon, chance) as the returns.
 
     expected regret     V*(s0) - V^{pi_k}(s0)      of a policy, by exact evaluation; never negative
     realised regret     V*(s0) - return_k          of an episode as it was played, exploration and luck included
@@ -10,9 +10,9 @@ chance) as the returns.
 
 Both agree in expectation where pi_k is what played episode k; a DQN also explores, so its realised regret is larger.
 
-Source: expected regret over episodes: Azar, Osband and Munos (2017), section 2; expected and realised ("pseudo-regret" and "regret"):
-Bubeck and Cesa-Bianchi (2012), section 1; 1 minus the normalised regret is the normalised score of Mnih et al. (2015), with
-the exact optimum in the place of a human.
+Source: expected regret over episodes: Azar, Osband and Munos (2017), section 2; expected and realised ("pseudo-regret"
+and "regret"): Bubeck and Cesa-Bianchi (2012), section 1; 1 minus the normalised regret is the normalised score of Mnih
+et al. (2015), with the exact optimum in the place of a human.
 """
 
 import math
@@ -36,7 +36,8 @@ class ReferenceValues:
     """Values from the start of the policies that regret is measured against.
 
     Attributes:
-        optimal, uniform, worst: of the optimal, the uniformly random and the worst policy; `worst` may be NaN where unknown.
+        optimal, uniform, worst: of the optimal, the uniformly random and the worst policy; `worst` may be NaN where
+            unknown.
         error_bound: each is within this of the true value.
     """
 
@@ -70,8 +71,9 @@ def regret(value: Any, values: ReferenceValues, *, normalized_by: str | None = N
         values: of the task.
         normalized_by: None; or "uniform" or "worst", the policy whose regret is 1.
     Returns:
-        A float or an array; in units of return, or without where normalised. NaN where it cannot be normalised, since the
-        reference policy is itself optimal (within the errors of the values). Values with errors may give as much less than 0.
+        A float or an array; in units of return, or without where normalised. NaN where it cannot be normalised, since
+        the reference policy is itself optimal (within the errors of the values). Values with errors may give as much
+        less than 0.
     Raises:
         ParameterError: another reference.
     """
@@ -84,8 +86,8 @@ def regret(value: Any, values: ReferenceValues, *, normalized_by: str | None = N
 def cumulative_expected_regret(episodes: Any, expected: Any) -> np.ndarray:
     """Expected regret summed over episodes, when the policy is evaluated only now and then.
 
-    Between two evaluations every finished episode counts with the policy of the earlier one: a step function that a denser grid
-    of evaluations refines.
+    Between two evaluations every finished episode counts with the policy of the earlier one: a step function that a
+    denser grid of evaluations refines.
 
     Args:
         episodes: (N,) episodes finished before each evaluation, not decreasing.

@@ -52,8 +52,8 @@ class Task:
         observation, observation_options: what the agent sees, as `pharos.observe` takes it.
         previous_action: whether the agent also sees the previously executed action.
         gamma: discount of values and returns.
-        horizon: number of steps of an episode in values and returns, as `Horizon.of` reads it; "default": the environment's
-            time limit.
+        horizon: number of steps of an episode in values and returns, as `Horizon.of` reads it; "default": the
+            environment's time limit.
         values: at the start, where they are known already; None: solved for when they are needed.
     """
 
@@ -72,7 +72,8 @@ class Task:
             raise ParameterError(f"env is {self.env!r}; expected an Environment: use Task.of")
         if isinstance(self.env, TabularMDP):
             raise ParameterError(
-                f"env is {self.env!r}, a table without an environment, which can be solved and measured but not trained on; "
+                f"env is {self.env!r}, a table without an environment, which can be solved and measured "
+                f"but not trained on; "
                 f"expected an Environment"
             )
         if not isinstance(self.env, Environment):

@@ -2,10 +2,11 @@
 
     FOLDER/run.json         configuration, versions, status, result
     FOLDER/curve.parquet    a row for each evaluation
-    FOLDER/checkpoint/      while it runs: what the next attempt goes on from; plain arrays, JSON and tensors, never code
+    FOLDER/checkpoint/      while it runs: what the next attempt goes on from; arrays, JSON and tensors, never code
 
-A run that is killed goes on from its last checkpoint when it is started again: at most the last interval between evaluations is
-lost (or the last ten seconds, where intervals are shorter). Without interruption the same seed gives the same curve file.
+A run that is killed goes on from its last checkpoint when it is started again: at most the last interval between
+evaluations is lost (or the last ten seconds, where intervals are shorter). Without interruption the same seed gives the
+same curve file.
 """
 
 import json
@@ -76,20 +77,23 @@ def train(
     """Train an agent, and measure the exact regret of its policy as it learns.
 
     Args:
-        agent: "q_learning", "dqn", "ppo", "a2c", or "module:Class" or "file.py:Class" of an algorithm for Stable-Baselines3.
+        agent: "q_learning", "dqn", "ppo", "a2c", or "module:Class" or "file.py:Class" of an algorithm for
+            Stable-Baselines3.
         environment: a name, with its `parameters` as keywords, or an Environment.
         steps: number of environment steps to learn from.
-        observation, observation_options: what the agent sees, also "module:name" or "file.py:name"; tabular agents see the
-            index of the state.
+        observation, observation_options: what the agent sees, also "module:name" or "file.py:name"; tabular agents see
+            the index of the state.
         sticky, random: chance.
         gamma, horizon: setting of values and returns, see `Task`; the agent's own discount is a hyperparameter.
         evaluation_interval: steps between evaluations; None: a hundredth of `steps`.
-        hyperparameters: go before those of agents/hyperparameters.yaml; or a YAML file of the same form, such as one that `tune` wrote.
+        hyperparameters: go before those of agents/hyperparameters.yaml; or a YAML file of the same form, such as one
+            that `tune` wrote.
         out: folder of the run; None: nothing is written. A finished run there is returned, an unfinished one resumed.
         tensorboard: write TensorBoard's logs into `out`/tensorboard (algorithms of Stable-Baselines3).
         progress: called after each evaluation with steps done, steps in all, and the row of the curve.
     Raises:
-        ParameterError: an option is wrong, or `out` holds another run. UnknownName: no such name; the nearest is suggested.
+        ParameterError: an option is wrong, or `out` holds another run. UnknownName: no such name; the nearest is
+            suggested.
         MissingExtra: Stable-Baselines3 is not installed.
     """
     seen = agent_kind(agent).observation(observation)
@@ -155,7 +159,8 @@ def train_config(
 
     Args:
         values: at the start of the task, where they are known already.
-        trust: whether code that the configuration names may be imported: an environment, observation or agent of its own.
+        trust: whether code that the configuration names may be imported: an environment, observation or agent of its
+            own.
         strict: whether a file of such code that has changed since is an error instead of a warning.
     Raises:
         FileFormatError: it is not the configuration of a run. UntrustedCode: it names code. Else as `train`.
@@ -166,7 +171,7 @@ def train_config(
     return _run(config, task, Path(folder), False, progress, algorithm)
 
 
-# One run ----------------------------------------------------------------------------------------------------------------
+# One run --------------------------------------------------------------------------------------------------------------
 
 
 @dataclass
@@ -177,7 +182,7 @@ class _Curve:
     rows: list[dict[str, Any]] = field(default_factory=list)
 
     def add(self, step: int, episodes: int, returns: float, agent: Any) -> dict[str, Any]:
-        """Evaluate the policy after `step` steps, `episodes` finished episodes and the sum `returns` of their returns."""
+        """Evaluate the policy after `step` steps and `episodes` finished episodes, whose returns sum to `returns`."""
         found = evaluate_agent(agent, self.task)
         best, uniform = self.task.reference.optimal, self.task.reference.uniform
         last = self.rows[-1] if self.rows else None
@@ -310,7 +315,8 @@ def _finished(folder: Path, config: RunConfig) -> TrainingResult | None:
         entry = json.loads(json.dumps(config.to_dict()))
         different = [name for name in {**entry, **stored} if stored.get(name) != entry.get(name)]
         raise ParameterError(
-            f"{folder}: holds a run with another {', '.join(different) or 'configuration'}; choose another folder, or delete it"
+            f"{folder}: holds a run with another {', '.join(different) or 'configuration'}; "
+            f"choose another folder, or delete it"
         )
     for part, source in config.sources.items():
         if stored["sources"][part].get("checksum") != source.checksum:
@@ -348,7 +354,7 @@ class _Checkpoint:
         self._saved = time.monotonic()
 
     def restore(self, learner: Learner) -> tuple[list[dict[str, Any]], float] | None:
-        """(rows of the curve, seconds spent) of the last checkpoint, with the learner set to it; None where there is none."""
+        """(rows of the curve, seconds spent) of the last checkpoint, which the learner takes over; None: there is none."""
         for folder in (self.folder, self.folder.with_name(f"{self.folder.name}.old")):
             try:
                 kept = json.loads((folder / "curve.json").read_text())

@@ -1,13 +1,13 @@
-"""Tuning: hyperparameters for an agent on a class of environments, searched with Optuna's tree-structured Parzen estimator.
+"""Tuning: hyperparameters for an agent on a class of environments, searched by Optuna's TPE sampler.
 
     FOLDER/hyperparameters.yaml   the best ones, in the form of agents/hyperparameters.yaml
     FOLDER/tuning.json            what was searched, and every trial: hyperparameters, score, status, seconds
     FOLDER/journal.log            Optuna's own record, from which an interrupted search goes on
 
-A trial trains on every instance with every seed. Its score is the mean over these runs of the mean normalised regret of their
-evaluations after the first: 0 is optimal from the first evaluation on, 1 as bad as acting at random. A trial whose mean so far is worse
-than the median of earlier trials at the same point is given up. The first trial is what the table says now, so that the best
-is never worse than that on the instances and seeds of the search.
+A trial trains on every instance with every seed. Its score is the mean over these runs of the mean normalised regret of
+their evaluations after the first: 0 is optimal from the first evaluation on, 1 as bad as acting at random. A trial
+whose mean so far is worse than the median of earlier trials at the same point is given up. The first trial is what the
+table says now, so that the best is never worse than that on the instances and seeds of the search.
 
 Source: Bergstra et al. (2011), Algorithms for hyper-parameter optimization; Akiba et al. (2019), Optuna.
 """
@@ -84,7 +84,8 @@ class TuningResult:
         hyperparameters: the best that were found, all of them, those that were not searched included.
         score: mean normalised regret of the best trial.
         first_score: that of the first trial, what the table said before; None where it was not finished.
-        trials: a dictionary for each: number, hyperparameters, score, status ("finished", "given up", "failed"), seconds.
+        trials: a dictionary for each: number, hyperparameters, score, status ("finished", "given up", "failed"),
+            seconds.
         folder: where it was written, or None.
     """
 
@@ -121,16 +122,16 @@ def tune(
         environments: instances, named or made; all of one class.
         steps, observation, sticky, random: of every run, as for `train`.
         trials: number of trials, those that `out` holds already included.
-        chances: several kinds of chance, such as [{}, {"random": 0.1}, {"sticky": 0.25}], each for every instance; in place of
-            `sticky` and `random`.
+        chances: several kinds of chance, such as [{}, {"random": 0.1}, {"sticky": 0.25}], each for every instance; in
+            place of `sticky` and `random`.
         seeds: of the runs of a trial; keep them apart from the seeds of the experiment that follows.
         space: what is searched, in the form of `SPACES`; None: what that says of the agent.
         search_seed: of the search.
         out: folder; a search there goes on. None: nothing is written.
         progress: called after each trial with trials done, trials in all, and the best score so far.
     Raises:
-        ParameterError: the environments are of several classes, the agent has no space, `out` holds another search, or no trial
-            was finished. MissingExtra: Optuna is not installed.
+        ParameterError: the environments are of several classes, the agent has no space, `out` holds another search, or
+            no trial was finished. MissingExtra: Optuna is not installed.
     Cost: at most trials x instances x kinds of chance x seeds runs, about half of it with what is given up.
     """
     try:
@@ -249,7 +250,7 @@ def _score(
     return sum(found) / len(found)
 
 
-# The space --------------------------------------------------------------------------------------------------------------
+# The space ------------------------------------------------------------------------------------------------------------
 
 
 def _checked_chances(
@@ -276,7 +277,8 @@ def _checked_space(agent: str, space: Mapping[str, Sequence[Any]] | None) -> dic
         ranged = kind in ("log", "linear") and len(values) == 2 and 0 <= values[0] < values[1]
         if not (ranged and (kind == "linear" or values[0] > 0)) and not (kind == "one of" and values):
             raise ParameterError(
-                f"space: {name} is {tuple(choices)!r}; expected ('log', low, high), ('linear', low, high) or ('one of', value, ...)"
+                f"space: {name} is {tuple(choices)!r}; expected ('log', low, high), ('linear', low, high) "
+                f"or ('one of', value, ...)"
             )
     return {name: tuple(choices) for name, choices in searched.items()}
 
@@ -310,7 +312,7 @@ def _class_of(instances: Sequence[Environment]) -> str:
     return names[0]
 
 
-# Files ------------------------------------------------------------------------------------------------------------------
+# Files ----------------------------------------------------------------------------------------------------------------
 
 
 def _claim(folder: Path, config: Mapping[str, Any]) -> None:

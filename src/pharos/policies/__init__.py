@@ -1,4 +1,4 @@
-"""Policies: what chooses actions, from a table or from what it observes; asked in the states that it reaches, and evaluated."""
+"""Policies: tables, and functions of observations; asked in the states that they reach, and evaluated."""
 
 from pharos.policies.asking import Answers, PolicyAnswers, Sight, TableAnswers
 from pharos.policies.evaluation import (

@@ -107,7 +107,7 @@ class Answers:
         return self.mdp.start_states * self.width + (self.num_actions if self.by_pairs else 0)
 
     def reach(self, max_rows: int | None = None, steps: int | None = None) -> bool:
-        """Ask the policy in all rows that it reaches (within `steps`), level by level; False beyond `max_rows` of them."""
+        """Ask the policy in all rows that it reaches within `steps`, level by level; False beyond `max_rows` rows."""
         mdp, width = self.mdp, self.width
         frontier = np.unique(self.start_rows())
         level = 0
@@ -131,7 +131,7 @@ class Answers:
         return states * self.width + (actions if self.by_pairs else 0)
 
     def reached_mdp(self) -> tuple[TabularMDP, np.ndarray]:
-        """The MDP on what is reached, and the policy on it. What is not reached counts as the end: it has probability 0."""
+        """The MDP on what is reached, and the policy on it; what is not reached has probability 0, and is the end."""
         mdp = self.mdp
         if not mdp.is_sticky:  # a row is a state of the new MDP
             states, starts = self.rows // self.width, self.index(self.start_rows())
@@ -200,7 +200,7 @@ class PolicyAnswers(Answers):
         return self.answer(observations, len(rows))
 
     def answer(self, observations: Any, count: int = 1) -> np.ndarray:
-        """(N, A) probabilities for a batch of `count` observations; ParameterError where the policy answers otherwise."""
+        """(N, A) probabilities for a batch of `count` observations; ParameterError for any other answer."""
         answer = np.asarray(self.policy(observations))
         if answer.dtype.kind in "iu" and answer.shape == (count,):
             if (answer < 0).any() or (answer >= self.num_actions).any():
@@ -223,7 +223,7 @@ class PolicyAnswers(Answers):
 
 
 class TableAnswers(Answers):
-    """Answers of a table: (S,) actions, (S, A) probabilities, or for each previous action, as `evaluate_policy` takes it.
+    """Answers of a table: (S,) actions, (S, A) probabilities, or either for each previous action.
 
     Raises:
         ParameterError: it has another shape.

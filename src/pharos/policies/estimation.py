@@ -39,7 +39,7 @@ def estimate(
 
 
 def _half_width(returns: np.ndarray, low: float, high: float) -> float:
-    """Of an interval that holds the mean with probability 1 - RISK, for returns in [low, high]; rare returns included."""
+    """Half the width of an interval that holds the mean with probability 1 - RISK, for returns in [low, high]."""
     count, log = len(returns), math.log(4 / RISK)
     spread = math.sqrt(2 * float(returns.var(ddof=1)) * log / count)
     return spread + 7 * (high - low) * log / (3 * (count - 1))

@@ -1,7 +1,7 @@
 """The exact value of a policy: it is asked in the states that it reaches, and evaluated there.
 
-A deterministic policy in a deterministic game of a million states reaches some hundred of them; under chance it may reach many,
-and beyond a limit the value is estimated from simulated episodes instead, and the answer says so.
+A deterministic policy in a deterministic game of a million states reaches some hundred of them; under chance it may
+reach many, and beyond a limit the value is estimated from simulated episodes instead, and the answer says so.
 """
 
 import math
@@ -31,8 +31,8 @@ class Evaluation:
     Attributes:
         value: expected return of an episode, in the setting of the task.
         exact: whether the value is computed, not estimated.
-        error_bound: proven bound on the error of an exact value; for an estimate, half the width of an interval that holds the
-            value with a probability of at least 99 % (empirical Bernstein bound).
+        error_bound: proven bound on the error of an exact value; for an estimate, half the width of an interval that
+            holds the value with a probability of at least 99 % (empirical Bernstein bound).
         states: number of states (or pairs of state and previous action) in which the policy was asked.
         episodes: simulated episodes behind an estimate; 0 where the value is exact.
     """
@@ -109,11 +109,11 @@ def evaluate_policy(
             `previous_action`, whether they see it, under sticky actions; `deterministic`, whether the most probable
             action is taken.
     Returns:
-        A Solution of kind "policy", see `pharos.solvers.evaluate_policy`. A policy that sees observations is asked only in
-        the states that it reaches from the start; values elsewhere are NaN.
+        A Solution of kind "policy", see `pharos.solvers.evaluate_policy`. A policy that sees observations is asked only
+        in the states that it reaches from the start; values elsewhere are NaN.
     Raises:
-        ParameterError: the policy has the wrong shape, or its rows are not probabilities; or it sees observations, and the
-            MDP was not made from a state space.
+        ParameterError: the policy has the wrong shape, or its rows are not probabilities; or it sees observations, and
+            the MDP was not made from a state space.
         DivergenceError: gamma is 1, there is no horizon, and the value is or may be infinite.
     Source: Puterman (1994), section 6.1.
     """
@@ -158,8 +158,9 @@ def evaluate_observing(
     """Evaluate a policy that sees observations; `experiments.evaluate_agent` also gives estimates.
 
     Raises:
-        ParameterError: the MDP was not made from a state space of an environment, the policy is none for its observations, or
-            it sees the previous action where actions are not sticky, so that values do not belong to states.
+        ParameterError: the MDP was not made from a state space of an environment, the policy is none for its
+            observations, or it sees the previous action where actions are not sticky, so that values do not belong to
+            states.
         DivergenceError: gamma is 1 and there is no horizon.
     """
     if mdp.horizon is None and mdp.gamma == 1.0:

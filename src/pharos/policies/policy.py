@@ -35,8 +35,8 @@ class Model(Protocol):
 
 
 PolicyLike = np.ndarray | TabularAgent | Policy | Model | Callable[[Any], Any]
-"""What is taken for a policy: a table (S,), (S, A) or (S, A + 1, A), an agent, a model of Stable-Baselines3, or a function from a
-batch of observations to (N, A) probabilities or (N,) actions."""
+"""What is taken for a policy: a table (S,), (S, A) or (S, A + 1, A), an agent, a model of Stable-Baselines3, or a
+function from a batch of observations to (N, A) probabilities or (N,) actions."""
 
 
 def policy_function(policy: PolicyLike) -> Callable[[Any], Any]:

@@ -27,6 +27,7 @@ def warn_of_changes(study: Specification, folder: Path) -> None:
     for file, count in changed.items():
         if count:
             warnings.warn(
-                f"{file} has changed since {count} runs in {folder} were trained with it; another --out trains them anew",
+                f"{file} has changed since {count} runs in {folder} were trained with it; "
+                f"another --out trains them anew",
                 stacklevel=3,
             )
