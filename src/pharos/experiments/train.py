@@ -354,7 +354,7 @@ class _Checkpoint:
         self._saved = time.monotonic()
 
     def restore(self, learner: Learner) -> tuple[list[dict[str, Any]], float] | None:
-        """(rows of the curve, seconds spent) of the last checkpoint, which the learner takes over; None: there is none."""
+        """(rows of the curve, seconds spent) of the last checkpoint, from which the learner goes on; or None."""
         for folder in (self.folder, self.folder.with_name(f"{self.folder.name}.old")):
             try:
                 kept = json.loads((folder / "curve.json").read_text())
