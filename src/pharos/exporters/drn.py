@@ -59,10 +59,10 @@ def _choice(
     reward = float(np.sum([p * paid for p, _, paid, _ in outcomes]))
     probabilities: dict[int, float] = {}
     for p, t, _, ended in outcomes:
-        kept = p if ended else gamma * p
-        probabilities[t] = probabilities.get(t, 0.0) + kept
-        if kept < p:
-            probabilities[end] = probabilities.get(end, 0.0) + p - kept
+        weight = p if ended else gamma * p
+        probabilities[t] = probabilities.get(t, 0.0) + weight
+        if weight < p:
+            probabilities[end] = probabilities.get(end, 0.0) + p - weight
     file.write(f"\taction {action} [{reward!r}]\n")
     for t in sorted(probabilities):
         if probabilities[t] > 0:

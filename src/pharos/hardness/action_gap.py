@@ -73,7 +73,7 @@ def action_gap_regularity(
     """
     if isinstance(zeta, bool) or not isinstance(zeta, int | float | np.floating) or not 0 <= zeta < math.inf:
         raise ParameterError(f"zeta is {zeta!r}; expected a finite number, at least 0")
-    found: dict[float, float] = {}
+    weights: dict[float, float] = {}
     states = 0.0
     blocks, tolerance, conventions = gaps_of_states(mdp, solution, tie_tolerance)
     for gap, weight in blocks:
@@ -82,8 +82,8 @@ def action_gap_regularity(
         there = np.isfinite(smallest) & (weight > 0)
         values, which = np.unique(smallest[there], return_inverse=True)
         for value, times in zip(values.tolist(), np.bincount(which, weight[there]).tolist(), strict=True):
-            found[value] = found.get(value, 0.0) + times
-    ordered = np.array(sorted(found))
-    shares = np.cumsum([found[value] for value in ordered.tolist()]) / max(states, 1.0)
+            weights[value] = weights.get(value, 0.0) + times
+    ordered = np.array(sorted(weights))
+    shares = np.cumsum([weights[value] for value in ordered.tolist()]) / max(states, 1.0)
     constant = float((shares / ordered**zeta).max()) if len(ordered) else 0.0
     return ActionGapRegularity(constant, float(zeta), ordered, shares, int(states), tolerance, conventions)

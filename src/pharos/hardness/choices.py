@@ -61,8 +61,8 @@ class Choices:
         if final.sum() != 1:
             return -1
         inside = final[component]
-        met = np.unique(self.underlying)
-        return int(np.flatnonzero(inside)[0]) if np.unique(self.underlying[inside]).size == met.size else -1
+        targets = np.unique(self.underlying)
+        return int(np.flatnonzero(inside)[0]) if np.unique(self.underlying[inside]).size == targets.size else -1
 
     @property
     def is_connected(self) -> bool:
@@ -175,10 +175,10 @@ def reachable(choices: Choices) -> Choices:
     first, previous = choices.reversed
     size = len(choices.underlying)
     graph = sparse.csr_matrix((np.ones(len(previous), np.int8), previous, first), shape=(size, size)).T.tocsr()
-    kept = np.zeros(size, np.bool_)
+    is_reached = np.zeros(size, np.bool_)
     for node, _ in choices.starts:
-        kept[csgraph.breadth_first_order(graph, node, return_predecessors=False)] = True
-    nodes = np.flatnonzero(kept)
+        is_reached[csgraph.breadth_first_order(graph, node, return_predecessors=False)] = True
+    nodes = np.flatnonzero(is_reached)
     place = np.full(size, -1)
     place[nodes] = np.arange(nodes.size)
     rows = (nodes[:, None] * choices.num_actions + np.arange(choices.num_actions)).ravel()

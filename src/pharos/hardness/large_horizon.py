@@ -83,9 +83,9 @@ class LargeHorizon:
         for needed, gap, variance in self._walk(log, near=True):
             if needed is None:
                 return None
-            found = max(1, math.ceil(needed))
-            if worst is None or found > worst[0]:
-                worst = (found, gap, variance)
+            samples = max(1, math.ceil(needed))
+            if worst is None or samples > worst[0]:
+                worst = (samples, gap, variance)
         return worst
 
     def is_greedy_optimal(self) -> bool:

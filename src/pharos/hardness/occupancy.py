@@ -42,13 +42,13 @@ class Occupancy:
 
     def to_dict(self) -> dict[str, Any]:
         """A summary, JSON-able."""
-        met = self.visits > 0
+        is_visited = self.visits > 0
         return {
             "steps": self.steps,
             "error_bound": self.error_bound,
             "total": float(self.visits.sum()),
-            "visited_pairs": int(met.sum()),
-            "smallest": float(self.visits[met].min()) if met.any() else None,
+            "visited_pairs": int(is_visited.sum()),
+            "smallest": float(self.visits[is_visited].min()) if is_visited.any() else None,
             **self.conventions,
         }
 
@@ -99,7 +99,7 @@ def occupancy(
     if not tolerance > 0:
         raise ParameterError(f"tolerance is {tolerance!r}; expected a number above 0")
     total, largest = np.zeros(shape), np.zeros(shape)
-    kept, scale, steps, left = [], 1.0, 0, 0.0
+    by_step, scale, steps, left = [], 1.0, 0, 0.0
     for now, alive in walk.distributions():
         if walk.horizon is None:
             left = scale * alive / (1 - mdp.gamma)
@@ -109,7 +109,7 @@ def occupancy(
         if keep_all:
             each = np.zeros(shape)
             walk.record(now, executed, 1.0, each, np.zeros(shape))
-            kept.append(each)
+            by_step.append(each)
         scale *= mdp.gamma
         steps += 1
     conventions = {
@@ -118,7 +118,7 @@ def occupancy(
         "actions": "executed" if executed else "chosen",
         "policy": "uniform" if policy is None else "given",
     }
-    return Occupancy(total, largest, steps, left, np.stack(kept) if keep_all else None, conventions)
+    return Occupancy(total, largest, steps, left, np.stack(by_step) if keep_all else None, conventions)
 
 
 def discounted_visits(mdp: TabularMDP, policy: Any = None, *, tolerance: float = 1e-9) -> tuple[np.ndarray, float]:
@@ -161,10 +161,10 @@ def support(mdp: TabularMDP, policy: Any = None) -> np.ndarray:
     Cost: O(S A); with transitions as a matrix that for each step to the last state that is met.
     """
     walk = Walk(mdp, policy, 1)
-    started, met = walk.after_the_start()
-    met = (met > 0).astype(np.float64)
-    mdp.dynamics.support(walk.later, met)
-    return walk.live & ((met > 0).any(axis=1) | (started > 0))
+    started, is_visited = walk.after_the_start()
+    is_visited = (is_visited > 0).astype(np.float64)
+    mdp.dynamics.support(walk.later, is_visited)
+    return walk.live & ((is_visited > 0).any(axis=1) | (started > 0))
 
 
 class Walk:

@@ -76,9 +76,9 @@ def return_distribution(mdp: TabularMDP, policy: Any = None, *, horizon: int | N
     mass = np.zeros(len(returns))
     for state, probability in zip(mdp.start_states, mdp.start_probabilities, strict=True):
         mass += probability * last[state, 0]
-    kept = mass > 0
+    is_possible = mass > 0
     conventions = {"horizon": steps, "gamma": 1.0, "policy": "uniform" if policy is None else "given"}
-    return ReturnDistribution(returns[kept], mass[kept], conventions)
+    return ReturnDistribution(returns[is_possible], mass[is_possible], conventions)
 
 
 def central_moments(mdp: TabularMDP, steps: int) -> tuple[np.ndarray, np.ndarray]:

@@ -116,7 +116,7 @@ def stationary_effective_horizon(
     slack = max(1e-12, 2 * floor)
     optimal = nodes.best >= nodes.best.max(axis=1, keepdims=True) - tie
     k_min = window = 0
-    found: list[tuple[int, int, float, float]] = []
+    result: list[tuple[int, int, float, float]] = []
     best, k = float(limit), 1
     values: _Known | _Ahead = _Known(nodes.explored)
     spread = ((nodes.explored - nodes.worst) * (nodes.best - nodes.worst)).max(axis=1)
@@ -126,7 +126,7 @@ def stationary_effective_horizon(
         if k < best and (
             needed := _samples(nodes, values, spread, optimal, slack, math.log(2 * limit) + k * log_actions)
         ):
-            found.append((k, *needed))
+            result.append((k, *needed))
             best = min(best, k + (math.log(needed[0]) / log_actions if mdp.num_actions > 1 else 0.0))
         if not k_min and (k >= limit or _is_greedy_optimal(nodes, values, optimal, slack)):
             k_min = k
@@ -138,7 +138,7 @@ def stationary_effective_horizon(
         tell(f"window {window}")
         values = nodes.backup(values.best)
         window += 1
-    ks, ms, gaps, variances = (list(each) for each in zip(*found, strict=True)) if found else ([], [], [], [])
+    ks, ms, gaps, variances = (list(each) for each in zip(*result, strict=True)) if result else ([], [], [], [])
     conventions = {
         "gamma": mdp.gamma,
         "steps": int(limit),
@@ -177,9 +177,9 @@ class _Ahead:
         """(N,): max over a."""
         from pharos.kernels import horizon
 
-        found = np.empty(self.nodes.num_nodes)
-        horizon.lookahead(self.nodes.table, self.nodes.rewards, self.nodes.gamma, self.value, found)
-        return found
+        result = np.empty(self.nodes.num_nodes)
+        horizon.lookahead(self.nodes.table, self.nodes.rewards, self.nodes.gamma, self.value, result)
+        return result
 
     def at(self, nodes: np.ndarray) -> np.ndarray:
         """(n, A), of some nodes."""
@@ -233,9 +233,9 @@ class _Nodes:
         if self.table is not None:
             from pharos.kernels import horizon
 
-            found = np.empty(self.num_nodes)
-            horizon.largest(self.table, values, found)
-            return found
+            result = np.empty(self.num_nodes)
+            horizon.largest(self.table, values, result)
+            return result
         each = np.maximum.reduceat(values[self.matrix.indices], self.matrix.indptr[:-1])
         return each.reshape(self.rewards.shape).max(axis=1)
 
@@ -244,8 +244,8 @@ class _Nodes:
 
         actions: from nodes (n,) to (n, A) bool, the actions that are taken there.
         """
-        met = np.zeros(self.num_nodes, np.bool_)
-        met[self.starts] = True
+        is_reached = np.zeros(self.num_nodes, np.bool_)
+        is_reached[self.starts] = True
         nodes = self.starts
         while nodes.size:
             allowed = actions(nodes)
@@ -256,9 +256,9 @@ class _Nodes:
                 following = self.table[nodes[rows], chosen]
             else:
                 following = self.matrix[nodes[rows] * self.num_actions + chosen].indices
-            nodes = np.unique(following[~met[following]])
-            met[nodes] = True
-        return np.flatnonzero(met)
+            nodes = np.unique(following[~is_reached[following]])
+            is_reached[nodes] = True
+        return np.flatnonzero(is_reached)
 
 
 def _states_and_the_end(mdp: TabularMDP) -> tuple[Choices, np.ndarray]:
@@ -292,10 +292,10 @@ def _on_nodes(solution: Solution, choices: Any, mdp: TabularMDP) -> np.ndarray:
     inside = choices.underlying < mdp.num_states
     v = solution.v
     if v.ndim == 2:
-        found = v[np.where(inside, choices.underlying, 0), np.clip(choices.previous, 0, mdp.num_actions - 1)]
+        result = v[np.where(inside, choices.underlying, 0), np.clip(choices.previous, 0, mdp.num_actions - 1)]
     else:
-        found = v[np.where(inside, choices.underlying, 0)]
-    return np.where(inside, found, 0.0)
+        result = v[np.where(inside, choices.underlying, 0)]
+    return np.where(inside, result, 0.0)
 
 
 def _is_greedy_optimal(nodes: _Nodes, values: _Known | _Ahead, optimal: np.ndarray, slack: float) -> bool:
@@ -322,11 +322,11 @@ def _samples(
             return None
         return optimal[n] & (q > others[:, None] - slack)
 
-    met = nodes.closure(better)
-    if met is None:
+    reached_nodes = nodes.closure(better)
+    if reached_nodes is None:
         return None
-    q, largest = values.at(met), spread[met]
-    gap = q.max(axis=1) - second(met, q)
+    q, largest = values.at(reached_nodes), spread[reached_nodes]
+    gap = q.max(axis=1) - second(reached_nodes, q)
     with np.errstate(invalid="ignore"):
         needed = np.where(np.isinf(gap), 0.0, 16 * largest / gap**2 * log)
     i = int(needed.argmax())

@@ -62,12 +62,12 @@ def minimize(mdp: TabularMDP, observations: Any = None) -> Minimization:
     paid = rewards.table if len(rewards.palette) else rewards.table + 0.0  # -0.0 and 0.0 are one reward
     classes = _numbered(paid, np.asarray(mdp.terminal).astype(np.int64))
     if observations is not None:
-        seen = np.asarray(observations)
-        if seen.ndim == 0 or len(seen) != mdp.num_states:
-            found = len(seen) if seen.ndim else "a number"
-            raise ParameterError(f"there are {found} observations; expected {mdp.num_states}, one for each state")
-        rows = seen.reshape(mdp.num_states, -1)
-        classes = _numbered(rows + 0.0 if seen.dtype.kind == "f" else rows, classes)
+        observed = np.asarray(observations)
+        if observed.ndim == 0 or len(observed) != mdp.num_states:
+            count = len(observed) if observed.ndim else "a number"
+            raise ParameterError(f"there are {count} observations; expected {mdp.num_states}, one for each state")
+        rows = observed.reshape(mdp.num_states, -1)
+        classes = _numbered(rows + 0.0 if observed.dtype.kind == "f" else rows, classes)
     table = mdp.dynamics.deterministic_table()
     classes, rounds = _refined_general(mdp, classes) if table is None else _refined(table, classes)
     _, representatives = np.unique(classes, return_index=True)
@@ -95,16 +95,16 @@ def _refined(table: np.ndarray, classes: np.ndarray) -> tuple[np.ndarray, int]:
     states = len(table)
     small = np.int32 if states < 2**31 else np.int64
     slots, now = _slots(states), classes.astype(small)
-    asked, used, new = np.arange(states, dtype=small), np.empty(states, small), np.empty(states, small)
+    waiting, used, new = np.arange(states, dtype=small), np.empty(states, small), np.empty(states, small)
     count = int(now.max()) + 1
     sizes = np.zeros(states, small)
     sizes[:count] = np.bincount(now)
     changed = np.zeros(states, np.bool_)
     rounds, n = 0, states
     while n:
-        count = partition.split(table, now, sizes, count, asked, n, slots, used, new, changed)
+        count = partition.split(table, now, sizes, count, waiting, n, slots, used, new, changed)
         rounds += 1
-        n = partition.states_to_ask(table, changed, asked)
+        n = partition.states_to_ask(table, changed, waiting)
     return _numbered(now[:, None], np.zeros(states, np.int64)), rounds
 
 
@@ -117,17 +117,17 @@ def _refined_general(mdp: TabularMDP, classes: np.ndarray) -> tuple[np.ndarray, 
         keep = whole > 0
         edges = np.concatenate([[0], np.cumsum(keep)])[reached.indptr]
         columns, weights = reached.indices[keep].astype(np.int64), whole[keep]
-        known: dict[tuple[Any, ...], int] = {}
+        numbers: dict[tuple[Any, ...], int] = {}
         refined = np.empty_like(classes)
         for s in range(mdp.num_states):
             ends = edges[s * mdp.num_actions : (s + 1) * mdp.num_actions + 1]
             inside = slice(ends[0], ends[-1])
             key = (int(classes[s]), (ends - ends[0]).tobytes(), columns[inside].tobytes(), weights[inside].tobytes())
-            refined[s] = known.setdefault(key, len(known))
+            refined[s] = numbers.setdefault(key, len(numbers))
         classes, rounds = refined, rounds + 1
-        if len(known) == count:
+        if len(numbers) == count:
             return classes, rounds
-        count = len(known)
+        count = len(numbers)
 
 
 def _merged(mdp: TabularMDP, classes: np.ndarray, representatives: np.ndarray) -> TabularMDP:

@@ -206,20 +206,20 @@ class Dynamics(ABC):
         before = np.where(first > 0, passed[first - 1], 0.0)
         last = np.append(first[1:], len(outcomes.which)) - 1
         place = np.searchsorted(passed, before + rng.random(len(states)) * (passed[last] - before), side="right")
-        found = outcomes.states[np.clip(place, first, last)]
-        return np.where(found == self.num_states, -1, found)
+        drawn = outcomes.states[np.clip(place, first, last)]
+        return np.where(drawn == self.num_states, -1, drawn)
 
     def reachable(self, starts: np.ndarray, steps: int | None = None) -> np.ndarray:
         """(S,) bool: the states that can be met within `steps` steps (None: any number) from the start states."""
-        met = np.zeros(self.num_states + 1, np.bool_)
-        met[starts], met[-1] = True, True
+        reached_states = np.zeros(self.num_states + 1, np.bool_)
+        reached_states[starts], reached_states[-1] = True, True
         frontier, level = np.unique(starts), 0
         while len(frontier) and (steps is None or level < steps):
             following = self.successors_of(frontier)
-            frontier = following[~met[following]]
-            met[frontier] = True
+            frontier = following[~reached_states[following]]
+            reached_states[frontier] = True
             level += 1
-        return met[:-1]
+        return reached_states[:-1]
 
     def arrivals(self, states: np.ndarray) -> np.ndarray:
         """(S, A) bool: whether executing action a in some of these states may lead to s."""

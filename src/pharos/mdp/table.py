@@ -119,18 +119,18 @@ class Table(Dynamics):
         occupancy.support(self.next_states, play.live, play.policy, play.chance.triple, reached)
 
     def reachable(self, starts: np.ndarray, steps: int | None = None) -> np.ndarray:
-        met = np.zeros(self.num_states, np.bool_)
+        is_reached = np.zeros(self.num_states, np.bool_)
         frontier = np.unique(starts)
-        met[frontier] = True
+        is_reached[frontier] = True
         small = np.int32 if self.num_states < 2**31 else np.int64
         now, following = (np.empty(self.num_states, small) for _ in range(2))
         count, level = len(frontier), 0
         now[:count] = frontier
         while count and (steps is None or level < steps):
-            count = graph.onwards(self.next_states, now, count, following, met)
+            count = graph.onwards(self.next_states, now, count, following, is_reached)
             now, following = following, now
             level += 1
-        return met
+        return is_reached
 
     def longest_path(self, live: np.ndarray) -> int:
         return int(paths.longest_path_of_table(self.next_states, live))

@@ -236,8 +236,8 @@ class TabularMDP:
                 return np.zeros((self.num_states, self.num_actions), np.bool_)
             before = self.states_within(None if steps is None else steps - 1) & ~np.asarray(self.terminal)
             return self.dynamics.arrivals(np.flatnonzero(before))
-        met = np.zeros((self.num_states + 1, self.num_actions), np.bool_)
-        met[-1] = True
+        is_reached = np.zeros((self.num_states + 1, self.num_actions), np.bool_)
+        is_reached[-1] = True
         states, actions = (
             np.repeat(self.starts, self.num_actions),
             np.tile(np.arange(self.num_actions), len(self.starts)),
@@ -249,11 +249,11 @@ class TabularMDP:
             outcomes = self.dynamics.outcomes(states, actions)
             pairs = np.unique(outcomes.states * self.num_actions + actions[outcomes.which])
             states, actions = np.divmod(pairs, self.num_actions)
-            new = ~met[states, actions]
+            new = ~is_reached[states, actions]
             states, actions = states[new], actions[new]
-            met[states, actions] = True
+            is_reached[states, actions] = True
             level += 1
-        return met[:-1]
+        return is_reached[:-1]
 
     # Variants -------------------------------------------------------------------------------------------------------
 
@@ -290,11 +290,11 @@ class TabularMDP:
             This MDP where all of its states are met; else one without a folder, as its states have other numbers.
         Cost: one look at each transition of the states that are met, and a copy of them.
         """
-        met = self.states_within(steps)
-        met[self.start_states] = True
-        if met.all():
+        is_reached = self.states_within(steps)
+        is_reached[self.start_states] = True
+        if is_reached.all():
             return self
-        states = np.flatnonzero(met)
+        states = np.flatnonzero(is_reached)
         number = np.full(self.num_states, -1, np.int64)
         number[states] = np.arange(len(states))
         return replace(
@@ -333,20 +333,20 @@ def _rewards_of_shape(rewards: Any, shape: tuple[int, ...]) -> Rewards:
 
 def _start(initial: Any, num_states: int) -> tuple[np.ndarray, np.ndarray]:
     """Start states and their probabilities."""
-    given = np.asarray(initial)
-    if given.dtype.kind in "iu" and given.ndim == 0:
-        states, probabilities = given.reshape(1), np.ones(1)
-    elif given.dtype.kind in "iu" and given.ndim == 1 and len(given):
-        states, counts = np.unique(given, return_counts=True)
+    start = np.asarray(initial)
+    if start.dtype.kind in "iu" and start.ndim == 0:
+        states, probabilities = start.reshape(1), np.ones(1)
+    elif start.dtype.kind in "iu" and start.ndim == 1 and len(start):
+        states, counts = np.unique(start, return_counts=True)
         probabilities = counts / counts.sum()
-    elif given.dtype.kind == "f" and given.shape == (num_states,):
-        if not (np.isfinite(given).all() and (given >= 0).all() and abs(given.sum() - 1) < 1e-9):
-            raise ParameterError(f"initial sums to {given.sum()}; expected {num_states} probabilities that sum to 1")
-        states = np.flatnonzero(given)
-        probabilities = given[states]
+    elif start.dtype.kind == "f" and start.shape == (num_states,):
+        if not (np.isfinite(start).all() and (start >= 0).all() and abs(start.sum() - 1) < 1e-9):
+            raise ParameterError(f"initial sums to {start.sum()}; expected {num_states} probabilities that sum to 1")
+        states = np.flatnonzero(start)
+        probabilities = start[states]
     else:
         raise ParameterError(
-            f"initial has shape {given.shape} and type {given.dtype}; expected a state, several states, or "
+            f"initial has shape {start.shape} and type {start.dtype}; expected a state, several states, or "
             f"({num_states},) probabilities"
         )
     if (states < 0).any() or (states >= num_states).any():

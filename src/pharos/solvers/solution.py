@@ -70,9 +70,9 @@ class Solution:
     @cached_property
     def policy(self) -> np.ndarray:
         """The policy: for "optimal" and "worst" (S,) greedy actions, the first among equals; else the one given."""
-        given = self.given_policy
-        if given is not None:
-            return given
+        policy_table = self.given_policy
+        if policy_table is not None:
+            return policy_table
         actions = np.empty(self.mdp.num_states, np.int64)
         for start in range(0, self.mdp.num_states, _BLOCK):
             block = slice(start, min(start + _BLOCK, self.mdp.num_states))

@@ -70,14 +70,14 @@ def solution_of(
     began = time.perf_counter()
     steps = None
     if horizon is None:
-        found = fixed_point(mdp, select, tolerance, progress)
-        following = found.x
+        values = fixed_point(mdp, select, tolerance, progress)
+        following = values.x
     else:
-        found, following, steps = backward_induction(mdp, select, horizon, keep_all)
+        values, following, steps = backward_induction(mdp, select, horizon, keep_all)
     if steps is not None:
         steps = steps[:, :-1] if mdp.is_sticky else steps[:, :-1, 0]
     seconds = time.perf_counter() - began
-    return Solution(mdp, found.bound, found.sweeps, seconds, horizon, select, found.x, following, steps)
+    return Solution(mdp, values.bound, values.sweeps, seconds, horizon, select, values.x, following, steps)
 
 
 def check_tolerance(tolerance: float) -> None:
