@@ -1,6 +1,7 @@
 """Searching hyperparameters: what a score is, what is written, that a search goes on, and what bad input gets."""
 
 import json
+import time
 
 import pytest
 import yaml
@@ -8,7 +9,7 @@ from typer.testing import CliRunner
 
 from pharos.agents import hyperparameters
 from pharos.cli import app
-from pharos.errors import ParameterError
+from pharos.errors import FileFormatError, ParameterError
 from pharos.experiments import SPACES, read_record, train, tune
 
 LAKE = "frozen_lake/4x4"
@@ -149,3 +150,24 @@ def test_the_command_takes_several_kinds_of_chance(tmp_path):
     assert run("tune", LAKE, *options, *chances).exit_code == 0
     kept = json.loads((tmp_path / "t" / "tuning.json").read_text())["config"]["chance"]
     assert kept == [{"sticky": 0.0, "random": 0.0}, {"sticky": 0.25, "random": 0.1}]
+
+
+def test_a_search_goes_on_where_the_last_line_of_its_journal_was_cut(tmp_path):
+    once = tune("q_learning", "frozen_lake/4x4", steps=200, trials=3, seeds=[0], out=tmp_path)
+    journal = tmp_path / "journal.log"
+    journal.write_bytes(journal.read_bytes()[:-7])
+    (tmp_path / "journal.log.lock").touch()  # Optuna's, of a process that was killed
+    began = time.perf_counter()
+    again = tune("q_learning", "frozen_lake/4x4", steps=200, trials=4, seeds=[0], out=tmp_path)
+    assert time.perf_counter() - began < 20
+    assert [trial["score"] for trial in again.trials][:2] == [trial["score"] for trial in once.trials][:2]
+    assert sum(trial["status"] in ("finished", "given up") for trial in again.trials) == 4
+
+
+def test_a_journal_that_is_damaged_elsewhere_is_one_line(tmp_path):
+    tune("q_learning", "frozen_lake/4x4", steps=200, trials=2, seeds=[0], out=tmp_path)
+    journal = tmp_path / "journal.log"
+    lines = journal.read_bytes().splitlines(keepends=True)
+    journal.write_bytes(b"".join([lines[0], lines[1][:9] + b"\n", *lines[2:]]))
+    with pytest.raises(FileFormatError, match=r"journal\.log:2: is no JSON"):
+        tune("q_learning", "frozen_lake/4x4", steps=200, trials=3, seeds=[0], out=tmp_path)

@@ -29,6 +29,7 @@ from pharos.environments import Environment, make
 from pharos.errors import MissingExtra, ParameterError
 from pharos.experiments import results as _results
 from pharos.experiments.config import ChanceSetting
+from pharos.experiments.journal import JournalLock, mend_journal
 from pharos.experiments.task import Task
 from pharos.experiments.train import train_on
 from pharos.observations import own_observation
@@ -332,10 +333,15 @@ def _claim(folder: Path, config: Mapping[str, Any]) -> None:
 def _storage(optuna: Any, folder: Path | None) -> Any:
     if folder is None:
         return None
-    from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
+    from optuna.storages.journal import JournalFileBackend
 
-    path = str(folder / "journal.log")
-    return optuna.storages.JournalStorage(JournalFileBackend(path, lock_obj=JournalFileOpenLock(path)))
+    journal_lock = JournalLock(folder)
+    journal_lock.acquire()
+    try:
+        mend_journal(folder / "journal.log")
+    finally:
+        journal_lock.release()
+    return optuna.storages.JournalStorage(JournalFileBackend(str(folder / "journal.log"), lock_obj=journal_lock))
 
 
 def _write(
