@@ -341,7 +341,8 @@ def _storage(optuna: Any, folder: Path | None) -> Any:
         mend_journal(folder / "journal.log")
     finally:
         journal_lock.release()
-    return optuna.storages.JournalStorage(JournalFileBackend(str(folder / "journal.log"), lock_obj=journal_lock))
+    backend = JournalFileBackend(str(folder / "journal.log"), lock_obj=journal_lock)  # type: ignore[arg-type]
+    return optuna.storages.JournalStorage(backend)
 
 
 def _write(
