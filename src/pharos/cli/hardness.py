@@ -70,7 +70,7 @@ def hardness(
     """Measure how hard an instance is: visitation, estimation and planning complexity."""
     limit = parse_size(memory)
     if measures is not None:
-        from pharos.hardness.registry import chosen
+        from pharos.hardness import chosen
 
         chosen(measures)  # an unknown name is told before anything is built
     goal = parse_target(target, parameters)

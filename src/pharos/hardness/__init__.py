@@ -16,7 +16,7 @@ from pharos.hardness.interval import Budget, Certificate, Certified, Interval, P
 from pharos.hardness.mismatch import distribution_mismatch
 from pharos.hardness.mixing_time import MixingTime, mixing_time
 from pharos.hardness.occupancy import Occupancy, occupancy
-from pharos.hardness.registry import Measure, Problem, measures, register
+from pharos.hardness.registry import Measure, Problem, chosen, measures, register
 from pharos.hardness.report import Report, Result, report
 from pharos.hardness.return_distribution import ReturnDistribution, return_distribution
 from pharos.hardness.stationary_horizon import StationaryHorizon, stationary_effective_horizon
@@ -43,6 +43,7 @@ __all__ = [
     "ReturnDistribution",
     "StationaryHorizon",
     "action_gap_regularity",
+    "chosen",
     "colosseum_diameter",
     "covering",
     "diameter",
