@@ -175,11 +175,9 @@ class Graph:
         """The graph of `mdp`; None where a choice or a restart has several outcomes."""
         if mdp.is_sticky or mdp.is_random:
             return None
-        table = mdp.next_states
+        table = mdp.dynamics.deterministic_table()
         if table is None:
-            table = _deterministic_table(mdp)
-            if table is None:
-                return None
+            return None
         restarts = restart and (bool(mdp.terminal.any()) or _leads_to_end(table, mdp.terminal))
         if restarts and len(mdp.start_states) > 1:
             return None
@@ -216,18 +214,6 @@ def _leads_to_end(table: np.ndarray, terminal: np.ndarray) -> bool:
         if (ending & ~np.asarray(terminal[low : low + block])).any():
             return True
     return False
-
-
-def _deterministic_table(mdp: TabularMDP) -> np.ndarray | None:
-    """(S, A) next states of a general MDP whose rows have one entry, 1, or none; else None."""
-    matrix = mdp.transitions
-    assert matrix is not None
-    counts = np.diff(matrix.indptr)
-    if (counts > 1).any() or not (matrix.data == 1.0).all():
-        return None
-    table = np.full(counts.size, -1, np.int32 if mdp.num_states < 2**31 else np.int64)
-    table[counts == 1] = matrix.indices
-    return table.reshape(mdp.num_states, mdp.num_actions)
 
 
 class _Sweep:
