@@ -278,3 +278,44 @@ def test_a_folder_of_an_imported_mdp_is_said_to_be_one_and_never_to_be_deleted(t
             attempt(folder)
         assert "delete" not in str(caught.value) and "\n" not in str(caught.value)
     assert exporters.gym_p(importers.load(folder))[1][1] == [(1.0, 2, 1.0, True)]
+
+
+def survive_imported(folder, mutations):
+    """The same with the arrays of imported MDPs, tables and matrices."""
+    rng, right, wrong = np.random.default_rng(3), 0, 0
+    table = TabularMDP.from_arrays(rng.integers(-1, 40, (40, 3)), rng.random((40, 3)))
+    matrices = rng.random((20, 2, 20)) * (rng.random((20, 2, 20)) < 0.2)
+    general = TabularMDP.from_matrices(matrices / np.maximum(matrices.sum(2, keepdims=True), 1), rng.random((20, 2)))
+    for mdp in (table, general):
+        place = importers.save(mdp, folder / str(mdp.num_states))
+        files = {path.name: path.read_bytes() for path in place.iterdir()}
+        for _ in range(mutations // 2):
+            for name, data in files.items():
+                (place / name).write_bytes(data)
+            name = rng.choice(sorted(name for name in files if name.endswith(".npy")))
+            data = bytearray(files[name])
+            first = 0 if rng.random() < 0.2 else 128  # headers now and then
+            for _ in range(rng.integers(1, 4)):
+                data[rng.integers(first, len(data))] ^= 1 << int(rng.integers(8))
+            (place / name).write_bytes(data)
+            manifest = json.loads(files["manifest.json"])
+            manifest.pop("digest")
+            manifest["arrays"][name.removesuffix(".npy")] = xxhash.xxh3_128_hexdigest(bytes(data))
+            (place / "manifest.json").write_text(json.dumps(manifest))
+            try:
+                solution = pharos.value_iteration(importers.load(place).with_gamma(0.5))
+                assert np.isfinite(solution.v).all() and solution.error_bound < np.inf
+                right += 1
+            except PharosError as error:
+                assert "\n" not in str(error), error
+                wrong += 1
+    print(right, wrong)
+
+
+def test_mutants_of_an_imported_mdp_never_end_the_process(tmp_path):
+    code = f"import sys, pathlib; sys.path.insert(0, {str(Path(__file__).parent)!r}); import test_hostile_spaces as t\n"
+    code += f"t.survive_imported(pathlib.Path({str(tmp_path)!r}), 400)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-2000:]
+    right, wrong = map(int, done.stdout.split())
+    assert right + wrong == 400 and right > 20 and wrong > 100
