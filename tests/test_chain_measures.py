@@ -118,9 +118,8 @@ def test_the_mismatch_contains_the_largest_ratio_of_visits(mdp):
     solution = pharos.value_iteration(mdp, 1e-9)
     P, _, start = augmented(mdp)
     width = mdp.num_actions + 1
-    dead = np.append(np.repeat(np.asarray(mdp.terminal), width), True)
-    start = np.where(dead, 0, start)
-    P[:, :, dead] = 0
+    for n in np.flatnonzero(np.append(np.repeat(np.asarray(mdp.terminal), width), True)):
+        P[n] = np.eye(len(P))[n]  # terminal states and the end are never left
     choice = np.append(np.repeat(np.asarray(solution.policy), width), 0)
     if np.asarray(solution.policy).ndim == 2:
         choice = np.append(np.asarray(solution.policy).ravel(), 0)
@@ -128,20 +127,35 @@ def test_the_mismatch_contains_the_largest_ratio_of_visits(mdp):
     def visits(policy):
         chain = np.einsum("na,nam->nm", policy, P)
         d = np.linalg.solve(np.eye(len(P)) - mdp.gamma * chain.T, start)
-        return d[:-1].reshape(mdp.num_states, width).sum(axis=1)
+        return np.append(d[:-1].reshape(mdp.num_states, width).sum(axis=1), d[-1])
 
     best = visits(np.eye(mdp.num_actions)[choice])
     other = visits(np.full((len(P), mdp.num_actions), 1 / mdp.num_actions))
     met = best > 1e-8
-    expected = (best[met] / other[met]).max() if met.any() else 0.0
+    expected = (best[met] / other[met]).max()
     found = hardness.distribution_mismatch(mdp, solution=solution)
-    assert found.lower <= expected * (1 + 1e-6) + 1e-9
+    assert 1 <= found.lower <= expected * (1 + 1e-6) + 1e-9
     assert found.upper >= expected * (1 - 1e-6) - 1e-9
+    if found.exact and mdp.gamma > 0:
+        assert found.upper == pytest.approx(expected, rel=1e-5)
+
+
+def test_the_mismatch_counts_terminal_states_and_the_end_alike():
+    """Half of uniform play comes to the state that the optimal policy always comes to; it is the same process, told in
+    three ways."""
+    rewards = [[1.0, 0.0], [0.0, 0.0], [0.0, 0.0]]
+    plain = TabularMDP.from_arrays([[1, 2], [1, 1], [2, 2]], rewards, gamma=0.9)
+    terminal = TabularMDP.from_arrays([[1, 2], [1, 1], [2, 2]], rewards, gamma=0.9, terminal=[False, True, True])
+    ending = TabularMDP.from_arrays([[-1, 1], [1, 1]], rewards[:2], gamma=0.9)
+    for mdp in (plain, terminal, ending):
+        found = hardness.distribution_mismatch(mdp)
+        assert found.exact and found.lower <= 2.0 <= found.upper
 
 
 @pytest.mark.parametrize("backwards", [False, True])
 def test_the_mismatch_counts_states_that_are_met_after_all_that_is_worth_a_step(backwards):
-    """A path: one action goes on and pays 1, the other ends. d*(s) / d(s) = 2^s, while gamma^s sinks below any tolerance."""
+    """A path: one action goes on and pays 1, the other ends. d*(s) / d(s) = 2^s, while gamma^s sinks below any
+    tolerance."""
     length = 60
     following = np.full((length, 2), -1)
     following[:-1, 0] = np.arange(1, length)
@@ -164,6 +178,15 @@ def test_support_is_where_the_walk_may_be(mdp, seed):
     policy = random.integers(mdp.num_actions, size=mdp.num_states)
     walk = hardness.occupancy(mdp.with_horizon(None), policy, horizon=mdp.num_states * (mdp.num_actions + 1) + 1)
     assert (_occupancy.support(mdp, policy) == (walk.largest.sum(axis=1) > 0)).all()
+    P, _, start = augmented(mdp)  # of terminal states and the end: what executed actions lead to
+    width = mdp.num_actions + 1
+    over = np.append(np.repeat(np.asarray(mdp.terminal), width), True)
+    chain = P[np.arange(len(P)), np.append(np.repeat(policy, width), 0)]
+    met = start > 0
+    for _ in range(len(P)):
+        met = met | ((chain[met & ~over] > 0).any(axis=0))
+    states = np.append(met[:-1].reshape(mdp.num_states, width).any(axis=1), met[-1])
+    assert (_occupancy.support_with_ends(mdp, policy) == states).all()
 
 
 def test_the_mismatch_of_the_optimal_policy_with_itself_is_one():

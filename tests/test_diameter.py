@@ -131,7 +131,7 @@ def test_wrong_options_are_named():
         hardness.diameter(mdp, budget=-1)
 
 
-# Clocks: products of an autonomous clock with a walker ---------------------------------------------------------------------
+# Clocks: products of an autonomous clock with a walker ----------------------------------------------------------------
 
 
 def clocked(period, rows, blocked):
@@ -176,7 +176,7 @@ def test_a_clock_with_layers_of_many_words_is_followed():
     assert (found.lower, found.upper) == (period + rows - 2, period + rows - 2)
 
 
-# Start eccentricity -------------------------------------------------------------------------------------------------------
+# Start eccentricity ---------------------------------------------------------------------------------------------------
 
 
 def ring(length, starts):

@@ -203,3 +203,15 @@ def test_a_freeway_is_analysed_for_the_states_that_an_episode_meets():
     found = hardness.effective_horizon(mdp, horizon=100)
     assert found.num_states == met < mdp.num_states / 5
     assert found.optimal_return == pharos.value_iteration(mdp.with_horizon(100)).value_at_start
+
+
+@pytest.mark.parametrize("less", [0.0, 5e-5, 2e-4])
+def test_actions_that_rounding_or_less_than_the_tie_tolerance_tells_apart_are_both_optimal(less):
+    """0.1 + 0.2 is more than 0.3 by rounding. Random play prefers 0.3 at once; that is optimal unless it is 1e-4 less."""
+    mdp = TabularMDP.from_arrays(
+        [[1, 2], [3, 3], [3, 3], [3, 3]], [[0.1, 0.3 - less], [0.2, 0.0], [0.0, 0.0], [0.0, 0.0]]
+    )
+    expected = 1 if less < TIE else 2
+    assert 0.1 + 0.2 > 0.3
+    assert _vectorized(Steps(mdp, 2))["k_min"] == expected
+    assert _compiled(LargeHorizon(mdp, 2, TIE))["k_min"] == expected

@@ -108,11 +108,12 @@ def test_a_solution_of_another_mdp_or_policy_is_refused():
         hardness.gaps(mdp, pharos.evaluate_policy(mdp, np.array([0])))
 
 
-# Proofs -------------------------------------------------------------------------------------------------------------------
+# Proofs ---------------------------------------------------------------------------------------------------------------
 
 
 def exact_gaps(mdp):
-    """All gaps of a deterministic MDP without chance, of reachable live states, by policy iteration in exact fractions."""
+    """All gaps of a deterministic MDP without chance, of reachable live states, by policy iteration in exact
+    fractions."""
     gamma, table, rewards = Fraction(mdp.gamma), mdp.next_states, mdp.rewards
     size, policy = len(table), [0] * len(table)
     while True:
@@ -229,7 +230,8 @@ def test_ties_between_ways_round_are_proven():
 
 
 def test_a_wide_interval_counts_the_whole_error_at_either_end():
-    """Of a bandit with arms of 1 and 0.5: 1 / (gap + error) and 1 / (gap - error), where a gap is known to twice the bound."""
+    """Of a bandit with arms of 1 and 0.5: 1 / (gap + error) and 1 / (gap - error), where a gap is known to twice the
+    bound."""
     mdp = TabularMDP.from_arrays([[0, 0]], [[1.0, 0.5]], gamma=0.5)
     solution = pharos.value_iteration(mdp, 0.1)
     error = 2 * solution.error_bound

@@ -178,7 +178,7 @@ def test_the_command_refuses_unknown_measures_before_it_builds():
     assert result.stdout == ""
 
 
-# What is proven ---------------------------------------------------------------------------------------------------------
+# What is proven -------------------------------------------------------------------------------------------------------
 
 
 def test_every_measure_says_what_is_proven_of_it():
@@ -227,7 +227,7 @@ def test_reasons_stand_below_the_table():
     assert any("effective_horizon is defined for episodes of T steps: give a horizon" in line for line in lines)
 
 
-# Kept results -------------------------------------------------------------------------------------------------------------
+# Kept results ---------------------------------------------------------------------------------------------------------
 
 
 def edited(path, change):

@@ -133,7 +133,8 @@ def test_every_step_of_a_lazy_ring_takes_longer(lazy):
 
 
 def test_a_lazy_grid_has_the_published_diameter():
-    """Colosseum's continuous simple grid of 16 x 16 with a lazy probability of 0.065: 32.08537, to its tolerance of 1e-3."""
+    """Colosseum's continuous simple grid of 16 x 16 with a lazy probability of 0.065: 32.08537, to its tolerance of
+    1e-3."""
     size, lazy = 16, 0.065
     matrix = np.zeros((size * size, 4, size * size))
     for row in range(size):
@@ -178,18 +179,20 @@ def test_progress_shows_bounds_that_squeeze():
     assert all(each.lower <= found.upper <= each.upper * (1 + 1e-9) for each in seen)
 
 
-# Large hitting times ------------------------------------------------------------------------------------------------------
+# Large hitting times --------------------------------------------------------------------------------------------------
 
 
 def combination_lock(length, wrong=0.5):
-    """`length` right actions in a row; anything else leads back to the start. A wrong one is executed with probability wrong / 2."""
+    """`length` right actions in a row; anything else leads back to the start. A wrong one is executed with probability
+    wrong / 2."""
     following = [[i + 1, 0] for i in range(length)] + [[0, 0]]
     plain = TabularMDP.from_arrays(following, np.zeros((length + 1, 2)), gamma=0.9)
     return random_actions(plain, wrong)
 
 
 def time_to_open(length):
-    """E[steps] = sum over k = 1, ..., length of (4 / 3)^k, where the right action is executed with probability 3 / 4."""
+    """E[steps] = sum over k = 1, ..., length of (4 / 3)^k, where the right action is executed with probability 3 /
+    4."""
     return sum(Fraction(4, 3) ** k for k in range(1, length + 1))
 
 
@@ -231,7 +234,8 @@ def test_long_lakes_have_the_diameter_of_sixty_digits(width, truth):
 
 @st.composite
 def rare_rows(draw, max_states=4, max_actions=2):
-    """(S, A) of (state, rare state, k): an action leads to the rare state with probability 2^-k, else to the other one."""
+    """(S, A) of (state, rare state, k): an action leads to the rare state with probability 2^-k, else to the other
+    one."""
     num_states, num_actions = draw(st.integers(2, max_states)), draw(st.integers(1, max_actions))
     state = st.integers(0, num_states - 1)
     outcome = st.tuples(state, state, st.sampled_from([1, 4, 12, 20, 30, 40, 50]))

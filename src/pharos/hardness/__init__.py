@@ -1,7 +1,8 @@
 """How hard an MDP is to learn: how long it takes to get around, to tell actions apart, and to look ahead.
 
-Visitation complexity: `diameter`, `start_eccentricity`, `covering`. Estimation complexity: `gaps`, `sum_of_reciprocal_gaps`, `minimal_gap`,
-`environmental_value_norm`. Planning: `effective_horizon`. All of them: `report`; one of your own: `register`.
+Visitation complexity: `diameter`, `start_eccentricity`, `covering`. Estimation complexity: `gaps`,
+`sum_of_reciprocal_gaps`, `minimal_gap`, `environmental_value_norm`. Planning: `effective_horizon`. All of them:
+`report`; one of your own: `register`.
 """
 
 from pharos.hardness import built_in as _built_in  # noqa: F401  (registers the measures; the order of a report)

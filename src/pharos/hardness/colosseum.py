@@ -1,4 +1,4 @@
-"""The diameter as Colosseum defines it for episodes of a fixed length, for comparison. Source: Conserva and Rauber (2022)."""
+"""The diameter as Colosseum defines it for episodes of a fixed length. Source: Conserva and Rauber (2022)."""
 
 from typing import Any
 
@@ -17,8 +17,9 @@ def colosseum_diameter(mdp: TabularMDP, *, horizon: int | None = None) -> float:
 
         ET_e(h, e) = 0;  ET_e(h, s) = 1 + min_a E[ET_e(h + 1, s')] for h < H - 1;  ET_e(H - 1, s) = 1 + E[ET_e(0, s0)]
 
-    After H steps an episode starts again, in a state s0 of the start distribution. The minimum runs over all h, also those at
-    which s cannot be reached, so this is not the diameter of `diameter`. Terminal states last until the episode starts again.
+    After H steps an episode starts again, in a state s0 of the start distribution. The minimum runs over all h, also
+    those at which s cannot be reached, so this is not the diameter of `diameter`. Terminal states last until the
+    episode starts again.
 
     Args:
         horizon: H, steps; that of the MDP by default.
@@ -50,16 +51,16 @@ def colosseum_diameter(mdp: TabularMDP, *, horizon: int | None = None) -> float:
 class _Episodes:
     """Least expected times to each of several targets, through episodes of H steps.
 
-    With x = E[ET(0, s0)], every policy of an episode gives x -> c + q x: c its expected steps, q the probability that it
-    misses the target. The least of these lines crosses the diagonal at x; it is found from above by Newton's method, each
-    step of which takes the best policy for the last x. It starts with the policy that is least likely to miss.
+    With x = E[ET(0, s0)], every policy of an episode gives x -> c + q x: c its expected steps, q the probability that
+    it misses the target. The least of these lines crosses the diagonal at x; it is found from above by Newton's method,
+    each step of which takes the best policy for the last x. It starts with the policy that is least likely to miss.
     """
 
     def __init__(self, matrix: Any, num_actions: int, goal: np.ndarray, rho: np.ndarray, horizon: int):
         self.matrix, self.num_actions, self.goal, self.rho, self.horizon = matrix, num_actions, goal, rho, horizon
 
     def _pass(self, x: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The episode that is best for x, a step costing `step`: its c and q at the start, and the least positive times."""
+        """The episode that is best for x at `step` a step: its c and q at the start, and the least positive times."""
         steps, misses = np.where(self.goal, 0.0, 1.0), np.where(self.goal, 0.0, 1.0)
         least = step * steps + misses * x
         shape = (len(self.goal), self.num_actions, self.goal.shape[1])

@@ -1,7 +1,8 @@
-"""Diameter: the largest number of steps that the best way between two states takes. Source: Jaksch, Ortner and Auer (2010).
+"""Diameter: the largest number of steps of the best way between two states. Source: Jaksch, Ortner and Auer (2010).
 
-Deterministic MDPs: directed ExactSumSweep (Borassi et al. 2015) from the start state, searches from many nodes at once where
-it does not close (Then et al. 2014), and an argument of ours for spaces that contain a clock. Chance: _stochastic_diameter.
+Deterministic MDPs: directed ExactSumSweep (Borassi et al. 2015) from the start state, searches from many nodes at once
+where it does not close (Then et al. 2014), and an argument of ours for spaces that contain a clock. Chance:
+`stochastic_diameter`.
 """
 
 import math
@@ -13,11 +14,17 @@ import numpy as np
 from pharos.errors import ParameterError, UndefinedMeasure
 from pharos.hardness.interval import Budget, Interval, Progress, Spending, conventions_of
 from pharos.hardness.stochastic_diameter import stochastic_diameter, stochastic_start_eccentricity
+from pharos.kernels import graph
 from pharos.mdp import TabularMDP, takes_mdp
 
-_WIDE = 1024  # nodes of a layer, beyond which layers are not narrow
-_WORDS = (1, 8)  # widths of searches from many nodes, in words of 64 sources
-_BATCH_MEMORY = 2**31  # bytes
+# Untyped, as starred arguments of compiled functions are not checked.
+kernels: Any = graph
+# Nodes of a layer beyond which layers are not narrow: a set of them no longer fits into a core's cache.
+_WIDE = 1024
+# Widths of searches from many nodes, in words of 64 sources: eight words are a cache line.
+_WORDS = (1, 8)
+# Bytes that searches from many nodes may take.
+_BATCH_MEMORY = 2**31
 
 
 @takes_mdp
@@ -33,24 +40,25 @@ def diameter(
 
         D = max over s != s' of min over policies of E[steps from s to s']
 
-    Deterministic MDPs: the largest distance in the graph, exact. With chance: the largest optimal expected hitting time, up
-    to `tolerance`. Rewards, gamma and the horizon do not matter.
+    Deterministic MDPs: the largest distance in the graph, exact. With chance: the largest optimal expected hitting
+    time, up to `tolerance`. Rewards, gamma and the horizon do not matter.
 
     Args:
-        restart: in a terminal state every action leads to a start state, drawn from the start distribution, in one step.
+        restart: in a terminal state every action leads to a start state, drawn from the start distribution, in one
+            step.
             False: terminal states are absorbing, so that D is infinite wherever a state cannot be reached from one.
         tolerance: relative width of the interval from which on it counts as exact. Counted steps are exact anyway.
         budget: seconds (300 by default), or a `Budget`; a value out of reach comes as the interval proven by then.
         progress: called with a `Progress` now and then.
     Returns:
-        An `Interval`, in steps. The implicit end of an episode (-1 in a row of `next_states`) counts as one more state, the
-        only one beside the S states. Under sticky actions s' is a state reached with any previous action, and s stands for
-        every reachable (state, previously executed action) and the start states without a previous action.
+        An `Interval`, in steps. The implicit end of an episode (-1 in a row of `next_states`) counts as one more state,
+        the only one beside the S states. Under sticky actions s' is a state reached with any previous action, and s
+        stands for every reachable (state, previously executed action) and the start states without a previous action.
     Raises:
         ParameterError: an option is out of range.
     Cost:
         deterministic: usually 3 to 100 breadth-first searches, each one pass over the table in the order of discovery;
-        memory 8 bytes an edge and 32 a state. Chance: see `_stochastic_diameter`.
+        memory 8 bytes an edge and 32 a state. Chance: see `stochastic_diameter`.
     Source: Jaksch, Ortner and Auer (2010), definition 1; Borassi et al. (2015), "Fast diameter and radius BFS-based
         computation in (weakly connected) real-world graphs", section 4.
     """
@@ -66,22 +74,22 @@ def diameter(
 def start_eccentricity(
     mdp: TabularMDP, *, restart: bool = True, tolerance: float = 1e-6, budget: Budget | float | None = None
 ) -> float:
-    """Return the largest least expected number of steps from the start to a state: the literal reading of the paper's (1).
+    """Return the largest least expected number of steps from the start to a state: the paper's (1), read literally.
 
-        max over s' of min over policies of E[steps from a start state to s'], the start drawn from the start distribution
+        max over s' of min over policies of E[steps from a start state to s'], the start being drawn
 
     Args:
         restart: as in `diameter`; without chance and with one start state it makes no difference.
         tolerance: relative accuracy under chance, and with several start states; else it is counted.
         budget: seconds (300 by default), or a `Budget`, under chance and with several start states.
     Returns:
-        Steps; infinite where some state cannot be reached from some start state. An expectation comes as its upper bound,
-        proven to lie within `tolerance`.
+        Steps; infinite where some state cannot be reached from some start state. An expectation comes as its upper
+        bound, proven to lie within `tolerance`.
     Raises:
         UndefinedMeasure: out of reach of the budget or of 64-bit floats; it names the interval that is proven.
         `start_eccentricity_interval` returns it.
-    Cost: one search for each start state; under chance, and where terminal states lead back to several start states, one
-        stochastic shortest path problem for each target that bounds do not rule out.
+    Cost: one search for each start state; under chance, and where terminal states lead back to several start states,
+        one stochastic shortest path problem for each target that bounds do not rule out.
     Source: the pharos paper, equation 1.
     """
     interval = start_eccentricity_interval(mdp, restart=restart, tolerance=tolerance, budget=budget)
@@ -144,15 +152,8 @@ def _check_tolerance(tolerance: float) -> None:
         raise ParameterError(f"tolerance is {tolerance!r}; expected a number between 0 and 1")
 
 
-def _kernels() -> Any:
-    """The compiled searches, loaded when the first one is made."""
-    from pharos.kernels import graph
-
-    return graph
-
-
 class Graph:
-    """The graph of a deterministic MDP, with restart edges and the implicit end as `pharos.kernels.graph` describes them.
+    """The graph of a deterministic MDP, with restart edges and the implicit end; see `pharos.kernels.graph`.
 
     Attributes:
         num_nodes: N, the states and, where some transition of a state that is not terminal is -1, the end.
@@ -192,17 +193,15 @@ class Graph:
             if self.start >= 0:
                 ending = np.flatnonzero(self.ends)
                 restarting = np.append(ending, [len(self.next_states)] * self.has_end).astype(self.dtype)
-            self._reversed = (*_kernels().reversed_graph(self.next_states, self.ends, self.num_nodes), restarting)
+            self._reversed = (*kernels.reversed_graph(self.next_states, self.ends, self.num_nodes), restarting)
         return self._reversed
 
     def search_forward(self, source: int, distance: np.ndarray) -> tuple[int, int, int]:
         """distance[v] = d(source, v); (nodes found, largest distance, sum of distances)."""
-        kernels = _kernels()
         return kernels.search_forward(self.next_states, self.ends, self.start, source, distance, self.queue)
 
     def search_backward(self, source: int, distance: np.ndarray) -> tuple[int, int, int]:
         """distance[v] = d(v, source); (nodes found, largest distance, sum of distances)."""
-        kernels = _kernels()
         return kernels.search_backward(*self.backward, self.start, source, distance, self.queue)
 
 
@@ -220,9 +219,9 @@ class _Sweep:
     """Bounds on all eccentricities, tightened by searches until one side leaves no node that could be farther.
 
     out(v) = max over w of d(v, w), in(v) = max over w of d(w, v). From d(v, w) <= d(v, p) + d(p, w) follow
-    out(v) <= d(v, p) + out(p) and in(v) <= in(p) + d(p, v) for a pivot p searched in both directions; a search from w in
-    one direction gives out(w) or in(w) exactly, and a lower bound for everyone. D = max out = max in: it is proven as soon
-    as no out(v), or no in(v), can exceed the largest eccentricity found.
+    out(v) <= d(v, p) + out(p) and in(v) <= in(p) + d(p, v) for a pivot p searched in both directions; a search from w
+    in one direction gives out(w) or in(w) exactly, and a lower bound for everyone. D = max out = max in: it is proven
+    as soon as no out(v), or no in(v), can exceed the largest eccentricity found.
     """
 
     def __init__(self, graph: Graph, spending: Spending, conventions: dict[str, Any]):
@@ -267,11 +266,10 @@ class _Sweep:
             seconds=self.spending.seconds,
         )
 
-    # Searches ------------------------------------------------------------------------------------------------------------
+    # Searches ---------------------------------------------------------------------------------------------------------
 
     def _pivot(self, p: int) -> bool:
-        """Search from p in both directions; False where p does not reach everything, or is not reached by everything."""
-        kernels = _kernels()
+        """Search from p in both directions; False where p does not reach all nodes, or not all reach p."""
         found, out_pivot, _ = self.graph.search_forward(p, self.away)
         reached, in_pivot, _ = self.graph.search_backward(p, self.to)
         self.spending.searches += 2
@@ -285,14 +283,12 @@ class _Sweep:
         return True
 
     def _search_out(self, v: int) -> None:
-        kernels = _kernels()
         _, largest, _ = self.graph.search_forward(v, self.away)
         kernels.raise_lower(self.away, self.in_lower)
         self._settle_out(v, largest)
         self.spending.searches += 1
 
     def _search_in(self, v: int) -> None:
-        kernels = _kernels()
         _, largest, _ = self.graph.search_backward(v, self.to)
         kernels.raise_lower(self.to, self.out_lower)
         self._settle_in(v, largest)
@@ -307,21 +303,20 @@ class _Sweep:
         self.best = max(self.best, int(value))
 
     def _open(self) -> tuple[int, tuple[int, int, int, int, int]]:
-        kernels = _kernels()
         counts = kernels.open_eccentricities(self.out_lower, self.out_upper, self.in_lower, self.in_upper, self.best)
         return min(counts[0], counts[1]), counts
 
     def _upper(self) -> int:
         return max(self.best, min(int(self.out_upper.max()), int(self.in_upper.max())))
 
-    # The sweep -----------------------------------------------------------------------------------------------------------
+    # The sweep --------------------------------------------------------------------------------------------------------
 
     def _sweep(self) -> None:
-        """Search where it pays: the kind of search that closed most nodes for its cost, the others tried again now and then.
+        """Search where it pays: the kind that closed most nodes for its cost, the others now and then.
 
-        The kinds: from the node of the largest upper bound forward, or backward; from the middle in both directions; from
-        up to 512 open nodes at once. Costs are counted in table entries read, not in seconds, so that the searches made are
-        the same on every machine.
+        The kinds: from the node of the largest upper bound forward, or backward; from the middle in both directions;
+        from up to 512 open nodes at once. Costs are counted in table entries read, not in seconds, so that the searches
+        made are the same on every machine.
         """
         one = max(1, self.graph.num_nodes * self.graph.next_states.shape[1])
         worth = {"out": math.inf, "in": math.inf, "middle": math.inf}
@@ -352,7 +347,6 @@ class _Sweep:
 
     def _search_many(self, outward: bool, words: int) -> int:
         """The exact eccentricities of the open nodes with the largest upper bounds; table entries read, times words."""
-        kernels = _kernels()
         graph = self.graph
         upper, lower = (self.out_upper, self.out_lower) if outward else (self.in_upper, self.in_lower)
         nodes = np.flatnonzero(np.greater(upper, self.best))
@@ -378,25 +372,24 @@ class _Sweep:
         self.method = "directed ExactSumSweep, then searches from many states at once"
         return int(reads) * (1 + words)
 
-    # Clocks --------------------------------------------------------------------------------------------------------------
+    # Clocks -----------------------------------------------------------------------------------------------------------
 
     def _from_clock(self) -> "Interval | str":
-        """D of a graph that contains a clock, or why this argument does not give it (an empty string: there is no clock).
+        """D of a graph that contains a clock, or why this argument does not give it ("": there is no clock).
 
         Let the graph be strongly connected and P the greatest common divisor of the lengths of its cycles. The layers
-        C_j = {v: d(p, v) = j modulo P} are such that every edge leads from C_j to C_{j+1}. Let R_k(u) be the set of nodes
-        that u in C_j reaches in exactly k steps, a subset of C_{j+k}. Once R_k(u) is all of C_{j+k}, so is R_{k+1}(u) all of
-        C_{j+k+1}, as every node has a predecessor, which lies in the layer before. Let g be the largest k at which some u
-        does not reach its whole layer, g = -1 if there is none.
+        C_j = {v: d(p, v) = j modulo P} are such that every edge leads from C_j to C_{j+1}. Let R_k(u) be the set of
+        nodes that u in C_j reaches in exactly k steps, a subset of C_{j+k}. Once R_k(u) is all of C_{j+k}, so is
+        R_{k+1}(u) all of C_{j+k+1}, as every node has a predecessor, which lies in the layer before. Let g be the
+        largest k at which some u does not reach its whole layer, g = -1 if there is none.
 
-        Claim: if g < P then D = P + g. At most: for all u and v one of g + 1, ..., g + P is the difference of their layers
-        modulo P, and R of that many steps is whole, so d(u, v) <= g + P. At least, for g >= 0: let v be missing in R_g(u).
-        All walks from u to v have a length of g modulo P; g itself is none, and as g < P nothing smaller is, so
-        d(u, v) >= g + P. For g = -1 every layer is one node and the graph is a cycle of P nodes: D = P - 1.
+        Claim: if g < P then D = P + g. At most: for all u and v one of g + 1, ..., g + P is the difference of their
+        layers modulo P, and R of that many steps is whole, so d(u, v) <= g + P. At least, for g >= 0: let v be missing
+        in R_g(u). All walks from u to v have a length of g modulo P; g itself is none, and as g < P nothing smaller is,
+        so d(u, v) >= g + P. For g = -1 every layer is one node and the graph is a cycle of P nodes: D = P - 1.
 
         The sets are found for one layer at a time, a bit for each of its nodes; this pays where layers are narrow.
         """
-        kernels = _kernels()
         graph = self.graph
         if graph.num_nodes < 64:
             return ""
@@ -426,8 +419,7 @@ class _Sweep:
 
 
 def _infinite_diameter(graph: Graph, spending: Spending, conventions: dict[str, Any]) -> Interval:
-    """D of a graph that is not strongly connected: infinite; with the count of unreachable pairs and the finite part."""
-    kernels = _kernels()
+    """D of a graph that is not strongly connected: infinite, with unreachable pairs and the finite part."""
     size = graph.num_nodes
     words = 8 if 24 * 8 * size <= _BATCH_MEMORY else 1
     bits = [np.zeros((size, words), np.uint64) for _ in range(3)]

@@ -1,8 +1,9 @@
 """Suboptimality gaps: how much worse an action is than the best one. Source: Simchowitz and Jamieson (2019).
 
-What is proven. Each value is within the solution's error bound of the true one, so a gap is known to twice that. A gap above the
-tie tolerance is a gap. Below it, a tie is proven where the best action and this one pay the same and lead to the same states, or
-where `ties` shows that equal values come from equal rewards for ever; else it may be a gap of any size, and its reciprocal anything.
+What is proven. Each value is within the solution's error bound of the true one, so a gap is known to twice that. A gap
+above the tie tolerance is a gap. Below it, a tie is proven where the best action and this one pay the same and lead to
+the same states, or where `ties` shows that equal values come from equal rewards for ever; else it may be a gap of any
+size, and its reciprocal anything.
 """
 
 import math
@@ -23,7 +24,8 @@ from pharos.solvers import Solution, value_iteration
 REGULARIZER = 0.1
 # Relative width up to which an interval counts as the value.
 NARROW = 1e-6
-# The default tie tolerance is this times the error bound of the values; more than 2, as a gap is known to twice the bound.
+# The default tie tolerance is this times the error bound of the values; more than 2, as a gap is known to twice the
+# bound.
 ERRORS_PER_TIE = 2.5
 # States at once; fixed, so that sums do not depend on the machine.
 _BLOCK = 1 << 18
@@ -42,16 +44,16 @@ class Gaps:
     """The suboptimality gaps gap(s, a) = V*(s) - Q*(s, a) of an MDP, summed up.
 
     Attributes:
-        sum_of_reciprocals: sum of 1 / gap over the states that can be reached and are not terminal, and the actions with
-            gap > tie_tolerance. Unit: 1 / return.
-        lower, upper: the true sum lies between them: each gap is known up to twice the error bound of the solution. `upper` is
-            infinite where ties are unresolved.
+        sum_of_reciprocals: sum of 1 / gap over the states that can be reached and are not terminal, and the actions
+            with gap > tie_tolerance. Unit: 1 / return.
+        lower, upper: the true sum lies between them: each gap is known up to twice the error bound of the solution.
+            `upper` is infinite where ties are unresolved.
         regularized: sum of 1 / (gap + 0.1) over all states and actions, optimal ones and terminal states included, as
             Colosseum prints it.
         minimal: the smallest gap > tie_tolerance; infinite where there is none.
         count, ties: how many gaps exceed tie_tolerance, and how many do not, the best actions among them.
-        unresolved: how many ties are not proven, so that they may be gaps smaller than the tolerance; with a `tie_tolerance`
-            of the caller's own, how many gaps are within their error of it.
+        unresolved: how many ties are not proven, so that they may be gaps smaller than the tolerance; with a
+            `tie_tolerance` of the caller's own, how many gaps are within their error of it.
         small: how many gaps are computed as larger than 0, and no larger than the tolerance.
         histogram, edges: (B,) numbers of gaps in bins of a quarter of a decade, and their (B + 1,) edges.
         tie_tolerance: gaps up to it count as ties.
@@ -92,7 +94,7 @@ class Gaps:
 
     @property
     def certified_regularized(self) -> Certified:
-        """The regularized sum, with its interval: each 1 / (gap + 0.1) changes by a factor of at most 1 + error / 0.1."""
+        """The regularized sum, with its interval: each 1 / (gap + 0.1) changes by a factor up to 1 + error / 0.1."""
         share = self.error / REGULARIZER
         high = self.regularized / (1 - share) * (1 + _ROUNDING) if share < 1 else math.inf
         low = self.regularized / (1 + share) * (1 - _ROUNDING)
@@ -140,22 +142,22 @@ def gaps(mdp: TabularMDP, solution: Solution | None = None, *, tie_tolerance: fl
 
         gap(s, a) = V*(s) - Q*(s, a)
 
-    Under random actions Q* is the value of choosing an action. Under sticky actions a state is a pair (state, previously
-    executed action) that can be reached, and a start state without a previous action is one more; gap((s, b), a) is the weight
-    of the choice times the difference of the values of executing. With a horizon T, gaps belong to steps: the sum runs over
-    t = 1, ..., T and the states that can be reached at step t (Simchowitz and Jamieson's setting).
+    Under random actions Q* is the value of choosing an action. Under sticky actions a state is a pair (state,
+    previously executed action) that can be reached, and a start state without a previous action is one more; gap((s,
+    b), a) is the weight of the choice times the difference of the values of executing. With a horizon T, gaps belong to
+    steps: the sum runs over t = 1, ..., T and the states that can be reached at step t, as in Simchowitz and Jamieson.
 
     Args:
-        solution: the optimal solution of `mdp`; None: solved here to an error of 1e-9, and where that leaves ties unresolved
-            to what 64-bit floats can reach.
+        solution: the optimal solution of `mdp`; None: solved here to an error of 1e-9, and where that leaves ties
+            unresolved to what 64-bit floats can reach.
         tie_tolerance: gaps up to it count as ties. None: 2.5 times the error bound of the solution.
     Raises:
         ParameterError: `solution` belongs to another MDP or is not optimal.
         PrecisionError: tie_tolerance is not larger than twice the error bound, so that a tie could be counted as a gap.
-    Cost: one pass over the table, 30 to 60 ns a state, and another where ties are to be proven; with a horizon T passes and
-        8 T S bytes.
-    Source: Simchowitz and Jamieson (2019), "Non-asymptotic gap-dependent regret bounds for tabular MDPs", section 2; the
-        pharos paper, equation 2; regularized: Colosseum (Conserva and Rauber, 2022).
+    Cost: one pass over the table, 30 to 60 ns a state, and another where ties are to be proven; with a horizon T passes
+        and 8 T S bytes.
+    Source: Simchowitz and Jamieson (2019), "Non-asymptotic gap-dependent regret bounds for tabular MDPs", section 2;
+        the pharos paper, equation 2; regularized: Colosseum (Conserva and Rauber, 2022).
     """
     if solution is None and tie_tolerance is None:
         return resolved_gaps(mdp, checked(mdp, None))
@@ -163,7 +165,7 @@ def gaps(mdp: TabularMDP, solution: Solution | None = None, *, tie_tolerance: fl
 
 
 def resolved_gaps(mdp: TabularMDP, solution: Solution) -> Gaps:
-    """The gaps of a solution; of a more accurate one where ties are unresolved, or the sum is wide, and floats allow it."""
+    """The gaps of a solution; of a more accurate one where ties are unresolved, or the sum is wide."""
     if solution.horizon is not None or mdp.gamma == 1.0:
         return _summed(mdp, solution, None)
     settled = _settled(mdp, solution) if TieProof(mdp).holds else solution  # else ties cannot be proven that way
@@ -177,8 +179,8 @@ def resolved_gaps(mdp: TabularMDP, solution: Solution) -> Gaps:
 def _settled(mdp: TabularMDP, solution: Solution) -> Solution:
     """The solution after more sweeps, until values do not change, or by no more than rounding.
 
-    The bound is that of `pharos.solvers`: (rho change + rounding) / (1 - rho). Values that do not change at all make proofs of
-    ties possible, as equal states then have equal floats.
+    The bound is that of `pharos.solvers`: (rho change + rounding) / (1 - rho). Values that do not change at all make
+    proofs of ties possible, as equal states then have equal floats.
     """
     equation = BellmanEquation(mdp.reward_table, mdp.gamma, mdp.chance, BEST)
     operations = 2 * mdp.num_actions + mdp.dynamics.operations + 16
@@ -215,7 +217,7 @@ def sum_of_reciprocal_gaps(
 
 @takes_mdp
 def minimal_gap(mdp: TabularMDP, solution: Solution | None = None, *, tie_tolerance: float | None = None) -> float:
-    """Return the smallest gap(s, a) that is no tie; infinite where all actions are optimal everywhere. As `gaps` says."""
+    """Return the smallest gap(s, a) that is no tie; infinite where there is none. As `gaps` says."""
     return gaps(mdp, solution, tie_tolerance=tie_tolerance).minimal
 
 
@@ -249,8 +251,8 @@ def checked(mdp: TabularMDP, solution: Solution | None) -> Solution:
 def _error(mdp: TabularMDP, solution: Solution) -> float:
     """By how much a gap may be off: values of all steps are within the error bound of the solution.
 
-    With a horizon the bound is that of the first step. Where gamma is below 1, that of a later one may be larger: it is a sum of
-    discounted rounding errors, in proportion to the largest reward and value of its own steps.
+    With a horizon the bound is that of the first step. Where gamma is below 1, that of a later one may be larger: it is
+    a sum of discounted rounding errors, in proportion to the largest reward and value of its own steps.
     """
     error = 2 * solution.error_bound
     if solution.horizon is None or mdp.gamma == 1.0 or solution.error_bound == 0.0:
@@ -279,7 +281,7 @@ def _conventions(mdp: TabularMDP, solution: Solution, tolerance: float) -> dict[
     }
 
 
-# Gaps and how often they count -------------------------------------------------------------------------------------------
+# Gaps and how often they count ----------------------------------------------------------------------------------------
 
 
 def _summed(mdp: TabularMDP, solution: Solution, tie_tolerance: float | None) -> Gaps:
@@ -389,8 +391,8 @@ def _weighted_gaps(mdp: TabularMDP, solution: Solution) -> Iterator[_Part]:
 def _steps(mdp: TabularMDP, solution: Solution) -> Iterator[_Step]:
     """For each step t = 1, ..., T, or once: values, and how many times each state counts.
 
-    later (S,): 1 for a reachable state, under sticky actions the number of actions by which it can be reached; first (S,) bool:
-    start states, which count once more under sticky actions, without a previous action.
+    later (S,): 1 for a reachable state, under sticky actions the number of actions by which it can be reached; first
+    (S,) bool: start states, which count once more under sticky actions, without a previous action.
     """
     nothing = np.zeros(mdp.num_states, np.bool_)
     starts = nothing.copy()
@@ -448,15 +450,15 @@ def _with_end(values: np.ndarray) -> np.ndarray:
     return np.concatenate([values.reshape(len(values), -1), np.zeros((1, values[0].size))])
 
 
-# Ties --------------------------------------------------------------------------------------------------------------------
+# Ties -----------------------------------------------------------------------------------------------------------------
 
 
 class _Ties:
     """Counts the ties that are not proven to be ties.
 
     Attributes:
-        small: gaps that are computed as larger than 0, and no larger than the tolerance; of a tolerance that is part of what is
-            asked for, gaps that are within their error of it.
+        small: gaps that are computed as larger than 0, and no larger than the tolerance; of a tolerance that is part of
+            what is asked for, gaps that are within their error of it.
         equal: gaps that are computed as 0, beyond the first of a state.
     """
 

@@ -1,24 +1,27 @@
 """Least expected hitting times of one target under chance, with a certificate that counts rounding.
 
-For a target e let T J(n) = 1 + min_a sum_m p(m | n, a) J(m), J = 0 at e. The least expected hitting time J* is its fixed point.
+For a target e let T J(n) = 1 + min_a sum_m p(m | n, a) J(m), J = 0 at e. The least expected hitting time J* is its
+fixed point.
 
 Certificate. For any J >= 0 with T J - J <= above < 1 and J - T J <= below everywhere,
 
     J / (1 + below)  <=  J*  <=  J / (1 - above).
 
-With c = 1 / (1 - above), T(c J) = 1 + c (T J - 1) <= 1 + c (J + above - 1) = c J: the policy that is greedy in c J loses at least
-one expected step a step, so it needs at most c J. With c = 1 / (1 + below), T(c J) >= c J in the same way, and iterating T from
-c J rises to J*. It does not matter where J comes from, and the second half holds for J of any sign.
+With c = 1 / (1 - above), T(c J) = 1 + c (T J - 1) <= 1 + c (J + above - 1) = c J: the policy that is greedy in c J
+loses at least one expected step a step, so it needs at most c J. With c = 1 / (1 + below), T(c J) >= c J in the same
+way, and iterating T from c J rises to J*. It does not matter where J comes from, and the second half holds for J of any
+sign.
 
-Rounding. Rows sum to 1, so T J(n) - J(n) = 1 + min_a sum_m p(m | n, a) (J(m) - J(n)), and its rounding error is a few units in the
-last place of sum_m p(m | n, a) |J(m) - J(n)|; the kernels add it to `above` and `below`. What is left is that J itself is rounded: a
-float of 1e10 is known to 1e-6 steps, and each of the 1e10 visits on the way to the target may lose as much. So beyond
-1e9 or so J is kept as the sum of two floats, improved by Newton's method (`_refined`), and moved up and down by W with
+Rounding. Rows sum to 1, so T J(n) - J(n) = 1 + min_a sum_m p(m | n, a) (J(m) - J(n)), and its rounding error is a few
+units in the last place of sum_m p(m | n, a) |J(m) - J(n)|; the kernels add it to `above` and `below`. What is left is
+that J itself is rounded: a float of 1e10 is known to 1e-6 steps, and each of the 1e10 visits on the way to the target
+may lose as much. So beyond 1e9 or so J is kept as the sum of two floats, improved by Newton's method (`_refined`), and
+moved up and down by W with
 
     W(n) - sum_m p(m | n, policy) W(m) = 2 (|residual(n)| + its error): what the residuals cost over all visits.
 
-J + W then falls short of no step, J - W exceeds none: both certificates hold with 0. W is about 1e-12 of J. Where the linear solver
-itself has no correct digit (J beyond 1e15), the bounds of plain floats stand, wide as they are.
+J + W then falls short of no step, J - W exceeds none: both certificates hold with 0. W is about 1e-12 of J. Where the
+linear solver itself has no correct digit (J beyond 1e15), the bounds of plain floats stand, wide as they are.
 """
 
 import math
@@ -40,7 +43,8 @@ SWEEPS = 40
 SOLVABLE = 60_000
 # Stands for infinity in the hitting times of nodes that do not surely reach the target: products with it stay finite.
 TOP = 1e300
-# The residual of a float J is some units in its last place: where that is more than the tolerance, one float is too short.
+# The residual of a float J is some units in its last place: where that is more than the tolerance, one float is too
+# short.
 RESIDUAL_UNITS = 16
 # Linear solves that do not halve the distance of the bounds, after which one float is too short as well.
 STALLS = 3
@@ -133,8 +137,8 @@ class HittingTimes:
         """Begin with a target.
 
         Returns:
-            (J, nodes to sweep, nodes that do not surely reach the target, or None). J is a guess: `initial_scale` times the
-            distance. A guess from above proves after few sweeps that a target is not the farthest.
+            (J, nodes to sweep, nodes that do not surely reach the target, or None). J is a guess: `initial_scale` times
+            the distance. A guess from above proves after few sweeps that a target is not the farthest.
         """
         count = self.distances(target)
         j = np.maximum(self.distance, 0) * self.initial_scale
@@ -153,7 +157,8 @@ class HittingTimes:
         return _certified(above, below, largest)
 
     def sweep(self, j: np.ndarray, count: int, sweeps: int, enough: float, spending: Spending) -> Bounds:
-        """Sweeps in place; ends early where the upper bound is at most `enough`, the budget ends, or J does not move."""
+        """Sweeps in place; ends early where the upper bound is at most `enough`, the budget ends, or J does not
+        move."""
         for number in range(sweeps):
             change = hitting.sweep_in_place(*self.arrays, self.goal, self.order, count, j)
             if number % 4 == 3 or change < 1e-13:
@@ -165,7 +170,8 @@ class HittingTimes:
         return self.bounds(j, count)
 
     def solve(self, j: np.ndarray, count: int, tolerance: float, enough: float, spending: Spending) -> Bounds:
-        """Bounds within `tolerance` of each other, or an upper bound of at most `enough`, or what budget and floats allow."""
+        """Bounds within `tolerance` of each other, or an upper bound of at most `enough`, or what budget and floats
+        allow."""
         bounds, failures, stalls, apart = self.sweep(j, count, SWEEPS, enough, spending), 0, 0, math.inf
         while not bounds.meets(tolerance) and bounds.upper > enough and not spending.is_over:
             if count > SOLVABLE:
@@ -196,7 +202,8 @@ class HittingTimes:
         return bounds
 
     def _factored(self, count: int) -> tuple[np.ndarray, Any] | None:
-        """(inner nodes, factors of 1 - P of the greedy policy); None where no policy is proper. Rows are made to sum to 1."""
+        """(inner nodes, factors of 1 - P of the greedy policy); None where no policy is proper. Rows are made to sum to
+        1."""
         nodes = self.order[:count]
         inner = nodes[~self.goal[nodes]]
         rows = sparse.csr_matrix(self.choices.matrix[inner * self.choices.num_actions + self.policy[inner]])
@@ -221,10 +228,11 @@ class HittingTimes:
         full[inner] = times
         return full[self.order[:count]]
 
-    # Two floats a node ---------------------------------------------------------------------------------------------------
+    # Two floats a node ------------------------------------------------------------------------------------------------
 
     def _refined(self, j: np.ndarray, count: int, tolerance: float, plain: Bounds, spending: Spending) -> Bounds:
-        """Bounds of a J that is the sum of two floats; `plain`, those of one, where they are no better. j becomes J + W."""
+        """Bounds of a J that is the sum of two floats; `plain`, those of one, where they are no better. j becomes J +
+        W."""
         high, low = j.copy(), np.zeros_like(j)
         best, policy = plain.but_limited(), None
         for _ in range(REFINEMENTS):
@@ -251,7 +259,8 @@ class HittingTimes:
         return best
 
     def _moved(self, high: np.ndarray, low: np.ndarray, count: int, factored: Any) -> tuple[Bounds, np.ndarray]:
-        """(bounds of J* relative to J + W, J + W rounded up); a policy that is greedy in J - W in place of that in J where ties need it."""
+        """(bounds of J* relative to J + W, J + W rounded up); a policy that is greedy in J - W in place of that in J
+        where ties need it."""
         inner, factors = factored
         residual, error, _ = self._residuals(high, low, count)
         cost = 2 * (np.abs(residual[inner]) + error[inner])
@@ -280,7 +289,8 @@ class HittingTimes:
     def _residuals(
         self, high: np.ndarray, low: np.ndarray, count: int
     ) -> tuple[np.ndarray, np.ndarray, tuple[float, float]]:
-        """(residuals of J = high + low, their errors, (bound of T J - J, bound of J - T J)); the greedy policy stands in `policy`."""
+        """(residuals of J = high + low, their errors, (bound of T J - J, bound of J - T J)); the greedy policy stands
+        in `policy`."""
         residual, error = np.zeros_like(high), np.zeros_like(high)
         arrays = (high, low, self.policy, residual, error)
         return residual, error, hitting.residuals_of_pairs(*self.arrays, self.goal, self.order, count, *arrays)
@@ -293,7 +303,8 @@ def _certified(above: float, below: float, largest: float) -> Bounds:
 
 
 def _added(high: np.ndarray, low: np.ndarray, more: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """high + low + more as two floats, the first of which is the nearest to the sum. Source: Knuth's and Dekker's sums."""
+    """high + low + more as two floats, the first of which is the nearest to the sum. Source: Knuth's and Dekker's
+    sums."""
     total = high + more
     part = total - high
     rest = (high - (total - part)) + (more - part) + low
@@ -305,7 +316,8 @@ def _without_common(matrix: Any, num_actions: int) -> tuple[tuple[np.ndarray, ..
     """What the actions of a node have in common is added up once: under random and sticky actions most of a row.
 
     Returns:
-        ((first, node, weight) of the rows without it, one for each action; (first, node, weight) of it, one for each node).
+        ((first, node, weight) of the rows without it, one for each action; (first, node, weight) of it, one for each
+        node).
     """
     nodes = matrix.shape[0] // num_actions
     row = np.repeat(np.arange(matrix.shape[0]), np.diff(matrix.indptr))

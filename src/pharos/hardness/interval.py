@@ -16,8 +16,8 @@ class Interval:
 
     Attributes:
         lower, upper: the value lies in [lower, upper]; both are infinite where the value is.
-        exact: whether the interval is the value: lower == upper for counted steps, a relative width of at most `tolerance`
-            for expected ones.
+        exact: whether the interval is the value: lower == upper for counted steps, a relative width of at most
+            `tolerance` for expected ones.
         unreachable_pairs: ordered pairs (s, s') such that no policy leads from s to s' with probability 1.
         finite_part: the largest value among the other pairs; equal to `upper` where the value is finite and exact.
         counted: whether `unreachable_pairs` and `finite_part` are exact; else both are lower bounds.
@@ -110,8 +110,8 @@ class Certificate:
     """What is proven of a measure.
 
     Attributes:
-        kind: "exact", proven to be the value (counted, or to a relative width of 1e-6 and less); "interval", proven to contain
-            the value; "float64", computed in 64-bit floats without a bound of the error.
+        kind: "exact", proven to be the value (counted, or to a relative width of 1e-6 and less); "interval", proven to
+            contain the value; "float64", computed in 64-bit floats without a bound of the error.
         lower, upper: of the interval; None for "float64", and for results that are more than one number.
         note: why it is not exact; empty otherwise.
         details: anything else worth knowing, JSON-able: ties, for measures of gaps.
@@ -190,7 +190,8 @@ class Budget:
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a measure is: the interval so far, the searches done, how many candidates are left, and seconds since the start."""
+    """How far a measure is: the interval so far, the searches done, how many candidates are left, and seconds since the
+    start."""
 
     lower: float
     upper: float

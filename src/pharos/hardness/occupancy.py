@@ -9,7 +9,7 @@ import numpy as np
 
 from pharos.errors import ParameterError, UndefinedMeasure
 from pharos.kernels import occupancy as kernels
-from pharos.mdp import Chance, Play, PolicyTable, TabularMDP, takes_mdp
+from pharos.mdp import Chance, Play, PolicyTable, TabularMDP, chosen_mass, takes_mdp
 
 _MEMORY = 8 << 30  # bytes that all steps together may take
 _LEAST = 1e-280  # mass that is not worth a step: smaller numbers lose their digits, and take a hundred times longer
@@ -140,15 +140,33 @@ def discounted_visits(mdp: TabularMDP, policy: Any = None, *, tolerance: float =
         fewer.
     """
     walk = Walk(mdp if mdp.horizon is None else mdp.with_horizon(None), policy, None)
-    visits, waiting = walk.after_the_start()
-    waiting *= mdp.gamma if mdp.is_sticky else 1.0
-    before = math.inf
-    while True:
-        waits = mdp.dynamics.settle(walk.later, mdp.gamma, _LEAST, waiting, visits)
-        left = waits / (1 - mdp.gamma)
-        if left <= tolerance or left >= before:
-            return visits, left
-        before = left
+    started, visits, left = walk.discounted(tolerance)
+    return started + visits.sum(axis=1), left
+
+
+def discounted_arrivals(mdp: TabularMDP, policy: Any = None, *, tolerance: float = 1e-9) -> tuple[np.ndarray, float]:
+    """Return the visits of states without a horizon, in terminal states and the end by arrival; and what they may lack
+    together.
+
+        d(s) = sum over t of gamma^t P(s_t = s), times 1 - gamma where s is terminal or the end, which is never left
+
+    Args, cost, errors: as for `discounted_visits`.
+    Returns:
+        (S + 1,) float64, entry S for the end; and the bound.
+    """
+    walk = Walk(mdp if mdp.horizon is None else mdp.with_horizon(None), policy, None)
+    started, visits, left = walk.discounted(tolerance)
+    executed = walk.executed(started, visits)
+    result = np.append(started + visits.sum(axis=1), 0.0)
+    over = np.flatnonzero(~walk.live)
+    arrived = mdp.gamma * mdp.dynamics.pushed(executed)[:, 0]
+    np.add.at(arrived, mdp.start_states, mdp.start_probabilities)
+    result[over] = arrived[over]
+    if mdp.has_ends:
+        is_end = np.zeros(mdp.num_states + 1)
+        is_end[-1] = 1.0
+        result[-1] = mdp.gamma * float((executed * mdp.dynamics.expected(is_end)).sum())
+    return result, left
 
 
 def support(mdp: TabularMDP, policy: Any = None) -> np.ndarray:
@@ -160,11 +178,23 @@ def support(mdp: TabularMDP, policy: Any = None) -> np.ndarray:
         ParameterError: the policy is wrong.
     Cost: O(S A); with transitions as a matrix that for each step to the last state that is met.
     """
+    return support_with_ends(mdp, policy)[:-1] & ~np.asarray(mdp.terminal)
+
+
+def support_with_ends(mdp: TabularMDP, policy: Any = None) -> np.ndarray:
+    """As `support`, with terminal states, and the end as one more: (S + 1,) bool."""
     walk = Walk(mdp, policy, 1)
     started, is_visited = walk.after_the_start()
     is_visited = (is_visited > 0).astype(np.float64)
     mdp.dynamics.support(walk.later, is_visited)
-    return walk.live & ((is_visited > 0).any(axis=1) | (started > 0))
+    is_visited[~walk.live] = 0.0
+    live = (is_visited > 0).any(axis=1) | (started > 0)
+    executed = walk.executed((started > 0).astype(np.float64), is_visited) > 0
+    arrived = mdp.dynamics.pushed(executed.astype(np.float64))[:, 0] > 0
+    arrived[mdp.starts] = True
+    is_end = np.append(np.zeros(mdp.num_states), 1.0)
+    ends = mdp.has_ends and bool((mdp.dynamics.expected(is_end)[executed] > 0).any())
+    return np.append(np.where(walk.live, live, arrived), ends)
 
 
 class Walk:
@@ -204,6 +234,26 @@ class Walk:
             now += start
         started[~self.live] = now[~self.live] = 0.0
         return started, now
+
+    def executed(self, started: np.ndarray, visits: np.ndarray) -> np.ndarray:
+        """(S, A): how masses execute the actions: started (S,) under the rules of the first step, visits (S, W) of
+        later ones."""
+        later = self.later.chance.executed(visits, chosen_mass(self.later.policy, visits))
+        first = started[:, None]
+        return later + self.first.chance.executed(first, chosen_mass(self.first.policy, first))
+
+    def discounted(self, tolerance: float) -> tuple[np.ndarray, np.ndarray, float]:
+        """((S,), (S, W), bound): discounted visits, under sticky actions those of the first step apart; what they may
+        lack."""
+        started, waiting = self.after_the_start()
+        gamma = self.mdp.gamma
+        waiting *= gamma if self.mdp.is_sticky else 1.0
+        visits, before = np.zeros_like(waiting), math.inf
+        while True:
+            left = self.mdp.dynamics.settle(self.later, gamma, _LEAST, waiting, visits) / (1 - gamma)
+            if left <= tolerance or left >= before:
+                return started, visits, left
+            before = left
 
     def distributions(self) -> Iterator[tuple["Nodes", float]]:
         """(distribution, probability that play goes on) at t = 0, 1, ...; T of them with a horizon.

@@ -92,8 +92,9 @@ class Measure:
 
     Attributes:
         name: key of the result.
-        function: Problem -> a number, or an object with `to_dict()`; UndefinedMeasure where it does not exist. What is proven of
-            it the result says itself, by attributes `exact`, `lower`, `upper`, `note`; a plain number says nothing, and the
+        function: Problem -> a number, or an object with `to_dict()`; UndefinedMeasure where it does not exist. What is
+            proven of it the result says itself, by attributes `exact`, `lower`, `upper`, `note`; a plain number says
+            nothing, and the
             report says so: "float64". `Certified` is a number that has them.
         definition: formula, in a line.
         source: who defined it.
@@ -133,8 +134,8 @@ def register(
         register("density", lambda p: float((p.mdp.rewards != 0).mean()), definition="share of transitions that pay")
 
     Args:
-        function: takes a `Problem` (`.mdp`, `.solution`, `.gaps`, `.horizon`, `.budget`) and returns a number, a `Certified`
-            number, or an object with `to_dict()`; see `Measure`.
+        function: takes a `Problem` (`.mdp`, `.solution`, `.gaps`, `.horizon`, `.budget`) and returns a number, a
+            `Certified` number, or an object with `to_dict()`; see `Measure`.
         definition, source: printed beside the value.
         version: give one to keep results beside the state space, and raise it when the function changes.
         depends, on_request: see `Measure`.

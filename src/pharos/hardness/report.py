@@ -64,8 +64,8 @@ class Report:
         return self.results[name]
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-able: `measures`, `conventions`, `seconds`; what is proven of each under `certificates`, and under `undefined`
-        why some are None."""
+        """JSON-able: `measures`, `conventions`, `seconds`; what is proven of each under `certificates`, and under
+        `undefined` why some are None."""
         return {
             "measures": {name: _finite(result.value) for name, result in self.results.items()},
             "conventions": dict(self.conventions),
@@ -118,14 +118,16 @@ def report(
     """Measure how hard an MDP is.
 
     Args:
-        measures: names, as a sequence or with commas; None: all that are registered but for those that are slow and come on
-            request; "all": these as well.
-        horizon: number of steps T for measures of episodes; None: that of the MDP, if any. Values and gaps have the gamma and
-            the horizon of the MDP itself.
+        measures: names, as a sequence or with commas; None: all that are registered but for those that are slow and
+            come on request; "all": these as well.
+        horizon: number of steps T for measures of episodes; None: that of the MDP, if any. Values and gaps have the
+            gamma and the horizon of the MDP itself.
         tolerance: largest error of the optimal values, in units of return.
         restart: convention of the diameter: terminal states lead back to the start.
-        budget: what each measure may spend (seconds, or a `Budget`; 300 s by default) before it returns a proven interval.
-        keep: use results kept beside the state space, and keep new ones there. Nothing is kept where there is no folder.
+        budget: what each measure may spend (seconds, or a `Budget`; 300 s by default) before it returns a proven
+            interval.
+        keep: use results kept beside the state space, and keep new ones there. Nothing is kept where there is no
+            folder.
         progress: called with the name of the running measure and a line on how far it is.
     Returns:
         A Report. A measure that does not exist for this MDP says why; the others are there.

@@ -1,4 +1,5 @@
-"""`hardness.json`: results of measures beside the state space, each sealed by a digest and tied to what it depends on."""
+"""`hardness.json`: results of measures beside the state space, each sealed by a digest and tied to what it depends
+on."""
 
 import contextlib
 import json
@@ -30,9 +31,9 @@ _DEPENDS = {
 class ResultsFile:
     """Results in `hardness.json` of the state space's folder.
 
-    The key of a result is the name and version of the measure, and a digest of all that it depends on: the manifest of the folder,
-    conventions, the start, rewards. An entry holds its key and is sealed, so that one that was edited, cut short or brought from
-    another space is measured anew, with a warning.
+    The key of a result is the name and version of the measure, and a digest of all that it depends on: the manifest of
+    the folder, conventions, the start, rewards. An entry holds its key and is sealed, so that one that was edited, cut
+    short or brought from another space is measured anew, with a warning.
     """
 
     def __init__(self, mdp: TabularMDP, conventions: Mapping[str, Any]):
@@ -41,7 +42,8 @@ class ResultsFile:
         self._has_warned = False
 
     def get(self, measure: Measure, budget: Budget) -> dict[str, Any] | None:
-        """Value, text, seconds and certificate; None where there is no result, or one that a larger budget could improve on."""
+        """Value, text, seconds and certificate; None where there is no result, or one that a larger budget could
+        improve on."""
         if self.path is None or measure.version is None:
             return None
         key = self._key(measure)

@@ -1,9 +1,10 @@
-"""Diameter under chance: for every target one stochastic shortest path problem, most of them only as far as bounds need.
+"""Diameter under chance: for every target one stochastic shortest path problem, most of them only as far as bounds
+need.
 
-`hitting_times` bounds the hitting times of one target. This file chooses the targets. A target whose upper bound falls below the
-largest hitting time proven so far is dropped at once. Solved targets bound the others (`travel`), so that there is an interval
-whenever the budget ends. Where a look at each target would take longer than that, the target with the largest upper bound is
-always the next.
+`hitting_times` bounds the hitting times of one target. This file chooses the targets. A target whose upper bound falls
+below the largest hitting time proven so far is dropped at once. Solved targets bound the others (`travel`), so that
+there is an interval whenever the budget ends. Where a look at each target would take longer than that, the target with
+the largest upper bound is always the next.
 """
 
 import itertools
@@ -23,7 +24,8 @@ from pharos.kernels.hitting import UNIT
 from pharos.mdp import TabularMDP
 from pharos.workers import usable_workers
 
-# Most targets that threads look at before they learn of a larger hitting time: a target may be looked at in vain that often.
+# Most targets that threads look at before they learn of a larger hitting time: a target may be looked at in vain that
+# often.
 BATCH = 64
 # Nodes times targets from which on one search for each target, to find the most promising, takes minutes.
 MANY = 10**9
@@ -225,7 +227,8 @@ def _look(
 
 
 def _by_promise(targets: HittingTimes, wanted: np.ndarray, spending: Spending) -> np.ndarray:
-    """The targets wanted, those first that are farthest from some node: a large hitting time, early, rules out others."""
+    """The targets wanted, those first that are farthest from some node: a large hitting time, early, rules out
+    others."""
     promise = np.zeros(len(wanted))
     for target in np.flatnonzero(wanted):
         if spending.is_over:

@@ -2,12 +2,14 @@
 
 1. Two actions that pay the same and have the same outcomes are tied, whatever the MDP.
 
-2. Deterministic dynamics, with or without sticky actions. Let x be the computed values, and let every action that is not among
-the best computed ones be surely worse (its gap exceeds the error). Call two pairs (state, previous action) alike where x is the
-same to the last bit. If all pairs that are alike, and each of the best actions there, pay the same and lead to pairs that are
-alike, then what the best actions collect is the same sequence of rewards for ever, so their values are the same number: any
-choice among them solves the same equations, one for each class of pairs. Under sticky actions the action that is repeated must
-lead on alike as well. A map from values to rewards and next values (`kernels.ties`) finds out in one pass.
+2. Deterministic dynamics, with or without sticky actions. Let x be the computed values, and let every action that is
+not among the best computed ones be surely worse (its gap exceeds the error). Call two pairs (state, previous action)
+alike where x is the same to the last bit. If all pairs that are alike, and each of the best actions there, pay the same
+and lead to pairs that are
+alike, then what the best actions collect is the same sequence of rewards for ever, so their values are the same number:
+any choice among them solves the same equations, one for each class of pairs. Under sticky actions the action that is
+repeated must lead on alike as well. A map from values to rewards and next values (`kernels.ties`) finds out in one
+pass.
 """
 
 import numpy as np
@@ -81,7 +83,8 @@ def _empty_map(size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def same_outcomes(
     mdp: TabularMDP, states: np.ndarray, rewards: np.ndarray, action: np.ndarray, other: np.ndarray
 ) -> np.ndarray:
-    """(K,) bool: the first proof, whether two actions pay the same and have the same outcomes; rewards (K, A) of the states (K,)."""
+    """(K,) bool: the first proof, whether two actions pay the same and have the same outcomes; rewards (K, A) of the
+    states (K,)."""
     rows = np.arange(len(states))
     same = rewards[rows, action] == rewards[rows, other]
     one, two = (mdp.dynamics.outcomes(states, each) for each in (action, other))

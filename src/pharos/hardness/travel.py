@@ -1,20 +1,23 @@
 """Upper bounds of expected times under chance, for all targets at once, from the solution of one of them.
 
-Let E(s, y) be the least expected number of steps from s to y, and h a hub with E(s, h) <= U(s) for all s. To go from x to y, choose an
-action a that may lead there. What happens instead, with probability P(s'), is s' != y. From there take a short way back to y where there
-is one, each of its steps in the same manner; else give up, and go to the hub. This attempt takes at most c(x, a, y) expected steps and
-is given up with probability at most l(x, a, y), where
+Let E(s, y) be the least expected number of steps from s to y, and h a hub with E(s, h) <= U(s) for all s. To go from x
+to y, choose an action a that may lead there. With probability P(s') it leads to s' != y instead. From there take a
+short way back to y where there is one, each of its steps in the same manner; else give up, and go to the hub. This
+attempt takes at most c(x, a, y) expected steps and is given up with probability at most l(x, a, y), where
 
     c(x, a, y) = 1 + sum over near s' of P(s') (sum of c along the way back) + sum over other s' of P(s') U(s')
     l(x, a, y) =     sum over near s' of P(s') (sum of l along the way back) + sum over other s' of P(s').
 
-An s' counts as near as long as rho = sum of P(s') (steps of the way back) stays below a limit, so that both have a solution:
-for any c' that falls short of the right side by at most d, c' + d / (1 - rho) does not. Given up, go on from the hub to y directly:
+An s' counts as near as long as rho = sum of P(s') (steps of the way back) stays below a limit, so that both have a
+solution:
+for any c' that falls short of the right side by at most d, c' + d / (1 - rho) does not. Given up, go on from the hub to
+y directly:
 
     E(h, y) <= E(h, x) + c(x, a, y) + l(x, a, y) E(h, y),
 
-and Dijkstra's algorithm finds the best x and a for every y: E(h, y) <= V(y). The largest expected time to target e is then at most the
-largest U(s) plus V(e). Under sticky actions sums are the largest over the previously executed action, and so is U.
+and Dijkstra's algorithm finds the best x and a for every y: E(h, y) <= V(y). The largest expected time to target e is
+then at most the largest U(s) plus V(e). Under sticky actions sums are the largest over the previously executed action,
+and so is U.
 """
 
 import itertools
@@ -23,23 +26,33 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 
 from pharos.hardness.choices import outcomes_of
+from pharos.kernels import travel
 from pharos.mdp import TabularMDP
 from pharos.workers import usable_workers
 
-NEARBY = 64  # nodes around each state that are looked at
-LIMIT = 0.8  # of the expected steps on ways back: a step takes at most five times as long
-SQUARE = 64  # outcomes of a state, beyond which nothing counts as near
+# Nodes around each state among which ways back are looked for: a few steps in all directions of a grid.
+NEARBY = 64
+# Expected steps on ways back, at most: a step takes 1 / (1 - LIMIT) = 5 times as long then; more ways are seldom worth
+# it.
+LIMIT = 0.8
+# Outcomes of a state beyond which nothing counts as near: ways back are kept for each pair of them.
+SQUARE = 64
+# Passes over the ways back, and the change of a value, in steps, at which they end; what is missing is added to the
+# bound.
 PASSES = 100
-ACCURACY = 1e-4  # steps
-SMALL = 100_000  # outcomes, below which threads are not worth their start
+ACCURACY = 1e-4
+# Outcomes below which threads are not worth their start.
+SMALL = 100_000
+# More than the relative rounding of sums of positive numbers along any way.
 ROUNDING = 1 + 1e-9
 
 
 class TravelBounds:
     """The bounds of an MDP; nodes are its states, and the implicit end where there is one.
 
-    Cost: two searches of 64 nodes around each state, once; for a hub some passes over the ways back and one run of Dijkstra's algorithm.
-    Memory: some 30 bytes for each outcome of each action and a byte for each pair of outcomes of a state.
+    Cost: two searches of 64 nodes around each state, once; for a hub some passes over the ways back and one run of
+        Dijkstra's algorithm. Memory: some 30 bytes for each outcome of each action and a byte for each pair of outcomes
+        of a state.
     """
 
     def __init__(self, mdp: TabularMDP, restart: bool):
@@ -61,8 +74,6 @@ class TravelBounds:
         self.leak = self._solve(0.0, np.ones(len(first) - 1))
 
     def _find_ways_back(self, owner: np.ndarray, pool: ThreadPoolExecutor) -> None:
-        from pharos.kernels import travel
-
         first, _, node, _ = self._outcomes
         size = len(first) - 1
         counts = np.diff(first)[owner]
@@ -94,8 +105,6 @@ class TravelBounds:
 
     def _solve(self, own: float, times: np.ndarray) -> np.ndarray:
         """(outcomes,) c for own = 1 and times = U; l for own = 0 and times = 1."""
-        from pharos.kernels import travel
-
         value = np.full(len(self._fixed[1]), own)
         new = value.copy()
         edges = np.linspace(0, len(value), self._threads + 1).astype(np.int64)
@@ -112,15 +121,15 @@ class TravelBounds:
         return value + max(short, 0.0) / (1 - self._rho)
 
     def times_from(self, hub: int, times: np.ndarray) -> np.ndarray:
-        """(N,) V: upper bounds of the expected steps from the hub to each node, given those from each node to the hub."""
-        from pharos.kernels import travel
-
+        """(N,) V: upper bounds of the expected steps from the hub to each node, given those from each node to the
+        hub."""
         first, _, node, _ = self._outcomes
         return travel.times_from(hub, first, node, self._solve(1.0, times), self.leak) * ROUNDING
 
 
 def _outcomes(mdp: TabularMDP, restart: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """(first, action, node, probability) of what executing each action in each state may lead to; -1: whatever action."""
+    """(first, action, node, probability) of what executing each action in each state may lead to; -1: whatever
+    action."""
     terminal = np.asarray(mdp.terminal)
     executed, ends = outcomes_of(mdp, terminal)
     num_states, num_actions = mdp.num_states, mdp.num_actions

@@ -22,8 +22,8 @@ def environmental_value_norm(mdp: TabularMDP, solution: Solution | None = None) 
 
         max over s, a of sqrt(Var(V*(s') : s' ~ p(. | s, a)))
 
-    over the states that can be reached; 0 for deterministic MDPs. Under sticky actions s is a pair (state, previously executed
-    action), and so is s'. With a horizon, V* is that of the first step.
+    over the states that can be reached; 0 for deterministic MDPs. Under sticky actions s is a pair (state, previously
+    executed action), and so is s'. With a horizon, V* is that of the first step.
 
     Args:
         solution: the optimal solution of `mdp`; None: solved here to an error of 1e-9.
@@ -31,7 +31,8 @@ def environmental_value_norm(mdp: TabularMDP, solution: Solution | None = None) 
         ParameterError: `solution` belongs to another MDP or is not optimal.
     Exactness: `certified_value_norm` returns the interval that follows from the error of the values.
     Cost: one pass over the table; 20 to 100 ns a state.
-    Source: Maillard, Mann and Mannor (2014), definition 1. (Colosseum centres with the expectation of another state: a slip.)
+    Source: Maillard, Mann and Mannor (2014), definition 1. (Colosseum centres with the expectation of another state: a
+        slip.)
     """
     return certified_value_norm(mdp, solution).value
 
@@ -39,8 +40,8 @@ def environmental_value_norm(mdp: TabularMDP, solution: Solution | None = None) 
 def certified_value_norm(mdp: TabularMDP, solution: Solution | None = None) -> Certified:
     """Return `environmental_value_norm` with its interval.
 
-    A standard deviation changes by no more than the values do. Every variance is a sum of squares of values less their mean, in
-    the row of one state, so that large values that lie close together lose no digits.
+    A standard deviation changes by no more than the values do. Every variance is a sum of squares of values less their
+    mean, in the row of one state, so that large values that lie close together lose no digits.
     """
     solution = checked(mdp, solution)
     if mdp.is_deterministic:
@@ -85,7 +86,8 @@ def _outcomes(mdp: TabularMDP, x: np.ndarray, states: np.ndarray) -> tuple[np.nd
 
 
 def _largest_variance(chance: Chance, means: np.ndarray, within: np.ndarray, previous: int | None = None) -> float:
-    """The largest variance of what follows a choice: within the outcomes of what is executed, and between their means."""
+    """The largest variance of what follows a choice: within the outcomes of what is executed, and between their
+    means."""
     repeated = 0.0 if previous is None else means[:, previous : previous + 1]
     mean = chance.chosen * means + chance.uniform * means.mean(axis=1, keepdims=True) + chance.previous * repeated
     result = chance.chosen * (within + (means - mean) ** 2)

@@ -1,8 +1,8 @@
 """Breadth-first searches on the graph of a deterministic MDP, forward on its table and backward on a reversed copy.
 
-Nodes are the S states and, where some transition is -1, one more: node S, the implicit end of an episode. `ends` (S,) bool
-marks states whose row is not followed (terminal states). With `start` >= 0 every such state and node S lead to `start` in
-one step, without that edge being stored; with `start` = -1 they lead nowhere.
+Nodes are the S states and, where some transition is -1, one more: node S, the implicit end of an episode. `ends` (S,)
+bool marks states whose row is not followed (terminal states). With `start` >= 0 every such state and node S lead to
+`start` in one step, without that edge being stored; with `start` = -1 they lead nowhere.
 
 Distances are in steps, -1 where there is no path. `queue` is scratch of one entry a node; after a search it holds the
 nodes found, in the order of their distance.
@@ -157,8 +157,8 @@ def raise_lower(distance, lower):
 def open_eccentricities(out_lower, out_upper, in_lower, in_upper, best):
     """Whose eccentricity may exceed `best`, and where to search next.
 
-    Returns (open out, open in, node of the largest upper bound out, the same in, open node in the middle): the middle is
-    the least sum of lower bounds; ties of upper bounds go to the larger lower bound.
+    Returns (open out, open in, node of the largest upper bound out, the same in, open node in the middle): the middle
+    is the least sum of lower bounds; ties of upper bounds go to the larger lower bound.
     """
     num_out, num_in = 0, 0
     far_out, far_in, middle = -1, -1, -1
@@ -336,7 +336,8 @@ def _gcd(a, b):
 
 @njit(cache=True, nogil=True)
 def last_gap(next_states, ends, start, order, layer_first, position, current, coming, max_reads):
-    """Largest k such that some node does not yet reach its whole layer in exactly k steps; -1 where layers are single nodes.
+    """Largest k such that some node does not yet reach its whole layer in exactly k steps; -1 where layers are single
+    nodes.
 
     Every edge leads from layer j to layer j + 1 modulo P. order (N,): the nodes by layer, layer_first (P + 1,),
     position (N,): place of a node in its layer. current, coming: (widest layer, words) uint64 scratch.

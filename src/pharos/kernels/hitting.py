@@ -1,4 +1,5 @@
-"""Least expected hitting times on explicit choices: nodes, A actions each, row n A + a of a sparse matrix (first, node, weight).
+"""Least expected hitting times on explicit choices: nodes, A actions each, row n A + a of a sparse matrix (first, node,
+weight).
 
 hardness/hitting_times.py says what is computed and why the bounds hold. `goal` (N,) bool marks the nodes of the target.
 """
@@ -12,7 +13,8 @@ UNIT = 2.0**-53
 
 @njit(cache=True, nogil=True)
 def backward_order(first, previous, goal, order, distance):
-    """Nodes by their distance to the goal on the reversed graph: distance (N,), -1 where there is no path; returns how many."""
+    """Nodes by their distance to the goal on the reversed graph: distance (N,), -1 where there is no path; returns how
+    many."""
     distance[:] = -1
     tail = 0
     for n in range(len(goal)):
@@ -63,9 +65,11 @@ def sweep_in_place(rows, common, goal, order, count, j):
 
 @njit(cache=True, nogil=True)
 def residuals(rows, common, goal, order, count, j, policy):
-    """(bound of T j - j, bound of j - T j, largest j) over nodes that are not the goal; policy[n] = the action that attains T j.
+    """(bound of T j - j, bound of j - T j, largest j) over nodes that are not the goal; policy[n] = the action that
+    attains T j.
 
-    T j(n) - j(n) = 1 + min_a sum_m p(m | n, a) (j(m) - j(n)): written with differences, no rounding error grows with j itself.
+    T j(n) - j(n) = 1 + min_a sum_m p(m | n, a) (j(m) - j(n)): written with differences, no rounding error grows with j
+    itself.
     Both bounds count all rounding: `operations` says how many units in the last place one sum may be off.
     """
     first, node, weight = rows
@@ -107,8 +111,8 @@ def residuals(rows, common, goal, order, count, j, policy):
 def residuals_of_pairs(rows, common, goal, order, count, high, low, policy, residual, error):
     """As `residuals`, for j = high + low: two floats a node, so that j may be 1e16 times its differences.
 
-    residual, error (N,): T j - j, and by how much it may be off. The error of a difference of two such numbers is a unit of the
-    difference and eight units of a unit of the numbers.
+    residual, error (N,): T j - j, and by how much it may be off. The error of a difference of two such numbers is a
+    unit of the difference and eight units of a unit of the numbers.
     """
     first, node, weight = rows
     always, always_node, always_weight = common
@@ -153,8 +157,8 @@ def residuals_of_pairs(rows, common, goal, order, count, high, low, policy, resi
 def operations(num_actions, terms):
     """Units in the last place by which a sum of so many products may be off, relative to the sum of their sizes.
 
-    One for each product, difference and addition; num_actions + 8 for a probability, itself a sum over the actions that chance
-    may execute; 9 for what `common` left out.
+    One for each product, difference and addition; num_actions + 8 for a probability, itself a sum over the actions that
+    chance may execute; 9 for what `common` left out.
     """
     return terms + num_actions + 24
 
@@ -170,7 +174,8 @@ def _difference(high, low, other_high, other_low):
 
 @njit(cache=True, nogil=True)
 def almost_surely(first, node, num_actions, goal, sure, found):
-    """sure[n]: some policy leads from n to the goal with probability 1. A greatest fixed point over least ones (de Alfaro 1999)."""
+    """sure[n]: some policy leads from n to the goal with probability 1. A greatest fixed point over least ones (de
+    Alfaro 1999)."""
     size = len(goal)
     sure[:] = True
     while True:
@@ -203,9 +208,11 @@ def almost_surely(first, node, num_actions, goal, sure, found):
 
 @njit(cache=True, nogil=True)
 def proper_policy(first, node, weight, num_actions, goal, order, count, sure, policy):
-    """policy[n] of order[:count]: an action that may lead nearer to the goal and never out of these nodes; so it surely arrives.
+    """policy[n] of order[:count]: an action that may lead nearer to the goal and never out of these nodes; so it surely
+    arrives.
 
-    order: nodes by distance to the goal; all of them surely reach it. The most probable way nearer is taken. sure (N,) is scratch.
+    order: nodes by distance to the goal; all of them surely reach it. The most probable way nearer is taken. sure (N,)
+        is scratch.
     """
     sure[:] = False
     for i in range(count):

@@ -72,8 +72,9 @@ def settle(next_states, live, policy, weights, gamma, least, waiting, visits):
             continue
         for a in range(num_actions):
             leaving[a] = _executed(policy, weights, waiting, s, a, mass)
+        for b in range(waiting.shape[1]):
+            visits[s, b] += waiting[s, b]
         waiting[s] = 0.0
-        visits[s] += mass
         for a in range(num_actions):
             t = next_states[s, a]
             if t >= 0 and live[t]:

@@ -28,12 +28,12 @@ def count(gap, counted, tolerance):
 def extend(own, rewards, following, gap, counted, begin, used, keys, rows, filled):
     """Map own[i, b] to (rewards, following) of each best action, and where there are several b to those of b as well.
 
-    own (N, W), rewards, following (N, A): int64, the bits of floats. The map: used (C,) bool, keys (C,), rows (C, 2 or 4) int64, with
-    open addressing; C is a power of two.
+    own (N, W), rewards, following (N, A): int64, the bits of floats. The map: used (C,) bool, keys (C,), rows (C, 2 or
+    4) int64, with open addressing; C is a power of two.
 
     Returns:
-        (i, filled): where it stopped, because all are done (i = N) or half of the places are taken, and how many those are;
-        i = -1 where a key has two different rows.
+        (i, filled): where it stopped, because all are done (i = N) or half of the places are taken, and how many those
+        are; i = -1 where a key has two different rows.
     """
     for i in range(begin, len(gap)):
         if counted[i] == 0:
@@ -77,7 +77,8 @@ def _put(key, reward, following, other_reward, other_following, used, keys, rows
 
 @njit(cache=True, nogil=True)
 def _place(key, used, keys):
-    """Where the key is, or may be put. Its hash is the finalizer of SplitMix64: similar floats go to different places."""
+    """Where the key is, or may be put. Its hash is the finalizer of SplitMix64: similar floats go to different
+    places."""
     z = np.uint64(key)
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)

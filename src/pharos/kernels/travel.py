@@ -1,7 +1,8 @@
 """Bounds of expected times between neighbouring states, for all pairs at once; hardness/travel.py says what and why.
 
-Outcomes: state x has those numbered first[x] to first[x + 1]: outcome i happens with probability prob[i] when action[i] is
-executed (-1: any action), and leads to node[i]. Outcome i stands for the aim to go from x to node[i] by choosing action[i].
+Outcomes: state x has those numbered first[x] to first[x + 1]: outcome i happens with probability prob[i] when action[i]
+is executed (-1: any action), and leads to node[i]. Outcome i stands for the aim to go from x to node[i] by choosing
+action[i].
 """
 
 import heapq
@@ -43,7 +44,8 @@ def outcomes_into(node, num_nodes):
 
 @njit(cache=True, nogil=True)
 def _search_back(y, node, owner, into, ball, seen, queue, via):
-    """Nodes by their distance to y: queue[:result]; seen[n] = distance + 1, via[n] = the outcome taken first. Ends with `ball` nodes."""
+    """Nodes by their distance to y: queue[:result]; seen[n] = distance + 1, via[n] = the outcome taken first. Ends with
+    `ball` nodes."""
     into_first, into_outcome = into
     seen[y] = 1
     queue[0] = y
@@ -63,7 +65,8 @@ def _search_back(y, node, owner, into, ball, seen, queue, via):
 
 @njit(cache=True, nogil=True)
 def steps_back(low, high, outcomes, owner, into, square, steps, ball, seen, queue, via):
-    """For outcomes i that lead to nodes low..high: steps[square[i] + j] of a shortest way from outcome j of its state to node[i].
+    """For outcomes i that lead to nodes low..high: steps[square[i] + j] of a shortest way from outcome j of its state
+    to node[i].
 
     NONE where the `ball` nodes nearest to node[i] do not include it. seen (N,) uint8 is zero before and after.
     """
@@ -107,7 +110,8 @@ def ways_back(low, high, outcomes, owner, into, square, steps, start, way, ball,
 
 @njit(cache=True, nogil=True)
 def keep_near(outcomes, owner, weights, num_previous, square, steps, limit, length):
-    """Forget the longest ways back, until the expected steps on the way back are at most `limit`; length[i]: of the ways that are kept.
+    """Forget the longest ways back, until the expected steps on the way back are at most `limit`; length[i]: of the
+    ways that are kept.
 
     Returns the largest expected steps.
     """
@@ -176,9 +180,11 @@ def attempt(begin, end, outcomes, owner, weights, num_previous, square, steps, s
 
 @njit(cache=True, nogil=True)
 def times_from(hub, first, node, cost, leak):
-    """(N,) least t with t(hub) = 0, t(y) = (t(x) + cost[i]) / (1 - leak[i]) over outcomes i from x to y, by Dijkstra's algorithm.
+    """(N,) least t with t(hub) = 0, t(y) = (t(x) + cost[i]) / (1 - leak[i]) over outcomes i from x to y, by Dijkstra's
+    algorithm.
 
-    Where almost all attempts are given up, 1 - leak is no more than the rounding of a sum of probabilities, which is taken off.
+    Where almost all attempts are given up, 1 - leak is no more than the rounding of a sum of probabilities, which is
+    taken off.
     """
     bound = np.full(len(first) - 1, np.inf)
     done = np.zeros(len(bound), np.bool_)

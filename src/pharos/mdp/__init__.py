@@ -7,7 +7,7 @@ from pharos.mdp.dynamics import BellmanEquation, Dynamics, Outcomes, Play
 from pharos.mdp.matrices import Matrices
 from pharos.mdp.rewards import Rewards
 from pharos.mdp.rewards_of_space import rewards_of_space
-from pharos.mdp.selection import BEST, WORST, Extreme, PolicyTable, Selection
+from pharos.mdp.selection import BEST, WORST, Extreme, PolicyTable, Selection, chosen_mass
 from pharos.mdp.table import Table
 from pharos.mdp.tabular import TabularMDP
 
@@ -27,6 +27,7 @@ __all__ = [
     "Selection",
     "Table",
     "TabularMDP",
+    "chosen_mass",
     "minimize",
     "random_actions",
     "rewards_of_space",

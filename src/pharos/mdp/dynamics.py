@@ -153,12 +153,12 @@ class Dynamics(ABC):
         return float(after[play.live].sum())
 
     def settle(self, play: Play, gamma: float, least: float, waiting: np.ndarray, visits: np.ndarray) -> float:
-        """Count the waiting mass (S, W) as visits (S,) and move it on, discounted. Returns what waits afterwards.
+        """Count the waiting mass (S, W) as visits (S, W) and move it on, discounted. Returns what waits afterwards.
 
         Masses below `least` may stay.
         """
         after = np.empty_like(waiting)
-        visits[play.live] += waiting[play.live].sum(axis=1)
+        visits[play.live] += waiting[play.live]
         self.move(play, waiting, after)
         waiting[:] = gamma * after
         waiting[~play.live] = 0.0
