@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pharos import storage
 from pharos.agents import TABULAR_OBSERVATION
 from pharos.environments import classes
 from pharos.study.analysis import IMAGE, REGRETS, VECTOR, Models, mean_curve
@@ -254,8 +255,9 @@ def save(draw: Callable[[], "Figure | None"], place: Path) -> dict[str, bytes] |
             images[theme] = buffer.getvalue()
             if theme == "light":
                 place.parent.mkdir(parents=True, exist_ok=True)
-                place.with_suffix(".png").write_bytes(images[theme])
-                figure.savefig(place.with_suffix(".pdf"), bbox_inches="tight", metadata={"CreationDate": None})
+                storage.replace_file(place.with_suffix(".png"), images[theme])
+                with storage.replacing(place.with_suffix(".pdf")) as file:
+                    figure.savefig(file, format="pdf", bbox_inches="tight", metadata={"CreationDate": None})
     return images
 
 
