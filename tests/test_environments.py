@@ -38,7 +38,7 @@ def assert_plays_like(env, twin, actions):
             return
 
 
-# Rules against their twins -----------------------------------------------------------------------------------------------
+# Rules against their twins ------------------------------------------------------------------------------------------
 
 actions_of_four = st.lists(st.integers(0, 3), max_size=60)
 
@@ -138,7 +138,7 @@ def test_the_breakout_player_clears_the_wall_and_meets_it_again():
     assert best > env.num_bricks
 
 
-# Frozen lake against Gymnasium -------------------------------------------------------------------------------------------
+# Frozen lake against Gymnasium --------------------------------------------------------------------------------------
 
 
 def gymnasium_law(size, slippery):
@@ -187,7 +187,9 @@ def test_frozen_lake_has_the_limit_of_gymnasium(size):
 
 @pytest.mark.parametrize("size", [4, 8])
 def test_slippery_ice_is_four_thirds_of_uniform_minus_a_third_of_the_opposite_action(size):
-    """The formula of random_actions(p) with p = 4/3 and the opposite action: a law, but no mixture for any p in [0, 1]."""
+    """The formula of random_actions(p) with p = 4/3 and the opposite action: a law, but no mixture for any p in [0,
+    1].
+    """
     table, _, ends = our_law(pharos.make("frozen_lake", size=size))
     opposite = table[:, [2, 3, 0, 1]]
     uniform = table.mean(axis=1, keepdims=True)
@@ -234,7 +236,7 @@ def test_a_random_map_is_the_same_on_every_machine():
 
 FIFTH_MAP = "SFFFH/FFFHF/HFFFF/FHFFH/FFHFG"
 
-# Freeway and Breakout: what their docstrings promise ---------------------------------------------------------------------
+# Freeway and Breakout: what their docstrings promise ----------------------------------------------------------------
 
 
 def test_freeway_moves_the_player_only_at_every_speed_th_step():
@@ -327,7 +329,7 @@ def test_a_terminal_breakout_state_stays_as_it_is():
     assert env.reward(lost, 0, lost) == 0.0
 
 
-# Names and parameters ----------------------------------------------------------------------------------------------------
+# Names and parameters -----------------------------------------------------------------------------------------------
 
 
 def test_every_row_block_of_the_papers_tables_has_a_name():
@@ -488,7 +490,7 @@ def test_listing_environments_loads_nothing_heavy():
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip() == "set()"
 
 
-# Drawings and golden games -----------------------------------------------------------------------------------------------
+# Drawings and golden games ------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ALL)

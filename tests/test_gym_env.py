@@ -1,4 +1,6 @@
-"""The Gymnasium environment: the conformance tests of Gymnasium, agreement with the tabulated MDP, chance, limits, errors."""
+"""The Gymnasium environment: the conformance tests of Gymnasium, agreement with the tabulated MDP, chance, limits,
+errors.
+"""
 
 import itertools
 import json
@@ -262,7 +264,8 @@ def test_gymnasium_finds_the_environments_in_a_fresh_process(env_id):
     heavy = "'numba', 'scipy', 'pandas', 'matplotlib', 'torch', 'stable_baselines3', 'pygame'"
     start = "" if ":" in env_id else "import pharos"
     check = f"assert not [name for name in ({heavy},) if name in sys.modules]"
-    code = f"import sys, gymnasium\n{start}\n{check}\nprint(gymnasium.make({env_id!r}, height=9).reset(seed=0)[1]['state'][0])"
+    made = f"gymnasium.make({env_id!r}, height=9)"
+    code = f"import sys, gymnasium\n{start}\n{check}\nprint({made}.reset(seed=0)[1]['state'][0])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["3"]
 
@@ -320,7 +323,7 @@ def test_what_a_step_returns_is_of_its_state_and_stays_so(name, observation, opt
     assert len({state.tobytes() for _, state, _, _ in kept}) > 10
 
 
-# What Gymnasium's tools ask for ------------------------------------------------------------------------------------------
+# What Gymnasium's tools ask for -------------------------------------------------------------------------------------
 
 
 def steps_until_truncated(env):

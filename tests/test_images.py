@@ -1,4 +1,6 @@
-"""Simple and complex images: compiled frames against their interpreted twins, spaces, layers that show, options, errors."""
+"""Simple and complex images: compiled frames against their interpreted twins, spaces, layers that show, options,
+errors.
+"""
 
 import copy
 import pickle

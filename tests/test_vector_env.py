@@ -1,4 +1,6 @@
-"""Vector environments: agreement with the table, the interpreted twin and Gymnasium's own; autoreset, seeds, chance, SB3."""
+"""Vector environments: agreement with the table, the interpreted twin and Gymnasium's own; autoreset, seeds, chance,
+SB3.
+"""
 
 import gymnasium
 import numpy as np

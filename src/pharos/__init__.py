@@ -42,19 +42,21 @@ _HOMES = {
 # Modules that stand in another folder than their public name says.
 _MODULES = {"bisimulation": "pharos.bisimulation", "sb3_env": "pharos.sb3_env"}
 _PACKAGES = (
-    "agents",
-    "environments",
     "errors",
-    "experiments",
-    "exporters",
+    "environments",
+    "drawing",
+    "state_space",
+    "mdp",
+    "solvers",
     "hardness",
     "importers",
-    "mdp",
+    "exporters",
     "observations",
-    "plots",
+    "interaction",
     "policies",
-    "solvers",
-    "state_space",
+    "agents",
+    "experiments",
+    "plots",
     "study",
 )
 
