@@ -18,6 +18,7 @@ import math
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -140,77 +141,45 @@ def tune(
     except ImportError as error:
         raise MissingExtra("tuning", "optuna", "agents") from error
 
-    given = [environments] if isinstance(environments, Environment | str) else list(environments)
-    instances = [make(each) if isinstance(each, str) else each for each in given]
-    name = _class_of(instances)
-    searched = _checked_space(agent, space)
+    listed = [environments] if isinstance(environments, Environment | str) else list(environments)
+    instances = [make(each) if isinstance(each, str) else each for each in listed]
     seeds = [int(seed) for seed in seeds]
     if not seeds or trials < 1:
         raise ParameterError(f"{len(seeds)} seeds and {trials} trials; expected at least one of each")
-    seen = agent_kind(agent).observation(observation)
-    own = own_observation(seen)
-    seen = str(own or seen)
-    kinds = _checked_chances(chances, sticky, random)
-    tasks = [
-        Task(each, sticky=kind.sticky, random=kind.random, observation=own or seen)
-        for each in instances
-        for kind in kinds
-    ]
-    config = {
-        "agent": agent,
-        "instances": [{"environment": each.name, "parameters": each.parameters} for each in instances],
-        "observation": seen,
-        "steps": steps,
-        "seeds": seeds,
-        "chance": kinds[0].to_dict() if len(kinds) == 1 else [kind.to_dict() for kind in kinds],
-        "space": {name: list(choices) for name, choices in searched.items()},
-        "search_seed": search_seed,
-    }
-    config = json.loads(json.dumps(config))
+    search = _Search(
+        agent=agent,
+        instances=instances,
+        environment=_class_of(instances),
+        observation=observation,
+        kinds=_checked_chances(chances, sticky, random),
+        space=_checked_space(agent, space),
+        seeds=seeds,
+        steps=steps,
+        search_seed=search_seed,
+    )
     folder = None if out is None else Path(out)
     if folder is not None:
-        _claim(folder, config)
-    now = hyperparameters_of(agent, name, seen)
-    optuna.logging.set_verbosity(optuna.logging.WARNING)
-    study = optuna.create_study(
-        study_name=_results.identifier(config),
-        storage=_storage(optuna, folder),
-        sampler=optuna.samplers.TPESampler(seed=search_seed, n_startup_trials=min(10, max(2, trials // 4))),
-        pruner=optuna.pruners.MedianPruner(n_startup_trials=5, n_warmup_steps=10),
-        direction="minimize",
-        load_if_exists=True,
-    )
-    if not _trials(study) and all(trial.state.name != "WAITING" for trial in study.trials):
-        before = {key: now.get(key, _default(agent, key)) for key in searched}
-        study.enqueue_trial({key: value for key, value in before.items() if _allows(searched[key], value)})
-
-    for task in tasks:
-        if not task.reference.optimal - task.reference.uniform > 1e-12:
-            raise ParameterError(
-                f"{task.env}: acting at random is optimal, so regret cannot be normalised; leave it out"
-            )
-
-    def objective(trial: Any) -> float:
-        chosen = {key: _suggested(trial, key, choices) for key, choices in searched.items()}
-        return _score(agent, tasks, seeds, steps, {**now, **chosen}, trial, optuna.TrialPruned)
+        _claim(folder, search.config)
+    study = _opened(optuna, search, folder, trials)
+    search.check_tasks()
 
     def after(*_: Any) -> None:
         if folder is not None:
-            _write(folder, config, name, agent, seen, now, study)
+            _write(folder, search, study)
         if progress is not None:
             progress(_done(study), trials, _best(study))
 
     missing = trials - _done(study)
     if missing > 0:
-        study.optimize(objective, n_trials=missing, callbacks=[after])
+        study.optimize(lambda trial: search.score(trial, optuna.TrialPruned), n_trials=missing, callbacks=[after])
     if not math.isfinite(_best(study)):
         raise ParameterError(f"none of {trials} trials was finished; give more trials, or look at tuning.json")
     records = _trials(study)
     return TuningResult(
         agent=agent,
-        environment=name,
-        observation=seen,
-        hyperparameters={**now, **study.best_params},
+        environment=search.environment,
+        observation=search.seen,
+        hyperparameters={**search.table, **study.best_params},
         score=float(study.best_value),
         first_score=records[0]["score"],
         trials=records,
@@ -218,37 +187,108 @@ def tune(
     )
 
 
-def _score(
-    agent: str,
-    tasks: Sequence[Task],
-    seeds: Sequence[int],
-    steps: int,
-    chosen: Mapping[str, Any],
-    trial: Any,
-    given_up: type[Exception],
-) -> float:
-    """The mean normalised regret of evaluations after the first, over all runs; `given_up` is raised on the way."""
-    found: list[float] = []
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Search:
+    """What is searched: hyperparameters of an agent in `space`, on `instances` of the class `environment`."""
 
-    def progress(_done: int, _steps: int, row: Mapping[str, Any]) -> None:
-        found.append(row["normalized_regret"])
-        trial.report(sum(found) / len(found), len(found))
-        if trial.should_prune():
-            raise given_up
+    agent: str
+    instances: Sequence[Environment]
+    environment: str
+    observation: str
+    kinds: Sequence[ChanceSetting]
+    space: Mapping[str, tuple[Any, ...]]
+    seeds: Sequence[int]
+    steps: int
+    search_seed: int
 
-    for seed in seeds:
-        for task in tasks:
-            interval = max(1, steps // EVALUATIONS)
-            train_on(
-                task,
-                agent,
-                steps=steps,
-                seed=seed,
-                evaluation_interval=interval,
-                hyperparameters=chosen,
-                progress=progress,
-            )
-    return sum(found) / len(found)
+    @cached_property
+    def seen(self) -> str:
+        """The name of what the agent sees."""
+        return str(self._observed)
+
+    @cached_property
+    def _observed(self) -> Any:
+        requested = agent_kind(self.agent).observation(self.observation)
+        return own_observation(requested) or requested
+
+    @cached_property
+    def tasks(self) -> list[Task]:
+        """Every instance under every kind of chance."""
+        return [
+            Task(each, sticky=kind.sticky, random=kind.random, observation=self._observed)
+            for each in self.instances
+            for kind in self.kinds
+        ]
+
+    @cached_property
+    def table(self) -> dict[str, Any]:
+        """The hyperparameters of now, which the first trial has, and every trial for what is not searched."""
+        return hyperparameters_of(self.agent, self.environment, self.seen)
+
+    @cached_property
+    def config(self) -> dict[str, Any]:
+        """What determines the search, as tuning.json keeps it."""
+        chance = [kind.to_dict() for kind in self.kinds]
+        config = {
+            "agent": self.agent,
+            "instances": [{"environment": each.name, "parameters": each.parameters} for each in self.instances],
+            "observation": self.seen,
+            "steps": self.steps,
+            "seeds": self.seeds,
+            "chance": chance[0] if len(chance) == 1 else chance,
+            "space": {name: list(choices) for name, choices in self.space.items()},
+            "search_seed": self.search_seed,
+        }
+        return json.loads(json.dumps(config))
+
+    def check_tasks(self) -> None:
+        """ParameterError for a task on which regret cannot be normalised."""
+        for task in self.tasks:
+            if not task.reference.optimal - task.reference.uniform > 1e-12:
+                raise ParameterError(
+                    f"{task.env}: acting at random is optimal, so regret cannot be normalised; leave it out"
+                )
+
+    def score(self, trial: Any, pruned: type[Exception]) -> float:
+        """The mean normalised regret of evaluations after the first, over all runs; `pruned` is raised on the way."""
+        chosen = {key: _suggested(trial, key, choices) for key, choices in self.space.items()}
+        regrets: list[float] = []
+
+        def progress(_done: int, _steps: int, row: Mapping[str, Any]) -> None:
+            regrets.append(row["normalized_regret"])
+            trial.report(sum(regrets) / len(regrets), len(regrets))
+            if trial.should_prune():
+                raise pruned
+
+        for seed in self.seeds:
+            for task in self.tasks:
+                train_on(
+                    task,
+                    self.agent,
+                    steps=self.steps,
+                    seed=seed,
+                    evaluation_interval=max(1, self.steps // EVALUATIONS),
+                    hyperparameters={**self.table, **chosen},
+                    progress=progress,
+                )
+        return sum(regrets) / len(regrets)
+
+
+def _opened(optuna: Any, search: _Search, folder: Path | None, trials: int) -> Any:
+    """Optuna's study, new or as it was left; its first trial is what the table says."""
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    study = optuna.create_study(
+        study_name=_results.identifier(search.config),
+        storage=_storage(optuna, folder),
+        sampler=optuna.samplers.TPESampler(seed=search.search_seed, n_startup_trials=min(10, max(2, trials // 4))),
+        pruner=optuna.pruners.MedianPruner(n_startup_trials=5, n_warmup_steps=10),
+        direction="minimize",
+        load_if_exists=True,
+    )
+    if not _trials(study) and all(trial.state.name != "WAITING" for trial in study.trials):
+        before = {key: search.table.get(key, _default(search.agent, key)) for key in search.space}
+        study.enqueue_trial({key: value for key, value in before.items() if _allows(search.space[key], value)})
+    return study
 
 
 # The space ------------------------------------------------------------------------------------------------------------
@@ -345,17 +385,15 @@ def _storage(optuna: Any, folder: Path | None) -> Any:
     return optuna.storages.JournalStorage(backend)
 
 
-def _write(
-    folder: Path, config: Mapping[str, Any], name: str, agent: str, seen: str, now: Mapping[str, Any], study: Any
-) -> None:
-    record = {"format": 1, "config": config, "versions": _results.versions(), "trials": _trials(study)}
+def _write(folder: Path, search: _Search, study: Any) -> None:
+    record = {"format": 1, "config": search.config, "versions": _results.versions(), "trials": _trials(study)}
     if math.isfinite(_best(study)):
         import yaml
 
-        best = {**now, **study.best_params}
+        best = {**search.table, **study.best_params}
         record["best"] = {"trial": study.best_trial.number, "score": study.best_value, "hyperparameters": best}
-        told = f"# Mean normalised regret {study.best_value:.4f} after {_done(study)} trials, see tuning.json\n"
-        text = told + yaml.safe_dump({agent: {name: {seen: best}}}, sort_keys=False)
+        head = f"# Mean normalised regret {study.best_value:.4f} after {_done(study)} trials, see tuning.json\n"
+        text = head + yaml.safe_dump({search.agent: {search.environment: {search.seen: best}}}, sort_keys=False)
         storage.replace_file(folder / "hyperparameters.yaml", text)
     storage.replace_json(folder / "tuning.json", record)
 
