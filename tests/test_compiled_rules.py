@@ -77,6 +77,16 @@ def test_the_reason_names_the_signature_that_is_missing():
     assert '(File "coins.py", line 12)' in reason_of(ValueError(message))
 
 
+def test_rules_that_mention_a_private_attribute_run_interpreted(cache, tmp_path):
+    def reward(self, state, action, next_state):
+        return 1.0 + self._bonus
+
+    env = corridor_class(reward=reward, _bonus=0.5)()
+    space = pharos.build(env, tmp_path / "space")
+    with pytest.warns(RuntimeWarning, match="Corridor: Numba cannot compile its rules.*_bonus"):
+        assert space.mdp().rewards[0].tolist() == [1.5, 1.5]
+
+
 # The cache ---------------------------------------------------------------------------------------------------------------
 
 

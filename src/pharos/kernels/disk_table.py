@@ -1,11 +1,12 @@
-"""The table of states already found, on disk: each entry is a whole state and its index, in the first free slot from its hash's.
+"""The table of states already found, on disk: each entry is a whole state and its index, in the first free slot from
+its hash's.
 
-entries (slots, W + 1) uint64, a mapped file: W words of a state, then 1 + its index, 0 in a free slot, or NEW + j while it waits for
-its number. Memory is read and written in order of slots: many candidates are first sorted by the 16 highest bits of their hash,
-their bucket, which are the highest bits of their slot in a table of any size.
+entries (slots, W + 1) uint64, a mapped file: W words of a state, then 1 + its index, 0 in a free slot, or NEW + j while
+it waits for its number. Memory is read and written in order of slots: many candidates are first sorted by the 16
+highest bits of their hash, their bucket, which are the highest bits of their slot in a table of any size.
 
-keys (M, W) uint64: candidates; found (M,) int64: -1 - bucket, or an index where it is known; order (M,) int32: candidates that are
-looked up, by bucket, each bucket in the order of candidates.
+keys (M, W) uint64: candidates; found (M,) int64: -1 - bucket, or an index where it is known; order (M,) int32:
+candidates that are looked up, by bucket, each bucket in the order of candidates.
 """
 
 import numpy as np
@@ -47,7 +48,9 @@ def _enter(entries, slot, keys, j, entry):
 
 @njit(cache=True, nogil=True)
 def sort_by_bucket(found, first, order):
-    """Fill order; returns its length. found[j] >= 0, a state in this block that leads to itself, gets its index: first + found[j]."""
+    """Fill order; returns its length. found[j] >= 0, a state in this block that leads to itself, gets its index: first
+    + found[j].
+    """
     size = 0
     if len(found) <= _FEW:
         for j in range(len(found)):
@@ -76,7 +79,9 @@ def sort_by_bucket(found, first, order):
 
 @njit(cache=True, nogil=True)
 def look_up(entries, keys, order, low, high, found, slots):
-    """found[j] for candidates order[low:high]: its index; -1 where it is new, slots[j] then being its slot; -2 - i where i is equal."""
+    """found[j] for candidates order[low:high]: its index; -1 where it is new, slots[j] then being its slot; -2 - i
+    where i is equal.
+    """
     capacity = entries.shape[0]
     for p in range(low, high):
         if p + _AHEAD < high:
@@ -96,8 +101,8 @@ def look_up(entries, keys, order, low, high, found, slots):
 
 @njit(cache=True, nogil=True)
 def number(keys, found, successors, states, appended, progress):
-    """Number what is new in the order of candidates, into states[count - appended :]; row i of successors (rows, A) is state
-    progress[FIRST] + i.
+    """Number what is new in the order of candidates, into states[count - appended :]; row i of successors (rows, A) is
+    state progress[FIRST] + i.
 
     `progress` goes on by these rows.
     """

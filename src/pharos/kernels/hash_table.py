@@ -1,6 +1,7 @@
 """The table of states already found: index of a state, or -1, in the first free slot from the one that its hash names.
 
-The keys are not in the table: slot -> index -> states[index], so it costs 4 bytes a slot, whatever the width of a state.
+The keys are not in the table: slot -> index -> states[index], so it costs 4 bytes a slot, whatever the width of a
+state.
 """
 
 from typing import Any
@@ -15,7 +16,8 @@ intrinsic: Any = numba.extending.intrinsic  # whose types would hide those of th
 _BATCH = 32
 
 # Fields of `progress`, (5,) int64: where a search stands.
-# States expanded; states numbered; states up to the end of the current level; levels finished; 0 or 1 + a component at fault.
+# States expanded; states numbered; states up to the end of the current level; levels finished; 0, or 1 + a component at
+# fault.
 FIRST, COUNT, LEVEL_END, DEPTH, FAULT = range(5)
 
 
@@ -113,7 +115,8 @@ def fill(table, states, count):
 def fill_range(table, states, count, low, high, left_over):
     """The same for the states whose slots are in [low, high), so that threads can fill disjoint ranges of one table.
 
-    Returns the number of states that found no free slot before `high`, and puts their indices into left_over, as many as fit.
+    Returns the number of states that found no free slot before `high`, and puts their indices into left_over, as many
+    as fit.
     """
     capacity = table.shape[0]
     slots = np.empty(2 * _BATCH, np.int64)
@@ -184,8 +187,8 @@ def slots_of(keys, capacity, out):
 def insert_missing(table, states, keys, found, successors, progress):
     """Number the successors that threads did not find, in order; the serial half of a wide frontier.
 
-    found (rows * A,): index, or -1 - slot from which to search on. Row i belongs to state progress[FIRST] + i; successors (rows, A).
-    `progress` goes on by these rows.
+    found (rows * A,): index, or -1 - slot from which to search on. Row i belongs to state progress[FIRST] + i;
+    successors (rows, A). `progress` goes on by these rows.
     """
     first, count, level_end, depth = progress[FIRST], progress[COUNT], progress[LEVEL_END], progress[DEPTH]
     capacity = table.shape[0]

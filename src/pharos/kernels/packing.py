@@ -1,4 +1,6 @@
-"""Packing states into words and back: a few states at a time, where NumPy (rules/layout.py) would take a call for each component."""
+"""Packing states into words and back: a few states at a time, where NumPy (rules/layout.py) would take a call for each
+component.
+"""
 
 import numpy as np
 from numba import njit
@@ -6,7 +8,10 @@ from numba import njit
 
 @njit(cache=True, nogil=True)
 def pack_rows(word, shift, low, states, packed):
-    """packed (N, W) uint64 |= states (N, D) int64, component i in bits from shift[i] of word[i]. `packed` is zero before."""
+    """packed (N, W) uint64 |= states (N, D) int64, component i in bits from shift[i] of word[i].
+
+    `packed` is zero before.
+    """
     for n in range(len(states)):
         for i in range(len(word)):
             packed[n, word[i]] |= np.uint64(states[n, i] - low[i]) << shift[i]

@@ -41,8 +41,8 @@ def rewards_of_space(space: "StateSpace", rewards: Any = None, *, workers: int |
         return Rewards.from_array(array)
     if space.environment is None:
         raise StateSpaceError(
-            f"{space.folder}: pharos does not know the class {space.manifest['environment']!r}, so it cannot compute the "
-            f"rewards; import the module that registers it, or pass rewards as an (S, A) array"
+            f"{space.folder}: pharos does not know the class {space.manifest['environment']!r}, so it cannot compute "
+            f"the rewards; import the module that registers it, or pass rewards as an (S, A) array"
         )
     env = space.environment if rewards is None else _with_reward(space.environment, rewards)
     collector = RewardsCollector(shape)

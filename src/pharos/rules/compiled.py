@@ -1,6 +1,7 @@
 """The compiled engine: rules run by Numba, inside of the kernels that search, step and draw.
 
-Each class makes its kernels ready when it is made, by calling them with no work to do, and raises Numba's error where it cannot.
+Each class makes its kernels ready when it is made, by calling them with no work to do, and raises Numba's error where
+it cannot.
 """
 
 from typing import Any
@@ -23,7 +24,7 @@ class _Compiled:
     def __init__(self, env: Environment, layout: Layout):
         names, self.parameters = numeric_attributes(env)
         self.env, self.layout = env, layout
-        self.kernels = exploration_kernels(type(env), names, layout.num_words, env.num_actions)
+        self.kernels = exploration_kernels(_class_of(env), names, layout.num_words, env.num_actions)
 
 
 class CompiledExploration(_Compiled):
@@ -116,7 +117,7 @@ class CompiledStepping:
     def __init__(self, env: Environment, layout: Layout | None = None):
         names, self.parameters = numeric_attributes(env)
         self.env = env
-        kernels = interaction_kernels(type(env), names, env.num_actions)
+        kernels = interaction_kernels(_class_of(env), names, env.num_actions)
         self.step_one, self.step_many = kernels.step_one, kernels.step_many
         self.is_terminal_one = kernels.is_terminal_one
         self._step_and_draw_one = kernels.step_and_draw_one
@@ -147,7 +148,7 @@ class CompiledDrawing:
 
     def __init__(self, env: Environment, kernel: str, *arguments: Any):
         names, self.parameters = numeric_attributes(env)
-        self._kernel = getattr(interaction_kernels(type(env), names, env.num_actions), kernel)
+        self._kernel = getattr(interaction_kernels(_class_of(env), names, env.num_actions), kernel)
         self(*arguments)
 
     def __call__(self, *arguments: Any) -> None:
@@ -158,3 +159,7 @@ def signature_of(env: Environment) -> tuple:
     """Instances with equal signatures share one compilation, and the reason why there is none."""
     _, parameters = numeric_attributes(env)
     return (type(env), env.num_actions, tuple(map(type_text, parameters)))
+
+
+def _class_of(env: Environment) -> Any:
+    return type(env)

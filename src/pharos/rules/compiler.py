@@ -1,9 +1,9 @@
 """Rules in Python -> kernels compiled by Numba, once per class of environments, cached on disk across processes.
 
-Numba's own file cache knows a function by its file and does not see changes in what the function calls. So kernels that call a
-user's rules (`exploration.py`, `interaction.py`) are cached under a fingerprint of the rules (`fingerprint.py`) and of the code
-around them: edited rules get another file, unchanged ones are found compiled. The parameters of an instance are arguments, not
-constants: all instances of a class share one compilation.
+Numba's own file cache knows a function by its file and does not see changes in what the function calls. So kernels that
+call a user's rules (`exploration.py`, `interaction.py`) are cached under a fingerprint of the rules (`fingerprint.py`)
+and of the code around them: edited rules get another file, unchanged ones are found compiled. The parameters of an
+instance are arguments, not constants: all instances of a class share one compilation.
 """
 
 import hashlib
@@ -35,10 +35,13 @@ _MACHINERY = (
 
 
 def numeric_attributes(env: Environment) -> tuple[tuple[str, ...], tuple[Any, ...]]:
-    """What compiled rules see as `self`: names and values of the numbers, tuples of numbers and arrays that they mention."""
+    """Names and values of what compiled rules see as `self`: the numbers, tuples of numbers and arrays that they mention.
+
+    Private ones are left out: a named tuple has no fields with an underscore.
+    """
     known = set(dir(type(env))) | set(vars(env))
     names = sorted(known & mentioned_names(getattr(type(env), rule) for rule in RULES))
-    found = {name: getattr(env, name) for name in names if not name.startswith("__")}
+    found = {name: getattr(env, name) for name in names if not name.startswith("_")}
     numeric = {name: _plain(value) for name, value in found.items() if _is_numeric(value)}
     return tuple(numeric), tuple(numeric.values())
 
@@ -60,16 +63,14 @@ def _plain(value: Any) -> Any:
 
 
 @cache
-def exploration_kernels(
-    cls: type[Environment], names: tuple[str, ...], num_words: int, num_actions: int
-) -> ExplorationKernels:
+def exploration_kernels(cls: Any, names: tuple[str, ...], num_words: int, num_actions: int) -> ExplorationKernels:
     """The kernels of `exploration.py` for the rules of a class that mention the attributes `names`."""
     compiler, rules, parameters = _compiler_of(cls, names, num_words, num_actions)
     return exploration(compiler, rules, parameters, num_words, num_actions)
 
 
 @cache
-def interaction_kernels(cls: type[Environment], names: tuple[str, ...], num_actions: int) -> InteractionKernels:
+def interaction_kernels(cls: Any, names: tuple[str, ...], num_actions: int) -> InteractionKernels:
     """The kernels of `interaction.py`."""
     compiler, rules, parameters = _compiler_of(cls, names, 0, num_actions)
     return interaction(compiler, rules, parameters, num_actions)
@@ -93,8 +94,8 @@ def _machinery() -> tuple[str, ...]:
 class Compiler:
     """Compiles the inner functions of the makers, under a name that is theirs for these rules alone.
 
-    The name goes into the symbols of the machine code: code of several classes of environments, compiled in several processes, is
-    loaded into one.
+    The name goes into the symbols of the machine code: code of several classes of environments, compiled in several
+    processes, is loaded into one.
     """
 
     def __init__(self, name: str):

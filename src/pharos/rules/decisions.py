@@ -1,9 +1,10 @@
-"""Rules as decision trees: at each node one component of the state is read, and its value says where to go on; a leaf says what is written.
+"""Rules as decision trees: at each node one component of the state is read, and its value says where to go on; a leaf
+says what is written.
 
-A tree is five arrays. component (nodes,): what a node reads; UNKNOWN; or LEAF - l for leaf l. first_child (nodes,): where its children
-begin in children, one for each value from the lowest on, -1 where nobody has been. first_write (leaves + 1,): leaf l writes
-written[first_write[l] : first_write[l + 1]] = (component, value). says (leaves,): what the leaf returns.
-Node a is the root of action a, node A that of `is_terminal`.
+A tree is five arrays. component (nodes,): what a node reads; UNKNOWN; or LEAF - l for leaf l. first_child (nodes,):
+where its children begin in children, one for each value from the lowest on, -1 where nobody has been. first_write
+(leaves + 1,): leaf l writes written[first_write[l] : first_write[l + 1]] = (component, value). says (leaves,): what the
+leaf returns. Node a is the root of action a, node A that of `is_terminal`.
 """
 
 import numpy as np
@@ -58,7 +59,9 @@ def follow(
 
 @njit(cache=True, nogil=True)
 def say(component, first_child, children, first_write, written, says, low, states, following, rows, out, missing):
-    """What the leaves of the pairs (state, next state) return to out (N, A); `missing` as above, root a being that of action a."""
+    """What the leaves of the pairs (state, next state) return to out (N, A); `missing` as above, root a being that of
+    action a.
+    """
     count, width = 0, states.shape[1]
     pair = np.empty(2 * width, np.int64)
     for i in rows:

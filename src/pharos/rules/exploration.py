@@ -1,7 +1,7 @@
 """Makers of the kernels that enumerate states: they call the rules of one class, on packed states.
 
-Each maker is an ordinary function that returns compiled ones (see `compiler.Compiler`). What the inner functions take from it
-are constants for Numba: the rules; `Parameters`, what the rules see as `self`; W words a state; A actions.
+Each maker is an ordinary function that returns compiled ones (see `compiler.Compiler`). What the inner functions take
+from it are constants for Numba: the rules; `Parameters`, what the rules see as `self`; W words a state; A actions.
 `layout` is a tuple of one table (D, 4): where component i of a state sits (layout.py).
 """
 
@@ -77,9 +77,11 @@ def expand_function(compiler: Any, rules: Any, Parameters: Any, words: Words, W:
 
     @compiler.function
     def expand(parameters, layout, states, first, n, keys, slots, terminal, row, table, progress):
-        """Successors of states [first, first + n): packed words to keys, slots from which to search to slots, -1 if terminal.
+        """Successors of states [first, first + n): packed words to keys, slots from which to search to slots, -1 if
+        terminal.
 
-        keys (n * A, W), slots (n * A,); terminal[row + i] gets whether state first + i is terminal. The slots are prefetched.
+        keys (n * A, W), slots (n * A,); terminal[row + i] gets whether state first + i is terminal. The slots are
+        prefetched.
         """
         self = Parameters(*parameters)
         state = read_only_view(WORDS, *layout)
@@ -126,12 +128,14 @@ def explore_kernel(compiler: Any, expand: Any, prefetch_states: Any, words: Word
 
     @compiler.kernel
     def explore(parameters, layout, states, successors, terminal, table, base, last, room, progress):
-        """Breadth-first search: expand states from progress[FIRST] on, in order, until `last` or until `room` is used up.
+        """Breadth-first search: expand states from progress[FIRST] on, in order, until `last` or until `room` is used
+        up.
 
         states (capacity, W) uint64: the states of the search, in the order of discovery: progress[COUNT] of them.
         successors (rows, A), terminal (rows,) uint8: row i belongs to state base + i.
         table (slots,): index of a state, or -1; its place follows from the hash of the state.
-        While one batch is looked up, the next one is expanded already where it is known: memory has that long to answer.
+        While one batch is looked up, the next one is expanded already where it is known: memory has that long to
+        answer.
         """
         keys = np.empty((2, BATCH * A, W), np.uint64)
         slots = np.empty((2, BATCH * A), np.int64)
@@ -191,9 +195,9 @@ def expand_and_find_kernel(compiler: Any, expand: Any, prefetch_states: Any, wor
     def expand_and_find(parameters, layout, states, start, stop, base, keys, found, terminal, table, progress):
         """Successors of states [start, stop), and the indices of those that the table has.
 
-        keys ((rows * A), W) gets the successors' words; found (rows * A,) their indices, or -1 - slot where the table has none;
-        row i belongs to state base + i. The table is only read; another thread may insert meanwhile: what it inserts is found
-        or not found, and the one that numbers the states searches on from the slot.
+        keys ((rows * A), W) gets the successors' words; found (rows * A,) their indices, or -1 - slot where the table
+        has none; row i belongs to state base + i. The table is only read; another thread may insert meanwhile: what it
+        inserts is found or not found, and the one that numbers the states searches on from the slot.
         """
         slots = np.empty((2, BATCH * A), np.int64)
         capacity = table.shape[0]
@@ -235,7 +239,10 @@ def rewards_of_kernel(compiler: Any, rules: Any, Parameters: Any, words: Words, 
 
     @compiler.kernel
     def rewards_of(parameters, layout, states, successors, terminal, start, stop, out):
-        """out[i, a] = reward of the stored transition of state start + i; 0 in terminal states. Returns whether all are finite."""
+        """out[i, a] = reward of the stored transition of state start + i; 0 in terminal states.
+
+        Returns whether all are finite.
+        """
         self = Parameters(*parameters)
         state = read_only_view(WORDS, *layout)
         following = read_only_view(WORDS, *layout)

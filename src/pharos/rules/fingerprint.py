@@ -1,8 +1,8 @@
 """A text for the rules of an environment that changes whenever what they do may change.
 
-It covers a rule's bytecode and constants, and everything that the rule reaches by name: functions, constants, arrays, enums,
-attributes of modules, and methods and attributes of `self`. Compiled code and cached state spaces are filed under it, so that
-edited rules never meet what was made from the old ones. Needs no Numba.
+It covers a rule's bytecode and constants, and everything that the rule reaches by name: functions, constants, arrays,
+enums, attributes of modules, and methods and attributes of `self`. Compiled code and cached state spaces are filed
+under it, so that edited rules never meet what was made from the old ones. Needs no Numba.
 """
 
 import enum
@@ -41,7 +41,9 @@ def fingerprint_of_rules(env: Any, rules: Iterable[str]) -> str:
 
 
 def mentioned_names(functions: Iterable[Any], owner: type | None = None) -> set[str]:
-    """Names of attributes and globals in these functions, in those that they call by a global name, and in methods of `owner`."""
+    """Names of attributes and globals in these functions, in those that they call by a global name, and in methods of
+    `owner`.
+    """
     names: set[str] = set()
     seen: set[Any] = set()
     pending = [plain_function(function) for function in functions]

@@ -1,7 +1,7 @@
 """Makers of the kernels of interaction: they call the rules of one class on states that are rows of int64.
 
-As in exploration.py, what the inner functions take from their makers are constants for Numba: the rules; `Parameters`, what the
-rules see as `self`; A actions. `ranges` (2, D) int64: lowest and highest value of each component.
+As in exploration.py, what the inner functions take from their makers are constants for Numba: the rules; `Parameters`,
+what the rules see as `self`; A actions. `ranges` (2, D) int64: lowest and highest value of each component.
 """
 
 from typing import Any, NamedTuple
@@ -45,7 +45,9 @@ def advance_function(compiler: Any, rules: Any) -> Any:
 
     @compiler.inlined
     def advance(self, ranges, state, action, following):
-        """Write the successor of `state`; return the reward and 0 (goes on), 1 (terminal) or 2 + i (component i left its range)."""
+        """Write the successor of `state`; return the reward and 0 (goes on), 1 (terminal) or 2 + i (component i left
+        its range).
+        """
         for i in range(len(state)):
             following[i] = state[i]
         transition(self, state, action, following)
@@ -62,7 +64,9 @@ def step_one_kernel(compiler: Any, Parameters: Any, advance: Any) -> Any:
 
     @compiler.kernel
     def step_one(parameters, ranges, scale, state, action, following, vector):
-        """One step: `advance`, and vector[i] = (following[i] - low[i]) * scale[i] where `vector` has room (0 entries: not wanted)."""
+        """One step: `advance`, and vector[i] = (following[i] - low[i]) * scale[i] where `vector` has room (0 entries:
+        not wanted).
+        """
         value, code = advance(Parameters(*parameters), ranges, state, action, following)
         if len(vector) > 0:
             for i in range(len(state)):
@@ -117,10 +121,11 @@ def step_many_kernel(compiler: Any, Parameters: Any, advance: Any, A: int) -> An
 
     @compiler.kernel
     def step_many(parameters, setting, batch, first, last):
-        """One step of environments first .. last - 1; return -1, or i * D + c where component c of environment i left its range.
+        """One step of environments first .. last - 1; return -1, or i * D + c where component c of environment i left
+        its range.
 
-        An environment that has `ended` is reset instead (the mode DISABLED never comes here with one); in the mode SAME_STEP it
-        is reset at once, and `final` gets its last state. See `kernels.stepping` for Setting and Batch.
+        An environment that has `ended` is reset instead (the mode DISABLED never comes here with one); in the mode
+        SAME_STEP it is reset at once, and `final` gets its last state. See `kernels.stepping` for Setting and Batch.
         """
         ranges, scale, chance, limit, mode, first_previous, starts, cumulative = setting
         rng, actions, states, previous, elapsed, ended, rewards, terminated, truncated, executed, final, vector = batch
@@ -180,8 +185,8 @@ def draw_simple_kernel(compiler: Any, rules: Any, Parameters: Any, draw_flat: An
     def draw_simple(parameters, states, first, last, planes, shades, covering, out):
         """out[n, l] = shades[l, value of layer l], each cell enlarged to a square, for states first .. last - 1.
 
-        planes (L, rows, columns) uint8 is room to draw; shades (L, 256) uint8; out (N, L or 1, rows k, columns k) uint8, zero.
-        With `covering`, all layers go to one plane and later ones cover earlier ones.
+        planes (L, rows, columns) uint8 is room to draw; shades (L, 256) uint8; out (N, L or 1, rows k, columns k)
+        uint8, zero. With `covering`, all layers go to one plane and later ones cover earlier ones.
         """
         self = Parameters(*parameters)
         layers, rows, columns = planes.shape
@@ -213,10 +218,10 @@ def draw_complex_kernel(compiler: Any, rules: Any, Parameters: Any) -> Any:
     def draw_complex(parameters, states, first, last, planes, picture, top, left, sprite, place, color, keep, out):
         """Lay the sprites of states first .. last - 1 on the ground, later layers over earlier ones.
 
-        picture (height, width, C) uint8: the ground; top (rows + 1,), left (columns + 1,): edges of the cells in pixels.
-        sprite (L, rows, 256): number of the sprite of a value of a layer in a row, -1 for none; place (sprites, heights, widths): where its pixels
-        for a cell of this height and width begin in color (P, C) uint8, premultiplied, and keep (P,) uint16: how much of the ground
-        stays, of 256.
+        picture (height, width, C) uint8: the ground; top (rows + 1,), left (columns + 1,): edges of the cells in
+        pixels. sprite (L, rows, 256): number of the sprite of a value of a layer in a row, -1 for none; place (sprites,
+        heights, widths): where its pixels for a cell of this height and width begin in color (P, C) uint8,
+        premultiplied, and keep (P,) uint16: how much of the ground stays, of 256.
         """
         self = Parameters(*parameters)
         layers, rows, columns = planes.shape

@@ -1,4 +1,6 @@
-"""The interpreted engine: rules called in Python, where Numba cannot compile them, and to name the state in which they failed."""
+"""The interpreted engine: rules called in Python, where Numba cannot compile them, and to name the state in which they
+failed.
+"""
 
 import multiprocessing
 import numbers
@@ -102,7 +104,9 @@ def refused_reward(env: Environment, state: tuple[int, ...], action: int, why: s
 
 
 def blame(env: Environment, layout: Layout, suspects: np.ndarray, failure: BaseException | None) -> NoReturn:
-    """Compiled rules failed or left the declared ranges in one of some packed states: name the first where they do interpreted."""
+    """Compiled rules failed or left the declared ranges in one of some packed states: name the first where they do
+    interpreted.
+    """
     rows = unpack(layout, suspects).tolist()
     interpreted_successors(env, rows)
     raise RuleError(
@@ -118,8 +122,8 @@ def interpreted_successors(env: Environment, rows: list[list[int]]) -> tuple[np.
     Args:
         rows: N states, D integers each.
     Returns:
-        (N * A, D) int64, or uint8 where it suffices: row i * A + a the successor of state i by action a, terminal states leading to
-        themselves; and (N,) bool, which states are terminal.
+        (N * A, D) int64, or uint8 where it suffices: row i * A + a the successor of state i by action a, terminal
+        states leading to themselves; and (N,) bool, which states are terminal.
     Raises:
         RuleError: a rule raised an exception or left the declared ranges; names the state and the action.
     """
@@ -162,7 +166,8 @@ def interpreted_successors(env: Environment, rows: list[list[int]]) -> tuple[np.
 def _small_successors(env: Environment, rows: list[list[int]]) -> tuple[np.ndarray, np.ndarray] | None:
     """The same for integers from 0 to 255, the usual case: each successor becomes bytes at once, and no list is kept.
 
-    None where a rule raises, an integer is another or a range is left: rules are pure, so that the caller can ask again.
+    None where a rule raises, an integer is another or a range is left: rules are pure, so that the caller can ask
+    again.
     """
     transition, is_terminal, actions = env.transition, env.is_terminal, range(env.num_actions)
     terminal = np.zeros(len(rows), np.bool_)
@@ -210,8 +215,8 @@ def _check_successor(env: Environment, state: tuple[int, ...], action: int, out:
 class Interpreters:
     """Processes that call the rules, each in a part of the states: Python runs on one processor at a time.
 
-    They are forked, so that rules of any kind come along, those typed at a prompt too; where the system cannot do that, or with one
-    worker, there are none. They end with this process, however it ends.
+    They are forked, so that rules of any kind come along, those typed at a prompt too; where the system cannot do that,
+    or with one worker, there are none. They end with this process, however it ends.
     """
 
     def __init__(self, env: Environment, workers: int):
@@ -260,7 +265,9 @@ def _send(connection: Connection, states: np.ndarray) -> bool:
 
 
 def _received(connection: Connection, rows: int, env: Environment) -> tuple[np.ndarray, np.ndarray] | None:
-    """What another process found; None where it was killed, or where a rule fails, which this process shall find out itself."""
+    """What another process found; None where it was killed, or where a rule fails, which this process shall find out
+    itself.
+    """
     try:
         data = connection.recv_bytes()
     except (EOFError, OSError):

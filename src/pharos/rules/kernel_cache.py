@@ -1,7 +1,7 @@
 """Compiled kernels on disk: one file for each kernel and each signature, in a folder that nobody else can write to.
 
-Reading such a file runs what is in it (it is a pickle, and machine code), so the folder is private to its user. Damage is noticed by
-a checksum: a damaged file is deleted, and the kernel is compiled again.
+Reading such a file runs what is in it (it is a pickle, and machine code), so the folder is private to its user. Damage
+is noticed by a checksum: a damaged file is deleted, and the kernel is compiled again.
 """
 
 import contextlib
@@ -10,7 +10,6 @@ import os
 import pickle
 import stat
 import sys
-import uuid
 import warnings
 from functools import cache
 from pathlib import Path
@@ -21,7 +20,7 @@ from numba.core.caching import NullCache
 from numba.core.compiler import CompileResult
 from numba.core.serialize import dumps
 
-from pharos import paths
+from pharos import paths, storage
 
 DIGEST_BYTES = 32
 
@@ -63,13 +62,8 @@ class KernelCache(NullCache):
             return
         data = dumps(cres._reduce())
         file = self._file(sig, cres.codegen)
-        temporary = file.with_name(f"{file.name}.{uuid.uuid4().hex[:16]}.tmp")
-        try:
-            temporary.write_bytes(hashlib.sha256(data).digest() + data)
-            os.replace(temporary, file)
-        except OSError:
-            with contextlib.suppress(OSError):
-                temporary.unlink()
+        with contextlib.suppress(OSError):
+            storage.replace_file(file, hashlib.sha256(data).digest() + data, durable=False)
 
     def _file(self, sig: Any, codegen: Any) -> Path:
         key = repr((sig, codegen.magic_tuple(), numba.__version__, sys.version_info[:2]))
@@ -86,8 +80,8 @@ def cache_of_kernel(name: str) -> Any:
 def private_folder(cache_directory: Path) -> Path | None:
     """The folder of compiled rules, which is this user's and which nobody else can write to; None where there is none.
 
-    It is `compiled`, or, where several users share the cache, `compiled-` and the user's number. A warning says what is wrong with
-    a folder that is refused.
+    It is `compiled`, or, where several users share the cache, `compiled-` and the user's number. A warning says what is
+    wrong with a folder that is refused.
     """
     candidates = [cache_directory / "compiled"]
     if hasattr(os, "getuid"):

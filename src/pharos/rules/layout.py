@@ -1,8 +1,9 @@
 """Where each component of a state sits in its 64-bit words; integer vectors <-> packed states.
 
-Component i with `size[i]` values takes ceil(log2(size[i])) bits and holds value - low[i]. Components follow one another in
-the order of declaration; one that would straddle two words starts the next word. The rule is part of the file format.
-`kernels.packing` has compiled twins of `pack` and `unpack` for a few states at a time; this file loads no Numba.
+Component i with `size[i]` values takes ceil(log2(size[i])) bits and holds value - low[i]. Components follow one another
+in the order of declaration; one that would straddle two words starts the next word. The rule is part of the file
+format. `kernels.packing` has compiled twins of `pack` and `unpack` for a few states at a time; this file loads no
+Numba.
 """
 
 from dataclasses import dataclass
@@ -27,7 +28,9 @@ class Layout:
 
     @cached_property
     def tables(self) -> tuple[np.ndarray, ...]:
-        """The layout as compiled code takes it: one table (D, 4) int64 of 64 * word + shift, mask << shift, low, size."""
+        """The layout as compiled code takes it: one table (D, 4) int64 of 64 * word + shift, mask << shift, low,
+        size.
+        """
         offset = (self.word << np.uint64(6)) + self.shift
         columns = (offset.astype(np.int64), (self.mask << self.shift).astype(np.int64), self.low, self.size)
         return (np.stack(columns, axis=1),)

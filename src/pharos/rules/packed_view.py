@@ -1,8 +1,9 @@
 """A packed state that rules read and write as if it were an array of integers.
 
 A state of D small integers is stored in a few 64-bit words (state_space/_packing.py says where each component sits).
-Unpacking 29 components, running a rule and packing them again costs three times the rule itself. So compiled rules get a
-view instead: `state[i]` is a shift and a mask of a word on the stack, which LLVM keeps in a register when there is one word.
+Unpacking 29 components, running a rule and packing them again costs three times the rule itself. So compiled rules get
+a view instead: `state[i]` is a shift and a mask of a word on the stack, which LLVM keeps in a register when there is
+one word.
 
 Reading or writing outside the declared ranges does not corrupt a neighbour: the view notes the component in `fault` and
 goes on with a harmless value; the caller looks at `fault` and stops.
@@ -27,8 +28,8 @@ _OFFSET, _MASK, _LOW, _SIZE = range(4)  # columns of the layout's table
 class PackedView(types.Type):
     """Numba type of the view on `num_words` words: where they are, the layout's table, and the fault.
 
-    Words that are only read are an array on the stack. Words that are written one after the other are a vector, kept in a
-    register: through memory each write would wait for the one before it.
+    Words that are only read are an array on the stack. Words that are written one after the other are a vector, kept in
+    a register: through memory each write would wait for the one before it.
     """
 
     def __init__(self, num_words: int, writable: bool):

@@ -6,8 +6,8 @@ Three engines run them, the first that can:
     traced       in Python, once for each way through a rule (traced.py)
     interpreted  in Python, state by state (interpreted.py, stepping.py)
 
-Here stands, once, what happens where Numba cannot compile a rule: one warning for each class of environments and use, and the next
-engine. Whatever the engine, a rule that fails is a RuleError that names the state and the action.
+Here stands, once, what happens where Numba cannot compile a rule: one warning for each class of environments and use,
+and the next engine. Whatever the engine, a rule that fails is a RuleError that names the state and the action.
 """
 
 import contextlib
@@ -33,7 +33,8 @@ Engine = TypeVar("Engine")
 
 
 class Exploration(Protocol):
-    """Successors of packed states, looked up in a table of states (kernels/hash_table.py). See exploration.py for the arrays.
+    """Successors of packed states, looked up in a table of states (kernels/hash_table.py). See exploration.py for the
+    arrays.
 
     Raises:
         RuleError: a rule failed, or left the declared ranges.
@@ -55,7 +56,9 @@ class Exploration(Protocol):
         room: int,
         progress: np.ndarray,
     ) -> None:
-        """Breadth-first search: expand and number states in order until `last`, until `room` is used up, or for a while."""
+        """Breadth-first search: expand and number states in order until `last`, until `room` is used up, or for a
+        while.
+        """
 
     def expand_and_find(
         self,
@@ -68,7 +71,9 @@ class Exploration(Protocol):
         terminal: np.ndarray,
         table: np.ndarray,
     ) -> None:
-        """Successors of states [start, stop) to keys, and their indices to found; -1 - slot where the table has none."""
+        """Successors of states [start, stop) to keys, and their indices to found; -1 - slot where the table has
+        none.
+        """
 
     def close(self) -> None:
         """End the processes that run rules, if there are any."""
@@ -114,7 +119,8 @@ class Stepping(Protocol):
 
 
 class Rules:
-    """The rules of one environment, each use at the highest speed that they allow; nothing is compiled before it is used.
+    """The rules of one environment, each use at the highest speed that they allow; nothing is compiled before it is
+    used.
 
     Attributes:
         env: the environment. layout: where its components sit in packed states.

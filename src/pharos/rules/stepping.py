@@ -1,4 +1,6 @@
-"""The interpreted engine of interaction: the functions of interaction.py, where their arguments are described, in plain Python."""
+"""The interpreted engine of interaction: the functions of interaction.py, where their arguments are described, in
+plain Python.
+"""
 
 from typing import Any
 

@@ -1,12 +1,13 @@
 """The traced engine: rules in Python, called once for each way through them.
 
-A rule is a pure function of the state, and most rules look at a few components of it. So a call is traced: what it read, in which order
-and with which values, and what it wrote. The traces of a rule are a tree (decisions.py), and a state that comes to a leaf of it need
-not be asked about again: a Breakout of 224,617 states and three actions has 4,860 leaves. Where hardly any call is saved, as in a
-Freeway, whose rules read every car, tracing ends and every state is asked.
+A rule is a pure function of the state, and most rules look at a few components of it. So a call is traced: what it
+read, in which order and with which values, and what it wrote. The traces of a rule are a tree (decisions.py), and a
+state that comes to a leaf of it need not be asked about again: a Breakout of 224,617 states and three actions has 4,860
+leaves. Where hardly any call is saved, as in a Freeway, whose rules read every car, tracing ends and every state is
+asked.
 
-A rule sees the state through stand-ins that note each access; whatever they do not offer raises an exception, upon which tracing
-ends as well. Each traced call is repeated with a tuple and a list, and must give the same.
+A rule sees the state through stand-ins that note each access; whatever they do not offer raises an exception, upon
+which tracing ends as well. Each traced call is repeated with a tuple and a list, and must give the same.
 """
 
 import operator
@@ -79,7 +80,10 @@ class _Traced:
         self._trees = _Trees(roots)
 
     def _learn(self, missing: np.ndarray, values: Callable[[int, int], np.ndarray]) -> bool:
-        """Call rules for some of the (row, root) that trees do not know, `values` of which they see. Returns whether to go on."""
+        """Call rules for some of the (row, root) that trees do not know, `values` of which they see.
+
+        Returns whether to go on.
+        """
         try:
             for row, root in missing[:: max(1, len(missing) // ASKED)][:ASKED].tolist():
                 seen = values(row, root)
@@ -240,7 +244,10 @@ def _grown(array: np.ndarray, needed: int, fill: int) -> np.ndarray:
 
 
 class _StandIn:
-    """What a tuple and a list have in common. Nothing of a state is told without being noted, or else an exception is raised."""
+    """What a tuple and a list have in common.
+
+    Nothing of a state is told without being noted, or else an exception is raised.
+    """
 
     def __len__(self) -> int:
         raise NotImplementedError

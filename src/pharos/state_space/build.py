@@ -1,8 +1,8 @@
 """build: enumerate the reachable states of an environment, onto disk. Algorithm 1 of the paper, compiled.
 
-Breadth-first search: the array of states, in the order of discovery, is the queue; a table of indices keyed by hash is the only
-other memory (table.py). The search (search.py) expands states and numbers what is new; the journal (journal.py) appends what it finds to
-files and commits them.
+Breadth-first search: the array of states, in the order of discovery, is the queue; a table of indices keyed by hash is
+the only other memory (table.py). The search (search.py) expands states and numbers what is new; the journal
+(journal.py) appends what it finds to files and commits them.
 """
 
 import hashlib
@@ -48,13 +48,15 @@ def build(
 
     Args:
         env: the environment, or its name, such as "frozen_lake/4x4".
-        folder: where to write; None for the user's cache, keyed by environment, parameters and rules. A folder that holds
-            the finished state space is loaded; one that holds part of it is resumed, with the same result.
+        folder: where to write; None for the user's cache, keyed by environment, parameters and rules. A folder that
+            holds the finished state space is loaded; one that holds part of it is resumed, with the same result.
         max_states: StateSpaceTooLarge when there are more.
 
         Cost only (the files are the same, byte for byte):
-        memory: bytes that states and table may take; None for as much as there is. Beyond them the table is on disk, in a file
-            without a name in `folder` of 23 to 46 bytes a state (11 to 23 more for each further word), which is gone in the end.
+        memory: bytes that states and table may take; None for as much as there is. Beyond them the table is on disk, in
+        a file
+            without a name in `folder` of 23 to 46 bytes a state (11 to 23 more for each further word), which is gone in
+            the end.
         workers: threads, or processes where rules are interpreted; None for all processors.
         progress: None for a bar on a terminal; False for silence; or a function that gets a BuildProgress now and then.
         checkpoint_seconds: at most this much work is lost when the process is killed.
@@ -63,8 +65,8 @@ def build(
     Raises:
         StateSpaceTooLarge, DiskFull: what was found is kept; the same command resumes.
         StateSpaceMismatch: the folder holds another environment, or other rules. StateSpaceLocked: somebody else is
-        building there. StateSpaceCorrupted: files were changed. RuleError: a rule failed or left the declared ranges, in the
-        state that is named. ParameterError: the folder cannot be used.
+        building there. StateSpaceCorrupted: files were changed. RuleError: a rule failed or left the declared ranges,
+        in the state that is named. ParameterError: the folder cannot be used.
     Cost: see docs/performance.md; 40 to 110 ns a state, 8 W + 8 to 16 bytes of memory a state (W words of 64 bits).
     Source: the pharos paper, appendix A, Algorithm 1 (whose successors are stored under the wrong index there).
     """

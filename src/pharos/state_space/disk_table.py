@@ -1,4 +1,7 @@
-"""The table of states on disk, for state spaces whose table does not fit in memory. kernels/disk_table.py has its layout."""
+"""The table of states on disk, for state spaces whose table does not fit in memory.
+
+kernels/disk_table.py has its layout.
+"""
 
 import contextlib
 import mmap
@@ -27,7 +30,9 @@ class DiskTable:
     """
 
     def __init__(self, folder: Path, num_words: int, window: int, states: int):
-        """An empty table with room for a number of states, of which about `window` bytes are in this process's memory at a time."""
+        """An empty table with room for a number of states, of which about `window` bytes are in this process's memory
+        at a time.
+        """
         self.folder, self.num_words, self.window = folder, num_words, window
         slots = LEAST
         while slots * LOAD < states:
@@ -73,7 +78,9 @@ class DiskTable:
         self._sweep(size, lambda low, high: kernels.settle(self.entries, order, low, high, found, slots))
 
     def _sweep(self, size: int, work: Callable[[int, int], None], also: mmap.mmap | None = None) -> None:
-        """Do work(low, high) for parts of range(size), in order of slots, so that a part touches no more than the window."""
+        """Do work(low, high) for parts of range(size), in order of slots, so that a part touches no more than the
+        window.
+        """
         each = min(_AROUND, self.entries.nbytes // max(size, 1) + 64)  # bytes that one of them may touch
         step = max(1, self.window // each)
         for low in range(0, size, step):
@@ -94,7 +101,9 @@ def _let_go(mapping: mmap.mmap) -> None:
 
 
 def _mapped(folder: Path, size: int) -> mmap.mmap:
-    """A file of zeros, its room on the disk taken: a mapped file that finds the disk full when it is written kills the process."""
+    """A file of zeros, its room on the disk taken: a mapped file that finds the disk full when it is written kills the
+    process.
+    """
     try:
         with tempfile.TemporaryFile(dir=folder) as file:
             if hasattr(os, "posix_fallocate"):

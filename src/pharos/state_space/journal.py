@@ -1,7 +1,8 @@
-"""The files of a build: states, successors and terminal bits are appended in the background, and committed at checkpoints.
+"""The files of a build: states, successors and terminal bits are appended in the background, and committed at
+checkpoints.
 
-Data first, then the manifest that speaks of it: whatever kills the process, the last manifest is true, and the same command goes on
-from there.
+Data first, then the manifest that speaks of it: whatever kills the process, the last manifest is true, and the same
+command goes on from there.
 """
 
 import contextlib
@@ -37,7 +38,8 @@ class Position:
 
     Attributes:
         first: states expanded. count: states numbered. level_end: states up to the end of the current level.
-        depth: levels finished, the start states' own level not counted. terminals: terminal states among those expanded.
+        depth: levels finished, the start states' own level not counted. terminals: terminal states among those
+            expanded.
     """
 
     first: int = 0
@@ -122,7 +124,7 @@ class Journal:
         words = self.plan.layout.num_words
         out[:] = np.fromfile(self.path / STATES, "<u8", len(out) * words, offset=8 * words * start).reshape(-1, words)
 
-    # Appending -----------------------------------------------------------------------------------------------------------
+    # Appending -------------------------------------------------------------------------------------------------------
 
     @contextlib.contextmanager
     def writing(self) -> Iterator[None]:
@@ -172,7 +174,7 @@ class Journal:
         old.close()
         old.path.unlink()
 
-    # Committing ----------------------------------------------------------------------------------------------------------
+    # Committing ------------------------------------------------------------------------------------------------------
 
     def checkpoint(self, *, complete: bool) -> None:
         """Commit everything appended."""

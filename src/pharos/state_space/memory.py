@@ -9,7 +9,8 @@ _PROC, _GROUPS = Path("/proc"), Path("/sys/fs/cgroup")
 
 
 def available_memory() -> int:
-    """Bytes: free memory of the machine, or of a control group that this process is in (Slurm, containers) where that is less.
+    """Bytes: free memory of the machine, or of a control group that this process is in (Slurm, containers) where that
+    is less.
 
     What files have left in memory counts as free: it goes when somebody needs the room.
     """
@@ -24,7 +25,9 @@ def available_memory() -> int:
 
 
 def _groups() -> Iterator[tuple[Path, Path, Path]]:
-    """(limit, usage, statistics) of the groups of this process and those around them; the root, too, which may be a container's."""
+    """(limit, usage, statistics) of the groups of this process and those around them; the root, too, which may be a
+    container's.
+    """
     with contextlib.suppress(OSError, ValueError):
         for line in (_PROC / "self" / "cgroup").read_text().splitlines():
             _, controllers, path = line.split(":", 2)

@@ -19,7 +19,8 @@ class Plan:
         env: the environment.
         layout: where its components sit in packed states.
         starts: its start states and their probabilities.
-        identity: what makes a state space its state space: kept in the manifest and hashed into the cache's folder names.
+        identity: what makes a state space its state space: kept in the manifest and hashed into the cache's folder
+            names.
         fingerprint: of its rules.
     """
 

@@ -1,9 +1,9 @@
 """The search: breadth-first, in the order of discovery, by one thread or by several.
 
-While the frontier is wide, threads compute successors and look up those that the table has, a piece ahead of the one thread that
-numbers the new ones in order: so states are numbered as one thread would number them. While it is narrow (Freeway: 148 thousand
-levels of 9 states) one thread does everything. Where memory ends, the table goes to disk, and states stay in their file. docs/decisions
-has the measurements.
+While the frontier is wide, threads compute successors and look up those that the table has, a piece ahead of the one
+thread that numbers the new ones in order: so states are numbered as one thread would number them. While it is narrow
+(Freeway: 148 thousand levels of 9 states) one thread does everything. Where memory ends, the table goes to disk, and
+states stay in their file. docs/decisions has the measurements.
 """
 
 import time
@@ -112,7 +112,7 @@ class Search:
         else:
             self._spill(stored)
 
-    # The table in memory -------------------------------------------------------------------------------------------------
+    # The table in memory ---------------------------------------------------------------------------------------------
 
     def _expand_chunk(self, pool: ThreadPoolExecutor) -> None:
         """Expand up to a chunk of states, then append their rows to the files."""
@@ -224,7 +224,7 @@ class Search:
         if self.spilled is None:
             self._grow_table(pool)
 
-    # The table on disk ---------------------------------------------------------------------------------------------------
+    # The table on disk -----------------------------------------------------------------------------------------------
 
     def _spill(self, stored: np.ndarray | None = None) -> None:
         """Go on with the table on disk, filled from the one in memory, or from the states of the last checkpoint."""
@@ -295,7 +295,7 @@ class Search:
         states[in_file:] = spilled.states[start + in_file - spilled.appended : stop - spilled.appended]
         return states
 
-    # Limits and reports --------------------------------------------------------------------------------------------------
+    # Limits and reports ----------------------------------------------------------------------------------------------
 
     def _check_size(self) -> None:
         check_size(self.env, self.position.count, self.position.count - self.position.first, self.options.max_states)

@@ -81,7 +81,8 @@ class MemoryTable:
         """Number the successors that are new, in their order.
 
         Args:
-            keys: (rows * A, W) uint64, successors. found: (rows * A,), their indices, or -1 - slot from which to search on.
+            keys: (rows * A, W) uint64, successors. found: (rows * A,), their indices, or -1 - slot from which to search
+                on.
             successors: (rows, A), gets the indices. progress: see kernels/hash_table.py; goes on by these rows.
         """
         insert_missing(self.slots, self.states, keys, found, successors, progress)
@@ -107,7 +108,8 @@ class SpilledTable:
 
     Attributes:
         rows: of a chunk: as many as half of the memory holds; the table takes a quarter at a time.
-        states: those that the chunk numbers and that are not in the file yet. terminal: of its rows. keys, found: of its candidates.
+        states: those that the chunk numbers and that are not in the file yet. terminal: of its rows. keys, found: of
+            its candidates.
         appended: states that are in the file; the first of `states` has this number.
     """
 
@@ -147,7 +149,9 @@ class SpilledTable:
 
 
 def rows_of_chunk(memory: int, num_words: int, num_actions: int) -> int:
-    """Rows of which half of the memory holds the candidates: a multiple of 8, so that terminal bits fill whole bytes."""
+    """Rows of which half of the memory holds the candidates: a multiple of 8, so that terminal bits fill whole
+    bytes.
+    """
     candidate = 2 * 8 * num_words + 8 + 8 + 8 + 4  # words here and as a state, found, slots, a successor, order
     bytes_of_a_row = num_actions * candidate + 8 * num_words + 1
     rows = max(memory // 2 // bytes_of_a_row // 1024, 1) * 1024
