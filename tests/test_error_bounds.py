@@ -212,3 +212,16 @@ def test_a_state_that_leads_to_itself_may_be_visited_again_at_gamma_1():
     with pytest.raises(DivergenceError, match="again and again"):
         value_iteration(by_matrix)
     assert value_iteration(replace(waits, gamma=0.9), 1e-9).v[0] == 1.0
+
+
+@pytest.mark.parametrize("solve", [value_iteration, worst_value])
+def test_large_deterministic_mdps_near_gamma_1_are_solved_on_their_functional_graph(solve):
+    rng = np.random.default_rng(1)
+    size = 12_000
+    mdp = TabularMDP.from_arrays(rng.integers(0, size, (size, 2)), rng.random((size, 2)), gamma=0.999999)
+    solution = solve(mdp, 0.01)
+    assert solution.error_bound <= 0.01
+    assert solution.sweeps <= 1025
+    attained = evaluate_policy(mdp, solution.policy)
+    sign = 1 if solve is value_iteration else -1  # no policy is better than the best, or worse than the worst
+    assert (sign * (attained.v - solution.v)).max() <= solution.error_bound + attained.error_bound

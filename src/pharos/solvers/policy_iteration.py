@@ -5,17 +5,20 @@ Source: Howard (1960); Puterman (1994), section 6.4.
 """
 
 import math
-from typing import Any
 
 import numpy as np
 
 from pharos.kernels import bellman
 from pharos.mdp import PolicyTable, Selection, TabularMDP
 
-# Sweeps before the first attempt; later ones come after twice as many sweeps each.
-FIRST_ATTEMPT = 64
-# Nodes (states, or pairs with a previous action) of the largest linear system, and of the largest dense one.
-MOST_NODES, DENSE = 3000, 400
+# Sweeps before the first attempt, and before that of more than LARGE nodes: most games are solved by then. Later attempts
+# come after twice as many sweeps each.
+FIRST_ATTEMPT, FIRST_ATTEMPT_OF_LARGE, LARGE = 64, 512, 10_000
+# Nodes (states, or pairs with a previous action) of the largest linear system, of the largest dense one, and of the largest
+# functional graph, which takes 48 bytes a state.
+MOST_NODES, DENSE, MOST_OF_CHAIN = 3000, 400, 5_000_000
+# States whose greedy actions are worked out in one go.
+BLOCK = 1 << 16
 # Improvements of one attempt.
 MOST_IMPROVEMENTS = 60
 # Operations that calling a sweep costs, however few states there are.
@@ -31,13 +34,14 @@ class PolicyIteration:
 
     def is_worth_it(self, sweeps: int, change: float, tolerance: float) -> bool:
         """Whether the sweeps that are left cost more than solving some linear systems."""
-        if sweeps < FIRST_ATTEMPT or sweeps & (sweeps - 1) or self.mdp.gamma == 0.0:
+        first = FIRST_ATTEMPT if self.nodes <= LARGE else FIRST_ATTEMPT_OF_LARGE
+        if sweeps < first or sweeps & (sweeps - 1) or self.mdp.gamma == 0.0:
             return False
         gamma = self.mdp.gamma
         left = math.log(max(change, 1e-300) / (tolerance * (1 - gamma))) / -math.log(gamma)
         of_sweeps = left * (CALL + 4.0 * self.nodes * self.mdp.num_actions)
         if self.is_chain:
-            return of_sweeps > 100.0 * self.nodes
+            return self.nodes <= MOST_OF_CHAIN and of_sweeps > 1000.0 * self.nodes
         return self.nodes <= MOST_NODES and of_sweeps > float(self.nodes) ** 3
 
     @property
@@ -48,12 +52,8 @@ class PolicyIteration:
 
     def improve(self, x: np.ndarray) -> None:
         """Replace x (S + 1, W) by values of a policy that is greedy in its own values, or nearly so."""
-        actions: Any = None
+        policy = self._greedy(x)
         for _ in range(MOST_IMPROVEMENTS):
-            q = self.mdp.rewards + self.mdp.gamma * self.mdp.dynamics.expected(x)
-            policy = self.select.policy(q)
-            if actions is not None and (policy.actions is None or (policy.actions == actions).all()):
-                return
             if self.is_chain and policy.actions is not None:
                 values = chain_values(self.mdp.gamma, *chain(self.mdp, policy.actions))[0][:, None]
             else:
@@ -61,7 +61,20 @@ class PolicyIteration:
             if not np.isfinite(values).all():
                 return
             x[:-1] = values
-            actions = policy.actions if policy.actions is not None else ()
+            before, policy = policy, self._greedy(x)
+            if policy is before or np.array_equal(policy.table, before.table):
+                return
+
+    def _greedy(self, x: np.ndarray) -> PolicyTable:
+        """The policy of the best (or worst) actions by x; a given policy as it is."""
+        if isinstance(self.select, PolicyTable):
+            return self.select
+        mdp, actions = self.mdp, np.empty(self.mdp.num_states, np.int64)
+        for start in range(0, mdp.num_states, BLOCK):
+            states = slice(start, min(start + BLOCK, mdp.num_states))
+            q = mdp.reward_table.rows(states) + mdp.gamma * mdp.dynamics.expected(x, states)
+            actions[states] = self.select.policy(q).table
+        return PolicyTable(mdp.num_actions, actions=actions)
 
 
 def chain(mdp: TabularMDP, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
