@@ -122,8 +122,9 @@ def _check(manifest: dict[str, Any]) -> None:
     """ValueError where a manifest, whoever wrote it, says what no state space can be."""
     for name in ("num_states", "num_actions"):
         _whole(manifest[name], name, 1)
-    for name in ("num_terminal_states", "depth", "num_expanded", "level_end"):
+    for name in ("num_terminal_states", "num_expanded", "level_end"):
         _whole(manifest[name], name, 0)
+    _whole(manifest["depth"], "depth", 0 if manifest["complete"] is True else -1)  # -1: no level is finished yet
     if not isinstance(manifest["complete"], bool) or not isinstance(manifest["environment"], str):
         raise ValueError("complete or environment are of another type than they should be")
     if not isinstance(manifest["parameters"], dict):
