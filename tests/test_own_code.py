@@ -1,4 +1,4 @@
-"""Environments, observations and agents of one's own, as a user has them: files in a folder, commands in fresh processes."""
+"""Environments, observations and agents of one's own, as a user has them: files in a folder, fresh processes."""
 
 import json
 import os
@@ -186,6 +186,20 @@ def test_a_changed_file_is_another_run_for_its_folder(tmp_path):
     file.write_text(TAXI + "\n# changed\n")
     with pytest.raises(ParameterError, match=r"holds a run from before .*edited.py was changed"):
         train("q_learning", f"{file}:Taxi", steps=20, out=tmp_path / "run")
+
+
+def test_hardness_of_changed_code_is_measured_anew(tmp_path):
+    from pharos.study import tables
+
+    spec = study.specification(
+        {"name": "a", "blocks": [{"environments": ["frozen_lake/4x4"], "agents": ["q_learning"]}]}
+    )
+    file = tmp_path / "measured.py"
+    file.write_text(TAXI)
+    before, again = (tables._asked(spec, tmp_path, config_of(file)) for _ in range(2))
+    file.write_text(TAXI + "\n# changed\n")
+    assert before == again != tables._asked(spec, tmp_path, config_of(file))
+    assert "code" not in tables._asked(spec, tmp_path, spec.runs[0].config)[0]
 
 
 @pytest.mark.parametrize("reference", ["corners:corner", "corners.py:corner", "corners.py:pair"])

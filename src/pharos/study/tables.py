@@ -264,6 +264,8 @@ def _asked(study: Specification, place: Path, config: Mapping[str, Any]) -> tupl
 
     asked = {name: config[name] for name in ("environment", "parameters", "chance", "horizon")}
     asked["gamma"] = study.hardness.gamma
+    if "environment" in config.get("sources", {}):  # a class of the user's own, which may change
+        asked["code"] = config["sources"]["environment"]["checksum"]
     key = xxhash.xxh3_64_hexdigest(json.dumps(asked, sort_keys=True).encode())
     return asked, place / "hardness" / f"{key}.json"
 
