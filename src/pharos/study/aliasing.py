@@ -66,7 +66,8 @@ def aliasing_table(
     num_states: Mapping[str, float],
     progress: Callable[[str], None] | None = None,
 ) -> "pd.DataFrame":
-    """Aliasing of every instance and observation of a study with at most MOST_STATES states; kept in the folder `aliasing`.
+    """Aliasing of every instance and observation of a study with at most MOST_STATES states; kept in the folder
+    `aliasing`.
 
     Args:
         num_states: of the instances that are to be looked at, by name.

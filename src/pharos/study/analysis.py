@@ -58,7 +58,8 @@ class Models:
 def models(
     cells: "pd.DataFrame", *, agent: str = "dqn", regret: str = "cumulative_regret", measures: Sequence[str] = MEASURES
 ) -> Models:
-    """Fit the models to the cells of one agent: the single one, one a representation, one a class; as far as there are rows.
+    """Fit the models to the cells of one agent: the single one, one a representation, one a class; as far as there are
+    rows.
 
     Rows without one of the measures are left out; measures that no row has are left out of the models. Both are noted.
     """
@@ -113,7 +114,8 @@ def _fits(rows: "pd.DataFrame", measures: Sequence[str], notes: list[str]) -> li
             continue
         if dropped := fits[-1].dropped:
             notes.append(
-                f"the {model} model of {subset} leaves out {', '.join(dropped)}: constant, or a combination of the others"
+                f"the {model} model of {subset} leaves out {', '.join(dropped)}: constant, or a combination of the "
+                f"others"
             )
     return fits
 
@@ -131,7 +133,8 @@ def _together(fits: Sequence[Fit], model: str) -> float | None:
 def intervals(rows: "pd.DataFrame", *, resamples: int = 1000) -> "pd.DataFrame":
     """Interquartile mean of the normalised regret for each class, agent and observation, with 95 % bootstrap interval.
 
-    Runs are resampled within each task (instance and chance), as Agarwal et al. (2021) do; NaN where no task has two runs.
+    Runs are resampled within each task (instance and chance), as Agarwal et al. (2021) do; NaN where no task has two
+    runs.
     """
     import pandas as pd
 
@@ -191,9 +194,10 @@ class Comparison:
     """Numbers of the paper beside ours.
 
     Attributes:
-        returns: one row a printed mean and deviation: the columns of `paper_returns`, `ours`, `our_deviation`, `our_steps` (the paper's
-            are 50 thousand for grids and lakes, else 600 thousand), `difference`.
-        regressions: one row a printed fit: the columns of `paper_regressions`, and for both kinds of regret ours and the difference.
+        returns: one row a printed mean and deviation: the columns of `paper_returns`, `ours`, `our_deviation`,
+            `our_steps` (the paper's are 50 thousand for grids and lakes, else 600 thousand), `difference`.
+        regressions: one row a printed fit: the columns of `paper_regressions`, and for both kinds of regret ours and
+            the difference.
     """
 
     returns: "pd.DataFrame"

@@ -1,7 +1,7 @@
 """The same runs on more than one machine: shards as a Slurm array through submitit, or single runs on Ray.
 
-Runs do not depend on the engine: every one of these executes what is missing in a folder that all machines share, and may be
-killed, repeated, or followed by another.
+Runs do not depend on the engine: every one of these executes what is missing in a folder that all machines share, and
+may be killed, repeated, or followed by another.
 """
 
 import os
@@ -46,10 +46,11 @@ def submit(
     Args:
         folder: of the results, on a disk that all machines share.
         cluster: "slurm"; or "local": all jobs at once on this machine, to try it.
-        parameters: of submitit's executor, such as {"timeout_min": 600, "slurm_partition": "cpu", "slurm_array_parallelism": 50}.
+        parameters: of submitit's executor, such as {"timeout_min": 600, "slurm_partition": "cpu",
+            "slurm_array_parallelism": 50}.
     Returns:
-        submitit's jobs, one for each part in which runs are missing: `job.job_id`, `job.result()` waits. Their logs are in the
-        folder `jobs`.
+        submitit's jobs, one for each part in which runs are missing: `job.job_id`, `job.result()` waits. Their logs
+        are in the folder `jobs`.
     Raises:
         MissingExtra: submitit is not installed. ParameterError: there is no such cluster, or an option is wrong.
     """

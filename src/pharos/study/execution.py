@@ -1,7 +1,7 @@
 """Executes what is missing of a study: one process a run, from a process that has loaded everything already.
 
-Runs are independent, named by the hash of their config, and appear whole or not at all (`_worker`): runner or workers may be
-killed at any moment, several runners may share a folder, and the same command goes on from there.
+Runs are independent, named by the hash of their config, and appear whole or not at all (`_worker`): runner or workers
+may be killed at any moment, several runners may share a folder, and the same command goes on from there.
 """
 
 import contextlib
@@ -33,7 +33,8 @@ BUSY_SECONDS = 0.5
 # Between two looks at what other runners have finished in the same folder
 OTHERS_SECONDS = 20.0
 TERMINATION_SECONDS = 5.0
-# How often in a row the process that forks workers is begun again, and what multiprocessing says of a worker whose server is gone
+# How often in a row the process that forks workers is begun again, and what multiprocessing says of a worker whose
+# server is gone
 LOST_SERVERS = 10
 SERVER_LOST = 255
 
@@ -86,14 +87,15 @@ def run(
         folder: of the results; None for that folder, or studies/NAME.
         shard: `i/n`: only the i-th of n parts, for n machines that share the folder.
         retry_failed: execute failed runs again.
-        resume: let runs that were killed go on from their last checkpoint, for long runs on machines that come and go. A deep
-            agent then ends elsewhere than without the interruption; else killed runs start anew, and results never depend on it.
+        resume: let runs that were killed go on from their last checkpoint, for long runs on machines that come and go.
+            A deep agent then ends elsewhere than without the interruption; else killed runs start anew, and results
+            never depend on it.
         timeout: seconds after which a run is ended, and failed.
         workers: processes; None for as many as there are processors.
         progress: called with a Status every now and then.
         runner: `runner(config, folder)`, a function of a module, which writes run.json and curve.parquet.
-        prepare: called with one config of each instance, in a process of its own, before the runs; None: builds state spaces
-            for the usual runner, and does nothing for another.
+        prepare: called with one config of each instance, in a process of its own, before the runs; None: builds state
+            spaces for the usual runner, and does nothing for another.
     Returns:
         The Status at the end. Failed runs do not stop the others.
     Raises:

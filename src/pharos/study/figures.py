@@ -72,10 +72,11 @@ def class_color(name: str, names: Sequence[str]) -> str:
 def regret_curves(
     points: "pd.DataFrame", *, by: str | list[str] = "environment", seeds: bool = False, resamples: int = 500
 ) -> "Figure":
-    """Cumulative expected regret by steps: a panel for each class (or instance, or task), a line for each agent and observation.
+    """Cumulative expected regret by steps: a panel for each class (or instance, or task), a line for each agent and
+    observation.
 
-    The mean over instances and kinds of chance, with its 95 % bootstrap interval over runs; with `seeds` a thin line for each run
-    as well. The paper's figure 2.
+    The mean over instances and kinds of chance, with its 95 % bootstrap interval over runs; with `seeds` a thin line
+    for each run as well. The paper's figure 2.
     """
     groups = [
         (name if isinstance(name, str) else ", ".join(map(str, name)), part)
@@ -102,7 +103,8 @@ def regret_curves(
 
 
 def _tasks(lines: "pd.DataFrame") -> tuple[np.ndarray, list[np.ndarray]]:
-    """Steps, and for each task the cumulative regret (runs, T) there, of the runs that were evaluated at the same steps.
+    """Steps, and for each task the cumulative regret (runs, T) there, of the runs that were evaluated at the same
+    steps.
 
     Where blocks of a study differ in steps, those are the steps that most runs have.
     """

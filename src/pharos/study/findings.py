@@ -27,23 +27,24 @@ def findings(cells: "pd.DataFrame", models: Models, *, resamples: int = 1000) ->
 
     A task is an instance under one kind of chance; every test counts it once, whatever the number of its observations.
 
-    - Which observation costs DQN more regret, for each class: the normalised regret of both on the same tasks, Wilcoxon's
-      signed-rank test, two-sided.
+    - Which observation costs DQN more regret, for each class: the normalised regret of both on the same tasks,
+      Wilcoxon's signed-rank test, two-sided.
     - One linear model of all explains next to nothing: the F test of class and measures on the means of the tasks over
-      observations. Where it is significant, the verdict adds "mostly by class" if class and representation alone explain
-      more than half of R2, and the evidence tests what the measures add.
-    - Models by representation explain more: the F test of class and measures on the differences within tasks. Models by class
-      explain more: the F test of their slopes on the means of the tasks. The single model is nested in both.
-    - Hardness explains regret better with vectors than with images: the difference of R2, tasks resampled, 95 % percentile
-      interval.
+      observations. Where it is significant, the verdict adds "mostly by class" if class and representation alone
+      explain more than half of R2, and the evidence tests what the measures add.
+    - Models by representation explain more: the F test of class and measures on the differences within tasks. Models
+      by class explain more: the F test of their slopes on the means of the tasks. The single model is nested in both.
+    - Hardness explains regret better with vectors than with images: the difference of R2, tasks resampled, 95 %
+      percentile interval.
     - DQN and PPO agree: Pearson's r of their mean returns over cells, with Fisher's interval.
 
     Args:
         cells: as from `cells`.
         models: of DQN's cumulative regret.
     Returns:
-        One row a finding: what the paper says, ours, the statistic in words, p-value (NaN where an interval decides), and the
-        verdict: "agrees" or "disagrees" where the test is significant at 0.05, "undecided" where it is not, "no data".
+        One row a finding: what the paper says, ours, the statistic in words, p-value (NaN where an interval decides),
+        and the verdict: "agrees" or "disagrees" where the test is significant at 0.05, "undecided" where it is not, "no
+        data".
     Cost: `resamples` small regressions.
     """
     import pandas as pd

@@ -4,10 +4,10 @@ One row of the data is one agent on one instance under one kind of chance with o
 columns `environment` (class), `observation`, `regret`, and the measures `effective_horizon`, `sum_of_reciprocal_gaps`,
 `diameter`, which enter as logarithms.
 
-A task is an instance under one kind of chance. Its rows, one for each observation, have the same measures, so they are not
-independent: tests and R2 outside the sample count a task once. Where every task has the same observations, the estimates of
-least squares come from two strata that are independent of each other (a split plot): class and measures from the means of
-the tasks, observations from the differences within tasks. Otherwise standard errors are clustered by task.
+A task is an instance under one kind of chance. Its rows, one for each observation, have the same measures, so they are
+not independent: tests and R2 outside the sample count a task once. Where every task has the same observations, the
+estimates of least squares come from two strata that are independent of each other (a split plot): class and measures from
+the means of the tasks, observations from the differences within tasks. Otherwise standard errors are clustered by task.
 
 Source: Cochran and Cox (1957), Experimental designs, chapter 7 (split plots); Liang and Zeger (1986) for clusters.
 """
@@ -38,7 +38,8 @@ class Fit:
         coefficients: one row a predictor: estimate, standard error, p-value, lower and upper end of its 95 % interval.
         dropped: predictors left out because they are constant or a linear combination of the others.
         condition_number: of the standardised predictors.
-        fitted, actual: one entry a row; influence: Cook's distances; classes: of environments; tasks: instance and chance;
+        fitted, actual: one entry a row; influence: Cook's distances; classes: of environments; tasks: instance and
+            chance;
         observations: what the agent saw.
         design: (rows, predictors), as they entered, in the order of `coefficients`.
     """
@@ -66,7 +67,8 @@ def fit_models(data: "pd.DataFrame", *, measures: Sequence[str] = MEASURES) -> l
     """The single model (equation 7), one model a representation (8), one model a class (9).
 
     Raises:
-        ParameterError: a column is missing, a measure is not positive (its logarithm is needed), or there are too few rows.
+        ParameterError: a column is missing, a measure is not positive (its logarithm is needed), or there are too few
+            rows.
     """
     checked = _checked(data, measures)
     fits = [fit(checked, "single", "all", ["observation", "environment", *measures])]
@@ -85,7 +87,8 @@ def fit(rows: "pd.DataFrame", model: str, subset: str, predictors: Sequence[str]
     needed = len(terms) + 3
     if len(rows) < needed:
         raise ParameterError(
-            f"the {model} model of {subset} has {len(rows)} rows; needs at least {needed} for its {len(terms)} predictors: "
+            f"the {model} model of {subset} has {len(rows)} rows; needs at least {needed} for its {len(terms)} "
+            f"predictors: "
             f"run more instances or fewer predictors"
         )
     formula = "regret ~ " + (" + ".join(terms) if terms else "1")

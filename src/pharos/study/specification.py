@@ -1,7 +1,8 @@
 """What a study runs: a YAML file of blocks, checked key by key, and the list of runs that it stands for.
 
     name: lakes
-    steps: 50000                       # of every block that does not say otherwise; so do evaluations, seeds, gamma, horizon
+    steps: 50000                       # of every block that does not say otherwise; so do evaluations, seeds, gamma,
+        horizon
     hyperparameters:
       patient: {learning_rate: 1e-4}
     blocks:
@@ -11,10 +12,11 @@
         agents: [dqn, ppo, q_learning]
         hyperparameters: {dqn: patient, ppo: {n_steps: 256}}
 
-A block is the product of its lists. Tabular agents see the index of the state whatever the block's observations are. Environments,
-observations and agents of one's own are named as module:Name or file.py:Name, and looked for in `folder`: that of the YAML file
-when not given. Such code is imported where the user names the YAML file, but never for the study.yaml of a folder of results or of
-a packed study, which somebody else may have written, unless it is trusted.
+A block is the product of its lists. Tabular agents see the index of the state whatever the block's observations are.
+Environments, observations and agents of one's own are named as module:Name or file.py:Name, and looked for in
+`folder`: that of the YAML file when not given. Such code is imported where the user names the YAML file, but never for
+    the study.yaml of a
+folder of results or of a packed study, which somebody else may have written, unless it is trusted.
 """
 
 import json
@@ -90,7 +92,8 @@ class Run:
         return (self.configuration.environment, self.configuration.agent, self.configuration.observation)
 
 
-# The file ---------------------------------------------------------------------------------------------------------------
+# The file
+# ---------------------------------------------------------------------------------------------------------------
 
 
 def _entry(value: Any) -> Any:
@@ -200,7 +203,8 @@ class Hardness(_Part):
 
     @property
     def predictors(self) -> list[str]:
-        """Those measures that explain regret in the linear models: the paper's three, or all where none of them is taken.
+        """Those measures that explain regret in the linear models: the paper's three, or all where none of them is
+        taken.
 
         The stationary effective horizon stands for the effective horizon where that is not taken.
         """
@@ -325,7 +329,8 @@ def registered() -> list[str]:
     return list(measures())
 
 
-# Reading ----------------------------------------------------------------------------------------------------------------
+# Reading
+# ----------------------------------------------------------------------------------------------------------------
 
 
 def presets() -> list[str]:
@@ -339,12 +344,14 @@ Source = str | Path | Mapping[str, Any] | Specification
 
 
 def specification(source: Source, *, trust: bool | None = None) -> Specification:
-    """The specification in a YAML file or a study's folder, of a preset or a study in `studies` by its name, or from a mapping.
+    """The specification in a YAML file or a study's folder, of a preset or a study in `studies` by its name, or from a
+    mapping.
 
     Args:
         trust: whether code that it names may be imported; None: unless it is the study.yaml of a folder of results.
     Raises:
-        UnknownName: no such file or preset. ParameterError: something in it is wrong; the message names file, line and key.
+        UnknownName: no such file or preset. ParameterError: something in it is wrong; the message names file, line and
+            key.
         UntrustedCode: it names code, and is not trusted.
     """
     if isinstance(source, Specification):
@@ -550,7 +557,8 @@ def _where(name: str, root: Any, loc: Loc) -> str:
 
 
 def _check_nodes(root: Any, name: str) -> None:
-    """Refuse what no specification needs: keys that are no words or repeated, nodes within themselves, millions by aliases.
+    """Refuse what no specification needs: keys that are no words or repeated, nodes within themselves, millions by
+    aliases.
 
     A node that aliases share is looked at once; its size counts wherever it stands.
     """

@@ -28,8 +28,8 @@ def interquartile_mean(*tasks: np.ndarray, axis: int | None = None) -> Any:
 
     Args:
         tasks: an array for each task.
-        axis: None: every entry is a run, and the result is a float. Else the axis that counts runs, for each entry of the
-            other axes.
+        axis: None: every entry is a run, and the result is a float. Else the axis that counts runs, for each entry of
+            the other axes.
     """
     from scipy import stats
 

@@ -33,7 +33,8 @@ class Status:
         name, folder: of the study.
         total, finished, failed, running: numbers of runs; those in `running` are started and not over.
         errors: of the failed runs, by id.
-        damaged: what is wrong with results that cannot be read, by id; such runs count as missing, and are executed again.
+        damaged: what is wrong with results that cannot be read, by id; such runs count as missing, and are executed
+            again.
         elapsed, remaining: seconds since this runner began, and until the end as far as one can tell (None: not yet).
         preparing: what is built or solved before the runs; empty otherwise.
     """

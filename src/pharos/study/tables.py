@@ -1,4 +1,5 @@
-"""The results of a study as tables: a row for each run, a row for each point of a curve, a row for each cell of the grid.
+"""The results of a study as tables: a row for each run, a row for each point of a curve, a row for each cell of the
+grid.
 
 A cell is one agent on one instance under one kind of chance with one observation: its row is the mean over seeds.
 """
@@ -89,10 +90,11 @@ def table(source: Source, folder: str | os.PathLike | None = None) -> "pd.DataFr
     """One row a finished run; runs whose files are damaged are left out.
 
     Returns:
-        Columns `id`, `environment` (class), `instance`, `chance`, `agent`, `observation`, `seed`, `steps`, `seconds`; the result
-        of the run (`cumulative_regret`, `normalized_regret`, `value_optimal`, ...); `return`, the mean return of the training
-        episodes in the last tenth of the run, undiscounted; `exact`, whether every value behind the regret is computed; and
-        `half_width`, by how much `normalized_regret` may at worst be wrong where some are estimated, 0 where none is.
+        Columns `id`, `environment` (class), `instance`, `chance`, `agent`, `observation`, `seed`, `steps`, `seconds`;
+        the result of the run (`cumulative_regret`, `normalized_regret`, `value_optimal`, ...); `return`, the mean
+        return of the training episodes in the last tenth of the run, undiscounted; `exact`, whether every value behind
+        the regret is computed; and `half_width`, by how much `normalized_regret` may at worst be wrong where some are
+        estimated, 0 where none is.
     Raises:
         ParameterError: no run is finished.
     """
@@ -128,9 +130,10 @@ def cells(rows: "pd.DataFrame", measures: "pd.DataFrame | None" = None) -> "pd.D
     """The means over seeds, a row for each cell; joined with hardness where `measures` (of `hardness_table`) is given.
 
     Returns:
-        Columns of the cell; `seeds`; `steps` (the most, where runs differ); means of `cumulative_regret`, `normalized_regret`,
-        `final_value`, `value_optimal`, `return`; `return_deviation` over seeds (population, as 0.00 is printed for equal runs;
-        NaN for one seed); `exact`, whether all runs are; the mean of `half_width`; and the measures.
+        Columns of the cell; `seeds`; `steps` (the most, where runs differ); means of `cumulative_regret`,
+        `normalized_regret`, `final_value`, `value_optimal`, `return`; `return_deviation` over seeds (population, as
+        0.00 is printed for equal runs; NaN for one seed); `exact`, whether all runs are; the mean of `half_width`; and
+        the measures.
     """
     values = ["cumulative_regret", "normalized_regret", "final_value", "value_optimal", "return"]
     groups = rows.groupby(CELL, sort=False)
@@ -180,7 +183,8 @@ def _described(run: Run) -> dict[str, Any]:
     }
 
 
-# Hardness ---------------------------------------------------------------------------------------------------------------
+# Hardness
+# ---------------------------------------------------------------------------------------------------------------
 
 
 def hardness_table(
@@ -195,10 +199,10 @@ def hardness_table(
     Args:
         tasks: (instance, chance) of those that are wanted; None for all.
     Returns:
-        Columns `environment`, `instance`, `chance`; each measure as a number; `num_states`; and `notes`: where a measure is
-        undefined or unknown, where it is the geometric mean of a proven interval (whose ends differ by a factor of at most two),
-        and where it is that of the instance without chance, because the measure does not exist, or cannot be computed within
-        the budget, under this chance.
+        Columns `environment`, `instance`, `chance`; each measure as a number; `num_states`; and `notes`: where a
+        measure is undefined or unknown, where it is the geometric mean of a proven interval (whose ends differ by a
+        factor of at most two), and where it is that of the instance without chance, because the measure does not
+        exist, or cannot be computed within the budget, under this chance.
     Cost: a state space and a report of hardness for each row, each measure at most the budget of the specification;
         `hardness_cost` tells beforehand.
     """
@@ -350,7 +354,8 @@ def _number(value: Any, exact: bool) -> dict[str, Any]:
     return found
 
 
-# The paper's instances --------------------------------------------------------------------------------------------------
+# The paper's instances
+# --------------------------------------------------------------------------------------------------
 
 
 @cache

@@ -1,7 +1,7 @@
 """Values at the start of each task, solved once for all runs of a study, and kept in the user's cache.
 
-A run needs the values of the optimal, the uniform and the worst policy only where episodes start; solving a large instance again
-for each run would take longer than some training.
+A run needs the values of the optimal, the uniform and the worst policy only where episodes start; solving a large
+instance again for each run would take longer than some training.
 """
 
 import json

@@ -4,7 +4,8 @@
     DIR/runs/ID/      when it is over, moved there in one step: run.json (finished or failed), curve.parquet, log.txt
     DIR/locks/ID/     held by the process that runs it
 
-A process that is killed leaves a folder in `partial`, which the next attempt throws away, unless its result is complete, or
+A process that is killed leaves a folder in `partial`, which the next attempt throws away, unless its result is
+complete, or
 unless it is to be resumed: then the runner finds there what it wrote before.
 """
 
@@ -86,7 +87,8 @@ def attempt(
 ) -> str:
     """Execute one run unless it is finished already; FINISHED, FAILED or BUSY (another process is at it).
 
-    A run that raises is FAILED: its error stands in run.json and its log; `again` repeats such runs. With `resume` the runner
+    A run that raises is FAILED: its error stands in run.json and its log; `again` repeats such runs. With `resume` the
+        runner
     gets what an attempt that was killed left behind, else an empty folder.
     """
     holder = folder / "locks" / id
@@ -189,7 +191,8 @@ def _log(path: Path):
                 os.close(old)
 
 
-# As a process -----------------------------------------------------------------------------------------------------------
+# As a process
+# -----------------------------------------------------------------------------------------------------------
 
 
 def main(

@@ -1,4 +1,5 @@
-"""The report of a study: one HTML file that needs nothing else, its figures as PNG and PDF, its tables as CSV and LaTeX.
+"""The report of a study: one HTML file that needs nothing else, its figures as PNG and PDF, its tables as CSV and
+LaTeX.
 
 results.py    everything a report is made of, read and computed once: `Results`
 sections.py   what each section says; a section that has nothing to say is left out

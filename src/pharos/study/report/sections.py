@@ -75,8 +75,10 @@ def _summary(results: Results) -> Section:
     now, runs = results.status, results.runs
     failed = f", {now.failed} failed" if now.failed else ""
     lines = [
-        f"{now.finished:,} of {now.total:,} runs are finished{failed}: {_many(runs['instance'].nunique(), 'instance')} of "
-        f"{_many(runs['environment'].nunique(), 'class', 'classes')}, {_many(runs['chance'].nunique(), 'kind')} of chance, "
+        f"{now.finished:,} of {now.total:,} runs are finished{failed}: "
+        f"{_many(runs['instance'].nunique(), 'instance')} of "
+        f"{_many(runs['environment'].nunique(), 'class', 'classes')}, {_many(runs['chance'].nunique(), 'kind')} of "
+        f"chance, "
         f"{_many(runs['agent'].nunique(), 'agent')}, {_many(runs['seed'].nunique(), 'seed')}; "
         f"{int(runs['steps'].sum()):,} steps, which took one processor {duration(runs['seconds'].sum())}."
     ]
@@ -86,8 +88,10 @@ def _summary(results: Results) -> Section:
     if main is not None:
         printed = "; the paper prints 0.09" if results.comparison is not None else ""
         lines.append(
-            f"One linear model of {agent_name(results.models[0].agent)}'s cumulative regret over all classes and representations "
-            f"explains R² = {main.r_squared:.2f} of it ({main.cross_validated_r_squared:.2f} for tasks it has not seen){printed}."
+            f"One linear model of {agent_name(results.models[0].agent)}'s cumulative regret over all classes and "
+            f"representations "
+            f"explains R² = {main.r_squared:.2f} of it ({main.cross_validated_r_squared:.2f} for tasks it has not "
+            f"seen){printed}."
         )
     if results.comparison is not None:
         returns = results.comparison.returns
@@ -109,8 +113,10 @@ def _estimated(runs: "pd.DataFrame") -> str | None:
     groups = estimates.groupby(["environment", "agent"], sort=True).size()
     of = ", ".join(f"{agent_name(agent)} on {title(name)} ({count})" for (name, agent), count in groups.items())
     return (
-        f"The regret of {_many(len(estimates), 'run')} of {len(runs):,} is estimated by playing, because the policy reaches too "
-        f"many states for an exact value: {of}. Their normalised regret may be off by up to ± {estimates['half_width'].max():.4f} "
+        f"The regret of {_many(len(estimates), 'run')} of {len(runs):,} is estimated by playing, because the policy "
+        f"reaches too "
+        f"many states for an exact value: {of}. Their normalised regret may be off by up to ± "
+        f"{estimates['half_width'].max():.4f} "
         f"if all errors of a run add up; tables mark them by ≈. All other regret is exact."
     )
 
@@ -128,7 +134,8 @@ def _findings(results: Results) -> Section | None:
         counts=f"{len(decided)} of {len(results.findings)} can be looked at here: {counts}.",
         table=table(
             decided,
-            "What the paper says in words, and the same from these runs. Undecided: not significant at 0.05; no correction for the "
+            "What the paper says in words, and the same from these runs. Undecided: not significant at 0.05; no "
+            "correction for the "
             "number of tests. Every test counts a task once. How each is tested: docs/study.md.",
         ),
     )
@@ -153,13 +160,16 @@ def _regret(results: Results, figures: Figures) -> Section:
         figure=image(
             figures,
             "regret",
-            "Cumulative regret by steps (lower is better), the mean over instances and kinds of chance with the 95 % bootstrap "
+            "Cumulative regret by steps (lower is better), the mean over instances and kinds of chance with the 95 % "
+            "bootstrap "
             "interval over seeds. The paper's figure 2.",
         ),
         table=table(
             shown[columns],
-            "Interquartile mean of the normalised regret (0: optimal from the first episode on; 1: as bad as acting at random) and "
-            "its 95 % stratified bootstrap interval. With few seeds such intervals are too narrow. ≈: some values are estimated.",
+            "Interquartile mean of the normalised regret (0: optimal from the first episode on; 1: as bad as acting "
+            "at random) and "
+            "its 95 % stratified bootstrap interval. With few seeds such intervals are too narrow. ≈: some values are "
+            "estimated.",
         ),
     )
 
@@ -173,12 +183,14 @@ def _representations(results: Results, figures: Figures, left_out: list[str]) ->
         wide = wide[[seen, VECTOR]].dropna()
         harder = (wide[seen] > wide[VECTOR]).groupby(level="environment").agg(["sum", "size"])
         lines = [
-            f"{title(str(name))}: the {title(seen) if seen != IMAGE else 'image'} costs {agent_name(agent)} more regret in "
+            f"{title(str(name))}: the {title(seen) if seen != IMAGE else 'image'} costs {agent_name(agent)} more "
+            f"regret in "
             f"{row['sum']} of {row['size']} tasks"
             for name, row in harder.iterrows()
         ]
         caption = (
-            f"Normalised regret of {agent_name(agent)} that sees a vector against that of {agent_name(agent)} that sees an image, "
+            f"Normalised regret of {agent_name(agent)} that sees a vector against that of {agent_name(agent)} that "
+            f"sees an image, "
             f"a point for each instance and kind of chance. Below the dotted line the image is harder."
         )
         if results.comparison is not None and agent == "dqn":
@@ -204,7 +216,8 @@ def _aliasing(results: Results) -> Section | None:
         "States that share an observation",
         "aliasing",
         text="These observations do not tell every state: an agent that remembers nothing cannot act differently in states that look "
-        "alike, and learns from targets that mix them. Regret is measured against the optimal policy of the states. So where "
+        "alike, and learns from targets that mix them. Regret is measured against the optimal policy of the states. "
+        "So where "
         "vectors and images are compared, a part of the difference may be this.",
         table=table(
             shown,
@@ -230,9 +243,12 @@ def _models_of(models: Models, results: Results, figures: Figures) -> dict[str, 
     heading = f"{what.capitalize()} of {agent_name(models.agent)}"
     fits = pd.DataFrame([_line(fit) for fit in models.fits])
     caption = (
-        "Ordinary least squares, section 4.3 of the paper: equations 7 (single), 8 (representation) and 9 (class). R² outside is "
-        "for each task by the model fitted on the others; the condition number is that of the standardised predictors, above 30 the "
-        "coefficients cannot be told apart; influence is the largest Cook's distance. Significant: p < 0.05, a task counted once."
+        "Ordinary least squares, section 4.3 of the paper: equations 7 (single), 8 (representation) and 9 (class). R² "
+        "outside is "
+        "for each task by the model fitted on the others; the condition number is that of the standardised "
+        "predictors, above 30 the "
+        "coefficients cannot be told apart; influence is the largest Cook's distance. Significant: p < 0.05, a task "
+        "counted once."
     )
     values = {
         "class and representation alone, without measures": models.class_alone,
@@ -319,7 +335,8 @@ def _hardness(results: Results) -> Section:
         "hardness",
         table=table(
             results.hardness,
-            "The tabular measures of each instance under each kind of chance, as they enter the models; notes say where one is of the "
+            "The tabular measures of each instance under each kind of chance, as they enter the models; notes say "
+            "where one is of the "
             "instance without chance, or stands for a proven interval.",
         ),
         complete=complete,
@@ -365,9 +382,12 @@ def _beside(results: Results) -> Section | None:
     if len(fits) == len(returns) == 0:
         return None
     text = (
-        f"Returns: {len(returns)} of {len(results.comparison.returns)} printed values have one of ours; the difference is "
-        f"{returns['difference'].mean():+.2f} in the mean, and {returns['difference'].abs().median():.2f} in the middle case. The "
-        f"paper trains 50 thousand steps on grids and lakes, else 600 thousand; it prints no rewards, discounts, probabilities of "
+        f"Returns: {len(returns)} of {len(results.comparison.returns)} printed values have one of ours; the "
+        f"difference is "
+        f"{returns['difference'].mean():+.2f} in the mean, and {returns['difference'].abs().median():.2f} in the "
+        f"middle case. The "
+        f"paper trains 50 thousand steps on grids and lakes, else 600 thousand; it prints no rewards, discounts, "
+        f"probabilities of "
         f"chance, or what of a run its returns are means of: differences are to be expected."
     )
     caption = "R² and correlation: printed, ours, and the difference, for both kinds of regret."
@@ -414,7 +434,8 @@ def _each_instance(results: Results, figures: Figures) -> Section:
     parts = []
     for environment in dict.fromkeys(results.runs["environment"]):
         caption = (
-            f"Cumulative regret on each instance of {title(environment)} under each kind of chance: the mean, its 95 % bootstrap "
+            f"Cumulative regret on each instance of {title(environment)} under each kind of chance: the mean, its 95 "
+            f"% bootstrap "
             f"interval, and thin a line for each seed."
         )
         drawn = image(figures, f"regret_by_task_{slug(environment)}", caption)
