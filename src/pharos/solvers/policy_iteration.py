@@ -11,11 +11,11 @@ import numpy as np
 from pharos.kernels import bellman
 from pharos.mdp import PolicyTable, Selection, TabularMDP
 
-# Sweeps before the first attempt, and before that of more than LARGE nodes: most games are solved by then. Later attempts
-# come after twice as many sweeps each.
+# Sweeps before the first attempt, and before that of more than LARGE nodes: most games are solved by then. Later
+# attempts come after twice as many sweeps each.
 FIRST_ATTEMPT, FIRST_ATTEMPT_OF_LARGE, LARGE = 64, 512, 10_000
-# Nodes (states, or pairs with a previous action) of the largest linear system, of the largest dense one, and of the largest
-# functional graph, which takes 48 bytes a state.
+# Nodes (states, or pairs with a previous action) of the largest linear system, of the largest dense one, and of the
+# largest functional graph, which takes 48 bytes a state.
 MOST_NODES, DENSE, MOST_OF_CHAIN = 3000, 400, 5_000_000
 # States whose greedy actions are worked out in one go.
 BLOCK = 1 << 16
