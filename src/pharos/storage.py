@@ -246,8 +246,8 @@ def _claim(folder: Path, error: type[PharosError], activity: str) -> Iterator[No
             break
         holder = _text(path)
         if holder is not None and not _is_of_a_dead_process(holder):
-            said = _held(folder, holder.split(",")[0], activity)
-            raise error(f"{said}; if it is gone, delete {path}")
+            message = _held(folder, holder.split(",")[0], activity)
+            raise error(f"{message}; if it is gone, delete {path}")
         if holder is not None:
             _remove_claim(path, holder)
     else:

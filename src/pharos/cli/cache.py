@@ -43,10 +43,10 @@ def clear(
 
     directory = paths.cache_directory()
     spaces = _spaces(directory)
-    known = {space["environment"] for space in spaces} | {space["name"] for space in spaces}
+    names = {space["environment"] for space in spaces} | {space["name"] for space in spaces}
     for name in environments or ():
-        if name not in known:
-            raise UnknownName("environment in the cache", name, known)
+        if name not in names:
+            raise UnknownName("environment in the cache", name, names)
     removed, freed = [], 0
     for space in spaces:
         if not environments or space["environment"] in environments or space["name"] in environments:
@@ -68,7 +68,7 @@ def _spaces(directory: Path) -> list[dict[str, Any]]:
     """Every cached state space, the largest first."""
     from pharos.state_space import read_manifest
 
-    found = []
+    listed = []
     for folder in sorted((directory / "spaces").glob("*")):
         if not folder.is_dir():
             continue
@@ -77,7 +77,7 @@ def _spaces(directory: Path) -> list[dict[str, Any]]:
             manifest = read_manifest(folder)
         state = "damaged" if manifest is None else "complete" if manifest["complete"] else "unfinished"
         manifest = manifest or {}
-        found.append(
+        listed.append(
             {
                 "name": folder.name,
                 "environment": manifest.get("environment", folder.name.rpartition("-")[0]),
@@ -88,7 +88,7 @@ def _spaces(directory: Path) -> list[dict[str, Any]]:
                 "folder": str(folder),
             }
         )
-    return sorted(found, key=lambda space: -space["bytes"])
+    return sorted(listed, key=lambda space: -space["bytes"])
 
 
 def _print(directory: Path, spaces: list[dict[str, Any]], compiled: int, total: int) -> None:

@@ -49,13 +49,13 @@ def versions() -> dict[str, str]:
 
     import pharos
 
-    found = {"pharos": pharos.__version__, "python": platform.python_version()}
+    numbers = {"pharos": pharos.__version__, "python": platform.python_version()}
     for name in ("numpy", "numba", "gymnasium", "stable-baselines3", "torch"):
         try:
-            found[name] = metadata.version(name)
+            numbers[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
             continue
-    return found
+    return numbers
 
 
 def write_record(folder: Path, record: Mapping[str, Any]) -> None:
@@ -153,10 +153,10 @@ def check_agent(folder: Path) -> None:
         if name == CURVE:
             continue
         try:
-            found = storage.digest_of_file(folder / name)
+            digest = storage.digest_of_file(folder / name)
         except OSError as error:
             raise ResultCorrupted(f"{folder / name}: cannot be read: {error.strerror}; {AGAIN}") from None
-        if found != expected:
+        if digest != expected:
             raise ResultCorrupted(f"{folder / name}: was changed after it was written; {AGAIN}")
 
 

@@ -89,30 +89,30 @@ def _members(path: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:
         raise FileFormatError(f"{path}: cannot be read as npz without unpickling: {reason}") from None
 
 
-def _horizon(path: Path, given: int | None) -> int:
+def _horizon(path: Path, horizon: int | None) -> int:
     named = horizon_of_name(path)
-    if given is not None and (isinstance(given, bool) or not isinstance(given, int | np.integer) or given < 1):
-        raise ParameterError(f"horizon is {given!r}; expected a whole number of steps, at least 1")
-    if named is None and given is None:
+    if horizon is not None and (isinstance(horizon, bool) or not isinstance(horizon, int | np.integer) or horizon < 1):
+        raise ParameterError(f"horizon is {horizon!r}; expected a whole number of steps, at least 1")
+    if named is None and horizon is None:
         raise ParameterError(
             f"{path}: its name does not tell the horizon; give one (`--horizon T`), as its values depend on it"
         )
-    if named is not None and given is not None and named != given:
-        raise ParameterError(f"{path}: horizon {given} contradicts its name, which says {named}; leave it out")
-    if given is None and named is not None and named > LARGEST_HORIZON:
+    if named is not None and horizon is not None and named != horizon:
+        raise ParameterError(f"{path}: horizon {horizon} contradicts its name, which says {named}; leave it out")
+    if horizon is None and named is not None and named > LARGEST_HORIZON:
         raise ParameterError(
             f"{path}: its name says {named} steps; expected at most {LARGEST_HORIZON}: "
             f"give a horizon (`--horizon T`) and another name"
         )
-    return int(named if given is None else given)  # type: ignore[arg-type]
+    return int(named if horizon is None else horizon)  # type: ignore[arg-type]
 
 
 def horizon_of_name(path: Path) -> int | None:
     """T from the name of a file or its folder: `freeway_10_fs30`, or MiniGrid."""
     for name in (path.stem, path.resolve().parent.name):
-        found = re.search(r"_(\d+)_fs\d+", name)
-        if found:
-            return int(found[1])
+        match = re.search(r"_(\d+)_fs\d+", name)
+        if match:
+            return int(match[1])
         if "minigrid" in name.lower():
             return MINIGRID_STEPS
     return None

@@ -118,11 +118,11 @@ def _arrays(folder: Path, checksums: Mapping[str, Any]) -> dict[str, np.ndarray]
 
 def _array(path: Path, checksum: Any) -> np.ndarray:
     try:
-        found = storage.digest_of_file(path)
+        digest = storage.digest_of_file(path)
     except OSError as error:
         wrong = "no such file" if isinstance(error, FileNotFoundError) else f"cannot be read: {error.strerror}"
         raise FileFormatError(f"{path}: {wrong}; {AGAIN}") from None
-    if found != checksum:
+    if digest != checksum:
         raise FileFormatError(f"{path} was changed after it was written; {AGAIN}")
     try:
         array = np.load(path, allow_pickle=False)

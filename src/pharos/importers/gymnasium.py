@@ -68,7 +68,7 @@ def gymnasium(env: Any, *, gamma: float = 0.99, horizon: int | None = None) -> T
 
 def _checked(env: Any, s: int, a: int, outcomes: list, states: int) -> dict[tuple[int, bool], tuple[float, float]]:
     """{(next state, terminated): (probability, probability x reward)}, equal outcomes added up."""
-    found: dict[tuple[int, bool], tuple[float, float]] = {}
+    merged: dict[tuple[int, bool], tuple[float, float]] = {}
     total = 0.0
     for outcome in outcomes:
         p, following, reward, ended = outcome
@@ -79,11 +79,11 @@ def _checked(env: Any, s: int, a: int, outcomes: list, states: int) -> dict[tupl
         total += p
         if p > 0:
             key = (-1, True) if ended else (int(following), False)
-            before = found.get(key, (0.0, 0.0))
-            found[key] = (before[0] + p, before[1] + p * reward)
+            before = merged.get(key, (0.0, 0.0))
+            merged[key] = (before[0] + p, before[1] + p * reward)
     if abs(total - 1) > 1e-6:
         raise FileFormatError(f"{env}: the probabilities of P[{s}][{a}] sum to {total}; expected 1")
-    return found
+    return merged
 
 
 def _start(env: Any, inner: Any, states: int) -> np.ndarray:

@@ -127,14 +127,14 @@ class _Driver:
         vars(self.env)["gen_obs"] = dict  # partial views cost most of a step, and nothing here looks at them
         self.snapshots: list[bytes] = []
 
-    def explore(self, given: Sequence[int] | None, max_states: int) -> tuple[np.ndarray, np.ndarray]:
+    def explore(self, chosen: Sequence[int] | None, max_states: int) -> tuple[np.ndarray, np.ndarray]:
         """(next states (S, A), rewards (S, A)), breadth first."""
-        known = int(self.env.action_space.n)
-        actions = list(range(known)) if given is None else [int(action) for action in given]
-        if not actions or not set(actions) <= set(range(known)) or len(set(actions)) < len(actions):
-            raise ParameterError(f"actions are {actions}; expected different ones from 0 to {known - 1}")
+        num_actions = int(self.env.action_space.n)
+        actions = list(range(num_actions)) if chosen is None else [int(action) for action in chosen]
+        if not actions or not set(actions) <= set(range(num_actions)) or len(set(actions)) < len(actions):
+            raise ParameterError(f"actions are {actions}; expected different ones from 0 to {num_actions - 1}")
         try:
-            return self._explore(actions, max_states, drop_done=given is None and known == DONE + 1)
+            return self._explore(actions, max_states, drop_done=chosen is None and num_actions == DONE + 1)
         finally:
             del self.env.gen_obs
 
@@ -196,10 +196,10 @@ class _Driver:
         """Put a state back that `save` returned: a copy in memory, never a file."""
         reader = pickle.Unpickler(io.BytesIO(snapshot))
         reader.persistent_load = self.fixed.__getitem__  # type: ignore[method-assign,assignment]
-        kept = reader.load()
-        for name in [name for name, _ in self._attributes() if name not in kept]:
+        attributes = reader.load()
+        for name in [name for name, _ in self._attributes() if name not in attributes]:
             delattr(self.env, name)
-        vars(self.env).update(kept)
+        vars(self.env).update(attributes)
 
     def _number_of_fixed(self, value: Any) -> int | None:
         """What is no part of a state and stays where it is: the environment itself, its spaces, its generator."""
@@ -232,10 +232,10 @@ class _Driver:
 
     def _attributes(self) -> Iterator[tuple[str, Any]]:
         """What the environment keeps; the grid first, so that objects are numbered by where they lie."""
-        kept = vars(self.env)
-        for name in sorted(kept, key=lambda name: (name != "grid", name)):
+        attributes = vars(self.env)
+        for name in sorted(attributes, key=lambda name: (name != "grid", name)):
             if name not in _NOT_STATE:
-                yield name, kept[name]
+                yield name, attributes[name]
 
     def _flatten(self, value: Any, flat: list[Any], places: dict[int, int]) -> None:
         if isinstance(value, np.ndarray | np.generic):

@@ -180,13 +180,13 @@ def _check_arrays(manifest: dict[str, Any]) -> None:
         raise ValueError(f"arrays are {', '.join(arrays)}; expected {', '.join(expected)}")
     for name, (dtype, length) in expected.items():
         entry = arrays[name]
-        found = _whole(entry["bytes"], f"bytes of {name}", 0)
-        if entry["dtype"] != dtype or (manifest["complete"] and found != length):
+        size = _whole(entry["bytes"], f"bytes of {name}", 0)
+        if entry["dtype"] != dtype or (manifest["complete"] and size != length):
             raise ValueError(
-                f"{name}: {found} bytes of type {entry['dtype']}; expected {length} of type {dtype} for {states} states"
+                f"{name}: {size} bytes of type {entry['dtype']}; expected {length} of type {dtype} for {states} states"
             )
-        if len(entry["checksums"]) != -(-found // CHECKSUM_BYTES):
-            raise ValueError(f"{name}: {len(entry['checksums'])} checksums for {found} bytes")
+        if len(entry["checksums"]) != -(-size // CHECKSUM_BYTES):
+            raise ValueError(f"{name}: {len(entry['checksums'])} checksums for {size} bytes")
 
 
 def _whole(value: Any, name: str, least: int) -> int:

@@ -141,9 +141,9 @@ def _digest(id: str, record: str, curve: "pa.Table") -> str:
 def _checked(file: Path, id: str, record: str, ids: set[str] | None) -> dict[str, Any]:
     """The record of a run, which must be finished, and one of `ids`."""
     try:
-        found = json.loads(record)
-        config, status = found["config"], found["status"]
-        if not storage.is_intact(found):
+        entry = json.loads(record)
+        config, status = entry["config"], entry["status"]
+        if not storage.is_intact(entry):
             raise ValueError("it was changed after it was written")
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise ResultCorrupted(f"{file}: the record of run {id} cannot be read: {error}; {_AGAIN}") from None
@@ -151,7 +151,7 @@ def _checked(file: Path, id: str, record: str, ids: set[str] | None) -> dict[str
         raise FileFormatError(f"{file}: run {id} is not one of the study, or its configuration was changed")
     if status != _worker.FINISHED:
         raise FileFormatError(f"{file}: run {id} is {status!r}; expected finished runs")
-    return found
+    return entry
 
 
 def _curve(file: Path, id: str, row: dict[str, list | None], schema: "pa.Schema") -> "pa.Table":
