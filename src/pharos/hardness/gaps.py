@@ -36,7 +36,7 @@ _ROUNDING = 1e-12
 _UNIT = 2.0**-53
 # Sweeps at most, after the solution, until values settle; and sweeps that change values by no more than rounding.
 _SWEEPS = 200
-_AT_REST = 8
+_AT_REST = 40
 
 
 @dataclass(frozen=True)
