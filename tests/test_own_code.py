@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 
+import gymnasium
 import pytest
 from typer.testing import CliRunner
 
@@ -15,6 +16,7 @@ from pharos.cli import app
 from pharos.environments import catalog
 from pharos.errors import FileFormatError, ParameterError, UntrustedCode
 from pharos.experiments import RunConfig, load_agent, read_record, run_id, train
+from pharos.observations import observation
 from pharos.sources import Source
 
 TAXI = """
@@ -71,6 +73,19 @@ def lab(tmp_path_factory):
     done = command("study", "run", "../own.yaml", "--out", "results", "--workers", 2, cwd=folder / "elsewhere")
     assert (done.returncode, done.stdout) == (0, "own: 3 of 3 runs finished\n"), done.stderr
     return folder
+
+
+@pytest.fixture(autouse=True)
+def nothing_is_left(monkeypatch):
+    """What one test registers, no other test finds."""
+    monkeypatch.setattr(catalog, "_REGISTERED", {})
+    monkeypatch.setattr(sources, "_LOADED", {})
+    monkeypatch.setattr(sources, "_MODULES", {})
+    monkeypatch.setattr(observation, "_registered", {})
+    before = dict(gymnasium.registry)
+    yield
+    for name in set(gymnasium.registry) - set(before):
+        del gymnasium.registry[name]
 
 
 def command(*words, cwd):
