@@ -16,7 +16,7 @@ import pharos
 from pharos.drawing import human
 from pharos.errors import MissingExtra, ParameterError
 from pharos.interaction import GymEnv
-from pharos.observations import observe
+from pharos.observations import NO_ACTION, observe
 
 SMALL = {
     "pharos/SimpleGrid-v0": {"height": 3, "width": 4, "rewards": (((1, 1), 0.1),), "penalties": (((0, 2), -0.5),)},
@@ -125,6 +125,15 @@ def executed_counts(env, steps, seed):
             env.reset()
             previous = None
     return counts
+
+
+@pytest.mark.parametrize(("sticky", "random"), [(0.25, 0.0), (0.0, 0.4), (0.5, 0.5), (1.0, 0.5), (0.0, 1.0)])
+def test_the_first_executed_action_has_the_distribution_of_the_tabular_mdp(sticky, random, breakout):
+    chance = pharos.random_actions(pharos.sticky_actions(breakout.mdp(), sticky), random).chance
+    simulator = GymEnv(breakout.environment, sticky=sticky, random=random).simulator
+    numbers = (np.arange(30_000) + 0.5) / 30_000
+    share = np.mean([simulator.executed(1, NO_ACTION, u) == 1 for u in numbers])
+    assert share == pytest.approx(chance.first_chosen + chance.first_uniform / 3, abs=1e-4)
 
 
 @pytest.mark.parametrize(("sticky", "random"), [(0.25, 0.0), (0.0, 0.4), (0.25, 0.4), (1.0, 0.0), (0.0, 1.0)])

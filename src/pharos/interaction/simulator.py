@@ -9,15 +9,15 @@ import numpy as np
 
 from pharos.environments import Environment, make, start_distribution
 from pharos.errors import ParameterError, RuleError, StateSpaceTooLarge
+from pharos.kernels import stepping
 from pharos.kernels.stepping import Setting
 from pharos.mdp import Chance, TabularMDP
 from pharos.observations import NO_ACTION, ObservationInContext, observe
 from pharos.rules import rules_of
 from pharos.state_space import StateSpace, build, load
 
-LARGEST_INDEX = (
-    20_000_000  # states that are built on the way where the observation "index" is asked for without `space`
-)
+# States that are built on the way where the observation "index" is asked for without `space`.
+LARGEST_INDEX = 20_000_000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,6 +56,7 @@ class Simulator:
     Attributes:
         env, state_space, context, limit: as the options say; `context` maps states to what the agent gets.
         chance: (chosen, previous, uniform), weights of the executed action; they sum to 1.
+        first_chosen: the weight of the chosen action where there is no previous one; the rest is uniform.
         has_chance: whether another than the chosen action may be executed.
         start_states (K, D), start_cumulative (K,): start states and the cumulative sum of their probabilities.
         ranges: (2, D) int64, lowest and highest value of each component.
@@ -74,7 +75,8 @@ class Simulator:
             remaining_time=options.remaining_time,
             limit=self.limit,
         )
-        self.chance = _chance(options)
+        chance = _chance(options)
+        self.chance, self.first_chosen = chance.triple, float(chance.first_chosen)
         self.has_chance = self.chance != (1.0, 0.0, 0.0)
         self.first_previous = _first_previous(options.initial_previous_action, self.env)
         states, probabilities = start_distribution(self.env)
@@ -88,7 +90,8 @@ class Simulator:
     def setting(self, mode: int, ranges: np.ndarray, scale: np.ndarray, starts: np.ndarray) -> Setting:
         """What the kernels of many environments take; `starts` are states, or their indices in a state space."""
         limit = self.limit if self.limit is not None else 1 << 62
-        return Setting(ranges, scale, self.chance, limit, mode, self.first_previous, starts, self.start_cumulative)
+        chance = (*self.chance, self.first_chosen)
+        return Setting(ranges, scale, chance, limit, mode, self.first_previous, starts, self.start_cumulative)
 
     def drawn_start(self, rng: np.random.Generator) -> int:
         """Which of the start states; draws one number where there are several."""
@@ -98,12 +101,8 @@ class Simulator:
 
     def executed(self, chosen: int, previous: int, u: float) -> int:
         """The executed action, by one uniform number u in [0, 1): chosen, then previous, then uniform."""
-        stay, stick, uniform = self.chance
-        if u < stay or (u < stay + stick and previous == NO_ACTION):
-            return chosen
-        if u < stay + stick:
-            return previous
-        return min(int((u - stay - stick) / uniform * self.env.num_actions), self.env.num_actions - 1)
+        weights = (*self.chance, self.first_chosen)
+        return stepping.executed_by_number.py_func(chosen, previous, weights, self.env.num_actions, u)
 
     def checked_state(self, state: Any) -> np.ndarray:
         """(D,) int64 from what a user gave; ParameterError unless every component is in its range."""
@@ -188,11 +187,11 @@ def spec_with_limit(spec: gymnasium.envs.registration.EnvSpec | None, limit: int
     return None if spec is None else replace(spec, max_episode_steps=limit)
 
 
-def _chance(options: Interaction) -> tuple[float, float, float]:
+def _chance(options: Interaction) -> Chance:
     for name, p in (("sticky", options.sticky), ("random", options.random)):
         if isinstance(p, bool) or not isinstance(p, int | float) or not 0 <= p <= 1:
             raise ParameterError(f"{name} is {p!r}; expected a probability in [0, 1]")
-    return Chance.of(options.sticky, options.random).triple
+    return Chance.of(options.sticky, options.random)
 
 
 def _time_limit(limit: int | str | None, env: Environment) -> int | None:

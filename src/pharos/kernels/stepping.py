@@ -2,7 +2,7 @@
 
 from typing import Any, NamedTuple
 
-from numba import float64, int64, njit, uint64
+from numba import float64, njit, uint64
 
 NEXT_STEP, SAME_STEP, DISABLED = range(3)  # when an environment that has ended is reset
 
@@ -13,7 +13,8 @@ class Setting(NamedTuple):
     Attributes:
         ranges: (2, D) int64, lowest and highest value of each component; (2, 0) on a table.
         scale: (D,) float64, of the vectors that `step_many` writes.
-        chance: (chosen, previous, uniform), weights of the executed action.
+        chance: (chosen, previous, uniform, first_chosen), weights of the executed action; the last is that of the
+            chosen one where there is no previous action.
         limit: steps after which an episode is truncated.
         mode: NEXT_STEP, SAME_STEP or DISABLED.
         first_previous: the previous action on the first step of an episode, -1 for none.
@@ -22,7 +23,7 @@ class Setting(NamedTuple):
 
     ranges: Any
     scale: Any
-    chance: tuple[float, float, float]
+    chance: tuple[float, float, float, float]
     limit: int
     mode: int
     first_previous: int
@@ -69,16 +70,28 @@ def uniform_number(rng, i):
 
 
 @njit(forceinline=True)
-def executed_action(chosen, previous, chance, num_actions, rng, i):
-    """The executed action: chosen, previous or uniform with the weights `chance`; without chance nothing is drawn."""
-    if chance[0] >= 1.0:
-        return chosen
-    u = uniform_number(rng, i)
-    if u < chance[0] or (u < chance[0] + chance[1] and previous < 0):
+def executed_by_number(chosen, previous, chance, num_actions, u):
+    """The executed action, by one uniform number u in [0, 1): chosen, then previous, then uniform.
+
+    chance: as in `Setting`; previous: -1 where there is none, and the chosen action has the weight of the first step.
+    """
+    if previous < 0:
+        if u < chance[3]:
+            return chosen
+        return min(int((u - chance[3]) / (1.0 - chance[3]) * num_actions), num_actions - 1)
+    if u < chance[0]:
         return chosen
     if u < chance[0] + chance[1]:
         return previous
-    return min(int64((u - chance[0] - chance[1]) / chance[2] * num_actions), num_actions - 1)
+    return min(int((u - chance[0] - chance[1]) / chance[2] * num_actions), num_actions - 1)
+
+
+@njit(forceinline=True)
+def executed_action(chosen, previous, chance, num_actions, rng, i):
+    """The executed action of stream i; nothing is drawn where the chosen action is always executed."""
+    if chance[0] >= 1.0:
+        return chosen
+    return executed_by_number(chosen, previous, chance, num_actions, uniform_number(rng, i))
 
 
 @njit(forceinline=True)

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from pharos.environments import Environment
+from pharos.kernels import stepping
 from pharos.kernels.stepping import SAME_STEP
 
 NO_ACTION = -1  # the previous action on the first step of an episode
@@ -74,15 +75,11 @@ class InterpretedStepping:
 
     def _executed(self, chosen: int, previous: int, chance, rng: np.ndarray, i: int) -> int:
         """The executed action, as `kernels.stepping.executed_action`."""
-        stay, stick, uniform = chance
-        if stay >= 1.0:
+        if chance[0] >= 1.0:
             return chosen
-        u = _uniform_number(rng, i)
-        if u < stay or (u < stay + stick and previous == NO_ACTION):
-            return chosen
-        if u < stay + stick:
-            return previous
-        return min(int((u - stay - stick) / uniform * self.env.num_actions), self.env.num_actions - 1)
+        return stepping.executed_by_number.py_func(
+            chosen, previous, chance, self.env.num_actions, _uniform_number(rng, i)
+        )
 
 
 def _uniform_number(rng: np.ndarray, i: int) -> float:
