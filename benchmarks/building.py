@@ -2,10 +2,10 @@
 
     python benchmarks/building.py [--quick]
 
-Prints states/s (files written, medians after a first run), and ratios: to Algorithm 1 in plain Python with RocksDB (the paper's
-method, once, on the same instance, of which it expands at most the first 3 million states, and with --quick the first 60 thousand, where
-it is faster: its table grows), to C with the same rules (the counts must agree), and for rules that are interpreted. Memory is the growth
-of the resident set of a process of its own.
+Prints states/s (files written, medians after a first run), and ratios: to Algorithm 1 in plain Python with RocksDB (the
+paper's method, once, on the same instance, of which it expands at most the first 3 million states, and with --quick the
+first 60 thousand, where it is faster: its table grows), to C with the same rules (the counts must agree), and for rules
+that are interpreted. Memory is the growth of the resident set of a process of its own.
 """
 
 import importlib.util
@@ -140,7 +140,8 @@ def opaque_class(env):
 
 
 def interpreted(env):
-    """(states, states/s of pharos, of the paper's method) with rules that Numba cannot compile; medians after a first run."""
+    """(states, states/s of pharos, of the paper's method) with rules that Numba cannot compile; medians after a first
+    run."""
     options = (
         {"height": 12, "columns": 6} if env.name == "breakout" else {"num_cars": 8, "car_speeds": (1, 2, 3, 4, 5, 7)}
     )
@@ -176,7 +177,8 @@ def main() -> None:
     for name in ("breakout", "freeway"):
         states, rate, reference = interpreted(pharos.make(name))
         print(
-            f"{name}, interpreted rules: {states:,} states; {rate / 1e3:.0f} k states/s, paper's method on the same instance "
+            f"{name}, interpreted rules: {states:,} states; {rate / 1e3:.0f} k states/s, paper's method on the same "
+            f"instance "
             f"{reference / 1e3:.1f} k; ratio {rate / reference:.1f}",
             flush=True,
         )

@@ -2,9 +2,9 @@
 
     python benchmarks/diameter.py [small | large]
 
-Deterministic rows: seconds, and the ratio to one search from the start. Rows with chance: random actions on a lake; seconds,
-and the ratio to plain value iteration for each target to the same relative accuracy, timed on 8 targets spread over all and
-scaled to their number. `large` adds the spaces of millions of states.
+Deterministic rows: seconds, and the ratio to one search from the start. Rows with chance: random actions on a lake;
+seconds, and the ratio to plain value iteration for each target to the same relative accuracy, timed on 8 targets spread
+over all and scaled to their number. `large` adds the spaces of millions of states.
 """
 
 import sys
@@ -44,7 +44,8 @@ def deterministic(label, mdp):
     found = pharos.hardness.diameter(mdp)
     seconds = time.perf_counter() - began
     print(
-        f"{label}, {mdp.num_states} states: {found} in {seconds:.3f} s, {found.searches} searches; one search {search:.4f} s, "
+        f"{label}, {mdp.num_states} states: {found} in {seconds:.3f} s, {found.searches} searches; one search "
+        f"{search:.4f} s, "
         f"ratio {seconds / search:.1f}; {found.method}{'; ' + found.note if found.note else ''}",
         flush=True,
     )
@@ -74,7 +75,8 @@ def chancy(size, seed):
     found = pharos.hardness.diameter(mdp)
     seconds = time.perf_counter() - began
     print(
-        f"frozen_lake {size}, random actions 0.2, {mdp.num_states} states: {found} in {seconds:.3f} s, {found.searches} targets; "
+        f"frozen_lake {size}, random actions 0.2, {mdp.num_states} states: {found} in {seconds:.3f} s, "
+        f"{found.searches} targets; "
         f"value iteration for each {plain:.2f} s (from {SAMPLE} targets), {plain / seconds:.1f} times as long",
         flush=True,
     )

@@ -2,9 +2,10 @@
 
     python benchmarks/horizon.py [small | large]
 
-`small`: BRIDGE's KeyCorridor (168 states, T = 100) with all that is published of it, and its tight bound, each beside its limit in
-seconds as the ratio of the time taken; the compiled analysis beside the vectorized one on Freeway. `large`: a Freeway of 1.0 million
-states with T = 500 in a process of its own, with its peak memory, and the stationary variant on a Breakout of 2.4 million states.
+`small`: BRIDGE's KeyCorridor (168 states, T = 100) with all that is published of it, and its tight bound, each beside
+its limit in seconds as the ratio of the time taken; the compiled analysis beside the vectorized one on Freeway.
+`large`: a Freeway of 1.0 million states with T = 500 in a process of its own, with its peak memory, and the stationary
+variant on a Breakout of 2.4 million states.
 """
 
 import resource
@@ -69,7 +70,8 @@ def large():
                 else "found = pharos.hardness.stationary_effective_horizon(mdp)\n"
             )
             + "peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\n"
-            "print(f'{mdp.num_states} states: {found} in {time.perf_counter() - began:.1f} s, peak {peak / 2**20:.2f} GiB')"
+            "print(f'{mdp.num_states} states: {found} in {time.perf_counter() - began:.1f} s, peak {peak / 2**20:.2f} "
+            "GiB')"
         )
         print(f"{name}, " + (f"T = {steps}" if steps else "stationary"), end=", ", flush=True)
         subprocess.run([sys.executable, "-c", code], check=True)

@@ -2,9 +2,9 @@
 
     python benchmarks/out_of_core.py [MEMORY ...] [--instance NAME_OR_PARAMETERS]
 
-Builds an instance (breakout/12x10x1, 21 million states) with all memory, and with each MEMORY (in MiB; 1024, 128 and 32), each in a process
-of its own. Prints seconds, their ratio to those with all memory, the most memory of its own that the process held, and whether the
-files are the same, byte for byte.
+Builds an instance (breakout/12x10x1, 21 million states) with all memory, and with each MEMORY (in MiB; 1024, 128 and
+32), each in a process of its own. Prints seconds, their ratio to those with all memory, the most memory of its own that
+the process held, and whether the files are the same, byte for byte.
 """
 
 import argparse
@@ -46,7 +46,8 @@ def measured(instance: str, folder: Path, memory: int) -> tuple[float, str]:
         [sys.executable, "-c", CODE, instance, str(folder), str(memory)], check=True, stdout=subprocess.PIPE, text=True
     )
     states, seconds, anonymous, mapped = (float(each) for each in done.stdout.split())
-    text = f"{seconds:.1f} s, {states / seconds / 1e6:.2f} M states/s, {anonymous:.0f} MiB of its own, {mapped:.0f} MiB of files"
+    text = f"{seconds:.1f} s, {states / seconds / 1e6:.2f} M states/s, "
+    text += f"{anonymous:.0f} MiB of its own, {mapped:.0f} MiB of files"
     return seconds, text
 
 

@@ -2,8 +2,8 @@
 
     python benchmarks/solving.py [INSTANCE]
 
-Prints ns for each state and action of one plain sweep (pharos on one and two threads, C on the same), and the seconds to a
-proven error of 1e-6 at gamma 0.99: plain, random actions, sticky actions.
+Prints ns for each state and action of one plain sweep (pharos on one and two threads, C on the same), and the seconds
+to a proven error of 1e-6 at gamma 0.99: plain, random actions, sticky actions.
 """
 
 import ctypes
@@ -89,7 +89,8 @@ def main() -> None:
                 found[name] = seconds(run) / pairs * 1e9
         ratio = found["pharos"] / found["C"]
         print(
-            f"plain sweep, {threads} thread(s): pharos {found['pharos']:.3f} ns, C {found['C']:.3f} ns for each state and action; "
+            f"plain sweep, {threads} thread(s): pharos {found['pharos']:.3f} ns, C {found['C']:.3f} ns for each state "
+            f"and action; "
             f"ratio {ratio:.2f}"
         )
 

@@ -2,8 +2,8 @@
 
     python benchmarks/startup.py [REPEATS]
 
-Prints medians of wall clock and of processor time, the interpreter's own start included. Cold: Numba's cache and pharos' own
-are empty folders. Warm: the same command once more. The bytecode of Python modules is there in both.
+Prints medians of wall clock and of processor time, the interpreter's own start included. Cold: Numba's cache and
+pharos' own are empty folders. Warm: the same command once more. The bytecode of Python modules is there in both.
 """
 
 import os

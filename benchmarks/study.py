@@ -2,9 +2,10 @@
 
     python benchmarks/study.py [--steps N] [--runs K]
 
-The same K runs (DQN with vectors, simple_grid/4x4-plain, seeds 0 to K - 1) by one worker and by two, in the order 1, 2, 2, 1, each study in a
-folder of its own, its state spaces built beforehand. A run's own seconds are those of its training; what one worker takes beyond them is the
-runner's: starting processes, status, files. The first run of a study pays for the warm process that the others are forked from.
+The same K runs (DQN with vectors, simple_grid/4x4-plain, seeds 0 to K - 1) by one worker and by two, in the order 1, 2,
+2, 1, each study in a folder of its own, its state spaces built beforehand. A run's own seconds are those of its
+training; what one worker takes beyond them is the runner's: starting processes, status, files. The first run of a study
+pays for the warm process that the others are forked from.
 """
 
 import argparse
@@ -54,8 +55,8 @@ def main():
         found[workers].append(seconds)
         rate = options.steps * options.runs / seconds
         print(
-            f"{workers} worker{'s' if workers > 1 else ' '}: {seconds:.1f} s, {rate:,.0f} steps/s; runs together {own:.1f} s"
-            + (f", beyond them {100 * (seconds - own) / seconds:.1f} %" if workers == 1 else ""),
+            f"{workers} worker{'s' if workers > 1 else ' '}: {seconds:.1f} s, {rate:,.0f} steps/s; runs together "
+            f"{own:.1f} s" + (f", beyond them {100 * (seconds - own) / seconds:.1f} %" if workers == 1 else ""),
             flush=True,
         )
     print(f"two workers: {sum(found[1]) / sum(found[2]):.2f} times the throughput of one")

@@ -2,9 +2,10 @@
 
     python benchmarks/training.py [--steps N] [--repeats R] [INSTANCE ...]
 
-Prints, for DQN of Stable-Baselines3 with the hyperparameters and the network of pharos: steps/s, and the share of the wall time that
-steps and resets of the environment take, observation and chance included; for CartPole-v1 the same with the same hyperparameters. Rounds go
-through all of them in turn, so that a busy machine slows all alike; medians over rounds. Then steps/s of tabular Q-learning.
+Prints, for DQN of Stable-Baselines3 with the hyperparameters and the network of pharos: steps/s, and the share of the
+wall time that steps and resets of the environment take, observation and chance included; for CartPole-v1 the same with
+the same hyperparameters. Rounds go through all of them in turn, so that a busy machine slows all alike; medians over
+rounds. Then steps/s of tabular Q-learning.
 """
 
 import argparse

@@ -44,8 +44,10 @@ def main() -> None:
         print(f"\n# {what}\n$ pharos {command}", flush=True)
         subprocess.run([sys.executable, "-m", "pharos", *shlex.split(command)], check=True, env=os.environ)
     print(
-        f"\nDone in {time.perf_counter() - began:.0f} s; pictures, {FOLDER}/q-learning/regret.png and the study's report are in {FOLDER}/.\n"
-        f"Ask for another instance by its parameters, `.venv/bin/pharos hardness breakout height=12 columns=10`, or by its name in\n"
+        f"\nDone in {time.perf_counter() - began:.0f} s; pictures, {FOLDER}/q-learning/regret.png and the study's "
+        f"report are in {FOLDER}/.\n"
+        f"Ask for another instance by its parameters, `.venv/bin/pharos hardness breakout height=12 columns=10`, or "
+        f"by its name in\n"
         f"`.venv/bin/pharos list`; for a larger study, `.venv/bin/pharos study run quick`."
     )
 

@@ -1,4 +1,5 @@
-"""Property tests draw the same examples in every run, so that a failure is a change; `HYPOTHESIS_PROFILE=explore` draws others."""
+"""Property tests draw the same examples in every run, so that a failure is a change; `HYPOTHESIS_PROFILE=explore` draws
+others."""
 
 import os
 

@@ -1,7 +1,7 @@
 """A runner that learns nothing: its curves are formulas of the config, so that a study over it takes no time.
 
-The value approaches the optimal one exponentially, more slowly in large instances, from images and under chance. Every finished
-execution leaves a line in the file PHAROS_FAKE_LOG; PHAROS_FAKE_SECONDS makes it last.
+The value approaches the optimal one exponentially, more slowly in large instances, from images and under chance. Every
+finished execution leaves a line in the file PHAROS_FAKE_LOG; PHAROS_FAKE_SECONDS makes it last.
 """
 
 import json

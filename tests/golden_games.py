@@ -1,4 +1,5 @@
-"""Short games, drawn frame by frame in golden/*.txt, to be read in review. `python tests/golden_games.py` writes them anew.
+"""Short games, drawn frame by frame in golden/*.txt, to be read in review. `python tests/golden_games.py` writes them
+anew.
 
 Look at every frame that changed: a golden game is right because someone has read it.
 """

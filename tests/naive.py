@@ -1,8 +1,10 @@
-"""The slow twins in plain Python and NumPy that fast code is compared with, by area; each is written for reading, not for speed.
+"""The slow twins in plain Python and NumPy that fast code is compared with, by area; each is written for reading, not
+for speed.
 
-naive_builder: Algorithm 1 of the paper, with a dict of tuples. naive_environments: the rules of the four classes once more.
-naive_mdp: MDPs with every kind of chance as full matrices, solved by linear algebra. naive_gaps, naive_hardness: measures from
-those matrices, and distances between all pairs.
+naive_builder: Algorithm 1 of the paper, with a dict of tuples. naive_environments: the rules of the four classes once
+more.
+naive_mdp: MDPs with every kind of chance as full matrices, solved by linear algebra. naive_gaps, naive_hardness:
+measures from those matrices, and distances between all pairs.
 """
 
 from naive_builder import *  # noqa: F403

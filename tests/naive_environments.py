@@ -1,7 +1,8 @@
-"""The built-in environments once more, written to be obviously right: objects, sets, sentences; no state vectors inside.
+"""The built-in environments once more, written to be obviously right: objects, sets, sentences; no state vectors
+inside.
 
-Each twin is a game one plays: `state()` is the vector that the environment should be in, `step(action)` plays a step and
-returns (reward, terminated). Nothing is shared with `pharos.environments` but the names of the actions.
+Each twin is a game one plays: `state()` is the vector that the environment should be in, `step(action)` plays a step
+and returns (reward, terminated). Nothing is shared with `pharos.environments` but the names of the actions.
 """
 
 OFFSETS = {"up": (-1, 0), "down": (1, 0), "left": (0, -1), "right": (0, 1)}

@@ -6,7 +6,8 @@ from naive_mdp import augmented, finite_values, optimal_values
 
 
 def pairs_by_step(mdp, steps):
-    """[set of pairs (s, b) that can be met at step t], by some sequence of executed actions; b = A: no previous action."""
+    """[set of pairs (s, b) that can be met at step t], by some sequence of executed actions; b = A: no previous
+    action."""
     num_actions = mdp.num_actions
     pairs = {(int(s), num_actions) for s, p in zip(mdp.start_states, mdp.start_probabilities, strict=True) if p > 0}
     result = []

@@ -45,7 +45,8 @@ def _outcomes(mdp, state, action):
 
 
 def failure_probability(mdp, steps, k, m):
-    """Probability that GORP, with k and m, takes an action that is not optimal: all outcomes of all samples, round by round."""
+    """Probability that GORP, with k and m, takes an action that is not optimal: all outcomes of all samples, round by
+    round."""
     uniform = np.full((mdp.num_states, mdp.num_actions), 1 / mdp.num_actions)
 
     def ended(state):

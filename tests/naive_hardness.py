@@ -4,7 +4,8 @@ import numpy as np
 
 
 def distances(mdp, *, restart=True):
-    """(N, N) distances between all nodes of a deterministic MDP (the end is one more where it occurs), by Floyd-Warshall."""
+    """(N, N) distances between all nodes of a deterministic MDP (the end is one more where it occurs), by
+    Floyd-Warshall."""
     table, terminal = mdp.next_states, mdp.terminal
     size = len(table) + bool((table[~terminal] == -1).any())
     d = np.full((size, size), np.inf)

@@ -1,4 +1,5 @@
-"""Least expected hitting times by value iteration on explicit matrices: the slow twin of pharos.hardness.stochastic_diameter."""
+"""Least expected hitting times by value iteration on explicit matrices: the slow twin of
+pharos.hardness.stochastic_diameter."""
 
 import itertools
 import math
@@ -12,7 +13,8 @@ FAR = 1e12  # stands for infinity inside of the iteration
 
 
 def hitting_times(mdp, restart):
-    """(times (N, S + 1): from node n to state e, column S the end; reachable nodes; state of each node; starts (N,))."""
+    """(times (N, S + 1): from node n to state e, column S the end; reachable nodes; state of each node; starts
+    (N,))."""
     P, _, start = augmented(mdp)
     num_states, width = mdp.num_states, mdp.num_actions + 1
     size = len(P)
@@ -78,7 +80,8 @@ def start_eccentricity(mdp, restart):
 
 
 def exact_hitting_times(matrix):
-    """[s][e] least expected steps from s to e, as exact fractions or inf; matrix (S, A, S). Every policy, one after the other."""
+    """[s][e] least expected steps from s to e, as exact fractions or inf; matrix (S, A, S). Every policy, one after the
+    other."""
     num_states, num_actions, _ = matrix.shape
     best = [[math.inf] * num_states for _ in range(num_states)]
     rows = [[[Fraction(float(p)) for p in matrix[s, a]] for a in range(num_actions)] for s in range(num_states)]

@@ -46,7 +46,8 @@ def general_mdps(draw, max_states: int = 5, max_actions: int = 3):
 
 @st.composite
 def hard_mdps(draw):
-    """MDPs whose values are hard on floats: gamma near 1, rewards that are no sums of powers of 2, values of 1e12 and more."""
+    """MDPs whose values are hard on floats: gamma near 1, rewards that are no sums of powers of 2, values of 1e12 and
+    more."""
     mdp = draw(small_mdps(max_states=4))
     scale = draw(st.sampled_from([0.7, 1.0, 1e-3, 1e12]))
     return mdp.with_gamma(draw(gammas_near_1)).with_rewards(scale * mdp.rewards)

@@ -13,8 +13,8 @@ from pharos.environments import Environment
 class TableWorld(Environment):
     """`num_positions` positions; position p goes to moves[p][a] by action a, and ends the episode where ends[p].
 
-    A position is written into the state in several components, of which only the first and the last together tell it; the
-    ones between are wide or narrow, negative or constant, so that states differ in any of their words.
+    A position is written into the state in several components, of which only the first and the last together tell it;
+    the ones between are wide or narrow, negative or constant, so that states differ in any of their words.
     """
 
     num_positions: int = 1

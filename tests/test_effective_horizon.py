@@ -207,7 +207,8 @@ def test_a_freeway_is_analysed_for_the_states_that_an_episode_meets():
 
 @pytest.mark.parametrize("less", [0.0, 5e-5, 2e-4])
 def test_actions_that_rounding_or_less_than_the_tie_tolerance_tells_apart_are_both_optimal(less):
-    """0.1 + 0.2 is more than 0.3 by rounding. Random play prefers 0.3 at once; that is optimal unless it is 1e-4 less."""
+    """0.1 + 0.2 is more than 0.3 by rounding. Random play prefers 0.3 at once; that is optimal unless it is 1e-4
+    less."""
     mdp = TabularMDP.from_arrays(
         [[1, 2], [3, 3], [3, 3], [3, 3]], [[0.1, 0.3 - less], [0.2, 0.0], [0.0, 0.0], [0.0, 0.0]]
     )

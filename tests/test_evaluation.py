@@ -1,4 +1,5 @@
-"""What an agent has learnt is evaluated exactly on the states that it reaches; estimates agree within their confidence."""
+"""What an agent has learnt is evaluated exactly on the states that it reaches; estimates agree within their
+confidence."""
 
 import math
 

@@ -1,4 +1,5 @@
-"""docs/format.md: its code reads a folder without pharos, and gets what pharos says; the file is described to the byte."""
+"""docs/format.md: its code reads a folder without pharos, and gets what pharos says; the file is described to the
+byte."""
 
 import hashlib
 import json

@@ -1,4 +1,5 @@
-"""MiniGrid: enumerated states against the environments as others play them, and against the MDP that BRIDGE published."""
+"""MiniGrid: enumerated states against the environments as others play them, and against the MDP that BRIDGE
+published."""
 
 import json
 import sys
@@ -21,7 +22,8 @@ from pharos.mdp.bisimulation import minimize
 CORRIDOR = "MiniGrid-KeyCorridorS3R1-v0"
 PUBLISHED = Path(__file__).parent / "data" / "bridge" / "key-corridor-s3r1.npz"
 
-# Keys, doors, lava, a task that needs `done`, one in which objects are put down, one whose rules remember, one of BabyAI.
+# Keys, doors, lava, a task that needs `done`, one in which objects are put down, one whose rules remember, one of
+# BabyAI.
 SMALL = (
     "MiniGrid-Empty-5x5-v0",
     "MiniGrid-DoorKey-5x5-v0",
@@ -52,7 +54,8 @@ def isomorphic(one, other):
 
 
 def test_key_corridor_is_what_bridge_published():
-    """Its 168 states, transition by transition: those that differ only in whether the key was ever carried are told apart."""
+    """Its 168 states, transition by transition: those that differ only in whether the key was ever carried are told
+    apart."""
     published = importers.bridge(PUBLISHED, horizon=100)
     mdp = importers.minigrid(CORRIDOR, seed=0, remember_carried=True)
     assert (mdp.num_states, mdp.num_actions, mdp.gamma, mdp.horizon) == (168, 6, 1.0, 100)

@@ -31,7 +31,8 @@ def policies(mdp, data):
 
 
 def explicit(mdp, policy, steps):
-    """[(distribution of (s, b) (S, A + 1), chosen (S, A), executed (S, A)) at each step], by the matrices written out."""
+    """[(distribution of (s, b) (S, A + 1), chosen (S, A), executed (S, A)) at each step], by the matrices written
+    out."""
     P, _, start = augmented(mdp)
     size, actions = mdp.num_states, mdp.num_actions
     over = np.append(np.repeat(mdp.terminal, actions + 1), True)

@@ -248,7 +248,8 @@ def test_a_path_that_leads_to_no_observation_is_refused_in_one_line(tmp_path, mo
     assert "\n" not in str(error.value)
 
 
-# Received files ---------------------------------------------------------------------------------------------------------
+# Received files
+# ---------------------------------------------------------------------------------------------------------
 
 CANARY = "from pathlib import Path\nPath(__file__).with_suffix('.executed').touch()\n"
 
@@ -262,7 +263,7 @@ def received(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     spec = tmp_path / "sent.yaml"
     spec.write_text(
-        'name: sent\nsteps: 20\nevaluations: 1\nseeds: 1\nblocks:\n  - {environments: ["canary.py:Taxi"], agents: [q_learning]}\n'
+        'name: sent\nsteps: 20\nevaluations: 1\nseeds: 1\nblocks:\n  - {environments: ["canary.py:Taxi"], agents: [q_learning]}\n'  # noqa: E501
     )
     (tmp_path / "canary.py").write_text(TAXI)
     (tmp_path / "canary_module.py").write_text(TAXI)

@@ -1,4 +1,5 @@
-"""Integer vectors <-> packed states: the layout of docs/format.md, its twin in Python integers, and the compiled view."""
+"""Integer vectors <-> packed states: the layout of docs/format.md, its twin in Python integers, and the compiled
+view."""
 
 from itertools import pairwise
 
@@ -30,7 +31,8 @@ def states_of(components: Components, seed: int, rows: int = 20) -> np.ndarray:
 
 
 def packed_by_hand(components: Components, state) -> list[int]:
-    """The words of one state: the fields one after the other from the lowest bit; one that does not fit starts a new word."""
+    """The words of one state: the fields one after the other from the lowest bit; one that does not fit starts a new
+    word."""
     words, used = [0], 0
     for value, low, size in zip(state, components.low, components.size, strict=True):
         bits = len(bin(int(size) - 1)) - 2 if size > 1 else 0
@@ -72,14 +74,16 @@ def test_a_component_with_one_value_takes_no_bits():
     assert unpack(layout, np.array([[1]], np.uint64)).tolist() == [[7, -3, 1]]
 
 
-# The compiled view -------------------------------------------------------------------------------------------------------
+# The compiled view
+# -------------------------------------------------------------------------------------------------------
 
 WORDS = (0, 0, 0, 0)
 
 
 @njit
 def copy_through_views(layout, packed, index, value):
-    """Read every component of `packed` and write it to another view, then view[index] = value; the words and the fault."""
+    """Read every component of `packed` and write it to another view, then view[index] = value; the words and the
+    fault."""
     source, target = packed_view(WORDS, *layout), packed_view(WORDS, *layout)
     for k in range(len(packed)):
         set_word(source, k, packed[k])
@@ -147,7 +151,8 @@ def test_a_component_that_does_not_exist_is_noted(index):
     assert unpack(layout, words[None])[0, 1:].tolist() == [5, 0]
 
 
-# The table of states -----------------------------------------------------------------------------------------------------
+# The table of states
+# -----------------------------------------------------------------------------------------------------
 
 
 @njit

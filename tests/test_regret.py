@@ -1,4 +1,5 @@
-"""Regret: never negative, a sum over episodes, and normalised so that the optimal policy is 0 and the reference policy 1."""
+"""Regret: never negative, a sum over episodes, and normalised so that the optimal policy is 0 and the reference policy
+1."""
 
 import math
 

@@ -1,4 +1,5 @@
-"""The files of a state space do not depend on threads, blocks, or on how often the build was killed, stopped or refused."""
+"""The files of a state space do not depend on threads, blocks, or on how often the build was killed, stopped or
+refused."""
 
 import errno
 import importlib
@@ -33,7 +34,8 @@ fork = multiprocessing.get_context("fork")
 
 @pytest.fixture
 def small_blocks(monkeypatch):
-    """Blocks so small that a build of 27,692 states goes through every path: narrow, wide, table growing, checkpoints."""
+    """Blocks so small that a build of 27,692 states goes through every path: narrow, wide, table growing,
+    checkpoints."""
     monkeypatch.setattr(search, "CHUNK", 512)
     monkeypatch.setattr(search, "WIDE", 200)
 
@@ -229,12 +231,14 @@ def test_raising_max_states_goes_on_where_the_build_stopped(tmp_path, undisturbe
         build(BREAKOUT, folder, max_states=33673)
 
 
-# A table on disk ---------------------------------------------------------------------------------------------------------
+# A table on disk
+# ---------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
 def little_memory(monkeypatch):
-    """Memory that holds nothing: the table is on disk at once, chunks have 1024 rows, and a part of the table is a few pages."""
+    """Memory that holds nothing: the table is on disk at once, chunks have 1024 rows, and a part of the table is a few
+    pages."""
     monkeypatch.setattr(machine, "available_memory", lambda: 0)
     monkeypatch.setattr(machine, "LEAST_MEMORY", 1 << 16)
 
@@ -355,7 +359,8 @@ def test_a_rule_that_fails_is_blamed_with_the_table_on_disk(tmp_path, little_mem
         build(Overflowing(num_positions=8000), tmp_path / "space")
 
 
-# Interpreted rules in several processes ----------------------------------------------------------------------------------
+# Interpreted rules in several processes
+# ----------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -420,7 +425,8 @@ class Fanning(Environment):
         return 0.0
 
 
-# More than 2^31 states ---------------------------------------------------------------------------------------------------
+# More than 2^31 states
+# ---------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -490,7 +496,8 @@ def test_a_build_that_dies_while_it_widens_its_indices_resumes_to_the_same_files
         assert_same_files(folder, widened)
 
 
-# Disks and other processes -----------------------------------------------------------------------------------------------
+# Disks and other processes
+# -----------------------------------------------------------------------------------------------
 
 
 def _build_with_little_disk(limit, env, folder):
@@ -517,7 +524,8 @@ def test_a_full_disk_loses_nothing(limit, tmp_path, undisturbed, small_blocks):
 
 
 class FullDisk:
-    """A disk that has no room from the n-th call of one kind on: a write to a file, an fsync, a rename, or making a file.
+    """A disk that has no room from the n-th call of one kind on: a write to a file, an fsync, a rename, or making a
+    file.
 
     Half of the write that fails is on the disk. `freed_at_once`: the next call has room again.
     """

@@ -14,7 +14,8 @@ MEASURES = ("effective_horizon", "sum_of_reciprocal_gaps", "diameter")
 
 
 def made(image_harder=0.0, slopes=(1.0, 1.0, 1.0, 1.0), image_slope=1.0, noise=0.1, instances=6, seed=0, ppo=0.0):
-    """Cells of DQN (and PPO): regret grows with log diameter by a slope for each class; images cost `image_harder` more."""
+    """Cells of DQN (and PPO): regret grows with log diameter by a slope for each class; images cost `image_harder`
+    more."""
     random = np.random.default_rng(seed)
     rows = []
     for environment, slope in zip(CLASSES, slopes, strict=True):
@@ -195,7 +196,8 @@ def test_agreement_has_fishers_interval():
     low, high = expected.confidence_interval()
     wide = cells.pivot_table(index=["instance", "chance", "observation"], columns="agent", values="normalized_regret")
     assert row.evidence.startswith(
-        f"of returns {low:.2f} to {high:.2f} (95 %, 96 cells); of normalized regret r = {stats.pearsonr(wide['dqn'], wide['ppo'])[0]:.2f};"
+        f"of returns {low:.2f} to {high:.2f} (95 %, 96 cells); of normalized regret r = "
+        f"{stats.pearsonr(wide['dqn'], wide['ppo'])[0]:.2f};"
     )
     assert row.verdict == ("agrees" if high >= 0.81 else "disagrees")
 

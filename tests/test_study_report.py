@@ -175,7 +175,8 @@ def test_the_command_prints_where_the_report_is(written, tmp_path):
     assert "ValueError: <no>" in status.stderr
 
 
-# A study of one's own --------------------------------------------------------------------------------------------------
+# A study of one's own
+# --------------------------------------------------------------------------------------------------
 
 
 def report_of(tmp_path, name="own", change=None, **block):
@@ -197,9 +198,16 @@ def test_a_study_without_dqn_says_nothing_false_and_has_no_empty_section(tmp_pat
     text = " ".join(page.text)
     assert "is known for no instance" not in text and "dqn" not in text
     assert page.headings == [
-        "Summary", "Regret", "Vector against image", "Hardness and regret", "Hardness of the instances", "Returns", "Instances",
-        "Each instance", "How it was made",
-    ]  # fmt: skip
+        "Summary",
+        "Regret",
+        "Vector against image",
+        "Hardness and regret",
+        "Hardness of the instances",
+        "Returns",
+        "Instances",
+        "Each instance",
+        "How it was made",
+    ]
     assert "the paper prints" not in text and "Findings" not in text
     assert "Cumulative regret of PPO" in text and "costs PPO more regret" in text
     names = {file.stem for file in report.figures}

@@ -84,7 +84,8 @@ def test_the_same_run_in_two_blocks_or_under_two_names_is_one_run():
 def test_a_block_may_say_otherwise_than_the_whole():
     study = parse(
         "name: a\nsteps: 100\ngamma: 0.9\nblocks:\n"
-        "  - {environments: [frozen_lake], agents: [dqn], seeds: [7, 9], steps: 60, evaluations: 3, gamma: 1, horizon: 5}\n"
+        "  - "
+        "{environments: [frozen_lake], agents: [dqn], seeds: [7, 9], steps: 60, evaluations: 3, gamma: 1, horizon: 5}\n"
         "  - {environments: [frozen_lake], agents: [dqn], seeds: 1}\n"
     )
     first, second, third = (run.config for run in study.runs)
@@ -100,18 +101,18 @@ def test_a_block_may_say_otherwise_than_the_whole():
         (2, "steps: many", "specification:2: steps: found 'many'; expected: a valid integer"),
         (4, "seeds: 0", "specification:4: seeds: found 0; expected how many, at least 1, or a list of seeds"),
         (8, "  - environments: [frozen_lake/5x5]", "unknown environment 'frozen_lake/5x5'; did you mean 'frozen_lake/"),
-        (8, "  - environments: [{name: frozen_lake, parameters: {sise: 8}}]", "specification:8: unknown parameter of frozen_lake 'sise'; did you mean 'size'?"),
+        (8, "  - environments: [{name: frozen_lake, parameters: {sise: 8}}]", "specification:8: unknown parameter of frozen_lake 'sise'; did you mean 'size'?"),  # noqa: E501
         (3, "gamma: 2", "specification:3: gamma: found 2; expected: less than or equal to 1"),
-        (3, "horizon: 0", "specification:3: horizon: found 0; expected a number of steps, limit (the environment's), or none"),
+        (3, "horizon: 0", "specification:3: horizon: found 0; expected a number of steps, limit (the environment's), or none"),  # noqa: E501
         (3, "horizon: none", "specification:8: gamma is 1 and horizon is none, so values may be infinite"),
         (3, "hardness: {measures: [diametr]}", "unknown measure of hardness 'diametr'; did you mean 'diameter'?"),
         (9, "    chance: [plain, {stiky: 0.25}]", "specification:9: unknown key 'stiky'; did you mean 'sticky'?"),
         (9, "    chance: [plian]", "specification:9: unknown chance 'plian'; did you mean 'plain'?"),
         (9, "    chance: [{random: 1.5}]", "specification:9: random: found 1.5; expected: less than or equal to 1"),
         (10, "    observations: [vectr]", "specification:10: unknown observation 'vectr'; did you mean 'vector'?"),
-        (11, "    agents: [dqn, ppo, qlearning]", "specification:11: unknown agent 'qlearning'; did you mean 'q_learning'?"),
+        (11, "    agents: [dqn, ppo, qlearning]", "specification:11: unknown agent 'qlearning'; did you mean 'q_learning'?"),  # noqa: E501
         (11, "    agents: []", "specification:11: agents: found []"),
-        (12, "    hyperparameters: {dqn: patent}", "specification:12: unknown set of hyperparameters 'patent'; did you mean 'patient'?"),
+        (12, "    hyperparameters: {dqn: patent}", "specification:12: unknown set of hyperparameters 'patent'; did you mean 'patient'?"),  # noqa: E501
         (12, "    hyperparameters: {a2c: patient}", "specification:12: unknown agent of this block 'a2c'"),
         (12, "    agents: [dqn]", "specification:12: the key 'agents' stands there twice (line 11)"),
         (12, "    hyperparameters: [", "specification:13"),
@@ -183,7 +184,7 @@ HOSTILE = {
     b"name: a\nblocks: &a [*a]\n": "study.yaml:2: an alias stands within what it names",
     b"name: a\nblocks: " + b"[" * 5000 + b"]" * 5000 + b"\n": "study.yaml: is nested too deeply",
     LAUGHS.encode(): "entries, aliases written out",
-    b"name: a\nseeds: 1000000000\nblocks: []\n": "study.yaml:2: seeds: found 1000000000; a study has at most 1,000,000 runs",
+    b"name: a\nseeds: 1000000000\nblocks: []\n": "study.yaml:2: seeds: found 1000000000; a study has at most 1,000,000 runs",  # noqa: E501
     b"name: a\nsteps: " + b"9" * 5000 + b"\n": "study.yaml: Exceeds the limit",
     b"name: 2001-99-99\n": "study.yaml: month must be in 1..12",
     b"name: a\n1: 2\nblocks: []\n": "study.yaml:",

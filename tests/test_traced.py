@@ -1,4 +1,5 @@
-"""Traced rules: successors are those of rules asked in every state, whatever way a rule has of looking at it; else tracing ends."""
+"""Traced rules: successors are those of rules asked in every state, whatever way a rule has of looking at it; else
+tracing ends."""
 
 import copy
 import itertools

@@ -1,4 +1,5 @@
-"""Training runs: what is written, what a kill loses, that seeds decide everything, and that regret is what it is defined to be."""
+"""Training runs: what is written, what a kill loses, that seeds decide everything, and that regret is what it is
+defined to be."""
 
 import importlib
 import json

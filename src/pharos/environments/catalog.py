@@ -121,7 +121,8 @@ def source_of(cls: type[Environment]) -> Source | None:
 def _known_class(source: Source, cls: Any) -> type[Environment]:
     if cls is None:
         raise ParameterError(
-            f"{source.name!r}: AttributeError: there is no {source.attribute!r}; expected 'module:Class' or 'file.py:Class'"
+            f"{source.name!r}: AttributeError: there is no {source.attribute!r}; expected 'module:Class' or "
+            f"'file.py:Class'"
         )
     if not isinstance(cls, type) or not issubclass(cls, Environment):
         raise ParameterError(

@@ -1,10 +1,10 @@
 """Bellman backups in place, over flat arrays. mdp/dynamics.py says what they mean, solvers/ proves their bounds.
 
 Common arguments: next_states (S, A), -1 where the episode ends; table, palette: see mdp/rewards.py; v (S + 1,) float64,
-under sticky actions (S + 1, A) by the previously executed action, with row S 0, so that index -1 reads 0; weights: (chosen,
-previous, uniform); sign: 1 maximises, -1 minimises; actions: a tuple of A zeros, whose length the compiler knows, so
-that the loops over actions are unrolled (a third faster). Each sweep goes from the last state to the first and returns
-the largest change of an entry.
+under sticky actions (S + 1, A) by the previously executed action, with row S 0, so that index -1 reads 0; weights:
+(chosen, previous, uniform); sign: 1 maximises, -1 minimises; actions: a tuple of A zeros, whose length the compiler
+knows, so that the loops over actions are unrolled (a third faster). Each sweep goes from the last state to the first
+and returns the largest change of an entry.
 """
 
 import numpy as np

@@ -13,8 +13,8 @@ from numba import njit, prange
 def values(next_states, rewards, tie, best, worst, explored, best_now, worst_now, explored_now, optimal, variance):
     """One step backwards: the values of optimal, worst and uniform play, and what the simple bound needs of them.
 
-    best, worst, explored (S,): of the step after; *_now (S,): of this step. optimal (S,) unsigned: bit a where Q*(s, a) is within
-    `tie` of the best. variance (S,): max over a of (Q^e - Q^w) (Q* - Q^w).
+    best, worst, explored (S,): of the step after; *_now (S,): of this step. optimal (S,) unsigned: bit a where Q*(s, a)
+    is within `tie` of the best. variance (S,): max over a of (Q^e - Q^w) (Q* - Q^w).
     """
     num_actions = next_states.shape[1]
     for s in prange(len(next_states)):
@@ -81,10 +81,11 @@ def greedy_return(next_states, rewards, after, followed, now):
 
 @njit(cache=True, nogil=True)
 def walk(next_states, rewards, after, optimal, variance, log, near, nodes, n, following, seen, most):
-    """Go one step on from nodes[:n] along greedy actions (`near` False), or along those better than all that are not optimal.
+    """Go one step on from nodes[:n] along greedy actions (`near` False), or along those better than all that are not
+    optimal.
 
-    after (S,): Q(s, a) = r(s, a) + after(next state). seen (S,) bool, all False before and after. most (3,): 16 variance log / gap^2
-    of the node that has the largest, the first among equals, and its gap and variance.
+    after (S,): Q(s, a) = r(s, a) + after(next state). seen (S,) bool, all False before and after. most (3,): 16
+    variance log / gap^2 of the node that has the largest, the first among equals, and its gap and variance.
     Returns how many states `following` holds; -1 where an action that is not optimal may be taken.
     """
     num_actions = next_states.shape[1]

@@ -1,6 +1,7 @@
 """Tabular Q-learning on a table of next states: the loop that agents/_q_learning.py describes, compiled.
 
-Random numbers: SplitMix64 (Steele, Lea and Flood 2014), whose whole state is one 64-bit word that can be stored and restored.
+Random numbers: SplitMix64 (Steele, Lea and Flood 2014), whose whole state is one 64-bit word that can be stored and
+restored.
 """
 
 import numpy as np
@@ -45,12 +46,14 @@ def q_learning(
 ):
     """`steps` steps of Watkins' Q-learning; everything that changes is in the arrays, so that it goes on from them.
 
-    next_states (S, A); table, palette: rewards; starts (K,), cumulative (K,): start states and their cumulated probabilities;
-    chance: (chosen, previous, uniform, first_chosen); limit: steps of an episode; q, visits (R, A): values and number of
-    updates, R = S, or S (A + 1) with rows s (A + 1) + b where the previous action b (A: none) is seen.
-    schedule: (learning rate, exponent of visits or 0, gamma, first epsilon, last epsilon, steps of exploration, exponential?).
-    place: int64 (state or -1, previous action, steps in the episode, steps in all, episodes); sums: float64 (return of this
-    episode, its discount, sum of finished returns); word: uint64 (1,).
+    next_states (S, A); table, palette: rewards; starts (K,), cumulative (K,): start states and their cumulated
+    probabilities;
+    chance: (chosen, previous, uniform, first_chosen); limit: steps of an episode; q, visits (R, A): values and number
+    of updates, R = S, or S (A + 1) with rows s (A + 1) + b where the previous action b (A: none) is seen.
+    schedule: (learning rate, exponent of visits or 0, gamma, first epsilon, last epsilon, steps of exploration,
+        exponential?).
+    place: int64 (state or -1, previous action, steps in the episode, steps in all, episodes); sums: float64 (return of
+    this episode, its discount, sum of finished returns); word: uint64 (1,).
     """
     num_states, num_actions = next_states.shape
     chosen_weight, previous_weight, _, first_chosen = chance

@@ -1,7 +1,7 @@
 """Partitions of states: equal rows get equal numbers; classes split by where their members lead.
 
-Exact: hashes only say where to look, and rows are compared entry by entry. `slots` is a hash table of at least twice as many entries
-as rows, -1 where empty, that is empty again after each call.
+Exact: hashes only say where to look, and rows are compared entry by entry. `slots` is a hash table of at least twice as
+many entries as rows, -1 where empty, that is empty again after each call.
 """
 
 import numpy as np
@@ -62,8 +62,9 @@ def states_to_ask(next_states, changed, asked):
 def split(next_states, classes, sizes, count, asked, n, slots, used, new, changed):
     """Split classes by the classes that the asked states lead to; returns the number of classes.
 
-    Members that are not asked lead where their class led before, and keep its number; so does the first group where all are asked.
-    classes (S,), sizes (S,) members of each class; asked (S,) of which n; used, new (S,) scratch; changed (S,) bool: whose class changed.
+    Members that are not asked lead where their class led before, and keep its number; so does the first group where all
+    are asked. classes (S,), sizes (S,) members of each class; asked (S,) of which n; used, new (S,) scratch; changed
+    (S,) bool: whose class changed.
     """
     mask = len(slots) - 1
     num_actions = next_states.shape[1]

@@ -18,7 +18,8 @@ class Setting(NamedTuple):
         limit: steps after which an episode is truncated.
         mode: NEXT_STEP, SAME_STEP or DISABLED.
         first_previous: the previous action on the first step of an episode, -1 for none.
-        starts, cumulative: (K, D) or (K,), the start states or their indices; (K,) cumulative sum of their probabilities.
+        starts, cumulative: (K, D) or (K,), the start states or their indices; (K,) cumulative sum of their
+            probabilities.
     """
 
     ranges: Any
@@ -124,7 +125,8 @@ def first_outside(actions, num_actions):
 
 @njit(cache=True, nogil=True)
 def walk_table(successors, table_rewards, is_terminal, setting, batch, first, last):
-    """One step of environments first .. last - 1 on a tabulated state space; as `step_many`, with indices for states."""
+    """One step of environments first .. last - 1 on a tabulated state space; as `step_many`, with indices for
+    states."""
     _, _, chance, limit, mode, first_previous, starts, cumulative = setting
     rng, actions, index, previous, elapsed, ended, rewards, terminated, truncated, executed, final, _ = batch
     for i in range(first, last):

@@ -35,7 +35,8 @@ def _quantile(probability, m, width, variance):
 
 @njit(cache=True, nogil=True)
 def bernstein(means, widths, m, lower, upper):
-    """Samples in intervals of length `widths` (N, n), whose variance is at most (best - mean) (mean - worst) = `upper` on entry."""
+    """Samples in intervals of length `widths` (N, n), whose variance is at most (best - mean) (mean - worst) = `upper`
+    on entry."""
     n = means.shape[1]
     variances = np.empty(n)
     for row in range(len(means)):
@@ -64,7 +65,8 @@ def _normal(x, mean, deviation):
 
 @njit(cache=True, nogil=True)
 def berry_esseen(means, deviations, errors, lows, highs, lower, upper):
-    """Means that are normal up to `errors` in their distribution function (N, n); lows, highs (N, n, 100) enclose the parts."""
+    """Means that are normal up to `errors` in their distribution function (N, n); lows, highs (N, n, 100) enclose the
+    parts."""
     n = means.shape[1]
     for row in range(len(means)):
         for a in range(n):

@@ -35,7 +35,8 @@ _MACHINERY = (
 
 
 def numeric_attributes(env: Environment) -> tuple[tuple[str, ...], tuple[Any, ...]]:
-    """Names and values of what compiled rules see as `self`: the numbers, tuples of numbers and arrays that they mention.
+    """Names and values of what compiled rules see as `self`: the numbers, tuples of numbers and arrays that they
+    mention.
 
     Private ones are left out: a named tuple has no fields with an underscore.
     """

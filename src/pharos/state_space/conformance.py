@@ -1,7 +1,8 @@
 """check_environment: does a class of environments keep the contract that `Environment` states?
 
 Run it on every new class, on a few small instances. It looks at the declarations (declarations.py), then calls the
-rules on many states, interpreted (guarded_rules.py) and compiled, and names the rule and the state that broke the contract.
+rules on many states, interpreted (guarded_rules.py) and compiled, and names the rule and the state that broke the
+contract.
 """
 
 import random

@@ -1,4 +1,5 @@
-"""How many states of an environment look alike: an observation that some states share does not tell the agent the state."""
+"""How many states of an environment look alike: an observation that some states share does not tell the agent the
+state."""
 
 import json
 from collections.abc import Callable, Mapping

@@ -171,7 +171,8 @@ def mean_curve(
 
 
 def agreement(cells: "pd.DataFrame", value: str, agents: tuple[str, str] = ("dqn", "ppo")) -> tuple[float, int] | None:
-    """Pearson correlation of two agents over the cells that both have, and how many these are; None for fewer than three."""
+    """Pearson correlation of two agents over the cells that both have, and how many these are; None for fewer than
+    three."""
     wide = cells.pivot_table(index=["instance", "chance", "observation"], columns="agent", values=value)
     if not set(agents) <= set(wide.columns):
         return None

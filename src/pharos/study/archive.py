@@ -102,7 +102,8 @@ def unpack(
 
 
 def _read(file: Path) -> tuple[str, "pa.Table", dict[str, Any] | None]:
-    """The study in YAML, its runs, and the digests of both; None in place of digests where an older version packed it."""
+    """The study in YAML, its runs, and the digests of both; None in place of digests where an older version packed
+    it."""
     if not file.exists():
         raise ParameterError(f"{file}: no such file")
     table = experiments.read_table(file, _AGAIN)

@@ -163,7 +163,8 @@ class Execution:
                 self.pending.append((0.0, run))
 
     def prepare(self, prepare: Callable[[Mapping[str, Any]], Any]) -> None:
-        """Call `prepare` with one config of each instance that has runs to come; a failure is left to the runs to tell."""
+        """Call `prepare` with one config of each instance that has runs to come; a failure is left to the runs to
+        tell."""
         instances: dict[str, Run] = {}
         for _, run in self.pending:
             config = run.config

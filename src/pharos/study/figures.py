@@ -243,7 +243,8 @@ def _fits(fits: Sequence[Fit], regret: str) -> "Figure | None":
 
 
 def save(draw: Callable[[], "Figure | None"], place: Path) -> dict[str, bytes] | None:
-    """Draw a figure into place.png and place.pdf; its PNG for light and for dark pages. None where there is nothing to draw."""
+    """Draw a figure into place.png and place.pdf; its PNG for light and for dark pages. None where there is nothing to
+    draw."""
     import matplotlib
 
     images = {}

@@ -6,8 +6,9 @@ columns `environment` (class), `observation`, `regret`, and the measures `effect
 
 A task is an instance under one kind of chance. Its rows, one for each observation, have the same measures, so they are
 not independent: tests and R2 outside the sample count a task once. Where every task has the same observations, the
-estimates of least squares come from two strata that are independent of each other (a split plot): class and measures from
-the means of the tasks, observations from the differences within tasks. Otherwise standard errors are clustered by task.
+estimates of least squares come from two strata that are independent of each other (a split plot): class and measures
+from the means of the tasks, observations from the differences within tasks. Otherwise standard errors are clustered by
+task.
 
 Source: Cochran and Cox (1957), Experimental designs, chapter 7 (split plots); Liang and Zeger (1986) for clusters.
 """
@@ -127,7 +128,8 @@ def _tasks(rows: "pd.DataFrame") -> tuple[str, ...]:
 
 
 def _errors_without_the_task(design: np.ndarray, residuals: np.ndarray, tasks: Sequence[str]) -> np.ndarray:
-    """The error of each row under the model fitted without its task: (I - H)^-1 residuals, for the task's block of H."""
+    """The error of each row under the model fitted without its task: (I - H)^-1 residuals, for the task's block of
+    H."""
     basis, _ = np.linalg.qr(design)
     errors = np.empty(len(residuals))
     places: dict[Any, list[int]] = {}

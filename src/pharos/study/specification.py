@@ -187,7 +187,8 @@ class ObservationEntry(_Part):
 
 
 class Hardness(_Part):
-    """Which measures of hardness are taken, with which discount, and how many seconds each may take for one instance."""
+    """Which measures of hardness are taken, with which discount, and how many seconds each may take for one
+    instance."""
 
     gamma: float = Field(default=0.99, ge=0, le=1)
     measures: list[str] = Field(default_factory=lambda: [name for name in MEASURES if name in registered()])
@@ -484,7 +485,8 @@ def _references(data: Mapping[str, Any]) -> Iterator[tuple[Loc, str]]:
 
 
 def _wrong(found: Specification) -> Iterator[tuple[Loc, str]]:
-    """What only the whole specification shows: names of agents and of hyperparameters, environments that cannot be made."""
+    """What only the whole specification shows: names of agents and of hyperparameters, environments that cannot be
+    made."""
     number = 0
     for i, block in enumerate(found.blocks):
         kinds = len(block.environments) * len(block.chance) * len(block.agents) * len(block.observations)

@@ -133,7 +133,8 @@ def status(source: Source, folder: str | os.PathLike | None = None) -> Status:
 
 
 def _lives(said: Mapping[str, Any]) -> bool:
-    """Whether the runner that wrote a status file is there: told exactly on its own machine, by the file's age elsewhere."""
+    """Whether the runner that wrote a status file is there: told exactly on its own machine, by the file's age
+    elsewhere."""
     if said["host"] != socket.gethostname():
         return time.time() - said["updated"] < 60
     try:
@@ -146,7 +147,8 @@ def _lives(said: Mapping[str, Any]) -> bool:
 
 
 def claim(study: Specification, folder: Path) -> None:
-    """Write the specification into the folder, so that it can be reported on alone; refuse a folder of another study."""
+    """Write the specification into the folder, so that it can be reported on alone; refuse a folder of another
+    study."""
     folder.mkdir(parents=True, exist_ok=True)
     file = folder / STUDY_FILE
     if file.exists():

@@ -300,7 +300,8 @@ def _stored(file: Path, asked: Mapping[str, Any]) -> dict[str, Any] | None:
 def _measure(
     study: Specification, config: Mapping[str, Any], names: Sequence[str], kept: dict[str, Any]
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """What is kept with the measures added (value, lower, upper, exact; or why there is none); the same with those that failed."""
+    """What is kept with the measures added (value, lower, upper, exact; or why there is none); the same with those that
+    failed."""
     from pharos.environments import make
     from pharos.hardness import report
 
@@ -375,6 +376,7 @@ def _key(parameters: Mapping[str, Any]) -> str:
 
 
 def paper_instance(environment: str, parameters: Mapping[str, Any]) -> int | None:
-    """The number of the instance among the blocks of its class in the paper's appendix C, counted from 1; None if not there."""
+    """The number of the instance among the blocks of its class in the paper's appendix C, counted from 1; None if not
+    there."""
     found = _paper_instances().get((environment, _key(parameters)))
     return None if found is None else found[1]

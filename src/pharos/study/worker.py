@@ -234,7 +234,8 @@ def end_cleanly() -> None:
 
 
 def end_with_parent() -> None:
-    """End this process when the one that started it is gone, however it went: cleanly, and if that takes long, at once."""
+    """End this process when the one that started it is gone, however it went: cleanly, and if that takes long, at
+    once."""
     from multiprocessing import connection, parent_process
 
     parent = parent_process()

@@ -203,7 +203,10 @@ def _representations(results: Results, figures: Figures, left_out: list[str]) ->
         return None
     paper = ""
     if results.comparison is not None:
-        paper = "The paper finds the image harder in simple grid and frozen lake, the vector harder in freeway and breakout."
+        paper = (
+            "The paper finds the image harder in simple grid and frozen lake, "
+            "the vector harder in freeway and breakout."
+        )
     return _section("Vector against image", "representations", parts=parts, paper=paper)
 
 
@@ -215,7 +218,8 @@ def _aliasing(results: Results) -> Section | None:
     return _section(
         "States that share an observation",
         "aliasing",
-        text="These observations do not tell every state: an agent that remembers nothing cannot act differently in states that look "
+        text="These observations do not tell every state: an agent that remembers nothing cannot act differently in "
+        "states that look "
         "alike, and learns from targets that mix them. Regret is measured against the optimal policy of the states. "
         "So where "
         "vectors and images are compared, a part of the difference may be this.",
