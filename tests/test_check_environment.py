@@ -87,8 +87,7 @@ def test_max_states_must_be_positive():
         pharos.check_environment(Corridor(), max_states=0)
 
 
-# Declarations
-# ------------------------------------------------------------------------------------------------------------
+# Declarations --------------------------------------------------------------------------------------------------------
 
 
 def test_what_is_no_environment_is_refused():
@@ -155,8 +154,7 @@ def test_parameters_must_survive_json():
     assert "expected an equal instance" in message(WithTuple())
 
 
-# Transition
-# --------------------------------------------------------------------------------------------------------------
+# Transition ----------------------------------------------------------------------------------------------------------
 
 
 def test_a_transition_that_leaves_the_range_is_named_with_state_and_action():
@@ -229,8 +227,7 @@ def test_an_exception_in_a_rule_is_reported_with_its_state():
     )
 
 
-# is_terminal, reward
-# -----------------------------------------------------------------------------------------------------
+# is_terminal, reward -------------------------------------------------------------------------------------------------
 
 
 def test_is_terminal_must_say_true_or_false():
@@ -297,8 +294,7 @@ def test_a_reward_must_not_write_to_the_states(which):
     )
 
 
-# draw
-# --------------------------------------------------------------------------------------------------------------------
+# draw ----------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("index", [(0, 0, 5), (0, 0, -1), (2, 0, 0), (0, 1, 0)])
@@ -339,8 +335,7 @@ def test_slices_of_the_planes_may_be_drawn():
     assert pharos.check_environment(corridor(draw=draw)).notes == ()
 
 
-# Interpreted and compiled
-# ------------------------------------------------------------------------------------------------
+# Interpreted and compiled --------------------------------------------------------------------------------------------
 
 LAST_BIT = 63  # integers of compiled code have 64 bits, those of Python any number
 
@@ -414,8 +409,7 @@ def test_the_built_state_space_is_compared(monkeypatch):
     assert "built, it leads to states [1, 1]; expected [0, 1]" in message(Corridor())
 
 
-# Notes
-# -------------------------------------------------------------------------------------------------------------------
+# Notes ---------------------------------------------------------------------------------------------------------------
 
 
 def test_declared_values_that_no_state_takes_are_noted():

@@ -82,8 +82,7 @@ def process(*words, cache=None, **options):
     return subprocess.run(command, capture_output=True, text=True, env=environment, timeout=300, **options)
 
 
-# Parameters
-# --------------------------------------------------------------------------------------------------------------
+# Parameters ----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -136,8 +135,7 @@ def test_what_is_no_size_is_refused(text):
         parse_size(text)
 
 
-# list, build, cache
-# -------------------------------------------------------------------------------------------------------
+# list, build, cache --------------------------------------------------------------------------------------------------
 
 
 def test_list_names_every_environment_with_its_parameters(answer, pharos):
@@ -267,8 +265,7 @@ def test_the_cache_is_listed_and_cleared(tmp_path, monkeypatch):
     assert not (tmp_path / "compiled").exists()
 
 
-# solve
-# -------------------------------------------------------------------------------------------------------------------
+# solve ---------------------------------------------------------------------------------------------------------------
 
 SOLVE_KEYS = {"value_at_start", "uniform_value_at_start", "error_bound", "sweeps", "seconds", "gamma", "horizon"}
 
@@ -312,8 +309,7 @@ def test_solve_speaks_to_people(pharos):
     assert "optimal value at the start" in pharos("solve", "simple_grid").stdout
 
 
-# render
-# ------------------------------------------------------------------------------------------------------------------
+# render --------------------------------------------------------------------------------------------------------------
 
 
 def test_render_writes_pictures_and_episodes(answer, tmp_path):
@@ -343,8 +339,7 @@ def test_render_draws_in_the_terminal(pharos):
     assert [line.split() for line in shown.splitlines()] == [list("A..."), list(".O.O"), list("...O"), list("O..G")]
 
 
-# Failures
-# ----------------------------------------------------------------------------------------------------------------
+# Failures ------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -408,8 +403,7 @@ def test_a_full_or_forbidden_disk_is_one_line(failure, monkeypatch):
     assert failure("build", "simple_grid") == (1, "pharos: /somewhere: Permission denied\n")
 
 
-# As a process
-# -------------------------------------------------------------------------------------------------------------
+# As a process --------------------------------------------------------------------------------------------------------
 
 
 def test_a_pipe_gets_one_json_object_and_silence_beside_it(cache, tmp_path):

@@ -87,8 +87,7 @@ def test_rules_that_mention_a_private_attribute_run_interpreted(cache, tmp_path)
         assert space.mdp().rewards[0].tolist() == [1.5, 1.5]
 
 
-# The cache
-# ---------------------------------------------------------------------------------------------------------------
+# The cache -----------------------------------------------------------------------------------------------------------
 
 
 def build_and_step(folder):
@@ -165,8 +164,7 @@ def test_the_folder_of_another_user_is_not_used(cache, monkeypatch):
     private_folder.cache_clear()
 
 
-# Many actions
-# ------------------------------------------------------------------------------------------------------------
+# Many actions --------------------------------------------------------------------------------------------------------
 
 
 def test_more_than_a_thousand_actions_are_solved(tmp_path):

@@ -191,8 +191,7 @@ def test_an_environment_with_other_actions_or_components_is_refused(folder):
         pharos.load(folder, environment=pharos.make("simple_grid"))
 
 
-# Many mutations, in a process of their own, which must live
-# -------------------------------------------------------------
+# Many mutations, in a process of their own, which must live ----------------------------------------------------------
 
 
 def mutate(folder, rng):
@@ -268,8 +267,7 @@ def test_mutants_of_a_space_never_end_the_process(tmp_path):
     assert right + wrong == 400 and right > 20 and wrong > 100
 
 
-# Imported folders
-# -------------------------------------------------------------------------------------------------------
+# Imported folders ----------------------------------------------------------------------------------------------------
 
 
 def test_a_folder_of_an_imported_mdp_is_said_to_be_one_and_never_to_be_deleted(tmp_path):

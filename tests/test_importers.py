@@ -210,8 +210,7 @@ def test_an_imported_file_and_folder_are_targets(tmp_path):
     assert run("solve", CORRIDOR).exit_code == 2  # its name here does not tell the horizon
 
 
-# Exporters
-# --------------------------------------------------------------------------------------------------------------
+# Exporters -----------------------------------------------------------------------------------------------------------
 
 
 def test_bridge_files_come_back(tmp_path):
@@ -292,8 +291,7 @@ def test_matrices_are_mdps():
     assert hardness.diameter(sticky_actions(mdp, 0.5)).upper == pytest.approx(2.0)
 
 
-# Damage and harm
-# --------------------------------------------------------------------------------------------------------
+# Damage and harm -----------------------------------------------------------------------------------------------------
 
 
 def edited_manifest(folder, **changes):
@@ -477,8 +475,7 @@ def test_a_start_that_is_no_distribution_is_refused(start):
         importers.gymnasium(env)
 
 
-# A table is no environment
-# ----------------------------------------------------------------------------------------------
+# A table is no environment -------------------------------------------------------------------------------------------
 
 
 def test_a_table_is_not_trained_on_or_stepped():

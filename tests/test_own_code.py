@@ -248,8 +248,7 @@ def test_a_path_that_leads_to_no_observation_is_refused_in_one_line(tmp_path, mo
     assert "\n" not in str(error.value)
 
 
-# Received files
-# ---------------------------------------------------------------------------------------------------------
+# Received files ------------------------------------------------------------------------------------------------------
 
 CANARY = "from pathlib import Path\nPath(__file__).with_suffix('.executed').touch()\n"
 

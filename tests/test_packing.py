@@ -74,8 +74,7 @@ def test_a_component_with_one_value_takes_no_bits():
     assert unpack(layout, np.array([[1]], np.uint64)).tolist() == [[7, -3, 1]]
 
 
-# The compiled view
-# -------------------------------------------------------------------------------------------------------
+# The compiled view ---------------------------------------------------------------------------------------------------
 
 WORDS = (0, 0, 0, 0)
 
@@ -151,8 +150,7 @@ def test_a_component_that_does_not_exist_is_noted(index):
     assert unpack(layout, words[None])[0, 1:].tolist() == [5, 0]
 
 
-# The table of states
-# -----------------------------------------------------------------------------------------------------
+# The table of states -------------------------------------------------------------------------------------------------
 
 
 @njit

@@ -135,8 +135,7 @@ def test_the_page_about_agents_defines_every_column_and_every_key():
     assert [name for name in (*_results.COLUMNS, *result) if f"`{name}`" not in page] == []
 
 
-# Damage
-# ------------------------------------------------------------------------------------------------------------------
+# Damage --------------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")

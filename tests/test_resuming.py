@@ -231,8 +231,7 @@ def test_raising_max_states_goes_on_where_the_build_stopped(tmp_path, undisturbe
         build(BREAKOUT, folder, max_states=33673)
 
 
-# A table on disk
-# ---------------------------------------------------------------------------------------------------------
+# A table on disk -----------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -359,8 +358,7 @@ def test_a_rule_that_fails_is_blamed_with_the_table_on_disk(tmp_path, little_mem
         build(Overflowing(num_positions=8000), tmp_path / "space")
 
 
-# Interpreted rules in several processes
-# ----------------------------------------------------------------------------------
+# Interpreted rules in several processes ------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -425,8 +423,7 @@ class Fanning(Environment):
         return 0.0
 
 
-# More than 2^31 states
-# ---------------------------------------------------------------------------------------------------
+# More than 2^31 states -----------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -496,8 +493,7 @@ def test_a_build_that_dies_while_it_widens_its_indices_resumes_to_the_same_files
         assert_same_files(folder, widened)
 
 
-# Disks and other processes
-# -----------------------------------------------------------------------------------------------
+# Disks and other processes -------------------------------------------------------------------------------------------
 
 
 def _build_with_little_disk(limit, env, folder):

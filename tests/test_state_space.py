@@ -85,8 +85,7 @@ def test_a_state_of_several_words_is_found_by_every_one_of_them(folder):
                 space.index(other)
 
 
-# StateSpace
-# --------------------------------------------------------------------------------------------------------------
+# StateSpace ----------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -168,8 +167,7 @@ def test_a_callback_hears_of_the_end(folder):
     assert [done.finished for done in heard] == [False] * (len(heard) - 1) + [True]
 
 
-# Folders
-# -----------------------------------------------------------------------------------------------------------------
+# Folders -------------------------------------------------------------------------------------------------------------
 
 
 GRID = pharos.make("simple_grid", height=6, width=7)
@@ -423,8 +421,7 @@ def test_options_out_of_range_are_refused(options, expected, folder):
         build(GRID, folder, **options)
 
 
-# Rules that break the contract
-# -------------------------------------------------------------------------------------------
+# Rules that break the contract ---------------------------------------------------------------------------------------
 
 
 class LeavesItsRange(Walk):
@@ -495,8 +492,7 @@ def test_what_was_found_before_a_rule_failed_is_kept(folder, monkeypatch):
         build(DividesByZero(), folder)
 
 
-# Rewards
-# -----------------------------------------------------------------------------------------------------------------
+# Rewards -------------------------------------------------------------------------------------------------------------
 
 
 def test_rewards_are_those_of_the_stored_transitions(breakout):

@@ -33,8 +33,7 @@ def names(folder):
     return sorted(path.name for path in folder.iterdir())
 
 
-# Replacing files
-# --------------------------------------------------------------------------------------------------------
+# Replacing files -----------------------------------------------------------------------------------------------------
 
 
 def test_a_file_that_cannot_be_written_whole_leaves_the_old_one(tmp_path):
@@ -142,8 +141,7 @@ def test_leftovers_of_killed_processes_are_removed_and_others_stay(tmp_path):
     assert names(tmp_path) == sorted([alive.name, other.name])
 
 
-# Locks
-# ------------------------------------------------------------------------------------------------------------------
+# Locks ---------------------------------------------------------------------------------------------------------------
 
 
 def _hold(folder, ready, release):
@@ -266,8 +264,7 @@ def test_a_lock_that_fails_otherwise_is_no_lock_of_another(tmp_path, monkeypatch
         raise AssertionError
 
 
-# JSON and digests
-# -------------------------------------------------------------------------------------------------------
+# JSON and digests ----------------------------------------------------------------------------------------------------
 
 
 @settings(max_examples=100, deadline=None)

@@ -166,8 +166,7 @@ def test_a_killed_run_starts_anew_unless_it_is_to_be_resumed(tmp_path, resume):
     assert (tmp_path / "runs" / spec.runs[0].id / f"found-{resume}").exists()
 
 
-# kill -9
-# ----------------------------------------------------------------------------------------------------------------
+# kill -9 -------------------------------------------------------------------------------------------------------------
 
 RUNNER = """
 import sys, fake_training
@@ -272,8 +271,7 @@ def test_a_result_that_was_complete_when_its_process_was_killed_is_kept(tmp_path
     assert log.read_text().split() == [id]
 
 
-# Damage, and processes that die
-# ----------------------------------------------------------------------------------------
+# Damage, and processes that die --------------------------------------------------------------------------------------
 
 
 def cut(file):

@@ -175,8 +175,7 @@ def test_the_command_prints_where_the_report_is(written, tmp_path):
     assert "ValueError: <no>" in status.stderr
 
 
-# A study of one's own
-# --------------------------------------------------------------------------------------------------
+# A study of one's own ------------------------------------------------------------------------------------------------
 
 
 def report_of(tmp_path, name="own", change=None, **block):
