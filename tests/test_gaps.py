@@ -108,6 +108,27 @@ def test_a_solution_of_another_mdp_or_policy_is_refused():
         hardness.gaps(mdp, pharos.evaluate_policy(mdp, np.array([0])))
 
 
+def test_sums_of_many_gaps_are_those_of_exact_sums():
+    """Over several blocks, with gaps that differ by 9 orders of magnitude."""
+    rng = np.random.default_rng(0)
+    rewards = 10.0 ** rng.uniform(-6, 3, (40_000, 3))
+    mdp = TabularMDP.from_arrays(np.full(rewards.shape, -1), rewards, gamma=0.0, initial=np.full(40_000, 1 / 40_000))
+    result = hardness.gaps(mdp, tie_tolerance=1e-6)
+    gaps = rewards.max(axis=1, keepdims=True) - rewards
+    positive = gaps[gaps > result.tie_tolerance]
+    assert result.count == positive.size and result.minimal == positive.min()
+    assert result.sum_of_reciprocals == pytest.approx(math.fsum(1 / positive), rel=1e-14)
+    assert result.regularized == pytest.approx(math.fsum((1 / (gaps + 0.1)).ravel()), rel=1e-14)
+    numbers, _ = np.histogram(positive, result.edges)
+    assert (result.histogram == numbers).all()
+
+
+def test_a_gap_beyond_floats_is_counted():
+    mdp = TabularMDP.from_arrays([[-1, -1]], [[1.5e308, -1.5e308]], gamma=0.0)
+    result = hardness.gaps(mdp, pharos.value_iteration(mdp.with_rewards([[1.0, 0.0]])))
+    assert result.count == 1 and result.histogram.tolist() == [1]
+
+
 # Proofs ---------------------------------------------------------------------------------------------------------------
 
 

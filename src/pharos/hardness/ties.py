@@ -56,7 +56,7 @@ class TieProof:
             return
         if step != self._step:
             self._step, self._filled = step, 0
-            self._map = _empty_map(_FIRST)
+            self._map = _empty_map(_FIRST, own.shape[1])
             ended = np.zeros((1, own.shape[1])), np.zeros_like(rewards[:1]), np.zeros_like(rewards[:1])
             self._extend(*ended, np.zeros_like(gap[:1]), np.ones(1, np.int64))  # worth 0 for ever
         self._extend(own, rewards, following, gap, counted)
@@ -67,17 +67,17 @@ class TieProof:
         own, rewards, following = (np.ascontiguousarray(each).view(np.int64) for each in (own, rewards, following))
         begin = 0
         while self.holds and begin < len(gap):
-            begin, self._filled = ties.extend(own, rewards, following, gap, counted, begin, *self._map, self._filled)
+            begin, self._filled = ties.extend(own, rewards, following, gap, counted, begin, self._map, self._filled)
             if begin < 0 or self._filled > MOST:
                 self.holds = False
             elif begin < len(gap):
-                larger = _empty_map(4 * len(self._map[0]))
-                ties.refill(*self._map, *larger)
+                larger = _empty_map(4 * len(self._map), own.shape[1])
+                ties.refill(self._map, larger)
                 self._map = larger
 
 
-def _empty_map(size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    return np.zeros(size, np.bool_), np.empty(size, np.int64), np.empty((size, 4), np.int64)
+def _empty_map(size: int, width: int) -> np.ndarray:
+    return np.full((size, 3 if width == 1 else 5), ties.FREE, np.int64)
 
 
 def same_outcomes(
