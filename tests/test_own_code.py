@@ -305,6 +305,19 @@ def test_received_files_execute_nothing(received, tmp_path, words):
     assert executed(tmp_path) == []
 
 
+@pytest.mark.parametrize("verb", ["show", "status", "report", "run", "pack"])
+@pytest.mark.parametrize("source", ["empty", "named"])
+def test_a_folder_executes_nothing_though_it_has_no_runs(received, tmp_path, verb, source):
+    for folder in (tmp_path / "empty", tmp_path / "studies" / "named"):
+        folder.mkdir(parents=True)
+        (folder / "study.yaml").write_text((tmp_path / "sent.yaml").read_text())
+        (folder / "canary.py").write_text(CANARY + TAXI)
+    done = here("study", verb, source, *(("--to", "again.parquet") if verb == "pack" else ()))
+    assert done.exit_code == 2, done.output
+    assert "executed only if you trust it: add --trust" in done.stderr
+    assert not list(tmp_path.rglob("*.executed"))
+
+
 @pytest.mark.filterwarnings("ignore:.*has changed since")
 @pytest.mark.parametrize(
     "words", [("study", "status", "got"), ("plot", "policies", "RUN", "--steps", "2", "--out", "policies.gif")]

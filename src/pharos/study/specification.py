@@ -14,9 +14,9 @@
 
 A block is the product of its lists. Tabular agents see the index of the state whatever the block's observations are.
 Environments, observations and agents of one's own are named as module:Name or file.py:Name, and looked for in
-`folder`: that of the YAML file when not given. Such code is imported where the user names the YAML file, but never for
-    the study.yaml of a
-folder of results or of a packed study, which somebody else may have written, unless it is trusted.
+`folder`: that of the YAML file when not given. Such code is imported where the user names the YAML file. It is never
+imported where the user names a folder, for the study.yaml beside results, or for a packed study, which somebody else
+may have written, unless it is trusted.
 """
 
 import json
@@ -347,7 +347,8 @@ def specification(source: Source, *, trust: bool | None = None) -> Specification
     mapping.
 
     Args:
-        trust: whether code that it names may be imported; None: unless it is the study.yaml of a folder of results.
+        trust: whether code that it names may be imported; None: where `source` is a YAML file, but for the study.yaml
+            beside results.
     Raises:
         UnknownName: no such file or preset. ParameterError: something in it is wrong; the message names file, line and
             key.
@@ -367,7 +368,7 @@ def specification(source: Source, *, trust: bool | None = None) -> Specification
         path = named / STUDY_FILE
     if not path.is_file():
         raise UnknownName("study (no such file, and no such preset)", source, [*presets(), *_studies_here()])
-    trusted = not _is_of_results(path) if trust is None else trust
+    trusted = path == Path(source) and not _is_of_results(path) if trust is None else trust
     return parse(_text_of(path), str(path), folder=path.absolute().parent, trust=trusted)
 
 
