@@ -35,6 +35,7 @@ def bisimilar(mdp):
         same = new
 
 
+@pytest.mark.slow
 @settings(max_examples=150, deadline=None)
 @given(deterministic_mdps(max_states=7, max_actions=2))
 def test_classes_are_those_of_the_greatest_bisimulation(mdp):
@@ -42,6 +43,7 @@ def test_classes_are_those_of_the_greatest_bisimulation(mdp):
     assert ((classes[:, None] == classes[None]) == bisimilar(mdp)[:-1, :-1]).all()
 
 
+@pytest.mark.slow
 @settings(max_examples=80, deadline=None)
 @given(deterministic_mdps(max_states=7, max_actions=2), probabilities, probabilities)
 def test_values_are_kept_under_every_chance(mdp, sticky, random):
@@ -150,6 +152,7 @@ def rounds_of_all(mdp):
 ROAD = {"num_cars": 7, "lane_length": 6}  # 19,284 states
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "parameters"), [("freeway", ROAD), ("frozen_lake/8x8", {}), ("simple_grid", {})])
 def test_classes_of_games_are_those_of_refinement_in_full(name, parameters):
     mdp = pharos.build(pharos.make(name, **parameters)).mdp()

@@ -68,6 +68,7 @@ def lump(chain, nodes, mdp):
     return (chain @ members)[first]
 
 
+@pytest.mark.slow
 @settings(max_examples=150, deadline=None)
 @given(small_mdps(max_states=5, max_actions=2), st.booleans())
 def test_the_mixing_time_is_that_of_powers_of_the_matrix(mdp, restart):
@@ -112,6 +113,7 @@ def test_several_recurrent_classes_never_mix():
     assert found.to_dict()["infinite"]
 
 
+@pytest.mark.slow
 @settings(max_examples=100, deadline=None)
 @given(small_mdps(max_states=5, max_actions=3))
 def test_the_mismatch_contains_the_largest_ratio_of_visits(mdp):
@@ -218,6 +220,7 @@ def test_the_action_gap_is_as_regular_as_all_gaps_say(mdp, zeta):
         assert share <= found.constant * t**zeta * (1 + 1e-9)
 
 
+@pytest.mark.slow
 def test_they_are_part_of_a_report_when_asked_for():
     mdp = pharos.build(pharos.make("frozen_lake/4x4")).mdp(gamma=0.9)
     names = ["action_gap_regularity", "distribution_mismatch", "mixing_time", "tight_effective_horizon"]
@@ -229,6 +232,7 @@ def test_they_are_part_of_a_report_when_asked_for():
     assert "deterministic" in chancy["tight_effective_horizon"].undefined
 
 
+@pytest.mark.slow
 def test_what_is_not_defined_says_why():
     mdp = pharos.build(pharos.make("frozen_lake/4x4")).mdp(gamma=1.0)
     with pytest.raises(UndefinedMeasure, match="gamma < 1"):

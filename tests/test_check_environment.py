@@ -62,6 +62,7 @@ def message(env, **options):
     return str(error.value)
 
 
+@pytest.mark.slow
 def test_a_good_class_passes_and_the_report_says_what_was_checked():
     report = pharos.check_environment(Corridor())
     assert (report.num_states, report.num_transitions, report.complete, report.compiled) == (5, 8, True, True)
@@ -77,6 +78,7 @@ def test_a_large_space_is_sampled_near_the_start_and_far_from_it():
     assert "a sample of 60 states" in str(report)
 
 
+@pytest.mark.slow
 def test_the_sample_does_not_depend_on_anything_but_the_seed():
     env = pharos.make("breakout")
     assert pharos.check_environment(env, max_states=50) == pharos.check_environment(env, max_states=50)
@@ -328,6 +330,7 @@ def test_a_drawing_must_not_write_to_its_state():
     assert "draw in state (position=0) writes to its state" in message(corridor(draw=draw))
 
 
+@pytest.mark.slow
 def test_slices_of_the_planes_may_be_drawn():
     def draw(self, state, planes):
         planes[0, :, 1:3] = 1
@@ -340,6 +343,7 @@ def test_slices_of_the_planes_may_be_drawn():
 LAST_BIT = 63  # integers of compiled code have 64 bits, those of Python any number
 
 
+@pytest.mark.slow
 def test_rules_must_say_the_same_compiled():
     def transition(self, state, action, out):
         out[0] = (state[0] + action) % self.length if (1 + state[0]) << LAST_BIT > 0 else 0
@@ -363,6 +367,7 @@ def test_rules_must_say_the_same_compiled():
     assert "draw in state (position=0) writes 0 at [0, 0, 0] compiled, 1 interpreted" in message(corridor(draw=draw))
 
 
+@pytest.mark.slow
 def test_a_value_in_between_must_stay_in_the_range_too():
     def transition(self, state, action, out):
         out[0] = state[0] + 2 * action - 1
@@ -374,6 +379,7 @@ def test_a_value_in_between_must_stay_in_the_range_too():
     )
 
 
+@pytest.mark.slow
 def test_rules_that_numba_cannot_compile_are_noted():
     def transition(self, state, action, out):
         out[0] = max(0, state[0] + eval("2 * action - 1"))
@@ -385,6 +391,7 @@ def test_rules_that_numba_cannot_compile_are_noted():
     assert "Numba cannot compile its rules, so they run interpreted" in report.notes[0]
 
 
+@pytest.mark.slow
 def test_a_drawing_that_numba_cannot_compile_is_noted():
     def draw(self, state, planes):
         planes[0, 0, eval("0")] = 1
@@ -395,6 +402,7 @@ def test_a_drawing_that_numba_cannot_compile_is_noted():
     assert "Numba cannot compile draw" in report.notes[0]
 
 
+@pytest.mark.slow
 def test_the_built_state_space_is_compared(monkeypatch):
     import pharos.state_space
 
@@ -412,6 +420,7 @@ def test_the_built_state_space_is_compared(monkeypatch):
 # Notes ---------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_declared_values_that_no_state_takes_are_noted():
     env = corridor(variables=lambda self: {"position": range(-1, 8)})
     assert pharos.check_environment(env).notes == (
@@ -419,6 +428,7 @@ def test_declared_values_that_no_state_takes_are_noted():
     )
 
 
+@pytest.mark.slow
 def test_an_environment_that_cannot_be_drawn_is_noted():
     report = pharos.check_environment(corridor(layers={}, grid=Environment.grid, draw=Environment.draw))
     assert report.notes == ("it declares no layers: it cannot be drawn, and has no image observations",)
@@ -430,6 +440,7 @@ def test_episodes_that_end_before_they_begin_are_noted():
     assert report.num_states == 1
 
 
+@pytest.mark.slow
 def test_truths_and_numbers_of_numpy_are_accepted():
     def reward(self, state, action, next_state):
         return np.float64(next_state[0])

@@ -102,6 +102,7 @@ def test_its_named_instances_are_made_by_name(corridor):
     ]
 
 
+@pytest.mark.slow
 def test_its_gymnasium_ids_follow_its_name_its_instances_and_the_version_of_its_rules(corridor):
     for name, length in (("Corridor", 5), ("Corridor-short", 3), ("Corridor-long", 40)):
         env = gymnasium.make(f"pharos/{name}-v1")
@@ -110,12 +111,14 @@ def test_its_gymnasium_ids_follow_its_name_its_instances_and_the_version_of_its_
     assert gymnasium.make_vec("pharos/Corridor-short-v1", num_envs=2).reset()[0].shape == (2, 1)
 
 
+@pytest.mark.slow
 def test_a_class_does_not_take_the_id_of_another(corridor):
     breakout = pharos.make("breakout")
     pharos.environments.register(type("Breakout", (type(corridor),), {"name": "my_breakout", "version": 2}))
     assert gymnasium.make("pharos/Breakout-v0").unwrapped.environment == breakout
 
 
+@pytest.mark.slow
 def test_all_its_looks_are_drawn(corridor):
     assert text_drawing(corridor, (1,)) == ".W..G"
     picture = human(corridor, (1,), cell=8)
@@ -146,6 +149,7 @@ def test_its_parameters_are_checked_by_what_it_declares(corridor):
     assert pharos.make("corridor", toll=1).toll == 1.0
 
 
+@pytest.mark.slow
 def test_it_keeps_the_contract(corridor):
     report = pharos.check_environment(corridor)
     assert report.complete and report.compiled

@@ -200,6 +200,7 @@ def test_a_progress_bar_says_what_happens_before_anything_is_counted(monkeypatch
     assert "0/20000" in screen.file.getvalue() and "first evaluation" in screen.file.getvalue()
 
 
+@pytest.mark.slow
 def test_build_answers_with_the_keys_of_its_contract(answer, tmp_path):
     built = answer(
         "build", "simple_grid", "height=3", "width=5", "--out", tmp_path / "grid", "--memory", "1GiB", "--workers", 1
@@ -220,6 +221,7 @@ def test_a_built_folder_is_a_target(answer, tmp_path):
     assert again["parameters"]["penalties"] == [[[1, 1], -1.0]]
 
 
+@pytest.mark.slow
 def test_a_users_own_class_is_a_target(answer, tmp_path, monkeypatch):
     (tmp_path / "corridor_of_mine.py").write_text(
         "from dataclasses import dataclass\n"
@@ -406,12 +408,14 @@ def test_a_full_or_forbidden_disk_is_one_line(failure, monkeypatch):
 # As a process --------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_pipe_gets_one_json_object_and_silence_beside_it(cache, tmp_path):
     done = process("build", "simple_grid", "--out", tmp_path / "grid", "--json", cache=cache)
     assert (done.returncode, done.stderr) == (0, "")
     assert set(json.loads(done.stdout)) >= BUILD_KEYS
 
 
+@pytest.mark.slow
 def test_exit_codes_reach_the_shell(cache):
     for words, code in ((["build", "brekout"], 2), ([], 0), (["--help"], 0), (["--version"], 0)):
         done = process(*words, cache=cache)

@@ -38,6 +38,7 @@ def folders(tmp_path_factory):
     return {path.name: path for path in place.iterdir()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["q_learning-0", "ppo-0"])
 def test_what_a_run_has_learnt_has_the_value_that_the_run_wrote_down(folders, name):
     found = answer("evaluate", "frozen_lake/4x4", "--policy", folders[name], "--random", 0.1, "--horizon", 100)

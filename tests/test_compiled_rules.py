@@ -58,6 +58,7 @@ def files_of(folder):
     return {path: path.read_bytes() for path in folder.rglob("*.nb[ci]")}
 
 
+@pytest.mark.slow
 def test_a_truth_is_a_reward(cache, tmp_path):
     env = corridor_class()()
     with warnings.catch_warnings():
@@ -77,6 +78,7 @@ def test_the_reason_names_the_signature_that_is_missing():
     assert '(File "coins.py", line 12)' in reason_of(ValueError(message))
 
 
+@pytest.mark.slow
 def test_rules_that_mention_a_private_attribute_run_interpreted(cache, tmp_path):
     def reward(self, state, action, next_state):
         return 1.0 + self._bonus
@@ -101,6 +103,7 @@ def build_and_step(folder):
     return space
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "damage", [lambda data: b"", lambda data: data[: len(data) // 2], lambda data: data[:-1] + b"x"]
 )
@@ -120,11 +123,13 @@ def test_a_damaged_file_is_compiled_again(cache, tmp_path, damage):
     assert files_of(cache) == after, "what was mended is read"
 
 
+@pytest.mark.slow
 def test_the_folder_of_compiled_rules_is_private(cache, tmp_path):
     build_and_step(tmp_path / "space")
     assert (cache / "compiled").stat().st_mode & 0o777 == 0o700
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "getuid"), reason="no users to tell apart")
 def test_a_folder_that_others_can_write_to_is_not_read(cache, tmp_path):
     build_and_step(tmp_path / "first")
@@ -167,6 +172,7 @@ def test_the_folder_of_another_user_is_not_used(cache, monkeypatch):
 # Many actions --------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_more_than_a_thousand_actions_are_solved(tmp_path):
     def transition(self, state, action, out):
         out[0] = (state[0] + action) % self.length

@@ -137,6 +137,7 @@ def test_every_representation_gives_the_same_answers(mdp, seed, data):
     assert (mdp.dynamics.pushed(mass)[:, 0] * values[:-1]).sum() == pytest.approx(adjoint)
 
 
+@pytest.mark.slow
 @often
 @given(small_mdps(), st.integers(0, 2**32))
 def test_compiled_backups_and_moves_are_those_of_the_formulas(mdp, seed):

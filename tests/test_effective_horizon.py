@@ -62,6 +62,7 @@ def test_returns_of_key_corridor_are_the_published_ones():
     assert (found.optimal_return, found.worst_return) == (1.0, 0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name, horizon", PUBLISHED)
 def test_published_analyses_with_sticky_actions_are_reproduced(name, horizon):
     found = hardness.effective_horizon(sticky_actions(bridge_mdp(name, horizon), 0.25))
@@ -99,6 +100,7 @@ def test_it_is_what_its_definition_says(mdp, chance, steps):
         assert found.value == pytest.approx(value, rel=1e-5)
 
 
+@pytest.mark.slow
 @settings(max_examples=150, deadline=None)
 @given(deterministic_mdps(max_states=6, max_actions=3), st.integers(1, 7))
 def test_the_compiled_analysis_is_the_other_one(mdp, steps):
@@ -117,6 +119,7 @@ def test_the_compiled_analysis_of_key_corridor_is_the_published_one():
     assert found["value"] == pytest.approx(expected["effective_horizon"], rel=1e-12)
 
 
+@pytest.mark.slow
 def test_larger_games_are_analysed_by_the_compiled_one(monkeypatch):
     mdp = pharos.build(pharos.make("frozen_lake/8x8")).mdp(gamma=1.0)
     expected = hardness.effective_horizon(mdp, horizon=30)
@@ -179,6 +182,7 @@ def test_a_report_with_a_horizon_has_it_and_one_without_says_what_is_missing():
     assert "give a horizon" in hardness.report(mdp, "effective_horizon", keep=False)["effective_horizon"].undefined
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(
     st.one_of(

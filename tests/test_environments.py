@@ -101,6 +101,7 @@ def courts(draw):
     }
 
 
+@pytest.mark.slow
 @given(courts(), st.floats(0, 1), st.randoms(use_true_random=False))
 @settings(max_examples=200, deadline=None)
 def test_breakout_plays_like_its_twin(parameters, skill, rng):
@@ -260,6 +261,7 @@ def test_freeway_hit_sends_the_player_back(restart, row):
     assert env.reward(state, 1, following) == -1.0
 
 
+@pytest.mark.slow
 def test_freeway_clock_counts_the_states():
     """All cars together are a clock with lane_length * lcm(periods) phases; rows and hits do the rest."""
     env = pharos.make("freeway", num_cars=3, lane_length=4, car_speeds="1,2,3")
@@ -359,6 +361,7 @@ def test_parameters_survive_json(name):
     assert hash(again) == hash(env)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ALL)
 def test_every_environment_keeps_the_contract(name):
     report = pharos.check_environment(pharos.make(name), max_states=120)

@@ -38,6 +38,7 @@ def largest_error(solution, truth):
     return naive_exact.largest_error(found, truth)
 
 
+@pytest.mark.slow
 @often
 @given(hard_mdps())
 def test_optimal_and_worst_values_are_within_their_bounds(mdp):
@@ -49,6 +50,7 @@ def test_optimal_and_worst_values_are_within_their_bounds(mdp):
             assert naive_exact.largest_error(solution.q, action_values) <= Fraction(solution.error_bound)
 
 
+@pytest.mark.slow
 @often
 @given(hard_mdps())
 def test_values_of_uniform_play_are_within_their_bound(mdp):
@@ -57,6 +59,7 @@ def test_values_of_uniform_play_are_within_their_bound(mdp):
     assert largest_error(solution, naive_exact.values_of(solution.mdp, nothing)) <= Fraction(solution.error_bound)
 
 
+@pytest.mark.slow
 @often
 @given(hard_mdps(), st.integers(0, 2**32))
 def test_values_of_a_stochastic_policy_are_within_their_bound(mdp, seed):
@@ -135,6 +138,7 @@ def test_probabilities_that_sum_to_more_than_1_over_gamma_give_no_false_bound():
         value_iteration(grows, 1e30)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("actions", [65, 1001])
 def test_any_number_of_actions_is_solved(actions):
     rewards = np.arange(float(actions))[None].repeat(2, axis=0)

@@ -34,6 +34,7 @@ def linear(task, seed, sharp):
     return policy
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(
     st.sampled_from(["simple_grid/4x4-decoy", "frozen_lake/4x4", "frozen_lake/8x8"]),
@@ -52,6 +53,7 @@ def test_the_value_on_reached_states_is_the_value_on_all(name, chance, setting, 
     assert found.states <= task.mdp.num_states * (task.mdp.num_actions + 1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("chance", CHANCE)
 @pytest.mark.parametrize("sharp", [True, False])
 def test_estimates_agree_with_exact_values_within_their_confidence(chance, sharp):
@@ -168,6 +170,7 @@ def test_steps_that_no_longer_matter_are_not_asked_about(chance, gamma):
     assert found.states < (length - 10) * (4 if chance.get("sticky") else 1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["dqn", "ppo"])
 @pytest.mark.parametrize("observation", ["vector", "simple_image"])
 def test_models_of_stable_baselines_are_policies(name, observation):

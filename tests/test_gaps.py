@@ -20,6 +20,7 @@ from strategies import deterministic_mdps, small_mdps
 TOLERANCE = 1e-7
 
 
+@pytest.mark.slow
 @settings(max_examples=150, deadline=None)
 @given(small_mdps())
 def test_gaps_are_those_of_the_explicit_matrices(mdp):
@@ -188,6 +189,7 @@ def check_against_exact(mdp, result):
 tiny = st.sampled_from([0.0, 1.0, 1.0 + 2.0**-40, 2.0**-30, 2.0**-38, 2.0**-45, 2.0**-70, 1e12, 1e12 + 2.0**-10, -1.0])
 
 
+@pytest.mark.slow
 @settings(max_examples=300, deadline=None)
 @given(deterministic_mdps(rewards=tiny), st.sampled_from([0.0, 0.5, 0.99, 1 - 2.0**-13, 1 - 2.0**-20]))
 def test_intervals_of_gaps_hold_the_exact_fractions(mdp, gamma):
@@ -198,6 +200,7 @@ def test_intervals_of_gaps_hold_the_exact_fractions(mdp, gamma):
         check_against_exact(mdp, result)
 
 
+@pytest.mark.slow
 def test_small_gaps_of_a_grid_are_gaps_not_ties():
     mdp = pharos.build(pharos.make("simple_grid", height=20, width=20)).mdp(gamma=0.5)
     result = hardness.gaps(mdp)

@@ -26,6 +26,7 @@ SMALL = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("env_id", SMALL)
 @pytest.mark.parametrize(
     "options", [{}, {"sticky": 0.25, "previous_action": True}, {"random": 0.3, "remaining_time": True}]
@@ -268,6 +269,7 @@ def test_any_named_instance_can_be_made_through_gymnasium():
     assert env.unwrapped.environment == pharos.make("breakout/12x10x1")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("env_id", ["pharos/Breakout-v0", "pharos:pharos/Breakout-v0"])
 def test_gymnasium_finds_the_environments_in_a_fresh_process(env_id):
     heavy = "'numba', 'scipy', 'pandas', 'matplotlib', 'torch', 'stable_baselines3', 'pygame'"
@@ -307,6 +309,7 @@ def test_wrong_use_is_named():
         env.step(-1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("observation", "options"),
     (("vector", {}), ("simple_image", {}), ("simple_image", {"scale": 8}), ("simple_image", {"grey": True})),

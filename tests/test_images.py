@@ -45,6 +45,7 @@ def random_states(env, number, seed=0):
     return components.low + rng.integers(0, components.size, (number, len(components)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "options"), OPTIONS)
 def test_compiled_frames_are_the_interpreted_ones(env, name, options):
     states = random_states(env, 150)
@@ -70,6 +71,7 @@ def test_a_simple_image_has_a_plane_for_each_layer(env):
         np.testing.assert_array_equal(image.one(state)[:, ::scale, ::scale] > 0, planes > 0)
 
 
+@pytest.mark.slow
 def test_channels_come_first_or_last_and_colour_becomes_luminance(env):
     states = random_states(env, 20)
     last, first = observe(env, "complex_image"), observe(env, "complex_image", channels_first=True)
@@ -80,6 +82,7 @@ def test_channels_come_first_or_last_and_colour_becomes_luminance(env):
     assert np.abs(luminance - grey(states)[..., 0]).max() <= 2 * len(env.layers)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["simple_image", "complex_image"])
 def test_different_pictures_for_different_drawings(env, name):
     states = random_states(env, 60, seed=3)
@@ -103,6 +106,7 @@ def shown(planes):
     return out
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize(("name", "options"), OPTIONS[:4])
 def test_the_checkers_of_gymnasium_and_stable_baselines_pass(env, name, options):
@@ -162,6 +166,7 @@ def test_an_environment_with_images_is_copied_as_it_stands(name, copied):
     np.testing.assert_array_equal(env.reset(seed=1)[0], other.reset(seed=1)[0])
 
 
+@pytest.mark.slow
 def test_a_copy_in_another_process_compiles_nothing_anew(tmp_path):
     env = GymEnv("freeway", num_cars=6, lane_length=5, observation="simple_image")
     env.reset(seed=0)

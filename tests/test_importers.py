@@ -108,6 +108,7 @@ def test_screens_come_one_a_state(tmp_path):
         importers.bridge_screens(file)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "options", "value"),
     [
@@ -197,6 +198,7 @@ def run(*words):
     return CliRunner().invoke(app, [str(word) for word in words])
 
 
+@pytest.mark.slow
 def test_an_imported_file_and_folder_are_targets(tmp_path):
     done = run("import", "bridge", CORRIDOR, "--horizon", 100, "--out", tmp_path / "kc", "--json")
     assert json.loads(done.stdout)["num_states"] == 168

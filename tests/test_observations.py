@@ -60,6 +60,7 @@ def test_a_one_hot_has_one_one_for_each_component(env):
     assert marked == [f"{name}={value}" for name, value in zip(env.components.names, states[3], strict=True)]
 
 
+@pytest.mark.slow
 def test_an_index_is_the_number_of_the_state_in_its_space(tmp_path):
     env = pharos.make("breakout", height=7, columns=4)
     space = pharos.build(env, tmp_path / "space")

@@ -104,6 +104,7 @@ def runs_of(lab):
     return {record["config"]["observation"]: record for record in records}
 
 
+@pytest.mark.slow
 def test_a_study_keeps_where_its_code_comes_from(lab):
     records = runs_of(lab)
     assert set(records) == {"index", "corner", "pair"}
@@ -118,6 +119,7 @@ def test_a_study_keeps_where_its_code_comes_from(lab):
     assert records["index"]["config"]["environment"] == "taxi"
 
 
+@pytest.mark.slow
 def test_a_shard_of_one_worker_finds_nothing_missing(lab):
     done = command(
         "study", "run", "own.yaml", "--out", lab / "elsewhere" / "results", "--shard", "1/2", "--workers", 1, cwd=lab
@@ -125,6 +127,7 @@ def test_a_shard_of_one_worker_finds_nothing_missing(lab):
     assert (done.returncode, done.stdout) == (0, "own: 2 of 2 runs finished\n"), done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("observation", ["index", "pair"])
 def test_what_was_learnt_on_ones_own_environment_is_evaluated(lab, observation):
     record = runs_of(lab)[observation]
@@ -135,6 +138,7 @@ def test_what_was_learnt_on_ones_own_environment_is_evaluated(lab, observation):
     assert json.loads(done.stdout)["value_at_start"] == pytest.approx(record["result"]["final_value"], abs=1e-6)
 
 
+@pytest.mark.slow
 def test_what_was_learnt_is_drawn_where_it_is_trusted(lab):
     run = lab / "elsewhere" / "results" / "runs" / runs_of(lab)["corner"]["id"]
     refused = command("plot", "policies", run, "--out", "a.gif", cwd=lab)
@@ -296,6 +300,7 @@ COMMANDS = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
 def test_received_files_execute_nothing(received, tmp_path, words):
     done = here(*(received if word == "RUN" else word for word in words))
@@ -318,6 +323,7 @@ def test_a_folder_executes_nothing_though_it_has_no_runs(received, tmp_path, ver
     assert not list(tmp_path.rglob("*.executed"))
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*has changed since")
 @pytest.mark.parametrize(
     "words", [("study", "status", "got"), ("plot", "policies", "RUN", "--steps", "2", "--out", "policies.gif")]
@@ -328,11 +334,13 @@ def test_what_is_trusted_is_executed(received, tmp_path, words):
     assert executed(tmp_path) == ["canary.executed"]
 
 
+@pytest.mark.slow
 def test_regret_is_drawn_without_any_code(received, tmp_path):
     assert here("plot", "regret", received, "--out", "regret.png").exit_code == 0
     assert executed(tmp_path) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "change",
     [
@@ -354,6 +362,7 @@ def test_the_configuration_of_a_received_run_executes_nothing(received, tmp_path
     assert executed(tmp_path) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("entry", [{"name": "canary.py:Taxi"}, 3, {"name": "canary", "file": "", "checksum": ""}, [1]])
 def test_a_damaged_source_is_no_source(received, entry):
     config = {**read_record(received)["config"], "sources": {"environment": entry}}
@@ -361,6 +370,7 @@ def test_a_damaged_source_is_no_source(received, entry):
         RunConfig.from_dict(config)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*has changed since")
 def test_the_target_that_a_command_names_is_trusted(received, tmp_path):
     done = here("evaluate", "canary.py:Taxi", "--policy", received, "--horizon", 5, "--json")
@@ -368,6 +378,7 @@ def test_the_target_that_a_command_names_is_trusted(received, tmp_path):
     assert executed(tmp_path) == ["canary.executed"]
 
 
+@pytest.mark.slow
 def test_a_study_is_unpacked_into_ones_own_without_trust(received, tmp_path):
     done = here("study", "unpack", "got.parquet", "--into", "sent.yaml", "--out", "new", "--json")
     assert done.exit_code == 0, done.output

@@ -99,6 +99,7 @@ def test_nobody_imports_another_packages_modules():
     assert inside == set()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("package", sorted(path.parent.name for path in SOURCE.glob("*/__init__.py")))
 def test_a_package_has_what_it_announces(package):
     module = importlib.import_module(f"pharos.{package}")

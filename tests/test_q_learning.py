@@ -13,6 +13,7 @@ from pharos.mdp import TabularMDP, random_actions, sticky_actions
 from strategies import deterministic_mdps, probabilities
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(
     deterministic_mdps(),

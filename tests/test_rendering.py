@@ -139,6 +139,7 @@ def test_observations_can_be_plugged_in(monkeypatch):
     assert picture.shape == (2, 3, 3) and (picture == 7).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["freeway", "breakout"])
 def test_images_that_agents_see_are_drawn_for_people(name):
     env = make(name)

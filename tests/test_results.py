@@ -83,6 +83,7 @@ def test_a_run_that_fails_says_why_and_can_be_started_again(tmp_path):
     assert "error" not in read_record(tmp_path / "run")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("agent", "file"), [("q_learning", "q_learning.npz"), ("dqn", "parameters.pt")])
 def test_a_damaged_checkpoint_is_said_to_be_one(agent, file, tmp_path, monkeypatch):
     monkeypatch.setattr(_train, "CHECKPOINT_SECONDS", 0.0)

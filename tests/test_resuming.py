@@ -63,6 +63,7 @@ def undisturbed(tmp_path_factory) -> dict[str, Path]:
     return {env.name: folder / env.name for env in (BREAKOUT, NARROW)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("env", (BREAKOUT, NARROW), ids=lambda env: env.name)
 @pytest.mark.parametrize("workers", (1, 2, 3))
 @pytest.mark.parametrize(("chunk", "wide"), ((64, 8), (512, 100), (1 << 16, 1 << 13)))
@@ -138,6 +139,7 @@ def _build_and_die_at(call: int, env, folder):
     build(env, folder, checkpoint_seconds=0.0)
 
 
+@pytest.mark.slow
 def test_a_build_that_dies_at_any_step_of_a_checkpoint_ends_in_the_same_files(tmp_path, undisturbed, monkeypatch):
     monkeypatch.setattr(search, "CHUNK", 4096)
     for call in range(1, 30):
@@ -202,6 +204,7 @@ class _InterruptAtLine:
             sys.settrace(previous)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings(
     "ignore::pytest.PytestUnraisableExceptionWarning"
 )  # a file interrupted between open and with
@@ -253,6 +256,7 @@ def test_files_do_not_depend_on_where_the_table_is(
     assert_same_files(tmp_path / "space", undisturbed[env.name])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("limit", (1 << 16, 1 << 20, 3 << 20))
 @pytest.mark.parametrize("chunk", (64, 1 << 16))
 def test_the_table_moves_to_disk_in_the_middle_of_a_build(limit, chunk, tmp_path, monkeypatch):
@@ -304,6 +308,7 @@ def test_a_chunk_has_whole_bytes_of_terminal_bits_and_candidates_that_int32_can_
     assert rows >= 8 and rows % 8 == 0 and rows * num_actions < 2**31
 
 
+@pytest.mark.slow
 def test_indices_widen_while_the_table_is_on_disk(widened, tmp_path, little_memory, monkeypatch):
     monkeypatch.setattr(search, "INT32_STATES", 5000)
     build(BREAKOUT, tmp_path / "space")
@@ -343,6 +348,7 @@ def test_a_disk_without_room_for_the_table_loses_nothing(tmp_path, monkeypatch):
     assert_same_files(tmp_path / "space", tmp_path / "undisturbed")
 
 
+@pytest.mark.slow
 def test_a_rule_that_fails_is_blamed_with_the_table_on_disk(tmp_path, little_memory):
     @dataclass(frozen=True, kw_only=True)
     class Overflowing(TableWorld):
@@ -475,6 +481,7 @@ def test_a_build_that_widens_its_indices_resumes_to_the_same_files(limit, widene
     assert_same_files(folder, widened)
 
 
+@pytest.mark.slow
 def test_a_build_that_dies_while_it_widens_its_indices_resumes_to_the_same_files(widened, tmp_path, monkeypatch):
     monkeypatch.setattr(search, "INT32_STATES", 5000)
     monkeypatch.setattr(search, "CHUNK", 512)
@@ -586,6 +593,7 @@ class _FileOnFullDisk:
 DATA = ("states.bin", "successors.bin", "terminal.bin")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("freed_at_once", (False, True))
 @pytest.mark.parametrize("call", (1, 2, 7, 23))
 @pytest.mark.parametrize(

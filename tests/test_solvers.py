@@ -23,6 +23,7 @@ def as_pairs(mdp, solution):
     return solution.v if mdp.is_sticky else np.repeat(solution.v[:, None], mdp.num_actions, axis=1)
 
 
+@pytest.mark.slow
 @often
 @given(small_mdps())
 def test_optimal_values_are_those_of_the_explicit_matrices(mdp):
@@ -35,6 +36,7 @@ def test_optimal_values_are_those_of_the_explicit_matrices(mdp):
     assert abs(solution.value_at_start - start @ truth) <= allowed
 
 
+@pytest.mark.slow
 @often
 @given(small_mdps())
 def test_worst_values_are_those_of_the_explicit_matrices(mdp):
@@ -46,6 +48,7 @@ def test_worst_values_are_those_of_the_explicit_matrices(mdp):
     assert abs(solution.value_at_start - start @ truth) <= allowed
 
 
+@pytest.mark.slow
 @often
 @given(small_mdps(), st.integers(1, 6))
 def test_values_with_a_horizon_are_those_of_backward_induction(mdp, horizon):
@@ -57,6 +60,7 @@ def test_values_with_a_horizon_are_those_of_backward_induction(mdp, horizon):
     assert abs(solution.value_at_start - start @ truth) <= TWIN
 
 
+@pytest.mark.slow
 @often
 @given(small_mdps(), st.data())
 def test_values_of_any_stochastic_policy_are_those_of_the_linear_system(mdp, data):
@@ -86,6 +90,7 @@ def test_a_deterministic_policy_on_a_deterministic_mdp_is_evaluated_exactly(mdp,
     assert np.abs(exact.v - naive_mdp.by_state(mdp, truth)[:, -1]).max() <= exact.error_bound + TWIN
 
 
+@pytest.mark.slow
 @often
 @given(small_mdps())
 def test_the_greedy_policy_of_the_solution_attains_its_value(mdp):
@@ -112,6 +117,7 @@ def test_random_actions_with_probability_one_give_the_uniform_policy(mdp):
     assert np.abs(uniform_value(mdp).v - uniform.v).max() <= allowed
 
 
+@pytest.mark.slow
 @often
 @given(small_mdps())
 def test_uniform_value_is_that_of_the_uniform_policy(mdp):
@@ -163,6 +169,7 @@ def test_a_closed_part_of_an_mdp_has_the_same_values_alone(mdp):
     assert np.abs(alone.v - whole.v[part]).max() <= alone.error_bound + whole.error_bound
 
 
+@pytest.mark.slow
 @often
 @given(small_mdps(), st.integers(0, 2**32))
 def test_backups_contract_in_the_maximum_norm(mdp, seed):

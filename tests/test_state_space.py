@@ -61,6 +61,7 @@ def test_build_numbers_states_as_algorithm_1_does(env, folder):
     assert_equals_naive(build(env, folder), env)
 
 
+@pytest.mark.slow
 @given(table_worlds())
 @settings(max_examples=60, deadline=None)
 def test_build_agrees_with_algorithm_1_on_random_environments(env):
@@ -342,6 +343,7 @@ class OtherEnd(Walk):
         return state[0] == self.length - 1
 
 
+@pytest.mark.slow
 def test_a_folder_of_another_version_of_the_rules_is_refused(folder):
     build(Walk(), folder)
     with pytest.raises(StateSpaceMismatch, match="with rules_version = 1; expected 2"):
@@ -377,6 +379,7 @@ def test_each_of_64_states_spread_over_the_file_is_checked(sample, folder):
         pharos.load(folder, environment=OneOtherState(changed=state))
 
 
+@pytest.mark.slow
 def test_a_build_is_not_resumed_with_other_rules(folder, monkeypatch):
     class OtherStart(Walk):
         def transition(self, state, action, out):
@@ -449,6 +452,7 @@ class DividesByZero(Walk):
         out[0] = min(state[0] + 1 + 0 // (700 - state[0]), self.length - 1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("workers", (1, 2))
 @pytest.mark.parametrize("wide", (1, 1 << 13))
 @pytest.mark.parametrize(
@@ -475,6 +479,7 @@ class WritesToItsState(Walk):
         state[0] = min(max(state[0] + 2 * action - 1, 0), self.length - 1)
 
 
+@pytest.mark.slow
 def test_a_rule_that_writes_to_the_state_is_neither_compiled_nor_interpreted(folder):
     with (
         pytest.warns(RuntimeWarning, match="WritesToItsState: Numba cannot compile its rules"),
@@ -539,6 +544,7 @@ class PaysAPosition(Walk):
         return 1.0 / np.float64(state[0] - 70)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("env", (PaysNothingWithoutLength(), PaysAPosition()), ids=lambda env: type(env).__name__)
 def test_a_reward_that_is_no_number_is_refused_with_its_transition(env, folder):
     with pytest.raises(RuleError, match=r"reward of action '(left|right)' in state \(70,\) is (nan|inf)"):

@@ -69,6 +69,7 @@ def analysis(mdp, steps):
     return first_greedy(explored), first_greedy(R), found, lists
 
 
+@pytest.mark.slow
 @settings(max_examples=120, deadline=None)
 @given(small_mdps(max_states=4, max_actions=2), st.integers(1, 8))
 def test_it_is_what_its_definition_says(mdp, steps):
@@ -95,6 +96,7 @@ def layered(draw):
     return following, rewards, depth + 1
 
 
+@pytest.mark.slow
 @settings(max_examples=100, deadline=None)
 @given(layered())
 def test_where_each_state_has_one_depth_it_is_the_time_indexed_one(case):

@@ -208,6 +208,7 @@ def test_hitting_times_beyond_the_digits_of_a_float_are_proven(length):
     assert Fraction(start.lower) <= truth <= Fraction(start.upper)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("length", [130, 150, 300])
 def test_where_floats_prove_no_closer_bounds_an_interval_comes_at_once(length):
     truth = time_to_open(length)
@@ -243,6 +244,7 @@ def rare_rows(draw, max_states=4, max_actions=2):
     return draw(st.lists(row, min_size=num_states, max_size=num_states))
 
 
+@pytest.mark.slow
 @settings(max_examples=150, deadline=None)
 @given(rare_rows())
 def test_intervals_hold_the_hitting_times_of_exact_fractions(rows):

@@ -59,6 +59,7 @@ def cells(rows, measured):
     return study.cells(rows, measured)
 
 
+@pytest.mark.slow
 def test_there_is_a_row_for_each_finished_run_with_the_numbers_of_its_file(done, rows):
     found, folder = done
     assert sorted(rows["id"]) == sorted(run.id for run in found.runs)
@@ -320,6 +321,7 @@ def test_runs_with_estimates_say_so_with_the_half_width_of_their_regret(done, tm
     assert cell["half_width"] == pytest.approx(row["half_width"] / 3)  # three seeds
 
 
+@pytest.mark.slow
 def test_records_of_absurd_numbers_are_damaged(done, tmp_path):
     import json
     import shutil

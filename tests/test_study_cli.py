@@ -45,6 +45,7 @@ def folder(tmp_path_factory):
     return place
 
 
+@pytest.mark.slow
 def test_results_are_in_studies_name_and_the_folder_stands_for_the_study(folder):
     assert len(list((folder / "studies" / "lake" / "runs").glob("*/run.json"))) == 2
     for what in ("lake.yaml", "studies/lake"):
@@ -52,12 +53,14 @@ def test_results_are_in_studies_name_and_the_folder_stands_for_the_study(folder)
         assert (done.returncode, done.stdout) == (0, "lake: 2 of 2 runs finished\n")
 
 
+@pytest.mark.slow
 def test_show_counts_the_runs(folder):
     answer = json.loads(pharos("show", "lake.yaml", "--json", cwd=folder).stdout)
     assert answer["num_runs"] == 2 and answer["steps"] == 400
     assert "2 runs, 400 steps" in pharos("show", "lake.yaml", cwd=folder).stdout
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -76,6 +79,7 @@ def test_wrong_usage_is_one_line_and_exit_code_2(folder, arguments, message):
     assert message in done.stderr and done.stderr.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_a_study_with_failed_runs_ends_with_exit_code_1_and_says_where_to_look(folder):
     wrong = SPECIFICATION.replace("name: lake", "name: wrong").replace(
         "[q_learning]", "[q_learning]\n    hyperparameters: {q_learning: {learning_rat: 0.5}}"
@@ -87,6 +91,7 @@ def test_a_study_with_failed_runs_ends_with_exit_code_1_and_says_where_to_look(f
     assert "2 x " in done.stderr and "learning_rat" in done.stderr and "--retry-failed" in done.stderr
 
 
+@pytest.mark.slow
 def test_a_study_is_found_by_its_name_after_it_was_run(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     block = {"environments": ["frozen_lake/4x4"], "agents": ["q_learning"], "seeds": 1}

@@ -133,6 +133,7 @@ def test_progress_tells_how_long_it_will_take(tmp_path):
     assert str(told[-1]) == "fake: 6 of 6 runs finished"
 
 
+@pytest.mark.slow
 def test_instances_are_prepared_once_each_before_the_runs_and_a_failure_there_stops_nothing(tmp_path, log):
     spec = specification(agents=["dqn"], seeds=2, environments=["frozen_lake/4x4", "frozen_lake/8x8"])
     end = study.run(spec, tmp_path / "out", runner=fake_training.train, prepare=prepare, workers=2)
@@ -205,6 +206,7 @@ def workers_of(folder):
     return found
 
 
+@pytest.mark.slow
 def test_killing_runner_and_workers_loses_and_repeats_nothing(tmp_path, log):
     spec = specification(seeds=8)
     undisturbed = study.run(spec, tmp_path / "undisturbed", runner=fake_training.train, workers=2)
@@ -231,6 +233,7 @@ def test_killing_runner_and_workers_loses_and_repeats_nothing(tmp_path, log):
     assert not (out / "partial").exists()
 
 
+@pytest.mark.slow
 def test_two_runners_on_one_folder_share_the_work(tmp_path, log):
     spec = specification(seeds=4)
     study.run(spec, tmp_path / "undisturbed", runner=fake_training.train, workers=2)
@@ -298,6 +301,7 @@ DAMAGES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("damage", DAMAGES)
 def test_one_damaged_run_is_a_line_and_does_not_stop_the_others(tmp_path, log, damage):
     spec = specification()
@@ -331,6 +335,7 @@ def test_a_file_in_the_place_of_a_run_and_foreign_files_beside_it_stop_nothing(t
     assert study.run(spec, tmp_path, runner=fake_training.train, workers=2).finished == 6
 
 
+@pytest.mark.slow
 def test_the_process_that_forks_workers_is_begun_again_when_it_dies(tmp_path, log, monkeypatch):
     from multiprocessing.forkserver import _forkserver
 
@@ -339,12 +344,12 @@ def test_the_process_that_forks_workers_is_begun_again_when_it_dies(tmp_path, lo
     killed = []
 
     def kill(status):
-        if len(killed) < 4 and _forkserver._forkserver_pid not in (None, *killed):
+        if len(killed) < 2 and _forkserver._forkserver_pid not in (None, *killed):
             killed.append(_forkserver._forkserver_pid)
             os.kill(_forkserver._forkserver_pid, signal.SIGKILL)
 
     end = study.run(spec, tmp_path / "out", runner=fake_training.train, workers=2, progress=kill)
-    assert len(killed) == 4 and (end.finished, end.failed) == (8, 0)
+    assert len(killed) == 2 and (end.finished, end.failed) == (8, 0)
 
 
 def test_a_runner_whose_starts_always_fail_gives_up_in_one_line(tmp_path, log, monkeypatch):
@@ -385,6 +390,7 @@ def test_a_run_that_another_process_holds_is_busy_and_says_so_of_training(tmp_pa
     assert not issubclass(FolderLocked, StateSpaceLocked)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sent", (signal.SIGINT, signal.SIGTERM))
 def test_an_interrupted_study_leaves_no_warning_of_semaphores(tmp_path, log, sent):
     (tmp_path / "fake.yaml").write_text(json.dumps(specification().model_dump(mode="json", exclude_unset=True)))

@@ -77,6 +77,7 @@ def read(page):
     return reader
 
 
+@pytest.mark.slow
 def test_the_page_is_well_formed_and_loads_nothing_from_outside(written):
     page = written[1].html.read_text()
     reader = read(page)
@@ -113,6 +114,7 @@ def test_failed_and_missing_runs_and_models_without_rows_are_told(written):
     assert any("the class model of frozen_lake has 2 rows; needs at least" in note for note in written[1].notes)
 
 
+@pytest.mark.slow
 def test_each_figure_is_a_png_and_a_pdf_and_stands_in_the_page_light_and_dark(written):
     report = written[1]
     assert len(report.figures) % 2 == 0
@@ -134,6 +136,7 @@ def test_latex_tables_have_the_papers_columns_and_balanced_environments(written)
     assert escape("a_b & 50%") == r"a\_b \& 50\%"
 
 
+@pytest.mark.slow
 def test_a_report_made_again_is_the_same_but_for_its_date(written):
     page = written[1].html.read_text()
     again = study.report(written[0]).html.read_text()
@@ -141,6 +144,7 @@ def test_a_report_made_again_is_the_same_but_for_its_date(written):
     assert date.sub("", again) == date.sub("", page)
 
 
+@pytest.mark.slow
 def test_runs_of_different_length_or_without_regret_leave_a_report(tmp_path):
     block = {"environments": ["frozen_lake/4x4"], "agents": ["q_learning"], "observations": ["vector"]}
     hardness = {"measures": ["diameter"]}
@@ -166,6 +170,7 @@ def test_numbers_are_short():
     ]  # fmt: skip
 
 
+@pytest.mark.slow
 def test_the_command_prints_where_the_report_is(written, tmp_path):
     command = [sys.executable, "-m", "pharos", "study", "report", str(written[0]), "--to", str(tmp_path), "--json"]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
@@ -192,6 +197,7 @@ def report_of(tmp_path, name="own", change=None, **block):
     return report, read(report.html.read_text())
 
 
+@pytest.mark.slow
 def test_a_study_without_dqn_says_nothing_false_and_has_no_empty_section(tmp_path):
     report, page = report_of(tmp_path, agents=["ppo", "q_learning"], chance=["plain", {"sticky": 0.25}])
     text = " ".join(page.text)
@@ -215,6 +221,7 @@ def test_a_study_without_dqn_says_nothing_false_and_has_no_empty_section(tmp_pat
     assert not any("findings" in file.name or "paper" in file.name for file in report.tables)
 
 
+@pytest.mark.slow
 def test_each_agent_that_sees_observations_has_models(tmp_path):
     report, page = report_of(tmp_path, agents=["ppo", "a2c"], environments=["frozen_lake/4x4"])
     text = " ".join(page.text)
@@ -225,6 +232,7 @@ def test_each_agent_that_sees_observations_has_models(tmp_path):
     }
 
 
+@pytest.mark.slow
 def test_what_has_no_run_is_not_measured_and_the_cost_is_told_beforehand(tmp_path):
     block = {"environments": ["frozen_lake/4x4", "frozen_lake/8x8"], "agents": ["q_learning"]}
     spec = study.specification({"name": "half", "hardness": {"measures": ["diameter"], "budget": 7}, "blocks": [block]})
@@ -258,6 +266,7 @@ def test_curves_of_each_kind_of_chance_have_a_line_for_each_seed():
     assert [len(axis.lines) for axis in axes] == [1 + 3, 1 + 3]
 
 
+@pytest.mark.slow
 def test_estimated_regret_is_marked_and_its_half_width_stands_in_the_summary(tmp_path):
     def estimate(spec):
         import pandas as pd
@@ -278,6 +287,7 @@ def test_estimated_regret_is_marked_and_its_half_width_stands_in_the_summary(tmp
         assert "half_width" in lines[0].split(",")
 
 
+@pytest.mark.slow
 def test_damaged_runs_are_named_in_the_report_and_absurd_numbers_do_not_stop_it(tmp_path):
     def damage(spec):
         for run, change in zip(spec.runs, ({"seconds": 1e308}, {"cumulative_regret": -1e300}), strict=False):
@@ -306,6 +316,7 @@ def test_texts_that_a_spreadsheet_would_run_are_escaped_and_numbers_stay_numbers
     assert (safe["number"] == -1.5).all() and safe["number"].dtype == float
 
 
+@pytest.mark.slow
 def test_received_records_reach_the_tables_without_formulas(tmp_path):
     def inject(spec):
         file = tmp_path / "runs" / spec.runs[0].id / "run.json"
@@ -319,6 +330,7 @@ def test_received_records_reach_the_tables_without_formulas(tmp_path):
     assert ",=" not in text and "\n=" not in text
 
 
+@pytest.mark.slow
 def test_the_page_escapes_whatever_a_study_says(tmp_path):
     block = {"environments": ["frozen_lake/4x4"], "agents": ["q_learning"], "seeds": 1}
     spec = study.specification(
@@ -346,6 +358,7 @@ def test_states_that_share_an_image_are_counted(tmp_path):
     assert image.num_sharing == counts[counts > 1].sum()
 
 
+@pytest.mark.slow
 def test_a_report_says_which_images_hide_something(tmp_path):
     small = {"name": "breakout", "parameters": {"height": 7, "columns": 4, "brick_rows": 1}}
     report, page = report_of(tmp_path, agents=["ppo"], environments=[small, "frozen_lake/4x4"])

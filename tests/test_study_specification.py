@@ -64,6 +64,7 @@ def test_the_id_of_a_run_is_the_xxh3_hash_of_its_sorted_json():
     assert run_id(dict(reversed(run.config.items()))) == run.id
 
 
+@pytest.mark.slow
 def test_ids_are_the_same_in_another_process_with_another_hash_seed():
     code = "from pharos.study import specification; print(*[run.id for run in specification('quick').runs])"
     found = subprocess.run(
@@ -192,6 +193,7 @@ HOSTILE = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("text", HOSTILE, ids=lambda text: repr(text[:20]))
 def test_a_hostile_file_is_one_line_at_once(tmp_path, text):
     (tmp_path / "study.yaml").write_bytes(text)

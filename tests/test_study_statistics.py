@@ -130,6 +130,7 @@ def test_an_interval_of_equal_results_is_a_point():
     assert (estimate.value, estimate.lower, estimate.upper) == (0.25, 0.25, 0.25)
 
 
+@pytest.mark.slow
 def test_the_interval_is_that_of_resampling_each_task_by_a_loop():
     """The twin of the vectorised bootstrap; both ends within four standard errors of such a quantile."""
     rng = np.random.default_rng(3)

@@ -63,6 +63,7 @@ def test_a_run_writes_its_record_and_its_curve(agent, tmp_path):
     assert not any(path.suffix in (".pkl", ".zip") for path in (tmp_path / "run").rglob("*"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("agent", ["q_learning", "dqn", "ppo"])
 def test_the_same_seed_gives_the_same_file_and_another_seed_another(agent, tmp_path):
     for name, seed in (("a", 1), ("b", 1), ("c", 2)):
@@ -151,6 +152,7 @@ def test_a_run_killed_while_it_replaces_its_checkpoint_loses_one_interval(moved,
     assert not list(run.glob("checkpoint*"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("agent", ["dqn", "ppo"])
 def test_a_resumed_agent_does_not_repeat_its_first_random_numbers(agent, tmp_path):
     import torch
@@ -196,6 +198,7 @@ def _long_run(folder):
     train("q_learning", "frozen_lake/8x8", steps=40_000_000, evaluation_interval=100_000, out=folder)
 
 
+@pytest.mark.slow
 def test_a_killed_process_loses_no_more_than_an_interval(tmp_path):
     folder = tmp_path / "run"
     process = multiprocessing.get_context("spawn").Process(target=_long_run, args=(folder,))
@@ -316,6 +319,7 @@ def test_a_folder_that_is_no_run_is_said_to_be_none(tmp_path):
         read_curve(tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("missing", "message"),
     [

@@ -28,6 +28,7 @@ def test_the_score_is_the_mean_normalized_regret_of_runs_that_anyone_can_repeat(
     assert result.hyperparameters == hyperparameters("q_learning", "frozen_lake", "index")
 
 
+@pytest.mark.slow
 def test_several_kinds_of_chance_count_alike():
     result = search(1, chances=[{}, {"random": 0.1}, {"sticky": 0.25, "random": 0.1}])
     rows = []
@@ -37,6 +38,7 @@ def test_several_kinds_of_chance_count_alike():
     assert result.score == pytest.approx(sum(rows) / len(rows))
 
 
+@pytest.mark.slow
 def test_the_best_is_never_worse_than_what_the_table_said():
     result = search(8, space=ONE)
     scores = [trial["score"] for trial in result.trials if trial["status"] == "finished"]
@@ -46,6 +48,7 @@ def test_the_best_is_never_worse_than_what_the_table_said():
     assert search(8, space=ONE, search_seed=5).trials[1] != result.trials[1]
 
 
+@pytest.mark.slow
 def test_a_search_goes_on_and_writes_what_train_reads(tmp_path):
     search(2, tmp_path / "found")
     result = search(4, tmp_path / "found")
@@ -114,6 +117,7 @@ def run(*words):
     return CliRunner().invoke(app, [*map(str, words)])
 
 
+@pytest.mark.slow
 def test_the_command_answers_in_json_and_train_takes_its_file(tmp_path):
     options = (
         "--agent",

@@ -29,6 +29,7 @@ def page(monkeypatch, tmp_path):
     return module
 
 
+@pytest.mark.slow
 def test_the_code_prints_what_the_page_says(page):
     printed, compared = "", 0
     for kind, text in blocks():
@@ -50,6 +51,7 @@ def test_the_class_has_fewer_than_40_lines():
     assert len(written) < 40
 
 
+@pytest.mark.slow
 def test_the_class_of_the_page_is_made_from_a_file(tmp_path, monkeypatch):
     import pharos
 

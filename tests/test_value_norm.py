@@ -31,6 +31,7 @@ def reached(P, start):
         met = more
 
 
+@pytest.mark.slow
 @settings(max_examples=150, deadline=None)
 @given(small_mdps())
 def test_the_norm_is_that_of_the_explicit_matrices(mdp):
@@ -124,6 +125,7 @@ def test_large_values_that_lie_close_together_have_their_deviation(gamma, value)
     assert found.lower - rounding <= deviation <= found.upper + rounding
 
 
+@pytest.mark.slow
 @settings(max_examples=100, deadline=None)
 @given(small_mdps(), st.sampled_from([1e-3, 1e-6]))
 def test_the_interval_holds_the_norm_however_coarse_the_values_are(mdp, tolerance):

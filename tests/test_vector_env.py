@@ -35,6 +35,7 @@ def breakout(tmp_path_factory):
     return pharos.build(pharos.make("breakout", height=7, columns=4), tmp_path_factory.mktemp("one") / "space")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("chance", CHANCES)
 @pytest.mark.parametrize("tabulated", [False, True])
 def test_a_walk_agrees_with_the_table_at_every_step(space, chance, tabulated):
@@ -60,6 +61,7 @@ def test_a_walk_agrees_with_the_table_at_every_step(space, chance, tabulated):
         ended = terminated | truncated
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("chance", CHANCES)
 def test_rules_table_and_interpreted_twin_walk_the_same_way(space, mode, chance):

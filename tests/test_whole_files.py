@@ -61,6 +61,7 @@ def _write_with_little_disk(name, folder):
     os._exit(0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", WRITERS)
 def test_a_full_disk_leaves_the_older_file(name, tmp_path):
     WRITERS[name](tmp_path / name)
