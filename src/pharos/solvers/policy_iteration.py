@@ -31,14 +31,22 @@ class PolicyIteration:
     def __init__(self, mdp: TabularMDP, select: Selection):
         self.mdp, self.select = mdp, select
         self.nodes = mdp.num_states * mdp.width
+        self._change = math.inf
 
     def is_worth_it(self, sweeps: int, change: float, tolerance: float) -> bool:
-        """Whether the sweeps that are left cost more than solving some linear systems."""
-        first = FIRST_ATTEMPT if self.nodes <= LARGE else FIRST_ATTEMPT_OF_LARGE
-        if sweeps < first or sweeps & (sweeps - 1) or self.mdp.gamma == 0.0:
+        """Whether the sweeps that are left cost more than solving some linear systems.
+
+        How many are left, the last half of the sweeps tells: changes often shrink by much more than gamma in each.
+        """
+        if sweeps & (sweeps - 1) or self.mdp.gamma == 0.0:
+            return False
+        change = max(change, 1e-300)
+        before, self._change = self._change, change
+        if sweeps < (FIRST_ATTEMPT if self.nodes <= LARGE else FIRST_ATTEMPT_OF_LARGE):
             return False
         gamma = self.mdp.gamma
-        left = math.log(max(change, 1e-300) / (tolerance * (1 - gamma))) / -math.log(gamma)
+        rate = min(gamma, max(change / before, 1e-300) ** (2 / sweeps))
+        left = math.log(change / (tolerance * (1 - gamma))) / -math.log(rate)
         of_sweeps = left * (CALL + 4.0 * self.nodes * self.mdp.num_actions)
         if self.is_chain:
             return self.nodes <= MOST_OF_CHAIN and of_sweeps > 1000.0 * self.nodes
