@@ -87,6 +87,7 @@ def test_copies_of_a_state_are_merged():
     assert (found.classes == np.tile(cells, 2)).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["key-corridor-s3r1", "empty-16x16-distance-shaped"])
 def test_what_bridge_has_consolidated_is_minimal_or_tells_screens_apart(name):
     mdp = importers.bridge(BRIDGE / f"{name}.npz", horizon=100)
@@ -121,6 +122,7 @@ def test_classes_of_general_mdps_are_those_of_the_greatest_bisimulation(mdp):
     assert ((classes[:, None] == classes[None]) == bisimilar_general(mdp)).all()
 
 
+@pytest.mark.slow
 @settings(max_examples=80, deadline=None)
 @given(general_mdps(), probabilities, probabilities, st.data())
 def test_values_of_general_mdps_are_kept_when_states_are_doubled(mdp, sticky, random, data):

@@ -172,6 +172,7 @@ def test_the_mismatch_counts_states_that_are_met_after_all_that_is_worth_a_step(
     assert found.lower > 1e4
 
 
+@pytest.mark.slow
 @settings(max_examples=100, deadline=None)
 @given(small_mdps(max_states=6, max_actions=3), st.integers(0, 2**32 - 1))
 def test_support_is_where_the_walk_may_be(mdp, seed):
@@ -198,6 +199,7 @@ def test_the_mismatch_of_the_optimal_policy_with_itself_is_one():
     assert found.lower == pytest.approx(1) and found.upper == pytest.approx(1, abs=1e-6)
 
 
+@pytest.mark.slow
 @settings(max_examples=100, deadline=None)
 @given(small_mdps(max_states=5, max_actions=3), st.sampled_from([0.0, 0.5, 1.0, 2.0]))
 def test_the_action_gap_is_as_regular_as_all_gaps_say(mdp, zeta):

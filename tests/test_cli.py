@@ -184,6 +184,7 @@ def test_slippery_ice_is_found_where_it_is(pharos, name):
     assert f"unknown parameter {name!r} of frozen_lake: slipping comes as random actions: --random 0.667" in done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("words", "expected"), [("pharos sol", "solve"), ("pharos solve --hor", "--horizon")])
 def test_the_shell_completes_verbs_and_options(monkeypatch, words, expected):
     monkeypatch.setenv("_PHAROS_COMPLETE", "complete_bash")
@@ -287,6 +288,7 @@ def test_with_a_horizon_values_are_undiscounted_unless_told_otherwise(answer):
     assert answer("solve", "simple_grid", "--horizon", 6, "--gamma", 0.5)["value_at_start"] == 0.5**5
 
 
+@pytest.mark.slow
 def test_solving_a_folder_is_solving_its_environment(answer, tmp_path):
     answer("build", "breakout", "height=7", "columns=3", "--out", tmp_path / "court")
     options = ("--sticky", 0.25, "--random", 0.1)
@@ -423,6 +425,7 @@ def test_exit_codes_reach_the_shell(cache):
         assert "Traceback" not in done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("words", [["list"], ["--help"], ["list", "--json"]])
 def test_help_and_list_load_nothing_heavy(words):
     script = (

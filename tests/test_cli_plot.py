@@ -56,6 +56,7 @@ def test_an_agent_is_read_back_with_its_task(folders):
     assert found.value_at_start == pytest.approx(read_record(folders["ppo-0"])["result"]["final_value"], abs=1e-6)
 
 
+@pytest.mark.slow
 def test_regret_of_runs_is_drawn(folders, tmp_path):
     out = tmp_path / "regret.png"
     found = answer("plot", "regret", *folders.values(), "--out", out)
@@ -86,6 +87,7 @@ def test_growth_and_the_plane_are_drawn(tmp_path):
     assert plane["measures"]["simple_grid/4x4-plain"]["sum_of_reciprocal_gaps"] > 0
 
 
+@pytest.mark.slow
 def test_policies_of_runs_play_beside_the_best_and_a_random_one(folders, tmp_path):
     runs = (folders["ppo-0"], folders["q_learning-0"])
     found = answer("plot", "policies", *runs, "--out", tmp_path / "play.gif", "--steps", 5)

@@ -2,6 +2,7 @@
 
 import json
 
+import pytest
 from typer.testing import CliRunner
 
 from pharos.cli import app
@@ -12,6 +13,7 @@ def run(*words):
     return CliRunner().invoke(app, ["train", *map(str, words)])
 
 
+@pytest.mark.slow
 def test_train_answers_in_json_and_writes_a_plot(tmp_path):
     out = tmp_path / "run"
     done = run(

@@ -153,6 +153,7 @@ def clocked(period, rows, blocked):
     return TabularMDP.from_arrays([[found[int(t)] for t in table[s]] for s in order], np.zeros((len(order), 3)))
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(8, 60), st.integers(1, 9), st.floats(0, 0.6))
 def test_clocked_spaces_have_the_largest_distance_too(seed, period, rows, density):

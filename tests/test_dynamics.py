@@ -105,6 +105,7 @@ def same(answers):
         np.testing.assert_allclose(answer, answers[0], atol=1e-12)
 
 
+@pytest.mark.slow
 @often
 @given(small_mdps(), st.integers(0, 2**32), st.data())
 def test_every_representation_gives_the_same_answers(mdp, seed, data):
@@ -174,6 +175,7 @@ def test_compiled_backups_and_moves_are_those_of_the_formulas(mdp, seed):
     assert ((fast > 0) == (slow > 0))[live].all()
 
 
+@pytest.mark.slow
 @often
 @given(small_mdps())
 def test_solvers_take_any_representation(mdp):
@@ -216,6 +218,7 @@ def test_sampled_next_states_are_possible_ones_and_about_as_frequent(mdp, seed):
     assert set(found.tolist()) <= set(expected)
 
 
+@pytest.mark.slow
 @often
 @given(small_mdps())
 def test_pairs_that_can_be_met_are_those_of_the_explicit_matrices(mdp):

@@ -39,6 +39,7 @@ def published(analysis, name="key-corridor-s3r1"):
     return json.loads((BRIDGE / f"{name}{analysis}.json").read_text())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name, horizon", PUBLISHED)
 def test_published_analyses_are_reproduced(name, horizon):
     mdp = bridge_mdp(name, horizon)
@@ -56,6 +57,7 @@ def test_published_analyses_are_reproduced(name, horizon):
     assert omega.omega_sum == pytest.approx(occupancies["min_sum_state_action_occupancy"], rel=1e-6)
 
 
+@pytest.mark.slow
 def test_returns_of_key_corridor_are_the_published_ones():
     found = hardness.effective_horizon(key_corridor())
     assert found.random_return == pytest.approx(0.0032357130, abs=5e-11)
@@ -80,6 +82,7 @@ def test_published_analyses_with_sticky_actions_are_reproduced(name, horizon):
 exact = st.sampled_from([-1.0, 0.0, 0.5, 1.0])
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(
     st.one_of(
@@ -111,6 +114,7 @@ def test_the_compiled_analysis_is_the_other_one(mdp, steps):
         assert one[name] == pytest.approx(other[name], rel=1e-12, abs=1e-12), name
 
 
+@pytest.mark.slow
 def test_the_compiled_analysis_of_key_corridor_is_the_published_one():
     found = _compiled(LargeHorizon(key_corridor(), 100, TIE))
     expected = published("_analyzed")
@@ -201,6 +205,7 @@ def test_states_that_no_episode_meets_do_not_matter(mdp, chance, steps):
         assert part == whole
 
 
+@pytest.mark.slow
 def test_a_freeway_is_analysed_for_the_states_that_an_episode_meets():
     mdp = pharos.build(pharos.make("freeway", num_cars=8, lane_length=7)).mdp(gamma=1.0)
     met = int(mdp.states_within(99).sum())

@@ -83,6 +83,7 @@ def roads(draw):
     }
 
 
+@pytest.mark.slow
 @given(roads(), st.lists(st.sampled_from([0, 1, 1, 1, 2]), max_size=150))
 @settings(max_examples=200, deadline=None)
 def test_freeway_plays_like_its_twin(parameters, actions):

@@ -70,6 +70,7 @@ def test_values_of_a_stochastic_policy_are_within_their_bound(mdp, seed):
     assert largest_error(solution, naive_exact.values_of(mdp, written_out)) <= Fraction(solution.error_bound)
 
 
+@pytest.mark.slow
 @often
 @given(hard_mdps(), st.integers(0, 2**32))
 def test_values_of_a_deterministic_policy_are_within_their_bound(mdp, seed):
@@ -121,6 +122,7 @@ def test_rounding_adds_up_along_a_path_at_gamma_1():
     assert abs(error) <= Fraction(value_iteration(by_matrix).error_bound)
 
 
+@pytest.mark.slow
 def test_rounding_counts_every_operation_of_a_backup():
     actions = 300  # whose values are added up one after the other
     one = TabularMDP.from_arrays(np.zeros((1, actions), int), np.full((1, actions), 0.1), gamma=0.0)

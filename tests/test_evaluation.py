@@ -68,6 +68,7 @@ def test_estimates_agree_with_exact_values_within_their_confidence(chance, sharp
     assert outside == 0  # 20 intervals that hold with 99 % each, and are wider than needed
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["simple_grid/4x4-decoy", "frozen_lake/8x8"])
 @pytest.mark.parametrize("setting", [{"horizon": 7}, {"gamma": 0.9, "horizon": None}, {"gamma": 0.0, "horizon": None}])
 @pytest.mark.parametrize("chance", CHANCE)
@@ -214,6 +215,7 @@ def test_what_cannot_be_observed_is_refused():
         pharos.evaluate_policy(mdp.with_gamma(1.0), policy, observation="vector")
 
 
+@pytest.mark.slow
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 10**6))
 def test_the_most_probable_action_of_a_table_is_that_of_its_rows(seed):

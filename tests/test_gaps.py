@@ -38,6 +38,7 @@ def test_gaps_are_those_of_the_explicit_matrices(mdp):
         )
 
 
+@pytest.mark.slow
 @settings(max_examples=80, deadline=None)
 @given(small_mdps(), st.integers(1, 4))
 def test_gaps_with_a_horizon_are_those_of_every_step(mdp, horizon):

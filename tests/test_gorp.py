@@ -103,6 +103,7 @@ def test_the_exact_method_is_the_probability_of_failure(mdp, steps, k, m):
         assert search.failure(m, k) == pytest.approx(failure_probability(mdp, steps, k, m), abs=1e-9)
 
 
+@pytest.mark.slow
 @settings(max_examples=100, deadline=None)
 @given(st.integers(1, 5), st.data())
 def test_the_knapsack_is_the_linear_program(n, data):
@@ -117,6 +118,7 @@ def test_the_knapsack_is_the_linear_program(n, data):
     assert _knapsack(lower[None], upper[None], f[None])[0] == pytest.approx(-found.fun, abs=1e-6)
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(small_mdps(max_states=4, max_actions=2), st.integers(1, 4), st.data())
 def test_the_return_distribution_is_that_of_all_paths(mdp, steps, data):

@@ -88,6 +88,7 @@ def freeway(tmp_path_factory):
     return pharos.build(env, tmp_path_factory.mktemp("freeway") / "space")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["breakout", "freeway"])
 @pytest.mark.parametrize("chance", [{}, {"sticky": 0.3}, {"random": 0.2}, {"sticky": 0.3, "random": 0.2}])
 def test_a_walk_agrees_with_the_table_at_every_step(name, chance, request):

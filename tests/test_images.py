@@ -149,6 +149,7 @@ def test_wrong_options_are_refused_in_one_line(env):
         observe(env, "complex_image", size=(2, 2))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ("simple_image", "complex_image"))
 @pytest.mark.parametrize(
     "copied", (lambda env: pickle.loads(pickle.dumps(env)), copy.deepcopy), ids=("pickle", "deepcopy")

@@ -166,6 +166,7 @@ def test_spoilt_tables_are_refused(table, message):
         importers.gymnasium(table)
 
 
+@pytest.mark.slow
 @settings(max_examples=50, deadline=None)
 @given(small_mdps())
 def test_folders_give_back_what_was_saved(tmp_path_factory, mdp):
@@ -404,6 +405,7 @@ def test_an_array_header_that_promises_more_than_there_is_ends_in_one_line(impor
         assert "\n" not in str(caught.value)
 
 
+@pytest.mark.slow
 def test_no_bit_of_a_compressed_file_of_bridge_ends_in_a_traceback(tmp_path):
     data, expected = CORRIDOR.read_bytes(), importers.bridge(CORRIDOR, horizon=100)
     file = tmp_path / "damaged.npz"

@@ -150,6 +150,7 @@ def test_a_probability_lies_between_zero_and_one(randomize, p):
         randomize(TabularMDP.from_arrays([[0]], [[0.0]]), p)
 
 
+@pytest.mark.slow
 def test_a_state_space_becomes_an_mdp_with_its_own_or_other_rewards(tmp_path):
     space = pharos.build(pharos.make("simple_grid/4x4-decoy"), tmp_path / "grid", progress=False)
     own = space.mdp(gamma=0.9)
@@ -159,6 +160,7 @@ def test_a_state_space_becomes_an_mdp_with_its_own_or_other_rewards(tmp_path):
     assert (space.mdp(rewards=lambda self, state, action, next_state: 3.0).rewards[~own.terminal] == 3).all()
 
 
+@pytest.mark.slow
 @often
 @given(small_mdps(), st.integers(1, 6))
 def test_states_that_an_episode_cannot_meet_do_not_matter_to_it(mdp, steps):

@@ -53,6 +53,7 @@ def isomorphic(one, other):
     return len(names) == len(set(names.values())) == one.num_states == other.num_states
 
 
+@pytest.mark.slow
 def test_key_corridor_is_what_bridge_published():
     """Its 168 states, transition by transition: those that differ only in whether the key was ever carried are told
     apart."""
@@ -63,6 +64,7 @@ def test_key_corridor_is_what_bridge_published():
     assert not isomorphic(importers.minigrid(CORRIDOR, seed=2, remember_carried=True), published)
 
 
+@pytest.mark.slow
 def test_key_corridor_with_equal_states_merged():
     """What the key went through changes nothing that can happen: 156 classes."""
     published = importers.bridge(PUBLISHED, horizon=100)
@@ -143,6 +145,7 @@ def test_without_the_package_the_extra_is_named(monkeypatch):
         importers.minigrid(CORRIDOR)
 
 
+@pytest.mark.slow
 def test_the_command_line_keeps_an_environment_in_a_folder(tmp_path):
     words = ["import", "minigrid", CORRIDOR, "--out", str(tmp_path / "kept"), "--json"]
     answer = json.loads(CliRunner().invoke(app, words).stdout)

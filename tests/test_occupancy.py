@@ -81,6 +81,7 @@ def test_the_expected_return_is_the_reward_of_what_is_executed(mdp, horizon, dat
     assert (found.visits * mdp.rewards).sum() == pytest.approx(value, abs=1e-8)
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(small_mdps(), st.data())
 def test_chance_does_not_change_how_often_a_state_is_visited_by_actions_chosen_or_executed(mdp, data):
@@ -91,6 +92,7 @@ def test_chance_does_not_change_how_often_a_state_is_visited_by_actions_chosen_o
     assert (chosen.visits[np.asarray(mdp.terminal)] == 0).all()
 
 
+@pytest.mark.slow
 def test_uniform_play_on_a_lake_is_the_same_with_random_actions():
     mdp = pharos.build(pharos.make("frozen_lake/4x4")).mdp()
     plain, random = occupancy(mdp), occupancy(random_actions(mdp, 0.3), executed=True)

@@ -110,6 +110,7 @@ few = st.lists(
 )
 
 
+@pytest.mark.slow
 @given(few, st.integers(0, 2**32), st.data())
 @settings(max_examples=200, deadline=None)
 def test_the_compiled_view_reads_and_writes_components(ranges, seed, data):
@@ -125,6 +126,7 @@ def test_the_compiled_view_reads_and_writes_components(ranges, seed, data):
     assert (found, cleared, source) == (0, 0, 0)
 
 
+@pytest.mark.slow
 @given(few, st.integers(0, 2**32), st.data())
 @settings(max_examples=200, deadline=None)
 def test_a_value_out_of_range_is_noted_and_leaves_the_neighbours_alone(ranges, seed, data):

@@ -131,6 +131,7 @@ def test_growth_shows_the_states_within_each_distance():
         plots.growth({})
 
 
+@pytest.mark.slow
 def test_policies_play_beside_each_other(tmp_path):
     task = Task.of("frozen_lake/4x4")
     optimal = pharos.value_iteration(task.space.mdp(gamma=0.9)).policy
@@ -197,6 +198,7 @@ def test_large_numbers_on_axes_are_short(value, text):
     assert thousands(value) == text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ending", [".png", ".pdf", ".svg"])
 def test_figures_are_written_by_their_ending(tmp_path, ending):
     space = pharos.build(pharos.make("simple_grid"))
@@ -236,6 +238,7 @@ class Keys(pharos.Environment):
         return 1, 3
 
 
+@pytest.mark.slow
 def test_a_value_map_of_states_with_more_variables_is_a_slice():
     space = pharos.build(Keys(), progress=False)
     solution = pharos.value_iteration(space.mdp(gamma=0.5))

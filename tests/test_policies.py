@@ -11,6 +11,7 @@ from pharos.solvers import evaluate_policy
 from strategies import small_mdps
 
 
+@pytest.mark.slow
 @settings(max_examples=100, deadline=None)
 @given(small_mdps(), st.integers(0, 10**6), st.sampled_from([None, 3]))
 def test_what_a_policy_reaches_has_the_values_of_the_whole_mdp(mdp, seed, horizon):

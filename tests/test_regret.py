@@ -65,6 +65,7 @@ def test_the_references_are_at_zero_and_one_or_nowhere(mdp):
             assert ends.tolist() == [0.0, 1.0]
 
 
+@pytest.mark.slow
 @settings(max_examples=80, deadline=None)
 @given(deterministic_mdps(ends=False), st.sampled_from([0.5, 2.0, 30.0]), st.sampled_from([-3.0, 0.0, 7.0]))
 def test_normalised_regret_does_not_change_with_the_unit_or_the_zero_of_rewards(mdp, unit, zero):

@@ -213,6 +213,7 @@ def test_the_curve_of_another_run_is_noticed(copies):
     one_line(caught, copies[0] / "curve.parquet")
 
 
+@pytest.mark.slow
 def test_no_bit_of_a_curve_changes_what_is_read(copies):
     file = copies[0] / "curve.parquet"
     data, expected = file.read_bytes(), read_curve(copies[0])

@@ -95,6 +95,7 @@ def _build_slowly(env, folder):
     build(env, folder, checkpoint_seconds=0.0, workers=2, progress=lambda _: time.sleep(0.02))
 
 
+@pytest.mark.slow
 def test_a_build_killed_again_and_again_ends_in_the_same_files(tmp_path, undisturbed, small_blocks):
     folder = tmp_path / "space"
     rng = np.random.default_rng(0)
@@ -245,6 +246,7 @@ def little_memory(monkeypatch):
     monkeypatch.setattr(machine, "LEAST_MEMORY", 1 << 16)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("env", (BREAKOUT, NARROW), ids=lambda env: env.name)
 @pytest.mark.parametrize("workers", (1, 2))
 @pytest.mark.parametrize("wide", (8, 1 << 13))
@@ -274,6 +276,7 @@ def test_the_table_moves_to_disk_in_the_middle_of_a_build(limit, chunk, tmp_path
     assert_same_files(tmp_path / "space", tmp_path / "undisturbed")
 
 
+@pytest.mark.slow
 def test_memory_may_come_and_go_between_sessions(tmp_path, undisturbed, monkeypatch):
     folder = tmp_path / "space"
     monkeypatch.setattr(machine, "LEAST_MEMORY", 1 << 16)
@@ -286,6 +289,7 @@ def test_memory_may_come_and_go_between_sessions(tmp_path, undisturbed, monkeypa
     assert_same_files(folder, undisturbed["breakout"])
 
 
+@pytest.mark.slow
 def test_a_build_on_disk_killed_again_and_again_leaves_no_table_behind(tmp_path, undisturbed, little_memory):
     folder = tmp_path / "space"
     rng = np.random.default_rng(0)
@@ -317,6 +321,7 @@ def test_indices_widen_while_the_table_is_on_disk(widened, tmp_path, little_memo
     assert (wide.successors == expected.successors).all() and (wide.packed_states == expected.packed_states).all()
 
 
+@pytest.mark.slow
 def test_interpreted_rules_are_enumerated_with_the_table_on_disk(tmp_path, undisturbed, little_memory, monkeypatch):
     monkeypatch.setattr("pharos.rules.rules.compiled_or_none", lambda *args: None)
     build(BREAKOUT, tmp_path / "space")
@@ -374,6 +379,7 @@ def interpreted(monkeypatch):
     monkeypatch.setattr("pharos.rules.traced.TracedRules.successors", lambda self, states: None)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("env", (BREAKOUT, NARROW), ids=lambda env: env.name)
 @pytest.mark.parametrize("workers", (1, 2, 3))
 def test_files_do_not_depend_on_processes_that_interpret(env, workers, tmp_path, undisturbed, interpreted):
@@ -453,6 +459,7 @@ def test_beyond_32_bit_indices_only_the_width_of_the_successors_changes(widened,
     assert wide.indices(wide.states()).tolist() == list(range(wide.num_states))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("limit", (3000, 25_000, 28_000))  # beyond 24,000 the table grows as well
 def test_indices_widen_while_threads_are_a_piece_ahead(limit, tmp_path, undisturbed, monkeypatch):
     monkeypatch.setattr(search, "CHUNK", 512)

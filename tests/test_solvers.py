@@ -78,6 +78,7 @@ def test_values_of_any_stochastic_policy_are_those_of_the_linear_system(mdp, dat
     assert abs(solution.value_at_start - start @ truth) <= allowed
 
 
+@pytest.mark.slow
 @often
 @given(deterministic_mdps(), st.integers(0, 2**32))
 def test_a_deterministic_policy_on_a_deterministic_mdp_is_evaluated_exactly(mdp, seed):
@@ -100,6 +101,7 @@ def test_the_greedy_policy_of_the_solution_attains_its_value(mdp):
     assert (np.abs(attained.v - solution.v) <= loss + attained.error_bound + solution.error_bound).all()
 
 
+@pytest.mark.slow
 @often
 @given(deterministic_mdps())
 def test_sticky_actions_with_probability_zero_change_nothing(mdp):
@@ -107,6 +109,7 @@ def test_sticky_actions_with_probability_zero_change_nothing(mdp):
     assert (plain.v == sticky.v).all()
 
 
+@pytest.mark.slow
 @often
 @given(deterministic_mdps())
 def test_random_actions_with_probability_one_give_the_uniform_policy(mdp):
@@ -126,6 +129,7 @@ def test_uniform_value_is_that_of_the_uniform_policy(mdp):
     assert abs(direct.value_at_start - policy.value_at_start) <= direct.error_bound + policy.error_bound
 
 
+@pytest.mark.slow
 @often
 @given(deterministic_mdps(rewards=st.sampled_from([0.0, 0.5, 1.0])), probabilities)
 def test_values_grow_with_gamma_where_no_reward_is_negative(mdp, p):
@@ -136,6 +140,7 @@ def test_values_grow_with_gamma_where_no_reward_is_negative(mdp, p):
     assert (low.v <= high.v + low.error_bound + high.error_bound).all()
 
 
+@pytest.mark.slow
 @often
 @given(small_mdps(), st.sampled_from([0.5, 2.0, 10.0]))
 def test_scaling_rewards_scales_values(mdp, scale):
@@ -143,6 +148,7 @@ def test_scaling_rewards_scales_values(mdp, scale):
     assert np.abs(scale * one.v - scaled.v).max() <= scale * one.error_bound + scaled.error_bound
 
 
+@pytest.mark.slow
 @often
 @given(deterministic_mdps(ends=False), probabilities)
 def test_shifting_all_rewards_shifts_values_by_a_geometric_series(mdp, p):
@@ -152,6 +158,7 @@ def test_shifting_all_rewards_shifts_values_by_a_geometric_series(mdp, p):
     assert np.abs(one.v + 1 / (1 - mdp.gamma) - two.v).max() <= one.error_bound + two.error_bound + TWIN
 
 
+@pytest.mark.slow
 @often
 @given(deterministic_mdps(ends=False))
 def test_a_closed_part_of_an_mdp_has_the_same_values_alone(mdp):
@@ -181,6 +188,7 @@ def test_backups_contract_in_the_maximum_norm(mdp, seed):
     assert after <= mdp.gamma * before + 1e-12
 
 
+@pytest.mark.slow
 @often
 @given(small_mdps())
 def test_a_finer_tolerance_moves_values_by_less_than_the_bounds(mdp):
@@ -189,6 +197,7 @@ def test_a_finer_tolerance_moves_values_by_less_than_the_bounds(mdp):
     assert np.abs(coarse.q - fine.q).max() <= coarse.error_bound + fine.error_bound + TWIN
 
 
+@pytest.mark.slow
 def test_an_established_solver_finds_the_same_values():
     from quantecon.markov import DiscreteDP
 

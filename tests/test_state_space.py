@@ -511,6 +511,7 @@ def test_rewards_are_those_of_the_stored_transitions(breakout):
             assert rewards[i, action] == expected
 
 
+@pytest.mark.slow
 def test_rewards_are_replaced_without_a_new_build(breakout, monkeypatch):
     monkeypatch.setattr(search, "Search", None)
 

@@ -26,6 +26,7 @@ def chancy_mdps(draw):
     return random_actions(sticky_actions(mdp, draw(some)), draw(some))
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(chancy_mdps(), st.booleans())
 def test_diameters_are_those_of_the_explicit_matrices(mdp, restart):
@@ -105,6 +106,7 @@ def test_spaces_too_large_for_a_look_at_each_target_have_the_same_diameter(mdp):
         assert found.exact and found.upper == pytest.approx(expected, rel=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("chance", [lambda mdp: random_actions(mdp, 0.1), lambda mdp: sticky_actions(mdp, 0.25)])
 def test_few_targets_settle_a_grid_and_the_interval_squeezes(chance):
     mdp = chance(pharos.build(pharos.make("simple_grid", height=30, width=30)).mdp())
@@ -196,6 +198,7 @@ def time_to_open(length):
     return sum(Fraction(4, 3) ** k for k in range(1, length + 1))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("length", [10, 40, 60, 70, 75, 80, 90, 100, 110, 120])
 def test_hitting_times_beyond_the_digits_of_a_float_are_proven(length):
     truth = time_to_open(length)

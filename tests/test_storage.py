@@ -242,6 +242,7 @@ def _count(folder, times, counter):
             continue
 
 
+@pytest.mark.slow
 def test_processes_with_claims_never_hold_a_folder_together(tmp_path):
     """Half of them are killed while they hold it, so that others race to take the claim over."""
     folder, counter = tmp_path / "folder", tmp_path / "counter"
@@ -267,6 +268,7 @@ def test_a_lock_that_fails_otherwise_is_no_lock_of_another(tmp_path, monkeypatch
 # JSON and digests ----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @settings(max_examples=100, deadline=None)
 @given(value=st.dictionaries(st.text(max_size=5), values, max_size=4))
 def test_what_is_written_as_json_comes_back_and_is_intact(tmp_path_factory, value):

@@ -84,6 +84,7 @@ def test_runs_that_are_missing_or_failed_are_no_rows(tmp_path):
     assert list(study.table(spec, tmp_path)["id"]) == [first.id]
 
 
+@pytest.mark.slow
 def test_curves_hold_every_evaluation_of_every_run(done):
     points = study.curves(*done)
     assert len(points) == len(done[0].runs) * 20
@@ -177,6 +178,7 @@ def test_the_return_is_the_mean_over_episodes_that_ended_in_the_last_tenth():
     assert np.isnan(_last_return(curve.assign(mean_return=np.nan)))
 
 
+@pytest.mark.slow
 def test_every_model_with_enough_rows_is_fitted_and_the_others_are_named(cells):
     found = study.models(cells, measures=["sum_of_reciprocal_gaps", "diameter"])
     assert [(fit.model, fit.subset) for fit in found.fits] == [
@@ -299,6 +301,7 @@ def test_kept_hardness_that_was_edited_cut_or_swapped_is_measured_again(tmp_path
     assert list(study.hardness_table(spec, tmp_path)["diameter"]) == expected
 
 
+@pytest.mark.slow
 def test_runs_with_estimates_say_so_with_the_half_width_of_their_regret(done, tmp_path):
     import shutil
 

@@ -51,6 +51,7 @@ def verdicts(cells, **options):
 OBSERVATION = "the harder observation of DQN"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("shift", "ours", "grids", "games"), ((1, "image", "agrees", "disagrees"), (-1, "vector", "disagrees", "agrees"))
 )
@@ -73,6 +74,7 @@ def test_equal_observations_are_undecided_as_often_as_the_level_says():
     assert len(decided) == 100 and sum(decided) <= 14  # 5 expected
 
 
+@pytest.mark.slow
 def test_one_model_that_explains_much_disagrees_with_the_paper():
     name = ("one model explains next to nothing", "all")
     assert verdicts(made())[name].verdict == "disagrees"
@@ -101,6 +103,7 @@ def by_task(cells):
 LOGS = " + ".join(f"np.log({name})" for name in MEASURES)
 
 
+@pytest.mark.slow
 def test_the_test_of_slopes_is_that_of_an_analysis_of_variance():
     """Against statsmodels' comparison of the nested models, written as one formula each, a row for each task."""
     import statsmodels.formula.api as smf
@@ -118,6 +121,7 @@ def test_the_test_of_slopes_is_that_of_an_analysis_of_variance():
     assert found["one model explains next to nothing", "all"].p == pytest.approx(small.f_pvalue, rel=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("finding", ("one model explains next to nothing", "models by class explain more than one"))
 def test_a_task_seen_twice_is_one_piece_of_evidence(finding):
     """Images repeat what vectors told: the p-value is that of the vectors alone."""
@@ -177,6 +181,7 @@ def test_r_squared_outside_leaves_out_the_whole_task():
     assert single.cross_validated_r_squared == pytest.approx(1 - press / total)
 
 
+@pytest.mark.slow
 def test_where_tasks_differ_in_their_observations_errors_are_clustered():
     cells = made(noise=1.0)
     lacking = cells.drop(cells[(cells["observation"] == "vector") & (cells["agent"] == "dqn")].index[:3])
@@ -185,12 +190,14 @@ def test_where_tasks_differ_in_their_observations_errors_are_clustered():
     assert verdicts(lacking)["one model explains next to nothing", "all"].evidence.startswith("F(6, 38)")
 
 
+@pytest.mark.slow
 def test_vectors_that_hardness_explains_better_are_found():
     name = ("hardness explains vectors better than images", "all")
     assert verdicts(made(image_slope=0.0, noise=0.3))[name].verdict == "agrees"
     assert verdicts(made(noise=0.3))[name].verdict == "undecided"
 
 
+@pytest.mark.slow
 def test_agreement_has_fishers_interval():
     row = verdicts(made(ppo=1.5))["DQN and PPO find the same hard", "all"]
     cells = made(ppo=1.5)

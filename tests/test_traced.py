@@ -243,6 +243,7 @@ def test_files_do_not_depend_on_tracing(tmp_path, monkeypatch):
             assert file.read_bytes() == (tmp_path / "asked" / file.name).read_bytes()
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(
     st.lists(st.tuples(st.integers(0, 3), st.integers(0, 4), st.integers(0, 3), st.integers(0, 4)), max_size=6),

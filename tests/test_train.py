@@ -50,6 +50,7 @@ def short(agent, out=None, steps=400, seed=1, progress=None, **options):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("agent", ["q_learning", "dqn", "ppo"])
 def test_a_run_writes_its_record_and_its_curve(agent, tmp_path):
     result = short(agent, tmp_path / "run", observation="vector", sticky=0.25)
@@ -112,6 +113,7 @@ def kill_at(step):
     return progress
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("agent", ["q_learning", "dqn", "ppo"])
 def test_a_run_that_died_goes_on_from_its_last_checkpoint(agent, tmp_path):
     with pytest.raises(Killed):

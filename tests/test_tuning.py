@@ -156,6 +156,7 @@ def test_the_command_takes_several_kinds_of_chance(tmp_path):
     assert kept == [{"sticky": 0.0, "random": 0.0}, {"sticky": 0.25, "random": 0.1}]
 
 
+@pytest.mark.slow
 def test_a_search_goes_on_where_the_last_line_of_its_journal_was_cut(tmp_path):
     once = tune("q_learning", "frozen_lake/4x4", steps=200, trials=3, seeds=[0], out=tmp_path)
     journal = tmp_path / "journal.log"

@@ -59,6 +59,7 @@ def test_the_norm_of_a_coin_is_its_deviation():
     assert hardness.environmental_value_norm(mdp) == pytest.approx(math.sqrt(0.21))
 
 
+@pytest.mark.slow
 @settings(max_examples=100, deadline=None)
 @given(small_mdps(), st.integers(1, 6))
 def test_covering_is_that_of_the_explicit_matrices(mdp, steps):

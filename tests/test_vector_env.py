@@ -89,6 +89,7 @@ def test_rules_table_and_interpreted_twin_walk_the_same_way(space, mode, chance)
                 walk.reset(options={"reset_mask": done})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("name", SMALL)
 @pytest.mark.parametrize("extras", [{}, {"previous_action": True, "remaining_time": True}])
@@ -120,6 +121,7 @@ def test_gymnasiums_own_vector_environment_does_the_same(name, mode, extras):
             np.testing.assert_array_equal(vec.reset(options=options)[0], own.reset(options=options)[0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("sticky", "random"), [(0.3, 0.0), (0.0, 0.4), (0.25, 0.2)])
 @pytest.mark.parametrize("tabulated", [False, True])
 def test_executed_actions_follow_the_chance(breakout, sticky, random, tabulated):
