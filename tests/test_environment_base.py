@@ -8,7 +8,7 @@ import pytest
 
 import pharos
 from pharos.environments import Environment, start_distribution
-from pharos.errors import ParameterError, PharosError, UnknownName
+from pharos.errors import ParameterError, PharosError, RuleError, UnknownName
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -161,3 +161,62 @@ def test_what_a_class_must_define_is_said(method):
 
     with pytest.raises(NotImplementedError, match=f"Bare must define {method}"):
         getattr(Bare(), method)()
+
+
+class Coin(Declared):
+    """With chance: by outcome 1 the first variable grows."""
+
+    outcomes = 2
+
+    def probability(self, state, action, outcome):
+        return 0.5 if state[0] < 2 else 1.0 - outcome
+
+    def transition(self, state, action, outcome, out):
+        out[0] = min(state[0] + outcome, 2)
+
+
+def test_a_class_has_chance_where_it_declares_outcomes_and_their_probabilities():
+    coin, declared = Coin(), Declared()
+    assert (coin.has_chance, coin.takes_outcomes(), coin.has_age) == (True, True, False)
+    assert (declared.has_chance, declared.takes_outcomes(), declared.outcomes) == (False, False, 1)
+    assert [coin.next_state((0, 0), 0, outcome) for outcome in range(2)] == [(0, 0), (1, 0)]
+    assert coin.next_state((0, 0), 0) == declared.next_state((0, 0), 0) == (0, 0)
+    assert [declared.probability((0, 0), 0, outcome) for outcome in range(2)] == [1.0, 0.0]
+    with pytest.raises(ParameterError, match="an action has one outcome; found outcome 1, expected 0"):
+        declared.next_state((0, 0), 0, 1)
+
+
+def test_a_class_with_one_outcome_in_this_instance_has_no_chance():
+    class One(Coin):
+        outcomes = 1
+
+    assert not One().has_chance
+    assert One().next_state((0, 0), 0) == (0, 0)
+
+
+@pytest.mark.parametrize("outcomes", (0, -1, 1.5, True, None, "2"))
+def test_outcomes_that_are_no_number_of_them_are_refused(outcomes):
+    class Wrong(Coin):
+        pass
+
+    Wrong.outcomes = outcomes
+    with pytest.raises(RuleError, match="expected an integer of at least 1"):
+        _ = Wrong().has_chance
+
+
+def test_outcomes_without_probabilities_are_refused():
+    class Unlikely(Declared):
+        outcomes = 2
+
+    with pytest.raises(RuleError, match=r"outcomes is 2, but Unlikely defines no probability\(\)"):
+        _ = Unlikely().has_chance
+
+
+def test_an_age_is_optional():
+    class Aged(Declared):
+        def age(self, state):
+            return state[0]
+
+    assert Aged().has_age
+    with pytest.raises(NotImplementedError, match="Declared defines no age"):
+        Declared().age((0, 0))

@@ -1,6 +1,7 @@
 """Environment: what a class of environments defines. Small deterministic rules on integer states, nothing else.
 
-A state is a vector of D integers. Chance (sticky and random actions), time limits, observations and pixels are added
+A state is a vector of D integers. Chance of the world's own is said by outcomes: which ones there are, how likely each
+is, and where each leads. Chance of acting (sticky and random actions), time limits, observations and pixels are added
 outside, so that the same state space serves every one of them.
 """
 
@@ -15,7 +16,7 @@ import numpy as np
 
 from pharos.environments.look import Layer, Look
 from pharos.environments.parameters import check_parameters
-from pharos.errors import ParameterError
+from pharos.errors import ParameterError, RuleError
 
 State = tuple[int, ...]
 Ranges = Any  # range, or a nested sequence of ranges
@@ -66,6 +67,8 @@ class Environment:
                                     before those of agents/hyperparameters.yaml
         foreign_parameters: dict    name that other libraries have -> what to do here instead; for the error message
         first_version: int          the `version` that the Gymnasium id pharos/ClassName-v0 stands for
+        outcomes: int               K, how many outcomes an action has at most: of classes with chance; an attribute or
+                                    a property. 1 in the base class
 
     Parameters are the fields of the dataclass. `parameter(12, low=4)` as a default declares what they may be.
 
@@ -82,10 +85,19 @@ class Environment:
         reward(self, state, action, next_state)     the reward of a transition, a float
         draw(self, state, planes)                   planes (L, rows, columns) uint8, zero: write 1, 2, ... at things
 
+    Methods that are the rules of a class with chance: it defines `probability`, and its `transition` takes the outcome
+        probability(self, state, action, outcome)   of outcome 0 .. K-1, a float; 0: it is impossible here. They sum to
+                                                    1 over the outcomes, up to 1e-9
+        transition(self, state, action, outcome, out)    where this outcome leads; asked for possible ones only
+
+    Rule that may be left out
+        age(self, state) -> int     a number that every transition out of a state that is not terminal increases, such
+                                    as the steps taken: values are then solved in one backward pass
+
     In compiled rules `self` offers the numeric fields of the dataclass and the numeric properties of the class
     (numbers, tuples of numbers, arrays), under the same names; it has no methods. Call module-level functions instead:
-    pharos compiles those that a rule mentions. Rules never change `state`, and use neither chance, time nor anything
-    global that varies.
+    pharos compiles those that a rule mentions. Rules never change `state`, and draw no lots, and use neither time nor
+    anything global that varies. An outcome is a number that the rule is given, so `transition` is deterministic, too.
     """
 
     name: ClassVar[str]
@@ -99,6 +111,7 @@ class Environment:
     hyperparameters: ClassVar[Mapping[str, Mapping[str, Mapping[str, Any]]]] = {}
     foreign_parameters: ClassVar[Mapping[str, str]] = {}
     first_version: ClassVar[int] = 1
+    outcomes: Any = 1
 
     def __post_init__(self) -> None:
         check_parameters(self)
@@ -131,6 +144,14 @@ class Environment:
         """Write into `out`, a copy of `state`, what `action` changes."""
         raise NotImplementedError(f"{type(self).__name__} must define transition()")
 
+    def probability(self, state, action, outcome) -> float:
+        """The probability of an outcome of `action` in `state`; 0 where it is impossible. Here: there is but one."""
+        return 1.0 if outcome == 0 else 0.0
+
+    def age(self, state) -> int:
+        """A number that every transition out of a state that is not terminal increases."""
+        raise NotImplementedError(f"{type(self).__name__} defines no age()")
+
     def is_terminal(self, state) -> bool:
         """Whether the episode has ended in `state`. The base class never ends."""
         return False
@@ -149,6 +170,30 @@ class Environment:
     def num_actions(self) -> int:
         """A, the number of actions."""
         return len(self.actions)
+
+    @classmethod
+    def takes_outcomes(cls) -> bool:
+        """Whether the rule of this class is `transition(self, state, action, outcome, out)`."""
+        return cls.probability is not Environment.probability
+
+    @property
+    def has_chance(self) -> bool:
+        """Whether an action may have several outcomes in this instance.
+
+        Raises:
+            RuleError: `outcomes` is no integer of at least 1, or is more than 1 in a class without `probability`.
+        """
+        outcomes = self.outcomes
+        if not isinstance(outcomes, int | np.integer) or isinstance(outcomes, bool) or outcomes < 1:
+            raise RuleError(f"{self}: outcomes is {outcomes!r}; expected an integer of at least 1")
+        if outcomes > 1 and not self.takes_outcomes():
+            raise RuleError(f"{self}: outcomes is {outcomes}, but {type(self).__name__} defines no probability()")
+        return bool(outcomes > 1)
+
+    @property
+    def has_age(self) -> bool:
+        """Whether the class defines `age`."""
+        return type(self).age is not Environment.age
 
     @property
     def parameters(self) -> dict[str, Any]:
@@ -184,10 +229,19 @@ class Environment:
         low.flags.writeable = size.flags.writeable = False
         return Components(tuple(names), slices, low, size)
 
-    def next_state(self, state: Sequence[int], action: int) -> State:
-        """The state after `action` in `state`, terminal ones included; interpreted: for reading, testing, drawing."""
+    def next_state(self, state: Sequence[int], action: int, outcome: int = 0) -> State:
+        """The state after `action` in `state`, terminal ones included; interpreted: for reading, testing, drawing.
+
+        Args:
+            outcome: which one of a class with chance, whether it is possible in `state` or not; else 0.
+        """
         out = list(state)
-        self.transition(tuple(state), action, out)
+        if self.takes_outcomes():
+            self.transition(tuple(state), action, outcome, out)  # type: ignore[call-arg]
+        elif outcome == 0:
+            self.transition(tuple(state), action, out)
+        else:
+            raise ParameterError(f"{self}: an action has one outcome; found outcome {outcome}, expected 0")
         return tuple(int(value) for value in out)
 
     def __str__(self) -> str:
