@@ -4,6 +4,9 @@ from fractions import Fraction
 
 import numpy as np
 
+import naive_mdp
+from pharos.mdp import OutcomeTable
+
 
 def exact(array):
     """The same numbers as fractions."""
@@ -12,6 +15,8 @@ def exact(array):
 
 def outcomes(mdp, s, x):
     """[(next state, probability)] of executing x in s; what is missing ends."""
+    if isinstance(mdp.dynamics, OutcomeTable):
+        return [(t, Fraction(p)) for t, p in naive_mdp.listed(mdp.dynamics, s, x) if t >= 0]
     if mdp.transitions is None:
         t = int(mdp.next_states[s, x])
         return [] if t < 0 else [(t, Fraction(1))]

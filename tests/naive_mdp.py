@@ -4,6 +4,8 @@ import itertools
 
 import numpy as np
 
+from pharos.mdp import OutcomeTable
+
 
 def augmented(mdp):
     """The MDP as explicit matrices (P, R, start), over its own states with every kind of chance written out.
@@ -38,10 +40,24 @@ def augmented(mdp):
 
 def outcomes(mdp, s, x):
     """[(next state or -1, probability)] of executing x in s."""
+    if isinstance(mdp.dynamics, OutcomeTable):
+        return listed(mdp.dynamics, s, x)
     if mdp.transitions is None:
         return [(int(mdp.next_states[s, x]), 1.0)]
     row = mdp.transitions[s * mdp.num_actions + x].toarray().ravel()
     return [(-1, 1 - row.sum()), *((t, row[t]) for t in np.flatnonzero(row))]
+
+
+def listed(dynamics, s, x):
+    """The same of an OutcomeTable, entry by entry; what leads to the same state stays apart."""
+    row, k = s * dynamics.num_actions + x, dynamics.num_outcomes
+    first, last = (row * k, (row + 1) * k) if dynamics.offsets is None else dynamics.offsets[row : row + 2]
+    states = dynamics.successors.ravel()[first:last]
+    if dynamics.palette is None:
+        weights = dynamics.probabilities.ravel()[first:last]
+    else:
+        weights = dynamics.palette[dynamics.codes[s, x]][: last - first]
+    return [(int(t), float(p)) for t, p in zip(states, weights, strict=True) if p > 0]
 
 
 def values_of(P, R, gamma, policy):

@@ -14,6 +14,7 @@ __all__ = [
     "learning",
     "observation_kernels",
     "occupancy",
+    "outcomes",
     "packing",
     "partition",
     "paths",

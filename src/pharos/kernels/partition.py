@@ -44,6 +44,23 @@ def number_rows(rows, before, slots, numbers):
     return count
 
 
+def numbered_rows(rows, before=None):
+    """((N,) int64, how many): equal rows (N, ...) get equal numbers, in the order in which they appear first.
+
+    before (N,) int64: rows are equal only where these are, too.
+    """
+    rows = np.ascontiguousarray(rows)
+    before = np.zeros(len(rows), np.int64) if before is None else before
+    numbers = np.empty(len(rows), np.int64)
+    count = number_rows(rows.view(np.uint8).reshape(len(rows), -1), before, slots_for(len(rows)), numbers)
+    return numbers, count
+
+
+def slots_for(rows):
+    """An empty hash table for so many rows."""
+    return np.full(1 << max(3, (2 * rows - 1).bit_length()), -1, np.int32 if rows < 2**31 else np.int64)
+
+
 @njit(cache=True, nogil=True)
 def states_to_ask(next_states, changed, asked):
     """asked[:n] = the states with a next state that changed its class; returns n."""

@@ -5,6 +5,7 @@ from pharos.mdp.bisimulation import Minimization, minimize
 from pharos.mdp.chance import Chance, random_actions, sticky_actions
 from pharos.mdp.dynamics import BellmanEquation, Dynamics, Outcomes, Play
 from pharos.mdp.matrices import Matrices
+from pharos.mdp.outcome_table import OutcomeTable
 from pharos.mdp.rewards import Rewards
 from pharos.mdp.rewards_of_space import rewards_of_space
 from pharos.mdp.selection import BEST, WORST, Extreme, PolicyTable, Selection, chosen_mass
@@ -20,6 +21,7 @@ __all__ = [
     "Extreme",
     "Matrices",
     "Minimization",
+    "OutcomeTable",
     "Outcomes",
     "Play",
     "PolicyTable",

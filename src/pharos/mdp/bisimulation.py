@@ -78,14 +78,7 @@ def _numbered(rows: np.ndarray, before: np.ndarray) -> np.ndarray:
     """(N,) int64: equal pairs (before, row) get equal numbers, in the order in which they appear first."""
     from pharos.kernels import partition
 
-    rows = np.ascontiguousarray(rows)
-    numbers = np.empty(len(rows), np.int64)
-    partition.number_rows(rows.view(np.uint8).reshape(len(rows), -1), before, _slots(len(rows)), numbers)
-    return numbers
-
-
-def _slots(rows: int) -> np.ndarray:
-    return np.full(1 << max(3, (2 * rows - 1).bit_length()), -1, np.int32 if rows < 2**31 else np.int64)
+    return partition.numbered_rows(rows, before)[0]
 
 
 def _refined(table: np.ndarray, classes: np.ndarray) -> tuple[np.ndarray, int]:
@@ -94,7 +87,7 @@ def _refined(table: np.ndarray, classes: np.ndarray) -> tuple[np.ndarray, int]:
 
     states = len(table)
     small = np.int32 if states < 2**31 else np.int64
-    slots, now = _slots(states), classes.astype(small)
+    slots, now = partition.slots_for(states), classes.astype(small)
     waiting, used, new = np.arange(states, dtype=small), np.empty(states, small), np.empty(states, small)
     count = int(now.max()) + 1
     sizes = np.zeros(states, small)

@@ -10,6 +10,8 @@ from pharos.errors import ParameterError
 from pharos.mdp.chance import Chance
 from pharos.mdp.dynamics import Dynamics
 from pharos.mdp.matrices import Matrices, expected_rewards, transitions_of
+from pharos.mdp.outcome_arrays import checked_outcomes, compact_outcomes
+from pharos.mdp.outcome_table import OutcomeTable
 from pharos.mdp.rewards import Rewards
 from pharos.mdp.table import Table
 
@@ -23,7 +25,8 @@ if TYPE_CHECKING:
 class TabularMDP:
     """A Markov decision process of S states and A actions.
 
-    Made by `StateSpace.mdp`, `from_arrays` or `from_matrices`; `sticky_actions` and `random_actions` add chance.
+    Made by `StateSpace.mdp`, `from_arrays`, `from_outcomes` or `from_matrices`; `sticky_actions` and `random_actions`
+    add chance.
 
     Attributes:
         dynamics: what executing an action does; solvers and measures ask it, whatever it is stored as.
@@ -94,19 +97,52 @@ class TabularMDP:
         dtype = np.int32 if len(table) < 2**31 else np.int64
         table = np.ascontiguousarray(table, dtype)
         silent = (reward_table.array == 0).all(axis=1)
-        if terminal is None:
-            mask = (table == -1).all(axis=1) & silent
-        else:
-            mask = np.asarray(terminal, np.bool_)
-            own = np.arange(len(table), dtype=dtype)[:, None]
-            if mask.shape != (len(table),) or (mask & ~(((table == own) | (table == -1)).all(axis=1) & silent)).any():
-                raise ParameterError(
-                    f"terminal has shape {mask.shape}; expected ({len(table)},), true only where a state leads "
-                    "to itself "
-                    f"(or to -1) with reward 0 by every action"
-                )
+        own = np.arange(len(table), dtype=dtype)[:, None]
+        stays = ((table == own) | (table == -1)).all(axis=1)
+        mask = _terminal(terminal, (table == -1).all(axis=1) & silent, stays & silent)
         states, probabilities = _start(initial, len(table))
         return TabularMDP(Table(table), reward_table, mask, gamma, horizon, states, probabilities)
+
+    @staticmethod
+    def from_outcomes(
+        successors: Any,
+        probabilities: Any,
+        rewards: Any,
+        *,
+        gamma: float = 0.99,
+        initial: Any = 0,
+        horizon: int | None = None,
+        terminal: Any = None,
+    ) -> "TabularMDP":
+        """An MDP in which each action has up to K outcomes, from arrays.
+
+        Args:
+            successors: (S, A, K) integers in [-1, S); -1 ends the episode after the transition's reward. Entries of
+                probability 0 count for nothing.
+            probabilities: (S, A, K) of the outcomes; each row sums to 1 within 1e-9.
+            rewards: (S, A) expected rewards; or (S, A, K), averaged.
+            gamma, initial, horizon, terminal: as in `from_arrays`.
+        Raises:
+            ParameterError: as in `from_arrays`, or a probability is not in [0, 1] or a row does not sum to 1.
+        """
+        table, chances = checked_outcomes(successors, probabilities)
+        paid = np.asarray(rewards, np.float64)
+        if paid.shape == table.shape:
+            paid = _mean_rewards(paid, chances)
+        elif paid.shape != table.shape[:2]:
+            raise ParameterError(
+                f"rewards have shape {paid.shape}; expected {table.shape[:2]}, one for each state and action, or "
+                f"{table.shape}, one for each outcome"
+            )
+        reward_table = Rewards.from_array(paid)
+        possible = chances > 0
+        ends, silent = ((table == -1) | ~possible).all(axis=(1, 2)), (reward_table.array == 0).all(axis=1)
+        own = np.arange(len(table), dtype=table.dtype)[:, None, None]
+        stays = ((table == own) | (table == -1) | ~possible).all(axis=(1, 2))
+        mask = _terminal(terminal, ends & silent, stays & silent)
+        states, starts = _start(initial, len(table))
+        dynamics = OutcomeTable(**compact_outcomes(table, chances))
+        return TabularMDP(dynamics, reward_table, mask, gamma, horizon, states, starts)
 
     @staticmethod
     def from_matrices(
@@ -134,8 +170,9 @@ class TabularMDP:
     @staticmethod
     def from_space(space: "StateSpace", rewards: Rewards, gamma: float = 0.99) -> "TabularMDP":
         """The MDP on the states of a state space; `StateSpace.mdp` computes the rewards."""
+        outcomes = getattr(space, "outcome_arrays", None)
         return TabularMDP(
-            Table(space.successors),
+            Table(space.successors) if outcomes is None else OutcomeTable(num_actions=space.num_actions, **outcomes),
             rewards,
             space.terminal,
             gamma,
@@ -329,6 +366,31 @@ def _rewards_of_shape(rewards: Any, shape: tuple[int, ...]) -> Rewards:
     if array.shape != shape:
         raise ParameterError(f"rewards have shape {array.shape}; expected {shape}, one for each state and action")
     return Rewards.from_array(array)
+
+
+def _mean_rewards(rewards: np.ndarray, probabilities: np.ndarray) -> np.ndarray:
+    """(S, A), from the rewards of outcomes (S, A, K); those of impossible ones may be anything."""
+    possible = probabilities > 0
+    wrong = possible & ~np.isfinite(rewards)
+    if wrong.any():
+        s, a, k = map(int, np.argwhere(wrong)[0])
+        raise ParameterError(
+            f"the reward of state {s}, action {a}, outcome {k} is {rewards[s, a, k]}; expected a finite number"
+        )
+    return (probabilities * np.where(possible, rewards, 0.0)).sum(axis=2)
+
+
+def _terminal(terminal: Any, default: np.ndarray, allowed: np.ndarray) -> np.ndarray:
+    """(S,) bool, the terminal states: those given, which must be among the allowed ones, or the default."""
+    if terminal is None:
+        return default
+    mask = np.asarray(terminal, np.bool_)
+    if mask.shape != allowed.shape or (mask & ~allowed).any():
+        raise ParameterError(
+            f"terminal has shape {mask.shape}; expected {allowed.shape}, true only where a state leads to itself (or "
+            "to -1) with reward 0 by every action"
+        )
+    return mask
 
 
 def _start(initial: Any, num_states: int) -> tuple[np.ndarray, np.ndarray]:

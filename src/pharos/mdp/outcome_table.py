@@ -1,0 +1,194 @@
+"""Dynamics with several outcomes for each state and action: games whose rules have chance."""
+
+import math
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from pharos.errors import ParameterError
+from pharos.kernels import outcomes as kernels
+from pharos.mdp.dynamics import Dynamics, Outcomes, as_indices
+from pharos.mdp.outcome_arrays import checked_outcomes, compact_outcomes
+
+_UNIT = 2.0**-53
+
+
+class OutcomeTable(Dynamics):
+    """Several next states for each state and action, and their probabilities, as tables.
+
+    Attributes:
+        successors: (S, A, K) int32 or int64, -1 where the episode ends; or (N,), the rows s A + a one after another.
+        offsets: (S A + 1,) where the rows begin; None where successors are (S, A, K).
+        codes: (S, A) uint8 or uint16, which vector of the palette has the probabilities; None without a palette.
+        palette: (P, K) float64, the probabilities of the outcomes in their order, then zeros; None without one.
+        probabilities: float64 in the shape of successors; None where there is a palette.
+        num_outcomes: K, the most outcomes of a row.
+    In (S, A, K) the last successors of a row may have probability 0: they repeat its first one.
+    """
+
+    def __init__(
+        self,
+        successors: np.ndarray,
+        num_actions: int,
+        *,
+        offsets: np.ndarray | None = None,
+        codes: np.ndarray | None = None,
+        palette: np.ndarray | None = None,
+        probabilities: np.ndarray | None = None,
+    ):
+        """From arrays as the files of a state space hold them: nothing is copied, so they may be memory maps.
+
+        Raises:
+            ParameterError: there is neither a palette with codes, nor probabilities.
+        """
+        if (palette is None) != (codes is None) or (palette is None) == (probabilities is None):
+            raise ParameterError("an OutcomeTable takes codes with a palette, or probabilities; found both or neither")
+        self.successors, self.offsets = np.asarray(successors), None if offsets is None else np.asarray(offsets)
+        self.codes, self.palette, self.probabilities = codes, palette, probabilities
+        self.num_actions = num_actions
+        if offsets is None:
+            self.num_states, _, self.num_outcomes = successors.shape
+        else:
+            self.num_states = (len(offsets) - 1) // num_actions
+            self.num_outcomes = int(np.diff(offsets).max()) if palette is None else palette.shape[1]
+        self.operations = 2 * self.num_outcomes
+
+    @staticmethod
+    def from_arrays(successors: Any, probabilities: Any) -> "OutcomeTable":
+        """From (S, A, K) successors, -1 for the end, and probabilities; what is impossible is left out.
+
+        Up to 65,536 distinct vectors of probabilities become a palette. Rows are kept one after another where more than
+        30 % of (S, A, K) would be padding.
+
+        Raises:
+            ParameterError: a shape, an index or a probability is wrong, or a row does not sum to 1 within 1e-9; the
+                first such entry is named.
+        """
+        return OutcomeTable(**compact_outcomes(*checked_outcomes(successors, probabilities)))
+
+    # What it says of itself -----------------------------------------------------------------------------------------
+
+    @cached_property
+    def transitions_of_kernels(self) -> tuple[Any, ...]:
+        """The argument `transitions` of kernels/outcomes.py."""
+        successors = self.successors.reshape(-1)
+        shape = (self.num_states, self.num_actions, self.num_outcomes)
+        if self.probabilities is not None:
+            return successors, self.offsets, None, np.asarray(self.probabilities).reshape(-1), shape
+        return successors, self.offsets, np.asarray(self.codes).reshape(-1), np.asarray(self.palette), shape
+
+    @cached_property
+    def mass(self) -> float:  # type: ignore[override]
+        if self.palette is not None:  # the sign of a sum by fsum is that of the exact one
+            beyond = max(math.fsum([*vector, -1.0]) for vector in np.asarray(self.palette).tolist())
+            return 1.0 if beyond <= 0 else math.nextafter(1.0 + beyond, 2.0)
+        assert self.probabilities is not None
+        if self.offsets is None:
+            sums = self.probabilities.sum(axis=2)
+        else:
+            sums = np.add.reduceat(self.probabilities, self.offsets[:-1])
+        return max(1.0, float(sums.max()) * (1 + self.num_outcomes * _UNIT))
+
+    @cached_property
+    def has_ends(self) -> bool:  # type: ignore[override]
+        return bool((self.successors == -1).any())
+
+    @cached_property
+    def is_deterministic(self) -> bool:  # type: ignore[override]
+        return bool(kernels.have_one_outcome(self.transitions_of_kernels))
+
+    @cached_property
+    def _table(self) -> np.ndarray:
+        first = self.successors if self.offsets is not None else self.successors[..., 0]
+        return np.ascontiguousarray(first.reshape(self.num_states, self.num_actions))
+
+    def deterministic_table(self) -> np.ndarray | None:
+        return self._table if self.is_deterministic else None
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        names = ("successors", "offsets", "codes", "palette", "probabilities")
+        return {name: np.asarray(array) for name in names if (array := getattr(self, name)) is not None}
+
+    # What executing does --------------------------------------------------------------------------------------------
+
+    def expected(self, x: np.ndarray, states: Any = slice(None)) -> np.ndarray:
+        rows = np.arange(self.num_states)[states]
+        flat = np.ascontiguousarray(x, np.float64).reshape(len(x), x.shape[1] if x.ndim > 1 else 1, -1)
+        out = np.empty((len(rows), self.num_actions, flat.shape[2]))
+        kernels.expected(self.transitions_of_kernels, flat, rows, out)
+        return out.reshape(len(rows), self.num_actions, *x.shape[2:])
+
+    def pushed(self, mass: np.ndarray, width: int = 1) -> np.ndarray:
+        after = np.zeros((self.num_states, width))
+        kernels.pushed(self.transitions_of_kernels, np.ascontiguousarray(mass, np.float64), after)
+        return after
+
+    def outcomes(self, states: np.ndarray, actions: np.ndarray) -> Outcomes:
+        """Ascending by next state; outcomes that lead to the same one are one."""
+        from scipy import sparse
+
+        rows = np.asarray(states) * self.num_actions + np.asarray(actions)
+        which, following, probabilities = self._entries(rows)
+        following = np.where(following < 0, self.num_states, following)
+        indptr = np.searchsorted(which, np.arange(len(rows) + 1))
+        matrix = sparse.csr_matrix((probabilities, following, indptr), shape=(len(rows), self.num_states + 1))
+        matrix.sum_duplicates()
+        which = np.repeat(np.arange(len(rows)), np.diff(matrix.indptr))
+        return Outcomes(which, matrix.indices.astype(np.int64), matrix.data)
+
+    def restricted_to(self, states: np.ndarray) -> "OutcomeTable":
+        """These states alone; what leads out of them leads back to where it came from."""
+        number = np.full(self.num_states + 1, -2, np.int64)
+        number[states], number[-1] = np.arange(len(states)), -1
+        return self._renumbered(states, number)
+
+    def merged(self, classes: np.ndarray, representatives: np.ndarray) -> "OutcomeTable":
+        return self._renumbered(representatives, np.append(classes, -1))
+
+    # Parts of it ----------------------------------------------------------------------------------------------------
+
+    def _entries(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(which row, next state or -1, probability > 0) of all outcomes of some rows s A + a, in order."""
+        if self.offsets is None:
+            following = self.successors.reshape(-1, self.num_outcomes)[rows]
+            if self.palette is not None:
+                chances = np.asarray(self.palette)[np.asarray(self.codes).reshape(-1)[rows]]
+            else:
+                chances = np.asarray(self.probabilities).reshape(-1, self.num_outcomes)[rows]
+            which, k = np.nonzero(chances)
+            return which, following[which, k].astype(np.int64), chances[which, k]
+        which, places = self._places(rows)
+        if self.palette is not None:
+            k = places - self.offsets[rows][which]
+            chances = np.asarray(self.palette)[np.asarray(self.codes).reshape(-1)[rows][which], k]
+        else:
+            chances = np.asarray(self.probabilities)[places]
+        return which, self.successors[places].astype(np.int64), chances
+
+    def _places(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(which row, place in `successors`) of all outcomes of some rows, where they lie one after another."""
+        assert self.offsets is not None
+        first = self.offsets[rows].astype(np.int64)
+        counts = self.offsets[rows + 1] - first
+        which = np.repeat(np.arange(len(rows)), counts)
+        return which, np.arange(len(which)) + np.repeat(first - (np.cumsum(counts) - counts), counts)
+
+    def _renumbered(self, states: np.ndarray, number: np.ndarray) -> "OutcomeTable":
+        """The rows of some states; number (S + 1,) of each next state, -1 for the end, -2 for where it came from."""
+        rows = (np.asarray(states)[:, None] * self.num_actions + np.arange(self.num_actions)).ravel()
+        arrays: dict[str, Any] = {}
+        if self.offsets is None:
+            places = np.asarray(states)
+            own = np.arange(len(states))[:, None, None]
+        else:
+            which, places = self._places(rows)
+            own = which // self.num_actions
+            arrays["offsets"] = np.append(0, np.cumsum(np.bincount(which, minlength=len(rows))))
+        following = number[self.successors[places]]
+        arrays["successors"] = as_indices(np.where(following == -2, own, following), len(states))
+        if self.probabilities is not None:
+            arrays["probabilities"] = np.asarray(self.probabilities[places])
+        else:
+            arrays.update(codes=np.asarray(self.codes)[states], palette=self.palette)  # type: ignore[index]
+        return OutcomeTable(num_actions=self.num_actions, **arrays)
