@@ -46,6 +46,8 @@ GAMES = {
         {"height": 5, "columns": 3, "brick_rows": 1, "extra_paddle_width": 1, "respawn": False},
         "s" * 24,
     ),
+    "sliding_tiles_solved": ("sliding_tiles", {"rows": 2, "columns": 3, "start": "1,0,3,4,2,5"}, "udr"),
+    "sliding_tiles_against_the_edge": ("sliding_tiles/3x3", {}, "drulluur"),
 }
 
 

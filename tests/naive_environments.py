@@ -121,3 +121,20 @@ class Breakout:
     def _come_back(self):
         if self.respawn and not self.bricks:
             self.bricks = set(self.wall)
+
+
+class SlidingTiles:
+    """A tray as a dictionary of the cells; a step looks for the blank and swaps."""
+
+    def __init__(self, tiles, columns):
+        self.tray = {(i // columns, i % columns): tile for i, tile in enumerate(tiles)}
+
+    def state(self):
+        return tuple(self.tray[cell] for cell in sorted(self.tray))
+
+    def step(self, action):
+        (row, column) = next(cell for cell, tile in self.tray.items() if tile == 0)
+        beside = (row + OFFSETS[action][0], column + OFFSETS[action][1])
+        if beside in self.tray:
+            self.tray[row, column], self.tray[beside] = self.tray[beside], 0
+        return -1.0, self.state() == (*range(1, len(self.tray)), 0)

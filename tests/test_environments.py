@@ -1,4 +1,4 @@
-"""The four built-in classes: rules against plain twins and Gymnasium, parameters, names, drawings, golden games."""
+"""The built-in classes: rules against plain twins and Gymnasium, parameters, names, drawings, golden games."""
 
 import json
 import random
@@ -19,6 +19,7 @@ from pharos.environments import Environment, catalog, named_instances, register
 from pharos.errors import ParameterError, UnknownName
 
 GRIDS = ("simple_grid", "frozen_lake")
+SMALL = ("sliding_tiles/2x2",)  # beside them, spaces of at most 120 states
 ALL = pharos.list_environments()
 
 
@@ -367,7 +368,7 @@ def test_parameters_survive_json(name):
 def test_every_environment_keeps_the_contract(name):
     report = pharos.check_environment(pharos.make(name), max_states=120)
     assert report.compiled
-    assert report.complete == (name.split("/")[0] in GRIDS)
+    assert report.complete == (name.split("/")[0] in GRIDS or name in SMALL)
 
 
 def test_text_forms_are_the_same_as_python_forms():

@@ -182,6 +182,28 @@ def _car(color: np.ndarray, cell: int, glyph: str) -> np.ndarray:
     return np.concatenate((body, cover[..., None]), axis=2)
 
 
+def _lettered(color: np.ndarray, cell: int, glyph: str) -> np.ndarray:
+    """A block with its glyph, a digit or a capital, in the middle."""
+    tile = block(color, cell, glyph)
+    if glyph in FONT:
+        scale = max(1, cell // 8)
+        letter = np.array([[FONT[glyph] >> (14 - 3 * y - x) & 1 for x in range(3)] for y in range(5)], bool)
+        letter = letter.repeat(scale, axis=0).repeat(scale, axis=1)[:cell, :cell]
+        top, left = ((cell - size) // 2 for size in letter.shape)
+        part = tile[top : top + letter.shape[0], left : left + letter.shape[1]]
+        part[letter, :3] = 24.0 if color.mean() > 110 else 240.0
+    return tile
+
+
+# Letters of 3 x 5 pixels, from the top left: an octal digit for each row
+FONT = {
+    **{"0": 0o75557, "1": 0o26227, "2": 0o71747, "3": 0o71717, "4": 0o55711, "5": 0o74717, "6": 0o74757, "7": 0o71122},
+    **{"8": 0o75757, "9": 0o75717, "A": 0o25755, "B": 0o65656, "C": 0o34443, "D": 0o65556, "E": 0o74647, "F": 0o74644},
+    **{"G": 0o34553, "H": 0o55755, "I": 0o72227, "J": 0o11152, "K": 0o55655, "L": 0o44447, "M": 0o57755, "N": 0o57775},
+    **{"O": 0o25552, "P": 0o65644, "Q": 0o25563, "R": 0o65655, "S": 0o34216, "T": 0o72222, "U": 0o55557, "V": 0o55552},
+    **{"W": 0o55775, "X": 0o55255, "Y": 0o55222, "Z": 0o71247},
+}
+
 SHAPES: dict[str, Shape] = {
     "block": block,
     "ball": _disc,
@@ -190,5 +212,6 @@ SHAPES: dict[str, Shape] = {
     "goal": _flag,
     "paddle": _bar,
     "car": _car,
+    "lettered": _lettered,
 }
 """Name of a shape, and of layers that look like it by default -> function (colour, pixels, glyph) -> tile."""

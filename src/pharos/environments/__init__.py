@@ -27,6 +27,7 @@ from pharos.environments.parameters import (
     parameter,
 )
 from pharos.environments.simple_grid import SimpleGrid
+from pharos.environments.sliding_tiles import SlidingTiles
 
 __all__ = [
     "CELL",
@@ -46,6 +47,7 @@ __all__ = [
     "Scenery",
     "Shape",
     "SimpleGrid",
+    "SlidingTiles",
     "Sprite",
     "State",
     "as_tuples",

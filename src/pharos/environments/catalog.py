@@ -22,6 +22,7 @@ BUILT_IN = (  # file:class, in the order in which they are listed
     "frozen_lake:FrozenLake",
     "freeway:Freeway",
     "breakout:Breakout",
+    "sliding_tiles:SlidingTiles",
 )
 
 
