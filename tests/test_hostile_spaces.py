@@ -68,8 +68,8 @@ def test_a_successor_that_is_no_state_is_found(index, row, folder):
 
 def test_indices_are_looked_at_once(folder, monkeypatch):
     calls = []
-    real = reading._check_successors
-    monkeypatch.setattr(reading, "_check_successors", lambda *arguments: calls.append(real(*arguments)))
+    real = reading.check_successors
+    monkeypatch.setattr(reading, "check_successors", lambda *arguments: calls.append(real(*arguments)))
     space = pharos.load(folder)
     assert calls == []
     for _ in range(3):

@@ -17,6 +17,7 @@ import numpy as np
 
 from pharos.errors import DiskFull
 from pharos.rules import pack
+from pharos.state_space.checks import check_rules
 from pharos.state_space.files import GrowingFile, write_manifest
 from pharos.state_space.manifest import (
     FORMAT_VERSION,
@@ -27,7 +28,6 @@ from pharos.state_space.manifest import (
     successors_name,
 )
 from pharos.state_space.plan import Plan
-from pharos.state_space.store import check_rules
 
 WIDENED_ROWS = 1 << 16  # rows of successors that are copied at a time
 

@@ -6,14 +6,8 @@ import math
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from pharos import storage
-from pharos.environments import Environment, State, start_distribution
 from pharos.errors import StateSpaceCorrupted, StateSpaceError, StateSpaceMismatch
-from pharos.rules import Layout, layout_of
-
-Starts = tuple[list[State], np.ndarray]
 
 FORMAT, FORMAT_VERSION = "pharos state space", 1
 IMPORTED_FORMAT = "pharos mdp"
@@ -86,33 +80,6 @@ def check_lengths(folder: Path, manifest: dict[str, Any]) -> None:
                 f"{path}: expected {entry['bytes']} bytes, found {'no such file' if length is None else length}: "
                 f"the file was truncated or replaced; {AGAIN}"
             )
-
-
-def identity_of(env: Environment, layout: Layout | None = None, starts: Starts | None = None) -> dict[str, Any]:
-    """What makes a state space the state space of `env`: kept in the manifest and hashed into the cache's folder names.
-
-    Args:
-        layout, starts: of `env`, where they are known already.
-    """
-    layout = layout_of(env.components) if layout is None else layout
-    starts = start_distribution(env) if starts is None else starts
-    return {
-        "environment": env.name,
-        "class": f"{type(env).__module__}:{type(env).__qualname__}",
-        "rules_version": env.version,
-        "parameters": json.loads(json.dumps(env.parameters)),
-        "actions": list(env.actions),
-        "layout": {
-            "names": list(env.components.names),
-            "low": env.components.low.tolist(),
-            "size": env.components.size.tolist(),
-            "bits": [int(mask).bit_length() for mask in layout.mask],
-            "word": layout.word.tolist(),
-            "shift": layout.shift.tolist(),
-            "num_words": layout.num_words,
-        },
-        "start": [[list(state), float(p)] for state, p in zip(*starts, strict=True)],
-    }
 
 
 # What a manifest says -------------------------------------------------------------------------------------------------

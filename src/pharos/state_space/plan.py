@@ -1,5 +1,6 @@
-"""What a build needs to know of an environment."""
+"""What a state space needs to know of an environment."""
 
+import json
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -8,12 +9,11 @@ import numpy as np
 
 from pharos.environments import Environment, State, start_distribution
 from pharos.rules import Layout, fingerprint_of_rules, layout_of
-from pharos.state_space.manifest import identity_of
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What a build needs to know of an environment, each computed once.
+    """What a state space needs to know of an environment, each computed once.
 
     Attributes:
         env: the environment.
@@ -36,7 +36,24 @@ class Plan:
 
     @cached_property
     def identity(self) -> dict[str, Any]:
-        return identity_of(self.env, self.layout, self.starts)
+        env, layout = self.env, self.layout
+        return {
+            "environment": env.name,
+            "class": f"{type(env).__module__}:{type(env).__qualname__}",
+            "rules_version": env.version,
+            "parameters": json.loads(json.dumps(env.parameters)),
+            "actions": list(env.actions),
+            "layout": {
+                "names": list(env.components.names),
+                "low": env.components.low.tolist(),
+                "size": env.components.size.tolist(),
+                "bits": [int(mask).bit_length() for mask in layout.mask],
+                "word": layout.word.tolist(),
+                "shift": layout.shift.tolist(),
+                "num_words": layout.num_words,
+            },
+            "start": [[list(state), float(p)] for state, p in zip(*self.starts, strict=True)],
+        }
 
     @cached_property
     def fingerprint(self) -> str:
