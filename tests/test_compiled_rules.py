@@ -1,8 +1,10 @@
 """Compiled rules: what Numba compiles, the private cache of machine code, damage, and many actions."""
 
 import hashlib
+import itertools
 import os
 import pickle
+import shutil
 import warnings
 from dataclasses import dataclass
 
@@ -15,6 +17,7 @@ from pharos.hardness import diameter
 from pharos.interaction.gym_env import GymEnv
 from pharos.interaction.vector_env import make_vec
 from pharos.rules import reason_of
+from pharos.rules.compiler import exploration_kernels, interaction_kernels, numeric_attributes
 from pharos.rules.kernel_cache import private_folder
 
 
@@ -58,8 +61,31 @@ def files_of(folder):
     return {path: path.read_bytes() for path in folder.rglob("*.nb[ci]")}
 
 
+def build_and_step(folder):
+    env = corridor_class()()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        space = pharos.build(env, folder)
+        gym = GymEnv(env)
+        gym.reset(seed=0)
+        gym.step(1)
+        space.mdp()
+    return space
+
+
+@pytest.fixture(scope="module")
+def filled(tmp_path_factory):
+    """A cache that a build, a step and an MDP filled."""
+    folder = tmp_path_factory.mktemp("filled")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PHAROS_CACHE_DIR", str(folder / "cache"))
+        build_and_step(folder / "space")
+    return folder / "cache"
+
+
 @pytest.mark.slow
-def test_a_truth_is_a_reward(cache, tmp_path):
+def test_a_truth_is_a_reward(cache, filled, tmp_path):
+    shutil.copytree(filled, cache)
     env = corridor_class()()
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -92,48 +118,60 @@ def test_rules_that_mention_a_private_attribute_run_interpreted(cache, tmp_path)
 # The cache -----------------------------------------------------------------------------------------------------------
 
 
-def build_and_step(folder):
-    env = corridor_class()()
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        space = pharos.build(env, folder)
-        gym = GymEnv(env)
-        gym.reset(seed=0)
-        gym.step(1)
-    return space
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "damage", [lambda data: b"", lambda data: data[: len(data) // 2], lambda data: data[:-1] + b"x"]
-)
-def test_a_damaged_file_is_compiled_again(cache, tmp_path, damage):
-    build_and_step(tmp_path / "first")
+def test_damaged_files_are_compiled_again(cache, filled, tmp_path):
+    shutil.copytree(filled, cache)
     before = files_of(cache)
-    assert before
-    for path, data in before.items():
-        path.write_bytes(damage(data))
+    ways = (lambda data: b"", lambda data: data[: len(data) // 2], lambda data: data[:-1] + b"x")
+    damaged = {path: damage(before[path]) for path, damage in zip(sorted(before), itertools.cycle(ways), strict=False)}
+    assert len(damaged) == len(before) >= len(ways)
+    for path, data in damaged.items():
+        path.write_bytes(data)
     space = build_and_step(tmp_path / "second")
     assert space.num_states == 5
     after = files_of(cache)
     assert set(after) == set(before)
     for path, data in after.items():
-        assert data != damage(before[path]), "it is still the damaged one"
+        assert data != damaged[path], "it is still the damaged one"
     build_and_step(tmp_path / "third")
     assert files_of(cache) == after, "what was mended is read"
 
 
 @pytest.mark.slow
-def test_the_folder_of_compiled_rules_is_private(cache, tmp_path):
-    build_and_step(tmp_path / "space")
-    assert (cache / "compiled").stat().st_mode & 0o777 == 0o700
+def test_the_folder_of_compiled_rules_is_private(filled):
+    assert (filled / "compiled").stat().st_mode & 0o777 == 0o700
+
+
+def test_kernels_do_not_depend_on_rules_that_they_do_not_call():
+    def places(**rules):
+        cls = corridor_class(**rules)
+        names = numeric_attributes(cls())[0]
+        explored, played = exploration_kernels(cls, names, 1, 2), interaction_kernels(cls, names, 2)
+        return {name: kernel._cache.path for each in (explored, played) for name, kernel in each._asdict().items()}
+
+    def reward(self, state, action, next_state):
+        return 2.0 * (next_state[0] == self.length - 1)
+
+    def draw(self, state, planes):
+        planes[0, 0, 0] = self.length
+
+    def changed(**rules):
+        return {name for name, path in places(**rules).items() if path != before[name]}
+
+    before = places()
+    drawings = {"step_and_draw_one", "draw_simple", "draw_complex", "draw_planes"}
+    assert changed() == set()
+    assert changed(reward=reward) == {"rewards_of", "step_one", "step_many", "step_and_draw_one"}
+    assert changed(draw=draw) == drawings
+    assert changed(is_terminal=lambda self, state: state[0] >= self.length - 1) == set(before) - drawings - {
+        "rewards_of"
+    } | {"step_and_draw_one"}
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "getuid"), reason="no users to tell apart")
-def test_a_folder_that_others_can_write_to_is_not_read(cache, tmp_path):
-    build_and_step(tmp_path / "first")
-    os.rename(cache / "compiled", cache / "planted")
+def test_a_folder_that_others_can_write_to_is_not_read(cache, filled, tmp_path):
+    shutil.copytree(filled / "compiled", cache / "planted")
     os.mkdir(cache / "compiled")
     for path in (cache / "planted").iterdir():
         data = pickle.dumps(Planted(str(tmp_path / "it ran")))

@@ -86,10 +86,7 @@ class CompiledRewards(_Compiled):
     def __init__(self, env: Environment, layout: Layout):
         super().__init__(env, layout)
         states = np.empty((1, layout.num_words), np.uint64)
-        successors, terminal = np.empty((1, env.num_actions), np.int32), np.empty(1, np.bool_)
-        for array in (states, successors, terminal):
-            array.flags.writeable = False  # as they come out of a StateSpace
-        self._rewards_of(states, successors, terminal, 0, 0)
+        self._rewards_of(states, np.empty((1, env.num_actions), np.int32), np.empty(1, np.bool_), 0, 0)
 
     def threads(self, workers: int) -> int:
         return workers
@@ -105,8 +102,16 @@ class CompiledRewards(_Compiled):
 
     def _rewards_of(self, states, successors, terminal, start: int, stop: int) -> np.ndarray:
         out = np.empty((stop - start, self.env.num_actions))
+        states, successors, terminal = (_read_only(array) for array in (states, successors, terminal))
         self.kernels.rewards_of(self.parameters, self.layout.tables, states, successors, terminal, start, stop, out)
         return out
+
+
+def _read_only(array: np.ndarray) -> np.ndarray:
+    """A view that is not to be written to, as arrays of a StateSpace are: the kernel is compiled for these alone."""
+    view = array.view()
+    view.flags.writeable = False
+    return view
 
 
 class CompiledStepping:

@@ -81,10 +81,8 @@ def _compiler_of(cls: type[Environment], names: tuple[str, ...], *numbers: int) 
     """What a maker needs: the compiler, the compiled rules by their names, and the class of `self`."""
     rule_compiler = _RuleCompiler()
     rules = {rule: rule_compiler.compiled(getattr(cls, rule)) for rule in RULES}
-    texts = [function_text(getattr(cls, rule), {}) for rule in RULES]
-    key = (_machinery(), texts, names, numbers, numba.__version__)
-    digest = hashlib.sha256(repr(key).encode()).hexdigest()[:20]
-    return Compiler(f"{cls.__name__.lower()}_{digest}"), rules, namedtuple("Parameters", names)
+    texts = {rule: function_text(getattr(cls, rule), {}) for rule in RULES}
+    return Compiler(cls.__name__.lower(), texts, (names, numbers)), rules, namedtuple("Parameters", names)
 
 
 @cache
@@ -97,10 +95,19 @@ class Compiler:
 
     The name goes into the symbols of the machine code: code of several classes of environments, compiled in several
     processes, is loaded into one.
+
+    Args:
+        label: how names begin. texts: of the rules that the functions call. key: what else they depend on.
     """
 
-    def __init__(self, name: str):
-        self.name = name
+    def __init__(self, label: str, texts: dict[str, Any], key: tuple):
+        self.label, self.texts, self.key = label, texts, key
+        everything = (_machinery(), list(texts.values()), *key, numba.__version__)
+        self.name = f"{label}_{hashlib.sha256(repr(everything).encode()).hexdigest()[:20]}"
+
+    def calling(self, *rules: str) -> "Compiler":
+        """The compiler of functions that call these rules alone: when another one is edited, they stay compiled."""
+        return Compiler(self.label, {rule: self.texts[rule] for rule in rules}, self.key)
 
     def inlined(self, function: Callable) -> Any:
         """A function that becomes part of its callers."""

@@ -34,13 +34,14 @@ class Words(NamedTuple):
 
 def exploration(compiler: Any, rules: Any, Parameters: Any, W: int, A: int) -> ExplorationKernels:
     """The kernels of a class of environments whose states take W words and which has A actions."""
-    words = words_functions(compiler, W)
-    expand = expand_function(compiler, rules, Parameters, words, W, A)
-    prefetch_states = prefetch_function(compiler, A)
+    search = compiler.calling("transition", "is_terminal")
+    words = words_functions(search, W)
+    expand = expand_function(search, rules, Parameters, words, W, A)
+    prefetch_states = prefetch_function(search, A)
     return ExplorationKernels(
-        explore=explore_kernel(compiler, expand, prefetch_states, words, W, A),
-        expand_and_find=expand_and_find_kernel(compiler, expand, prefetch_states, words, A),
-        rewards_of=rewards_of_kernel(compiler, rules, Parameters, words, W, A),
+        explore=explore_kernel(search, expand, prefetch_states, words, W, A),
+        expand_and_find=expand_and_find_kernel(search, expand, prefetch_states, words, A),
+        rewards_of=rewards_of_kernel(compiler.calling("reward"), rules, Parameters, words, W, A),
     )
 
 

@@ -26,16 +26,17 @@ class InteractionKernels(NamedTuple):
 
 def interaction(compiler: Any, rules: Any, Parameters: Any, A: int) -> InteractionKernels:
     """The kernels of a class of environments with A actions."""
-    advance = advance_function(compiler, rules)
-    draw_flat = draw_flat_function(compiler, rules)
+    step, drawing = compiler.calling("transition", "is_terminal", "reward"), compiler.calling("draw")
+    advance = advance_function(step, rules)
+    draw_flat = draw_flat_function(drawing, rules)
     return InteractionKernels(
-        step_one=step_one_kernel(compiler, Parameters, advance),
+        step_one=step_one_kernel(step, Parameters, advance),
         step_and_draw_one=step_and_draw_one_kernel(compiler, Parameters, advance, draw_flat),
-        step_many=step_many_kernel(compiler, Parameters, advance, A),
-        is_terminal_one=is_terminal_one_kernel(compiler, rules, Parameters),
-        draw_simple=draw_simple_kernel(compiler, rules, Parameters, draw_flat),
-        draw_complex=draw_complex_kernel(compiler, rules, Parameters),
-        draw_planes=draw_planes_kernel(compiler, rules, Parameters),
+        step_many=step_many_kernel(step, Parameters, advance, A),
+        is_terminal_one=is_terminal_one_kernel(compiler.calling("is_terminal"), rules, Parameters),
+        draw_simple=draw_simple_kernel(drawing, rules, Parameters, draw_flat),
+        draw_complex=draw_complex_kernel(drawing, rules, Parameters),
+        draw_planes=draw_planes_kernel(drawing, rules, Parameters),
     )
 
 
