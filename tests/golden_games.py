@@ -11,7 +11,7 @@ from pharos.drawing import text_drawing
 
 FOLDER = Path(__file__).with_name("golden")
 
-# name of the file -> (environment, parameters, actions by their first letters)
+# name of the file -> (environment, parameters, actions by their first letters, or as a list)
 GAMES = {
     "simple_grid_penalty_then_goal": (
         "simple_grid",
@@ -48,6 +48,12 @@ GAMES = {
     ),
     "sliding_tiles_solved": ("sliding_tiles", {"rows": 2, "columns": 3, "start": "1,0,3,4,2,5"}, "udr"),
     "sliding_tiles_against_the_edge": ("sliding_tiles/3x3", {}, "drulluur"),
+    "pocket_cube_solved": ("pocket_cube", {"scramble": "F' U2 R"}, ["R'", "U2", "F"]),
+    "pocket_cube_commutator": (
+        "pocket_cube",
+        {"metric": "quarter", "scramble": "R U R' U' R U R' U' R U R' U'"},
+        ["R", "U", "R'", "U'"] * 3,
+    ),
 }
 
 

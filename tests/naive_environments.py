@@ -138,3 +138,57 @@ class SlidingTiles:
         if beside in self.tray:
             self.tray[row, column], self.tray[beside] = self.tray[beside], 0
         return -1.0, self.state() == (*range(1, len(self.tray)), 0)
+
+
+class PocketCube:
+    """24 stickers in space, each at the place of its corner, facing out; a turn rotates those of one side.
+
+    x points right, y up, z to the front; the corner left down back is never turned.
+    """
+
+    SIDES = {"U": (0, 1, 0), "R": (1, 0, 0), "F": (0, 0, 1), "D": (0, -1, 0), "L": (-1, 0, 0), "B": (0, 0, -1)}
+    # Of each side: where it begins on the net, and the ways in which its columns and its rows go
+    NET = {
+        "U": ((0, 2), (1, 0, 0), (0, 0, 1)),
+        "L": ((2, 0), (0, 0, 1), (0, -1, 0)),
+        "F": ((2, 2), (1, 0, 0), (0, -1, 0)),
+        "R": ((2, 4), (0, 0, -1), (0, -1, 0)),
+        "B": ((2, 6), (-1, 0, 0), (0, -1, 0)),
+        "D": ((4, 2), (1, 0, 0), (0, 0, -1)),
+    }
+
+    def __init__(self):
+        places = [(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]
+        self.stickers = {
+            (place, out): side for side, out in self.SIDES.items() for place in places if _dot(place, out) > 0
+        }
+
+    def step(self, turn):
+        axis = self.SIDES[turn[0]]
+        for _ in range({"": 1, "2": 2, "'": 3}[turn[1:]]):
+            self.stickers = {
+                (_clockwise(place, axis), _clockwise(out, axis)) if _dot(place, axis) > 0 else (place, out): side
+                for (place, out), side in self.stickers.items()
+            }
+        return -1.0, all(
+            len({side for (_, o), side in self.stickers.items() if o == out}) == 1 for out in self.SIDES.values()
+        )
+
+    def net(self):
+        """The drawing, a letter for each sticker."""
+        rows = [["."] * 8 for _ in range(6)]
+        for (place, out), side in self.stickers.items():
+            (top, left), right, down = next(self.NET[name] for name, normal in self.SIDES.items() if normal == out)
+            rows[top + (_dot(place, down) + 1) // 2][left + (_dot(place, right) + 1) // 2] = side
+        return "\n".join(map("".join, rows))
+
+
+def _dot(a, b):
+    return sum(x * y for x, y in zip(a, b, strict=True))
+
+
+def _clockwise(v, axis):
+    """v turned by a quarter, clockwise for whoever looks against the axis: what is across it becomes v x axis."""
+    along = tuple(_dot(v, axis) * part for part in axis)
+    across = (v[1] * axis[2] - v[2] * axis[1], v[2] * axis[0] - v[0] * axis[2], v[0] * axis[1] - v[1] * axis[0])
+    return tuple(a + b for a, b in zip(along, across, strict=True))

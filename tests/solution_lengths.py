@@ -1,15 +1,23 @@
-"""The least number of moves to the solved position, from the values of a puzzle that pays -1 a move."""
+"""The least number of moves to the solved position of a puzzle whose moves can be taken back."""
 
 import numpy as np
 
-import pharos
 
-
-def solution_lengths(space):
-    """(S,) int64. A discounted value of -1 a move for n moves is -(1 - gamma^n) / (1 - gamma)."""
-    gamma = 0.9
-    v = pharos.value_iteration(space.mdp(gamma=gamma), tolerance=1e-9).v
-    exact = np.log1p((1 - gamma) * v) / np.log(gamma)
-    lengths = np.rint(exact).astype(np.int64)
-    assert abs(exact - lengths).max() < 0.01
+def solution_lengths(space, actions=None):
+    """(S,) int64, by breadth-first search from the solved position over the moves of the table; from itself, which is
+    terminal, over those of the rules. actions: the moves that may be made; all of them."""
+    env = space.environment
+    actions = list(range(env.num_actions) if actions is None else actions)
+    (solved,) = np.flatnonzero(space.terminal)
+    position = space.state(int(solved))
+    lengths = np.full(space.num_states, -1, np.int64)
+    lengths[solved] = 0
+    following = {space.index(env.next_state(position, action)) for action in actions} - {int(solved)}
+    frontier, level = np.array(sorted(following)), 1
+    while frontier.size:
+        lengths[frontier] = level
+        reached = np.zeros(space.num_states, np.bool_)
+        reached[space.successors[frontier][:, actions]] = True
+        frontier, level = np.flatnonzero(reached & (lengths < 0)), level + 1
+    assert lengths.min() == 0
     return lengths

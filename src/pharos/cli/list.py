@@ -54,7 +54,7 @@ def _overview(name: str, cls: type["Environment"]) -> dict[str, Any]:
     return {
         "name": name,
         "description": _first_line(cls),
-        "actions": list(cls.actions),
+        "actions": list(cls.actions if isinstance(cls.actions, tuple) else cls().actions),
         "parameters": {field.name: _default(field) for field in dataclasses.fields(cls)},  # type: ignore[arg-type]
         "instances": {f"{name}/{instance}": dict(parameters) for instance, parameters in cls.instances.items()},
     }

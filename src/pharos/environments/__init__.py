@@ -24,8 +24,10 @@ from pharos.environments.parameters import (
     as_tuples,
     declared_parameters,
     integers,
+    one_of,
     parameter,
 )
+from pharos.environments.pocket_cube import PocketCube
 from pharos.environments.simple_grid import SimpleGrid
 from pharos.environments.sliding_tiles import SlidingTiles
 
@@ -44,6 +46,7 @@ __all__ = [
     "Look",
     "Margin",
     "Parameter",
+    "PocketCube",
     "Scenery",
     "Shape",
     "SimpleGrid",
@@ -60,6 +63,7 @@ __all__ = [
     "make",
     "named_instances",
     "on_registration",
+    "one_of",
     "parameter",
     "register",
     "source_of",

@@ -53,7 +53,7 @@ class Environment:
 
     Class attributes
         name: str                   the name users type, such as "breakout"
-        actions: tuple[str, ...]    names of the A actions; actions are the integers 0 .. A-1
+        actions: tuple[str, ...]    names of the A actions, the integers 0 .. A-1; an attribute or a property
         version: int                raised when a transition or reward changes, never for a refactoring
         max_episode_steps: int      the time limit that the Gymnasium environments use unless told otherwise;
                                     an attribute or a property

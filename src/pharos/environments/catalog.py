@@ -23,6 +23,7 @@ BUILT_IN = (  # file:class, in the order in which they are listed
     "freeway:Freeway",
     "breakout:Breakout",
     "sliding_tiles:SlidingTiles",
+    "pocket_cube:PocketCube",
 )
 
 

@@ -142,6 +142,17 @@ def integers(expected: str, allowed: Callable[[int], bool]) -> Kind:
     return Kind(f"integers, each {expected}", checked)
 
 
+def one_of(*names: str) -> Kind:
+    """Texts, each one of `names`."""
+
+    def checked(env: Any, name: str, value: Any) -> str:
+        if value not in names:
+            raise ParameterError(f"{type(env).__name__}: {name}={value!r}; expected {' or '.join(names)}")
+        return str(value)
+
+    return Kind(" or ".join(names), checked)
+
+
 def _cell(env: Any, name: str, value: Any) -> tuple[int, int]:
     """A cell inside `env.height` x `env.width`, from (row, column) or text such as "3,2"."""
     try:
