@@ -242,6 +242,20 @@ def test_where_every_action_is_repeated_only_first_actions_go_on():
     assert sticky_actions(one_way, 1.0).pairs_within(1).tolist() == [[0, 0], [1, 0], [0, 0], [0, 1]]
 
 
+@pytest.mark.parametrize(
+    ("steps", "pairs"),
+    [
+        (0, [[0, 0], [0, 0], [0, 0], [0, 0]]),
+        (1, [[0, 0], [1, 0], [0, 0], [0, 1]]),
+        (2, [[0, 1], [1, 0], [1, 0], [1, 1]]),
+        (3, [[0, 1], [1, 0], [1, 1], [1, 1]]),
+    ],
+)
+def test_pairs_within_some_steps_end_with_those_of_the_last_step(steps, pairs):
+    one_way = TabularMDP.from_arrays([[1, 3], [2, 0], [2, 2], [3, 3]], np.zeros((4, 2)))
+    assert sticky_actions(one_way, 0.5).pairs_within(steps).tolist() == pairs
+
+
 @often
 @given(probabilities, probabilities, st.integers(0, 2**32))
 def test_weights_draws_and_adjoints_of_chance_agree(sticky, random, seed):

@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from scipy import sparse
 
 import pharos
 from pharos.errors import ParameterError
@@ -74,8 +75,6 @@ def test_an_mdp_made_of_the_arrays_of_another_is_the_same(mdp):
 
 
 def test_matrices_may_be_dense_stacked_or_one_for_each_action():
-    from scipy import sparse
-
     rng = np.random.default_rng(0)
     dense = rng.dirichlet(np.ones(4), (4, 2))
     rewards = rng.normal(size=(4, 2))
@@ -92,6 +91,12 @@ def test_rewards_of_transitions_are_averaged_over_them():
     P = np.array([[[0.25, 0.75]], [[0.0, 1.0]]])
     R = np.array([[[4.0, 8.0]], [[0.0, 2.0]]])
     assert TabularMDP.from_matrices(P, R).rewards.tolist() == [[7.0], [2.0]]
+    assert TabularMDP.from_matrices(P.tolist(), R.tolist()).rewards.tolist() == [[7.0], [2.0]]
+
+
+def test_rewards_of_states_are_those_of_every_action():
+    P = np.array([[[0.25, 0.75], [1.0, 0.0]], [[0.0, 1.0], [0.5, 0.5]]])
+    assert TabularMDP.from_matrices(P, [3.0, 4.0]).rewards.tolist() == [[3.0, 3.0], [4.0, 4.0]]
 
 
 def test_a_row_of_minus_one_without_reward_is_a_terminal_state():
@@ -136,6 +141,12 @@ def test_arrays_that_are_no_mdp_get_a_clear_error(change, message):
         (np.ones((2, 1, 3)), np.zeros((2, 1)), "expected"),
         (np.ones((2, 1, 2)) / 2, np.zeros((3, 1)), "shape"),
         (np.full((2, 1, 2), np.nan), np.zeros((2, 1)), "NaN"),
+        (np.ones((2, 2)) / 2, np.zeros((2, 1)), r"shape \(2, 2\); expected \(states, actions, states\)"),
+        (np.ones((2, 0, 2)), np.zeros((2, 0)), "expected"),
+        (sparse.csr_matrix(np.ones((5, 2)) / 2), np.zeros((2, 2)), r"shape \(5, 2\); expected \(states \* actions"),
+        (sparse.csr_matrix([[1.0, 0], [0, 1], [0, 1], [0.5, 0.6]]), np.zeros((2, 2)), "state 1, action 1 sums to 1.1"),
+        (sparse.csr_matrix([[0, 0], [1 + 2e-9, 0], [0, 1], [0, 1]]), np.zeros((2, 2)), "state 0, action 1 sums to 1"),
+        (sparse.csr_matrix([[1.0, 0], [0, 1]]), np.zeros((2, 1, 2)), "shape"),
     ],
 )
 def test_matrices_that_are_no_mdp_get_a_clear_error(P, R, message):

@@ -250,9 +250,31 @@ def test_a_tolerance_must_be_a_positive_number(tolerance):
         (np.array([[0.5, 0.6], [1, 0]]), "sum to 1"),
         (np.array([[np.nan, 1], [1, 0]]), "sum to 1"),
         (np.ones((2, 3)) / 3, "shape"),
+        (np.array([0, -1]), r"chooses action -1 at \(1,\); expected 0 to 1"),
+        (np.array([[0, 1, 0], [1, 0, 1]]), r"shape \(2, 3\); expected \(2,\) actions$"),
+        (np.full((2, 3, 2), 0.5), r"shape \(2, 3, 2\); expected \(2, 2\) probabilities"),
+        (np.array([[1, 0], [1.5, -0.5]]), "sum to 1"),
+        (np.array([[0.5, 0.5 + 1e-5], [0.3, 0.3]]), r"row \(1,\)"),
+        (np.array([[0.5, 0.5 + 1e-5], [1, 0]]), r"row \(0,\)"),
     ],
 )
 def test_a_policy_that_is_none_gets_a_clear_error(policy, message):
     mdp = TabularMDP.from_arrays([[0, 1], [1, 0]], [[0.0, 1.0], [0.0, 0.0]])
     with pytest.raises(ParameterError, match=message):
         evaluate_policy(mdp, policy)
+
+
+def test_rounding_of_probabilities_is_no_error():
+    mdp = TabularMDP.from_arrays([[0, 1], [1, 0]], [[0.0, 1.0], [0.0, 0.0]])
+    rounded, policy = np.array([[0.5, 0.5 + 1e-8], [1, 0]]), np.array([[0.5, 0.5], [1, 0]])
+    assert np.abs(evaluate_policy(mdp, rounded).v - evaluate_policy(mdp, policy).v).max() < 1e-4
+
+
+def test_under_sticky_actions_a_policy_may_look_at_the_previous_action():
+    mdp = sticky_actions(TabularMDP.from_arrays([[0, 1], [1, 0]], [[0.0, 1.0], [2.0, 0.0]], gamma=0.5), 0.25)
+    actions = np.array([[0, 1, 0], [1, 1, 0]])
+    by_number, by_row = evaluate_policy(mdp, actions), evaluate_policy(mdp, np.eye(2)[actions])
+    assert (by_number.v == by_row.v).all() and by_number.value_at_start == by_row.value_at_start
+    for wrong in (actions[:, :2], np.eye(2)[actions][:, :2], np.eye(2, dtype=int)[actions]):
+        with pytest.raises(ParameterError, match=r"expected .* or \(2, 3"):
+            evaluate_policy(mdp, wrong)
