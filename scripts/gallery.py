@@ -18,12 +18,14 @@ INSTANCES = {
     "frozen_lake": (("frozen_lake/4x4", 2), ("frozen_lake/8x8", 6)),
     "freeway": (("freeway/16x7-speed1", 12), ("freeway/20x11-speed1", 12)),
     "breakout": (("breakout/12x8x1", 60), ("breakout/16x8x3", 60)),
+    "mini_grid": (("mini_grid/key-corridor-s4r3", 7), ("mini_grid/lava-crossing-s9n2", 3)),
 }
 PLAYED = {
     "simple_grid": "simple_grid/6x6-decoy",
     "frozen_lake": "frozen_lake/8x8",
     "freeway": "freeway/16x7-speed1",
     "breakout": "breakout/12x8x3",
+    "mini_grid": "mini_grid/unlock-pickup",
 }
 FRAMES = 90
 NUMBERS = 8  # of a vector

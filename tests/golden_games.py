@@ -54,6 +54,13 @@ GAMES = {
         {"metric": "quarter", "scramble": "R U R' U' R U R' U' R U R' U'"},
         ["R", "U", "R'", "U'"] * 3,
     ),
+    "mini_grid_door_key": ("mini_grid/door-key-5x5", {}, "rfpffrftttfdfpfrff"),
+    "mini_grid_box_opened_and_ball_taken": (
+        "mini_grid",
+        {"level": "##########/##>>BRAB##/##########", "target": "AB"},
+        "pdtfp",
+    ),
+    "mini_grid_lava": ("mini_grid/lava-gap-s5", {"seed": 1}, "rflfrf"),
 }
 
 

@@ -95,7 +95,7 @@ def corridor(tmp_path, monkeypatch):
 
 def test_its_named_instances_are_made_by_name(corridor):
     assert pharos.make("corridor/short") == type(corridor)(length=3)
-    assert [name for name in pharos.list_environments() if "corridor" in name] == [
+    assert [name for name in pharos.list_environments() if name.startswith("corridor")] == [
         "corridor",
         "corridor/short",
         "corridor/long",

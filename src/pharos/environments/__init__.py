@@ -16,6 +16,7 @@ from pharos.environments.catalog import (
 from pharos.environments.freeway import Freeway
 from pharos.environments.frozen_lake import FrozenLake
 from pharos.environments.look import Color, Ground, Layer, Look, Margin, Scenery, Shape, Sprite
+from pharos.environments.mini_grid import MiniGrid
 from pharos.environments.parameters import (
     CELL,
     VALUED_CELLS,
@@ -45,6 +46,7 @@ __all__ = [
     "Layer",
     "Look",
     "Margin",
+    "MiniGrid",
     "Parameter",
     "PocketCube",
     "Scenery",

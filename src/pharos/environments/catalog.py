@@ -24,6 +24,7 @@ BUILT_IN = (  # file:class, in the order in which they are listed
     "breakout:Breakout",
     "sliding_tiles:SlidingTiles",
     "pocket_cube:PocketCube",
+    "mini_grid:MiniGrid",
 )
 
 
