@@ -231,3 +231,48 @@ def test_large_deterministic_mdps_near_gamma_1_are_solved_on_their_functional_gr
     attained = evaluate_policy(mdp, solution.policy)
     sign = 1 if solve is value_iteration else -1  # no policy is better than the best, or worse than the worst
     assert (sign * (attained.v - solution.v)).max() <= solution.error_bound + attained.error_bound
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("neighbours", ["copies apart", "copies mixed at random"])
+def test_large_mdps_with_chance_near_gamma_1_are_solved_by_sparse_systems(neighbours):
+    # copies of each state: whichever copy an action leads to, the values are those of six states
+    rng = np.random.default_rng(0)
+    small = TabularMDP.from_arrays(rng.integers(0, 6, (6, 3)), rng.random((6, 3)), gamma=0.999999)
+    copies = 600
+    own = np.broadcast_to(np.arange(copies)[:, None, None], (copies, 6, 3))
+    other = own if neighbours == "copies apart" else rng.integers(0, copies, own.shape)
+    successors = (other * 6 + small.dynamics.deterministic_table()).reshape(-1, 3)
+    large = TabularMDP.from_arrays(successors, np.tile(small.rewards, (copies, 1)), gamma=0.999999)
+
+    def no_more_than(sweeps, _bound):
+        assert sweeps <= 600
+
+    for chance in (lambda mdp: random_actions(mdp, 0.1), lambda mdp: sticky_actions(mdp, 0.25)):
+        truth = naive_exact.extreme_values(chance(small))
+        solution = value_iteration(chance(large), 0.01, progress=no_more_than)
+        values = solution.v.reshape(copies, 6, -1)
+        bound = Fraction(solution.error_bound)
+        assert bound <= Fraction(0.01)
+        assert naive_exact.largest_error(values.min(axis=0), truth) <= bound
+        assert naive_exact.largest_error(values.max(axis=0), truth) <= bound
+
+
+def test_elimination_is_counted_entry_by_entry():
+    from scipy import sparse
+
+    from pharos.kernels import elimination
+
+    rng = np.random.default_rng(0)
+    for size in (1, 2, 7, 30):
+        pattern = rng.random((size, size)) < 3 / size
+        pattern = pattern | pattern.T | np.eye(size, dtype=bool)
+        matrix = sparse.csr_matrix(pattern)
+        filled = pattern.copy()
+        for pivot in range(size):  # what is eliminated joins all that it was joined to
+            below = pivot + 1 + np.flatnonzero(filled[pivot + 1 :, pivot])
+            filled[np.ix_(below, below)] = True
+        counts = np.tril(filled, -1).sum(axis=0)
+        assert elimination.entries_of_factor(matrix.indptr, matrix.indices, 10**6).tolist() == counts.tolist()
+        if counts.sum() > 5:
+            assert elimination.entries_of_factor(matrix.indptr, matrix.indices, 5).sum() > 5

@@ -6,6 +6,7 @@ The package announces its files; each is loaded where it is used, and loads Numb
 __all__ = [
     "bellman",
     "disk_table",
+    "elimination",
     "gaps",
     "graph",
     "hash_table",

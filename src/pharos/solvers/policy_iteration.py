@@ -9,20 +9,22 @@ import math
 import numpy as np
 
 from pharos.kernels import bellman
-from pharos.mdp import PolicyTable, Selection, TabularMDP
+from pharos.mdp import BellmanEquation, PolicyTable, Selection, TabularMDP
+from pharos.solvers.linear_systems import solution_of_system
 
 # Sweeps before the first attempt, and before that of more than LARGE nodes: most games are solved by then. Later
 # attempts come after twice as many sweeps each.
 FIRST_ATTEMPT, FIRST_ATTEMPT_OF_LARGE, LARGE = 64, 512, 10_000
-# Nodes (states, or pairs with a previous action) of the largest linear system, of the largest dense one, and of the
-# largest functional graph, which takes 48 bytes a state.
-MOST_NODES, DENSE, MOST_OF_CHAIN = 3000, 400, 5_000_000
+# Nodes (states, or pairs with a previous action) of the largest functional graph, which takes 48 bytes a state; nodes
+# times actions of the largest linear system.
+MOST_OF_CHAIN, MOST_ENTRIES = 5_000_000, 2_000_000
 # States whose greedy actions are worked out in one go.
 BLOCK = 1 << 16
-# Improvements of one attempt.
-MOST_IMPROVEMENTS = 60
-# Operations that calling a sweep costs, however few states there are.
-CALL = 5000
+# Improvements of one attempt, and the relative change by a sweep that is no more than rounding.
+MOST_IMPROVEMENTS, SETTLED = 60, 2.0**-47
+# Operations that calling a sweep costs, however few states there are; and those of policy iteration by sparse systems,
+# for each node.
+CALL, SPARSE = 5000, 50_000.0
 
 
 class PolicyIteration:
@@ -30,8 +32,10 @@ class PolicyIteration:
 
     def __init__(self, mdp: TabularMDP, select: Selection):
         self.mdp, self.select = mdp, select
+        self.equation = BellmanEquation(mdp.reward_table, mdp.gamma, mdp.chance, select)
         self.nodes = mdp.num_states * mdp.width
         self._change = math.inf
+        self._has_failed = False
 
     def is_worth_it(self, sweeps: int, change: float, tolerance: float) -> bool:
         """Whether the sweeps that are left cost more than solving some linear systems.
@@ -50,7 +54,9 @@ class PolicyIteration:
         of_sweeps = left * (CALL + 4.0 * self.nodes * self.mdp.num_actions)
         if self.is_chain:
             return self.nodes <= MOST_OF_CHAIN and of_sweeps > 1000.0 * self.nodes
-        return self.nodes <= MOST_NODES and of_sweeps > float(self.nodes) ** 3
+        if self._has_failed or self.nodes * self.mdp.num_actions > MOST_ENTRIES:
+            return False
+        return of_sweeps > self.nodes * min(SPARSE, float(self.nodes) ** 2)
 
     @property
     def is_chain(self) -> bool:
@@ -65,10 +71,13 @@ class PolicyIteration:
             if self.is_chain and policy.actions is not None:
                 values = chain_values(self.mdp.gamma, *chain(self.mdp, policy.actions))[0][:, None]
             else:
-                values = linear_values(self.mdp, policy)
+                values = linear_values(self.mdp, policy, x[:-1])
             if not np.isfinite(values).all():
+                self._has_failed = True
                 return
             x[:-1] = values
+            if self.mdp.dynamics.sweep(self.equation, x) <= SETTLED * np.abs(x).max():
+                return  # all that still changes is the policy, between actions that are equal up to rounding
             before, policy = policy, self._greedy(x)
             if policy is before or np.array_equal(policy.table, before.table):
                 return
@@ -100,10 +109,9 @@ def chain_values(gamma: float, successor: np.ndarray, reward: np.ndarray) -> tup
     return v, int(bellman.chain_values(successor, reward, gamma, v, np.empty(len(successor), np.int64)))
 
 
-def linear_values(mdp: TabularMDP, policy: PolicyTable) -> np.ndarray:
-    """(S, W): the values of a policy, as the solution of (1 - gamma P) x = r."""
+def linear_values(mdp: TabularMDP, policy: PolicyTable, guess: np.ndarray) -> np.ndarray:
+    """(S, W): the values of a policy, as the solution of (1 - gamma P) x = r; NaN where it is not found."""
     from scipy import sparse
-    from scipy.sparse import linalg
 
     states, actions, width = mdp.num_states, mdp.num_actions, mdp.width
     nodes = states * width
@@ -115,6 +123,7 @@ def linear_values(mdp: TabularMDP, policy: PolicyTable) -> np.ndarray:
     weights = sparse.csr_matrix(
         (executed.ravel(), columns.ravel(), np.arange(nodes + 1) * actions), shape=(nodes, states * actions)
     )
+    weights.eliminate_zeros()
     outcomes = mdp.dynamics.matrix().tocoo()
     inside = outcomes.col < states
     row, column = outcomes.row[inside], outcomes.col[inside].astype(np.int64)
@@ -122,8 +131,4 @@ def linear_values(mdp: TabularMDP, policy: PolicyTable) -> np.ndarray:
     moves = sparse.csr_matrix((outcomes.data[inside], (row, following)), shape=(states * actions, nodes))
     system = sparse.identity(nodes, format="csr") - mdp.gamma * (weights @ moves)
     paid = weights @ mdp.rewards.ravel()
-    try:
-        solved = np.linalg.solve(system.toarray(), paid) if nodes <= DENSE else linalg.splu(system.tocsc()).solve(paid)
-    except (np.linalg.LinAlgError, RuntimeError):  # singular to the last bit
-        solved = np.full(nodes, np.nan)
-    return solved.reshape(states, width)
+    return solution_of_system(system, paid, guess.reshape(nodes)).reshape(states, width)

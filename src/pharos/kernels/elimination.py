@@ -1,0 +1,35 @@
+"""What elimination of a sparse matrix will cost, before it is done. Source: Liu (1990), elimination trees."""
+
+import numpy as np
+from numba import njit
+
+
+@njit(cache=True, nogil=True)
+def entries_of_factor(first, columns, limit):
+    """(N,) entries below the diagonal in each column of the factor of a matrix whose pattern is symmetric.
+
+    Row i of the matrix has its entries in columns[first[i] : first[i + 1]]; pivots are taken in order. In place of the
+    counts of all rows those so far are returned as soon as their sum passes the limit.
+
+    Cost: O(entries of the factor) time, 24 bytes a row.
+    """
+    size = len(first) - 1
+    entries = np.zeros(size, np.int64)
+    parent = np.full(size, -1)
+    seen = np.full(size, -1)
+    total = 0
+    for row in range(size):
+        seen[row] = row
+        for place in range(first[row], first[row + 1]):
+            column = columns[place]
+            # row `row` of the factor: the ways up the tree from the entries left of the diagonal
+            while column < row and seen[column] != row:
+                if parent[column] < 0:
+                    parent[column] = row
+                entries[column] += 1
+                total += 1
+                seen[column] = row
+                column = parent[column]
+        if total > limit:
+            break
+    return entries
