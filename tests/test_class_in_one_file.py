@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 import pharos
+from pharos import environments
 from pharos.agents import hyperparameters
 from pharos.drawing import human, scenery_of, text_drawing
-from pharos.environments import catalog
+from pharos.environments import BuiltIn, catalog
 from pharos.errors import ParameterError, UnknownName
 from pharos.observations import render
 
@@ -167,13 +168,19 @@ def test_a_ground_or_shape_that_nobody_paints_is_named(corridor):
         human(type("Lost", (cls,), {"layers": layers})(), (0,))
 
 
+def test_the_list_says_what_the_classes_say():
+    for entry in environments.BUILT_IN:
+        cls = getattr(environments, entry.class_name)
+        version = max(0, cls.version - cls.first_version)
+        assert entry == BuiltIn(cls.name, cls.__name__, " ".join(cls.instances), version)
+
+
 def test_every_class_of_the_list_has_ids_a_colour_and_instances_that_can_be_made():
-    assert [place.partition(":")[2] for place in catalog.BUILT_IN] == [
-        cls.__name__ for cls in catalog._BUILT_IN.values()
-    ]
-    colors = [cls.look.color for cls in catalog._BUILT_IN.values()]
+    built_in = [getattr(environments, entry.class_name) for entry in environments.BUILT_IN]
+    assert [entry.class_name for entry in environments.BUILT_IN] == [cls.__name__ for cls in built_in]
+    colors = [cls.look.color for cls in built_in]
     assert len(set(colors)) == len(colors)
-    for cls in catalog._BUILT_IN.values():
+    for cls in built_in:
         assert set(cls.paper_instances) <= set(cls.instances)
         for gymnasium_id, name in registration.ids_of(cls).items():
             assert gymnasium.spec(gymnasium_id).kwargs == {"environment": name}

@@ -17,7 +17,6 @@ from types import ModuleType
 from typing import Any
 
 from pharos.errors import FileFormatError, ParameterError, UntrustedCode
-from pharos.storage import digest_of_file
 
 # Modules loaded from files, by their path: (digest of the file, module).
 _MODULES: dict[str, tuple[str, ModuleType]] = {}
@@ -101,11 +100,11 @@ def find(name: str, folder: str | Path | None = None) -> Source:
         path = base / Path(where).expanduser()
         if not path.is_file():
             raise ParameterError(f"{name!r}: there is no file {path}; {_EXPECTED}")
-        return Source(f"{path.name}:{attribute}", str(path.resolve()), digest_of_file(path))
+        return Source(f"{path.name}:{attribute}", str(path.resolve()), _checksum(path))
     inside = base.joinpath(*where.split("."))
     for candidate in (inside.with_suffix(".py"), inside / "__init__.py"):
         if where and candidate.is_file():
-            return Source(name, str(candidate.resolve()), digest_of_file(candidate))
+            return Source(name, str(candidate.resolve()), _checksum(candidate))
     try:
         spec = importlib.util.find_spec(where)
     except Exception as error:  # of the module's parents
@@ -236,6 +235,8 @@ def _module_called(source: Source) -> ModuleType:
 
 def _checksum(file: str | Path) -> str:
     """The digest of a file; empty where there is none."""
+    from pharos.storage import digest_of_file  # which built-in classes do without
+
     return digest_of_file(file) if file and Path(file).is_file() else ""
 
 

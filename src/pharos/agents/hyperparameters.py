@@ -9,7 +9,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from pharos.environments import classes
+from pharos.environments import class_called
 from pharos.errors import MissingExtra, ParameterError
 
 TABLE = Path(__file__).with_name("hyperparameters.yaml")
@@ -28,7 +28,7 @@ def hyperparameters(
         ParameterError: the table has another form. MissingExtra: PyYAML is not installed.
     """
     entries = _read(table or TABLE).get(agent, {})
-    declaring = None if table else classes().get(environment)
+    declaring = None if table else class_called(environment)
     by_observation = declaring.hyperparameters.get(agent, {}) if declaring else entries.get(environment, {})
     result: dict[str, Any] = {}
     for part in (entries.get("default"), by_observation.get("default"), by_observation.get(observation), given):

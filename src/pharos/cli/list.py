@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from pharos.cli.common import Json, console, print_json
-from pharos.environments import classes, declared_parameters, imported, named_instances
+from pharos.environments import class_called, classes, declared_parameters, imported, named_instances
 from pharos.errors import UnknownName
 
 if TYPE_CHECKING:
@@ -41,8 +41,9 @@ def list_(
 
 def _class_called(name: str) -> type["Environment"]:
     """The class of a name, of a named instance, or of module:Class."""
-    if name in classes():
-        return classes()[name]
+    cls = class_called(name)
+    if cls is not None:
+        return cls
     if name in named_instances():
         return classes()[named_instances()[name][0]]
     if ":" in name:

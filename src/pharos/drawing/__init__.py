@@ -1,11 +1,45 @@
-"""Pixels and text from the layers and the look that an environment declares; knows no class."""
+"""Pixels and text from the layers and the look that an environment declares; knows no class.
 
-from pharos.drawing.pictures import INK, NIGHT, episode, human, image, save_gif, save_png
-from pharos.drawing.planes import check_state, planes_of
-from pharos.drawing.scenery import GROUNDS, ground_of, inside, scenery_of
-from pharos.drawing.shapes import SHAPES, color_of, glyph_of, shade, shape_of, sprite_of, sprite_pixels, tile
-from pharos.drawing.text import colored_text, text_drawing
-from pharos.drawing.window import Window
+A file is loaded when something in it is first used.
+"""
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from pharos.drawing.pictures import INK, NIGHT, episode, human, image, save_gif, save_png
+    from pharos.drawing.planes import check_state, planes_of
+    from pharos.drawing.scenery import GROUNDS, ground_of, inside, scenery_of
+    from pharos.drawing.shapes import SHAPES, color_of, glyph_of, shade, shape_of, sprite_of, sprite_pixels, tile
+    from pharos.drawing.text import colored_text, text_drawing
+    from pharos.drawing.window import Window
+
+_FILES = {
+    "GROUNDS": "scenery",
+    "INK": "pictures",
+    "NIGHT": "pictures",
+    "SHAPES": "shapes",
+    "Window": "window",
+    "check_state": "planes",
+    "color_of": "shapes",
+    "colored_text": "text",
+    "episode": "pictures",
+    "glyph_of": "shapes",
+    "ground_of": "scenery",
+    "human": "pictures",
+    "image": "pictures",
+    "inside": "scenery",
+    "planes_of": "planes",
+    "save_gif": "pictures",
+    "save_png": "pictures",
+    "scenery_of": "scenery",
+    "shade": "shapes",
+    "shape_of": "shapes",
+    "sprite_of": "shapes",
+    "sprite_pixels": "shapes",
+    "text_drawing": "text",
+    "tile": "shapes",
+}
 
 __all__ = [
     "GROUNDS",
@@ -33,3 +67,11 @@ __all__ = [
     "text_drawing",
     "tile",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _FILES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(importlib.import_module(f"{__name__}.{_FILES[name]}"), name)
+    globals()[name] = value
+    return value

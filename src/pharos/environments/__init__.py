@@ -1,41 +1,86 @@
-"""Environments: the contract of a class (`Environment`, `Layer`), the built-in classes, the catalogue of names."""
+"""Environments: the contract of a class (`Environment`, `Layer`), the built-in classes, the catalogue of names.
 
-from pharos.environments.base import Components, Environment, State, start_distribution
-from pharos.environments.breakout import Breakout
-from pharos.environments.catalog import (
-    class_of,
-    classes,
-    imported,
-    list_environments,
-    make,
-    named_instances,
-    on_registration,
-    register,
-    source_of,
-)
-from pharos.environments.freeway import Freeway
-from pharos.environments.frozen_lake import FrozenLake
-from pharos.environments.look import Color, Ground, Layer, Look, Margin, Scenery, Shape, Sprite
-from pharos.environments.mini_grid import MiniGrid
-from pharos.environments.parameters import (
-    CELL,
-    VALUED_CELLS,
-    Kind,
-    Parameter,
-    as_tuples,
-    declared_parameters,
-    integers,
-    one_of,
-    parameter,
-)
-from pharos.environments.pocket_cube import PocketCube
-from pharos.environments.simple_grid import SimpleGrid
-from pharos.environments.sliding_tiles import SlidingTiles
+`import pharos` needs the names of the built-in classes alone; a file is loaded when something in it is first used.
+"""
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+from pharos.environments.built_in import BUILT_IN, BuiltIn, on_registration
+
+if TYPE_CHECKING:
+    from pharos.environments.base import Components, Environment, State, start_distribution
+    from pharos.environments.breakout import Breakout
+    from pharos.environments.catalog import (
+        class_called,
+        class_of,
+        classes,
+        imported,
+        list_environments,
+        make,
+        named_instances,
+        register,
+        source_of,
+    )
+    from pharos.environments.freeway import Freeway
+    from pharos.environments.frozen_lake import FrozenLake
+    from pharos.environments.look import Color, Ground, Layer, Look, Margin, Scenery, Shape, Sprite
+    from pharos.environments.mini_grid import MiniGrid
+    from pharos.environments.parameters import (
+        CELL,
+        VALUED_CELLS,
+        Kind,
+        Parameter,
+        as_tuples,
+        declared_parameters,
+        integers,
+        one_of,
+        parameter,
+    )
+    from pharos.environments.pocket_cube import PocketCube
+    from pharos.environments.simple_grid import SimpleGrid
+    from pharos.environments.sliding_tiles import SlidingTiles
+
+_FILES = {
+    **{entry.class_name: entry.name for entry in BUILT_IN},
+    "CELL": "parameters",
+    "VALUED_CELLS": "parameters",
+    "Color": "look",
+    "Components": "base",
+    "Environment": "base",
+    "Ground": "look",
+    "Kind": "parameters",
+    "Layer": "look",
+    "Look": "look",
+    "Margin": "look",
+    "Parameter": "parameters",
+    "Scenery": "look",
+    "Shape": "look",
+    "Sprite": "look",
+    "State": "base",
+    "as_tuples": "parameters",
+    "class_called": "catalog",
+    "class_of": "catalog",
+    "classes": "catalog",
+    "declared_parameters": "parameters",
+    "imported": "catalog",
+    "integers": "parameters",
+    "list_environments": "catalog",
+    "make": "catalog",
+    "named_instances": "catalog",
+    "one_of": "parameters",
+    "parameter": "parameters",
+    "register": "catalog",
+    "source_of": "catalog",
+    "start_distribution": "base",
+}
 
 __all__ = [
+    "BUILT_IN",
     "CELL",
     "VALUED_CELLS",
     "Breakout",
+    "BuiltIn",
     "Color",
     "Components",
     "Environment",
@@ -56,6 +101,7 @@ __all__ = [
     "Sprite",
     "State",
     "as_tuples",
+    "class_called",
     "class_of",
     "classes",
     "declared_parameters",
@@ -71,3 +117,11 @@ __all__ = [
     "source_of",
     "start_distribution",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _FILES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(importlib.import_module(f"{__name__}.{_FILES[name]}"), name)
+    globals()[name] = value
+    return value

@@ -1,41 +1,25 @@
 """The catalogue of environments that `pharos.make` knows: classes by name, and their named instances.
 
-BUILT_IN is the only list of environments: everything else about a class stands in its own file. A user's own class
+The built-in classes are listed in built_in.py, and a class is loaded when it is first asked for. A user's own class
 joins the catalogue with `register`.
 """
 
 import dataclasses
 import importlib
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from pharos import sources
 from pharos.environments.base import Environment
+from pharos.environments.built_in import BUILT_IN, announce
 from pharos.environments.parameters import as_tuples
 from pharos.errors import ParameterError, UnknownName
 from pharos.sources import Source
 
-BUILT_IN = (  # file:class, in the order in which they are listed
-    "simple_grid:SimpleGrid",
-    "frozen_lake:FrozenLake",
-    "freeway:Freeway",
-    "breakout:Breakout",
-    "sliding_tiles:SlidingTiles",
-    "pocket_cube:PocketCube",
-    "mini_grid:MiniGrid",
-)
-
-
-def _built_in(place: str) -> type[Environment]:
-    file, _, class_name = place.partition(":")
-    return getattr(importlib.import_module(f"pharos.environments.{file}"), class_name)
-
-
-_BUILT_IN: dict[str, type[Environment]] = {cls.name: cls for cls in map(_built_in, BUILT_IN)}
+_CLASS_NAMES = {entry.name: entry.class_name for entry in BUILT_IN}
 _REGISTERED: dict[str, type[Environment]] = {}
-_LISTENERS: list[Callable[[type[Environment]], None]] = []
 
 
 def make(name: str, **parameters: Any) -> Environment:
@@ -49,19 +33,15 @@ def make(name: str, **parameters: Any) -> Environment:
         UnknownName: no such environment or parameter; the nearest name is suggested.
         ParameterError: a parameter is out of range, or there is no such module or class.
     """
-
-    defaults: Mapping[str, Any] = {}
-    class_name = name
-    if name in named_instances():
-        class_name, defaults = named_instances()[name]
-    if sources.is_reference(class_name):
-        cls = imported(class_name)
+    class_name, slash, instance = name.partition("/")
+    cls = class_called(class_name)
+    if cls is None or (slash and instance not in cls.instances):
+        if not sources.is_reference(name):
+            shown = f"known: {', '.join(sorted(classes()))}; `pharos list` shows their parameters and named instances"
+            raise UnknownName("environment", name, list_environments(), shown)
+        cls, slash = imported(name), ""
         class_name = cls.name
-    elif class_name in classes():
-        cls = classes()[class_name]
-    else:
-        shown = f"known: {', '.join(sorted(classes()))}; `pharos list` shows their parameters and named instances"
-        raise UnknownName("environment", name, list_environments(), shown)
+    defaults: Mapping[str, Any] = cls.instances[instance] if slash else {}
     names = {field.name for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
     for parameter in parameters:
         if parameter in cls.foreign_parameters:
@@ -75,13 +55,21 @@ def make(name: str, **parameters: Any) -> Environment:
 
 def list_environments() -> list[str]:
     """The names that `make` knows: every class, then every named instance."""
-
     return [*classes(), *named_instances()]
 
 
+def class_called(name: str) -> type[Environment] | None:
+    """The class with this name; None where there is none."""
+    return _built_in(name) if name in _CLASS_NAMES else _REGISTERED.get(name)
+
+
 def classes() -> dict[str, type[Environment]]:
-    """Name -> class of every environment, the registered ones last."""
-    return {**_BUILT_IN, **_REGISTERED}
+    """Name -> class of every environment, the registered ones last. Loads all of them."""
+    return {**{name: _built_in(name) for name in _CLASS_NAMES}, **_REGISTERED}
+
+
+def _built_in(name: str) -> type[Environment]:
+    return getattr(importlib.import_module(f"pharos.environments.{name}"), _CLASS_NAMES[name])
 
 
 def named_instances() -> dict[str, tuple[str, Mapping[str, Any]]]:
@@ -118,7 +106,7 @@ def class_of(source: Source, *, trust: bool = False, strict: bool = False) -> ty
 
 def source_of(cls: type[Environment]) -> Source | None:
     """Where a user's class comes from; None for built-in classes, and for those that no other process can import."""
-    return None if cls in _BUILT_IN.values() else sources.source_of(cls)
+    return None if _is_built_in(cls) else sources.source_of(cls)
 
 
 def _known_class(source: Source, cls: Any) -> type[Environment]:
@@ -132,7 +120,7 @@ def _known_class(source: Source, cls: Any) -> type[Environment]:
             f"{source.name!r}: found {cls!r}; "
             f"expected 'module:Class' or 'file.py:Class' of a subclass of pharos.Environment"
         )
-    return cls if cls in _BUILT_IN.values() else register(cls)
+    return cls if _is_built_in(cls) else register(cls)
 
 
 def register(cls: type[Environment]) -> type[Environment]:
@@ -148,16 +136,12 @@ def register(cls: type[Environment]) -> type[Environment]:
     name = getattr(cls, "name", None)
     if not isinstance(name, str) or not name or "/" in name or ":" in name:
         raise ParameterError(f"register: {cls.__name__}.name is {name!r}; expected a text without '/' and ':'")
-    if name in _BUILT_IN:
+    if name in _CLASS_NAMES:
         raise ParameterError(f"register: {name!r} is the name of a built-in class; choose another name")
     _REGISTERED[name] = cls
-    for hear in _LISTENERS:
-        hear(cls)
+    announce(cls)
     return cls
 
 
-def on_registration(hear: Callable[[type[Environment]], None]) -> None:
-    """Call `hear` with every class that is known, and with every one that is registered from now on."""
-    for cls in classes().values():
-        hear(cls)
-    _LISTENERS.append(hear)
+def _is_built_in(cls: Any) -> bool:
+    return getattr(cls, "name", None) in _CLASS_NAMES and cls is class_called(cls.name)

@@ -6,19 +6,21 @@ needs to be built.
 """
 
 import operator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
 
-from pharos.drawing import Window, human, text_drawing
 from pharos.environments import Environment
 from pharos.errors import ParameterError
-from pharos.interaction.simulator import Simulator, spec_with_limit, split_options
+from pharos.interaction.simulator import SimulatedEnv, Simulator, split_options
 from pharos.observations import NO_ACTION, Index, SimpleImage
 
+if TYPE_CHECKING:
+    from pharos.drawing import Window
 
-class GymEnv(gymnasium.Env):
+
+class GymEnv(SimulatedEnv, gymnasium.Env):
     """An environment of pharos as a Gymnasium environment.
 
     Actions are 0 .. A-1, named by `action_names`. `info` has "state" (D,) int64, "executed_action" (-1 after reset),
@@ -45,13 +47,10 @@ class GymEnv(gymnasium.Env):
                 f"render_mode is {render_mode!r}; expected None or one of {', '.join(self.metadata['render_modes'])}"
             )
         self.render_mode = render_mode
-        self._window: Window | None = None
-        if render_mode == "human":
-            self._window = Window(str(simulator.env), self.metadata["render_fps"])
+        self._window = _window(simulator, self.metadata["render_fps"]) if render_mode == "human" else None
         self.observation_space = simulator.context.space
         self.action_space = gymnasium.spaces.Discrete(simulator.env.num_actions)
         self.action_names = simulator.env.actions
-        self._spec: Any = None
         self._state: np.ndarray | None = None
         self._index = -1
         self._previous = NO_ACTION
@@ -83,24 +82,6 @@ class GymEnv(gymnasium.Env):
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
         self._step_one, self._step_and_draw = self.simulator.rules.step_one, _step_and_draw(self.simulator)
-
-    @property
-    def environment(self) -> Environment:
-        """The environment without chance, time limit and observation."""
-        return self.simulator.env
-
-    @property
-    def spec(self) -> Any:  # type: ignore[override]
-        """Gymnasium's specification, with the limit of this instance; None unless it was made by an id."""
-        return self._spec
-
-    @spec.setter
-    def spec(self, spec: Any) -> None:
-        self._spec = spec_with_limit(spec, self.simulator.limit)
-
-    def get_action_meanings(self) -> list[str]:
-        """The names of the actions, as the Arcade Learning Environment gives them."""
-        return list(self.action_names)
 
     @property
     def state(self) -> tuple[int, ...]:
@@ -174,6 +155,8 @@ class GymEnv(gymnasium.Env):
         """The current state in the render mode: text, a picture, or None where there is a window."""
         if self.render_mode is None:
             return None
+        from pharos.drawing import human, text_drawing  # which an environment without pictures does not load
+
         if self.render_mode == "ansi":
             return text_drawing(self.environment, self.state)
         picture = human(self.environment, self.state)
@@ -202,6 +185,12 @@ class GymEnv(gymnasium.Env):
         if self._is_index:
             return np.int64(self._index)
         return self.simulator.context.one(self._started(), self._previous, self._elapsed)
+
+
+def _window(simulator: Simulator, fps: int) -> "Window":
+    from pharos.drawing import Window
+
+    return Window(str(simulator.env), fps)
 
 
 def _step_and_draw(simulator: Simulator) -> Any:

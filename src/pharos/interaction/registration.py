@@ -8,20 +8,28 @@ instance, and `gymnasium.make("pharos/Environment-v0", environment="breakout/12x
 The version of an id rises with the rules: it is `version - first_version` of the class.
 """
 
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
 from gymnasium.envs import registration
 
-from pharos.environments import Environment, on_registration
+from pharos.environments import BUILT_IN, on_registration
+
+if TYPE_CHECKING:
+    from pharos.environments import Environment
 
 
-def ids_of(cls: type[Environment]) -> dict[str, str]:
+def ids_of(cls: type["Environment"]) -> dict[str, str]:
     """Gymnasium id -> name that `pharos.make` knows, of a class and its named instances."""
-    version = f"v{max(0, cls.version - cls.first_version)}"
-    name = cls.__name__
-    instances = {f"pharos/{name}-{instance}-{version}": f"{cls.name}/{instance}" for instance in cls.instances}
-    return {f"pharos/{name}-{version}": cls.name, **instances}
+    return _ids(cls.name, cls.__name__, cls.instances, max(0, cls.version - cls.first_version))
 
 
-def register_class(cls: type[Environment]) -> None:
+def _ids(name: str, class_name: str, instances: Iterable[str], version: int) -> dict[str, str]:
+    named = {f"pharos/{class_name}-{instance}-v{version}": f"{name}/{instance}" for instance in instances}
+    return {f"pharos/{class_name}-v{version}": name, **named}
+
+
+def register_class(cls: type["Environment"]) -> None:
     """Register a class and its named instances. An id stays with the class that had it first."""
     for gymnasium_id, name in ids_of(cls).items():
         owner = registration.registry.get(gymnasium_id)
@@ -42,4 +50,7 @@ def _register(gymnasium_id: str, **arguments: str) -> None:
 
 
 _register("pharos/Environment-v0")
+for _entry in BUILT_IN:
+    for _id, _name in _ids(_entry.name, _entry.class_name, _entry.instance_names, _entry.version).items():
+        _register(_id, environment=_name)
 on_registration(register_class)

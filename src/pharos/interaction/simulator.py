@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
@@ -11,10 +11,12 @@ from pharos.environments import Environment, make, start_distribution
 from pharos.errors import ParameterError, RuleError, StateSpaceTooLarge
 from pharos.kernels import stepping
 from pharos.kernels.stepping import Setting
-from pharos.mdp import Chance, TabularMDP
+from pharos.mdp import Chance
 from pharos.observations import NO_ACTION, ObservationInContext, observe
 from pharos.rules import rules_of
-from pharos.state_space import StateSpace, build, load
+
+if TYPE_CHECKING:
+    from pharos.state_space import StateSpace
 
 # States that are built on the way where the observation "index" is asked for without `space`.
 LARGEST_INDEX = 20_000_000
@@ -131,6 +133,37 @@ class Simulator:
         )
 
 
+class SimulatedEnv:
+    """What single and vector environments say of their `simulator` in the same words."""
+
+    simulator: Simulator
+    action_names: tuple[str, ...]
+    _spec: Any = None
+
+    @property
+    def environment(self) -> Environment:
+        """The environment without chance, time limit and observation."""
+        return self.simulator.env
+
+    def get_action_meanings(self) -> list[str]:
+        """The names of the actions, as the Arcade Learning Environment gives them."""
+        return list(self.action_names)
+
+    @property
+    def spec(self) -> Any:
+        """Gymnasium's specification, with the limit of this instance; None unless it was made by an id.
+
+        The registry says that there is no limit, because it depends on the arguments of `gymnasium.make`: with a number
+        there, Gymnasium would wrap the environment in a second TimeLimit that knows nothing of `height=20` or
+        `time_limit=None`.
+        """
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: gymnasium.envs.registration.EnvSpec | None) -> None:
+        self._spec = None if spec is None else replace(spec, max_episode_steps=self.simulator.limit)
+
+
 def split_options(options: Mapping[str, Any]) -> tuple[Interaction, dict[str, Any]]:
     """The options of interaction, and the rest: parameters of the environment."""
     fields = Interaction.__dataclass_fields__
@@ -148,6 +181,8 @@ def _environment(environment: Environment | str, parameters: Mapping[str, Any]) 
             )
         env = environment
     else:
+        from pharos.mdp import TabularMDP  # which loads its kernels
+
         table = ", and a table of an MDP has no environment to step" if isinstance(environment, TabularMDP) else ""
         raise ParameterError(f"environment is {environment!r}; expected a name or a pharos Environment{table}")
     clashes = sorted(set(env.parameters) & set(Interaction.__dataclass_fields__))
@@ -158,17 +193,21 @@ def _environment(environment: Environment | str, parameters: Mapping[str, Any]) 
     return env
 
 
-def _state_space(options: Interaction, env: Environment) -> StateSpace | None:
+def _state_space(options: Interaction, env: Environment) -> "StateSpace | None":
     if options.space is None:
         return _indexed(env) if options.observation == "index" else None
+    from pharos.state_space import StateSpace, load  # which most environments do without
+
     space = options.space if isinstance(options.space, StateSpace) else load(options.space)
     if space.environment != env:
         raise ParameterError(f"space holds the states of {space.environment}; expected those of {env}")
     return space
 
 
-def _indexed(env: Environment) -> StateSpace:
+def _indexed(env: Environment) -> "StateSpace":
     """The state space of `env`, from the user's cache or built, for the observation "index"."""
+    from pharos.state_space import build
+
     try:
         return build(env, max_states=LARGEST_INDEX)
     except StateSpaceTooLarge as error:
@@ -176,15 +215,6 @@ def _indexed(env: Environment) -> StateSpace:
             f"{env}: observation 'index' without space= builds at most {LARGEST_INDEX:,} states; "
             f"build it yourself and give space=pharos.build(env), or its folder"
         ) from error
-
-
-def spec_with_limit(spec: gymnasium.envs.registration.EnvSpec | None, limit: int | None) -> Any:
-    """The specification of an environment that truncates its episodes itself, with its true limit.
-
-    The registry says None, because the limit depends on the arguments of `gymnasium.make`: with a number there,
-    Gymnasium would wrap the environment in a second TimeLimit that knows nothing of `height=20` or `time_limit=None`.
-    """
-    return None if spec is None else replace(spec, max_episode_steps=limit)
 
 
 def _chance(options: Interaction) -> Chance:

@@ -13,10 +13,9 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from pharos.drawing import human
 from pharos.environments import Environment
 from pharos.errors import ParameterError
-from pharos.interaction.simulator import Simulator, spec_with_limit, split_options
+from pharos.interaction.simulator import SimulatedEnv, Simulator, split_options
 from pharos.interaction.walks import RulesWalk, TableWalk
 from pharos.kernels.stepping import DISABLED, SAME_STEP, Batch, first_outside
 from pharos.observations import NO_ACTION
@@ -24,7 +23,7 @@ from pharos.observations import NO_ACTION
 _MODES = (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP, AutoresetMode.DISABLED)
 
 
-class VectorEnv(gymnasium.vector.VectorEnv):
+class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
     """`num_envs` copies of one environment as a Gymnasium vector environment.
 
     With `space` the built state space is walked as a table, and the rules are not run: `info` has "index" (N,) in place
@@ -74,7 +73,6 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.action_names = simulator.env.actions
-        self._spec: Any = None
         self._seed = seed
         self._rng: np.ndarray | None = None
         n = self.num_envs
@@ -83,24 +81,6 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         self._ended = np.zeros(n, np.bool_)
         walk = RulesWalk if simulator.state_space is None else TableWalk
         self._walk: Any = walk(simulator, n, self._mode)
-
-    @property
-    def environment(self) -> Environment:
-        """The environment without chance, time limit and observation."""
-        return self.simulator.env
-
-    @property
-    def spec(self) -> Any:  # type: ignore[override]
-        """Gymnasium's specification, with the limit of this instance; None unless it was made by an id."""
-        return self._spec
-
-    @spec.setter
-    def spec(self, spec: Any) -> None:
-        self._spec = spec_with_limit(spec, self.simulator.limit)
-
-    def get_action_meanings(self) -> list[str]:
-        """The names of the actions, as the Arcade Learning Environment gives them."""
-        return list(self.action_names)
 
     @property
     def states(self) -> np.ndarray:
@@ -113,6 +93,8 @@ class VectorEnv(gymnasium.vector.VectorEnv):
             return None
         if self._rng is None:
             raise gymnasium.error.ResetNeeded(f"{self.environment}: call reset() before render()")
+        from pharos.drawing import human
+
         return tuple(human(self.environment, state.tolist()) for state in self.states)
 
     def reset(

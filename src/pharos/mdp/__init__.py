@@ -1,16 +1,48 @@
-"""Tabular MDPs: dynamics, rewards, the chance that can be added, what is chosen, and states merged."""
+"""Tabular MDPs: dynamics, rewards, the chance that can be added, what is chosen, and states merged.
 
-from pharos.mdp.arguments import takes_mdp
-from pharos.mdp.bisimulation import Minimization, minimize
-from pharos.mdp.chance import Chance, random_actions, sticky_actions
-from pharos.mdp.dynamics import BellmanEquation, Dynamics, Outcomes, Play
-from pharos.mdp.matrices import Matrices
-from pharos.mdp.outcome_table import OutcomeTable
-from pharos.mdp.rewards import Rewards
-from pharos.mdp.rewards_of_space import rewards_of_space
-from pharos.mdp.selection import BEST, WORST, Extreme, PolicyTable, Selection, chosen_mass
-from pharos.mdp.table import Table
-from pharos.mdp.tabular import TabularMDP
+A file is loaded when something in it is first used: to step an environment needs `Chance` and no table.
+"""
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from pharos.mdp.arguments import takes_mdp
+    from pharos.mdp.bisimulation import Minimization, minimize
+    from pharos.mdp.chance import Chance, random_actions, sticky_actions
+    from pharos.mdp.dynamics import BellmanEquation, Dynamics, Outcomes, Play
+    from pharos.mdp.matrices import Matrices
+    from pharos.mdp.outcome_table import OutcomeTable
+    from pharos.mdp.rewards import Rewards
+    from pharos.mdp.selection import BEST, WORST, Extreme, PolicyTable, Selection, chosen_mass
+    from pharos.mdp.space_rewards import rewards_of_space
+    from pharos.mdp.table import Table
+    from pharos.mdp.tabular import TabularMDP
+
+_FILES = {
+    "BEST": "selection",
+    "WORST": "selection",
+    "BellmanEquation": "dynamics",
+    "Chance": "chance",
+    "Dynamics": "dynamics",
+    "Extreme": "selection",
+    "Matrices": "matrices",
+    "Minimization": "bisimulation",
+    "OutcomeTable": "outcome_table",
+    "Outcomes": "dynamics",
+    "Play": "dynamics",
+    "PolicyTable": "selection",
+    "Rewards": "rewards",
+    "Selection": "selection",
+    "Table": "table",
+    "TabularMDP": "tabular",
+    "chosen_mass": "selection",
+    "minimize": "bisimulation",
+    "random_actions": "chance",
+    "rewards_of_space": "space_rewards",
+    "sticky_actions": "chance",
+    "takes_mdp": "arguments",
+}
 
 __all__ = [
     "BEST",
@@ -36,3 +68,11 @@ __all__ = [
     "sticky_actions",
     "takes_mdp",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _FILES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(importlib.import_module(f"{__name__}.{_FILES[name]}"), name)
+    globals()[name] = value
+    return value

@@ -4,9 +4,7 @@ import functools
 from collections.abc import Callable
 from typing import Any, ParamSpec, TypeVar
 
-from pharos.environments import Environment
 from pharos.errors import ParameterError
-from pharos.state_space import StateSpace
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -35,6 +33,9 @@ def _described(value: Any) -> str:
 
 
 def _remedy(value: Any) -> str:
+    from pharos.environments import Environment
+    from pharos.state_space import StateSpace  # which takes longer to load than all that chance needs
+
     if isinstance(value, StateSpace):
         return "space.mdp(gamma=0.99)"
     if isinstance(value, Environment):

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pharos.agents import agent_kind
-from pharos.environments import as_tuples, classes, make
+from pharos.environments import as_tuples, class_called, make
 from pharos.errors import ParameterError
 from pharos.experiments import bootstrap_interval, read_curve, read_record
 from pharos.plots.style import COLORS, INK, figure, styled, thousands
@@ -105,7 +105,7 @@ def _label(config: dict[str, Any], configs: list[dict[str, Any]]) -> str:
 
 def _instance(environment: str, parameters: dict[str, Any]) -> str:
     """`frozen_lake/8x8` where the instance has a name, else the class and what differs from its defaults."""
-    cls = classes().get(environment)
+    cls = class_called(environment)
     given = as_tuples(parameters)
     if cls is None:
         return " ".join([environment, *(f"{name}={value}" for name, value in given.items() if value not in (None, ()))])

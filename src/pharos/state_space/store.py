@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xxhash
 
-from pharos.environments import Environment, State, as_tuples
+from pharos.environments import Environment, State, as_tuples, class_called
 from pharos.errors import (
     ParameterError,
     StateSpaceCorrupted,
@@ -247,9 +247,7 @@ def load(folder: str | os.PathLike, *, verify: bool = True, environment: Environ
 
 def _environment_of(folder: Path, manifest: dict[str, Any]) -> Environment | None:
     """The environment that a manifest names, where its class is a built-in or registered one."""
-    from pharos.environments import classes
-
-    cls = classes().get(manifest["environment"])
+    cls = class_called(manifest["environment"])
     if cls is None:
         return None
     try:

@@ -5,10 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from pharos.kernels import disk_table as disk_kernels
 from pharos.kernels.hash_table import fill, fill_more, fill_range, insert_missing
 from pharos.state_space import memory as machine
-from pharos.state_space.disk_table import DiskTable
 from pharos.state_space.memory_map import huge_pages, reserved_states, reserved_table
 
 LOAD = 0.5  # the table in memory grows beyond this share of used slots
@@ -122,6 +120,8 @@ class SpilledTable:
         self.terminal = np.empty(self.rows, np.uint8)
         self.appended = count
         self._successors = np.empty((0, num_actions), np.int32)
+        from pharos.state_space.disk_table import DiskTable  # whose kernels few need
+
         self._table = DiskTable(path, num_words, memory // 4, 2 * count)
 
     def fill(self, states: np.ndarray) -> None:
@@ -144,7 +144,9 @@ class SpilledTable:
         first, count = int(progress[0]), int(progress[1])
         self._table.grow(count + len(keys))
         looked_up = self._table.look_up(keys, found, first, self._order, self._slots)
-        disk_kernels.number(keys, found, successors, self.states, self.appended, progress)
+        from pharos.kernels import disk_table
+
+        disk_table.number(keys, found, successors, self.states, self.appended, progress)
         self._table.settle(looked_up, found, self._order, self._slots)
 
 
