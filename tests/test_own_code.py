@@ -78,14 +78,19 @@ def lab(tmp_path_factory):
 @pytest.fixture(autouse=True)
 def nothing_is_left(monkeypatch):
     """What one test registers, no other test finds."""
-    monkeypatch.setattr(catalog, "_REGISTERED", {})
-    monkeypatch.setattr(sources, "_LOADED", {})
-    monkeypatch.setattr(sources, "_MODULES", {})
-    monkeypatch.setattr(observation, "_registered", {})
+    forget(monkeypatch)
     before = dict(gymnasium.registry)
     yield
     for name in set(gymnasium.registry) - set(before):
         del gymnasium.registry[name]
+
+
+def forget(monkeypatch):
+    """The process knows no code of anybody's own."""
+    monkeypatch.setattr(catalog, "_REGISTERED", {})
+    monkeypatch.setattr(sources, "_LOADED", {})
+    monkeypatch.setattr(sources, "_MODULES", {})
+    monkeypatch.setattr(observation, "_registered", {})
 
 
 def command(*words, cwd):
@@ -257,28 +262,35 @@ def test_a_path_that_leads_to_no_observation_is_refused_in_one_line(tmp_path, mo
 CANARY = "from pathlib import Path\nPath(__file__).with_suffix('.executed').touch()\n"
 
 
-@pytest.fixture
-def received(tmp_path, monkeypatch):
-    """A finished run, a study's folder and a packed study, each naming code that leaves a mark where it is executed."""
-    monkeypatch.setattr(catalog, "_REGISTERED", {})
-    monkeypatch.setattr(sources, "_LOADED", {})
-    monkeypatch.setattr(sources, "_MODULES", {})
-    monkeypatch.chdir(tmp_path)
-    spec = tmp_path / "sent.yaml"
-    spec.write_text(
-        'name: sent\nsteps: 20\nevaluations: 1\nseeds: 1\nblocks:\n  - {environments: ["canary.py:Taxi"], agents: [q_learning]}\n'  # noqa: E501
-    )
-    (tmp_path / "canary.py").write_text(TAXI)
-    (tmp_path / "canary_module.py").write_text(TAXI)
-    study.run(spec, tmp_path / "got", workers=1)
-    study.pack(spec, tmp_path / "got", file=tmp_path / "got.parquet")
-    run = next((tmp_path / "got" / "runs").iterdir())
+@pytest.fixture(scope="module")
+def sent(tmp_path_factory):
+    """A folder with a finished run, a study's folder and a packed study; each names code that leaves a mark where it
+    is executed. Beside it, as it was sent: `pristine`."""
+    folder = tmp_path_factory.mktemp("sent") / "folder"
+    folder.mkdir()
+    with pytest.MonkeyPatch.context() as patch:
+        forget(patch)
+        patch.chdir(folder)
+        spec = folder / "sent.yaml"
+        spec.write_text(
+            'name: sent\nsteps: 20\nevaluations: 1\nseeds: 1\nblocks:\n  - {environments: ["canary.py:Taxi"], agents: [q_learning]}\n'  # noqa: E501
+        )
+        (folder / "canary.py").write_text(TAXI)
+        study.run(spec, folder / "got", workers=1)
+        study.pack(spec, folder / "got", file=folder / "got.parquet")
     for name in ("canary", "canary_module"):
-        (tmp_path / f"{name}.py").write_text(CANARY + TAXI)
-    monkeypatch.setattr(sources, "_LOADED", {})
-    monkeypatch.setattr(sources, "_MODULES", {})
-    monkeypatch.setattr(catalog, "_REGISTERED", {})
-    yield run
+        (folder / f"{name}.py").write_text(CANARY + TAXI)
+    shutil.copytree(folder, folder.with_name("pristine"))
+    return folder
+
+
+@pytest.fixture
+def received(sent, monkeypatch):
+    """The run in the folder, which nobody has touched, and where the process is."""
+    shutil.rmtree(sent)
+    shutil.copytree(sent.with_name("pristine"), sent)
+    monkeypatch.chdir(sent)
+    yield next((sent / "got" / "runs").iterdir())
     assert "canary_module" not in sys.modules
 
 
@@ -302,25 +314,25 @@ COMMANDS = [
 
 @pytest.mark.slow
 @pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
-def test_received_files_execute_nothing(received, tmp_path, words):
+def test_received_files_execute_nothing(received, sent, words):
     done = here(*(received if word == "RUN" else word for word in words))
     assert done.exit_code == 2, done.output
     assert "executed only if you trust it: add --trust" in done.stderr
     assert done.stderr.count("\n") == 1
-    assert executed(tmp_path) == []
+    assert executed(sent) == []
 
 
 @pytest.mark.parametrize("verb", ["show", "status", "report", "run", "pack"])
 @pytest.mark.parametrize("source", ["empty", "named"])
-def test_a_folder_executes_nothing_though_it_has_no_runs(received, tmp_path, verb, source):
-    for folder in (tmp_path / "empty", tmp_path / "studies" / "named"):
+def test_a_folder_executes_nothing_though_it_has_no_runs(received, sent, verb, source):
+    for folder in (sent / "empty", sent / "studies" / "named"):
         folder.mkdir(parents=True)
-        (folder / "study.yaml").write_text((tmp_path / "sent.yaml").read_text())
+        (folder / "study.yaml").write_text((sent / "sent.yaml").read_text())
         (folder / "canary.py").write_text(CANARY + TAXI)
     done = here("study", verb, source, *(("--to", "again.parquet") if verb == "pack" else ()))
     assert done.exit_code == 2, done.output
     assert "executed only if you trust it: add --trust" in done.stderr
-    assert not list(tmp_path.rglob("*.executed"))
+    assert not list(sent.rglob("*.executed"))
 
 
 @pytest.mark.slow
@@ -328,16 +340,16 @@ def test_a_folder_executes_nothing_though_it_has_no_runs(received, tmp_path, ver
 @pytest.mark.parametrize(
     "words", [("study", "status", "got"), ("plot", "policies", "RUN", "--steps", "2", "--out", "policies.gif")]
 )
-def test_what_is_trusted_is_executed(received, tmp_path, words):
+def test_what_is_trusted_is_executed(received, sent, words):
     done = here(*(received if word == "RUN" else word for word in words), "--trust")
     assert done.exit_code == 0, done.output
-    assert executed(tmp_path) == ["canary.executed"]
+    assert executed(sent) == ["canary.executed"]
 
 
 @pytest.mark.slow
-def test_regret_is_drawn_without_any_code(received, tmp_path):
+def test_regret_is_drawn_without_any_code(received, sent):
     assert here("plot", "regret", received, "--out", "regret.png").exit_code == 0
-    assert executed(tmp_path) == []
+    assert executed(sent) == []
 
 
 @pytest.mark.slow
@@ -353,13 +365,13 @@ def test_regret_is_drawn_without_any_code(received, tmp_path):
         {"sources": {"agent": {"name": "canary.py:Taxi", "file": "canary.py", "checksum": ""}}},
     ],
 )
-def test_the_configuration_of_a_received_run_executes_nothing(received, tmp_path, change):
+def test_the_configuration_of_a_received_run_executes_nothing(received, sent, change):
     config = {**read_record(received)["config"], "environment": "frozen_lake", "parameters": {"size": 4}, **change}
     with pytest.raises(UntrustedCode, match="add --trust"):
         found = RunConfig.from_dict(config)
         found.task()
         found.algorithm()
-    assert executed(tmp_path) == []
+    assert executed(sent) == []
 
 
 @pytest.mark.slow
@@ -372,14 +384,14 @@ def test_a_damaged_source_is_no_source(received, entry):
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*has changed since")
-def test_the_target_that_a_command_names_is_trusted(received, tmp_path):
+def test_the_target_that_a_command_names_is_trusted(received, sent):
     done = here("evaluate", "canary.py:Taxi", "--policy", received, "--horizon", 5, "--json")
     assert done.exit_code == 0, done.output
-    assert executed(tmp_path) == ["canary.executed"]
+    assert executed(sent) == ["canary.executed"]
 
 
 @pytest.mark.slow
-def test_a_study_is_unpacked_into_ones_own_without_trust(received, tmp_path):
+def test_a_study_is_unpacked_into_ones_own_without_trust(received, sent):
     done = here("study", "unpack", "got.parquet", "--into", "sent.yaml", "--out", "new", "--json")
     assert done.exit_code == 0, done.output
     assert json.loads(done.stdout)["added"] == 1
