@@ -281,6 +281,23 @@ def test_weights_draws_and_adjoints_of_chance_agree(sticky, random, seed):
         assert (executed * values).sum() == pytest.approx((mass * of_choice).sum())
 
 
+@often
+@given(small_mdps())
+def test_an_action_leads_to_a_state_where_its_probability_is_not_zero(mdp):
+    possible = np.zeros((mdp.num_states, mdp.num_actions, mdp.num_states + 1), bool)
+    for s, a in np.ndindex(possible.shape[:2]):
+        for t, p in naive_mdp.outcomes(mdp, s, a):
+            possible[s, a, t] |= p > 1e-12
+    for state in range(mdp.num_states + 1):
+        assert (mdp.dynamics.leads_to(state) == possible[:, :, state]).all()
+
+
+def test_what_a_row_lacks_to_1_by_rounding_leads_nowhere():
+    dynamics = TabularMDP.from_matrices(np.full((1, 1, 1), 1 - 2.0**-53), [[0.0]]).dynamics
+    assert not dynamics.has_ends
+    assert (dynamics.leads_to(0).tolist(), dynamics.leads_to(1).tolist()) == ([[True]], [[False]])
+
+
 def test_a_table_keeps_the_index_type_of_what_is_left():
     table = Table(np.array([[1, 2], [2, -1], [0, 0]], np.int32))
     assert table.restricted_to(np.array([0, 1])).next_states.tolist() == [[1, 0], [1, -1]]

@@ -136,8 +136,12 @@ def test_rounding_counts_every_operation_of_a_backup():
 
 def test_probabilities_that_sum_to_more_than_1_over_gamma_give_no_false_bound():
     grows = TabularMDP.from_matrices(np.full((1, 1, 1), 1 + 9e-10), [[1.0]], gamma=1 - 1e-10)
-    with pytest.raises(PrecisionError, match="1 / gamma"):  # the value is infinite
-        value_iteration(grows, 1e30)
+    for solve in (value_iteration, worst_value, uniform_value):  # the value is infinite
+        with pytest.raises(PrecisionError, match="1 / gamma"):
+            solve(grows, 1e30)
+    for policy in ([0], [[1.0]]):
+        with pytest.raises(PrecisionError, match="1 / gamma"):
+            evaluate_policy(grows, np.array(policy), 1e30)
 
 
 @pytest.mark.slow

@@ -10,6 +10,7 @@ from pharos.errors import DivergenceError, ParameterError, PrecisionError
 from pharos.mdp import BEST, TabularMDP, random_actions, sticky_actions
 from pharos.solvers import evaluate_policy, uniform_policy, uniform_value, value_iteration, worst_value
 from pharos.solvers.fixed_point import Backup
+from pharos.solvers.policy_iteration import PolicyIteration
 from strategies import deterministic_mdps, probabilities, small_mdps
 
 # Rounding of the twins, which solve linear systems in floats. Bounds are held against exact fractions in
@@ -234,6 +235,17 @@ def test_a_tolerance_below_what_floats_can_reach_is_refused():
     ring = TabularMDP.from_arrays([[1], [0]], [[1.0], [0.3]], gamma=0.999)
     with pytest.raises(PrecisionError, match="raise the tolerance"):
         value_iteration(ring, 1e-15)
+
+
+def test_linear_systems_that_are_too_large_are_left_to_sweeps_however_many():
+    """3,000 states at most, and under sticky actions pairs; a sweep that changes as much as one of half as many."""
+    size = 2000
+    slow = TabularMDP.from_arrays(
+        np.tile((np.arange(size) + 1)[:, None] % size, 2), np.ones((size, 2)), gamma=1 - 1e-12
+    )
+    for mdp, expected in ((random_actions(slow, 0.5), True), (sticky_actions(slow, 0.5), False)):
+        decision = PolicyIteration(mdp, BEST)
+        assert [decision.is_worth_it(sweeps, 1.0, 1e-6) for sweeps in (32, 64)] == [False, expected]
 
 
 @pytest.mark.parametrize("tolerance", [0, -1, float("nan"), "small"])

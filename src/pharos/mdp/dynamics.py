@@ -196,7 +196,7 @@ class Dynamics(ABC):
         """(S, A) bool: whether executing an action may lead to a state."""
         indicator = np.zeros(self.num_states + 1)
         indicator[state] = 1.0
-        return self.expected(indicator) > 0
+        return self.largest(indicator) > 0
 
     def sample(self, states: np.ndarray, actions: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """(N,): a next state of each execution, -1 for the end. Draws nothing where each has one outcome."""
