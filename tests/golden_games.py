@@ -61,6 +61,8 @@ GAMES = {
         "pdtfp",
     ),
     "mini_grid_lava": ("mini_grid/lava-gap-s5", {"seed": 1}, "rflfrf"),
+    "sokoban_corner_solved": ("sokoban/corner", {}, "rdldr"),
+    "sokoban_off_and_on_a_target": ("sokoban", {"level": "#######/#-@*--#/#---$-#/#---.-#/#######"}, "rddrruuld"),
 }
 
 

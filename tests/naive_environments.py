@@ -192,3 +192,46 @@ def _clockwise(v, axis):
     along = tuple(_dot(v, axis) * part for part in axis)
     across = (v[1] * axis[2] - v[2] * axis[1], v[2] * axis[0] - v[0] * axis[2], v[0] * axis[1] - v[1] * axis[0])
     return tuple(a + b for a, b in zip(along, across, strict=True))
+
+
+class Sokoban:
+    """Sets of cells: walls, targets, boxes; and where the player stands."""
+
+    def __init__(self, level):
+        cells = {(y, x): letter for y, row in enumerate(level.split("/")) for x, letter in enumerate(row)}
+        where = {letter: {cell for cell, other in cells.items() if other == letter} for letter in "#@$.+*"}
+        self.walls, self.targets = where["#"], where["."] | where["+"] | where["*"]
+        self.boxes = frozenset(where["$"] | where["*"])
+        (self.player,) = where["@"] | where["+"]
+
+    def state(self):
+        return self.player, self.boxes
+
+    def step(self, action):
+        down, right = OFFSETS[action]
+        ahead, beyond = ((self.player[0] + n * down, self.player[1] + n * right) for n in (1, 2))
+        before = len(self.boxes & self.targets)
+        if ahead in self.boxes and beyond not in self.walls | self.boxes:
+            self.boxes = self.boxes - {ahead} | {beyond}
+        if ahead not in self.walls | self.boxes:
+            self.player = ahead
+        solved = self.boxes == self.targets
+        return -0.1 + len(self.boxes & self.targets) - before + 10 * solved, solved
+
+    def solution(self):
+        """(least number of steps to a solution, states within reach, the solved ones included but not gone through)."""
+        frontier, seen, steps, least = [self.state()], {self.state()}, 0, None
+        while frontier:
+            steps, reached = steps + 1, []
+            for position in frontier:
+                for action in OFFSETS:
+                    self.player, self.boxes = position
+                    _, solved = self.step(action)
+                    if self.state() not in seen:
+                        seen.add(self.state())
+                        if solved:
+                            least = least or steps
+                        else:
+                            reached.append(self.state())
+            frontier = reached
+        return least, len(seen)

@@ -20,7 +20,7 @@ from pharos.errors import ParameterError, UnknownName
 
 GRIDS = ("simple_grid", "frozen_lake")
 SMALL = (  # beside them, spaces of at most 120 states
-    "sliding_tiles/2x2",
+    *("sliding_tiles/2x2", "sokoban", "sokoban/corridor", "sokoban/corner"),
     *(f"mini_grid/{name}" for name in ("empty-5x5", "empty-6x6", "empty-random-5x5", "empty-random-6x6")),
     *(f"mini_grid/{name}" for name in ("lava-gap-s5", "lava-gap-s6", "lava-gap-s7", "multi-room-n2-s4")),
     *(f"mini_grid/{what}-crossing-{name}" for what in ("lava", "simple") for name in ("s9n3", "s11n5")),

@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from pharos.environments.pocket_cube import PocketCube
     from pharos.environments.simple_grid import SimpleGrid
     from pharos.environments.sliding_tiles import SlidingTiles
+    from pharos.environments.sokoban import Sokoban
 
 _FILES = {
     **{entry.class_name: entry.name for entry in BUILT_IN},
@@ -98,6 +99,7 @@ __all__ = [
     "Shape",
     "SimpleGrid",
     "SlidingTiles",
+    "Sokoban",
     "Sprite",
     "State",
     "as_tuples",

@@ -50,6 +50,11 @@ BUILT_IN = (  # in the order in which they are listed
     BuiltIn("sliding_tiles", "SlidingTiles", "2x2 2x3 3x3 3x3-hardest 2x4 2x5 3x4"),
     BuiltIn("pocket_cube", "PocketCube", "half quarter half-4 quarter-4"),
     BuiltIn(
+        "sokoban",
+        "Sokoban",
+        "corridor corner two-rooms pillar three-in-a-row storehouse random-1 random-2 random-3",
+    ),
+    BuiltIn(
         "mini_grid",
         "MiniGrid",
         "empty-5x5 empty-6x6 empty-8x8 empty-16x16 empty-random-5x5 empty-random-6x6 four-rooms door-key-5x5 "

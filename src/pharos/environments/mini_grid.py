@@ -89,7 +89,9 @@ class MiniGrid(Environment):
             largest room (multi_room, on 25 x 25 cells). The grid of dist_shift is size - 2 high. None: that of
             minigrid.
         seed: of the layout, as given to minigrid's `reset`; None stands for 0.
-        rows: of rooms in key_corridor. rooms: of multi_room. crossings: obstacles of the crossings.
+        rows: of rooms in key_corridor.
+        rooms: of multi_room.
+        crossings: obstacles of the crossings.
         strip: the row of the second strip of lava in dist_shift.
         level: a layout of one's own, in place of the above: two characters a cell (see mini_grid_canvas.py), rows
             separated by "/" or line ends, with walls around.
