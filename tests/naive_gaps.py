@@ -1,8 +1,6 @@
 """Suboptimality gaps from the explicit matrices of `naive_mdp.augmented`: the slow twin of pharos.hardness.gaps."""
 
-import numpy as np
-
-from naive_mdp import augmented, finite_values, optimal_values
+from naive_mdp import augmented, finite_values, optimal_values, outcomes
 
 
 def pairs_by_step(mdp, steps):
@@ -14,15 +12,11 @@ def pairs_by_step(mdp, steps):
     for _ in range(steps):
         result.append(pairs)
         following = set()
-        for s, _b in pairs:
+        for s, b in pairs:
             if mdp.terminal[s]:
                 continue
-            for x in range(num_actions):
-                if mdp.transitions is None:
-                    targets = [int(mdp.next_states[s, x])]
-                else:
-                    targets = np.flatnonzero(mdp.transitions[s * num_actions + x].toarray().ravel()).tolist()
-                following |= {(t, x) for t in targets if t >= 0}
+            for x in range(num_actions) if b == num_actions or mdp.chance.executes_any else [b]:
+                following |= {(t, x) for t, p in outcomes(mdp, s, x) if t >= 0 and p > 0}
         pairs = following
     return result
 

@@ -5,7 +5,7 @@ import math
 
 import numpy as np
 
-from naive_mdp import augmented
+from naive_mdp import augmented, outcomes
 
 
 def returns_of_paths(mdp, policy, steps):
@@ -28,20 +28,13 @@ def returns_of_paths(mdp, policy, steps):
                 weight += chance.previous * (previous == b)
             if not weight:
                 continue
-            for following, p in _outcomes(mdp, state, b):
+            for following, p in outcomes(mdp, state, b):
                 if p > 0:
                     follow(following, b, t + 1, probability * weight * p, total + mdp.rewards[state, b])
 
     for s in np.flatnonzero(start):
         follow(s // width, None, 0, start[s], 0.0)
     return found
-
-
-def _outcomes(mdp, state, action):
-    if mdp.transitions is None:
-        return [(int(mdp.next_states[state, action]), 1.0)]
-    row = mdp.transitions[state * mdp.num_actions + action].toarray().ravel()
-    return [(-1, 1 - row.sum()), *((t, row[t]) for t in np.flatnonzero(row))]
 
 
 def failure_probability(mdp, steps, k, m):

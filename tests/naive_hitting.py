@@ -7,7 +7,7 @@ from fractions import Fraction
 
 import numpy as np
 
-from naive_mdp import augmented
+from naive_mdp import augmented, outcomes
 
 FAR = 1e12  # stands for infinity inside of the iteration
 
@@ -56,10 +56,8 @@ def nodes_that_count(mdp, reached, state):
 
 def any_end(mdp):
     """Whether a state that is not terminal leads to the implicit end."""
-    if mdp.transitions is None:
-        return bool((mdp.next_states[~mdp.terminal] < 0).any())
-    live = np.repeat(~mdp.terminal, mdp.num_actions)
-    return bool((1 - np.asarray(mdp.transitions.sum(axis=1)).ravel()[live] > 1e-12).any())
+    pairs = ((s, a) for s in np.flatnonzero(~mdp.terminal) for a in range(mdp.num_actions))
+    return any(t < 0 and p > 1e-12 for s, a in pairs for t, p in outcomes(mdp, s, a))
 
 
 def diameter(mdp, restart):

@@ -2,6 +2,8 @@
 
 import numpy as np
 
+import naive_mdp
+
 MASK = (1 << 64) - 1
 
 
@@ -20,6 +22,19 @@ class SplitMix64:
 
     def below(self, n):
         return min(int(self.random() * n), n - 1)
+
+
+def drawn(mdp, s, x, rng):
+    """A next state, -1 for the end; draws a number only where the MDP is not a table of next states."""
+    outcomes = naive_mdp.outcomes(mdp, s, x)
+    if mdp.dynamics.deterministic_table() is not None:
+        return outcomes[0][0]
+    u, passed = rng.random() * sum(p for _, p in outcomes), 0.0
+    for t, p in outcomes:
+        passed += p
+        if passed > u:
+            return t
+    return outcomes[-1][0]
 
 
 def q_learning(mdp, word, steps, total_steps, options, limit):
@@ -61,7 +76,7 @@ def q_learning(mdp, word, steps, total_steps, options, limit):
                 executed = rng.below(num_actions)
         elif u >= chance.chosen:
             executed = previous if u < chance.chosen + chance.previous else rng.below(num_actions)
-        reward, after = rewards[state, executed], int(mdp.next_states[state, executed])
+        reward, after = rewards[state, executed], drawn(mdp, state, executed, rng)
         ended = after < 0 or bool(mdp.terminal[after])
         following = (after, executed) if sees else after
         target = reward + (0.0 if ended else options["gamma"] * max(value(following, a) for a in range(num_actions)))

@@ -1,10 +1,13 @@
 """Small MDPs of every kind, for property tests."""
 
+from dataclasses import replace
+
 import numpy as np
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from pharos.mdp import TabularMDP, random_actions, sticky_actions
+import naive_mdp
+from pharos.mdp import OutcomeTable, TabularMDP, random_actions, sticky_actions
 
 probabilities = st.sampled_from([0.0, 0.1, 0.25, 0.5, 1.0])
 gammas = st.sampled_from([0.0, 0.5, 0.9, 0.99])
@@ -44,6 +47,70 @@ def general_mdps(draw, max_states: int = 5, max_actions: int = 3):
     return TabularMDP.from_matrices(matrix, paid, gamma=draw(gammas))
 
 
+# How tables of several outcomes can be held: (rows one after another, palette, outcomes of the widest row).
+LAYOUTS = {
+    "dense, palette": (False, True, 2),
+    "ragged, palette": (True, True, 3),
+    "dense, one by one": (False, False, 5),
+    "ragged, one by one": (True, False, 3),
+}
+
+FEW = ("dense, palette", "ragged, palette")  # what most tests have kernels compiled for
+
+
+def outcome_table(lists, num_actions, ragged, palette, width):
+    """An OutcomeTable of lists of (next state, probability), row s A + a; width: the widest row's, at least."""
+    num_states, width = len(lists) // num_actions, max(width, *map(len, lists))
+    states = np.array([[t for t, _ in row] + [row[0][0]] * (width - len(row)) for row in lists], np.int32)
+    chances = np.array([[p for _, p in row] + [0.0] * (width - len(row)) for row in lists])
+    arrays = {"successors": states.reshape(num_states, num_actions, width)}
+    if ragged:
+        arrays = {
+            "successors": np.concatenate([states[i, : len(row)] for i, row in enumerate(lists)]),
+            "offsets": np.cumsum([0, *map(len, lists)]),
+        }
+    if palette:
+        vectors, codes = np.unique(chances, axis=0, return_inverse=True)
+        arrays.update(palette=vectors, codes=codes.reshape(num_states, num_actions).astype(np.uint8))
+    else:
+        arrays["probabilities"] = chances[chances > 0] if ragged else chances.reshape(num_states, num_actions, width)
+    return OutcomeTable(num_actions=num_actions, **arrays)
+
+
+def as_outcome_tables(mdp):
+    """The same MDP as tables of outcomes in every layout."""
+    pairs = [(s, a) for s in range(mdp.num_states) for a in range(mdp.num_actions)]
+    lists = [[(t, p) for t, p in naive_mdp.outcomes(mdp, s, a) if p > 1e-12] for s, a in pairs]
+    return [outcome_table(lists, mdp.num_actions, *layout) for layout in LAYOUTS.values()]
+
+
+@st.composite
+def outcome_mdps(draw, layouts=tuple(LAYOUTS)):
+    """An MDP of two actions with one or several outcomes each, that may lead to one state, in some layout."""
+    num_states, num_actions = draw(st.integers(1, 4)), 2
+    ragged, palette, width = LAYOUTS[draw(st.sampled_from(layouts))]
+    vectors = [[1.0], [0.5, 0.5], [0.3, 0.7], [0.1, 0.9], [1 / 3, 2 / 3]]
+    vectors += [[1 / 3, 1 / 3, 1 / 3], [0.8, 0.1, 0.1], [0.7, 0.2, 0.1]] if width > 2 else []
+    chances = draw(st.lists(st.sampled_from(vectors), min_size=2 * num_states, max_size=2 * num_states))
+    states = st.integers(-1, num_states - 1)
+    lists = [[(draw(states), p) for p in vector] for vector in chances]
+    paid = draw(hnp.arrays(np.float64, (num_states, num_actions), elements=rewards_of_games))
+    terminal = draw(hnp.arrays(np.bool_, num_states))
+    for s in np.flatnonzero(terminal):
+        lists[2 * s : 2 * s + 2] = [[(int(s), 1.0)]] * 2
+        paid[s] = 0.0
+    mdp = TabularMDP.from_arrays(np.zeros((num_states, num_actions), int), paid, gamma=draw(gammas))
+    starts = draw(st.lists(st.integers(0, num_states - 1), min_size=1, max_size=3))
+    dynamics = outcome_table(lists, num_actions, ragged, palette, width)
+    return replace(mdp, dynamics=dynamics, terminal=terminal).with_initial(starts[0] if len(starts) == 1 else starts)
+
+
+@st.composite
+def with_chance(draw, mdps):
+    """An MDP with any chance of choosing."""
+    return _with_chance(draw, draw(mdps))
+
+
 @st.composite
 def hard_mdps(draw):
     """MDPs whose values are hard on floats: gamma near 1, rewards that are no sums of powers of 2, values of 1e12 and
@@ -56,7 +123,11 @@ def hard_mdps(draw):
 @st.composite
 def small_mdps(draw, **options):
     """Any of the above, with any chance."""
-    mdp = draw(st.one_of(deterministic_mdps(**options), general_mdps()))
+    of_outcomes = outcome_mdps(FEW)
+    return _with_chance(draw, draw(st.one_of(deterministic_mdps(**options), general_mdps(), of_outcomes)))
+
+
+def _with_chance(draw, mdp):
     first, second = draw(probabilities), draw(probabilities)
     kind = draw(st.sampled_from(["plain", "random", "sticky", "random outside", "sticky outside"]))
     if kind == "random":

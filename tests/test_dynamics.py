@@ -22,7 +22,15 @@ from pharos.mdp import (
     sticky_actions,
 )
 from pharos.solvers import evaluate_policy, uniform_value, value_iteration, worst_value
-from strategies import deterministic_mdps, general_mdps, probabilities, small_mdps
+from strategies import (
+    as_outcome_tables,
+    deterministic_mdps,
+    general_mdps,
+    outcome_mdps,
+    probabilities,
+    small_mdps,
+    with_chance,
+)
 
 often = settings(max_examples=80, deadline=None)
 
@@ -97,7 +105,7 @@ def as_matrices(mdp):
 
 
 def representations(mdp):
-    return [mdp.dynamics, as_matrices(mdp), Listed.of(mdp)]
+    return [mdp.dynamics, as_matrices(mdp), Listed.of(mdp), *as_outcome_tables(mdp)]
 
 
 def same(answers):
@@ -107,8 +115,8 @@ def same(answers):
 
 @pytest.mark.slow
 @often
-@given(small_mdps(), st.integers(0, 2**32), st.data())
-def test_every_representation_gives_the_same_answers(mdp, seed, data):
+@given(st.one_of(small_mdps(), outcome_mdps()), st.integers(0, 2**32))
+def test_every_representation_gives_the_same_answers(mdp, seed):
     rng = np.random.default_rng(seed)
     size, num_actions = mdp.num_states, mdp.num_actions
     all_of_them = representations(mdp)
@@ -140,7 +148,7 @@ def test_every_representation_gives_the_same_answers(mdp, seed, data):
 
 @pytest.mark.slow
 @often
-@given(small_mdps(), st.integers(0, 2**32))
+@given(st.one_of(small_mdps(), with_chance(outcome_mdps())), st.integers(0, 2**32))
 def test_compiled_backups_and_moves_are_those_of_the_formulas(mdp, seed):
     rng = np.random.default_rng(seed)
     looks_back = mdp.is_sticky and seed % 2 == 0

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy import sparse
 
+import naive_mdp
 import pharos
 from pharos.errors import ParameterError
 from pharos.mdp import Rewards, TabularMDP, random_actions, sticky_actions
@@ -179,20 +180,14 @@ def test_states_that_an_episode_cannot_meet_do_not_matter_to_it(mdp, steps):
     met = {int(s) for s, p in zip(mdp.start_states, mdp.start_probabilities, strict=True) if p > 0}
     frontier = set(met)
     for _ in range(steps):
-        frontier = {t for s in frontier for a in range(mdp.num_actions) for t in successors(mdp, s, a)} - met
+        pairs = [(s, a) for s in frontier for a in range(mdp.num_actions)]
+        frontier = {t for s, a in pairs for t, p in naive_mdp.outcomes(mdp, s, a) if t >= 0 and p > 0} - met
         met |= frontier
     assert set(np.flatnonzero(mdp.states_within(steps))) == met
     assert found.num_states == len(met | set(mdp.start_states.tolist()))
     for solve in (value_iteration, uniform_value, worst_value):
         whole, part = (solve(each.with_gamma(1.0).with_horizon(steps)) for each in (mdp, found))
         assert part.value_at_start == pytest.approx(whole.value_at_start, abs=1e-12)
-
-
-def successors(mdp, state, action):
-    if mdp.next_states is None:
-        return mdp.transitions[state * mdp.num_actions + action].indices.tolist()
-    following = int(mdp.next_states[state, action])
-    return [following] if following >= 0 else []
 
 
 def test_an_mdp_whose_states_are_all_met_stays_itself_and_a_smaller_one_has_other_numbers():

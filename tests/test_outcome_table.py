@@ -6,6 +6,7 @@ import pytest
 from pharos.errors import ParameterError
 from pharos.mdp import OutcomeTable, TabularMDP
 from pharos.solvers import value_iteration
+from strategies import LAYOUTS, outcome_table
 
 # Two states: one action of state 0 stays or goes on, the other ends or goes on; state 1 leads to itself.
 SUCCESSORS = [[[0, 1], [-1, 1]], [[1, 1], [1, 0]]]
@@ -105,3 +106,65 @@ def test_errors_name_the_first_entry_that_is_wrong(successors, probabilities, re
 def test_an_outcome_table_takes_a_palette_or_probabilities():
     with pytest.raises(ParameterError, match="codes with a palette, or probabilities"):
         OutcomeTable(np.zeros((1, 1, 1), np.int32), 1)
+
+
+@pytest.mark.parametrize(("ragged", "palette", "width"), LAYOUTS.values(), ids=LAYOUTS)
+def test_next_states_are_drawn_as_often_as_they_are_probable(ragged, palette, width):
+    rows = [[(1, 0.5), (0, 0.25), (-1, 0.25)], [(1, 1.0)], [(0, 1.0)], [(1, 0.5), (1, 0.5)]]
+    dynamics = outcome_table(rows, 2, ragged, palette, width)
+    for row, outcomes in enumerate(rows):
+        states, actions = np.full(4000, row // 2), np.full(4000, row % 2)
+        drawn = dynamics.sample(states, actions, np.random.default_rng(row))
+        for state in (-1, 0, 1):
+            assert abs((drawn == state).mean() - sum(p for t, p in outcomes if t == state)) < 0.04
+
+
+def hostile(**changes):
+    """Arrays of an OutcomeTable of two states and an action, with something changed."""
+    arrays = {
+        "successors": np.array([[[0, 1]], [[1, 1]]], np.int32),
+        "codes": np.array([[0], [1]], np.uint8),
+        "palette": np.array([[0.5, 0.5], [1.0, 0.0]]),
+    }
+    return {name: array for name, array in {**arrays, **changes}.items() if array is not None}
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({}, None),
+        ({"successors": np.array([0, 1, 1], np.int32), "offsets": np.array([0, 2, 3])}, None),
+        ({"codes": None, "palette": None, "probabilities": np.array([[[0.5, 0.5]], [[1.0, 0.0]]])}, None),
+        ({"successors": np.array([[[0, 2]], [[1, 1]]], np.int32)}, "a successor is 2"),
+        ({"successors": np.array([[[0, 1]], [[1, 0]]], np.int32)}, "not the first successor"),
+        ({"successors": np.array([[[0.0, 1]], [[1, 1]]])}, "type float64"),
+        ({"successors": np.array([0, 1, 1], np.int32), "offsets": np.array([0, 3, 3])}, "offsets do not cut"),
+        ({"successors": np.array([0, 1, 1], np.int32), "offsets": np.array([0, 1, 3])}, "another number of successors"),
+        ({"codes": np.array([[0], [2]], np.uint8)}, "a code is 2"),
+        ({"codes": np.array([0, 1], np.uint8)}, r"codes have shape \(2,\)"),
+        ({"palette": np.array([[0.5, 0.4], [1.0, 0.0]])}, "does not sum to 1"),
+        ({"palette": np.array([[1.5, -0.5], [1.0, 0.0]])}, "below 0"),
+        ({"palette": np.array([[0.5, np.nan], [1.0, 0.0]])}, "does not sum to 1"),
+        ({"palette": np.array([[0.5, 0.5], [0.0, 1.0]])}, "zeros before others"),
+        ({"codes": None, "palette": None, "probabilities": np.ones((2, 1))}, "probabilities have shape"),
+    ],
+)
+def test_arrays_that_are_no_outcome_table_are_told(changes, message):
+    dynamics = OutcomeTable(num_actions=1, **hostile(**changes))
+    if message is None:
+        dynamics.check()
+        return
+    with pytest.raises(ParameterError, match=message):
+        dynamics.check()
+
+
+def test_memory_maps_are_not_copied(tmp_path):
+    arrays = hostile()
+    maps = {}
+    for name, array in arrays.items():
+        np.save(tmp_path / f"{name}.npy", array)
+        maps[name] = np.load(tmp_path / f"{name}.npy", mmap_mode="r")
+    dynamics = OutcomeTable(num_actions=1, **maps)
+    assert dynamics.for_kernels[0].base is not None and not dynamics.for_kernels[0].flags.writeable
+    assert dynamics.expected(np.array([2.0, 4.0, 0.0])).tolist() == [[3.0], [4.0]]
+    assert dynamics.restricted_to(np.array([1])).successors.tolist() == [[[0, 0]]]

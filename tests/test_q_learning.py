@@ -10,13 +10,13 @@ from naive_learning import q_learning
 from pharos.agents import QLearning
 from pharos.errors import ParameterError, UnknownName
 from pharos.mdp import TabularMDP, random_actions, sticky_actions
-from strategies import deterministic_mdps, probabilities
+from strategies import FEW, deterministic_mdps, outcome_mdps, probabilities
 
 
 @pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(
-    deterministic_mdps(),
+    st.one_of(deterministic_mdps(), outcome_mdps(FEW)),
     probabilities,
     probabilities,
     st.integers(0, 2**32),

@@ -14,15 +14,16 @@ from pharos import hardness
 from pharos.errors import UndefinedMeasure
 from pharos.hardness.travel import TravelBounds
 from pharos.mdp import TabularMDP, random_actions, sticky_actions
-from strategies import deterministic_mdps, general_mdps
+from strategies import deterministic_mdps, general_mdps, outcome_mdps
 
 some = st.sampled_from([0.0, 0.25, 0.5])
 
 
 @st.composite
 def chancy_mdps(draw):
-    """Small MDPs with chance: sticky, random, both, general matrices, several start states."""
-    mdp = draw(st.one_of(deterministic_mdps(max_states=4, max_actions=2), general_mdps(max_states=3, max_actions=2)))
+    """Small MDPs with chance: sticky, random, both, general matrices, several outcomes, several start states."""
+    small = deterministic_mdps(max_states=4, max_actions=2), general_mdps(max_states=3, max_actions=2)
+    mdp = draw(st.one_of(*small, outcome_mdps()))
     return random_actions(sticky_actions(mdp, draw(some)), draw(some))
 
 

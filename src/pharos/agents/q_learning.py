@@ -51,16 +51,17 @@ class QLearning:
         self, mdp: TabularMDP, *, total_steps: int, seed: int = 0, time_limit: int | None = None, **options: Any
     ):
         table = mdp.dynamics.deterministic_table()
-        if table is None:
+        self._transitions = mdp.dynamics.for_kernels if table is None else table
+        if self._transitions is None:
             raise ParameterError(
-                f"q_learning: {mdp} has no table of next states; expected an MDP with one next state a pair"
+                f"q_learning: {mdp} has no table of next states; expected one next state a pair, or a table of "
+                "outcomes (TabularMDP.from_outcomes)"
             )
         unknown = set(options) - set(DEFAULTS)
         if unknown:
             from pharos.errors import UnknownName
 
             raise UnknownName("hyperparameter of q_learning", sorted(unknown)[0], DEFAULTS)
-        self._next_states = table
         self.mdp, self.options, self.seed = mdp, {**DEFAULTS, **options}, int(seed)
         self.total_steps = int(total_steps)
         self.limit = time_limit or mdp.horizon or 2**62
@@ -105,7 +106,7 @@ class QLearning:
             float(mdp.gamma),
         )
         q_learning(
-            self._next_states,
+            self._transitions,
             mdp.reward_table.table,
             mdp.reward_table.palette,
             np.asarray(mdp.terminal, np.bool_),

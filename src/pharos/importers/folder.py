@@ -10,12 +10,13 @@ import numpy as np
 
 from pharos import storage
 from pharos.errors import FileFormatError, ParameterError
-from pharos.mdp import TabularMDP
+from pharos.mdp import OutcomeTable, TabularMDP
 
 FORMAT, VERSION, MANIFEST = "pharos mdp", 1, "manifest.json"
 COMMON = ("rewards", "terminal", "start_states", "start_probabilities")
 TABLE = ("next_states",)
 MATRIX = ("transitions_data", "transitions_indices", "transitions_indptr")
+OUTCOMES = ("successors",)  # and, where they are: offsets; probabilities, or codes and palette
 AGAIN = "import it again"
 
 
@@ -110,7 +111,11 @@ def _manifest(folder: Path) -> dict[str, Any]:
 
 
 def _arrays(folder: Path, checksums: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    names = (*COMMON, *(TABLE if TABLE[0] in checksums else MATRIX))
+    kind = TABLE if TABLE[0] in checksums else MATRIX
+    if OUTCOMES[0] in checksums:
+        offsets = ("offsets",) if "offsets" in checksums else ()
+        kind = (*OUTCOMES, *offsets, *(("probabilities",) if "probabilities" in checksums else ("codes", "palette")))
+    names = (*COMMON, *kind)
     if set(checksums) != set(names):
         raise ValueError(f"its arrays are {', '.join(checksums)}; expected {', '.join(names)}")
     return {name: _array(folder / f"{name}.npy", checksums[name]) for name in names}
@@ -145,6 +150,11 @@ def _mdp(manifest: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Tabul
     options = {"gamma": manifest["gamma"], "horizon": manifest["horizon"], "initial": initial}
     if TABLE[0] in arrays:
         return TabularMDP.from_arrays(arrays[TABLE[0]], rewards, terminal=arrays["terminal"], **options)
+    if OUTCOMES[0] in arrays:
+        parts = {name: array for name, array in arrays.items() if name not in COMMON}
+        dynamics = OutcomeTable(num_actions=rewards.shape[1], **parts)
+        dynamics.check()
+        return TabularMDP.from_outcome_table(dynamics, rewards, terminal=arrays["terminal"], **options)
     from scipy import sparse
 
     matrix = sparse.csr_matrix(tuple(arrays[name] for name in MATRIX), shape=(rewards.size, len(rewards)))

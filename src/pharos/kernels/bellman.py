@@ -1,6 +1,6 @@
 """Bellman backups in place, over flat arrays. mdp/dynamics.py says what they mean, solvers/ proves their bounds.
 
-Common arguments: next_states (S, A), -1 where the episode ends; table, palette: see mdp/rewards.py; v (S + 1,) float64,
+Common arguments: transitions: see kernels/outcomes.py; table, palette: see mdp/rewards.py; v (S + 1,) float64,
 under sticky actions (S + 1, A) by the previously executed action, with row S 0, so that index -1 reads 0; weights:
 (chosen, previous, uniform); sign: 1 maximises, -1 minimises; actions: a tuple of A zeros, whose length the compiler
 knows, so that the loops over actions are unrolled (a third faster). Each sweep goes from the last state to the first
@@ -10,6 +10,8 @@ and returns the largest change of an entry.
 import numpy as np
 from numba import njit
 from numba.extending import overload
+
+from pharos.kernels.outcomes import expectation, expectation_of_pair, size_of
 
 UNROLLED = 128  # actions
 
@@ -31,12 +33,12 @@ def _reward_at(table, palette, s, a):
 
 
 @njit(forceinline=True)
-def _backup(next_states, table, palette, gamma, uniform, sign, v, actions, s):
+def _backup(transitions, table, palette, gamma, uniform, sign, v, actions, s):
     """(1 - uniform) max_a q(s, a) + uniform mean_a q(s, a)."""
     best = -np.inf
     total = 0.0
     for a in range(len(actions)):
-        q = reward_at(table, palette, s, a) + gamma * v[next_states[s, a]]
+        q = reward_at(table, palette, s, a) + gamma * expectation(transitions, v, s, a)
         best = max(best, sign * q)
         total += q
     if uniform > 0.0:
@@ -45,45 +47,45 @@ def _backup(next_states, table, palette, gamma, uniform, sign, v, actions, s):
 
 
 @njit(cache=True, nogil=True)
-def optimal_sweep(next_states, table, palette, gamma, uniform, sign, v, actions):
+def optimal_sweep(transitions, table, palette, gamma, uniform, sign, v, actions):
     """v[s] = (1 - uniform) max_a q(s, a) + uniform mean_a q(s, a), in place."""
     change = 0.0
-    for s in range(len(next_states) - 1, -1, -1):
-        value = _backup(next_states, table, palette, gamma, uniform, sign, v, actions, s)
+    for s in range(size_of(transitions)[0] - 1, -1, -1):
+        value = _backup(transitions, table, palette, gamma, uniform, sign, v, actions, s)
         change = max(change, abs(value - v[s]))
         v[s] = value
     return change
 
 
 @njit(cache=True, nogil=True)
-def optimal_block(next_states, table, palette, gamma, uniform, sign, v, out, actions, start, stop):
+def optimal_block(transitions, table, palette, gamma, uniform, sign, v, out, actions, start, stop):
     """out[s] = the backup of v for s in [start, stop), not in place: what threads share, and horizons need."""
     for s in range(start, stop):
-        out[s] = _backup(next_states, table, palette, gamma, uniform, sign, v, actions, s)
+        out[s] = _backup(transitions, table, palette, gamma, uniform, sign, v, actions, s)
 
 
 @njit(forceinline=True)
-def _sticky_values(next_states, table, palette, gamma, sign, v, actions, q, s):
+def _sticky_values(transitions, table, palette, gamma, sign, v, actions, q, s):
     """q[a] = r(s, a) + gamma v(next, a). Returns (the best of them, their sum)."""
     best = -np.inf
     total = 0.0
     for a in range(len(actions)):
-        q[a] = reward_at(table, palette, s, a) + gamma * v[next_states[s, a], a]
+        q[a] = reward_at(table, palette, s, a) + gamma * expectation_of_pair(transitions, v, s, a)
         best = max(best, sign * q[a])
         total += q[a]
     return sign * best, total
 
 
 @njit(cache=True, nogil=True)
-def sticky_sweep(next_states, table, palette, gamma, weights, sign, v, actions, q):
+def sticky_sweep(transitions, table, palette, gamma, weights, sign, v, actions, q):
     """v[s, b] = chosen max_a q(s, a) + previous q(s, b) + uniform mean_a q(s, a), in place.
 
     v (S + 1, A); q (A,) scratch.
     """
     chosen, previous, uniform = weights
     change = 0.0
-    for s in range(len(next_states) - 1, -1, -1):
-        best, total = _sticky_values(next_states, table, palette, gamma, sign, v, actions, q, s)
+    for s in range(size_of(transitions)[0] - 1, -1, -1):
+        best, total = _sticky_values(transitions, table, palette, gamma, sign, v, actions, q, s)
         shared = chosen * best + uniform * total / len(actions)
         for b in range(len(actions)):
             value = shared + previous * q[b]
@@ -93,27 +95,27 @@ def sticky_sweep(next_states, table, palette, gamma, weights, sign, v, actions, 
 
 
 @njit(cache=True, nogil=True)
-def sticky_block(next_states, table, palette, gamma, weights, sign, v, out, actions, start, stop):
+def sticky_block(transitions, table, palette, gamma, weights, sign, v, out, actions, start, stop):
     """out[s, b] = the backup of v for s in [start, stop), not in place."""
     chosen, previous, uniform = weights
     q = np.empty(len(actions))
     for s in range(start, stop):
-        best, total = _sticky_values(next_states, table, palette, gamma, sign, v, actions, q, s)
+        best, total = _sticky_values(transitions, table, palette, gamma, sign, v, actions, q, s)
         shared = chosen * best + uniform * total / len(actions)
         for b in range(len(actions)):
             out[s, b] = shared + previous * q[b]
 
 
 @njit(cache=True, nogil=True)
-def policy_sweep(next_states, table, palette, gamma, chosen, uniform, policy, v):
+def policy_sweep(transitions, table, palette, gamma, chosen, uniform, policy, v):
     """v[s] = sum_a (chosen policy[s, a] + uniform / A) q(s, a), in place; policy (S, A): probabilities of choosing."""
-    num_states, num_actions = next_states.shape
+    num_states, num_actions = size_of(transitions)
     each = uniform / num_actions
     change = 0.0
     for s in range(num_states - 1, -1, -1):
         value = 0.0
         for a in range(num_actions):
-            q = reward_at(table, palette, s, a) + gamma * v[next_states[s, a]]
+            q = reward_at(table, palette, s, a) + gamma * expectation(transitions, v, s, a)
             value += (chosen * policy[s, a] + each) * q
         change = max(change, abs(value - v[s]))
         v[s] = value
@@ -121,19 +123,19 @@ def policy_sweep(next_states, table, palette, gamma, chosen, uniform, policy, v)
 
 
 @njit(cache=True, nogil=True)
-def sticky_policy_sweep(next_states, table, palette, gamma, weights, policy, v, q):
+def sticky_policy_sweep(transitions, table, palette, gamma, weights, policy, v, q):
     """v[s, b] = sum_a (chosen policy[s, b, a] + uniform / A) q(s, a) + previous q(s, b), in place.
 
     v (S + 1, A). policy (S, B, A): B is A, or 1 where the previous action does not matter. q (A,) scratch.
     """
-    num_states, num_actions = next_states.shape
+    num_states, num_actions = size_of(transitions)
     chosen, previous, uniform = weights
     each = uniform / num_actions
     looks_back = policy.shape[1] > 1
     change = 0.0
     for s in range(num_states - 1, -1, -1):
         for a in range(num_actions):
-            q[a] = reward_at(table, palette, s, a) + gamma * v[next_states[s, a], a]
+            q[a] = reward_at(table, palette, s, a) + gamma * expectation_of_pair(transitions, v, s, a)
         shared = 0.0
         for b in range(num_actions):
             if b == 0 or looks_back:

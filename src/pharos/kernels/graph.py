@@ -11,6 +11,8 @@ nodes found, in the order of their distance.
 import numpy as np
 from numba import njit
 
+from pharos.kernels.outcomes import outcome, outcomes_of, size_of
+
 
 @njit(cache=True, nogil=True)
 def search_forward(next_states, ends, start, source, distance, queue):
@@ -418,14 +420,15 @@ def mark_reachable(next_states, ends, reached, queue, tail):
 
 
 @njit(cache=True, nogil=True)
-def onwards(next_states, nodes, n, following, seen):
+def onwards(transitions, nodes, n, following, seen):
     """States that nodes[:n] lead to and that were not seen before; returns how many. seen (S,) bool."""
     count = 0
     for i in range(n):
-        for a in range(next_states.shape[1]):
-            t = next_states[nodes[i], a]
-            if t >= 0 and not seen[t]:
-                seen[t] = True
-                following[count] = t
-                count += 1
+        for a in range(size_of(transitions)[1]):
+            for j in outcomes_of(transitions, nodes[i], a):
+                t, _ = outcome(transitions, nodes[i], a, j)
+                if t >= 0 and not seen[t]:
+                    seen[t] = True
+                    following[count] = t
+                    count += 1
     return count

@@ -1,13 +1,15 @@
-"""Tabular Q-learning on a table of next states: the loop that agents/_q_learning.py describes, compiled.
+"""Tabular Q-learning on the transitions of an MDP: the loop that agents/q_learning.py describes, compiled.
 
 Random numbers: SplitMix64 (Steele, Lea and Flood 2014), whose whole state is one 64-bit word that can be stored and
 restored.
 """
 
 import numpy as np
-from numba import njit, uint64
+from numba import njit, types, uint64
+from numba.extending import overload
 
 from pharos.kernels.bellman import reward_at
+from pharos.kernels.outcomes import drawn, size_of
 
 
 @njit(forceinline=True)
@@ -26,9 +28,20 @@ def _below(word, n):
     return min(int(_random(word) * n), n - 1)
 
 
+def _following(transitions, s, a, word):
+    """A next state of (s, a), -1 for the end; draws a number only where there are several outcomes."""
+
+
+@overload(_following)
+def _following_of(transitions, s, a, word):
+    if isinstance(transitions, types.Array):
+        return lambda transitions, s, a, word: np.int64(transitions[s, a])
+    return lambda transitions, s, a, word: drawn(transitions, s, a, _random(word))
+
+
 @njit(cache=True, nogil=True)
 def q_learning(
-    next_states,
+    transitions,
     table,
     palette,
     terminal,
@@ -46,8 +59,8 @@ def q_learning(
 ):
     """`steps` steps of Watkins' Q-learning; everything that changes is in the arrays, so that it goes on from them.
 
-    next_states (S, A); table, palette: rewards; starts (K,), cumulative (K,): start states and their cumulated
-    probabilities;
+    transitions: see kernels/outcomes.py; table, palette: rewards; starts (K,), cumulative (K,): start states and their
+    cumulated probabilities;
     chance: (chosen, previous, uniform, first_chosen); limit: steps of an episode; q, visits (R, A): values and number
     of updates, R = S, or S (A + 1) with rows s (A + 1) + b where the previous action b (A: none) is seen.
     schedule: (learning rate, exponent of visits or 0, gamma, first epsilon, last epsilon, steps of exploration,
@@ -55,7 +68,7 @@ def q_learning(
     place: int64 (state or -1, previous action, steps in the episode, steps in all, episodes); sums: float64 (return of
     this episode, its discount, sum of finished returns); word: uint64 (1,).
     """
-    num_states, num_actions = next_states.shape
+    num_states, num_actions = size_of(transitions)
     chosen_weight, previous_weight, _, first_chosen = chance
     rate, exponent, gamma, first_epsilon, last_epsilon, exploration, exponential, measure_gamma = schedule
     sees_previous = len(q) > num_states
@@ -92,7 +105,7 @@ def q_learning(
         elif u >= chosen_weight:
             executed = b if u < chosen_weight + previous_weight else _below(word, num_actions)
         reward = reward_at(table, palette, s, executed)
-        t = next_states[s, executed]
+        t = _following(transitions, s, executed, word)
         ended = t < 0 or terminal[t]
         value = 0.0
         if not ended:

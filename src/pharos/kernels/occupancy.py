@@ -1,6 +1,6 @@
-"""Distributions of states, pushed one step forward over a table of next states.
+"""Distributions of states, pushed one step forward.
 
-next_states (S, A), -1 where the episode ends; live (S,) bool: states that play goes on in; now, after (S, W) float64:
+transitions: see kernels/outcomes.py; live (S,) bool: states that play goes on in; now, after (S, W) float64:
 the distribution over states, W = 1, or over pairs (state, previously executed action), W = A, where `previous` > 0;
 policy (S, B, A) probabilities, B = 1 or, for policies that look at the previous action, A; weights: (chosen, previous,
 uniform).
@@ -8,6 +8,8 @@ uniform).
 
 import numpy as np
 from numba import njit
+
+from pharos.kernels.outcomes import outcome, outcomes_of, size_of
 
 
 @njit(forceinline=True)
@@ -27,14 +29,15 @@ def _executed(policy, weights, now, s, a, mass):
 
 
 @njit(cache=True, nogil=True)
-def push(next_states, live, policy, weights, now, after):
+def push(transitions, live, policy, weights, now, after):
     """after = the distribution one step later, without what has ended.
 
     Returns what goes on: the sum over live states.
     """
+    num_states, num_actions = size_of(transitions)
     after[:] = 0.0
     sticky = weights[1] > 0.0
-    for s in range(len(next_states)):
+    for s in range(num_states):
         if not live[s]:
             continue
         mass = 0.0
@@ -42,12 +45,14 @@ def push(next_states, live, policy, weights, now, after):
             mass += now[s, b]
         if mass == 0.0:
             continue
-        for a in range(next_states.shape[1]):
-            t = next_states[s, a]
-            if t >= 0:
-                after[t, a if sticky else 0] += _executed(policy, weights, now, s, a, mass)
+        for a in range(num_actions):
+            executed = _executed(policy, weights, now, s, a, mass)
+            for i in outcomes_of(transitions, s, a):
+                t, p = outcome(transitions, s, a, i)
+                if t >= 0:
+                    after[t, a if sticky else 0] += p * executed
     total = 0.0
-    for s in range(len(next_states)):
+    for s in range(num_states):
         if live[s]:
             for b in range(after.shape[1]):
                 total += after[s, b]
@@ -55,16 +60,16 @@ def push(next_states, live, policy, weights, now, after):
 
 
 @njit(cache=True, nogil=True)
-def settle(next_states, live, policy, weights, gamma, least, waiting, visits):
+def settle(transitions, live, policy, weights, gamma, least, waiting, visits):
     """Count what waits in a state as a visit, and let it go on; from the first state to the last, in place.
 
     waiting (S, W): discounted mass that has come and has not gone on. visits (S,): sum over t of gamma^t P(s_t = s), as
     far as it has gone on. Masses below `least` stay. Returns what waits in the end.
     """
-    num_actions = next_states.shape[1]
+    num_states, num_actions = size_of(transitions)
     sticky = weights[1] > 0.0
     leaving = np.empty(num_actions)
-    for s in range(len(next_states)):
+    for s in range(num_states):
         mass = 0.0
         for b in range(waiting.shape[1]):
             mass += waiting[s, b]
@@ -76,19 +81,21 @@ def settle(next_states, live, policy, weights, gamma, least, waiting, visits):
             visits[s, b] += waiting[s, b]
         waiting[s] = 0.0
         for a in range(num_actions):
-            t = next_states[s, a]
-            if t >= 0 and live[t]:
-                waiting[t, a if sticky else 0] += gamma * leaving[a]
+            for i in outcomes_of(transitions, s, a):
+                t, p = outcome(transitions, s, a, i)
+                if t >= 0 and live[t]:
+                    waiting[t, a if sticky else 0] += p * (gamma * leaving[a])
     total = 0.0
-    for s in range(len(next_states)):
+    for s in range(num_states):
         for b in range(waiting.shape[1]):
             total += waiting[s, b]
     return total
 
 
 @njit(cache=True, nogil=True)
-def support(next_states, live, policy, weights, met):
+def support(transitions, live, policy, weights, met):
     """Add to met (S, W), 1 where play may be and else 0, whatever may come after."""
+    num_actions = size_of(transitions)[1]
     width = met.shape[1]
     sticky = weights[1] > 0.0
     alone = np.zeros_like(met)  # a row is 1 at one place while its node is looked at
@@ -102,11 +109,13 @@ def support(next_states, live, policy, weights, met):
         if not live[s]:
             continue
         alone[s, b] = 1.0
-        for a in range(next_states.shape[1]):
-            t = next_states[s, a]
-            if t >= 0 and live[t] and _executed(policy, weights, alone, s, a, 1.0) > 0.0:
-                c = a if sticky else 0
-                if met[t, c] == 0.0:
+        for a in range(num_actions):
+            if _executed(policy, weights, alone, s, a, 1.0) <= 0.0:
+                continue
+            c = a if sticky else 0
+            for i in outcomes_of(transitions, s, a):
+                t, _ = outcome(transitions, s, a, i)
+                if t >= 0 and live[t] and met[t, c] == 0.0:
                     met[t, c] = 1.0
                     stack[top] = t * width + c
                     top += 1

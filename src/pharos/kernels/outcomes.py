@@ -3,17 +3,26 @@
 Kernels take `transitions`, one of two things:
 
 - a table (S, A) of next states, -1 where the episode ends;
-- several outcomes, as a tuple (successors (N,), offsets, codes, weights, (S, A, K)) that `OutcomeTable` makes. The
-  outcomes of (s, a), row = s A + a, are successors[row K : (row + 1) K], or successors[offsets[row] : offsets[row + 1]]
-  where there are offsets. Their probabilities are weights[codes[row]], or, without codes, weights at the same places as
-  the successors. Of a row without offsets the last ones may have probability 0: they repeat its first successor.
+- several outcomes, as a tuple (successors (N,), offsets, codes, weights, (S, A), each). The outcomes of (s, a), row =
+  s A + a, are successors[row K : (row + 1) K], or successors[offsets[row] : offsets[row + 1]] where there are offsets.
+  Their probabilities are weights[codes[row]], or, without codes, weights at the same places as the successors. Without
+  offsets the last ones of a row may have probability 0: they repeat its first successor. each: K, or, so that the
+  compiler knows it and unrolls loops (twice as fast), a tuple of K zeros (`each_of`).
 
-`outcomes_of` and `outcome` give them one by one, `expectation` adds up values. The compiler knows which of the two it
-has, so loops over tables cost nothing more.
+`outcomes_of` and `outcome` give them one by one, `expectation` adds up values. Loops over tables cost nothing more.
 """
 
-from numba import njit, types
+import numpy as np
+from numba import njit, types, uint64
 from numba.extending import overload
+
+# The largest K that the compiler is told.
+UNROLLED = 4
+
+
+def each_of(num_outcomes):
+    """The last of `transitions`, for sweeps: a tuple of K zeros where K is small."""
+    return (0,) * num_outcomes if num_outcomes <= UNROLLED else num_outcomes
 
 
 def size_of(transitions):
@@ -24,53 +33,70 @@ def size_of(transitions):
 def _size_of(transitions):
     if isinstance(transitions, types.Array):
         return lambda transitions: transitions.shape
-    return lambda transitions: (transitions[4][0], transitions[4][1])
+    return lambda transitions: transitions[4]
 
 
 def outcomes_of(transitions, s, a):
-    """The range of numbers of the outcomes of (s, a)."""
+    """The numbers of the outcomes of (s, a), as a range. Impossible ones among them repeat the state of another."""
 
 
 @overload(outcomes_of)
 def _outcomes_of(transitions, s, a):
     if isinstance(transitions, types.Array):
         return lambda transitions, s, a: range(1)
+    if isinstance(transitions[5], types.BaseTuple):
+        return lambda transitions, s, a: range(len(transitions[5]))
     if isinstance(transitions[1], types.NoneType):
-
-        def dense(transitions, s, a):
-            first = (s * transitions[4][1] + a) * transitions[4][2]
-            return range(first, first + transitions[4][2])
-
-        return dense
+        return lambda transitions, s, a: range(transitions[5])
 
     def ragged(transitions, s, a):
-        row = s * transitions[4][1] + a
-        return range(transitions[1][row], transitions[1][row + 1])
+        row = uint64(s * transitions[4][1] + a)
+        return range(np.int64(transitions[1][row + uint64(1)]) - np.int64(transitions[1][row]))
 
     return ragged
 
 
-def outcome(transitions, s, a, i):
-    """(next state, -1 for the end; probability) of the outcome with number i."""
+def outcome(transitions, s, a, k):
+    """(next state, -1 for the end; probability) of the outcome with number k."""
 
 
 @overload(outcome)
-def _outcome(transitions, s, a, i):
+def _outcome(transitions, s, a, k):
     if isinstance(transitions, types.Array):
-        return lambda transitions, s, a, i: (transitions[s, a], 1.0)
+        return lambda transitions, s, a, k: (transitions[s, a], 1.0)
     if isinstance(transitions[2], types.NoneType):
-        return lambda transitions, s, a, i: (transitions[0][i], transitions[3][i])
-    if isinstance(transitions[1], types.NoneType):
 
-        def dense(transitions, s, a, i):
-            row = s * transitions[4][1] + a
-            return transitions[0][i], transitions[3][transitions[2][row], i - row * transitions[4][2]]
+        def one_by_one(transitions, s, a, k):
+            place, is_padding = _place(transitions, s * transitions[4][1] + a, k)
+            return transitions[0][place], 0.0 if is_padding else transitions[3][place]
 
-        return dense
+        return one_by_one
 
-    def ragged(transitions, s, a, i):
+    def by_palette(transitions, s, a, k):
         row = s * transitions[4][1] + a
-        return transitions[0][i], transitions[3][transitions[2][row], i - transitions[1][row]]
+        place, _ = _place(transitions, row, k)
+        return transitions[0][place], transitions[3][uint64(transitions[2][uint64(row)]), uint64(k)]
+
+    return by_palette
+
+
+def _place(transitions, row, k):
+    """(place of a successor, whether the row has fewer than k + 1, so that it is the last one's)."""
+
+
+@overload(_place)
+def _place_of(transitions, row, k):
+    if isinstance(transitions[1], types.NoneType):
+        if isinstance(transitions[5], types.BaseTuple):
+            return lambda transitions, row, k: (uint64(row) * uint64(len(transitions[5])) + uint64(k), False)
+        return lambda transitions, row, k: (uint64(row) * uint64(transitions[5]) + uint64(k), False)
+    if not isinstance(transitions[5], types.BaseTuple):
+        return lambda transitions, row, k: (uint64(transitions[1][uint64(row)]) + uint64(k), False)
+
+    def ragged(transitions, row, k):
+        first, after = transitions[1][uint64(row)], transitions[1][uint64(row) + uint64(1)]
+        place = first + k
+        return uint64(min(place, after - 1)), place >= after
 
     return ragged
 
@@ -86,8 +112,8 @@ def _expectation(transitions, v, s, a):
 
     def several(transitions, v, s, a):
         total = 0.0
-        for i in outcomes_of(transitions, s, a):
-            t, p = outcome(transitions, s, a, i)
+        for k in outcomes_of(transitions, s, a):
+            t, p = outcome(transitions, s, a, k)
             total += p * v[t]
         return total
 
@@ -105,8 +131,8 @@ def _expectation_of_pair(transitions, v, s, a):
 
     def several(transitions, v, s, a):
         total = 0.0
-        for i in outcomes_of(transitions, s, a):
-            t, p = outcome(transitions, s, a, i)
+        for k in outcomes_of(transitions, s, a):
+            t, p = outcome(transitions, s, a, k)
             total += p * v[t, a]
         return total
 
@@ -141,6 +167,52 @@ def pushed(transitions, mass, out):
                     t, p = outcome(transitions, s, a, i)
                     if t >= 0:
                         out[t, a if by_action else 0] += p * mass[s, a]
+
+
+@njit(cache=True, nogil=True)
+def largest(transitions, x, states, sign, out):
+    """out[i, a] = the largest (sign 1) or smallest (-1) of x (S + 1,) over what (states[i], a) may lead to."""
+    for i in range(len(states)):
+        for a in range(out.shape[1]):
+            best = -np.inf
+            for k in outcomes_of(transitions, states[i], a):
+                best = max(best, sign * x[outcome(transitions, states[i], a, k)[0]])
+            out[i, a] = sign * best
+
+
+@njit(cache=True, nogil=True)
+def arrive(transitions, states, out):
+    """out[t, a] = True where executing a in some of these states may lead to t."""
+    for s in states:
+        for a in range(out.shape[1]):
+            for k in outcomes_of(transitions, s, a):
+                t, _ = outcome(transitions, s, a, k)
+                if t >= 0:
+                    out[t, a] = True
+
+
+@njit(cache=True, nogil=True)
+def drawn(transitions, s, a, u):
+    """The next state, -1 for the end, of the outcome of (s, a) that u, uniform in [0, 1), falls on."""
+    total = 0.0
+    for k in outcomes_of(transitions, s, a):
+        total += outcome(transitions, s, a, k)[1]
+    passed, found = 0.0, np.int64(-1)
+    for k in outcomes_of(transitions, s, a):
+        t, p = outcome(transitions, s, a, k)
+        if p > 0.0:
+            found = np.int64(t)
+            passed += p
+            if passed > u * total:
+                break
+    return found
+
+
+@njit(cache=True, nogil=True)
+def draw(transitions, states, actions, u, out):
+    """out[i] = what `drawn` says of (states[i], actions[i]) and u[i]."""
+    for i in range(len(states)):
+        out[i] = drawn(transitions, states[i], actions[i], u[i])
 
 
 @njit(cache=True, nogil=True)

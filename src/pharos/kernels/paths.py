@@ -3,22 +3,26 @@
 import numpy as np
 from numba import njit
 
+from pharos.kernels.outcomes import outcome, outcomes_of, size_of
+
 
 @njit(cache=True, nogil=True)
-def longest_path_of_table(next_states, live):
-    """Edges of the longest path of a table of next states (S, A), -1 for none, from live (S,) states alone.
+def longest_path_of_table(transitions, live):
+    """Edges of the longest path through transitions (see kernels/outcomes.py) from live (S,) states alone.
 
     Returns -1 where there is a cycle.
 
     Cost: two passes over the table; 24 bytes a state.
     """
-    num_states, num_actions = next_states.shape
+    num_states, num_actions = size_of(transitions)
     waiting = np.zeros(num_states, np.int64)  # edges from states that are not done yet
     for s in range(num_states):
         if live[s]:
             for a in range(num_actions):
-                if next_states[s, a] >= 0:
-                    waiting[next_states[s, a]] += 1
+                for i in outcomes_of(transitions, s, a):
+                    t, _ = outcome(transitions, s, a, i)
+                    if t >= 0:
+                        waiting[t] += 1
     length = np.zeros(num_states, np.int64)
     queue = np.empty(num_states, np.int64)
     tail = 0
@@ -34,13 +38,14 @@ def longest_path_of_table(next_states, live):
         if not live[s]:
             continue
         for a in range(num_actions):
-            t = next_states[s, a]
-            if t >= 0:
-                length[t] = max(length[t], length[s] + 1)
-                waiting[t] -= 1
-                if waiting[t] == 0:
-                    queue[tail] = t
-                    tail += 1
+            for i in outcomes_of(transitions, s, a):
+                t, _ = outcome(transitions, s, a, i)
+                if t >= 0:
+                    length[t] = max(length[t], length[s] + 1)
+                    waiting[t] -= 1
+                    if waiting[t] == 0:
+                        queue[tail] = t
+                        tail += 1
     return longest if tail == num_states else -1
 
 

@@ -124,6 +124,11 @@ class Dynamics(ABC):
         """(S, A) next states, -1 for the end, where each execution has one outcome; else None."""
         return None
 
+    @property
+    def for_kernels(self) -> Any:
+        """The argument `transitions` of kernels, see kernels/outcomes.py; None where they cannot read it."""
+        return self.deterministic_table()
+
     # What follows from it -------------------------------------------------------------------------------------------
 
     def backup(self, equation: BellmanEquation, x: np.ndarray, out: np.ndarray) -> None:

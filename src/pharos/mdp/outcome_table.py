@@ -2,19 +2,23 @@
 
 import math
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pharos.errors import ParameterError
 from pharos.kernels import outcomes as kernels
-from pharos.mdp.dynamics import Dynamics, Outcomes, as_indices
-from pharos.mdp.outcome_arrays import checked_outcomes, compact_outcomes
+from pharos.mdp.compiled import CompiledDynamics
+from pharos.mdp.dynamics import Outcomes, as_indices
+from pharos.mdp.outcome_arrays import check_outcome_arrays, checked_outcomes, compact_outcomes
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_matrix
 
 _UNIT = 2.0**-53
 
 
-class OutcomeTable(Dynamics):
+class OutcomeTable(CompiledDynamics):
     """Several next states for each state and action, and their probabilities, as tables.
 
     Attributes:
@@ -45,7 +49,9 @@ class OutcomeTable(Dynamics):
         if (palette is None) != (codes is None) or (palette is None) == (probabilities is None):
             raise ParameterError("an OutcomeTable takes codes with a palette, or probabilities; found both or neither")
         self.successors, self.offsets = np.asarray(successors), None if offsets is None else np.asarray(offsets)
-        self.codes, self.palette, self.probabilities = codes, palette, probabilities
+        self.codes, self.palette, self.probabilities = (
+            None if array is None else np.asarray(array) for array in (codes, palette, probabilities)
+        )
         self.num_actions = num_actions
         if offsets is None:
             self.num_states, _, self.num_outcomes = successors.shape
@@ -67,16 +73,24 @@ class OutcomeTable(Dynamics):
         """
         return OutcomeTable(**compact_outcomes(*checked_outcomes(successors, probabilities)))
 
+    def check(self) -> None:
+        """ParameterError where the arrays, whoever wrote them, are not what the attributes say. Cost: O(S A K)."""
+        check_outcome_arrays(**self.arrays(), shape=(self.num_states, self.num_actions))
+
     # What it says of itself -----------------------------------------------------------------------------------------
 
     @cached_property
-    def transitions_of_kernels(self) -> tuple[Any, ...]:
-        """The argument `transitions` of kernels/outcomes.py."""
-        successors = self.successors.reshape(-1)
-        shape = (self.num_states, self.num_actions, self.num_outcomes)
+    def for_kernels(self) -> tuple[Any, ...]:  # type: ignore[override]
+        codes, weights = self.codes, self.palette
         if self.probabilities is not None:
-            return successors, self.offsets, None, np.asarray(self.probabilities).reshape(-1), shape
-        return successors, self.offsets, np.asarray(self.codes).reshape(-1), np.asarray(self.palette), shape
+            weights = self.probabilities.reshape(-1)
+        shape = (self.num_states, self.num_actions)
+        flat = None if codes is None else codes.reshape(-1)
+        return self.successors.reshape(-1), self.offsets, flat, weights, shape, self.num_outcomes
+
+    @cached_property
+    def for_sweeps(self) -> tuple[Any, ...]:  # type: ignore[override]
+        return (*self.for_kernels[:-1], kernels.each_of(self.num_outcomes))
 
     @cached_property
     def mass(self) -> float:  # type: ignore[override]
@@ -96,7 +110,7 @@ class OutcomeTable(Dynamics):
 
     @cached_property
     def is_deterministic(self) -> bool:  # type: ignore[override]
-        return bool(kernels.have_one_outcome(self.transitions_of_kernels))
+        return bool(kernels.have_one_outcome(self.for_kernels))
 
     @cached_property
     def _table(self) -> np.ndarray:
@@ -116,26 +130,68 @@ class OutcomeTable(Dynamics):
         rows = np.arange(self.num_states)[states]
         flat = np.ascontiguousarray(x, np.float64).reshape(len(x), x.shape[1] if x.ndim > 1 else 1, -1)
         out = np.empty((len(rows), self.num_actions, flat.shape[2]))
-        kernels.expected(self.transitions_of_kernels, flat, rows, out)
+        kernels.expected(self.for_kernels, flat, rows, out)
         return out.reshape(len(rows), self.num_actions, *x.shape[2:])
 
     def pushed(self, mass: np.ndarray, width: int = 1) -> np.ndarray:
         after = np.zeros((self.num_states, width))
-        kernels.pushed(self.transitions_of_kernels, np.ascontiguousarray(mass, np.float64), after)
+        kernels.pushed(self.for_kernels, np.ascontiguousarray(mass, np.float64), after)
         return after
 
     def outcomes(self, states: np.ndarray, actions: np.ndarray) -> Outcomes:
         """Ascending by next state; outcomes that lead to the same one are one."""
-        from scipy import sparse
-
         rows = np.asarray(states) * self.num_actions + np.asarray(actions)
         which, following, probabilities = self._entries(rows)
-        following = np.where(following < 0, self.num_states, following)
-        indptr = np.searchsorted(which, np.arange(len(rows) + 1))
-        matrix = sparse.csr_matrix((probabilities, following, indptr), shape=(len(rows), self.num_states + 1))
-        matrix.sum_duplicates()
+        matrix = self._merged_entries(np.bincount(which, minlength=len(rows)), following, probabilities)
         which = np.repeat(np.arange(len(rows)), np.diff(matrix.indptr))
         return Outcomes(which, matrix.indices.astype(np.int64), matrix.data)
+
+    def matrix(self, live: np.ndarray | None = None) -> "csr_matrix":
+        states = np.arange(self.num_states) if live is None else np.flatnonzero(live)
+        rows = self._rows(states)
+        which, following, probabilities = self._entries(rows)
+        counts = np.zeros(self.num_states * self.num_actions, np.int64)
+        counts[rows] = np.bincount(which, minlength=len(rows))
+        return self._merged_entries(counts, following, probabilities)
+
+    def _merged_entries(self, counts: np.ndarray, following: np.ndarray, probabilities: np.ndarray) -> "csr_matrix":
+        """(N, S + 1), column S for the end; counts (N,) of the entries of each row, which lie one after another."""
+        from scipy import sparse
+
+        small = np.int32 if max(len(following), self.num_states + 1) < 2**31 else np.int64
+        columns = np.where(following < 0, self.num_states, following).astype(small, copy=False)
+        indptr = np.concatenate([[0], np.cumsum(counts)]).astype(small)
+        matrix = sparse.csr_matrix((probabilities, columns, indptr), shape=(len(counts), self.num_states + 1))
+        matrix.sum_duplicates()
+        return matrix
+
+    def sample(self, states: np.ndarray, actions: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        if self.is_deterministic:
+            return self._table[states, actions]
+        drawn = np.empty(len(states), np.int64)
+        kernels.draw(self.for_kernels, np.asarray(states), np.asarray(actions), rng.random(len(states)), drawn)
+        return drawn
+
+    def largest(self, x: np.ndarray, states: Any = slice(None)) -> np.ndarray:
+        return self._extreme(x, states, 1.0)
+
+    def smallest(self, x: np.ndarray, states: Any = slice(None)) -> np.ndarray:
+        return self._extreme(x, states, -1.0)
+
+    def _extreme(self, x: np.ndarray, states: Any, sign: float) -> np.ndarray:
+        rows = np.arange(self.num_states)[states]
+        out = np.empty((len(rows), self.num_actions))
+        kernels.largest(self.for_kernels, np.ascontiguousarray(x, np.float64), rows, sign, out)
+        return out
+
+    def successors_of(self, states: np.ndarray) -> np.ndarray:
+        _, following, _ = self._entries(self._rows(states))
+        return np.unique(np.where(following < 0, self.num_states, following))
+
+    def arrivals(self, states: np.ndarray) -> np.ndarray:
+        result = np.zeros((self.num_states, self.num_actions), np.bool_)
+        kernels.arrive(self.for_kernels, np.asarray(states), result)
+        return result
 
     def restricted_to(self, states: np.ndarray) -> "OutcomeTable":
         """These states alone; what leads out of them leads back to where it came from."""
@@ -145,6 +201,18 @@ class OutcomeTable(Dynamics):
 
     def merged(self, classes: np.ndarray, representatives: np.ndarray) -> "OutcomeTable":
         return self._renumbered(representatives, np.append(classes, -1))
+
+    def ends_and_stays(self) -> tuple[np.ndarray, np.ndarray]:
+        """(S,) bool each: whether all that a state leads to is the end; and whether it is the end or the state."""
+        own = np.arange(self.num_states, dtype=self.successors.dtype)
+        if self.offsets is None:
+            ends = self.successors == -1
+            stays = ends | (self.successors == own[:, None, None])
+            return ends.all(axis=(1, 2)), stays.all(axis=(1, 2))
+        first = self.offsets[:: self.num_actions]
+        ends = self.successors == -1
+        stays = ends | (self.successors == np.repeat(own, np.diff(first)))
+        return np.logical_and.reduceat(ends, first[:-1]), np.logical_and.reduceat(stays, first[:-1])
 
     # Parts of it ----------------------------------------------------------------------------------------------------
 
@@ -157,14 +225,18 @@ class OutcomeTable(Dynamics):
             else:
                 chances = np.asarray(self.probabilities).reshape(-1, self.num_outcomes)[rows]
             which, k = np.nonzero(chances)
-            return which, following[which, k].astype(np.int64), chances[which, k]
+            return which, following[which, k], chances[which, k]
         which, places = self._places(rows)
         if self.palette is not None:
             k = places - self.offsets[rows][which]
             chances = np.asarray(self.palette)[np.asarray(self.codes).reshape(-1)[rows][which], k]
         else:
             chances = np.asarray(self.probabilities)[places]
-        return which, self.successors[places].astype(np.int64), chances
+        return which, self.successors[places], chances
+
+    def _rows(self, states: np.ndarray) -> np.ndarray:
+        """The rows s A + a of some states."""
+        return (np.asarray(states)[:, None] * self.num_actions + np.arange(self.num_actions)).ravel()
 
     def _places(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(which row, place in `successors`) of all outcomes of some rows, where they lie one after another."""
@@ -176,7 +248,7 @@ class OutcomeTable(Dynamics):
 
     def _renumbered(self, states: np.ndarray, number: np.ndarray) -> "OutcomeTable":
         """The rows of some states; number (S + 1,) of each next state, -1 for the end, -2 for where it came from."""
-        rows = (np.asarray(states)[:, None] * self.num_actions + np.arange(self.num_actions)).ravel()
+        rows = self._rows(states)
         arrays: dict[str, Any] = {}
         if self.offsets is None:
             places = np.asarray(states)

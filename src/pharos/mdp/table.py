@@ -1,17 +1,14 @@
 """Dynamics with one next state for each state and action: games, and whatever is deterministic."""
 
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
 
-from pharos.kernels import bellman, graph, occupancy, paths
-from pharos.mdp.dynamics import BellmanEquation, Dynamics, Outcomes, Play, as_indices
-from pharos.mdp.selection import Extreme, PolicyTable
+from pharos.mdp.compiled import CompiledDynamics
+from pharos.mdp.dynamics import Outcomes, as_indices
 
 
-class Table(Dynamics):
+class Table(CompiledDynamics):
     """One next state for each state and action, as a table.
 
     Attributes:
@@ -24,6 +21,10 @@ class Table(Dynamics):
         self.next_states = next_states
         self.num_states, self.num_actions = next_states.shape
         self._has_ends: bool | None = None
+
+    @property
+    def for_kernels(self) -> np.ndarray:
+        return self.next_states
 
     @property
     def has_ends(self) -> bool:  # type: ignore[override]
@@ -72,77 +73,3 @@ class Table(Dynamics):
     def merged(self, classes: np.ndarray, representatives: np.ndarray) -> "Table":
         table = np.asarray(self.next_states)[representatives].astype(np.int64)
         return Table(as_indices(np.where(table >= 0, classes[table], -1), len(representatives)))
-
-    # Compiled: the same, without temporary arrays -------------------------------------------------------------------
-
-    def backup(self, equation: BellmanEquation, x: np.ndarray, out: np.ndarray) -> None:
-        rewards, gamma, chance, select = equation
-        if not isinstance(select, Extreme):
-            return super().backup(equation, x, out)
-        tables = (self.next_states, rewards.table, rewards.palette, gamma)
-        actions = bellman.actions_of(self.num_actions)
-        kernel, weights, x_, out_ = (
-            (bellman.sticky_block, chance.triple, x, out)
-            if chance.is_sticky
-            else (bellman.optimal_block, chance.uniform, x[:, 0], out[:, 0])
-        )
-        out[-1] = 0.0
-        _shared(
-            lambda start, stop: kernel(*tables, weights, select.sign, x_, out_, actions, start, stop), self.num_states
-        )
-
-    def sweep(self, equation: BellmanEquation, x: np.ndarray) -> float:
-        rewards, gamma, chance, select = equation
-        tables = (self.next_states, rewards.table, rewards.palette, gamma)
-        actions = bellman.actions_of(self.num_actions)
-        if isinstance(select, PolicyTable):
-            if chance.is_sticky:
-                scratch = np.empty(self.num_actions)
-                return bellman.sticky_policy_sweep(*tables, chance.triple, select.later, x, scratch)
-            weights = (float(chance.chosen), float(chance.uniform))
-            return bellman.policy_sweep(*tables, *weights, select.later[:, 0], x[:, 0])
-        assert isinstance(select, Extreme)
-        if chance.is_sticky:
-            return bellman.sticky_sweep(*tables, chance.triple, select.sign, x, actions, np.empty(self.num_actions))
-        return bellman.optimal_sweep(*tables, chance.uniform, select.sign, x[:, 0], actions)
-
-    def move(self, play: Play, now: np.ndarray, after: np.ndarray) -> float:
-        if now.shape[1] != after.shape[1]:  # the first step of sticky actions
-            return super().move(play, now, after)
-        return occupancy.push(self.next_states, play.live, play.policy, play.chance.triple, now, after)
-
-    def settle(self, play: Play, gamma: float, least: float, waiting: np.ndarray, visits: np.ndarray) -> float:
-        weights = play.chance.triple
-        return occupancy.settle(self.next_states, play.live, play.policy, weights, gamma, least, waiting, visits)
-
-    def support(self, play: Play, reached: np.ndarray) -> None:
-        occupancy.support(self.next_states, play.live, play.policy, play.chance.triple, reached)
-
-    def reachable(self, starts: np.ndarray, steps: int | None = None) -> np.ndarray:
-        is_reached = np.zeros(self.num_states, np.bool_)
-        frontier = np.unique(starts)
-        is_reached[frontier] = True
-        small = np.int32 if self.num_states < 2**31 else np.int64
-        now, following = (np.empty(self.num_states, small) for _ in range(2))
-        count, level = len(frontier), 0
-        now[:count] = frontier
-        while count and (steps is None or level < steps):
-            count = graph.onwards(self.next_states, now, count, following, is_reached)
-            now, following = following, now
-            level += 1
-        return is_reached
-
-    def longest_path(self, live: np.ndarray) -> int:
-        return int(paths.longest_path_of_table(self.next_states, live))
-
-
-def _shared(block: Callable[[int, int], None], num_states: int) -> None:
-    """block(start, stop) over all states, on all processors where there are enough states to share."""
-    from pharos.workers import usable_workers
-
-    workers = usable_workers(None) if num_states >= 1 << 16 else 1
-    if workers == 1:
-        return block(0, num_states)
-    cuts = [num_states * i // workers for i in range(workers + 1)]
-    with ThreadPoolExecutor(workers) as pool:
-        list(pool.map(block, cuts[:-1], cuts[1:]))

@@ -134,15 +134,33 @@ class TabularMDP:
                 f"rewards have shape {paid.shape}; expected {table.shape[:2]}, one for each state and action, or "
                 f"{table.shape}, one for each outcome"
             )
-        reward_table = Rewards.from_array(paid)
-        possible = chances > 0
-        ends, silent = ((table == -1) | ~possible).all(axis=(1, 2)), (reward_table.array == 0).all(axis=1)
-        own = np.arange(len(table), dtype=table.dtype)[:, None, None]
-        stays = ((table == own) | (table == -1) | ~possible).all(axis=(1, 2))
+        return TabularMDP.from_outcome_table(
+            OutcomeTable(**compact_outcomes(table, chances)),
+            paid,
+            gamma=gamma,
+            initial=initial,
+            horizon=horizon,
+            terminal=terminal,
+        )
+
+    @staticmethod
+    def from_outcome_table(
+        dynamics: OutcomeTable,
+        rewards: Any,
+        *,
+        gamma: float = 0.99,
+        initial: Any = 0,
+        horizon: int | None = None,
+        terminal: Any = None,
+    ) -> "TabularMDP":
+        """As `from_outcomes`, on a table of outcomes that is there, with expected rewards (S, A)."""
+        num_states = dynamics.num_states
+        reward_table = _rewards_of_shape(rewards, (num_states, dynamics.num_actions))
+        silent = (reward_table.array == 0).all(axis=1)
+        ends, stays = dynamics.ends_and_stays()
         mask = _terminal(terminal, ends & silent, stays & silent)
-        states, starts = _start(initial, len(table))
-        dynamics = OutcomeTable(**compact_outcomes(table, chances))
-        return TabularMDP(dynamics, reward_table, mask, gamma, horizon, states, starts)
+        states, probabilities = _start(initial, num_states)
+        return TabularMDP(dynamics, reward_table, mask, gamma, horizon, states, probabilities)
 
     @staticmethod
     def from_matrices(
