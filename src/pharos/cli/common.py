@@ -188,6 +188,11 @@ def discount(gamma: float | None, horizon: int | None) -> float:
     return 0.99 if horizon is None else 1.0
 
 
+def build_options(memory: str | None, workers: int | None, max_states: int | None) -> dict[str, Any]:
+    """What `build` takes, of --memory, --workers and --max-states."""
+    return {"memory": parse_size(memory), "workers": workers, "max_states": max_states}
+
+
 def parse_target(text: str, words: Iterable[str] | None = None) -> Target:
     """The target that a command names.
 
@@ -313,6 +318,11 @@ def describe_chance(sticky: float, random: float) -> str:
     """Chance in words."""
     parts = [f"sticky actions {sticky:g}"] * bool(sticky) + [f"random actions {random:g}"] * bool(random)
     return ", ".join(parts) or "none"
+
+
+def describe_discount(gamma: float, horizon: int | None) -> str:
+    """Discount and horizon in words."""
+    return f"{gamma:g}, {'no horizon' if horizon is None else f'horizon {horizon}'}"
 
 
 def size_text(count: float) -> str:

@@ -18,8 +18,9 @@ from pharos.cli.common import (
     Tolerance,
     Trust,
     Workers,
+    build_options,
     describe_chance,
-    parse_size,
+    describe_discount,
     parse_target,
     print_facts,
     print_json,
@@ -58,12 +59,10 @@ def evaluate(
     json: Json = False,
 ) -> None:
     """Evaluate a policy exactly, and say where it stands: regret 0 is optimal, 1 is as bad as playing at random."""
-    limit = parse_size(memory)
+    building = build_options(memory, workers, max_states)
     goal = parse_target(target, parameters)
     given = None if policy in POLICIES else read_policy(policy, trust=trust)
-    mdp = goal.mdp(
-        gamma=gamma, horizon=horizon, sticky=sticky, random=random, memory=limit, workers=workers, max_states=max_states
-    )
+    mdp = goal.mdp(gamma=gamma, horizon=horizon, sticky=sticky, random=random, **building)
     with progress_line("evaluating"):
         values = _values(mdp, policy, given, tolerance)
     best, uniform, worst = (values[name].value_at_start for name in POLICIES)
@@ -99,7 +98,7 @@ def evaluate(
             ("relative to worst", "-" if against_worst is None else f"{against_worst:.6g}  (0: optimal, 1: worst)"),
             ("optimal, uniform, worst", f"{best:.8g}, {uniform:.8g}, {worst:.8g}"),
             ("error at most", f"{max(each.error_bound for each in values.values()):.2g}"),
-            ("discount", f"{mdp.gamma:g}, {'no horizon' if mdp.horizon is None else f'horizon {mdp.horizon}'}"),
+            ("discount", describe_discount(mdp.gamma, mdp.horizon)),
             ("chance", describe_chance(sticky, random)),
         ],
     )

@@ -14,9 +14,9 @@ from pharos.cli.common import (
     Sticky,
     TargetArgument,
     Workers,
+    build_options,
     console,
     describe_chance,
-    parse_size,
     parse_target,
     print_json,
     progress_line,
@@ -68,7 +68,7 @@ def hardness(
     json: Json = False,
 ) -> None:
     """Measure how hard an instance is: visitation, estimation and planning complexity."""
-    limit = parse_size(memory)
+    building = build_options(memory, workers, max_states)
     if measures is not None:
         from pharos.hardness import chosen
 
@@ -80,9 +80,7 @@ def hardness(
         horizon=horizon if gamma == 1 or own else None,
         sticky=sticky,
         random=random,
-        memory=limit,
-        workers=workers,
-        max_states=max_states,
+        **building,
     )
     from pharos.hardness import report as measure
 

@@ -16,9 +16,10 @@ from pharos.cli.common import (
     Sticky,
     TargetArgument,
     Workers,
+    build_options,
     check_format,
     describe_chance,
-    parse_size,
+    describe_discount,
     parse_target,
     print_facts,
     print_json,
@@ -47,16 +48,8 @@ def solve(
     """Find the optimal values and policy, with a proven error bound."""
     if out is not None:
         check_format(out, (".npz", ".npy"))
-    limit = parse_size(memory)
-    mdp = parse_target(target, parameters).mdp(
-        gamma=gamma,
-        horizon=horizon,
-        sticky=sticky,
-        random=random,
-        memory=limit,
-        workers=workers,
-        max_states=max_states,
-    )
+    building = build_options(memory, workers, max_states)
+    mdp = parse_target(target, parameters).mdp(gamma=gamma, horizon=horizon, sticky=sticky, random=random, **building)
     from pharos.solvers import uniform_value, value_iteration
 
     with progress_line("solving") as report:
@@ -87,12 +80,11 @@ def solve(
     if json:
         print_json(answer)
         return
-    lasting = "no horizon" if solution.horizon is None else f"horizon {solution.horizon}"
     facts: list[tuple[str, object]] = [
         ("optimal value at the start", f"{solution.value_at_start:.8g}"),
         ("uniform policy at the start", f"{uniform.value_at_start:.8g}"),
         ("error at most", f"{max(solution.error_bound, uniform.error_bound):.2g}"),
-        ("discount", f"{solution.gamma:g}, {lasting}"),
+        ("discount", describe_discount(solution.gamma, solution.horizon)),
         ("chance", describe_chance(sticky, random)),
         ("states", f"{mdp.num_states:,} x {mdp.num_actions} actions"),
         ("sweeps", f"{solution.sweeps} in {solution.seconds:.2f} s"),

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -20,6 +20,9 @@ from pharos.cli.common import (
     print_json,
     progress_bar,
 )
+
+if TYPE_CHECKING:
+    from pharos.experiments import TrainingResult
 
 
 def train(
@@ -99,34 +102,32 @@ def train(
             progress=_telling(show),
         )
     picture = _plot(out)
-    found = result.result
     if json:
-        print_json({**found, "config": result.config, "seconds": result.seconds, "folder": out, "plot": picture})
+        print_json(
+            {**result.result, "config": result.config, "seconds": result.seconds, "folder": out, "plot": picture}
+        )
         return
-    regret = found["normalized_regret"]
-    facts: list[tuple[str, object]] = [
-        (
-            "final value",
-            f"{found['final_value']:.6g}  (optimal {found['value_optimal']:.6g}, uniform {found['value_uniform']:.6g})",
-        ),
-        ("final regret", f"{found['final_regret']:.6g}"),
-        (
-            "cumulative regret",
-            f"{found['cumulative_regret']:.6g} of the learnt policies, "
-            f"{found['cumulative_realised_regret']:.6g} as played",
-        ),
-        (
-            "normalized regret",
-            "-" if regret is None or math.isnan(regret) else f"{regret:.4g}  (0: optimal, 1: uniform)",
-        ),
-        ("mean return", f"{found['mean_return']:.6g} over {found['episodes']:,} episodes"),
-        ("values", "exact" if found["exact"] else "some are estimates, see exact in curve.parquet"),
-        ("chance", describe_chance(sticky, random)),
-        ("seconds", f"{result.seconds:.1f} ({steps / result.seconds:,.0f} steps/s, evaluation included)"),
-    ]
+    facts = _facts(result, steps, describe_chance(sticky, random))
     if out is not None:
         facts += [("results", out), *([("plot", picture)] if picture else [])]
     print_facts(f"{agent} on {' '.join((target, *(parameters or ())))}, {result.config['observation']}", facts)
+
+
+def _facts(run: "TrainingResult", steps: int, chance: str) -> list[tuple[str, object]]:
+    result, regret = run.result, run.result["normalized_regret"]
+    best, uniform = result["value_optimal"], result["value_uniform"]
+    learnt, played = result["cumulative_regret"], result["cumulative_realised_regret"]
+    shown = "-" if regret is None or math.isnan(regret) else f"{regret:.4g}  (0: optimal, 1: uniform)"
+    return [
+        ("final value", f"{result['final_value']:.6g}  (optimal {best:.6g}, uniform {uniform:.6g})"),
+        ("final regret", f"{result['final_regret']:.6g}"),
+        ("cumulative regret", f"{learnt:.6g} of the learnt policies, {played:.6g} as played"),
+        ("normalized regret", shown),
+        ("mean return", f"{result['mean_return']:.6g} over {result['episodes']:,} episodes"),
+        ("values", "exact" if result["exact"] else "some are estimates, see exact in curve.parquet"),
+        ("chance", chance),
+        ("seconds", f"{run.seconds:.1f} ({steps / run.seconds:,.0f} steps/s, evaluation included)"),
+    ]
 
 
 def _plot(out: Path | None) -> Path | None:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from pharos.environments.base import Environment
+from pharos.environments.hyperparameters import ARCADE
 from pharos.environments.look import Layer, Look, Scenery
 from pharos.environments.parameters import integers, parameter, store
 
@@ -132,21 +133,7 @@ class Freeway(Environment):
     )
     instances = INSTANCES
     paper_instances = tuple(INSTANCES)
-    hyperparameters = {
-        "q_learning": {"default": {"initial_q": 0.0}},
-        "dqn": {
-            "default": {
-                "buffer_size": 100000,
-                "learning_rate": 0.00025,
-                "learning_starts": 5000,
-                "target_update_interval": 1000,
-                "exploration_fraction": 0.1,
-                "exploration_final_eps": 0.02,
-                "batch_size": 32,
-            },
-            "complex_image": {"buffer_size": 20000},
-        },
-    }
+    hyperparameters = ARCADE
 
     def validate(self) -> None:
         if self.car_speeds is None:

@@ -12,6 +12,7 @@ import numpy as np
 
 from pharos.hardness.gorp import gorp_bound
 from pharos.hardness.large_horizon import LargeHorizon, applies
+from pharos.hardness.look_ahead import LookAhead
 from pharos.hardness.steps import TIE, Steps, steps_of
 from pharos.mdp import TabularMDP, takes_mdp
 
@@ -20,16 +21,12 @@ GREEDY_RETURNS = 5
 
 
 @dataclass(frozen=True)
-class EffectiveHorizon:
+class EffectiveHorizon(LookAhead):
     """How far ahead one must look in an MDP.
 
     Attributes:
-        value: the effective horizon by the simple bound, H = min over k of k + log_A m_k, at most T.
-        k_min: smallest k for which acting greedily in Q^k is optimal, Q^1 being the value of the exploration policy
-            (uniform).
-        effective_planning_window: the same from Q^1 = r: how many rewards ahead one must see.
-        ks, ms, gaps, vars: for each k that was tried and does not fail: k, the samples m_k, and gap and variance bound
-            where m_k is attained.
+        value, k_min, effective_planning_window, ks, ms, gaps, vars: see LookAhead; `value` is the effective horizon by
+            the simple bound.
         tight: a tighter bound by GORP's failure probability, where it was asked for; else None.
         greedy_returns: J_k for k = 1, ..., 5: return of the policy greedy in Q^k, ties broken adversarially.
         optimal_return, random_return, worst_return: from the start.
@@ -39,13 +36,6 @@ class EffectiveHorizon:
         conventions: horizon, exploration, chance, tie tolerance.
     """
 
-    value: float
-    k_min: int
-    effective_planning_window: int
-    ks: list[int]
-    ms: list[int]
-    gaps: list[float]
-    vars: list[float]
     greedy_returns: list[float]
     optimal_return: float
     random_return: float
@@ -57,13 +47,7 @@ class EffectiveHorizon:
     def to_dict(self) -> dict[str, Any]:
         """JSON-able; infinite gaps are None."""
         return {
-            "value": self.value,
-            "k_min": self.k_min,
-            "effective_planning_window": self.effective_planning_window,
-            "ks": self.ks,
-            "ms": self.ms,
-            "gaps": [gap if math.isfinite(gap) else None for gap in self.gaps],
-            "vars": self.vars,
+            **super().to_dict(),
             "tight": self.tight,
             "greedy_returns": self.greedy_returns,
             "optimal_return": self.optimal_return,
@@ -71,9 +55,6 @@ class EffectiveHorizon:
             "worst_return": self.worst_return,
             "num_states": self.num_states,
         }
-
-    def __str__(self) -> str:
-        return f"{self.value:.6g} (k_min {self.k_min}, window {self.effective_planning_window})"
 
 
 @takes_mdp

@@ -79,6 +79,7 @@ class Simulator:
         )
         chance = _chance(options)
         self.chance, self.first_chosen = chance.triple, float(chance.first_chosen)
+        self._weights = (*self.chance, self.first_chosen)
         self.has_chance = self.chance != (1.0, 0.0, 0.0)
         self.first_previous = _first_previous(options.initial_previous_action, self.env)
         states, probabilities = start_distribution(self.env)
@@ -92,8 +93,7 @@ class Simulator:
     def setting(self, mode: int, ranges: np.ndarray, scale: np.ndarray, starts: np.ndarray) -> Setting:
         """What the kernels of many environments take; `starts` are states, or their indices in a state space."""
         limit = self.limit if self.limit is not None else 1 << 62
-        chance = (*self.chance, self.first_chosen)
-        return Setting(ranges, scale, chance, limit, mode, self.first_previous, starts, self.start_cumulative)
+        return Setting(ranges, scale, self._weights, limit, mode, self.first_previous, starts, self.start_cumulative)
 
     def drawn_start(self, rng: np.random.Generator) -> int:
         """Which of the start states; draws one number where there are several."""
@@ -103,8 +103,7 @@ class Simulator:
 
     def executed(self, chosen: int, previous: int, u: float) -> int:
         """The executed action, by one uniform number u in [0, 1): chosen, then previous, then uniform."""
-        weights = (*self.chance, self.first_chosen)
-        return stepping.executed_by_number.py_func(chosen, previous, weights, self.env.num_actions, u)
+        return stepping.executed_by_number.py_func(chosen, previous, self._weights, self.env.num_actions, u)
 
     def checked_state(self, state: Any) -> np.ndarray:
         """(D,) int64 from what a user gave; ParameterError unless every component is in its range."""

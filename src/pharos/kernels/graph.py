@@ -85,15 +85,8 @@ def count_predecessors(next_states, ends, first):
         if ends[u]:
             continue
         for a in range(num_actions):
-            v = next_states[u, a]
-            if v == u:
-                continue
-            repeated = False
-            for b in range(a):
-                if next_states[u, b] == v:
-                    repeated = True
-                    break
-            if not repeated:
+            if _is_new_edge(next_states, u, a):
+                v = next_states[u, a]
                 first[(num_states if v < 0 else v) + 1] += 1
 
 
@@ -105,18 +98,23 @@ def fill_predecessors(next_states, ends, first, previous):
         if ends[u]:
             continue
         for a in range(num_actions):
-            v = next_states[u, a]
-            if v == u:
-                continue
-            repeated = False
-            for b in range(a):
-                if next_states[u, b] == v:
-                    repeated = True
-                    break
-            if not repeated:
+            if _is_new_edge(next_states, u, a):
+                v = next_states[u, a]
                 w = (num_states if v < 0 else v) + 1
                 previous[first[w]] = u
                 first[w] += 1
+
+
+@njit(cache=True, nogil=True)
+def _is_new_edge(next_states, u, a):
+    """Whether action a leads from u to another node, to which no action before it leads."""
+    v = next_states[u, a]
+    if v == u:
+        return False
+    for b in range(a):
+        if next_states[u, b] == v:
+            return False
+    return True
 
 
 def reversed_graph(next_states, ends, num_nodes):
