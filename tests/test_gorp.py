@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from naive_gorp import failure_probability, returns_of_paths
 from pharos import hardness, importers
 from pharos.errors import ParameterError, UndefinedMeasure
-from pharos.hardness.gorp import METHODS, _knapsack, _Search
+from pharos.hardness.gorp import METHODS, Search
+from pharos.hardness.gorp_tails import knapsack
 from pharos.mdp import TabularMDP, sticky_actions
 from strategies import deterministic_mdps, small_mdps
 
@@ -52,7 +53,7 @@ def test_exact_probabilities_give_a_smaller_bound_that_is_proven(corridor):
 
 @pytest.mark.slow
 def test_gorp_succeeds_as_often_as_the_exact_probability_says(corridor):
-    search = _Search(corridor, 100, ("exact",))
+    search = Search(corridor, 100, ("exact",))
     runs = hardness.run_gorp(corridor, k=1, m=100, runs=60, seed=3)
     expected = 1 - search.failure(100, 1)
     assert runs.success_rate == pytest.approx(expected, abs=3.3 * math.sqrt(expected * (1 - expected) / 60))
@@ -76,7 +77,7 @@ def test_gorp_repeats_itself_with_the_same_seed(corridor):
 )
 def test_no_proven_method_is_below_the_probability_of_failure(mdp, steps, k, m, method):
     mdp = mdp.with_initial(int(mdp.start_states[0]))
-    search = _Search(mdp, steps, (method,))
+    search = Search(mdp, steps, (method,))
     assert search.failure(m, k) >= failure_probability(mdp, steps, k, m) - 1e-9
 
 
@@ -98,7 +99,7 @@ def paying_once(draw):
 @given(paying_once(), st.integers(1, 4), st.integers(1, 2), st.integers(1, 3))
 def test_the_exact_method_is_the_probability_of_failure(mdp, steps, k, m):
     assume(mdp.num_actions**k <= 4)
-    search = _Search(mdp, steps, ("exact",))
+    search = Search(mdp, steps, ("exact",))
     if search.two_valued:
         assert search.failure(m, k) == pytest.approx(failure_probability(mdp, steps, k, m), abs=1e-9)
 
@@ -115,7 +116,7 @@ def test_the_knapsack_is_the_linear_program(n, data):
     upper = np.array([data.draw(st.floats(low, 1)) for low in lower])
     assume(upper.sum() >= 1)
     found = linprog(-f, A_eq=np.ones((1, n)), b_eq=[1], bounds=list(zip(lower, upper, strict=True)))
-    assert _knapsack(lower[None], upper[None], f[None])[0] == pytest.approx(-found.fun, abs=1e-6)
+    assert knapsack(lower[None], upper[None], f[None])[0] == pytest.approx(-found.fun, abs=1e-6)
 
 
 @pytest.mark.slow

@@ -27,17 +27,17 @@ def config(cache, monkeypatch):
 
 
 def test_kept_values_are_those_of_the_task_to_the_last_bit(config):
-    assert _values.kept(config) is None
+    assert _values.stored_values(config) is None
     found = _values.solve(config)
     task = _values.task_of(config)
     assert found == {"reference": asdict(task.reference), "return_range": list(task.return_range)}
-    assert _values.kept(config) == found == _values.solve(config)
+    assert _values.stored_values(config) == found == _values.solve(config)
 
 
 def test_a_run_with_kept_values_ends_with_the_same_files(config, tmp_path):
     train_config(config, tmp_path / "alone")
     _execution.prepare_instance(config)
-    assert _values.kept(config) is not None
+    assert _values.stored_values(config) is not None
     _execution.train(config, tmp_path / "prepared")
     for name in ("curve.parquet", "policy.npy"):
         assert (tmp_path / "alone" / name).read_bytes() == (tmp_path / "prepared" / name).read_bytes()
@@ -50,12 +50,12 @@ def test_a_run_with_kept_values_ends_with_the_same_files(config, tmp_path):
 )
 def test_another_setting_has_values_of_its_own(config, change):
     _values.solve(config)
-    assert _values.kept({**config, **change}) is None
+    assert _values.stored_values({**config, **change}) is None
 
 
 def test_another_seed_agent_or_observation_shares_them(config):
     found = _values.solve(config)
-    assert _values.kept({**config, "seed": 7, "agent": "dqn", "observation": "vector", "steps": 9}) == found
+    assert _values.stored_values({**config, "seed": 7, "agent": "dqn", "observation": "vector", "steps": 9}) == found
 
 
 @pytest.mark.parametrize(
@@ -67,14 +67,14 @@ def test_stored_values_that_were_changed_are_solved_again(change, config):
     text = file.read_text()
     start = text.index('"values"')
     file.write_text(text[:start] + change(text[start:]) if "values" in change(text) else change(text))
-    assert _values.kept(config) is None
-    assert _values.solve(config) == values == _values.kept(config)
+    assert _values.stored_values(config) is None
+    assert _values.solve(config) == values == _values.stored_values(config)
 
 
 def test_values_of_other_rules_are_not_taken(config, monkeypatch):
     _values.solve(config)
     monkeypatch.setattr("pharos.rules.fingerprint_of_rules", lambda env, names: "other")
-    assert _values.kept(config) is None
+    assert _values.stored_values(config) is None
 
 
 @pytest.mark.slow

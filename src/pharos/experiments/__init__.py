@@ -15,9 +15,10 @@ from pharos.experiments.results import (
     write_record,
     write_table,
 )
+from pharos.experiments.search_space import SPACES
 from pharos.experiments.task import Task, TaskValues
 from pharos.experiments.train import TrainingResult, train, train_config
-from pharos.experiments.tuning import SPACES, TuningResult, tune
+from pharos.experiments.tuning import TuningResult, tune
 
 __all__ = [
     "SPACES",

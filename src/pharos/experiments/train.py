@@ -246,14 +246,6 @@ def _run(
             f"expected an algorithm of Stable-Baselines3 and a folder (out)"
         )
     began = time.perf_counter()
-    entry = config.to_dict()
-    record: dict[str, Any] = {
-        "format": _results.FORMAT,
-        "id": config.id,
-        "config": entry,
-        "versions": _results.versions(),
-    }
-    spent = 0.0
     if folder is not None:
         _results.require_pyarrow()
         done = _finished(folder, config)
@@ -264,14 +256,36 @@ def _run(
         folder.mkdir(parents=True, exist_ok=True)
     logs = folder / "tensorboard" if folder is not None and tensorboard else None
     learner = make_learner(config, algorithm or config.algorithm(), task, chosen, logs)
-    curve = _Curve(task)
-    checkpoint = None if folder is None else _Checkpoint(folder / "checkpoint", config.id)
-    if folder is not None and checkpoint is not None:
-        restored = checkpoint.restore(learner)
-        if restored is not None:
-            curve.rows, spent = restored
-        record |= {"status": "running", "hyperparameters": chosen}
-        _results.write_record(folder, record)
+    curve, checkpoint = _Curve(task), None
+    if folder is not None:
+        checkpoint = _Checkpoint(folder / "checkpoint", config.id)
+        curve.rows, spent = checkpoint.restore(learner) or ([], 0.0)
+        began -= spent
+    record = _Record(folder, config, chosen)
+    record.write("running")
+    _learn(learner, curve, config, progress, checkpoint, record, began)
+    seconds = time.perf_counter() - began
+    result = curve.result()
+    if folder is not None:
+        learner.publish(folder)
+        _results.write_curve(folder, curve.rows)
+        record.write("finished", seconds=seconds, result=result)
+        for leftover in folder.glob("checkpoint*"):  # of kills in the middle of replacing one, too
+            shutil.rmtree(leftover, ignore_errors=True)
+    rows = [{name: row[name] for name in _results.COLUMNS} for row in curve.rows]
+    return TrainingResult(config.to_dict(), result, rows, learner.agent, folder, seconds)
+
+
+def _learn(
+    learner: Learner,
+    curve: _Curve,
+    config: RunConfig,
+    progress: Progress | None,
+    checkpoint: "_Checkpoint | None",
+    record: "_Record",
+    began: float,
+) -> None:
+    """Learn from the last row of the curve on, with an evaluation at each point; `began`: when the run did."""
     if not curve.rows:
         curve.add(0, 0, 0.0, learner.agent)
     start, steps, interval = curve.rows[-1]["step"], config.steps, config.evaluation_interval
@@ -282,27 +296,32 @@ def _run(
         if progress is not None:
             progress(step, steps, row)
         if checkpoint is not None and step < steps:
-            checkpoint.save(learner, curve.rows, spent + time.perf_counter() - began)
+            checkpoint.save(learner, curve.rows, time.perf_counter() - began)
         return row
 
-    if points:
-        try:
-            learner.learn(points, at_point)
-        except Exception as error:
-            if folder is not None:
-                said = f"{type(error).__name__}: {' '.join(str(error).split())}"
-                _results.write_record(folder, {**record, "status": "failed", "error": said})
-            raise
-    seconds = spent + time.perf_counter() - began
-    result = curve.result()
-    if folder is not None:
-        learner.publish(folder)
-        _results.write_curve(folder, curve.rows)
-        _results.write_record(folder, {**record, "status": "finished", "seconds": seconds, "result": result})
-        for leftover in folder.glob("checkpoint*"):  # of kills in the middle of replacing one, too
-            shutil.rmtree(leftover, ignore_errors=True)
-    rows = [{name: row[name] for name in _results.COLUMNS} for row in curve.rows]
-    return TrainingResult(entry, result, rows, learner.agent, folder, seconds)
+    if not points:
+        return
+    try:
+        learner.learn(points, at_point)
+    except Exception as error:
+        record.write("failed", error=f"{type(error).__name__}: {' '.join(str(error).split())}")
+        raise
+
+
+class _Record:
+    """The file run.json, where there is a folder for results."""
+
+    def __init__(self, folder: Path | None, config: RunConfig, hyperparameters: Mapping[str, Any]):
+        self.folder, self.hyperparameters = folder, hyperparameters
+        versions = _results.versions()
+        self.run = {"format": _results.FORMAT, "id": config.id, "config": config.to_dict(), "versions": versions}
+
+    def write(self, status: str, **entries: Any) -> None:
+        """Replace it: the run is "running", "failed" or "finished"."""
+        if self.folder is None:
+            return
+        record = {**self.run, "status": status, "hyperparameters": self.hyperparameters, **entries}
+        _results.write_record(self.folder, record)
 
 
 def _finished(folder: Path, config: RunConfig) -> TrainingResult | None:

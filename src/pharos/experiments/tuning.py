@@ -12,7 +12,6 @@ table says now, so that the best is never worse than that on the instances and s
 Source: Bergstra et al. (2011), Algorithms for hyper-parameter optimization; Akiba et al. (2019), Optuna.
 """
 
-import inspect
 import json
 import math
 import os
@@ -23,58 +22,19 @@ from pathlib import Path
 from typing import Any
 
 from pharos import storage
-from pharos.agents import Q_LEARNING_DEFAULTS as Q_LEARNING
-from pharos.agents import agent_kind, algorithm
+from pharos.agents import agent_kind
 from pharos.agents import hyperparameters as hyperparameters_of
 from pharos.environments import Environment, make
 from pharos.errors import MissingExtra, ParameterError
 from pharos.experiments import results as _results
 from pharos.experiments.config import ChanceSetting
 from pharos.experiments.journal import JournalLock, mend_journal
+from pharos.experiments.search_space import allows, checked_space, default_value, suggested_value
 from pharos.experiments.task import Task
 from pharos.experiments.train import train_on
 from pharos.observations import own_observation
 
 EVALUATIONS = 20  # of a run
-
-SPACES: dict[str, dict[str, tuple[Any, ...]]] = {
-    "q_learning": {
-        "learning_rate": ("log", 0.01, 1.0),
-        "visits_exponent": ("one of", 0.0, 0.6, 0.8),
-        "gamma": ("one of", 0.95, 0.99, 0.999),
-        "initial_q": ("one of", 0.0, 0.5, 1.0, 2.0),
-        "exploration_final_eps": ("linear", 0.0, 0.1),
-        "exploration_fraction": ("linear", 0.01, 0.5),
-    },
-    "dqn": {
-        "learning_rate": ("log", 5e-5, 2e-3),
-        "batch_size": ("one of", 32, 64, 128),
-        "gamma": ("one of", 0.95, 0.98, 0.99, 0.995),
-        "n_steps": ("one of", 1, 3, 5),
-        "train_freq": ("one of", 1, 4, 8),
-        "learning_starts": ("one of", 200, 1000, 5000),
-        "target_update_interval": ("one of", 100, 500, 1000, 2500),
-        "exploration_fraction": ("linear", 0.05, 0.5),
-        "exploration_final_eps": ("linear", 0.01, 0.1),
-    },
-    "ppo": {
-        "learning_rate": ("log", 5e-5, 2e-3),
-        "n_steps": ("one of", 16, 32, 64, 128, 256),
-        "n_epochs": ("one of", 4, 8),
-        "gamma": ("one of", 0.95, 0.98, 0.99, 0.995),
-        "gae_lambda": ("linear", 0.8, 1.0),
-        "ent_coef": ("log", 1e-4, 0.1),
-        "clip_range": ("one of", 0.1, 0.2, 0.3),
-    },
-    "a2c": {
-        "learning_rate": ("log", 5e-5, 5e-3),
-        "n_steps": ("one of", 5, 16, 32),
-        "gamma": ("one of", 0.95, 0.98, 0.99, 0.995),
-        "gae_lambda": ("linear", 0.8, 1.0),
-        "ent_coef": ("log", 1e-4, 0.1),
-    },
-}
-"""What is searched for each agent: between two bounds on a logarithmic or a linear scale, or one of some values."""
 
 
 @dataclass(frozen=True)
@@ -152,7 +112,7 @@ def tune(
         environment=_class_of(instances),
         observation=observation,
         kinds=_checked_chances(chances, sticky, random),
-        space=_checked_space(agent, space),
+        space=checked_space(agent, space),
         seeds=seeds,
         steps=steps,
         search_seed=search_seed,
@@ -178,7 +138,7 @@ def tune(
     return TuningResult(
         agent=agent,
         environment=search.environment,
-        observation=search.seen,
+        observation=search.observation_name,
         hyperparameters={**search.table, **study.best_params},
         score=float(study.best_value),
         first_score=records[0]["score"],
@@ -202,7 +162,7 @@ class _Search:
     search_seed: int
 
     @cached_property
-    def seen(self) -> str:
+    def observation_name(self) -> str:
         """The name of what the agent sees."""
         return str(self._observed)
 
@@ -223,7 +183,7 @@ class _Search:
     @cached_property
     def table(self) -> dict[str, Any]:
         """The hyperparameters of now, which the first trial has, and every trial for what is not searched."""
-        return hyperparameters_of(self.agent, self.environment, self.seen)
+        return hyperparameters_of(self.agent, self.environment, self.observation_name)
 
     @cached_property
     def config(self) -> dict[str, Any]:
@@ -232,7 +192,7 @@ class _Search:
         config = {
             "agent": self.agent,
             "instances": [{"environment": each.name, "parameters": each.parameters} for each in self.instances],
-            "observation": self.seen,
+            "observation": self.observation_name,
             "steps": self.steps,
             "seeds": self.seeds,
             "chance": chance[0] if len(chance) == 1 else chance,
@@ -251,7 +211,7 @@ class _Search:
 
     def score(self, trial: Any, pruned: type[Exception]) -> float:
         """The mean normalised regret of evaluations after the first, over all runs; `pruned` is raised on the way."""
-        chosen = {key: _suggested(trial, key, choices) for key, choices in self.space.items()}
+        chosen = {key: suggested_value(trial, key, choices) for key, choices in self.space.items()}
         regrets: list[float] = []
 
         def progress(_done: int, _steps: int, row: Mapping[str, Any]) -> None:
@@ -286,12 +246,9 @@ def _opened(optuna: Any, search: _Search, folder: Path | None, trials: int) -> A
         load_if_exists=True,
     )
     if not _trials(study) and all(trial.state.name != "WAITING" for trial in study.trials):
-        before = {key: search.table.get(key, _default(search.agent, key)) for key in search.space}
-        study.enqueue_trial({key: value for key, value in before.items() if _allows(search.space[key], value)})
+        before = {key: search.table.get(key, default_value(search.agent, key)) for key in search.space}
+        study.enqueue_trial({key: value for key, value in before.items() if allows(search.space[key], value)})
     return study
-
-
-# The space ------------------------------------------------------------------------------------------------------------
 
 
 def _checked_chances(
@@ -304,46 +261,6 @@ def _checked_chances(
             f"chances are {list(chances)}, sticky is {sticky} and random {random}; expected one or the other"
         )
     return [ChanceSetting.from_dict({name: float(value) for name, value in each.items()}) for each in chances]
-
-
-def _checked_space(agent: str, space: Mapping[str, Sequence[Any]] | None) -> dict[str, tuple[Any, ...]]:
-    searched = space if space is not None else SPACES.get(agent)
-    if not searched:
-        raise ParameterError(
-            f"agent {agent!r} has no space to search; expected one of {', '.join(SPACES)}, or give `space`, such as "
-            f"{{'learning_rate': ('log', 0.0001, 0.01)}}"
-        )
-    for name, choices in searched.items():
-        kind, *values = choices
-        ranged = kind in ("log", "linear") and len(values) == 2 and 0 <= values[0] < values[1]
-        if not (ranged and (kind == "linear" or values[0] > 0)) and not (kind == "one of" and values):
-            raise ParameterError(
-                f"space: {name} is {tuple(choices)!r}; expected ('log', low, high), ('linear', low, high) "
-                f"or ('one of', value, ...)"
-            )
-    return {name: tuple(choices) for name, choices in searched.items()}
-
-
-def _suggested(trial: Any, name: str, choices: tuple[Any, ...]) -> Any:
-    kind, *values = choices
-    if kind == "one of":
-        return trial.suggest_categorical(name, values)
-    return trial.suggest_float(name, *values, log=kind == "log")
-
-
-def _default(agent: str, name: str) -> Any:
-    """What the agent itself takes for a hyperparameter that the table leaves out; None: it says nothing."""
-    if agent_kind(agent).is_tabular:
-        return Q_LEARNING.get(name)
-    parameter = inspect.signature(algorithm(agent)).parameters.get(name)
-    return None if parameter is None or parameter.default is parameter.empty else parameter.default
-
-
-def _allows(choices: tuple[Any, ...], value: Any) -> bool:
-    kind, *values = choices
-    if kind == "one of":
-        return value in values
-    return isinstance(value, int | float) and values[0] <= value <= values[1]
 
 
 def _class_of(instances: Sequence[Environment]) -> str:
@@ -393,7 +310,9 @@ def _write(folder: Path, search: _Search, study: Any) -> None:
         best = {**search.table, **study.best_params}
         record["best"] = {"trial": study.best_trial.number, "score": study.best_value, "hyperparameters": best}
         head = f"# Mean normalised regret {study.best_value:.4f} after {_done(study)} trials, see tuning.json\n"
-        text = head + yaml.safe_dump({search.agent: {search.environment: {search.seen: best}}}, sort_keys=False)
+        text = head + yaml.safe_dump(
+            {search.agent: {search.environment: {search.observation_name: best}}}, sort_keys=False
+        )
         storage.replace_file(folder / "hyperparameters.yaml", text)
     storage.replace_json(folder / "tuning.json", record)
 

@@ -9,13 +9,14 @@ size, and its reciprocal anything.
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from pharos.errors import ParameterError, PrecisionError
+from pharos.hardness.gap_blocks import weighted_gaps
 from pharos.hardness.interval import Certified
-from pharos.hardness.ties import TieProof, same_outcomes
+from pharos.hardness.ties import TieProof, UnresolvedTies
 from pharos.kernels import gaps as kernels
 from pharos.mdp import BEST, BellmanEquation, TabularMDP, takes_mdp
 from pharos.solvers import Solution, value_iteration
@@ -27,10 +28,6 @@ NARROW = 1e-6
 # The default tie tolerance is this times the error bound of the values; more than 2, as a gap is known to twice the
 # bound.
 ERRORS_PER_TIE = 2.5
-# States at once; fixed, so that sums do not depend on the machine, and so few that a block stays in the cache.
-_BLOCK = 1 << 14
-# Bytes for the values of every step, with a horizon.
-_MEMORY = 8 * 2**30
 # Relative rounding of a gap, its reciprocal and sums of these: a few units each, and one for each action.
 _ROUNDING = 1e-12
 _UNIT = 2.0**-53
@@ -160,8 +157,8 @@ def gaps(mdp: TabularMDP, solution: Solution | None = None, *, tie_tolerance: fl
         the pharos paper, equation 2; regularized: Colosseum (Conserva and Rauber, 2022).
     """
     if solution is None and tie_tolerance is None:
-        return resolved_gaps(mdp, checked(mdp, None))
-    return _summed(mdp, checked(mdp, solution), tie_tolerance)
+        return resolved_gaps(mdp, optimal_solution(mdp, None))
+    return _summed(mdp, optimal_solution(mdp, solution), tie_tolerance)
 
 
 def resolved_gaps(mdp: TabularMDP, solution: Solution) -> Gaps:
@@ -226,13 +223,13 @@ def gaps_of_states(
     mdp: TabularMDP, solution: Solution | None, tie_tolerance: float | None
 ) -> tuple[Iterator[tuple[np.ndarray, np.ndarray]], float, dict[str, Any]]:
     """(blocks of (gap (N, A), weight (N,): how often each row counts, 0 for none), tie tolerance, conventions)."""
-    solution = checked(mdp, solution)
+    solution = optimal_solution(mdp, solution)
     tolerance = _tolerance(solution, tie_tolerance, _error(mdp, solution))
-    blocks = ((part.gap, part.counted) for part in _weighted_gaps(mdp, solution))
+    blocks = ((part.gap, part.counted) for part in weighted_gaps(mdp, solution))
     return blocks, tolerance, _conventions(mdp, solution, tolerance)
 
 
-def checked(mdp: TabularMDP, solution: Solution | None) -> Solution:
+def optimal_solution(mdp: TabularMDP, solution: Solution | None) -> Solution:
     """The optimal solution of `mdp` that was given, or a new one.
 
     Raises:
@@ -282,16 +279,13 @@ def _conventions(mdp: TabularMDP, solution: Solution, tolerance: float) -> dict[
     }
 
 
-# Gaps and how often they count ----------------------------------------------------------------------------------------
-
-
 def _summed(mdp: TabularMDP, solution: Solution, tie_tolerance: float | None) -> Gaps:
     error = _error(mdp, solution)
     tolerance = _tolerance(solution, tie_tolerance, error)
     sums, counts, histogram = kernels.empty_sums(), kernels.empty_counts(), kernels.empty_histogram()
-    proof = _Ties(mdp, tolerance, error, tie_tolerance is not None)
+    proof = UnresolvedTies(mdp, tolerance, error, tie_tolerance is not None)
     minimal, num_rows = math.inf, 0
-    for part in _weighted_gaps(mdp, solution):
+    for part in weighted_gaps(mdp, solution):
         seen = counts.copy()
         arguments = (tolerance, error, REGULARIZER, sums, counts, histogram)
         minimal = kernels.add_up(part.gap, part.weight, part.counted, minimal, *arguments)
@@ -301,7 +295,7 @@ def _summed(mdp: TabularMDP, solution: Solution, tie_tolerance: float | None) ->
     count = int(counts[0])
     num_ties = num_rows * mdp.num_actions - count
     bins = np.flatnonzero(histogram)
-    unresolved = proof.unresolved(_weighted_gaps(mdp, solution))
+    unresolved = proof.unresolved(weighted_gaps(mdp, solution))
     first, last = (int(bins[0]), int(bins[-1])) if bins.size else (0, -1)
     return Gaps(
         sum_of_reciprocals=total,
@@ -319,180 +313,3 @@ def _summed(mdp: TabularMDP, solution: Solution, tie_tolerance: float | None) ->
         error=error,
         conventions=_conventions(mdp, solution, tolerance),
     )
-
-
-class _Step(NamedTuple):
-    """A time step, or all where there is no horizon: x (S + 1, W), what follows it; which states count, how often."""
-
-    own: np.ndarray
-    next_x: np.ndarray
-    later: np.ndarray
-    first: np.ndarray
-
-
-class _Part(NamedTuple):
-    """Gaps of a block of states.
-
-    Attributes:
-        step: what they belong to. number: of that step.
-        states: (N,) indices. is_whole: whether they are a range.
-        rewards, following: (N, A), what executing an action pays, and the value of what follows.
-        gap: (N, A).
-        scale: the probability that the chosen action is executed, which each gap is multiplied by.
-        weight: (N,) how many pairs (state, previous action) a row stands for.
-        counted: (N,) the same; 0 for terminal states and those that cannot be reached.
-    """
-
-    step: _Step
-    number: int
-    states: np.ndarray
-    rewards: np.ndarray
-    following: np.ndarray
-    gap: np.ndarray
-    scale: float
-    weight: np.ndarray
-    counted: np.ndarray
-    is_whole: bool = True
-
-
-def _weighted_gaps(mdp: TabularMDP, solution: Solution) -> Iterator[_Part]:
-    """The gaps of all states, in blocks."""
-    chance, everywhere = mdp.chance, solution.horizon is None and not mdp.is_sticky
-    for number, step in enumerate(_steps(mdp, solution)):
-        for start in range(0, mdp.num_states, _BLOCK):
-            block = slice(start, min(start + _BLOCK, mdp.num_states))
-            states = np.arange(block.start, block.stop)
-            rewards = mdp.reward_table.rows(block)
-            following = mdp.dynamics.expected(step.next_x, block)
-            difference = kernels.differences(rewards, following, mdp.gamma)
-            live = ~np.asarray(mdp.terminal[block])
-            later = step.later[block]
-            weight = later + (everywhere & (later == 0))
-            part = (number, states, rewards, following)
-            gap = difference if chance.chosen == 1.0 else chance.chosen * difference
-            yield _Part(step, *part, gap, chance.chosen, weight, np.where(live, later, 0))
-            if step.first[block].any():
-                some = np.flatnonzero(step.first[block])
-                part = (number, states[some], rewards[some], following[some])
-                once = np.ones(some.size, np.int64)
-                gap = chance.first_chosen * difference[some]
-                yield _Part(step, *part, gap, chance.first_chosen, once, live[some] * once, False)
-
-
-def _steps(mdp: TabularMDP, solution: Solution) -> Iterator[_Step]:
-    """For each step t = 1, ..., T, or once: values, and how many times each state counts.
-
-    later (S,): 1 for a reachable state, under sticky actions the number of actions by which it can be reached; first
-    (S,) bool: start states, which count once more under sticky actions, without a previous action.
-    """
-    nothing = np.zeros(mdp.num_states, np.bool_)
-    starts = nothing.copy()
-    starts[mdp.starts] = True
-    if solution.horizon is None:
-        if mdp.is_sticky:
-            yield _Step(solution.x, solution.x, mdp.pairs_within().sum(axis=1), starts)
-        else:
-            yield _Step(solution.x, solution.x, mdp.states_within().astype(np.int64), nothing)
-        return
-    all_steps = _all_steps(mdp, solution)
-    pairs = np.zeros((mdp.num_states, mdp.num_actions), np.bool_)
-    reached = starts
-    for step in range(1, solution.horizon + 1):
-        to_go = solution.horizon - step + 1
-        own, following = (_with_end(all_steps[n]) for n in (to_go, to_go - 1))
-        if mdp.is_sticky:
-            yield _Step(own, following, pairs.sum(axis=1), starts if step == 1 else nothing)
-            pairs = _pairs_after(mdp, pairs, step == 1)
-        else:
-            yield _Step(own, following, reached.astype(np.int64), nothing)
-            arrived = mdp.dynamics.arrivals(np.flatnonzero(reached & ~np.asarray(mdp.terminal)))
-            reached = np.asarray(arrived.any(axis=1))
-
-
-def _pairs_after(mdp: TabularMDP, pairs: np.ndarray, is_first: bool) -> np.ndarray:
-    """(S, A) bool: the pairs (state, previously executed action) one step after these, or after the start."""
-    live = ~np.asarray(mdp.terminal)
-    if is_first or mdp.chance.executes_any:
-        states = mdp.starts if is_first else np.flatnonzero(pairs.any(axis=1))
-        return mdp.dynamics.arrivals(states[live[states]])
-    states, actions = np.nonzero(pairs & live[:, None])  # every action is a repetition
-    outcomes = mdp.dynamics.outcomes(states, actions)
-    after = np.zeros((mdp.num_states + 1, mdp.num_actions), np.bool_)
-    after[outcomes.states, actions[outcomes.which]] = True
-    return after[:-1]
-
-
-def _all_steps(mdp: TabularMDP, solution: Solution) -> np.ndarray:
-    """(T + 1, S) or (T + 1, S, A), the values with every number of steps to go."""
-    needed = 8 * ((solution.horizon or 0) + 1) * mdp.num_states * mdp.width
-    if solution.all_steps is None:
-        if needed > _MEMORY:
-            raise ParameterError(
-                f"gaps of {solution.horizon} steps of {mdp.num_states} states need {needed / 2**30:.1f} GiB; expected "
-                f"at most "
-                f"{_MEMORY / 2**30:.0f}: leave out the horizon, or make it or the space smaller"
-            )
-        solution = value_iteration(mdp, horizon=solution.horizon, keep_all=True)
-    assert solution.all_steps is not None
-    return solution.all_steps
-
-
-def _with_end(values: np.ndarray) -> np.ndarray:
-    """(S + 1, W), from (S,) or (S, A)."""
-    return np.concatenate([values.reshape(len(values), -1), np.zeros((1, values[0].size))])
-
-
-# Ties -----------------------------------------------------------------------------------------------------------------
-
-
-class _Ties:
-    """Counts the ties that are not proven to be ties.
-
-    Attributes:
-        small: gaps that are computed as larger than 0, and no larger than the tolerance; of a tolerance that is part of
-            what is asked for, gaps that are within their error of it.
-        equal: gaps that are computed as 0, beyond the first of a state.
-    """
-
-    def __init__(self, mdp: TabularMDP, tolerance: float, error: float, is_definition: bool):
-        self.mdp, self.tolerance, self.error, self.is_definition = mdp, tolerance, error, is_definition
-        self.small = self.equal = 0
-        self.proof = TieProof(mdp)
-
-    def look_at(self, part: _Part, small: int, equal: int) -> None:
-        """Take up the ties of a block: how many are small, and how many equal."""
-        if part.scale == 0.0:
-            return  # nothing can be chosen: every action is worth the same
-        if self.is_definition:
-            near = np.abs(part.gap - self.tolerance) <= self.error
-            self.small += int((near.sum(axis=1) * part.counted).sum())
-            return
-        self.small += small
-        self.equal += equal
-        if not self.small:
-            own = part.step.own[part.states[0] : part.states[-1] + 1] if part.is_whole else part.step.own[part.states]
-            self.proof.look_at(part.number, own, part.rewards, part.following, part.gap, part.counted)
-
-    def unresolved(self, parts: Iterator[_Part]) -> int:
-        """How many are not proven; `parts` once more, where that is to be seen one by one."""
-        if self.is_definition or (not self.small and self.proof.holds):
-            return self.small
-        if self.small or not self.equal:
-            return self.small + self.equal
-        return self.equal - sum(self._alike(part) for part in parts)
-
-    def _alike(self, part: _Part) -> int:
-        """Equal gaps of a block between actions that have the same outcomes."""
-        if part.scale == 0.0:
-            return 0
-        zero = (part.gap == 0.0) & (part.counted > 0)[:, None]
-        several = np.flatnonzero(zero.sum(axis=1) > 1)
-        zero = zero[several]
-        best = zero.argmax(axis=1)
-        zero[np.arange(several.size), best] = False
-        row, action = np.nonzero(zero)
-        rows = several[row]
-        likely = part.following[rows, best[row]] == part.following[rows, action]
-        row, action, rows = row[likely], action[likely], rows[likely]
-        same = same_outcomes(self.mdp, part.states[rows], part.rewards[rows], best[row], action)
-        return int(part.counted[rows[same]].sum())

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from pharos.errors import UndefinedMeasure
-from pharos.hardness.gaps import checked
+from pharos.hardness.gaps import optimal_solution
 from pharos.hardness.interval import Interval
 from pharos.hardness.occupancy import discounted_arrivals, support_with_ends
 from pharos.mdp import TabularMDP, takes_mdp
@@ -45,7 +45,7 @@ def distribution_mismatch(
         raise UndefinedMeasure(
             "distribution_mismatch is defined for discounted MDPs without a horizon: give gamma < 1 and no horizon"
         )
-    solution = checked(mdp, solution)
+    solution = optimal_solution(mdp, solution)
     best, lacking = discounted_arrivals(mdp, solution.policy, tolerance=tolerance)
     other, missing = discounted_arrivals(mdp, policy, tolerance=tolerance)
     there = support_with_ends(mdp, solution.policy)

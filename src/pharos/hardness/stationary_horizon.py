@@ -13,49 +13,26 @@ import numpy as np
 
 from pharos.errors import ParameterError, PrecisionError, UndefinedMeasure
 from pharos.hardness.choices import Choices, choices_of, reachable
+from pharos.hardness.look_ahead import LookAhead
 from pharos.hardness.steps import expected_rewards, single_outcomes
 from pharos.mdp import TabularMDP, takes_mdp
 from pharos.solvers import Solution, uniform_value, value_iteration, worst_value
 
 
 @dataclass(frozen=True)
-class StationaryHorizon:
+class StationaryHorizon(LookAhead):
     """How far ahead one must look in a discounted MDP.
 
     Attributes:
-        value: min over k of k + log_A m_k, at most `steps`.
-        k_min: smallest k for which acting greedily in Q^k is optimal, Q^1 being the value of uniform play; `steps`
-            where none is.
-        effective_planning_window: the same from Q^1 = r.
-        ks, ms, gaps, vars: for each k that was tried and does not fail: k, the samples m_k, and gap and variance bound
-            where m_k is attained.
+        value, k_min, effective_planning_window, ks, ms, gaps, vars: see LookAhead; k_min is `steps` where no k will do.
         conventions: gamma, steps, tie tolerance, slack of comparisons.
     """
 
-    value: float
-    k_min: int
-    effective_planning_window: int
-    ks: list[int]
-    ms: list[int]
-    gaps: list[float]
-    vars: list[float]
     conventions: dict[str, Any] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-able; infinite gaps are None."""
-        return {
-            "value": self.value,
-            "k_min": self.k_min,
-            "effective_planning_window": self.effective_planning_window,
-            "ks": self.ks,
-            "ms": self.ms,
-            "gaps": [gap if math.isfinite(gap) else None for gap in self.gaps],
-            "vars": self.vars,
-            **self.conventions,
-        }
-
-    def __str__(self) -> str:
-        return f"{self.value:.6g} (k_min {self.k_min}, window {self.effective_planning_window})"
+        return {**super().to_dict(), **self.conventions}
 
 
 @takes_mdp
@@ -197,7 +174,7 @@ class _Nodes:
     """
 
     def __init__(self, mdp: TabularMDP, solution: Solution | None, tolerance: float, tell: Callable[[str], None]):
-        from pharos.hardness.gaps import checked
+        from pharos.hardness.gaps import optimal_solution
 
         self.gamma, self.num_actions = mdp.gamma, mdp.num_actions
         self.table: np.ndarray | None
@@ -211,7 +188,7 @@ class _Nodes:
         self.starts = np.array(sorted(node for node, _ in choices.starts))
         self.rewards = expected_rewards(mdp, choices)
         tell("values of optimal play")
-        best = checked(mdp, solution) if solution is not None else _solved(value_iteration, mdp, tolerance)
+        best = optimal_solution(mdp, solution) if solution is not None else _solved(value_iteration, mdp, tolerance)
         tell("values of the worst play")
         worst = _solved(worst_value, mdp, tolerance)
         tell("values of uniform play")

@@ -12,8 +12,11 @@ repeated must lead on alike as well. A map from values to rewards and next value
 pass.
 """
 
+from collections.abc import Iterator
+
 import numpy as np
 
+from pharos.hardness.gap_blocks import GapBlock
 from pharos.kernels import ties
 from pharos.mdp import TabularMDP
 
@@ -96,3 +99,56 @@ def same_outcomes(
         here, there = firsts[0][some] + k, firsts[1][some] + k
         same[some] = (one.states[here] == two.states[there]) & (one.probabilities[here] == two.probabilities[there])
     return same
+
+
+class UnresolvedTies:
+    """Counts the ties that are not proven to be ties.
+
+    Attributes:
+        small: gaps that are computed as larger than 0, and no larger than the tolerance; of a tolerance that is part of
+            what is asked for, gaps that are within their error of it.
+        equal: gaps that are computed as 0, beyond the first of a state.
+    """
+
+    def __init__(self, mdp: TabularMDP, tolerance: float, error: float, is_definition: bool):
+        self.mdp, self.tolerance, self.error, self.is_definition = mdp, tolerance, error, is_definition
+        self.small = self.equal = 0
+        self.proof = TieProof(mdp)
+
+    def look_at(self, part: GapBlock, small: int, equal: int) -> None:
+        """Take up the ties of a block: how many are small, and how many equal."""
+        if part.scale == 0.0:
+            return  # nothing can be chosen: every action is worth the same
+        if self.is_definition:
+            near = np.abs(part.gap - self.tolerance) <= self.error
+            self.small += int((near.sum(axis=1) * part.counted).sum())
+            return
+        self.small += small
+        self.equal += equal
+        if not self.small:
+            own = part.step.own[part.states[0] : part.states[-1] + 1] if part.is_whole else part.step.own[part.states]
+            self.proof.look_at(part.number, own, part.rewards, part.following, part.gap, part.counted)
+
+    def unresolved(self, parts: Iterator[GapBlock]) -> int:
+        """How many are not proven; `parts` once more, where that is to be seen one by one."""
+        if self.is_definition or (not self.small and self.proof.holds):
+            return self.small
+        if self.small or not self.equal:
+            return self.small + self.equal
+        return self.equal - sum(self._alike(part) for part in parts)
+
+    def _alike(self, part: GapBlock) -> int:
+        """Equal gaps of a block between actions that have the same outcomes."""
+        if part.scale == 0.0:
+            return 0
+        zero = (part.gap == 0.0) & (part.counted > 0)[:, None]
+        several = np.flatnonzero(zero.sum(axis=1) > 1)
+        zero = zero[several]
+        best = zero.argmax(axis=1)
+        zero[np.arange(several.size), best] = False
+        row, action = np.nonzero(zero)
+        rows = several[row]
+        likely = part.following[rows, best[row]] == part.following[rows, action]
+        row, action, rows = row[likely], action[likely], rows[likely]
+        same = same_outcomes(self.mdp, part.states[rows], part.rewards[rows], best[row], action)
+        return int(part.counted[rows[same]].sum())

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from pharos.hardness.gaps import checked
+from pharos.hardness.gaps import optimal_solution
 from pharos.hardness.interval import Certified
 from pharos.mdp import Chance, TabularMDP, takes_mdp
 from pharos.solvers import Solution
@@ -43,7 +43,7 @@ def certified_value_norm(mdp: TabularMDP, solution: Solution | None = None) -> C
     A standard deviation changes by no more than the values do. Every variance is a sum of squares of values less their
     mean, in the row of one state, so that large values that lie close together lose no digits.
     """
-    solution = checked(mdp, solution)
+    solution = optimal_solution(mdp, solution)
     if mdp.is_deterministic:
         return Certified(0.0, 0.0, 0.0, True)
     live = ~np.asarray(mdp.terminal)

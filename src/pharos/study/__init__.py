@@ -12,13 +12,14 @@ from pharos.study.analysis import (
     paper_agreement,
 )
 from pharos.study.archive import pack, unpack
+from pharos.study.blocks import Run, Specification
 from pharos.study.clusters import run_on_ray, submit
 from pharos.study.execution import Status, opened, run, status
 from pharos.study.findings import findings
 from pharos.study.paper import paper_regressions, paper_returns
 from pharos.study.regression import Fit, aggregate_r_squared, fit, fit_models, leave_one_class_out_r_squared
 from pharos.study.report import StudyReport, report
-from pharos.study.specification import Run, Specification, presets, specification
+from pharos.study.specification import presets, specification
 from pharos.study.statistics import Estimate, interquartile_mean, stratified_interval
 from pharos.study.tables import cells, curves, hardness_table, paper_instance, table
 

@@ -12,6 +12,7 @@ from typing import Any
 
 from pharos.errors import MissingExtra, ParameterError
 from pharos.study import worker as _worker
+from pharos.study.blocks import Run
 from pharos.study.execution import (
     ATTEMPTS,
     STATUS_SECONDS,
@@ -25,7 +26,7 @@ from pharos.study.execution import (
     shard_of,
     train,
 )
-from pharos.study.specification import Run, Source, specification
+from pharos.study.specification import Source, specification
 
 
 def submit(

@@ -12,7 +12,7 @@ import shutil
 import socket
 import time
 from collections import defaultdict, deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from multiprocessing import connection
 from pathlib import Path
@@ -22,7 +22,9 @@ from pharos.errors import FileFormatError, ParameterError, PharosError, StateSpa
 from pharos.storage import replace_json
 from pharos.study import values as _values
 from pharos.study import worker as _worker
-from pharos.study.specification import Run, Source, Specification
+from pharos.study.blocks import Run, Specification
+from pharos.study.processes import end_processes, one_thread, processors, worker_context
+from pharos.study.specification import Source
 from pharos.study.status import Status, claim, duration, opened, status
 
 __all__ = ["Execution", "Options", "Status", "claim", "duration", "opened", "processors", "run", "shard_of", "status"]
@@ -32,7 +34,6 @@ STATUS_SECONDS = 2.0
 BUSY_SECONDS = 0.5
 # Between two looks at what other runners have finished in the same folder
 OTHERS_SECONDS = 20.0
-TERMINATION_SECONDS = 5.0
 # How often in a row the process that forks workers is begun again, and what multiprocessing says of a worker whose
 # server is gone
 LOST_SERVERS = 10
@@ -43,7 +44,7 @@ def train(config: Mapping[str, Any], folder: Path) -> None:
     """The runner of studies: trains as `config` says and writes run.json and curve.parquet into `folder`."""
     from pharos.experiments import TaskValues, train_config
 
-    values = _values.kept(config)
+    values = _values.stored_values(config)
     known = None if values is None else TaskValues.from_dict(values)
     train_config(config, folder, values=known, trust=True, strict=True)
 
@@ -137,11 +138,6 @@ class Options:
     status_file: str = "status.json"
 
 
-def processors() -> int:
-    """The processors that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 class Execution:
     """The loop that starts, awaits and counts worker processes."""
 
@@ -194,7 +190,7 @@ class Execution:
         except EOFError:
             done += 1
         except BaseException:
-            _end([process])
+            end_processes([process])
             raise
         finally:
             receiver.close()
@@ -202,7 +198,7 @@ class Execution:
         return done
 
     def run(self) -> Status:
-        context = _context(self.options.runner is train)
+        context = worker_context(self.options.runner is train)
         try:
             while self.pending or self.running:
                 if time.monotonic() - self.last_listing >= OTHERS_SECONDS:
@@ -211,7 +207,7 @@ class Execution:
                 self.report()
                 self._await()
         except BaseException:
-            _end([process for process, _, _ in self.running.values()])
+            end_processes([process for process, _, _ in self.running.values()])
             self.running.clear()
             self.report(final=True)
             raise
@@ -261,7 +257,7 @@ class Execution:
         where = (run.id, self.folder.absolute(), run.id in self.repeated, self.options.resume)
         arguments = (self.options.runner, dict(run.config), *where, dict(os.environ))
         process = context.Process(target=_worker.main, args=arguments, name=run.id)
-        with _one_thread():
+        with one_thread():
             process.start()
         return process
 
@@ -360,42 +356,6 @@ class Execution:
             record = {**now.to_dict(), "updated": time.time(), "process": os.getpid(), "host": socket.gethostname()}
             replace_json(self.folder / self.options.status_file, record, durable=False)
         return now
-
-
-@contextlib.contextmanager
-def _one_thread() -> Iterator[None]:
-    """What starts here, and whatever it forks, uses one thread, unless the user's variables say otherwise.
-
-    Numba reads its variable when it is loaded, which is before any line of the new process.
-    """
-    added = [name for name in _worker.THREAD_VARIABLES if name not in os.environ]
-    os.environ.update(dict.fromkeys(added, "1"))
-    try:
-        yield
-    finally:
-        for name in added:
-            del os.environ[name]
-
-
-def _end(processes: Sequence[Any]) -> None:
-    """End processes cleanly; at once those that take too long."""
-    for process in processes:
-        process.terminate()
-    latest = time.monotonic() + TERMINATION_SECONDS
-    for process in processes:
-        process.join(max(0.0, latest - time.monotonic()))
-        if process.is_alive():
-            process.kill()
-            process.join()
-
-
-def _context(warm: bool) -> Any:
-    """Processes are forked from one that has loaded everything; where the system cannot do that, started anew."""
-    if "forkserver" not in multiprocessing.get_all_start_methods():
-        return multiprocessing.get_context("spawn")
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["pharos.study.warm" if warm else "pharos.study.worker"])
-    return context
 
 
 def _prepare_all(

@@ -19,297 +19,37 @@ imported where the user names a folder, for the study.yaml beside results, or fo
 may have written, unless it is trusted.
 """
 
-import json
 import re
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Iterator, Mapping
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-from pharos.agents import AGENTS, TABULAR_OBSERVATION, agent_kind, agent_source, hyperparameters, is_known
-from pharos.environments import as_tuples, imported, source_of
+from pharos.agents import AGENTS, agent_source, is_known
 from pharos.errors import MissingExtra, ParameterError, UnknownName, UntrustedCode
-from pharos.experiments import ChanceSetting, Horizon, RunConfig
-from pharos.observations import OwnObservation, own_observation
 from pharos.sources import is_reference
-from pharos.study.regression import MEASURES
 
 try:
     import yaml
-    from pydantic import (
-        BaseModel,
-        BeforeValidator,
-        ConfigDict,
-        Field,
-        PrivateAttr,
-        ValidationError,
-        ValidationInfo,
-        field_validator,
-    )
+    from pydantic import BaseModel, ValidationError
 except ImportError as error:
     raise MissingExtra("a study", str(error.name), "study") from error
 
+from pharos.study.blocks import (
+    MOST_RUNS,
+    Block,
+    ChanceEntry,
+    EnvironmentEntry,
+    Hardness,
+    ObservationEntry,
+    Specification,
+)
+
 STUDIES = "studies"
 STUDY_FILE = "study.yaml"
-# Bounds on a specification, so that every mistake is told at once
-MOST_RUNS = 1_000_000
+# So that every mistake is told at once, and aliases do not stand for millions of entries.
 MOST_NODES = 1_000_000
 Loc = tuple[int | str, ...]
-
-
-@dataclass(frozen=True)
-class Run:
-    """One training run of a study.
-
-    Attributes:
-        configuration: what determines its result.
-        instance: name of the environment as the specification gives it, such as "frozen_lake/4x4".
-    """
-
-    configuration: RunConfig
-    instance: str
-
-    @cached_property
-    def config(self) -> Mapping[str, Any]:
-        """The configuration with the keys of the file run.json."""
-        return self.configuration.to_dict()
-
-    @cached_property
-    def id(self) -> str:
-        """Name of the run's folder: a hash of the config."""
-        return self.configuration.id
-
-    @property
-    def chance(self) -> str:
-        """`plain`, or such as `sticky 0.25`."""
-        return str(self.configuration.chance)
-
-    @property
-    def kind(self) -> tuple[str, str, str]:
-        """Class of environment, agent and observation: runs of a kind take about as long for each step."""
-        return (self.configuration.environment, self.configuration.agent, self.configuration.observation)
-
-
-# The file ------------------------------------------------------------------------------------------------------------
-
-
-def _entry(value: Any) -> Any:
-    return {"name": value} if isinstance(value, str) else value
-
-
-def _chance(value: Any) -> Any:
-    if value == "plain" or value is None:
-        return {}
-    if isinstance(value, str):
-        raise UnknownName("chance", value, ("plain", "{sticky: 0.25}", "{random: 0.1}"))
-    return value
-
-
-def _seeds(value: Any) -> Any:
-    if isinstance(value, list):
-        return value
-    if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-        raise ParameterError(f"seeds: found {value!r}; expected how many, at least 1, or a list of seeds")
-    if value > MOST_RUNS:
-        raise ParameterError(f"seeds: found {value}; a study has at most {MOST_RUNS:,} runs")
-    return list(range(value))
-
-
-class _Part(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class EnvironmentEntry(_Part):
-    """An environment: a name that `pharos.make` knows, and parameters."""
-
-    name: str
-    parameters: dict[str, Any] = {}
-    _folder: Path | None = PrivateAttr(None)
-
-    def model_post_init(self, context: Any) -> None:
-        self._folder = (context or {}).get("folder") if is_reference(self.name) else None
-
-    @cached_property
-    def instance(self) -> Any:
-        from pharos.environments import make
-
-        name = imported(self.name, self._folder).name if is_reference(self.name) else self.name
-        return make(name, **{name: as_tuples(value) for name, value in self.parameters.items()})
-
-    @cached_property
-    def label(self) -> str:
-        name = Path(self.name).name if is_reference(self.name) else self.name
-        if not self.parameters:
-            return name
-        return f"{name}({', '.join(f'{name}={value}' for name, value in self.parameters.items())})"
-
-
-class ChanceEntry(_Part):
-    """Probabilities that the previous action, or a uniformly random one, is executed instead of the chosen one."""
-
-    sticky: float = Field(default=0.0, ge=0, le=1)
-    random: float = Field(default=0.0, ge=0, le=1)
-
-    @property
-    def setting(self) -> ChanceSetting:
-        """The same for a run."""
-        return ChanceSetting(self.sticky, self.random)
-
-
-class ObservationEntry(_Part):
-    """An observation and its options."""
-
-    name: str
-    options: dict[str, Any] = {}
-    _folder: Path | None = PrivateAttr(None)
-
-    def model_post_init(self, context: Any) -> None:
-        self._folder = (context or {}).get("folder") if is_reference(self.name) else None
-
-    @field_validator("name")
-    @classmethod
-    def _known(cls, name: str, info: ValidationInfo) -> str:
-        from pharos.observations import names
-
-        if is_reference(name):
-            own_observation(name, (info.context or {}).get("folder"))
-        elif name not in names():
-            raise UnknownName("observation", name, names())
-        return name
-
-    @cached_property
-    def own(self) -> OwnObservation | None:
-        """The observation of one's own that is meant; None for one of pharos."""
-        return own_observation(self.name, self._folder)
-
-
-class Hardness(_Part):
-    """Which measures of hardness are taken, with which discount, and how many seconds each may take for one
-    instance."""
-
-    gamma: float = Field(default=0.99, ge=0, le=1)
-    measures: list[str] = Field(default_factory=lambda: [name for name in MEASURES if name in registered()])
-    budget: float = Field(default=60.0, gt=0)
-
-    @field_validator("measures")
-    @classmethod
-    def _known(cls, measures: list[str]) -> list[str]:
-        for measure in measures:
-            if measure not in registered():
-                raise UnknownName("measure of hardness", measure, registered())
-        return measures
-
-    @property
-    def predictors(self) -> list[str]:
-        """Those measures that explain regret in the linear models: the paper's three, or all where none of them is
-        taken.
-
-        The stationary effective horizon stands for the effective horizon where that is not taken.
-        """
-        stand_in = {"effective_horizon": "stationary_effective_horizon"}
-        taken = [name if name in self.measures else stand_in.get(name) for name in MEASURES]
-        return [name for name in taken if name in self.measures] or list(self.measures)
-
-
-def _horizon(value: Any) -> Any:
-    return Horizon.of(value).value
-
-
-Seeds = Annotated[list[Annotated[int, Field(ge=0)]], BeforeValidator(_seeds), Field(min_length=1)]
-Steps = Annotated[int, Field(ge=1)]
-Gamma = Annotated[float, Field(ge=0, le=1)]
-HorizonEntry = Annotated[Any, BeforeValidator(_horizon)]
-
-
-class Block(_Part):
-    """A product of environments, kinds of chance, observations, agents and seeds."""
-
-    environments: list[Annotated[EnvironmentEntry, BeforeValidator(_entry)]] = Field(min_length=1)
-    chance: list[Annotated[ChanceEntry, BeforeValidator(_chance)]] = Field([ChanceEntry()], min_length=1)
-    observations: list[Annotated[ObservationEntry, BeforeValidator(_entry)]] = Field(
-        [ObservationEntry(name="vector")], min_length=1
-    )
-    agents: list[str] = Field(min_length=1)
-    seeds: Seeds | None = None
-    steps: Steps | None = None
-    evaluations: Steps | None = None
-    gamma: Gamma | None = None
-    horizon: HorizonEntry | None = None
-    hyperparameters: dict[str, str | dict[str, Any]] = {}
-
-
-class Specification(_Part):
-    """A study: its blocks, and what holds for every block that does not say otherwise."""
-
-    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")
-    description: str = ""
-    folder: str | None = None
-    blocks: list[Block] = Field(min_length=1)
-    seeds: Seeds = list(range(5))
-    steps: Steps = 50_000
-    evaluations: Steps = 100
-    gamma: Gamma = 1.0
-    horizon: HorizonEntry = "limit"
-    hyperparameters: dict[str, dict[str, Any]] = {}
-    hardness: Hardness = Field(default_factory=Hardness)
-
-    @cached_property
-    def runs(self) -> tuple[Run, ...]:
-        """Every run, each once, in the order of the blocks."""
-        found: dict[str, Run] = {}
-        for block in self.blocks:
-            for run in self._runs_of(block):
-                found.setdefault(run.id, run)
-        return tuple(found.values())
-
-    def _runs_of(self, block: Block) -> Iterator[Run]:
-        steps = block.steps or self.steps
-        evaluations = block.evaluations or self.evaluations
-        gamma = self.gamma if block.gamma is None else block.gamma
-        horizon = self.horizon if block.horizon is None else block.horizon
-        for environment in block.environments:
-            for chance in block.chance:
-                for agent in block.agents:
-                    agent_from = agent_source(agent, self.folder, check=False)
-                    observations: Sequence[ObservationEntry] = block.observations
-                    if agent_kind(agent).is_tabular:
-                        observations = [ObservationEntry(name=TABULAR_OBSERVATION)]
-                    for observation in observations:
-                        sources = {
-                            "environment": source_of(type(environment.instance)),
-                            "observation": None if observation.own is None else observation.own.source,
-                            "agent": agent_from,
-                        }
-                        seen = str(observation.own or observation.name)
-                        for seed in block.seeds or self.seeds:
-                            yield Run(
-                                RunConfig(
-                                    environment=environment.instance.name,
-                                    parameters=_jsonable(environment.instance.parameters),
-                                    chance=chance.setting,
-                                    observation=seen,
-                                    observation_options=dict(observation.options),
-                                    agent=agent if agent_from is None else agent_from.name,
-                                    hyperparameters=self._hyperparameters(
-                                        block, agent, environment.instance.name, seen
-                                    ),
-                                    steps=steps,
-                                    seed=seed,
-                                    gamma=gamma,
-                                    horizon=Horizon.of(horizon).steps(environment.instance),
-                                    evaluation_interval=max(1, steps // evaluations),
-                                    sources={part: source for part, source in sources.items() if source is not None},
-                                ),
-                                environment.label,
-                            )
-
-    def _hyperparameters(self, block: Block, agent: str, environment: str, observation: str) -> dict[str, Any]:
-        """All of them, those of the library's table included: when that changes, these are other runs."""
-        given = block.hyperparameters.get(agent, {})
-        own = self.hyperparameters[given] if isinstance(given, str) else given
-        return hyperparameters(agent, environment, observation, own)
 
 
 _PARTS: dict[Loc, type[BaseModel]] = {
@@ -320,16 +60,6 @@ _PARTS: dict[Loc, type[BaseModel]] = {
     ("blocks", "chance"): ChanceEntry,
     ("blocks", "observations"): ObservationEntry,
 }
-
-
-def registered() -> list[str]:
-    """The names of the measures of hardness."""
-    from pharos.hardness import measures
-
-    return list(measures())
-
-
-# Reading -------------------------------------------------------------------------------------------------------------
 
 
 def presets() -> list[str]:
@@ -597,7 +327,3 @@ def _check_keys(node: Any, name: str) -> None:
         if key.value in lines:
             raise ParameterError(f"{name}:{line}: the key {key.value!r} stands there twice (line {lines[key.value]})")
         lines[key.value] = line
-
-
-def _jsonable(value: Any) -> Any:
-    return json.loads(json.dumps(value))

@@ -19,8 +19,9 @@ from pharos.errors import FileFormatError, ParameterError, UnknownName
 from pharos.experiments import ChanceSetting
 from pharos.storage import is_intact, read_json, replace_json, sealed
 from pharos.study import worker as _worker
+from pharos.study.blocks import Run, Specification
 from pharos.study.execution import opened
-from pharos.study.specification import Run, Source, Specification
+from pharos.study.specification import Source
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -25,7 +25,7 @@ def task_of(config: Mapping[str, Any]) -> "Task":
 
 def solve(config: Mapping[str, Any]) -> dict[str, Any]:
     """The values at the start of a task, as `TaskValues.to_dict` writes them; solved now unless they are stored."""
-    values = kept(config)
+    values = stored_values(config)
     if values is None:
         from pharos.experiments import TaskValues
 
@@ -37,7 +37,7 @@ def solve(config: Mapping[str, Any]) -> dict[str, Any]:
     return values
 
 
-def kept(config: Mapping[str, Any]) -> dict[str, Any] | None:
+def stored_values(config: Mapping[str, Any]) -> dict[str, Any] | None:
     """The stored values for these rules; None where there are none, or where the file was changed."""
     try:
         stored = read_json(_file(config))

@@ -4,18 +4,18 @@ import io
 import platform
 import time
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pharos.study.analysis import IMAGE, REGRETS, VECTOR, Models, agreement, paper_agreement
-from pharos.study.figures import agent_name, agents_figure, label, pairs_of, representations_figure, slug, title
+from pharos.study.analysis import IMAGE, VECTOR
+from pharos.study.figures import agent_name, label, pairs_of, representations_figure, slug, title
 from pharos.study.latex import returns_table
-from pharos.study.regression import Fit
+from pharos.study.report.model_sections import agreement_section, models_section
 from pharos.study.report.page import Figures, data_url, image, table
-from pharos.study.report.results import Results, coefficients
+from pharos.study.report.results import Results
+from pharos.study.report.section import Section
 from pharos.study.specification import Specification
 from pharos.study.status import duration
 
@@ -23,23 +23,6 @@ if TYPE_CHECKING:
     import pandas as pd
 
 PICTURE_PIXELS = 220
-
-
-@dataclass(frozen=True)
-class Section:
-    """A section of the page: its title, the template that prints it, and what that needs, by name."""
-
-    title: str
-    template: str
-    context: Mapping[str, Any] = field(default_factory=dict)
-
-    @property
-    def anchor(self) -> str:
-        """Where links lead to."""
-        return self.title.lower().replace(" ", "-")
-
-    def __getitem__(self, name: str) -> Any:
-        return self.context[name]
 
 
 def sections_of(results: Results, figures: Figures) -> list[Section]:
@@ -51,8 +34,8 @@ def sections_of(results: Results, figures: Figures) -> list[Section]:
         _regret(results, figures),
         _representations(results, figures, left_out),
         _aliasing(results),
-        _models(results, figures, left_out),
-        _agreement(results, figures, left_out),
+        models_section(results, figures, left_out),
+        agreement_section(results, figures, left_out),
         _hardness(results),
         _returns(results),
         _beside(results),
@@ -61,10 +44,6 @@ def sections_of(results: Results, figures: Figures) -> list[Section]:
         _made(results, left_out),
     ]
     return [section for section in sections if section is not None]
-
-
-def _section(name: str, template: str, **context: Any) -> Section:
-    return Section(name, f"{template}.html.j2", context)
 
 
 def _many(count: int, one: str, several: str | None = None) -> str:
@@ -102,7 +81,7 @@ def _summary(results: Results) -> Section:
     )
     errors = [f"{count} × {error}" for error, count in Counter(now.errors.values()).items()]
     damaged = list({**now.damaged, **results.damaged}.values())
-    return _section("Summary", "summary", lines=lines, missing=missing, errors=errors, damaged=damaged)
+    return Section.of("Summary", "summary", lines=lines, missing=missing, errors=errors, damaged=damaged)
 
 
 def _estimated(runs: "pd.DataFrame") -> str | None:
@@ -128,7 +107,7 @@ def _findings(results: Results) -> Section | None:
     if len(decided) == 0:
         return None
     counts = ", ".join(f"{number} {verdict}" for verdict, number in decided["verdict"].value_counts().items())
-    return _section(
+    return Section.of(
         "Findings of the paper",
         "findings",
         counts=f"{len(decided)} of {len(results.findings)} can be looked at here: {counts}.",
@@ -154,7 +133,7 @@ def _regret(results: Results, figures: Figures) -> Section:
         ],
     )
     columns = ["environment", "agent", "observation", "tasks", "runs", "iqm", "interval"]
-    return _section(
+    return Section.of(
         "Regret",
         "regret",
         figure=image(
@@ -207,7 +186,7 @@ def _representations(results: Results, figures: Figures, left_out: list[str]) ->
             "The paper finds the image harder in simple grid and frozen lake, "
             "the vector harder in freeway and breakout."
         )
-    return _section("Vector against image", "representations", parts=parts, paper=paper)
+    return Section.of("Vector against image", "representations", parts=parts, paper=paper)
 
 
 def _aliasing(results: Results) -> Section | None:
@@ -215,7 +194,7 @@ def _aliasing(results: Results) -> Section | None:
     if len(shared) == 0:
         return None
     shown = shared.assign(share=[f"{100 * share:.1f} %" for share in shared["share"]])
-    return _section(
+    return Section.of(
         "States that share an observation",
         "aliasing",
         text="These observations do not tell every state: an agent that remembers nothing cannot act differently in "
@@ -230,111 +209,12 @@ def _aliasing(results: Results) -> Section | None:
     )
 
 
-def _models(results: Results, figures: Figures, left_out: list[str]) -> Section | None:
-    if not results.agents:
-        left_out.append("Hardness and regret: tabular agents, which see the state itself, have no models.")
-        return None
-    return _section(
-        "Hardness and regret", "models", parts=[_models_of(models, results, figures) for models in results.models]
-    )
-
-
-def _models_of(models: Models, results: Results, figures: Figures) -> dict[str, Any]:
-    import pandas as pd
-
-    paper = results.comparison is not None and models.agent == "dqn"
-    what = REGRETS[models.regret]
-    heading = f"{what.capitalize()} of {agent_name(models.agent)}"
-    fits = pd.DataFrame([_line(fit) for fit in models.fits])
-    caption = (
-        "Ordinary least squares, section 4.3 of the paper: equations 7 (single), 8 (representation) and 9 (class). R² "
-        "outside is "
-        "for each task by the model fitted on the others; the condition number is that of the standardised "
-        "predictors, above 30 the "
-        "coefficients cannot be told apart; influence is the largest Cook's distance. Significant: p < 0.05, a task "
-        "counted once."
-    )
-    values = {
-        "class and representation alone, without measures": models.class_alone,
-        "representation models together": models.representation_r_squared,
-        "class models together": models.class_r_squared,
-        "classes that the model has not seen": models.leave_one_class_out,
-    }
-    suffix = models.suffix(results.models[0].agent)
-    drawn = []
-    for kind, number in (("single_model", 4), ("representation_models", 5), ("class_models", 6)):
-        text = f"Fitted against actual {what}, {kind.replace('_', ' ')}."
-        text += f" The paper's figure {number}." if paper else ""
-        drawn.append(image(figures, f"{kind}_{models.regret.removesuffix('_regret')}{suffix}", text))
-    return {
-        "title": heading,
-        "table": table(fits, caption) if models.fits else None,
-        "together": [f"R² of {name}: {value:.2f}" for name, value in values.items() if value is not None],
-        "figures": [each for each in drawn if each is not None],
-        "coefficients": table(coefficients(models), digits=4) if models.fits else None,
-        "notes": list(models.notes),
-    }
-
-
-def _line(fit: Fit) -> dict[str, Any]:
-    significant = [
-        _predictor(str(name)) for name, p in fit.coefficients["p_value"].items() if p < 0.05 and name != "Intercept"
-    ]
-    return {
-        "model": fit.model,
-        "of": fit.subset,
-        "rows": fit.num_rows,
-        "R²": fit.r_squared,
-        "adjusted": fit.adjusted_r_squared,
-        "outside": fit.cross_validated_r_squared,
-        "condition": fit.condition_number,
-        "influence": float(np.nanmax(fit.influence)) if np.isfinite(fit.influence).any() else float("nan"),
-        "significant": ", ".join(significant) or "none",
-        "left out": ", ".join(fit.dropped),
-    }
-
-
-def _predictor(name: str) -> str:
-    """`np.log(diameter)` -> `log diameter`, `C(environment)[T.freeway]` -> `freeway`."""
-    if name.startswith("C("):
-        return name.split("[T.")[1].rstrip("]")
-    return name.replace("np.log(", "log ").rstrip(")")
-
-
-def _agreement(results: Results, figures: Figures, left_out: list[str]) -> Section | None:
-    lines, drawn = [], []
-    for i, one in enumerate(results.agents):
-        for two in results.agents[i + 1 :]:
-            for value in ("return", "normalized_regret", "cumulative_regret"):
-                if (pair := agreement(results.cells, value, (one, two))) is not None:
-                    names = f"{agent_name(one)} and {agent_name(two)}, {REGRETS.get(value, value)}"
-                    lines.append(f"{names}: r = {pair[0]:.2f} over {pair[1]} cells")
-            caption = f"Normalised regret of {agent_name(two)} against that of {agent_name(one)}."
-            drawn.append(image(figures, agents_figure(one, two), caption))
-    if not lines:
-        left_out.append(
-            "Agreement of agents: there are fewer than three cells that both DQN and PPO have, or two other agents."
-        )
-        return None
-    text = "Pearson correlation of agents over instances, kinds of chance and observations"
-    if results.comparison is not None:
-        text += "; the paper prints 0.81 for DQN and PPO, and the returns that it prints in appendix C give "
-        text += f"{paper_agreement():.2f}"
-    return _section(
-        "Agreement of agents",
-        "agreement",
-        text=text + ".",
-        lines=lines,
-        figures=[each for each in drawn if each is not None],
-    )
-
-
 def _hardness(results: Results) -> Section:
     counted = results.aliasing
     complete = ""
     if len(counted) and not (counted["share"] > 0).any():
         complete = "No two states share an observation, on any instance and for any observation that was counted."
-    return _section(
+    return Section.of(
         "Hardness of the instances",
         "hardness",
         table=table(
@@ -354,7 +234,7 @@ def _returns(results: Results) -> Section:
         part = results.cells[results.cells["environment"] == environment]
         latex = returns_table(results.cells, environment) if set(part["agent"]) & {"dqn", "ppo"} else ""
         parts.append({"title": title(environment), "table": table(_wide_returns(part)), "latex": latex})
-    return _section("Returns", "returns", parts=parts)
+    return Section.of("Returns", "returns", parts=parts)
 
 
 def _wide_returns(part: "pd.DataFrame") -> "pd.DataFrame":
@@ -395,7 +275,7 @@ def _beside(results: Results) -> Section | None:
         f"chance, or what of a run its returns are means of: differences are to be expected."
     )
     caption = "R² and correlation: printed, ours, and the difference, for both kinds of regret."
-    return _section(
+    return Section.of(
         "Beside the paper",
         "beside",
         regressions=table(fits, caption) if len(fits) else None,
@@ -407,7 +287,7 @@ def _beside(results: Results) -> Section | None:
 
 def _instances(study: Specification) -> Section | None:
     pictures = [{"name": name, "data": data_url(png)} for name, png in _pictures(study).items()]
-    return _section("Instances", "instances", pictures=pictures) if pictures else None
+    return Section.of("Instances", "instances", pictures=pictures) if pictures else None
 
 
 def _pictures(study: Specification) -> dict[str, bytes]:
@@ -445,7 +325,7 @@ def _each_instance(results: Results, figures: Figures) -> Section:
         drawn = image(figures, f"regret_by_task_{slug(environment)}", caption)
         parts.append({"title": f"{title(environment)}, each kind of chance and each seed", "figure": drawn})
     text = "Cumulative regret on each instance, all kinds of chance together."
-    return _section("Each instance", "each_instance", figure=image(figures, "regret_by_instance", text), parts=parts)
+    return Section.of("Each instance", "each_instance", figure=image(figures, "regret_by_instance", text), parts=parts)
 
 
 def _made(results: Results, left_out: Sequence[str]) -> Section:
@@ -456,4 +336,4 @@ def _made(results: Results, left_out: Sequence[str]) -> Section:
     made = time.strftime("%Y-%m-%d %H:%M", time.gmtime())
     facts = f"pharos {pharos.__version__}, Python {platform.python_version()}, {made} UTC"
     text = yaml.safe_dump(results.study.model_dump(mode="json", exclude_unset=True), sort_keys=False, width=100)
-    return _section("How it was made", "made", facts=facts, left_out=list(left_out), specification=text)
+    return Section.of("How it was made", "made", facts=facts, left_out=list(left_out), specification=text)

@@ -1,0 +1,328 @@
+"""The diameter of a graph by directed ExactSumSweep, searches from many nodes at once, and the argument of clocks.
+
+Source: Borassi et al. (2015); Then et al. (2014). Clocks are an argument of ours.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+
+from pharos.hardness.interval import Interval, Spending
+from pharos.kernels import graph
+from pharos.mdp import TabularMDP
+
+# Untyped, as starred arguments of compiled functions are not checked.
+kernels: Any = graph
+# Nodes of a layer beyond which layers are not narrow: a set of them no longer fits into a core's cache.
+_WIDE = 1024
+# Widths of searches from many nodes, in words of 64 sources: eight words are a cache line.
+_WORDS = (1, 8)
+# Bytes that searches from many nodes may take.
+_BATCH_MEMORY = 2**31
+
+
+class Graph:
+    """The graph of a deterministic MDP, with restart edges and the implicit end; see `pharos.kernels.graph`.
+
+    Attributes:
+        num_nodes: N, the states and, where some transition of a state that is not terminal is -1, the end.
+        start: the node that terminal states lead to; -1: they lead nowhere.
+        pivot: a start state, where searches begin.
+    """
+
+    def __init__(self, next_states: np.ndarray, terminal: np.ndarray, start: int, pivot: int):
+        self.next_states = next_states
+        self.ends = np.ascontiguousarray(terminal, np.bool_)
+        self.start, self.pivot = start, pivot
+        self.has_end = _leads_to_end(next_states, self.ends)
+        self.num_nodes = len(next_states) + self.has_end
+        self.dtype = np.int32 if self.num_nodes < 2**31 else np.int64
+        self.queue = np.empty(self.num_nodes, self.dtype)
+        self._reversed: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
+
+    @staticmethod
+    def of(mdp: TabularMDP, restart: bool) -> "Graph | None":
+        """The graph of `mdp`; None where a choice or a restart has several outcomes."""
+        if mdp.is_sticky or mdp.is_random:
+            return None
+        table = mdp.dynamics.deterministic_table()
+        if table is None:
+            return None
+        restarts = restart and (bool(mdp.terminal.any()) or _leads_to_end(table, mdp.terminal))
+        if restarts and len(mdp.start_states) > 1:
+            return None
+        pivot = int(mdp.start_states[0])
+        return Graph(table, mdp.terminal, pivot if restarts else -1, pivot)
+
+    @property
+    def backward(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(first, previous, restarting): the reversed graph, made when it is first needed."""
+        if self._reversed is None:
+            restarting = np.empty(0, self.dtype)
+            if self.start >= 0:
+                ending = np.flatnonzero(self.ends)
+                restarting = np.append(ending, [len(self.next_states)] * self.has_end).astype(self.dtype)
+            self._reversed = (*kernels.reversed_graph(self.next_states, self.ends, self.num_nodes), restarting)
+        return self._reversed
+
+    def search_forward(self, source: int, distance: np.ndarray) -> tuple[int, int, int]:
+        """distance[v] = d(source, v); (nodes found, largest distance, sum of distances)."""
+        return kernels.search_forward(self.next_states, self.ends, self.start, source, distance, self.queue)
+
+    def search_backward(self, source: int, distance: np.ndarray) -> tuple[int, int, int]:
+        """distance[v] = d(v, source); (nodes found, largest distance, sum of distances)."""
+        return kernels.search_backward(*self.backward, self.start, source, distance, self.queue)
+
+
+def _leads_to_end(table: np.ndarray, terminal: np.ndarray) -> bool:
+    """Whether a row that is followed holds -1; in blocks, for tables that are larger than memory."""
+    block = 1 << 20
+    for low in range(0, len(table), block):
+        ending = (table[low : low + block] < 0).any(axis=1)
+        if (ending & ~np.asarray(terminal[low : low + block])).any():
+            return True
+    return False
+
+
+class SumSweep:
+    """Bounds on all eccentricities, tightened by searches until one side leaves no node that could be farther.
+
+    out(v) = max over w of d(v, w), in(v) = max over w of d(w, v). From d(v, w) <= d(v, p) + d(p, w) follow
+    out(v) <= d(v, p) + out(p) and in(v) <= in(p) + d(p, v) for a pivot p searched in both directions; a search from w
+    in one direction gives out(w) or in(w) exactly, and a lower bound for everyone. D = max out = max in: it is proven
+    as soon as no out(v), or no in(v), can exceed the largest eccentricity found.
+    """
+
+    def __init__(self, graph: Graph, spending: Spending, conventions: dict[str, Any]):
+        self.graph, self.spending, self.conventions = graph, spending, conventions
+        size, dtype = graph.num_nodes, graph.dtype
+        self.away, self.to = np.empty(size, dtype), np.empty(size, dtype)
+        self.out_lower, self.in_lower = np.zeros(size, dtype), np.zeros(size, dtype)
+        unknown = np.iinfo(dtype).max
+        self.out_upper, self.in_upper = np.full(size, unknown, dtype), np.full(size, unknown, dtype)
+        self.best = 0
+        self.method = "directed ExactSumSweep"
+
+    def interval(self) -> Interval:
+        graph = self.graph
+        if not self._pivot(graph.pivot):
+            return _infinite_diameter(graph, self.spending, self.conventions)
+        note = ""
+        clock = self._from_clock()
+        if isinstance(clock, Interval):
+            return clock
+        self._sweep()
+        upper = self._upper()
+        if upper > self.best:
+            note = f"budget spent: {self._open()[0]} states may have a larger eccentricity than {self.best}"
+            if clock:
+                note += f"; {clock}"
+        return self._result(self.best, upper, note)
+
+    def _result(self, lower: int, upper: int, note: str) -> Interval:
+        exact = lower == upper
+        self.spending.report(lower, upper, 0 if exact else self._open()[0], now=True)
+        return Interval(
+            float(lower),
+            float(upper),
+            exact,
+            finite_part=float(lower),
+            counted=exact,
+            searches=self.spending.searches,
+            method=self.method,
+            conventions=self.conventions,
+            note=note,
+            seconds=self.spending.seconds,
+        )
+
+    # Searches ---------------------------------------------------------------------------------------------------------
+
+    def _pivot(self, p: int) -> bool:
+        """Search from p in both directions; False where p does not reach all nodes, or not all reach p."""
+        found, out_pivot, _ = self.graph.search_forward(p, self.away)
+        reached, in_pivot, _ = self.graph.search_backward(p, self.to)
+        self.spending.searches += 2
+        if found < self.graph.num_nodes or reached < self.graph.num_nodes:
+            return False
+        kernels.bound_eccentricities(
+            self.away, self.to, out_pivot, in_pivot, self.out_lower, self.out_upper, self.in_lower, self.in_upper
+        )
+        self._settle_out(p, out_pivot)
+        self._settle_in(p, in_pivot)
+        return True
+
+    def _search_out(self, v: int) -> None:
+        _, largest, _ = self.graph.search_forward(v, self.away)
+        kernels.raise_lower(self.away, self.in_lower)
+        self._settle_out(v, largest)
+        self.spending.searches += 1
+
+    def _search_in(self, v: int) -> None:
+        _, largest, _ = self.graph.search_backward(v, self.to)
+        kernels.raise_lower(self.to, self.out_lower)
+        self._settle_in(v, largest)
+        self.spending.searches += 1
+
+    def _settle_out(self, v: int, value: int) -> None:
+        self.out_lower[v] = self.out_upper[v] = value
+        self.best = max(self.best, int(value))
+
+    def _settle_in(self, v: int, value: int) -> None:
+        self.in_lower[v] = self.in_upper[v] = value
+        self.best = max(self.best, int(value))
+
+    def _open(self) -> tuple[int, tuple[int, int, int, int, int]]:
+        counts = kernels.open_eccentricities(self.out_lower, self.out_upper, self.in_lower, self.in_upper, self.best)
+        return min(counts[0], counts[1]), counts
+
+    def _upper(self) -> int:
+        return max(self.best, min(int(self.out_upper.max()), int(self.in_upper.max())))
+
+    # The sweep --------------------------------------------------------------------------------------------------------
+
+    def _sweep(self) -> None:
+        """Search where it pays: the kind that closed most nodes for its cost, the others now and then.
+
+        The kinds: from the node of the largest upper bound forward, or backward; from the middle in both directions;
+        from up to 512 open nodes at once. Costs are counted in table entries read, not in seconds, so that the searches
+        made are the same on every machine.
+        """
+        one = max(1, self.graph.num_nodes * self.graph.next_states.shape[1])
+        worth = {"out": math.inf, "in": math.inf, "middle": math.inf}
+        still_open, (num_out, num_in, far_out, far_in, middle) = self._open()
+        while still_open and not self.spending.is_over:
+            if len(worth) == 3 and self.spending.searches >= 12 and still_open >= 16:
+                worth |= {f"many {words}": math.inf for words in _WORDS if self._fits(words)}
+            kind = max(worth, key=lambda name: worth[name])
+            cost = 1.0
+            if kind == "out":
+                self._search_out(far_out)
+            elif kind == "in":
+                self._search_in(far_in)
+            elif kind == "middle":
+                self._pivot(middle)
+                cost = 2.0
+            else:
+                cost = self._search_many(num_out <= num_in, int(kind.split()[1])) / one
+            before = still_open
+            still_open, (num_out, num_in, far_out, far_in, middle) = self._open()
+            for name in worth:
+                worth[name] *= 1.05
+            worth[kind] = (before - still_open + 1e-3) / max(cost, 1e-3)
+            self.spending.report(self.best, self._upper(), still_open)
+
+    def _fits(self, words: int) -> bool:
+        return 24 * words * self.graph.num_nodes <= _BATCH_MEMORY
+
+    def _search_many(self, outward: bool, words: int) -> int:
+        """The exact eccentricities of the open nodes with the largest upper bounds; table entries read, times words."""
+        graph = self.graph
+        upper, lower = (self.out_upper, self.out_lower) if outward else (self.in_upper, self.in_lower)
+        nodes = np.flatnonzero(np.greater(upper, self.best))
+        limit = int(min(64 * words, max(1, self.spending.budget.searches - self.spending.searches)))
+        if len(nodes) > limit:
+            nodes = np.sort(nodes[np.argsort(-upper[nodes].astype(np.int64), kind="stable")[:limit]])
+        sources = nodes.astype(graph.dtype)
+        words = -(-len(sources) // 64)
+        largest = np.empty(len(sources), np.int64)
+        bits = [np.zeros((graph.num_nodes, words), np.uint64) for _ in range(3)]
+        scratch = (graph.queue, np.empty_like(graph.queue))
+        if outward:
+            _, reads = kernels.search_forward_from_many(
+                graph.next_states, graph.ends, graph.start, sources, *bits, *scratch, largest
+            )
+        else:
+            _, reads = kernels.search_backward_from_many(
+                *graph.backward, graph.start, sources, *bits, *scratch, largest
+            )
+        upper[nodes] = lower[nodes] = largest
+        self.best = max(self.best, int(largest.max()))
+        self.spending.searches += len(sources)
+        self.method = "directed ExactSumSweep, then searches from many states at once"
+        return int(reads) * (1 + words)
+
+    # Clocks -----------------------------------------------------------------------------------------------------------
+
+    def _from_clock(self) -> "Interval | str":
+        """D of a graph that contains a clock, or why this argument does not give it ("": there is no clock).
+
+        Let the graph be strongly connected and P the greatest common divisor of the lengths of its cycles. The layers
+        C_j = {v: d(p, v) = j modulo P} are such that every edge leads from C_j to C_{j+1}. Let R_k(u) be the set of
+        nodes that u in C_j reaches in exactly k steps, a subset of C_{j+k}. Once R_k(u) is all of C_{j+k}, so is
+        R_{k+1}(u) all of C_{j+k+1}, as every node has a predecessor, which lies in the layer before. Let g be the
+        largest k at which some u does not reach its whole layer, g = -1 if there is none.
+
+        Claim: if g < P then D = P + g. At most: for all u and v one of g + 1, ..., g + P is the difference of their
+        layers modulo P, and R of that many steps is whole, so d(u, v) <= g + P. At least, for g >= 0: let v be missing
+        in R_g(u). All walks from u to v have a length of g modulo P; g itself is none, and as g < P nothing smaller is,
+        so d(u, v) >= g + P. For g = -1 every layer is one node and the graph is a cycle of P nodes: D = P - 1.
+
+        The sets are found for one layer at a time, a bit for each of its nodes; this pays where layers are narrow.
+        """
+        graph = self.graph
+        if graph.num_nodes < 64:
+            return ""
+        cycle = int(kernels.period(graph.next_states, graph.ends, graph.start, self.away, graph.has_end))
+        if cycle < 8:
+            return ""
+        layer = self.away % cycle
+        widths = np.bincount(layer, minlength=cycle)
+        widest = int(widths.max())
+        if widest > _WIDE:
+            return f"all cycles have multiples of {cycle} steps, but a layer of {widest} states is too wide to follow"
+        layer_first = np.concatenate([[0], np.cumsum(widths)])
+        order = np.argsort(layer, kind="stable").astype(graph.dtype)
+        position = np.empty(graph.num_nodes, np.int32)
+        position[order] = np.arange(graph.num_nodes) - np.repeat(layer_first[:-1], widths)
+        scratch = [np.empty((widest, -(-widest // 64)), np.uint64) for _ in range(2)]
+        max_reads = 200 * graph.num_nodes * graph.next_states.shape[1] + 10**8
+        gap, _ = kernels.last_gap(
+            graph.next_states, graph.ends, graph.start, order, layer_first, position, *scratch, max_reads
+        )
+        if gap == -2:
+            return f"all cycles have multiples of {cycle} steps, but some state needs more to reach its whole layer"
+        if gap == -3:
+            return f"all cycles have multiples of {cycle} steps, but following the layers takes too long"
+        self.method = f"reach sets in the {cycle} layers of a clock, none of more than {widest} states"
+        return self._result(cycle + int(gap), cycle + int(gap), "")
+
+
+def _infinite_diameter(graph: Graph, spending: Spending, conventions: dict[str, Any]) -> Interval:
+    """D of a graph that is not strongly connected: infinite, with unreachable pairs and the finite part."""
+    size = graph.num_nodes
+    words = 8 if 24 * 8 * size <= _BATCH_MEMORY else 1
+    bits = [np.zeros((size, words), np.uint64) for _ in range(3)]
+    scratch = (graph.queue, np.empty_like(graph.queue))
+    reached = finite = done = 0
+    while done < size and not spending.is_over:
+        sources = np.arange(done, min(done + 64 * words, size), dtype=graph.dtype)
+        bits[0][:] = 0
+        largest = np.empty(len(sources), np.int64)
+        pairs, _ = kernels.search_forward_from_many(
+            graph.next_states, graph.ends, graph.start, sources, *bits, *scratch, largest
+        )
+        reached += int(pairs)
+        finite = max(finite, int(largest.max()))
+        done += len(sources)
+        spending.searches += len(sources)
+        spending.report(finite, math.inf, size - done)
+    unreachable = done * (size - 1) - reached
+    counted = done == size
+    note = "some states cannot be reached from others"
+    if not counted:
+        note += f"; budget spent after the pairs from {done} of {size} states, so the counts are lower bounds"
+        unreachable = max(unreachable, 1)
+    return Interval(
+        math.inf,
+        math.inf,
+        True,
+        unreachable_pairs=unreachable,
+        finite_part=float(finite),
+        counted=counted,
+        searches=spending.searches,
+        method="searches from all states, many at once",
+        conventions=conventions,
+        note=note,
+        seconds=spending.seconds,
+    )
