@@ -152,6 +152,7 @@ def test_what_was_learnt_is_drawn_where_it_is_trusted(lab):
     assert done.returncode == 0 and (lab / "a.gif").stat().st_size > 0, done.stderr
 
 
+@pytest.mark.slow
 def test_a_run_can_be_read_in_python(lab, monkeypatch):
     monkeypatch.setattr(catalog, "_REGISTERED", {})
     record = runs_of(lab)["index"]
@@ -162,6 +163,7 @@ def test_a_run_can_be_read_in_python(lab, monkeypatch):
     assert again.env == task.env
 
 
+@pytest.mark.slow
 def test_changed_code_is_told(lab, tmp_path):
     copy = tmp_path / "lab"
     shutil.copytree(lab, copy)
@@ -312,7 +314,6 @@ COMMANDS = [
 ]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
 def test_received_files_execute_nothing(received, sent, words):
     done = here(*(received if word == "RUN" else word for word in words))
@@ -352,7 +353,6 @@ def test_regret_is_drawn_without_any_code(received, sent):
     assert executed(sent) == []
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "change",
     [
@@ -374,7 +374,6 @@ def test_the_configuration_of_a_received_run_executes_nothing(received, sent, ch
     assert executed(sent) == []
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("entry", [{"name": "canary.py:Taxi"}, 3, {"name": "canary", "file": "", "checksum": ""}, [1]])
 def test_a_damaged_source_is_no_source(received, entry):
     config = {**read_record(received)["config"], "sources": {"environment": entry}}
@@ -382,7 +381,6 @@ def test_a_damaged_source_is_no_source(received, entry):
         RunConfig.from_dict(config)
 
 
-@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*has changed since")
 def test_the_target_that_a_command_names_is_trusted(received, sent):
     done = here("evaluate", "canary.py:Taxi", "--policy", received, "--horizon", 5, "--json")
@@ -390,7 +388,6 @@ def test_the_target_that_a_command_names_is_trusted(received, sent):
     assert executed(sent) == ["canary.executed"]
 
 
-@pytest.mark.slow
 def test_a_study_is_unpacked_into_ones_own_without_trust(received, sent):
     done = here("study", "unpack", "got.parquet", "--into", "sent.yaml", "--out", "new", "--json")
     assert done.exit_code == 0, done.output

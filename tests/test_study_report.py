@@ -14,7 +14,7 @@ from pharos.study import worker as _worker
 from pharos.study.execution import claim
 from pharos.study.figures import _tasks
 from pharos.study.latex import escape
-from pharos.study.report import number
+from pharos.study.report import files, number
 
 SPECIFICATION = {
     "name": "lakes",
@@ -45,6 +45,24 @@ def written(tmp_path_factory):
     _worker.write_failure(folder / "partial" / failed.id, failed.config, failed.id, "ValueError: <no>", 1.0)
     _worker.publish(folder / "partial" / failed.id, folder, failed.id)
     return folder, study.report(folder)
+
+
+@pytest.fixture(scope="module")
+def again(written, tmp_path_factory):
+    """(folder, what was printed) of a report of the same study by the command line, in a process of its own."""
+    folder = tmp_path_factory.mktemp("again")
+    command = [sys.executable, "-m", "pharos", "study", "report", str(written[0]), "--to", str(folder), "--json"]
+    return folder, subprocess.run(command, capture_output=True, text=True, check=True).stdout
+
+
+@pytest.fixture
+def sketched(monkeypatch):
+    """Figures of a report are made, and not drawn: for tests of what the page and the tables say."""
+
+    def save(draw, place):
+        return None if draw() is None else {"light": b"light", "dark": b"dark"}
+
+    monkeypatch.setattr(files, "save", save)
 
 
 class Reader(HTMLParser):
@@ -86,6 +104,7 @@ def test_the_page_is_well_formed_and_loads_nothing_from_outside(written):
     assert "<!--TITLE-->" not in page and "<script" not in page
 
 
+@pytest.mark.slow
 def test_every_section_is_there_and_every_link_leads_to_one(written):
     page = written[1].html.read_text()
     reader = read(page)
@@ -107,6 +126,7 @@ def test_every_section_is_there_and_every_link_leads_to_one(written):
         assert f'id="{link[1:]}"' in page
 
 
+@pytest.mark.slow
 def test_failed_and_missing_runs_and_models_without_rows_are_told(written):
     page = written[1].html.read_text()
     assert "28 of 30 runs are finished, 1 failed" in page and "1 run missing" in page
@@ -126,6 +146,7 @@ def test_each_figure_is_a_png_and_a_pdf_and_stands_in_the_page_light_and_dark(wr
     assert report.html.read_text().count('prefers-color-scheme: dark)" srcset') == len(names)
 
 
+@pytest.mark.slow
 def test_latex_tables_have_the_papers_columns_and_balanced_environments(written):
     text = next(file for file in written[1].tables if file.name == "returns_simple_grid.tex").read_text()
     assert r" & & \multicolumn{2}{c}{PPO} & \multicolumn{2}{c}{DQN} \\" in text
@@ -137,11 +158,10 @@ def test_latex_tables_have_the_papers_columns_and_balanced_environments(written)
 
 
 @pytest.mark.slow
-def test_a_report_made_again_is_the_same_but_for_its_date(written):
+def test_a_report_made_again_is_the_same_but_for_its_date(written, again):
     page = written[1].html.read_text()
-    again = study.report(written[0]).html.read_text()
     date = re.compile(r"\d{4}-\d{2}-\d{2} \d{2}:\d{2}")
-    assert date.sub("", again) == date.sub("", page)
+    assert date.sub("", (again[0] / "report.html").read_text()) == date.sub("", page)
 
 
 @pytest.mark.slow
@@ -171,11 +191,10 @@ def test_numbers_are_short():
 
 
 @pytest.mark.slow
-def test_the_command_prints_where_the_report_is(written, tmp_path):
-    command = [sys.executable, "-m", "pharos", "study", "report", str(written[0]), "--to", str(tmp_path), "--json"]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
-    assert json.loads(done.stdout)["html"] == str(tmp_path / "report.html")
-    status = subprocess.run([*command[:4], "status", str(written[0])], capture_output=True, text=True)
+def test_the_command_prints_where_the_report_is(written, again):
+    assert json.loads(again[1])["html"] == str(again[0] / "report.html")
+    command = [sys.executable, "-m", "pharos", "study", "status", str(written[0])]
+    status = subprocess.run(command, capture_output=True, text=True)
     assert status.stdout.splitlines()[0] == "lakes: 28 of 30 runs finished, 1 failed"
     assert "ValueError: <no>" in status.stderr
 
@@ -232,8 +251,7 @@ def test_each_agent_that_sees_observations_has_models(tmp_path):
     }
 
 
-@pytest.mark.slow
-def test_what_has_no_run_is_not_measured_and_the_cost_is_told_beforehand(tmp_path):
+def test_what_has_no_run_is_not_measured_and_the_cost_is_told_beforehand(tmp_path, sketched):
     block = {"environments": ["frozen_lake/4x4", "frozen_lake/8x8"], "agents": ["q_learning"]}
     spec = study.specification({"name": "half", "hardness": {"measures": ["diameter"], "budget": 7}, "blocks": [block]})
     run = spec.runs[0]
@@ -266,8 +284,7 @@ def test_curves_of_each_kind_of_chance_have_a_line_for_each_seed():
     assert [len(axis.lines) for axis in axes] == [1 + 3, 1 + 3]
 
 
-@pytest.mark.slow
-def test_estimated_regret_is_marked_and_its_half_width_stands_in_the_summary(tmp_path):
+def test_estimated_regret_is_marked_and_its_half_width_stands_in_the_summary(tmp_path, sketched):
     def estimate(spec):
         import pandas as pd
 
@@ -316,8 +333,7 @@ def test_texts_that_a_spreadsheet_would_run_are_escaped_and_numbers_stay_numbers
     assert (safe["number"] == -1.5).all() and safe["number"].dtype == float
 
 
-@pytest.mark.slow
-def test_received_records_reach_the_tables_without_formulas(tmp_path):
+def test_received_records_reach_the_tables_without_formulas(tmp_path, sketched):
     def inject(spec):
         file = tmp_path / "runs" / spec.runs[0].id / "run.json"
         record = json.loads(file.read_text())
@@ -330,8 +346,7 @@ def test_received_records_reach_the_tables_without_formulas(tmp_path):
     assert ",=" not in text and "\n=" not in text
 
 
-@pytest.mark.slow
-def test_the_page_escapes_whatever_a_study_says(tmp_path):
+def test_the_page_escapes_whatever_a_study_says(tmp_path, sketched):
     block = {"environments": ["frozen_lake/4x4"], "agents": ["q_learning"], "seeds": 1}
     spec = study.specification(
         {"name": "x", "description": "<script>alert(1)</script>", "blocks": [block], "steps": 10}
@@ -341,6 +356,7 @@ def test_the_page_escapes_whatever_a_study_says(tmp_path):
     assert "<script" not in page and "&lt;script&gt;" in page
 
 
+@pytest.mark.slow
 def test_states_that_share_an_image_are_counted(tmp_path):
     import numpy as np
 
@@ -359,7 +375,7 @@ def test_states_that_share_an_image_are_counted(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_report_says_which_images_hide_something(tmp_path):
+def test_a_report_says_which_images_hide_something(tmp_path, sketched):
     small = {"name": "breakout", "parameters": {"height": 7, "columns": 4, "brick_rows": 1}}
     report, page = report_of(tmp_path, agents=["ppo"], environments=[small, "frozen_lake/4x4"])
     text = " ".join(page.text)
