@@ -1,8 +1,11 @@
 """Makes docs/gallery.md and its pictures: every class, what people and agents see, and an optimal policy at play.
 
-python scripts/gallery.py
+python scripts/gallery.py                      all classes
+python scripts/gallery.py sokoban taxi         these alone; the other sections stay as they are
 """
 
+import re
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +21,9 @@ INSTANCES = {
     "frozen_lake": (("frozen_lake/4x4", 2), ("frozen_lake/8x8", 6)),
     "freeway": (("freeway/16x7-speed1", 12), ("freeway/20x11-speed1", 12)),
     "breakout": (("breakout/12x8x1", 60), ("breakout/16x8x3", 60)),
+    "sliding_tiles": (("sliding_tiles/3x3", 5), ("sliding_tiles/2x5", 20)),
+    "pocket_cube": (("pocket_cube/half", 0), ("pocket_cube/quarter", 8)),
+    "sokoban": (("sokoban/pillar", 9), ("sokoban/storehouse", 12)),
     "mini_grid": (("mini_grid/key-corridor-s4r3", 7), ("mini_grid/lava-crossing-s9n2", 3)),
 }
 PLAYED = {
@@ -26,7 +32,11 @@ PLAYED = {
     "freeway": "freeway/16x7-speed1",
     "breakout": "breakout/12x8x3",
     "mini_grid": "mini_grid/unlock-pickup",
+    "sliding_tiles": "sliding_tiles/3x3-hardest",
+    "pocket_cube": "pocket_cube/quarter",
+    "sokoban": "sokoban/storehouse",
 }
+FRAMES_PER_SECOND = {"sliding_tiles": 4, "pocket_cube": 3, "sokoban": 6}  # others: 12
 FRAMES = 90
 NUMBERS = 8  # of a vector
 
@@ -82,36 +92,44 @@ def numbers(env, space, state):
     )
 
 
-def main() -> None:
-    """Write everything anew."""
+HEAD = """# Gallery
+
+Made by `python scripts/gallery.py`. In each row, from the left: the drawing for people, the complex image at
+its natural size and at 84 x 84 pixels, and the planes of the simple image, one for each layer; below it, the
+observations that are numbers. What agents learnt, at play beside the optimal policy and a random one:
+[large-runs.md](large-runs.md).
+"""
+
+
+def section(cls):
+    """The section of a class, its pictures written."""
+    lines = [f"## {cls}", "", " ".join(pharos.make(cls).__doc__.split("\n")[0].split()), ""]
+    for name, steps in INSTANCES[cls]:
+        env, policy = optimal(name)
+        state = drawing.episode(env, policy, env.initial_states()[0][0], steps=steps)[-1][0]
+        file = FOLDER / f"{name.replace('/', '-')}.png"
+        drawing.save_png(file, shown(env, state))
+        space = pharos.build(env)
+        lines += [f"`{name}`, {space.num_states:,} states, after {steps} steps of the optimal policy:", ""]
+        lines += [f"![{name}](gallery/{file.name})", "", numbers(env, space, state), ""]
+    name = PLAYED[cls]
+    env, policy = optimal(name)
+    played = drawing.episode(env, policy, env.initial_states()[0][0], steps=FRAMES)
+    pictures = [render(env, state, "complex_image", size="natural") for state, _, _ in played]
+    file = FOLDER / f"{name.replace('/', '-')}.gif"
+    drawing.save_gif(file, pictures, frames_per_second=FRAMES_PER_SECOND.get(cls, 12), at_least=160)
+    return "\n".join([*lines, f"The optimal policy of `{name}`:", "", f"![{name}](gallery/{file.name})", ""])
+
+
+def main(chosen) -> None:
+    """Write the sections of the chosen classes anew; of all of them where none is named."""
     FOLDER.mkdir(exist_ok=True)
-    lines = [
-        "# Gallery",
-        "",
-        "Made by `python scripts/gallery.py`. In each row, from the left: the drawing for people, the complex image at",
-        "its natural size and at 84 x 84 pixels, and the planes of the simple image, one for each layer; below it, the",
-        "observations that are numbers. What agents learnt, at play beside the optimal policy and a random one:",
-        "[large-runs.md](large-runs.md).",
-        "",
-    ]
-    for cls, instances in INSTANCES.items():
-        lines += [f"## {cls}", "", " ".join(pharos.make(cls).__doc__.split("\n")[0].split()), ""]
-        for name, steps in instances:
-            env, policy = optimal(name)
-            state = drawing.episode(env, policy, env.initial_states()[0][0], steps=steps)[-1][0]
-            file = FOLDER / f"{name.replace('/', '-')}.png"
-            drawing.save_png(file, shown(env, state))
-            space = pharos.build(env)
-            lines += [f"`{name}`, {space.num_states:,} states, after {steps} steps of the optimal policy:", ""]
-            lines += [f"![{name}](gallery/{file.name})", "", numbers(env, space, state), ""]
-        env, policy = optimal(PLAYED[cls])
-        played = drawing.episode(env, policy, env.initial_states()[0][0], steps=FRAMES)
-        pictures = [render(env, state, "complex_image", size="natural") for state, _, _ in played]
-        file = FOLDER / f"{PLAYED[cls].replace('/', '-')}.gif"
-        drawing.save_gif(file, pictures, frames_per_second=12, at_least=160)
-        lines += [f"The optimal policy of `{PLAYED[cls]}`:", "", f"![{PLAYED[cls]}](gallery/{file.name})", ""]
-    (DOCS / "gallery.md").write_text("\n".join(lines))
+    page = DOCS / "gallery.md"
+    texts = re.split(r"^## (\w+)\n", page.read_text(), flags=re.MULTILINE)[1:] if chosen else []
+    sections = {cls: f"## {cls}\n{text.rstrip()}\n" for cls, text in zip(texts[::2], texts[1::2], strict=True)}
+    sections |= {cls: section(cls) for cls in chosen or INSTANCES}
+    page.write_text("\n".join([HEAD, *(sections[cls] for cls in INSTANCES if cls in sections)]))
 
 
 if __name__ == "__main__":
-    main()
+    main(sys.argv[1:])
