@@ -49,3 +49,43 @@ def build(env: Environment) -> NaiveStateSpace:
         successors.append(row)
         terminal.append(ended)
     return NaiveStateSpace(states, successors, terminal, levels, probabilities.tolist())
+
+
+@dataclass(frozen=True)
+class NaiveOutcomes:
+    """The same with chance: for each state and action the possible outcomes, (next state, probability) in order."""
+
+    states: list[State]
+    outcomes: list[list[list[tuple[int, float]]]]
+    terminal: list[bool]
+    levels: list[int]
+
+
+def build_outcomes(env: Environment) -> NaiveOutcomes:
+    """Enumerate the states of `env`, whose actions have outcomes: row after row, action after action, outcome after
+    outcome.
+    """
+    states, _ = start_distribution(env)
+    index = {state: i for i, state in enumerate(states)}
+    levels = [0] * len(states)
+    found: list[list[list[tuple[int, float]]]] = []
+    terminal: list[bool] = []
+    for current, state in enumerate(states):  # which grows meanwhile
+        terminal.append(bool(env.is_terminal(state)))
+        if terminal[-1]:
+            found.append([[(current, 1.0)] for _ in range(env.num_actions)])
+            continue
+        found.append([])
+        for action in range(env.num_actions):
+            found[-1].append([])
+            for outcome in range(env.outcomes):
+                probability = float(env.probability(state, action, outcome))
+                if probability == 0:
+                    continue
+                following = env.next_state(state, action, outcome)
+                if following not in index:
+                    index[following] = len(states)
+                    states.append(following)
+                    levels.append(levels[current] + 1)
+                found[-1][-1].append((index[following], probability))
+    return NaiveOutcomes(states, found, terminal, levels)

@@ -2,6 +2,7 @@
 byte."""
 
 import hashlib
+import importlib
 import json
 import re
 from pathlib import Path
@@ -11,9 +12,10 @@ import pytest
 import xxhash
 
 import pharos
+from chance_worlds import ChanceWorld
 
 PAGE = (Path(__file__).parents[1] / "docs" / "format.md").read_text()
-CODE = re.search(r"```python\n(.*?)```", PAGE, re.DOTALL)[1]
+CODE, CODE_WITH_CHANCE = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
 
 
 @pytest.mark.parametrize("name", ["simple_grid/6x6-decoy", "frozen_lake/8x8", "freeway", "breakout"])
@@ -29,6 +31,29 @@ def test_the_code_of_the_page_reads_what_pharos_wrote(name, tmp_path, monkeypatc
     assert (read["vectors"] == space.states()).all()
     assert (read["successors"] == space.successors).all()
     assert (read["terminal"] == space.terminal).all()
+
+
+@pytest.mark.parametrize(("most_codes", "possible_share"), [(2**16, 1.0), (2**16, 0.3), (2, 1.0), (2, 0.3)])
+def test_the_code_of_the_page_reads_chance(most_codes, possible_share, tmp_path, monkeypatch):
+    """Dense and one after another, with a palette and without."""
+    monkeypatch.setattr(importlib.import_module("pharos.state_space.outcome_journal"), "MOST_CODES", most_codes)
+    world = ChanceWorld(num_positions=50, seed=3, vectors=0, possible_share=possible_share)
+    space = pharos.build(world, tmp_path / "space", progress=False)
+    assert (("offsets.bin" in space.manifest["arrays"]), ("palette.bin" in space.manifest["arrays"])) == (
+        possible_share < 1,
+        most_codes > 2,
+    )
+    monkeypatch.chdir(space.folder)
+    read: dict = {}
+    exec(CODE_WITH_CHANCE, read)
+    states = np.arange(space.num_states)
+    stored = [pair for state in space.outcomes.of_states(states, 2).values() for pair in state]
+    assert (read["successors"] == np.concatenate([successors for successors, _ in stored])).all()
+    assert (read["probabilities"] == np.concatenate([probabilities for _, probabilities in stored])).all()
+    assert (read["row"] == np.repeat(np.arange(len(stored)), [len(each) for each, _ in stored])).all()
+    described = {key for key in space.manifest if f"`{key}`" in PAGE}
+    assert described == set(space.manifest)
+    assert set(space.manifest["arrays"]) | {"manifest.json", "lock"} == {path.name for path in space.folder.iterdir()}
 
 
 def test_checksums_and_digest_are_as_the_page_says(tmp_path):
@@ -50,3 +75,20 @@ def test_bits_of_no_component_are_zero(tmp_path):
     layout = space.manifest["layout"]
     used = sum(((1 << bits) - 1) << shift for bits, shift in zip(layout["bits"], layout["shift"], strict=True))
     assert not (np.asarray(space.packed_states).ravel() & np.uint64(2**64 - 1 - used)).any()
+
+
+@pytest.mark.parametrize(
+    ("name", "parameters", "digest"),
+    (
+        ("frozen_lake/8x8", {}, "59df3691fed2895f"),
+        ("frozen_lake/8x8", {"slippery": False}, "59df3691fed2895f"),
+        ("freeway", {"num_cars": 4, "lane_length": 5}, "d0b6759b3dbc156c"),
+        ("breakout", {"height": 6, "columns": 3}, "3048e62854259b67"),
+        ("simple_grid/6x6-decoy", {}, "34fa7f2d9c0c3f46"),
+    ),
+)
+def test_folders_without_chance_are_what_they_were_byte_for_byte(name, parameters, digest, tmp_path):
+    """SHA-256 of the files of a build, written by a pharos that knew of no chance in rules."""
+    folder = pharos.build(pharos.make(name, **parameters), tmp_path / "space", progress=False).folder
+    files = b"".join(path.name.encode() + path.read_bytes() for path in sorted(folder.iterdir()))
+    assert hashlib.sha256(files).hexdigest()[:16] == digest

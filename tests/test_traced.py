@@ -15,7 +15,7 @@ from pharos import build
 from pharos.environments import Environment
 from pharos.errors import RuleError
 from pharos.rules import traced as _traced
-from pharos.rules.interpreted import interpreted_successors
+from pharos.rules.interpreted_branches import interpreted_branches
 from pharos.rules.traced import TracedRules
 
 
@@ -52,10 +52,10 @@ def assert_traced_rightly(env, states, is_on=True):
     """The traced successors, in two batches, are those of every state; so nothing depends on what was asked before."""
     traced = TracedRules(env)
     for part in np.array_split(states, 2):
-        found = traced.successors(part)
+        found = traced.branches(part)
         assert (found is not None) == is_on
         if found is not None:
-            following, terminal = interpreted_successors(env, part.tolist())
+            following, terminal, _ = interpreted_branches(env, part.tolist())
             np.testing.assert_array_equal(found[0], following)
             np.testing.assert_array_equal(found[1], terminal)
     assert traced.is_on == is_on
@@ -176,12 +176,12 @@ def test_a_rule_that_is_not_a_function_of_the_state_is_not_traced():
     def rule(state, action, out):
         out[0] = next(calls) % 3
 
-    assert TracedRules(cube(rule)).successors(STATES) is None
+    assert TracedRules(cube(rule)).branches(STATES) is None
 
     def wanders(state, action, out):
         out[0] = state[next(calls) % 4]
 
-    assert TracedRules(cube(wanders)).successors(STATES) is None
+    assert TracedRules(cube(wanders)).branches(STATES) is None
 
 
 def test_a_rule_that_fails_is_blamed_as_ever(tmp_path, monkeypatch):
@@ -213,7 +213,7 @@ def test_a_component_with_very_many_values_is_not_for_a_tree():
         out[0] = state[0] // 2
 
     env = type("Long", (Long,), {"rule": staticmethod(rule)})()
-    assert TracedRules(env).successors(STATES) is None
+    assert TracedRules(env).branches(STATES) is None
 
 
 def test_tracing_ends_where_it_saves_nothing(monkeypatch):
@@ -223,20 +223,20 @@ def test_tracing_ends_where_it_saves_nothing(monkeypatch):
         out[0] = bump(sum(state))
 
     traced = TracedRules(cube(looks_at_all))
-    assert traced.successors(STATES) is None and traced.asked < len(STATES)
+    assert traced.branches(STATES) is None and traced.asked < len(STATES)
 
     def looks_at_one(state, action, out):
         out[0] = bump(state[1])
 
     traced = TracedRules(cube(looks_at_one))
-    assert traced.successors(STATES) is not None and traced.asked <= 2 * 5 + 1
+    assert traced.branches(STATES) is not None and traced.asked <= 2 * 5 + 1
 
 
 def test_files_do_not_depend_on_tracing(tmp_path, monkeypatch):
     monkeypatch.setattr("pharos.rules.rules.compiled_or_none", lambda *args: None)
     env = pharos.make("breakout", height=7, columns=4)
     build(env, tmp_path / "traced", progress=False)
-    monkeypatch.setattr(TracedRules, "successors", lambda self, states: None)
+    monkeypatch.setattr(TracedRules, "branches", lambda self, states: None)
     build(env, tmp_path / "asked", progress=False)
     for file in (tmp_path / "traced").iterdir():
         if file.suffix != ".json":

@@ -10,12 +10,12 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
 from pharos.environments.look import Layer, Look
-from pharos.environments.parameters import check_parameters
+from pharos.environments.parameters import check_parameters, declared_parameters
 from pharos.errors import ParameterError, RuleError
 
 State = tuple[int, ...]
@@ -140,9 +140,13 @@ class Environment:
 
     # The rules ------------------------------------------------------------------------------------------------------
 
-    def transition(self, state, action, out) -> None:
-        """Write into `out`, a copy of `state`, what `action` changes."""
-        raise NotImplementedError(f"{type(self).__name__} must define transition()")
+    if TYPE_CHECKING:
+        transition: Any  # takes (state, action, out), or (state, action, outcome, out)
+    else:
+
+        def transition(self, state, action, out) -> None:
+            """Write into `out`, a copy of `state`, what `action` changes."""
+            raise NotImplementedError(f"{type(self).__name__} must define transition()")
 
     def probability(self, state, action, outcome) -> float:
         """The probability of an outcome of `action` in `state`; 0 where it is impossible. Here: there is but one."""
@@ -197,8 +201,14 @@ class Environment:
 
     @property
     def parameters(self) -> dict[str, Any]:
-        """The parameters of this instance, in the order of the dataclass; JSON-able."""
-        return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}  # type: ignore[arg-type]
+        """The parameters of this instance, in the order of the dataclass; JSON-able.
+
+        Without those that were `added` to the class and have their default: see `parameter`.
+        """
+        added = {name for name, declared in declared_parameters(type(self)).items() if declared.added}
+        fields = dataclasses.fields(self)  # type: ignore[arg-type]
+        values = {field.name: getattr(self, field.name) for field in fields}
+        return {f.name: values[f.name] for f in fields if f.name not in added or values[f.name] != f.default}
 
     @cached_property
     def components(self) -> Components:
@@ -237,7 +247,7 @@ class Environment:
         """
         out = list(state)
         if self.takes_outcomes():
-            self.transition(tuple(state), action, outcome, out)  # type: ignore[call-arg]
+            self.transition(tuple(state), action, outcome, out)
         elif outcome == 0:
             self.transition(tuple(state), action, out)
         else:

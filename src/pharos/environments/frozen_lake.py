@@ -20,9 +20,6 @@ MAPS = {  # those of Gymnasium's FrozenLake-v1
     8: "SFFFFFFF/FFFFFFFF/FFFHFFFF/FFFFFHFF/FFFHFFFF/FHHFFFHF/FHFFHFHF/FFFHFFFG",
 }
 FROZEN_PROBABILITY = 0.8
-SLIPPING = (
-    "slipping comes as random actions: --random 0.667, random=2/3, random_actions(mdp, 2/3); see the class' docstring"
-)
 ATTEMPTS = 10_000
 
 
@@ -35,12 +32,10 @@ class FrozenLake(Environment):
     Reward   1 on reaching the goal, otherwise 0.
     Ends     on reaching the goal or falling into a hole.
     Limit    25 steps for each cell of the longer side: 100 on the 4x4 map and 200 on the 8x8 map, as in Gymnasium.
-    Ours     the ice is not slippery here: slips come from outside, as random or sticky actions. Gymnasium's slippery
-             ice executes the chosen action or one of the two perpendicular ones, 1/3 each, and never the opposite
-             one. No `random_actions(p)` expresses that, because it executes each action with at least p / 4:
-             Gymnasium's law is 4/3 of the uniform law minus 1/3 of the opposite action, which would be p = 4/3. The
-             nearest, p = 2/3, differs by 1/6 in the probability of an action. Only under the uniform policy (its
-             states, its value) are the two the same, for every p.
+    Chance   on slippery ice the chosen action is executed, or one of the two perpendicular ones, 1/3 each, and never
+             the opposite one. No `random_actions(p)` expresses that, because it executes each action with at least
+             p / 4.
+    Ours     the ice is not slippery unless `slippery` says so; in Gymnasium it is unless told otherwise.
     Source   Gymnasium FrozenLake-v1 (Brockman et al., 2016); the pharos paper, section 3.3.
 
     Attributes:
@@ -49,12 +44,14 @@ class FrozenLake(Environment):
             least one G, and a way from S to a G.
         seed: draws a random map of `size` x `size` that has a way to the goal, start top left, goal bottom right.
         frozen_probability: of each tile of a random map to be ice, in (0, 1]; as in Gymnasium 0.8.
+        slippery: whether the ice is; Gymnasium's `is_slippery`.
     """
 
     size: int | None = parameter(None, kind=int, low=2)
     map: str | None = None
     seed: int | None = parameter(None, kind=int, low=0)
     frozen_probability: float = parameter(FROZEN_PROBABILITY, low=0.0, high=1.0)
+    slippery: bool = parameter(False, added=True)
 
     name = "frozen_lake"
     actions = ("left", "down", "right", "up")
@@ -68,7 +65,7 @@ class FrozenLake(Environment):
     look = Look(ground="ice", color="#56B4E9")
     instances = {"4x4": {"size": 4}, "8x8": {"size": 8}}
     paper_instances = ("4x4", "8x8")
-    foreign_parameters = {"slippery": SLIPPING, "is_slippery": SLIPPING}
+    foreign_parameters = {"is_slippery": "it is called slippery here: slippery=True"}
     hyperparameters = {
         # With a discount of 0.99 the goal of 8x8 is not found.
         "dqn": {
@@ -132,9 +129,18 @@ class FrozenLake(Environment):
         row, column = np.argwhere(self.tiles == START)[0]
         return int(row), int(column)
 
-    def transition(self, state, action, out):
-        row = state[ROW] + (action == DOWN) - (action == UP)
-        column = state[COLUMN] + (action == RIGHT) - (action == LEFT)
+    @property
+    def outcomes(self) -> int:  # type: ignore[override]
+        """On slippery ice three: the action before the chosen one, the chosen one, the one after it."""
+        return 3 if self.slippery else 1
+
+    def probability(self, state, action, outcome):
+        return 1 / 3 if self.slippery else 1.0
+
+    def transition(self, state, action, outcome, out):
+        executed = (action + outcome + 3) % 4 if self.slippery else action
+        row = state[ROW] + (executed == DOWN) - (executed == UP)
+        column = state[COLUMN] + (executed == RIGHT) - (executed == LEFT)
         out[ROW] = min(max(row, 0), self.height - 1)
         out[COLUMN] = min(max(column, 0), self.width - 1)
 

@@ -41,12 +41,15 @@ class Parameter:
         kind: int, float, bool, or a Kind.
         low, high: of numbers; constants, or functions of the environment.
         optional: whether None is a value too.
+        added: whether it came after instances had been kept by their parameters: where it has its default, it is not
+            among `Environment.parameters`, so that these stay what they were.
     """
 
     kind: type | Kind
     low: Any = None
     high: Any = None
     optional: bool = False
+    added: bool = False
 
     @property
     def is_bounded_by_others(self) -> bool:
@@ -81,15 +84,19 @@ class Parameter:
         return self.kind.checked(env, name, value)
 
 
-def parameter(default: Any, *, low: Any = None, high: Any = None, kind: type | Kind | None = None) -> Any:
+def parameter(
+    default: Any, *, low: Any = None, high: Any = None, kind: type | Kind | None = None, added: bool = False
+) -> Any:
     """A field of an environment's dataclass, with the values that it may take.
 
     Args:
         default: the value when none is given; None as a default is a value that is not checked.
         low, high: bounds of a number; functions of the environment where they depend on other parameters.
         kind: int, float, bool, or a Kind; None: the type of the default.
+        added: True for a parameter that a class gets when there are results of it already: what is kept by the
+            parameters of an instance, such as built state spaces, is found again where the new one has its default.
     """
-    declared = Parameter(kind or type(default), low, high, default is None)
+    declared = Parameter(kind or type(default), low, high, default is None, added)
     return dataclasses.field(default=default, metadata={_DECLARED: declared})
 
 

@@ -17,6 +17,7 @@ __all__ = [
     "occupancy",
     "outcomes",
     "packing",
+    "palettes",
     "partition",
     "paths",
     "stepping",

@@ -60,10 +60,16 @@ def _blocks(space: "StateSpace", env: Environment, workers: int | None) -> Itera
 
     rules = rules_of(env).rewards
     starts = range(0, space.num_states, _ROWS)
-    arrays = space.packed_states, space.successors, space.terminal
+    states, terminal = space.packed_states, space.terminal
+    successors = None if space.has_chance else space.successors
 
     def block(start: int) -> np.ndarray:
-        return rules.block(*arrays, start, min(start + _ROWS, space.num_states))
+        stop = min(start + _ROWS, space.num_states)
+        if successors is not None:
+            return rules.block(states, successors, terminal, start, stop)
+        pairs = np.arange(start * space.num_actions, stop * space.num_actions)
+        outcomes = space.dynamics.outcomes(*np.divmod(pairs, space.num_actions))
+        return rules.expected_block(states, tuple(outcomes), terminal, start, stop)
 
     threads = rules.threads(usable_workers(workers))
     with ThreadPoolExecutor(threads) as pool:

@@ -188,9 +188,8 @@ class TabularMDP:
     @staticmethod
     def from_space(space: "StateSpace", rewards: Rewards, gamma: float = 0.99) -> "TabularMDP":
         """The MDP on the states of a state space; `StateSpace.mdp` computes the rewards."""
-        outcomes = getattr(space, "outcome_arrays", None)
         return TabularMDP(
-            Table(space.successors) if outcomes is None else OutcomeTable(num_actions=space.num_actions, **outcomes),
+            space.dynamics,
             rewards,
             space.terminal,
             gamma,

@@ -4,6 +4,7 @@ Each class makes its kernels ready when it is made, by calling them with no work
 it cannot.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -24,7 +25,9 @@ class _Compiled:
     def __init__(self, env: Environment, layout: Layout):
         names, self.parameters = numeric_attributes(env)
         self.env, self.layout = env, layout
-        self.kernels = exploration_kernels(_class_of(env), names, layout.num_words, env.num_actions)
+        self.outcomes = int(env.outcomes)
+        cls = _class_of(env)
+        self.kernels: Any = exploration_kernels(cls, names, layout.num_words, env.num_actions, self.outcomes)
 
 
 class CompiledExploration(_Compiled):
@@ -34,18 +37,21 @@ class CompiledExploration(_Compiled):
 
     def __init__(self, env: Environment, layout: Layout):
         super().__init__(env, layout)
+        self._is_plain = self.outcomes == 1 and not env.has_age
+        branches = env.num_actions * self.outcomes
         states = np.empty((1, layout.num_words), np.uint64)
-        rows = (np.empty((1, env.num_actions), np.int32), np.empty(1, np.uint8))
+        rows = (np.empty((1, branches), np.int32), np.empty(1, np.uint8), np.empty((1, branches)))
         self.explore(states, *rows, np.full(1 << 16, -1, np.int32), 0, 0, 0, np.zeros(5, np.int64))
 
     def threads(self, workers: int) -> int:
         return workers
 
-    def explore(self, states, successors, terminal, table, base, last, room, progress) -> None:
+    def explore(self, states, successors, terminal, probabilities, table, base, last, room, progress) -> None:
+        rows = self._rows(terminal, probabilities)
         failure: Exception | None = None
         try:
             self.kernels.explore(
-                self.parameters, self.layout.tables, states, successors, terminal, table, base, last, room, progress
+                self.parameters, self.layout.tables, states, successors, rows, table, base, last, room, progress
             )
         except Exception as error:  # of the rules, such as a division by zero
             failure = error
@@ -53,27 +59,32 @@ class CompiledExploration(_Compiled):
             first, count = int(progress[FIRST]), int(progress[COUNT])
             blame(self.env, self.layout, states[first : min(first + _SUSPECTS, count)], failure)
 
-    def expand_and_find(self, states, start, stop, base, keys, found, terminal, table) -> None:
+    def expand_and_find(self, states, start, stop, base, keys, found, terminal, probabilities, table) -> None:
         progress = np.zeros(5, np.int64)
         failure: Exception | None = None
         try:
-            self._expand(states, start, stop, base, keys, found, terminal, table, progress)
+            self._expand(states, start, stop, base, keys, found, self._rows(terminal, probabilities), table, progress)
         except Exception as error:
             failure = error
         if failure or progress[FAULT]:
             first = int(progress[FIRST])
             blame(self.env, self.layout, states[first : min(first + _SUSPECTS, stop)], failure)
 
+    def _rows(self, terminal, probabilities) -> Any:
+        """What the kernels write of each row beside its successors."""
+        return terminal if self._is_plain else (terminal, probabilities)
+
     def _expand(self, *arrays: Any) -> None:
         self.kernels.expand_and_find(self.parameters, self.layout.tables, *arrays)
 
-    def component_at_fault(self, states, i: int, keys, terminal) -> int | None:
+    def component_at_fault(self, states, i: int, keys, terminal, probabilities) -> int | None:
         """Expand state i alone, its successors to its rows of keys; the component that it leaves, or None.
 
-        The number of components stands for one that does not exist.
+        The number of components stands for one that does not exist, the next one for a probability or an age.
         """
         progress, found = np.zeros(5, np.int64), np.empty(len(keys), np.int64)
-        self._expand(states, i, i + 1, 0, keys, found, terminal, np.full(64, -1, np.int32), progress)
+        rows = self._rows(terminal, probabilities)
+        self._expand(states, i, i + 1, 0, keys, found, rows, np.full(64, -1, np.int32), progress)
         return int(progress[FAULT]) - 1 if progress[FAULT] else None
 
     def close(self) -> None:
@@ -86,16 +97,27 @@ class CompiledRewards(_Compiled):
     def __init__(self, env: Environment, layout: Layout):
         super().__init__(env, layout)
         states = np.empty((1, layout.num_words), np.uint64)
-        self._rewards_of(states, np.empty((1, env.num_actions), np.int32), np.empty(1, np.bool_), 0, 0)
+        terminal = np.empty(1, np.bool_)
+        if self.outcomes == 1:
+            self._rewards_of(states, np.empty((1, env.num_actions), np.int32), terminal, 0, 0)
+        else:
+            nothing = np.empty(0, np.int64)
+            self._expected_rewards_of(states, (nothing, nothing, np.empty(0)), terminal, 0, 0)
 
     def threads(self, workers: int) -> int:
         return workers
 
     def block(self, states, successors, terminal, start: int, stop: int) -> np.ndarray:
+        return self._asked("block", self._rewards_of, states, successors, terminal, start, stop)
+
+    def expected_block(self, states, outcomes, terminal, start: int, stop: int) -> np.ndarray:
+        return self._asked("expected_block", self._expected_rewards_of, states, outcomes, terminal, start, stop)
+
+    def _asked(self, name: str, compiled: Callable[..., np.ndarray], *arguments: Any) -> np.ndarray:
         try:
-            return self._rewards_of(states, successors, terminal, start, stop)
+            return compiled(*arguments)
         except Exception as error:  # of the rule, such as a division by zero: name the state
-            out = InterpretedRewards(self.env, self.layout).block(states, successors, terminal, start, stop)
+            out = getattr(InterpretedRewards(self.env, self.layout), name)(*arguments)
             if np.isfinite(out).all():
                 raise RuleError(f"{self.env}: compiled, reward raises {error!r}; interpreted it does not") from error
             return out
@@ -104,6 +126,28 @@ class CompiledRewards(_Compiled):
         out = np.empty((stop - start, self.env.num_actions))
         states, successors, terminal = (_read_only(array) for array in (states, successors, terminal))
         self.kernels.rewards_of(self.parameters, self.layout.tables, states, successors, terminal, start, stop, out)
+        return out
+
+    def _expected_rewards_of(self, states, outcomes, terminal, start: int, stop: int) -> np.ndarray:
+        out = np.zeros((stop - start, self.env.num_actions))
+        which, following, probabilities = outcomes
+        arrays = states, which, following, probabilities, terminal
+        self.kernels.rewards_of(self.parameters, self.layout.tables, *arrays, start, out)
+        return out
+
+
+class CompiledAges(_Compiled):
+    """See `rules.Ages`."""
+
+    def __init__(self, env: Environment, layout: Layout):
+        super().__init__(env, layout)
+        states = np.empty((1, layout.num_words), np.uint64)
+        states.flags.writeable = False
+        self.block(states, 0, 0)
+
+    def block(self, states, start: int, stop: int) -> np.ndarray:
+        out = np.empty(stop - start, np.int64)
+        self.kernels.ages_of(self.parameters, self.layout.tables, states, start, stop, out)
         return out
 
 
@@ -122,7 +166,7 @@ class CompiledStepping:
     def __init__(self, env: Environment, layout: Layout | None = None):
         names, self.parameters = numeric_attributes(env)
         self.env = env
-        kernels = interaction_kernels(_class_of(env), names, env.num_actions)
+        kernels = interaction_kernels(_class_of(env), names, env.num_actions, int(env.outcomes))
         self.step_one, self.step_many = kernels.step_one, kernels.step_many
         self.is_terminal_one = kernels.is_terminal_one
         self._step_and_draw_one = kernels.step_and_draw_one
@@ -153,7 +197,8 @@ class CompiledDrawing:
 
     def __init__(self, env: Environment, kernel: str, *arguments: Any):
         names, self.parameters = numeric_attributes(env)
-        self._kernel = getattr(interaction_kernels(_class_of(env), names, env.num_actions), kernel)
+        kernels = interaction_kernels(_class_of(env), names, env.num_actions, int(env.outcomes))
+        self._kernel = getattr(kernels, kernel)
         self(*arguments)
 
     def __call__(self, *arguments: Any) -> None:
@@ -163,7 +208,7 @@ class CompiledDrawing:
 def signature_of(env: Environment) -> tuple:
     """Instances with equal signatures share one compilation, and the reason why there is none."""
     _, parameters = numeric_attributes(env)
-    return (type(env), env.num_actions, tuple(map(type_text, parameters)))
+    return (type(env), env.num_actions, env.outcomes, tuple(map(type_text, parameters)))
 
 
 def _class_of(env: Environment) -> Any:

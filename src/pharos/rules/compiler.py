@@ -20,6 +20,7 @@ import numpy as np
 from numba.extending import overload
 
 from pharos.environments import Environment
+from pharos.rules.branching import BranchingKernels, branching, one_outcome
 from pharos.rules.exploration import ExplorationKernels, exploration
 from pharos.rules.fingerprint import closure_of, function_text, mentioned_names, names_in, plain_function
 from pharos.rules.interaction import InteractionKernels, interaction
@@ -29,9 +30,16 @@ RULES = ("transition", "is_terminal", "reward", "draw")
 _HERE = Path(__file__).parent
 _KERNELS = _HERE.parent / "kernels"
 _MACHINERY = (
-    *(_HERE / name for name in ("compiler.py", "exploration.py", "interaction.py", "packed_view.py")),
+    *(_HERE / name for name in ("compiler.py", "exploration.py", "branching.py", "interaction.py", "packed_view.py")),
     *(_KERNELS / name for name in ("hash_table.py", "stepping.py")),
 )
+
+
+def rules_of_class(cls: Any) -> tuple[str, ...]:
+    """The names of the rules that a class has: those of every class, and `probability` and `age` where it defines
+    them.
+    """
+    return RULES + ("probability",) * cls.takes_outcomes() + ("age",) * (cls.age is not Environment.age)
 
 
 def numeric_attributes(env: Environment) -> tuple[tuple[str, ...], tuple[Any, ...]]:
@@ -41,7 +49,7 @@ def numeric_attributes(env: Environment) -> tuple[tuple[str, ...], tuple[Any, ..
     Private ones are left out: a named tuple has no fields with an underscore.
     """
     known = set(dir(type(env))) | set(vars(env))
-    names = sorted(known & mentioned_names(getattr(type(env), rule) for rule in RULES))
+    names = sorted(known & mentioned_names(getattr(type(env), rule) for rule in rules_of_class(type(env))))
     found = {name: getattr(env, name) for name in names if not name.startswith("_")}
     numeric = {name: _plain(value) for name, value in found.items() if _is_numeric(value)}
     return tuple(numeric), tuple(numeric.values())
@@ -64,25 +72,40 @@ def _plain(value: Any) -> Any:
 
 
 @cache
-def exploration_kernels(cls: Any, names: tuple[str, ...], num_words: int, num_actions: int) -> ExplorationKernels:
-    """The kernels of `exploration.py` for the rules of a class that mention the attributes `names`."""
-    compiler, rules, parameters = _compiler_of(cls, names, num_words, num_actions)
-    return exploration(compiler, rules, parameters, num_words, num_actions)
+def exploration_kernels(
+    cls: Any, names: tuple[str, ...], num_words: int, num_actions: int, outcomes: int = 1
+) -> ExplorationKernels | BranchingKernels:
+    """The kernels of `exploration.py` for the rules of a class that mention the attributes `names`; those of
+    `branching.py` where there is chance or an age.
+    """
+    compiler, rules, parameters = _compiler_of(cls, names, outcomes, num_words, num_actions)
+    if outcomes == 1 and "age" not in rules:
+        return exploration(compiler, rules, parameters, num_words, num_actions)
+    return branching(compiler, rules, parameters, num_words, num_actions, outcomes)
 
 
 @cache
-def interaction_kernels(cls: Any, names: tuple[str, ...], num_actions: int) -> InteractionKernels:
+def interaction_kernels(cls: Any, names: tuple[str, ...], num_actions: int, outcomes: int = 1) -> InteractionKernels:
     """The kernels of `interaction.py`."""
-    compiler, rules, parameters = _compiler_of(cls, names, 0, num_actions)
+    compiler, rules, parameters = _compiler_of(cls, names, outcomes, 0, num_actions)
     return interaction(compiler, rules, parameters, num_actions)
 
 
-def _compiler_of(cls: type[Environment], names: tuple[str, ...], *numbers: int) -> tuple["Compiler", dict, type]:
-    """What a maker needs: the compiler, the compiled rules by their names, and the class of `self`."""
+def _compiler_of(
+    cls: type[Environment], names: tuple[str, ...], outcomes: int, *numbers: int
+) -> tuple["Compiler", dict, type]:
+    """What a maker needs: the compiler, the compiled rules by their names, and the class of `self`.
+
+    With one outcome, `transition` takes none, whatever the class.
+    """
     rule_compiler = _RuleCompiler()
-    rules = {rule: rule_compiler.compiled(getattr(cls, rule)) for rule in RULES}
-    texts = {rule: function_text(getattr(cls, rule), {}) for rule in RULES}
-    return Compiler(cls.__name__.lower(), texts, (names, numbers)), rules, namedtuple("Parameters", names)
+    rules = {rule: rule_compiler.compiled(getattr(cls, rule)) for rule in rules_of_class(cls)}
+    texts = {rule: function_text(getattr(cls, rule), {}) for rule in rules}
+    key = (names, numbers, *((outcomes,) if outcomes > 1 else ()))
+    compiler = Compiler(cls.__name__.lower(), texts, key)
+    if outcomes == 1 and cls.takes_outcomes():
+        rules["transition"] = one_outcome(compiler.calling("transition"), rules["transition"])
+    return compiler, rules, namedtuple("Parameters", names)
 
 
 @cache
@@ -185,6 +208,6 @@ def reason_of(error: BaseException) -> str:
     what = lines[start] if lines else ""
     if what.endswith("for signature:"):  # the useful words stand below
         what += "".join(f" {line.removeprefix('>>>').strip()}" for line in lines[start + 1 : start + 2])
-    ours = (os.path.join("rules", "exploration.py"), os.path.join("rules", "interaction.py"))
+    ours = tuple(os.path.join("rules", file) for file in ("exploration.py", "branching.py", "interaction.py"))
     where = [line for line in lines if line.startswith("File ") and not any(file in line for file in ours)]
     return what + (f" ({where[-1].rstrip(':')})" if where else "")

@@ -4,7 +4,7 @@ says what is written.
 A tree is five arrays. component (nodes,): what a node reads; UNKNOWN; or LEAF - l for leaf l. first_child (nodes,):
 where its children begin in children, one for each value from the lowest on, -1 where nobody has been. first_write
 (leaves + 1,): leaf l writes written[first_write[l] : first_write[l + 1]] = (component, value). says (leaves,): what the
-leaf returns. Node a is the root of action a, node A that of `is_terminal`.
+leaf returns. Node b is the root of branch b (an action, or an outcome of one), node B that of `is_terminal`.
 """
 
 import numpy as np
@@ -27,31 +27,47 @@ def leaf_of(component, first_child, children, low, root, state):
 
 @njit(cache=True, nogil=True)
 def follow(
-    component, first_child, children, first_write, written, says, low, states, rows, num_actions, out, ended, missing
+    component,
+    first_child,
+    children,
+    first_write,
+    written,
+    says,
+    low,
+    states,
+    rows,
+    branches,
+    out,
+    ended,
+    likely,
+    missing,
 ):
-    """Successors of states[rows] (N, D) to out (N A, D) and whether they are terminal to ended (N,).
+    """Successors of states[rows] (N, D) to out (N B, D) and whether they are terminal to ended (N,); how likely the
+    branches are to likely (N, B), which has no rows without chance.
 
     missing (rows, 2) gets (row, root) of the first tree of each row that does not know. Returns how many.
     """
     count = 0
     for i in rows:
         state = states[i]
-        leaf = leaf_of(component, first_child, children, low, num_actions, state)
+        leaf = leaf_of(component, first_child, children, low, branches, state)
         if leaf < 0:
-            missing[count, 0], missing[count, 1] = i, num_actions
+            missing[count, 0], missing[count, 1] = i, branches
             count += 1
             continue
         ended[i] = says[leaf] != 0
-        for a in range(num_actions):
-            following = out[i * num_actions + a]
+        for b in range(branches):
+            following = out[i * branches + b]
             following[:] = state
             if ended[i]:
                 continue
-            leaf = leaf_of(component, first_child, children, low, a, state)
+            leaf = leaf_of(component, first_child, children, low, b, state)
             if leaf < 0:
-                missing[count, 0], missing[count, 1] = i, a
+                missing[count, 0], missing[count, 1] = i, b
                 count += 1
                 break
+            if len(likely) > 0:
+                likely[i, b] = says[leaf]
             for k in range(first_write[leaf], first_write[leaf + 1]):
                 following[written[k, 0]] = written[k, 1]
     return count

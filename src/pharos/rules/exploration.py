@@ -3,6 +3,9 @@
 Each maker is an ordinary function that returns compiled ones (see `compiler.Compiler`). What the inner functions take
 from it are constants for Numba: the rules; `Parameters`, what the rules see as `self`; W words a state; A actions.
 `layout` is a tuple of one table (D, 4): where component i of a state sits (layout.py).
+
+Classes with chance or an age have kernels of branching.py, which takes the search from here: A is the number of
+branches of a state then, and `terminal` whatever their `expand` writes beside the successors.
 """
 
 from typing import Any, NamedTuple

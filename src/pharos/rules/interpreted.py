@@ -3,13 +3,12 @@ failed.
 """
 
 import multiprocessing
-import numbers
 import os
 import signal
 import sys
 import warnings
 from multiprocessing.connection import Connection
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -17,6 +16,7 @@ from pharos.environments import Environment
 from pharos.errors import RuleError
 from pharos.kernels.hash_table import COUNT, FIRST, find, insert_missing, slots_of
 from pharos.kernels.packing import pack_rows, unpack_rows
+from pharos.rules.interpreted_branches import Branches, interpreted_branches
 from pharos.rules.layout import Layout, unpack
 
 BLOCK = 4096  # states whose successors are Python objects at a time
@@ -31,43 +31,47 @@ class InterpretedExploration:
 
     def __init__(self, env: Environment, layout: Layout, workers: int = 1):
         self.env, self.layout = env, layout
+        self.branches = env.num_actions * env.outcomes
         self._interpreters = Interpreters(env, workers)
 
     def threads(self, workers: int) -> int:
         return 1
 
-    def explore(self, states, successors, terminal, table, base, last, room, progress) -> None:
-        first, count, num_actions = int(progress[FIRST]), int(progress[COUNT]), self.env.num_actions
-        stop = min(last, count, first + min(BLOCK, (room - count) // num_actions))
-        keys = np.empty(((stop - first) * num_actions, self.layout.num_words), np.uint64)
+    def explore(self, states, successors, terminal, probabilities, table, base, last, room, progress) -> None:
+        first, count = int(progress[FIRST]), int(progress[COUNT])
+        stop = min(last, count, first + min(BLOCK, (room - count) // self.branches))
+        rows = slice(first - base, stop - base)
+        keys = np.empty(((stop - first) * self.branches, self.layout.num_words), np.uint64)
         found = np.empty(len(keys), np.int64)
-        self.expand_and_find(states, first, stop, first, keys, found, terminal[first - base : stop - base], table)
-        insert_missing(table, states, keys, found, successors[first - base : stop - base], progress)
+        self.expand_and_find(states, first, stop, first, keys, found, terminal[rows], probabilities[rows], table)
+        insert_missing(table, states, keys, found, successors[rows], progress)
 
-    def expand_and_find(self, states, start, stop, base, keys, found, terminal, table) -> None:
+    def expand_and_find(self, states, start, stop, base, keys, found, terminal, probabilities, table) -> None:
         for first in range(start, stop, BLOCK):
             last = min(first + BLOCK, stop)
             rows = slice(first - base, last - base)
-            part = slice(rows.start * self.env.num_actions, rows.stop * self.env.num_actions)
-            self._expand(states[first:last], keys[part], terminal[rows])
+            part = slice(rows.start * self.branches, rows.stop * self.branches)
+            self._expand(states[first:last], keys[part], terminal[rows], probabilities[rows])
             find(table, states, keys[part], found[part])
-        size = (stop - base) * self.env.num_actions
+        size = (stop - base) * self.branches
         missing = np.flatnonzero(found[:size] < 0)
         slots = np.empty(len(missing), np.int64)
         slots_of(keys[missing], len(table), slots)
         found[missing] = -1 - slots
 
-    def _expand(self, states: np.ndarray, keys: np.ndarray, terminal: np.ndarray) -> None:
-        """Successors of packed states to keys, packed; terminal states lead to themselves."""
+    def _expand(self, states: np.ndarray, keys: np.ndarray, terminal: np.ndarray, probabilities: np.ndarray) -> None:
+        """Successors of packed states to keys, packed; terminal states and impossible outcomes lead to the state."""
         layout = self.layout
         unpacked = np.empty((len(states), len(layout.word)), np.int64)
         unpack_rows(layout.word, layout.shift, layout.mask, layout.low, states, unpacked)
-        following, terminal[:] = self._successors(unpacked)
+        following, terminal[:], likely = self._branches(unpacked)
+        if likely is not None:
+            probabilities[:] = likely
         keys[:] = 0
         pack_rows(layout.word, layout.shift, layout.low, following, keys)
 
-    def _successors(self, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return self._interpreters.successors(states)
+    def _branches(self, states: np.ndarray) -> Branches:
+        return self._interpreters.branches(states)
 
     def close(self) -> None:
         """End the processes."""
@@ -91,11 +95,45 @@ class InterpretedRewards:
             for a in range(self.env.num_actions):
                 following = list(map(tuple, unpack(self.layout, states[successors[start:stop, a]]).tolist()))
                 for i in going:
-                    try:
-                        out[i, a] = self.env.reward(rows[i], a, following[i])
-                    except Exception as error:
-                        raise refused_reward(self.env, rows[i], a, f"raises {error!r}") from error
+                    out[i, a] = self._reward(rows[i], a, following[i])
         return out
+
+    def expected_block(self, states, outcomes, terminal, start: int, stop: int) -> np.ndarray:
+        num_actions = self.env.num_actions
+        out = np.zeros((stop - start) * num_actions)
+        paid: list[list[float]] = [[] for _ in out]
+        rows = list(map(tuple, unpack(self.layout, states[start:stop]).tolist()))
+        which, following, probabilities = outcomes
+        after = list(map(tuple, unpack(self.layout, states[following]).tolist()))
+        ended = np.asarray(terminal[start:stop]).tolist()
+        with np.errstate(all="ignore"):  # what is not finite is reported
+            for j, (pair, probability) in enumerate(zip(which.tolist(), probabilities.tolist(), strict=True)):
+                i, a = divmod(pair, num_actions)
+                if not ended[i]:
+                    paid[pair].append(float(self._reward(rows[i], a, after[j])))
+                    out[pair] += probability * paid[pair][-1]
+        for pair, each in enumerate(paid):
+            if each and each.count(each[0]) == len(each):
+                out[pair] = each[0]
+        return out.reshape(-1, num_actions)
+
+    def _reward(self, state: tuple[int, ...], action: int, following: tuple[int, ...]) -> Any:
+        try:
+            return self.env.reward(state, action, following)
+        except Exception as error:
+            raise refused_reward(self.env, state, action, f"raises {error!r}") from error
+
+
+class InterpretedAges:
+    """See `rules.Ages`."""
+
+    def __init__(self, env: Environment, layout: Layout):
+        self.env, self.layout = env, layout
+
+    def block(self, states, start: int, stop: int) -> np.ndarray:
+        return np.array(
+            [self.env.age(tuple(row)) for row in unpack(self.layout, states[start:stop]).tolist()], np.int64
+        )
 
 
 def refused_reward(env: Environment, state: tuple[int, ...], action: int, why: str) -> RuleError:
@@ -108,108 +146,12 @@ def blame(env: Environment, layout: Layout, suspects: np.ndarray, failure: BaseE
     interpreted.
     """
     rows = unpack(layout, suspects).tolist()
-    interpreted_successors(env, rows)
+    interpreted_branches(env, rows)
     raise RuleError(
         f"{env}: compiled rules {f'raise {failure!r}' if failure else 'read or write outside of the declared ranges'} "
         f"in one of the states from {tuple(rows[0])} to {tuple(rows[-1])}, interpreted they do not; "
         f"run pharos.check_environment to find out why"
     ) from failure
-
-
-def interpreted_successors(env: Environment, rows: list[list[int]]) -> tuple[np.ndarray, np.ndarray]:
-    """Call the rules in each state.
-
-    Args:
-        rows: N states, D integers each.
-    Returns:
-        (N * A, D) int64, or uint8 where it suffices: row i * A + a the successor of state i by action a, terminal
-        states leading to themselves; and (N,) bool, which states are terminal.
-    Raises:
-        RuleError: a rule raised an exception or left the declared ranges; names the state and the action.
-    """
-    quick = _small_successors(env, rows)
-    if quick is not None:
-        return quick
-    actions = range(env.num_actions)
-    transition, is_terminal = env.transition, env.is_terminal
-    terminal = np.zeros(len(rows), np.bool_)
-    out: list[list[int]] = []
-    try:
-        for i, row in enumerate(rows):
-            state = tuple(row)
-            if is_terminal(state):
-                terminal[i] = True
-                out.extend([row] * len(actions))
-                continue
-            for action in actions:
-                successor = row.copy()
-                out.append(successor)
-                transition(state, action, successor)
-    except Exception as error:
-        action_name = (
-            "" if len(out) % len(actions) == 0 else f" by action {env.actions[(len(out) - 1) % len(actions)]!r}"
-        )
-        raise RuleError(f"{env}: in state {state}{action_name} a rule raises {error!r}") from error
-    following = _array(out)
-    components = env.components
-    if following.shape == (len(out), len(components)):
-        outside = ((following < components.low) | (following > components.high)).any(axis=1)
-        suspects = np.flatnonzero(outside)[:1].tolist()
-    else:
-        suspects = list(range(len(out)))
-    for j in suspects:
-        i, action = divmod(j, len(actions))
-        _check_successor(env, tuple(rows[i]), action, out[j])
-    return following, terminal
-
-
-def _small_successors(env: Environment, rows: list[list[int]]) -> tuple[np.ndarray, np.ndarray] | None:
-    """The same for integers from 0 to 255, the usual case: each successor becomes bytes at once, and no list is kept.
-
-    None where a rule raises, an integer is another or a range is left: rules are pure, so that the caller can ask
-    again.
-    """
-    transition, is_terminal, actions = env.transition, env.is_terminal, range(env.num_actions)
-    terminal = np.zeros(len(rows), np.bool_)
-    out: list[bytes] = []
-    try:
-        for i, row in enumerate(rows):
-            state = tuple(row)
-            if is_terminal(state):
-                terminal[i] = True
-                out.extend([bytes(row)] * len(actions))
-                continue
-            for action in actions:
-                successor = row.copy()
-                transition(state, action, successor)
-                out.append(bytes(successor))
-    except Exception:
-        return None
-    components = env.components
-    data = b"".join(out)
-    if len(data) != len(out) * len(components) or len(set(map(len, out))) != 1:
-        return None
-    following = np.frombuffer(data, np.uint8).reshape(len(out), -1)
-    if (following.min(axis=0) < components.low).any() or (following.max(axis=0) > components.high).any():
-        return None
-    return following, terminal
-
-
-def _array(out: list[list[int]]) -> np.ndarray:
-    try:
-        return np.array(out, np.int64)
-    except (ValueError, TypeError, OverflowError):
-        return np.empty((0, 0), np.int64)
-
-
-def _check_successor(env: Environment, state: tuple[int, ...], action: int, out: list[int]) -> None:
-    components = env.components
-    where = f"{env}: action {env.actions[action]!r} in state {state}"
-    if len(out) != len(components):
-        raise RuleError(f"{where} leaves {len(out)} components in `out`; expected {len(components)}")
-    for name, value, low, high in zip(components.names, out, components.low, components.high, strict=True):
-        if not isinstance(value, numbers.Real) or not low <= value <= high:
-            raise RuleError(f"{where} leads to {name} = {value!r}; declared: {low} to {high}")
 
 
 class Interpreters:
@@ -234,20 +176,22 @@ class Interpreters:
             theirs.close()
             self._connections.append(ours)
 
-    def successors(self, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """As `interpreted_successors` of states (N, D) int64, shared between the processes where they are many."""
+    def branches(self, states: np.ndarray) -> Branches:
+        """As `interpreted_branches` of states (N, D) int64, shared between the processes where they are many."""
         shares = min(len(self._connections) + 1, len(states) // _SHARE)
         if shares < 2:
-            return interpreted_successors(self.env, states.tolist())
+            return interpreted_branches(self.env, states.tolist())
         parts = np.array_split(states, shares)
         asked = [
             _send(connection, part) for connection, part in zip(self._connections[: shares - 1], parts[1:], strict=True)
         ]
-        found = [interpreted_successors(self.env, parts[0].tolist())]
+        found = [interpreted_branches(self.env, parts[0].tolist())]
         for connection, part, is_asked in zip(self._connections[: shares - 1], parts[1:], asked, strict=True):
             answer = _received(connection, len(part), self.env) if is_asked else None
-            found.append(answer or interpreted_successors(self.env, part.tolist()))
-        return np.concatenate([each for each, _ in found]), np.concatenate([ended for _, ended in found])
+            found.append(answer or interpreted_branches(self.env, part.tolist()))
+        following, terminal, probabilities = zip(*found, strict=True)
+        likely = None if probabilities[0] is None else np.concatenate(probabilities)
+        return Branches(np.concatenate(following), np.concatenate(terminal), likely)
 
     def close(self) -> None:
         """Let the processes end."""
@@ -264,7 +208,7 @@ def _send(connection: Connection, states: np.ndarray) -> bool:
     return True
 
 
-def _received(connection: Connection, rows: int, env: Environment) -> tuple[np.ndarray, np.ndarray] | None:
+def _received(connection: Connection, rows: int, env: Environment) -> Branches | None:
     """What another process found; None where it was killed, or where a rule fails, which this process shall find out
     itself.
     """
@@ -274,11 +218,16 @@ def _received(connection: Connection, rows: int, env: Environment) -> tuple[np.n
         return None
     if not data:
         return None
+    branches = rows * env.num_actions * env.outcomes
+    size = branches * len(env.components)
+    likely = None
+    if env.outcomes > 1:
+        likely = np.frombuffer(data, np.float64, branches).reshape(rows, -1)
+        data = data[8 * branches :]
     terminal = np.frombuffer(data, np.bool_, rows)
-    size = rows * env.num_actions * len(env.components)
     small = len(data) == rows + size
     following = np.frombuffer(data, np.uint8 if small else np.int64, size, offset=rows)
-    return following.reshape(-1, len(env.components)), terminal
+    return Branches(following.reshape(-1, len(env.components)), terminal, likely)
 
 
 def _interpret(env: Environment, connection: Connection) -> None:
@@ -295,9 +244,10 @@ def _interpret(env: Environment, connection: Connection) -> None:
             return
         try:
             states = np.frombuffer(data, np.int64).reshape(-1, len(env.components))
-            following, terminal = interpreted_successors(env, states.tolist())
+            following, terminal, likely = interpreted_branches(env, states.tolist())
             small = following.size and following.min() >= 0 and following.max() < 256
             answer = terminal.tobytes() + following.astype(np.uint8 if small else np.int64).tobytes()
+            answer = answer if likely is None else likely.tobytes() + answer
         except Exception:
             answer = b""
         try:

@@ -19,7 +19,9 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 
 from pharos.environments import Environment
+from pharos.errors import RuleError
 from pharos.rules.compiled import (
+    CompiledAges,
     CompiledDrawing,
     CompiledExploration,
     CompiledRewards,
@@ -36,6 +38,10 @@ class Exploration(Protocol):
     """Successors of packed states, looked up in a table of states (kernels/hash_table.py). See exploration.py for the
     arrays.
 
+    A state has B branches: one for each of A actions, or, with chance, branch a K + k for outcome k of action a, of
+    which impossible ones lead to the state itself. `probabilities` (rows, B) gets how likely they are; it has no rows
+    without chance.
+
     Raises:
         RuleError: a rule failed, or left the declared ranges.
     """
@@ -50,6 +56,7 @@ class Exploration(Protocol):
         states: np.ndarray,
         successors: np.ndarray,
         terminal: np.ndarray,
+        probabilities: np.ndarray,
         table: np.ndarray,
         base: int,
         last: int,
@@ -69,6 +76,7 @@ class Exploration(Protocol):
         keys: np.ndarray,
         found: np.ndarray,
         terminal: np.ndarray,
+        probabilities: np.ndarray,
         table: np.ndarray,
     ) -> None:
         """Successors of states [start, stop) to keys, and their indices to found; -1 - slot where the table has
@@ -93,6 +101,28 @@ class Rewards(Protocol):
         Raises:
             RuleError: the rule raised an exception.
         """
+
+    def expected_block(
+        self,
+        states: np.ndarray,
+        outcomes: tuple[Any, ...],
+        terminal: np.ndarray,
+        start: int,
+        stop: int,
+    ) -> np.ndarray:
+        """The same with chance: what executing an action pays on average.
+
+        Args:
+            outcomes: three arrays: which (N,) int64, ascending, (s - start) A + a of each outcome; successors
+                (N,) int64, where it leads; probabilities (N,).
+        """
+
+
+class Ages(Protocol):
+    """Ages of packed states, of a class that has them."""
+
+    def block(self, states: np.ndarray, start: int, stop: int) -> np.ndarray:
+        """(stop - start,) int64, of states [start, stop)."""
 
 
 class Stepping(Protocol):
@@ -125,7 +155,7 @@ class Rules:
     Attributes:
         env: the environment. layout: where its components sit in packed states.
         exploration: for building state spaces.
-        rewards: for the rewards of built ones.
+        rewards: for the rewards of built ones. ages: for their ages, where the class has some.
         stepping: for interaction.
     """
 
@@ -152,7 +182,18 @@ class Rules:
         return TracedRewards(self.env, self.layout)
 
     @cached_property
+    def ages(self) -> Ages:
+        compiled = compiled_or_none(CompiledAges, self.env, self.layout)
+        if compiled is not None:
+            return compiled
+        from pharos.rules.interpreted import InterpretedAges
+
+        return InterpretedAges(self.env, self.layout)
+
+    @cached_property
     def stepping(self) -> Stepping:
+        if self.env.has_chance:
+            raise RuleError(f"{self.env}: outcomes are not drawn yet, so it can be built and solved but not stepped")
         compiled = compiled_or_none(CompiledStepping, self.env)
         if compiled is not None:
             return compiled
@@ -181,7 +222,10 @@ def rules_of(env: Environment, *, workers: int = 1) -> Rules:
 
     Args:
         workers: processes that share the work of rules that Numba cannot compile (cost only).
+    Raises:
+        RuleError: what the class says of its outcomes is not as the contract has it.
     """
+    _ = env.has_chance
     return Rules(env, workers)
 
 

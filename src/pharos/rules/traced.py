@@ -19,6 +19,7 @@ import numpy as np
 from pharos.environments import Environment
 from pharos.rules import decisions
 from pharos.rules.interpreted import InterpretedExploration, InterpretedRewards
+from pharos.rules.interpreted_branches import SUM_TOLERANCE, Branches
 from pharos.rules.layout import Layout, unpack
 
 WORTH_TRACING = 64  # states at a time
@@ -36,9 +37,9 @@ class TracedExploration(InterpretedExploration):
         super().__init__(env, layout, workers)
         self._traced = TracedRules(env)
 
-    def _successors(self, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        answer = self._traced.successors(states) if len(states) >= WORTH_TRACING else None
-        return super()._successors(states) if answer is None else answer
+    def _branches(self, states: np.ndarray) -> Branches:
+        answer = self._traced.branches(states) if len(states) >= WORTH_TRACING else None
+        return super()._branches(states) if answer is None else answer
 
 
 class TracedRewards(InterpretedRewards):
@@ -107,48 +108,71 @@ class _Traced:
 
 
 class TracedRules(_Traced):
-    """Successors of states. Root a is that of action a, root A that of `is_terminal`."""
+    """Successors of states. Root b is that of branch b (an action, or an outcome of one), root B that of `is_terminal`.
+
+    What a branch returns is how likely it is. Classes with an age are not traced: an age may look at everything.
+    """
 
     def __init__(self, env: Environment):
-        super().__init__(env, env.num_actions + 1)
+        self.branches_of_a_state = env.num_actions * env.outcomes
+        super().__init__(env, self.branches_of_a_state + 1)
+        self.is_on = not env.has_age
 
-    def successors(self, states: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-        """As `interpreted_successors` of states (N, D) int64; None where tracing does not work, or is not worth it."""
+    def branches(self, states: np.ndarray) -> Branches | None:
+        """As `interpreted_branches` of states (N, D) int64; None where tracing does not work, or is not worth it."""
         if not self.is_on:
             return None
-        out = np.empty((len(states) * self.num_actions, states.shape[1]), np.int64)
+        env, branches = self.env, self.branches_of_a_state
+        out = np.empty((len(states) * branches, states.shape[1]), np.int64)
         ended = np.zeros(len(states), np.bool_)
+        likely = np.zeros((len(states) if env.has_chance else 0, branches))
         rows, missing = np.arange(len(states)), np.empty((len(states), 2), np.int64)
         self.answered += len(out)
         while True:
-            count = self._kernels.follow(
-                *self._trees.arrays, self.low, states, rows, self.num_actions, out, ended, missing
-            )
+            arrays = self.low, states, rows, branches, out, ended, likely, missing
+            count = self._kernels.follow(*self._trees.arrays, *arrays)
             if not count:
-                return out, ended
+                break
             if not self._learn(missing[:count], lambda row, root: states[row]):
                 return None
             rows = missing[:count, 0].copy()
+        if not env.has_chance:
+            return Branches(out, ended)
+        likely[ended, :: env.outcomes] = 1.0
+        if (abs(likely.reshape(-1, env.outcomes).sum(axis=1) - 1) > SUM_TOLERANCE / 2).any():
+            return None  # the caller asks every state, and finds out whose they are
+        return Branches(out, ended, likely)
 
     def _ask(self, values: tuple[int, ...], root: int) -> None:
         state = _State(values)
         written: dict[int, int] = {}
-        says = False
-        if root == self.num_actions:
+        says = 0.0
+        if root == self.branches_of_a_state:
             says = bool(self.env.is_terminal(state))
             same = says == bool(self.env.is_terminal(values))
         else:
-            out = _Out(state)
-            self.env.transition(state, root, out)
-            written, plain = out.written, list(values)
-            self.env.transition(values, root, plain)
-            same = plain == [written.get(i, value) for i, value in enumerate(values)]
-        if not same:
+            out, plain = _Out(state), list(values)
+            says, written = self._branch(state, root, out), out.written
+            same = says == self._branch(values, root, plain)
+            same = same and plain == [written.get(i, value) for i, value in enumerate(values)]
+        if not same or not 0 <= says <= 1:
             raise _Untraceable
         for component, value in written.items():
             if not self.low[component] <= value < self.low[component] + self.size[component]:
                 raise _Untraceable
         self._add(root, values, state.read, written, says)
+
+    def _branch(self, state: Any, branch: int, out: Any) -> float:
+        """Call the rules of a branch that writes to `out`; how likely it is."""
+        env: Any = self.env
+        action, outcome = divmod(branch, env.outcomes)
+        if not env.takes_outcomes():
+            env.transition(state, action, out)
+            return 1.0
+        likely = float(env.probability(state, action, outcome)) + 0.0 if env.has_chance else 1.0  # never -0.0
+        if likely != 0:
+            env.transition(state, action, outcome, out)
+        return likely
 
 
 class TracedReward(_Traced):

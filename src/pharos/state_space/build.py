@@ -16,21 +16,12 @@ from pharos.environments import Environment, make
 from pharos.errors import ParameterError, StateSpaceMismatch
 from pharos.state_space import memory as machine
 from pharos.state_space.files import lock
-from pharos.state_space.manifest import (
-    FORMAT_VERSION,
-    MANIFEST,
-    STATES,
-    SUCCESSORS,
-    TERMINAL,
-    WIDE_SUCCESSORS,
-    check_lengths,
-    read_manifest,
-)
+from pharos.state_space.manifest import ARRAYS, MANIFEST, PARTS, check_lengths, read_manifest
 from pharos.state_space.plan import Plan
 from pharos.state_space.progress import Progress, reporter
 from pharos.state_space.store import StateSpace, load
 
-OUR_FILES = (STATES, SUCCESSORS, WIDE_SUCCESSORS, TERMINAL, MANIFEST + ".tmp", storage.LOCK, storage.CLAIM)
+OUR_FILES = (*ARRAYS, *PARTS.values(), MANIFEST + ".tmp", storage.LOCK, storage.CLAIM)
 CHECKPOINT_SECONDS = 15.0
 
 
@@ -70,8 +61,8 @@ def build(
     Cost: see docs/performance.md; 40 to 110 ns a state, 8 W + 8 to 16 bytes of memory a state (W words of 64 bits).
     Source: the pharos paper, appendix A, Algorithm 1 (whose successors are stored under the wrong index there).
     """
-    from pharos.state_space.journal import Journal
-    from pharos.state_space.search import Options, Search, check_size  # loads Numba
+    from pharos.state_space.outcome_journal import remove_parts
+    from pharos.state_space.search import Options, Search, check_size, journal_of  # loads Numba
 
     if isinstance(env, str):
         env = make(env)
@@ -88,6 +79,8 @@ def build(
     manifest = _manifest_of(plan, path)
     if manifest is not None and manifest["complete"]:
         check_size(env, manifest["num_states"], 0, max_states)
+        if env.has_chance:
+            remove_parts(path)
         return load(path, environment=env)
     try:
         path.mkdir(parents=True, exist_ok=True)
@@ -97,7 +90,7 @@ def build(
         manifest = _manifest_of(plan, path)  # it may have grown while we waited
         if manifest is None or not manifest["complete"]:
             options = Options(max_states, memory, workers, checkpoint_seconds)
-            Search(plan, Journal(path, plan), options, report).run(manifest)
+            Search(plan, journal_of(path, plan), options, report).run(manifest)
     return load(path, verify=False, environment=env)
 
 
@@ -108,7 +101,7 @@ def cached_folder(env: Environment) -> Path:
 
 def folder_of(plan: Plan) -> Path:
     """The same, of a plan."""
-    content = json.dumps([plan.identity, plan.fingerprint, FORMAT_VERSION], sort_keys=True)
+    content = json.dumps([plan.identity, plan.fingerprint, plan.format_version], sort_keys=True)
     digest = hashlib.sha256(content.encode()).hexdigest()[:16]
     return paths.cache_directory() / "spaces" / f"{plan.env.name}-{digest}"
 

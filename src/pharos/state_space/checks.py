@@ -16,21 +16,31 @@ _BLOCK_ENTRIES = 1 << 17
 
 def check_environment(folder: Path, env: Environment, manifest: dict[str, Any]) -> None:
     """StateSpaceMismatch where the actions or the components of a state are not those of the environment."""
-    theirs = {"actions": list(env.actions), "names": list(env.components.names)}
-    stored = {"actions": manifest["actions"], "names": manifest["layout"]["names"]}
+    theirs = {"actions": list(env.actions), "names": list(env.components.names), "outcomes": int(env.outcomes)}
+    stored = {
+        "actions": manifest["actions"],
+        "names": manifest["layout"]["names"],
+        "outcomes": manifest.get("outcomes", 1),
+    }
     sizes = env.components.low.tolist(), env.components.size.tolist()
     if theirs != stored or sizes != (manifest["layout"]["low"], manifest["layout"]["size"]):
         raise StateSpaceMismatch(
-            f"{folder}: holds {manifest['environment']} with the actions {stored['actions']} and states of "
-            f"{stored['names']}, which are not those of {env}; choose another folder"
+            f"{folder}: holds {manifest['environment']} with the actions {stored['actions']} of at most "
+            f"{stored['outcomes']} outcomes and states of {stored['names']}, which are not those of {env}; choose "
+            f"another folder"
         )
+
+
+def states_to_check(num_states: int) -> np.ndarray:
+    """Numbers of 64 states, spread over all of them, in which rules are compared with what is stored."""
+    return np.unique(np.linspace(0, num_states - 1, 64).astype(np.int64))
 
 
 def check_rules(
     folder: Path, env: Environment, layout: Layout, states: np.ndarray, successors: np.ndarray, bits: np.ndarray
 ) -> None:
     """StateSpaceMismatch where the rules of `env` disagree with the stored transitions of 64 states."""
-    chosen = np.unique(np.linspace(0, len(successors) - 1, 64).astype(np.int64))
+    chosen = states_to_check(len(successors))
     _check_range(folder / SUCCESSORS, successors[chosen], len(states), chosen)
     following = unpack(layout, states[successors[chosen].ravel()]).tolist()
     check_states(folder / STATES, layout, states[chosen])

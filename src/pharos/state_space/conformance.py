@@ -11,6 +11,7 @@ import warnings
 from collections import deque
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,7 +19,10 @@ from pharos.environments import Environment, State, start_distribution
 from pharos.errors import ParameterError, RuleError
 from pharos.rules import pack, unpack
 from pharos.state_space.declarations import check_declarations, check_layers
-from pharos.state_space.guarded_rules import InterpretedCheck
+from pharos.state_space.guarded_rules import SUM_TOLERANCE, InterpretedCheck
+
+if TYPE_CHECKING:
+    from pharos.rules import Rules
 
 
 @dataclass(frozen=True)
@@ -52,7 +56,8 @@ def check_environment(env: Environment, *, max_states: int = 1000, seed: int = 0
     Declarations: name, actions, version, time limit, layers, parameters that survive JSON, variables, start states.
     Rules, on the states nearest to the start and on states far from it: values are integers in their declared ranges,
     the same question has the same answer, nothing but `out` and the planes is written to, rewards are finite, drawings
-    stay inside their planes, and compiled rules agree with interpreted ones. Where all states fit into `max_states`,
+    stay inside their planes, the probabilities of the outcomes of an action sum to 1, ages increase, and compiled rules
+    agree with interpreted ones. Where all states fit into `max_states`,
     the state space is built, too, and compared: the same states in the same order, terminal states absorbing.
 
     Args:
@@ -120,7 +125,7 @@ def _some_states(env: Environment, check: InterpretedCheck, max_states: int, see
         if state not in check.terminal:
             check.expand(state)
         if not check.terminal[state]:
-            successors = [check.transitions[state, action] for action in range(env.num_actions)]
+            successors = [check.transitions[state, *branch] for branch in check.branches(state)]
             stack += rng.sample(successors, len(successors))
     return list(chosen), False
 
@@ -154,13 +159,19 @@ def _check_compiled(env: Environment, check: InterpretedCheck, states: list[Stat
     if reason := rules.reason_not_compiled():
         notes.append(not_compiled(reason))
         return False
-    num_states, num_actions = len(states), env.num_actions
+    num_states, branches = len(states), env.num_actions * env.outcomes
     packed = pack(layout, np.array(states, np.int64))
-    keys = np.zeros((num_states * num_actions, layout.num_words), np.uint64)
+    keys = np.zeros((num_states * branches, layout.num_words), np.uint64)
     terminal = np.zeros(num_states, np.uint8)
+    likely = np.ones((num_states, branches))
     exploration = CompiledExploration(env, layout)
     for i in range(num_states):  # one by one, to know the state of a fault
-        component = exploration.component_at_fault(packed, i, keys, terminal)
+        component = exploration.component_at_fault(packed, i, keys, terminal, likely)
+        if component is not None and component > len(env.components):
+            raise RuleError(
+                f"{check.where('probability or age', states[i])}: compiled, it is not as the contract says; "
+                f"interpreted it is"
+            )
         if component is not None:
             names = (*env.components.names, "a component that does not exist")
             raise RuleError(
@@ -174,25 +185,58 @@ def _check_compiled(env: Environment, check: InterpretedCheck, states: list[Stat
                 f"{check.terminal[states[i]]} interpreted; expected the same"
             )
     following = unpack(layout, keys)
-    every = np.concatenate([packed, keys])
-    successors = np.arange(num_states, num_states + len(keys), dtype=np.int32).reshape(num_states, num_actions)
-    rewards = rules.rewards.block(every, successors, terminal.view(np.bool_), 0, num_states)
-    for i, state in enumerate(states):
-        for action in range(num_actions if not terminal[i] else 0):
-            successor = tuple(following[i * num_actions + action].tolist())
-            if successor != check.transitions[state, action]:
-                raise RuleError(
-                    f"{check.where('transition', state, action)} leads to {check.text(successor)} compiled, to "
-                    f"{check.text(check.transitions[state, action])} interpreted; expected the same"
-                )
-            if rewards[i, action] != check.rewards[state, action]:
-                raise RuleError(
-                    f"{check.where('reward', state, action)} is {rewards[i, action]} compiled, "
-                    f"{check.rewards[state, action]} interpreted; expected the same"
-                )
+    for j in range(len(keys)):
+        i, branch = divmod(j, branches)
+        if not terminal[i]:
+            which = states[i], *divmod(branch, env.outcomes)
+            _check_compiled_branch(check, which, float(likely[i, branch]), tuple(following[j].tolist()))
+    _check_compiled_rewards(check, rules, states, np.concatenate([packed, keys]))
     if env.layers:
         _check_compiled_drawings(check, states, notes)
     return True
+
+
+def _check_compiled_branch(
+    check: InterpretedCheck, branch: tuple[State, int, int], probability: float, successor: State
+) -> None:
+    """RuleError where an outcome of an action in a state is compiled another one than interpreted."""
+    if probability != check.probabilities.get(branch, 0.0):
+        raise RuleError(
+            f"{check.where('probability', *branch)} is {probability} compiled, "
+            f"{check.probabilities.get(branch, 0.0)} interpreted; expected the same"
+        )
+    if probability > 0 and successor != check.transitions[branch]:
+        raise RuleError(
+            f"{check.where('transition', *branch)} leads to {check.text(successor)} compiled, to "
+            f"{check.text(check.transitions[branch])} interpreted; expected the same"
+        )
+
+
+def _check_compiled_rewards(check: InterpretedCheck, rules: "Rules", states: list[State], every: np.ndarray) -> None:
+    """RuleError where a reward is compiled another one than interpreted.
+
+    Args:
+        every: the states, packed, and then the successors of each one by all branches.
+    """
+    env, num_states = check.env, len(states)
+    terminal = np.array([check.terminal[state] for state in states])
+    successors = np.arange(num_states, len(every)).reshape(num_states, env.num_actions, env.outcomes)
+    for outcome in range(env.outcomes):
+        rows = [(i, a) for i, state in enumerate(states) for a in range(env.num_actions)]
+        rows = [(i, a) for i, a in rows if (states[i], a, outcome) in check.transitions]
+        if env.has_chance:
+            which = np.array([i * env.num_actions + a for i, a in rows], np.int64)
+            outcomes = which, successors[..., outcome].ravel()[which], np.ones(len(which))
+            rewards = rules.rewards.expected_block(every, outcomes, terminal, 0, num_states)
+        else:
+            rewards = rules.rewards.block(every, successors[..., 0].astype(np.int32), terminal, 0, num_states)
+        for i, a in rows:
+            branch = states[i], a, outcome
+            if rewards[i, a] != check.rewards[branch]:
+                raise RuleError(
+                    f"{check.where('reward', *branch)} is {rewards[i, a]} compiled, "
+                    f"{check.rewards[branch]} interpreted; expected the same"
+                )
 
 
 def _check_compiled_drawings(check: InterpretedCheck, states: list[State], notes: list[str]) -> None:
@@ -222,17 +266,34 @@ def _check_built(env: Environment, check: InterpretedCheck, states: list[State],
         warnings.simplefilter("ignore", RuntimeWarning)
         space = build(env, Path(folder) / "space", progress=False)
         built = [tuple(state) for state in space.states().tolist()]
-        successors = np.array(space.successors)
-        terminal = np.array(space.terminal, bool)
+        matrix, terminal = space.dynamics.matrix(), np.array(space.terminal, bool)
+        successors = None if env.has_chance else np.array(space.successors)
         del space
     if built != states:
         raise RuleError(f"{env}: the builder finds {len(built)} states, calling the rules one by one {len(states)}")
     index = {state: i for i, state in enumerate(states)}
     for i, state in enumerate(states):
         ends = check.terminal[state]
-        expected = [i if ends else index[check.transitions[state, a]] for a in range(env.num_actions)]
-        if bool(terminal[i]) != ends or successors[i].tolist() != expected:
-            raise RuleError(
-                f"{check.where('transition', state)}: built, it leads to states {successors[i].tolist()}; "
-                f"expected {expected}"
-            )
+        if successors is not None:
+            expected = [i if ends else index[check.transitions[state, a, 0]] for a in range(env.num_actions)]
+            if bool(terminal[i]) != ends or successors[i].tolist() != expected:
+                raise RuleError(
+                    f"{check.where('transition', state)}: built, it leads to states {successors[i].tolist()}; "
+                    f"expected {expected}"
+                )
+            continue
+        for a in range(env.num_actions):
+            row, likely = matrix[i * env.num_actions + a].toarray()[0], np.zeros(len(states) + 1)
+            likely[i] += ends
+            for outcome in range(env.outcomes):
+                if (branch := (state, a, outcome)) in check.transitions:
+                    likely[index[check.transitions[branch]]] += check.probabilities[branch]
+            if bool(terminal[i]) != ends or (abs(row - likely) > SUM_TOLERANCE).any():
+                raise RuleError(
+                    f"{check.where('transition', state, a)}: built, it leads to {_text(row)}; expected {_text(likely)}"
+                )
+
+
+def _text(row: np.ndarray) -> str:
+    """A distribution over states, in words."""
+    return ", ".join(f"state {i} ({row[i]:.6g})" for i in np.flatnonzero(row))

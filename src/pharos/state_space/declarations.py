@@ -34,6 +34,7 @@ def check_declarations(env: Environment) -> None:
         value = getattr(env, attribute)
         if not isinstance(value, numbers.Integral) or isinstance(value, bool) or value < 1:
             raise RuleError(f"{env}: {attribute} is {value!r}; expected an integer of at least 1")
+    _ = env.has_chance  # which looks at `outcomes`
     try:
         again = cls(**json.loads(json.dumps(env.parameters, allow_nan=False)))
     except (TypeError, ValueError) as error:

@@ -11,6 +11,9 @@ import numpy as np
 from pharos.environments import Environment, State
 from pharos.errors import RuleError
 
+SUM_TOLERANCE = 1e-9
+"""By how much the probabilities of the outcomes of an action may sum to something else than 1."""
+
 SAME = "expected the same answer to the same question"
 
 
@@ -53,22 +56,37 @@ class InterpretedCheck:
         self.env = env
         self.components = env.components
         self.terminal: dict[State, bool] = {}
-        self.transitions: dict[tuple[State, int], State] = {}
-        self.rewards: dict[tuple[State, int], float] = {}
+        # of each outcome that is possible: (state, action, outcome); outcome 0 without chance
+        self.transitions: dict[tuple[State, int, int], State] = {}
+        self.rewards: dict[tuple[State, int, int], float] = {}
+        self.probabilities: dict[tuple[State, int, int], float] = {}
+        self.ages: dict[State, int] = {}
         self.drawings: dict[State, np.ndarray] = {}
 
     def expand(self, state: State) -> list[State]:
-        """The successors of `state` in the order of the actions, checked; none where it is terminal."""
+        """The successors of `state` in the order of actions and outcomes, checked; none where it is terminal."""
         self.terminal[state] = self._is_terminal(state)
         if self.terminal[state]:
             return []
         successors = []
         for action in range(self.env.num_actions):
-            successor = self._transition(state, action)
-            self.transitions[state, action] = successor
-            self.rewards[state, action] = self._reward(state, action, successor)
-            successors.append(successor)
+            for outcome, probability in enumerate(self._probabilities(state, action)):
+                if probability == 0:
+                    continue
+                successor = self._transition(state, action, outcome)
+                self.probabilities[state, action, outcome] = probability
+                self.transitions[state, action, outcome] = successor
+                self.rewards[state, action, outcome] = self._reward(state, action, successor, outcome)
+                if self.env.has_age:
+                    self._check_age(state, action, outcome, successor)
+                successors.append(successor)
         return successors
+
+    def branches(self, state: State) -> list[tuple[int, int]]:
+        """(action, outcome) of what is possible in an expanded state that is not terminal, in order."""
+        outcomes = range(self.env.outcomes)
+        pairs = ((action, outcome) for action in range(self.env.num_actions) for outcome in outcomes)
+        return [pair for pair in pairs if (state, *pair) in self.transitions]
 
     def repeat(self, state: State) -> None:
         """Ask again, with other questions asked in between: rules have no memory."""
@@ -77,18 +95,25 @@ class InterpretedCheck:
         if self.terminal[state]:
             return
         for action in range(self.env.num_actions):
-            successor = self._transition(state, action)
-            if successor != self.transitions[state, action]:
-                before = self.text(self.transitions[state, action])
+            for outcome, probability in enumerate(self._probabilities(state, action)):
+                before = self.probabilities.get((state, action, outcome), 0.0)
+                if probability != before:
+                    raise RuleError(
+                        f"{self.where('probability', state, action, outcome)} is now {probability}, "
+                        f"before {before}; {SAME}"
+                    )
+        for action, outcome in self.branches(state):
+            branch = state, action, outcome
+            successor = self._transition(*branch)
+            if successor != self.transitions[branch]:
+                was = self.text(self.transitions[branch])
                 raise RuleError(
-                    f"{self.where('transition', state, action)} now leads to {self.text(successor)}, "
-                    f"before to {before}; {SAME}"
+                    f"{self.where('transition', *branch)} now leads to {self.text(successor)}, before to {was}; {SAME}"
                 )
-            reward = self._reward(state, action, successor)
-            if reward != self.rewards[state, action]:
+            reward = self._reward(state, action, successor, outcome)
+            if reward != self.rewards[branch]:
                 raise RuleError(
-                    f"{self.where('reward', state, action)} is now {reward}, "
-                    f"before {self.rewards[state, action]}; {SAME}"
+                    f"{self.where('reward', *branch)} is now {reward}, before {self.rewards[branch]}; {SAME}"
                 )
 
     def drawing(self, state: State) -> None:
@@ -118,12 +143,55 @@ class InterpretedCheck:
             raise RuleError(f"{where} says {answers[0]}, then {answers[1]}; {SAME}")
         return bool(answers[0])
 
-    def _transition(self, state: State, action: int) -> State:
-        where = self.where("transition", state, action)
+    def _probabilities(self, state: State, action: int) -> list[float]:
+        """The probabilities of the outcomes of an action, which sum to 1."""
+        if not self.env.takes_outcomes():
+            return [1.0]
+        probabilities = [self._probability(state, action, outcome) for outcome in range(self.env.outcomes)]
+        if abs(sum(probabilities) - 1) > SUM_TOLERANCE:
+            raise RuleError(
+                f"{self.where('probability', state, action)}: those of outcomes 0 to {self.env.outcomes - 1} sum to "
+                f"{sum(probabilities)}; expected 1"
+            )
+        return probabilities
+
+    def _probability(self, state: State, action: int, outcome: int) -> float:
+        where = self.where("probability", state, action, outcome)
+        answers = [self._call(where, self.env.probability, _ReadOnly(state), action, outcome) for _ in range(2)]
+        for answer in answers:
+            if not isinstance(answer, numbers.Real | np.bool_) or not 0 <= float(answer) <= 1 + SUM_TOLERANCE:
+                raise RuleError(f"{where} is {answer!r}; expected a number from 0 to 1")
+        if answers[0] != answers[1]:
+            raise RuleError(f"{where} is {answers[0]}, then {answers[1]}; {SAME}")
+        return float(answers[0])
+
+    def _check_age(self, state: State, action: int, outcome: int, successor: State) -> None:
+        """RuleError where a successor is not older."""
+        before, after = self._age(state), self._age(successor)
+        if after <= before:
+            raise RuleError(
+                f"{self.where('transition', state, action, outcome)} leads from age {before} to {self.text(successor)} "
+                f"of age {after}; expected a larger one"
+            )
+
+    def _age(self, state: State) -> int:
+        if state not in self.ages:
+            where = self.where("age", state)
+            answers = [self._call(where, self.env.age, _ReadOnly(state)) for _ in range(2)]
+            if not isinstance(answers[0], numbers.Integral | np.bool_):
+                raise RuleError(f"{where} is {answers[0]!r}; expected an integer")
+            if answers[0] != answers[1]:
+                raise RuleError(f"{where} is {answers[0]}, then {answers[1]}; {SAME}")
+            self.ages[state] = int(answers[0])
+        return self.ages[state]
+
+    def _transition(self, state: State, action: int, outcome: int) -> State:
+        where = self.where("transition", state, action, outcome)
+        which = (action, outcome) if self.env.takes_outcomes() else (action,)
         results = []
         for _ in range(2):
             out = list(state)
-            returned = self._call(where, self.env.transition, _ReadOnly(state), action, out)
+            returned = self._call(where, self.env.transition, _ReadOnly(state), *which, out)
             if returned is not None:
                 raise RuleError(f"{where} returns {returned!r}; expected nothing: write the new state into `out`")
             results.append(self._checked(where, out))
@@ -146,8 +214,8 @@ class InterpretedCheck:
                 )
         return tuple(int(value) for value in out)
 
-    def _reward(self, state: State, action: int, successor: State) -> float:
-        where = self.where("reward", state, action)
+    def _reward(self, state: State, action: int, successor: State, outcome: int) -> float:
+        where = self.where("reward", state, action, outcome)
         answers = [self._call(where, self.env.reward, _ReadOnly(state), action, _ReadOnly(successor)) for _ in range(2)]
         for answer in answers:
             if not isinstance(answer, numbers.Real | np.bool_) or not math.isfinite(answer):
@@ -164,9 +232,11 @@ class InterpretedCheck:
         except Exception as error:
             raise RuleError(f"{where} raises {type(error).__name__}: {error}") from error
 
-    def where(self, rule: str, state: State, action: int | None = None) -> str:
-        """How a message begins: whose rule, by which action, in which state."""
+    def where(self, rule: str, state: State, action: int | None = None, outcome: int | None = None) -> str:
+        """How a message begins: whose rule, by which action and outcome, in which state."""
         chosen = "" if action is None else f" of action {self.env.actions[action]!r}"
+        if outcome is not None and self.env.takes_outcomes():
+            chosen = f" of outcome {outcome}{chosen}"
         return f"{self.env}: {rule}{chosen} in state {self.text(state)}"
 
     def text(self, state: State) -> str:

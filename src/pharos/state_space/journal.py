@@ -20,7 +20,8 @@ from pharos.rules import pack
 from pharos.state_space.checks import check_rules
 from pharos.state_space.files import GrowingFile, write_manifest
 from pharos.state_space.manifest import (
-    FORMAT_VERSION,
+    ARRAYS,
+    PARTS,
     STATES,
     SUCCESSORS,
     TERMINAL,
@@ -28,8 +29,9 @@ from pharos.state_space.manifest import (
     successors_name,
 )
 from pharos.state_space.plan import Plan
+from pharos.state_space.table import Block
 
-WIDENED_ROWS = 1 << 16  # rows of successors that are copied at a time
+BLOCK_BYTES = 1 << 22  # of a file that are copied at a time
 
 
 @dataclass
@@ -87,7 +89,7 @@ class Journal:
         self.index_dtype: np.dtype = np.dtype("<i4")
         self.appended = 0
         self.last_checkpoint = time.perf_counter()
-        self._successors_name = SUCCESSORS
+        self._successors_name, self._wide_name = SUCCESSORS, WIDE_SUCCESSORS
         self._files: dict[str, GrowingFile] = {}
         self._writes: list[Future] = []
         self._written: dict[str, Any] | None = None  # what a checkpoint commits: counts and files that belong together
@@ -96,12 +98,11 @@ class Journal:
     def open(self, manifest: dict[str, Any] | None) -> Position:
         """Open the files, at the start states or at the last checkpoint; returns where the search stands."""
         arrays = manifest["arrays"] if manifest else {}
-        self._successors_name = successors_name(arrays)
+        names = self._names(arrays)
         if manifest:
             self.index_dtype = np.dtype(arrays[self._successors_name]["dtype"])
-        names = (STATES, self._successors_name, TERMINAL)
-        for name in {STATES, SUCCESSORS, WIDE_SUCCESSORS, TERMINAL} - set(names):
-            (self.path / name).unlink(missing_ok=True)  # left by a process killed while it widened the indices
+        for name in {*ARRAYS, *PARTS.values()} - set(names):
+            (self.path / name).unlink(missing_ok=True)  # left by a process killed while it made other files of some
         for name in names:
             self._files[name] = GrowingFile(self.path / name, arrays.get(name))
         if manifest is None:
@@ -114,6 +115,11 @@ class Journal:
         self.appended = position.count
         self._written = self._entries(position)
         return position
+
+    def _names(self, arrays: dict[str, Any]) -> tuple[str, ...]:
+        """The files of a build, at the start or where it stopped with these arrays."""
+        self._successors_name = successors_name(arrays)
+        return STATES, self._successors_name, TERMINAL
 
     def stored_states(self, count: int) -> np.ndarray:
         """(count, W) uint64, a memory map."""
@@ -132,24 +138,22 @@ class Journal:
         with ThreadPoolExecutor(1) as self._writer:
             yield
 
-    def append(self, states: np.ndarray, successors: np.ndarray, terminal: np.ndarray, position: Position) -> None:
+    def append(self, states: np.ndarray, block: Block, position: Position) -> None:
         """Append in the background, while the next chunk is expanded; at most two chunks wait.
 
         Counts and checksums are noted by the thread that writes, once a chunk is in all files: whatever interrupts the
         main thread, and wherever, a checkpoint finds counts and files that belong together.
         """
-        files, name, at = self._files, self._successors_name, Position(**vars(position))
-
-        def write() -> None:
-            files[STATES].append(states)
-            files[name].append(successors)
-            files[TERMINAL].append(np.packbits(terminal, bitorder="little"))
-            self._written = self._entries(at)
-
         while len(self._writes) > 1:
             self._writes.pop(0).result()
-        self._writes.append(self._writer.submit(write))
+        self._writes.append(self._writer.submit(self._write, states, block, Position(**vars(position))))
         self.appended = position.count
+
+    def _write(self, states: np.ndarray, block: Block, at: Position) -> None:
+        self._files[STATES].append(states)
+        self._files[self._successors_name].append(block.successors)
+        self._files[TERMINAL].append(np.packbits(block.terminal, bitorder="little"))
+        self._written = self._entries(at)
 
     def finish_writes(self) -> None:
         """Wait until everything appended is in the files."""
@@ -159,20 +163,22 @@ class Journal:
     def widen(self, position: Position) -> None:
         """From int32 to int64 indices: a new file of successors; the old file goes once this is committed."""
         self.finish_writes()
-        num_actions = self.plan.env.num_actions
-        old = self._files[self._successors_name]
-        wide = GrowingFile(self.path / WIDE_SUCCESSORS)
-        for start in range(0, position.first, WIDENED_ROWS):
-            shape = (min(WIDENED_ROWS, position.first - start), num_actions)
-            rows = np.memmap(old.path, "<i4", "r", offset=4 * start * num_actions, shape=shape)
-            wide.append(rows.astype("<i8"))
-        self._files[WIDE_SUCCESSORS] = wide
-        self._successors_name, self.index_dtype = WIDE_SUCCESSORS, np.dtype("<i8")
+        narrow, name = self._successors_name, self._wide_name
+        old = self._files[narrow]
+        wide = GrowingFile(self.path / name)
+        for _, entries in blocks_of(old, np.dtype("<i4")):
+            wide.append(entries.astype("<i8"))
+        self._files[name] = wide
+        self._successors_name, self.index_dtype = name, np.dtype("<i8")
         self._written = self._entries(position)
         self.commit(complete=False)
-        del self._files[SUCCESSORS]
-        old.close()
-        old.path.unlink()
+        self._drop(narrow)
+
+    def _drop(self, name: str) -> None:
+        """A file that nothing speaks of any more."""
+        file = self._files.pop(name)
+        file.close()
+        file.path.unlink()
 
     # Committing ------------------------------------------------------------------------------------------------------
 
@@ -181,16 +187,20 @@ class Journal:
         self.finish_writes()
         self.commit(complete=complete)
 
-    def commit(self, *, complete: bool) -> None:
-        """Commit what was written: data first, then the manifest that speaks of it."""
-        if self._written is None:
+    def commit(self, *, complete: bool, written: dict[str, Any] | None = None) -> None:
+        """Commit what was written: data first, then the manifest that speaks of it.
+
+        Args:
+            written: what the manifest says of it; None for what the thread that writes noted.
+        """
+        written = written or self._written
+        if written is None:
             return
-        written = self._written
         for file in self._files.values():
             file.sync()
         manifest = {
             "format": "pharos state space",
-            "format_version": FORMAT_VERSION,
+            "format_version": self.plan.format_version,
             "complete": complete,
             **self.plan.identity,
             "num_actions": self.plan.env.num_actions,
@@ -211,9 +221,12 @@ class Journal:
         for file in self._files.values():
             file.close()
 
+    def _dtypes(self) -> dict[str, str]:
+        """The types of the arrays, by the names of their files."""
+        return {STATES: "<u8", self._successors_name: self.index_dtype.str, TERMINAL: "|u1"}
+
     def _entries(self, position: Position) -> dict[str, Any]:
-        dtypes = {STATES: "<u8", self._successors_name: self.index_dtype.str, TERMINAL: "|u1"}
-        arrays = {name: {"dtype": dtypes[name], **self._files[name].entry()} for name in dtypes}
+        arrays = {name: {"dtype": dtype, **self._files[name].entry()} for name, dtype in self._dtypes().items()}
         return {**position.to_dict(), "arrays": arrays}
 
     def _check_rules(self, position: Position) -> None:
@@ -224,3 +237,16 @@ class Journal:
         successors = np.memmap(self.path / self._successors_name, self.index_dtype, "r", shape=shape)
         bits = np.memmap(self.path / TERMINAL, "|u1", "r")
         check_rules(self.path, self.plan.env, self.plan.layout, self.stored_states(position.count), successors, bits)
+
+
+def blocks_of(file: GrowingFile, dtype: np.dtype, entries: int | None = None) -> Iterator[tuple[int, np.ndarray]]:
+    """(first, some of the numbers in a file, from the first one on), in their order.
+
+    Args:
+        entries: of a block, at most; None for BLOCK_BYTES.
+    """
+    size = file.bytes // dtype.itemsize
+    most = entries or max(1, BLOCK_BYTES // dtype.itemsize)
+    for first in range(0, size, most):
+        shape = (min(most, size - first),)
+        yield first, np.memmap(file.path, dtype, "r", offset=first * dtype.itemsize, shape=shape)

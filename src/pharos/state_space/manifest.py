@@ -10,6 +10,9 @@ from pharos import storage
 from pharos.errors import StateSpaceCorrupted, StateSpaceError, StateSpaceMismatch
 
 FORMAT, FORMAT_VERSION = "pharos state space", 1
+OUTCOMES_VERSION = 2
+"""Of folders of environments with chance."""
+
 IMPORTED_FORMAT = "pharos mdp"
 """What `pharos import` writes in place of it."""
 
@@ -17,6 +20,18 @@ MANIFEST = "manifest.json"
 STATES, SUCCESSORS, TERMINAL = "states.bin", "successors.bin", "terminal.bin"
 WIDE_SUCCESSORS = "successors64.bin"
 """In place of successors.bin beyond 2^31 states."""
+
+OFFSETS, CODES, PALETTE, PROBABILITIES = "offsets.bin", "codes.bin", "palette.bin", "probabilities.bin"
+"""Only with chance."""
+
+ARRAYS = (STATES, SUCCESSORS, WIDE_SUCCESSORS, TERMINAL, OFFSETS, CODES, PALETTE, PROBABILITIES)
+"""The files of arrays that a folder may hold."""
+
+PARTS = {name: f"building-{name}" for name in (SUCCESSORS, WIDE_SUCCESSORS, OFFSETS, CODES, PALETTE, PROBABILITIES)}
+"""With chance: what a build writes until it ends."""
+
+MOST_CODES = 1 << 16
+"""Vectors of probabilities that a palette may have."""
 
 CHECKSUM_BYTES = 1 << 24
 """A checksum covers this many bytes of a file."""
@@ -45,10 +60,10 @@ def read_manifest(folder: Path) -> dict[str, Any] | None:
     try:
         if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
             raise ValueError("it is not the manifest of a pharos state space")
-        if manifest["format_version"] != FORMAT_VERSION:
+        if manifest["format_version"] not in (FORMAT_VERSION, OUTCOMES_VERSION):
             raise StateSpaceMismatch(
-                f"{folder}: format version {manifest['format_version']}; this pharos reads version {FORMAT_VERSION}: "
-                f"build again"
+                f"{folder}: format version {manifest['format_version']}; this pharos reads versions {FORMAT_VERSION} "
+                f"and {OUTCOMES_VERSION}: build again"
             )
         if digest_of(manifest) != manifest["digest"]:
             raise ValueError("it was changed after it was written")
@@ -59,9 +74,14 @@ def read_manifest(folder: Path) -> dict[str, Any] | None:
     return manifest
 
 
-def successors_name(arrays: dict[str, Any]) -> str:
-    """The file of successors: its name depends on the width of the indices."""
-    return WIDE_SUCCESSORS if WIDE_SUCCESSORS in arrays else SUCCESSORS
+def successors_name(arrays: dict[str, Any], parts: dict[str, str] | None = None) -> str:
+    """The file of successors: its name depends on the width of the indices.
+
+    Args:
+        parts: PARTS, where the arrays are those of a build with chance that goes on.
+    """
+    wide = parts[WIDE_SUCCESSORS] if parts else WIDE_SUCCESSORS
+    return WIDE_SUCCESSORS if wide in arrays else SUCCESSORS
 
 
 def digest_of(manifest: dict[str, Any]) -> str:
@@ -136,24 +156,77 @@ def _check_start(manifest: dict[str, Any]) -> None:
 
 
 def _check_arrays(manifest: dict[str, Any]) -> None:
+    """Each array has the length and the type that follow from the numbers of states, actions and outcomes."""
     arrays, states = manifest["arrays"], manifest["num_states"]
-    width = 8 if successors_name(arrays) == WIDE_SUCCESSORS else 4
+    if manifest["format_version"] == OUTCOMES_VERSION:
+        _whole(manifest["outcomes"], "outcomes", 1)
+        if not manifest["complete"]:
+            _check_parts(arrays)
+            return
+        expected = _expected_outcomes(manifest)
+    else:
+        width = 8 if successors_name(arrays) == WIDE_SUCCESSORS else 4
+        expected = {successors_name(arrays): (f"<i{width}", width * states * manifest["num_actions"])}
     expected = {
         STATES: ("<u8", 8 * states * manifest["layout"]["num_words"]),
-        successors_name(arrays): (f"<i{width}", width * states * manifest["num_actions"]),
+        **expected,
         TERMINAL: ("|u1", -(-states // 8)),
     }
     if set(arrays) != set(expected):
         raise ValueError(f"arrays are {', '.join(arrays)}; expected {', '.join(expected)}")
     for name, (dtype, length) in expected.items():
         entry = arrays[name]
-        size = _whole(entry["bytes"], f"bytes of {name}", 0)
+        size = _checked_size(name, entry)
         if entry["dtype"] != dtype or (manifest["complete"] and size != length):
             raise ValueError(
                 f"{name}: {size} bytes of type {entry['dtype']}; expected {length} of type {dtype} for {states} states"
             )
-        if len(entry["checksums"]) != -(-size // CHECKSUM_BYTES):
-            raise ValueError(f"{name}: {len(entry['checksums'])} checksums for {size} bytes")
+
+
+def _expected_outcomes(manifest: dict[str, Any]) -> dict[str, tuple[str, int]]:
+    """Type and length of the arrays of outcomes of a finished build."""
+    arrays = manifest["arrays"]
+    most = _whole(manifest["num_outcomes"], "num_outcomes", 1)
+    rows = manifest["num_states"] * manifest["num_actions"]
+    transitions = _whole(manifest["num_transitions"], "num_transitions", rows)
+    if most > manifest["outcomes"] or transitions > rows * most:
+        raise ValueError(f"{transitions} transitions of at most {most} outcomes, for {manifest['outcomes']} declared")
+    name = successors_name(arrays)
+    width = 8 if name == WIDE_SUCCESSORS else 4
+    stored = transitions if OFFSETS in arrays else rows * most
+    expected = {name: (f"<i{width}", width * stored)}
+    if OFFSETS in arrays:
+        expected[OFFSETS] = ("<i8", 8 * (rows + 1))
+    if PROBABILITIES in arrays:
+        return expected | {PROBABILITIES: ("<f8", 8 * stored)}
+    vectors = arrays[PALETTE]["bytes"] // (8 * most)
+    if not 1 <= vectors <= MOST_CODES:
+        raise ValueError(f"{PALETTE} has {vectors} vectors; expected 1 to {MOST_CODES}")
+    codes = ("|u1", rows) if vectors <= 256 else ("<u2", 2 * rows)
+    return expected | {CODES: codes, PALETTE: ("<f8", 8 * most * vectors)}
+
+
+def _check_parts(arrays: dict[str, Any]) -> None:
+    """The files of a build with chance that goes on."""
+    names = set(arrays) - {STATES, TERMINAL}
+    successors = PARTS[successors_name(arrays, PARTS)]
+    spelled_out = {PARTS[OFFSETS], PARTS[PROBABILITIES]}
+    if {STATES, TERMINAL} - set(arrays) or names - {successors} not in ({PARTS[CODES], PARTS[PALETTE]}, spelled_out):
+        raise ValueError(f"arrays are {', '.join(arrays)}, which are not those of a build that goes on")
+    dtypes = {STATES: "<u8", TERMINAL: "|u1", PARTS[SUCCESSORS]: "<i4", PARTS[WIDE_SUCCESSORS]: "<i8"}
+    dtypes |= {PARTS[OFFSETS]: "<i8", PARTS[CODES]: "<u2", PARTS[PALETTE]: "<f8", PARTS[PROBABILITIES]: "<f8"}
+    for name, entry in arrays.items():
+        size = _checked_size(name, entry)
+        if entry["dtype"] != dtypes[name] or size % int(dtypes[name][-1]):
+            raise ValueError(f"{name}: {size} bytes of type {entry['dtype']}; expected whole numbers of {dtypes[name]}")
+
+
+def _checked_size(name: str, entry: dict[str, Any]) -> int:
+    """The bytes of a file, each block of which has a checksum."""
+    size = _whole(entry["bytes"], f"bytes of {name}", 0)
+    if len(entry["checksums"]) != -(-size // CHECKSUM_BYTES):
+        raise ValueError(f"{name}: {len(entry['checksums'])} checksums for {size} bytes")
+    return size
 
 
 def _whole(value: Any, name: str, least: int) -> int:

@@ -9,6 +9,7 @@ import numpy as np
 
 from pharos.environments import Environment, State, start_distribution
 from pharos.rules import Layout, fingerprint_of_rules, layout_of
+from pharos.state_space.manifest import FORMAT_VERSION, OUTCOMES_VERSION
 
 
 @dataclass(frozen=True)
@@ -43,6 +44,7 @@ class Plan:
             "rules_version": env.version,
             "parameters": json.loads(json.dumps(env.parameters)),
             "actions": list(env.actions),
+            **({"outcomes": int(env.outcomes)} if env.has_chance else {}),
             "layout": {
                 "names": list(env.components.names),
                 "low": env.components.low.tolist(),
@@ -56,5 +58,16 @@ class Plan:
         }
 
     @cached_property
+    def branches(self) -> int:
+        """How many successors a state may have: the number of actions, times that of outcomes."""
+        return self.env.num_actions * int(self.env.outcomes)
+
+    @property
+    def format_version(self) -> int:
+        """Of the folder."""
+        return OUTCOMES_VERSION if self.env.has_chance else FORMAT_VERSION
+
+    @cached_property
     def fingerprint(self) -> str:
-        return fingerprint_of_rules(self.env, ("transition", "is_terminal"))
+        chance = ("probability",) * self.env.has_chance
+        return fingerprint_of_rules(self.env, ("transition", "is_terminal", *chance))

@@ -9,6 +9,7 @@ states stay in their file. docs/decisions has the measurements.
 import time
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,15 +19,17 @@ from pharos.errors import StateSpaceTooLarge
 from pharos.rules import rules_of
 from pharos.state_space import memory as machine
 from pharos.state_space.journal import Journal, Position
+from pharos.state_space.outcome_journal import OutcomeJournal
 from pharos.state_space.plan import Plan
 from pharos.state_space.progress import BuildProgress, Progress
-from pharos.state_space.table import INT32_STATES, MemoryTable, SpilledTable
+from pharos.state_space.table import INT32_STATES, Block, MemoryTable, SpilledTable
 from pharos.workers import usable_workers
 
 # States expanded between two looks at the clock; a multiple of 8, so that terminal bits fill whole bytes.
 CHUNK = 1 << 16
-# Successors of a chunk, where there are very many actions.
+# Successors of a chunk, where there are very many actions; with chance, whose probabilities are kept beside them.
 CHUNK_SUCCESSORS = 1 << 26
+CHUNK_OUTCOMES = 1 << 21
 # Pieces of a chunk: threads expand one while the one before is numbered.
 PIECES = 4
 # A frontier of this many states is worth sharing between threads.
@@ -54,6 +57,7 @@ class Piece:
     keys: np.ndarray
     found: np.ndarray
     terminal: np.ndarray
+    probabilities: np.ndarray
     first: int = 0
     stop: int = 0
     futures: list[Future] = field(default_factory=list)
@@ -65,18 +69,19 @@ class Search:
     def __init__(self, plan: Plan, journal: Journal, options: Options, report: Progress):
         self.plan, self.journal, self.options, self.report = plan, journal, options, report
         self.env: Environment = plan.env
-        self.num_actions, self.num_words = plan.env.num_actions, plan.layout.num_words
+        self.branches, self.num_words = plan.branches, plan.layout.num_words
         self.workers = usable_workers(options.workers)
         self.rules = rules_of(plan.env, workers=self.workers).exploration
         self.threads = self.rules.threads(self.workers)
-        self.chunk = min(CHUNK, max(8, CHUNK_SUCCESSORS // self.num_actions // 8 * 8))
+        most = CHUNK_OUTCOMES if plan.env.has_chance else CHUNK_SUCCESSORS
+        self.chunk = min(CHUNK, max(8, most // self.branches // 8 * 8))
         self.position = Position()
-        margin = 32 * self.num_actions + len(self.plan.starts[0])
+        margin = 32 * self.branches + len(self.plan.starts[0])
         self.table = MemoryTable(self.num_words, margin, options.memory)
         self.spilled: SpilledTable | None = None
         self._ahead: Piece | None = None  # expanded by threads, not numbered yet
         self._spare: list[Piece] = []
-        self._blocks: list[tuple[np.ndarray, np.ndarray]] = []  # rows of successors and terminal bits, used in turn
+        self._blocks: list[Block] = []  # rows of a chunk, used in turn
         self._began = time.perf_counter()
 
     def run(self, manifest: dict[str, Any] | None) -> None:
@@ -117,12 +122,12 @@ class Search:
     def _expand_chunk(self, pool: ThreadPoolExecutor) -> None:
         """Expand up to a chunk of states, then append their rows to the files."""
         position, table = self.position, self.table
-        if self._needs_wide_indices(self.chunk * self.num_actions + 32 * self.num_actions):
+        if self._needs_wide_indices(self.chunk * self.branches + 32 * self.branches):
             self._widen_indices(pool)
             if self.spilled:
                 return
         base, last = position.first, position.first + self.chunk
-        successors, terminal = self._block()
+        block = self._block()
         while position.first < min(last, position.count):
             if self._ahead is None and table.is_full(position.count):
                 self._grow_table(pool)
@@ -131,34 +136,38 @@ class Search:
                     break
             is_wide = self.threads > 1 and min(last, position.count) - position.first >= WIDE
             if self._ahead or is_wide:
-                self._expand_wide(pool, successors, terminal, base)
+                self._expand_wide(pool, block, base)
             else:
-                self._expand_narrow(successors, terminal, base, last)
+                self._expand_narrow(block, base, last)
             self._check_size()
-        rows = position.first - base
-        position.terminals += int(terminal[:rows].sum())
-        states = table.states[self.journal.appended : position.count]
-        self.journal.append(states, successors[:rows], terminal[:rows], position)
+        block = block.rows(0, position.first - base)
+        position.terminals += int(block.terminal.sum())
+        self.journal.append(table.states[self.journal.appended : position.count], block, position)
         self._report()
 
-    def _block(self) -> tuple[np.ndarray, np.ndarray]:
+    def _block(self) -> Block:
         """Room for the rows of a chunk; the journal lets two chunks wait, so the third one back is written."""
-        if len(self._blocks) == 3 and self._blocks[0][0].dtype == self.journal.index_dtype:
+        if len(self._blocks) == 3 and self._blocks[0].successors.dtype == self.journal.index_dtype:
             self._blocks.append(self._blocks.pop(0))
         else:
-            rows = np.empty((self.chunk, self.num_actions), self.journal.index_dtype)
-            self._blocks = [*self._blocks, (rows, np.empty(self.chunk, np.uint8))][-3:]
+            rows = np.empty((self.chunk, self.branches), self.journal.index_dtype)
+            block = Block(rows, np.empty(self.chunk, np.uint8), self._probabilities(self.chunk))
+            self._blocks = [*self._blocks, block][-3:]
         return self._blocks[-1]
 
-    def _expand_narrow(self, successors: np.ndarray, terminal: np.ndarray, base: int, last: int) -> None:
+    def _probabilities(self, rows: int) -> np.ndarray:
+        """Room for how likely the branches of some states are; none without chance."""
+        return np.empty((rows if self.env.has_chance else 0, self.branches))
+
+    def _expand_narrow(self, block: Block, base: int, last: int) -> None:
         """One thread does everything; with several it looks at the width of the frontier again after a while."""
         position, table = self.position, self.table
         stop = min(last, max(position.first + NARROW, position.count)) if self.threads > 1 else last
         progress = position.progress()
-        self.rules.explore(table.states, successors, terminal, table.slots, base, stop, table.room, progress)
+        self.rules.explore(table.states, *block, table.slots, base, stop, table.room, progress)
         position.take(progress)
 
-    def _expand_wide(self, pool: ThreadPoolExecutor, successors: np.ndarray, terminal: np.ndarray, base: int) -> None:
+    def _expand_wide(self, pool: ThreadPoolExecutor, block: Block, base: int) -> None:
         """Number the successors of the piece that threads have expanded, while they expand the next one."""
         position = self.position
         piece = self._ahead or self._expand_ahead(pool, position.first, position.first - base)
@@ -171,10 +180,12 @@ class Search:
         row = piece.first - base
         if position.count - piece.stop >= WIDE:
             next_row = (row + rows) % self.chunk
-            self._ahead = self._expand_ahead(pool, piece.stop, next_row, reserved=rows * self.num_actions)
+            self._ahead = self._expand_ahead(pool, piece.stop, next_row, reserved=rows * self.branches)
         progress = position.progress()
-        self.table.find_or_number(piece.keys, piece.found, successors[row : row + rows], progress)
-        terminal[row : row + rows] = piece.terminal[:rows]
+        part = block.rows(row, row + rows)
+        self.table.find_or_number(piece.keys, piece.found, part.successors, progress)
+        part.terminal[:] = piece.terminal[:rows]
+        part.probabilities[:] = piece.probabilities[:rows]
         self._spare.append(piece)
         position.take(progress)
 
@@ -184,14 +195,14 @@ class Search:
         None where the table has no room left beside `reserved` other states: it grows while nobody reads it.
         """
         table, most = self.table, -(-self.chunk // PIECES)
-        room = (table.room - self.position.count - reserved) // self.num_actions
+        room = (table.room - self.position.count - reserved) // self.branches
         rows = min(most, self.chunk - row, self.position.count - first, room)
         if rows < 1:
             return None
         piece = self._spare.pop() if self._spare else self._new_piece(most)
         cuts = [first + rows * i // self.threads for i in range(self.threads + 1)]
         piece.first, piece.stop = first, first + rows
-        arrays = (first, piece.keys, piece.found, piece.terminal, table.slots)
+        arrays = (first, piece.keys, piece.found, piece.terminal, piece.probabilities, table.slots)
         piece.futures = [
             pool.submit(self.rules.expand_and_find, table.states, cuts[i], cuts[i + 1], *arrays)
             for i in range(self.threads)
@@ -199,8 +210,8 @@ class Search:
         return piece
 
     def _new_piece(self, rows: int) -> Piece:
-        keys = np.empty((rows * self.num_actions, self.num_words), np.uint64)
-        return Piece(keys, np.empty(len(keys), np.int64), np.empty(rows, np.uint8))
+        keys = np.empty((rows * self.branches, self.num_words), np.uint64)
+        return Piece(keys, np.empty(len(keys), np.int64), np.empty(rows, np.uint8), self._probabilities(rows))
 
     def _grow_table(self, pool: ThreadPoolExecutor) -> None:
         """A larger table; on disk where memory is not enough."""
@@ -232,7 +243,7 @@ class Search:
         if memory is None:
             memory = max(machine.LEAST_MEMORY, machine.available_memory() // 2)
         count = self.position.count
-        spilled = SpilledTable(self.journal.path, self.num_words, self.num_actions, memory, count)
+        spilled = SpilledTable(self.journal.path, self.num_words, self.branches, memory, count, self.env.has_chance)
         if stored is not None:
             spilled.fill(stored)
         elif len(self.table.slots):
@@ -244,38 +255,37 @@ class Search:
     def _expand_chunk_on_disk(self, pool: ThreadPoolExecutor, spilled: SpilledTable) -> None:
         """Successors of a chunk are looked up in the order of the table, many at once, and then numbered."""
         position = self.position
-        if self._needs_wide_indices(spilled.rows * self.num_actions):
+        if self._needs_wide_indices(spilled.rows * self.branches):
             self._widen_indices(pool)
         self.journal.finish_writes()
         if len(self.table.states):
             self.table.release()
             self._blocks, self._spare = [], []
         base, last = position.first, position.first + spilled.rows
-        successors, terminal = spilled.successors(self.journal.index_dtype), spilled.terminal
+        block = spilled.block(self.journal.index_dtype)
         spilled.appended = self.journal.appended
         while position.first < min(last, position.count):
             first, rows = position.first, min(last, position.count) - position.first
-            size = rows * self.num_actions
-            part = slice(first - base, first - base + rows)
+            size = rows * self.branches
+            part = block.rows(first - base, first - base + rows)
             keys, found = spilled.keys[:size], spilled.found[:size]
-            self._expand_rows(pool, self._states(spilled, first, first + rows), keys, found, terminal[part])
+            self._expand_rows(pool, self._states(spilled, first, first + rows), keys, found, part)
             progress = position.progress()
-            spilled.find_or_number(keys, found, successors[part], progress)
+            spilled.find_or_number(keys, found, part.successors, progress)
             position.take(progress)
             self._check_size()
-        rows = position.first - base
-        position.terminals += int(terminal[:rows].sum())
-        states = spilled.states[: position.count - self.journal.appended]
-        self.journal.append(states, successors[:rows], terminal[:rows], position)
+        block = block.rows(0, position.first - base)
+        position.terminals += int(block.terminal.sum())
+        self.journal.append(spilled.states[: position.count - self.journal.appended], block, position)
         self._report()
 
     def _expand_rows(
-        self, pool: ThreadPoolExecutor, states: np.ndarray, keys: np.ndarray, found: np.ndarray, terminal: np.ndarray
+        self, pool: ThreadPoolExecutor, states: np.ndarray, keys: np.ndarray, found: np.ndarray, block: Block
     ) -> None:
         """Successors of states to keys; to found -1 - bucket, or in terminal states their own row."""
         threads = self.threads if len(states) >= WIDE else 1
         cuts = [len(states) * i // threads for i in range(threads + 1)]
-        arrays = (0, keys, found, terminal, _NOTHING)
+        arrays = (0, keys, found, block.terminal, block.probabilities, _NOTHING)
         if threads == 1:
             self.rules.expand_and_find(states, 0, len(states), *arrays)
             return
@@ -303,6 +313,11 @@ class Search:
     def _report(self, finished: bool = False) -> None:
         at, seconds = self.position, time.perf_counter() - self._began
         self.report(BuildProgress(at.count, at.first, at.depth, seconds, finished, self.spilled is not None))
+
+
+def journal_of(path: Path, plan: Plan) -> Journal:
+    """The files of a build."""
+    return OutcomeJournal(path, plan) if plan.env.has_chance else Journal(path, plan)
 
 
 def check_size(env: Environment, count: int, left: int, max_states: int | None) -> None:

@@ -17,22 +17,27 @@ from pharos.errors import (
     StateSpaceIncomplete,
     StateSpaceMismatch,
 )
-from pharos.rules import Layout, pack, unpack
-from pharos.state_space.checks import check_environment, check_rules, check_states, check_successors
+from pharos.rules import Layout, pack, rules_of, unpack
+from pharos.state_space.checks import check_environment, check_rules, check_states, check_successors, states_to_check
 from pharos.state_space.manifest import (
     AGAIN,
     CHECKSUM_BYTES,
     MANIFEST,
+    OUTCOMES_VERSION,
     STATES,
     TERMINAL,
     check_lengths,
     read_manifest,
     successors_name,
 )
+from pharos.state_space.outcome_checks import check_outcome_rules, check_outcomes, outcomes_to_check
 from pharos.state_space.plan import Plan
+from pharos.state_space.stored_outcomes import StoredOutcomes
 
 if TYPE_CHECKING:
-    from pharos.mdp import TabularMDP
+    from pharos.mdp import Dynamics, TabularMDP
+
+_BLOCK = 1 << 16  # states whose ages are asked for at a time
 
 
 class StateSpace:
@@ -45,6 +50,7 @@ class StateSpace:
         folder: where the files are.
         num_states, num_actions, num_terminal_states, depth: S, A, terminal states, largest distance from the start
             states.
+        has_chance: whether actions have several outcomes, which `outcomes` has in place of `successors`.
         successors: (S, A) int32 (int64 beyond 2^31 states), index of the next state; terminal states lead to
             themselves.
         packed_states: (S, W) uint64, see docs/format.md.
@@ -59,6 +65,7 @@ class StateSpace:
         self.num_actions: int = manifest["num_actions"]
         self.num_terminal_states: int = manifest["num_terminal_states"]
         self.depth: int = manifest["depth"]
+        self.has_chance: bool = manifest["format_version"] == OUTCOMES_VERSION
         self.parameters: dict[str, Any] = manifest["parameters"]
         self.start_states = np.array([index for index, _ in manifest["initial"]], np.int64)
         self.start_probabilities = np.array([probability for _, probability in manifest["initial"]], np.float64)
@@ -80,10 +87,56 @@ class StateSpace:
         Raises:
             StateSpaceCorrupted: one is no state, or a terminal state does not lead to itself. The first access looks at
                 all.
+            StateSpaceError: actions have several outcomes.
         """
         path = self.folder / successors_name(self.manifest["arrays"])
         check_successors(path, self._stored_successors, self.terminal_bits, self.num_terminal_states)
         return self._stored_successors
+
+    @cached_property
+    def outcomes(self) -> StoredOutcomes:
+        """What each action may lead to, where it has several outcomes, as the files hold it; `dynamics` hides the form.
+
+        Raises:
+            StateSpaceCorrupted: an index is no state, probabilities do not sum to 1, or rows or codes are out of range.
+                The first access looks at all of them.
+            StateSpaceError: actions have one outcome each.
+        """
+        check_outcomes(self.folder, self.manifest, self._stored_outcomes, self.terminal_bits)
+        return self._stored_outcomes
+
+    @cached_property
+    def dynamics(self) -> "Dynamics":
+        """What executing an action leads to, whether there is chance or not."""
+        from pharos.mdp import OutcomeTable, Table
+
+        if not self.has_chance:
+            return Table(self.successors)
+        return OutcomeTable(num_actions=self.num_actions, **self.outcomes._asdict())
+
+    @cached_property
+    def ages(self) -> np.ndarray:
+        """(S,) int64, the age of each state, in memory.
+
+        Raises:
+            StateSpaceError: the class declares no age.
+        Cost: some 10 ns a state where Numba compiles the rule.
+        """
+        if self.environment is None or not self.environment.has_age:
+            raise StateSpaceError(f"{self}: {self.manifest['environment']} declares no age of states")
+        ages = np.empty(self.num_states, np.int64)
+        rule = rules_of(self.environment).ages
+        for start in range(0, self.num_states, _BLOCK):
+            stop = min(start + _BLOCK, self.num_states)
+            ages[start:stop] = rule.block(self.packed_states, start, stop)
+        ages.flags.writeable = False
+        return ages
+
+    @cached_property
+    def _stored_outcomes(self) -> StoredOutcomes:
+        if not self.has_chance:
+            raise StateSpaceError(f"{self}: each action has one outcome, in `successors`; there are no `outcomes`")
+        return StoredOutcomes.of_folder(self.folder, self.manifest)
 
     @cached_property
     def _stored_states(self) -> np.ndarray:
@@ -91,6 +144,8 @@ class StateSpace:
 
     @cached_property
     def _stored_successors(self) -> np.ndarray:
+        if self.has_chance:
+            raise StateSpaceError(f"{self}: actions have several outcomes, in `outcomes`; there are no `successors`")
         name = successors_name(self.manifest["arrays"])
         return self._map(name, self.manifest["arrays"][name]["dtype"], (self.num_states, self.num_actions))
 
@@ -172,7 +227,7 @@ class StateSpace:
         from pharos.kernels.hash_table import fill
 
         slots = max(65536, -(-int(self.num_states / 0.6) // 65536) * 65536)
-        table = np.full(slots, -1, self.successors.dtype)
+        table = np.full(slots, -1, np.int32 if self.num_states < 2**31 else np.int64)
         fill(table, self.packed_states, self.num_states)
         return table
 
@@ -240,9 +295,21 @@ def load(folder: str | os.PathLike, *, verify: bool = True, environment: Environ
         space.verify()
     if space.environment is not None:
         check_environment(folder, space.environment, manifest)
-        stored = space._stored_states, space._stored_successors, space.terminal_bits
-        check_rules(folder, space.environment, space.layout, *stored)
+        if space.has_chance:
+            _check_outcome_rules(space, space.environment)
+        else:
+            stored = space._stored_states, space._stored_successors, space.terminal_bits
+            check_rules(folder, space.environment, space.layout, *stored)
     return space
+
+
+def _check_outcome_rules(space: StateSpace, env: Environment) -> None:
+    """StateSpaceMismatch where the rules of `env` disagree with the stored outcomes of 64 states."""
+    chosen = states_to_check(space.num_states)
+    outcomes = outcomes_to_check(space.folder, space.manifest, space._stored_outcomes, chosen)
+    looked_at = np.concatenate([chosen, *(successors for each in outcomes.values() for successors, _ in each)])
+    check_states(space.folder / STATES, space.layout, space._stored_states[looked_at])
+    check_outcome_rules(space.folder, env, space.layout, space._stored_states, outcomes, space.terminal_bits)
 
 
 def _environment_of(folder: Path, manifest: dict[str, Any]) -> Environment | None:
@@ -258,10 +325,11 @@ def _environment_of(folder: Path, manifest: dict[str, Any]) -> Environment | Non
             f"{' '.join(str(error).split())}; build again"
         ) from error
     identity = Plan(env).identity
-    for key in ("rules_version", "parameters", "actions", "layout", "start"):
-        if identity[key] != manifest[key]:
+    for key in ("rules_version", "parameters", "actions", "outcomes", "layout", "start"):
+        if identity.get(key) != manifest.get(key):
             raise StateSpaceMismatch(
-                f"{folder}: {key} of {env.name} is {manifest[key]} in the folder and {identity[key]} in this pharos; "
+                f"{folder}: {key} of {env.name} is {manifest.get(key)} in the folder and {identity.get(key)} in this "
+                f"pharos; "
                 f"build again"
             )
     return env

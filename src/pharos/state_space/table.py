@@ -2,6 +2,7 @@
 
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,6 +14,22 @@ LOAD = 0.5  # the table in memory grows beyond this share of used slots
 PARALLEL_FILL = 1 << 16  # states that are worth sharing between threads when the table grows
 LEFT_OVER = 1 << 12  # states that may pass the end of a part of the table, which are a handful
 INT32_STATES = 2**31 - 1
+
+
+class Block(NamedTuple):
+    """What is found of some states, by B branches each: actions, or outcomes of actions (see `rules.Exploration`).
+
+    Attributes:
+        successors: (rows, B) indices. terminal: (rows,) uint8. probabilities: (rows, B), of no rows without chance.
+    """
+
+    successors: np.ndarray
+    terminal: np.ndarray
+    probabilities: np.ndarray
+
+    def rows(self, start: int, stop: int) -> "Block":
+        """Some of them."""
+        return Block(self.successors[start:stop], self.terminal[start:stop], self.probabilities[start:stop])
 
 
 class MemoryTable:
@@ -79,9 +96,9 @@ class MemoryTable:
         """Number the successors that are new, in their order.
 
         Args:
-            keys: (rows * A, W) uint64, successors. found: (rows * A,), their indices, or -1 - slot from which to search
-                on.
-            successors: (rows, A), gets the indices. progress: see kernels/hash_table.py; goes on by these rows.
+            keys: (rows * B, W) uint64, successors by B branches. found: (rows * B,), their indices, or -1 - slot from
+                which to search on.
+            successors: (rows, B), gets the indices. progress: see kernels/hash_table.py; goes on by these rows.
         """
         insert_missing(self.slots, self.states, keys, found, successors, progress)
 
@@ -106,20 +123,19 @@ class SpilledTable:
 
     Attributes:
         rows: of a chunk: as many as half of the memory holds; the table takes a quarter at a time.
-        states: those that the chunk numbers and that are not in the file yet. terminal: of its rows. keys, found: of
-            its candidates.
+        states: those that the chunk numbers and that are not in the file yet. keys, found: of its candidates.
         appended: states that are in the file; the first of `states` has this number.
     """
 
-    def __init__(self, path: Path, num_words: int, num_actions: int, memory: int, count: int):
-        self.rows = rows_of_chunk(memory, num_words, num_actions)
-        candidates = self.rows * num_actions
+    def __init__(self, path: Path, num_words: int, branches: int, memory: int, count: int, has_chance: bool = False):
+        self.rows = rows_of_chunk(memory, num_words, branches, has_chance)
+        candidates = self.rows * branches
         self.states, self.keys = (np.empty((candidates, num_words), np.uint64) for _ in range(2))
         self.found, self._slots = np.empty(candidates, np.int64), np.empty(candidates, np.int64)
         self._order = np.empty(candidates, np.int32)
-        self.terminal = np.empty(self.rows, np.uint8)
         self.appended = count
-        self._successors = np.empty((0, num_actions), np.int32)
+        likely = np.empty((self.rows if has_chance else 0, branches))
+        self._block = Block(np.empty((0, branches), np.int32), np.empty(self.rows, np.uint8), likely)
         from pharos.state_space.disk_table import DiskTable  # whose kernels few need
 
         self._table = DiskTable(path, num_words, memory // 4, 2 * count)
@@ -133,11 +149,12 @@ class SpilledTable:
         """Enter the states of the table in memory into the empty one."""
         self._table.take_over(table.slots, table.states)
 
-    def successors(self, dtype: np.dtype) -> np.ndarray:
-        """(rows, A), of the chunk."""
-        if len(self._successors) != self.rows or self._successors.dtype != dtype:
-            self._successors = np.empty((self.rows, self._successors.shape[1]), dtype)
-        return self._successors
+    def block(self, dtype: np.dtype) -> Block:
+        """The rows of the chunk."""
+        successors = self._block.successors
+        if len(successors) != self.rows or successors.dtype != dtype:
+            self._block = self._block._replace(successors=np.empty((self.rows, successors.shape[1]), dtype))
+        return self._block
 
     def find_or_number(self, keys: np.ndarray, found: np.ndarray, successors: np.ndarray, progress: np.ndarray) -> None:
         """As `MemoryTable.find_or_number`; found: -1 - bucket, or the own row of a terminal state."""
@@ -150,11 +167,12 @@ class SpilledTable:
         self._table.settle(looked_up, found, self._order, self._slots)
 
 
-def rows_of_chunk(memory: int, num_words: int, num_actions: int) -> int:
+def rows_of_chunk(memory: int, num_words: int, branches: int, has_chance: bool = False) -> int:
     """Rows of which half of the memory holds the candidates: a multiple of 8, so that terminal bits fill whole
     bytes.
     """
     candidate = 2 * 8 * num_words + 8 + 8 + 8 + 4  # words here and as a state, found, slots, a successor, order
-    bytes_of_a_row = num_actions * candidate + 8 * num_words + 1
+    candidate += 24 * has_chance  # a probability, and once more with its successor when it is written
+    bytes_of_a_row = branches * candidate + 8 * num_words + 1
     rows = max(memory // 2 // bytes_of_a_row // 1024, 1) * 1024
-    return max(8, min(rows, INT32_STATES // num_actions // 8 * 8))
+    return max(8, min(rows, INT32_STATES // branches // 8 * 8))

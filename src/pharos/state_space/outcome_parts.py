@@ -1,0 +1,181 @@
+"""The outcomes that a build has found, as its files hold them until it ends, and the files that they become.
+
+The rows s A + a lie one after another, possible outcomes alone. In the end they are padded to equal length where little
+of that would be padding, and codes take one byte where that suffices.
+"""
+
+import os
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from pharos.kernels import palettes
+from pharos.state_space.files import GrowingFile, cannot_write
+from pharos.state_space.manifest import CODES, OFFSETS, PALETTE, PARTS, PROBABILITIES, SUCCESSORS, WIDE_SUCCESSORS
+from pharos.state_space.stored_outcomes import OutcomesOfState
+
+MOST_PADDING = (3, 10)
+"""The share of (S, A, K) that may be padding, as a fraction."""
+
+ENTRIES = 1 << 21  # of rows of K, as many as are copied at a time
+
+
+class Part(NamedTuple):
+    """Some rows: the number of the first one, and that of its first outcome; then R rows of N outcomes in all.
+
+    counts (R,); codes (R,), None where probabilities are spelled out; successors (N,); likely (N,), bits of float64.
+    """
+
+    row: int
+    first: int
+    counts: np.ndarray
+    codes: np.ndarray | None
+    successors: np.ndarray
+    likely: np.ndarray
+
+
+@dataclass
+class OutcomeParts:
+    """What the files of a build that goes on hold of outcomes.
+
+    Attributes:
+        folder: where they are. rows: how many, A for each state. most_declared: the most outcomes that a row may have.
+        index_dtype: of the successors.
+        palette: (P, K) uint64, bits of the vectors; None where probabilities are spelled out.
+    """
+
+    folder: Path
+    rows: int
+    num_actions: int
+    most_declared: int
+    index_dtype: np.dtype
+    palette: np.ndarray | None
+
+    def parts(self) -> Iterator[Part]:
+        """All rows, some at a time."""
+        for row, first, codes, counts in self._counts():
+            yield self._part(row, first, codes, counts)
+
+    def _counts(self) -> Iterator[tuple[int, int, np.ndarray | None, np.ndarray]]:
+        """(row, first, codes, counts) of each `Part`."""
+        sizes = np.zeros(0, np.int64) if self.palette is None else (self.palette != 0).sum(axis=1)
+        first, step = 0, max(1, ENTRIES // self.most_declared // self.num_actions) * self.num_actions
+        for row in range(0, self.rows, step):
+            rows = min(step, self.rows - row)
+            codes = None
+            if self.palette is None:
+                counts = np.diff(np.fromfile(self.folder / PARTS[OFFSETS], "<i8", rows + 1, offset=8 * row))
+            else:
+                codes = np.fromfile(self.folder / PARTS[CODES], "<u2", rows, offset=2 * row)
+                counts = sizes[codes]
+            yield row, first, codes, counts
+            first += int(counts.sum())
+
+    def _part(self, row: int, first: int, codes: np.ndarray | None, counts: np.ndarray) -> Part:
+        entries = int(counts.sum())
+        name = WIDE_SUCCESSORS if self.index_dtype.itemsize == 8 else SUCCESSORS
+        place = first * self.index_dtype.itemsize
+        successors = np.fromfile(self.folder / PARTS[name], self.index_dtype, entries, offset=place)
+        if self.palette is None:
+            likely = np.fromfile(self.folder / PARTS[PROBABILITIES], "<u8", entries, offset=8 * first)
+        else:
+            assert codes is not None
+            vectors = self.palette[codes]
+            likely = vectors[vectors != 0]
+        return Part(row, first, counts, codes, successors, likely)
+
+    def most(self) -> int:
+        """K, the most possible outcomes of a row."""
+        if self.palette is not None:
+            return int((self.palette != 0).sum(axis=1).max())
+        return max(int(counts.max()) for _, _, _, counts in self._counts())
+
+    def finish(self, written: dict[str, dict[str, Any]]) -> tuple[dict[str, dict[str, Any]], int]:
+        """Write the files of a finished build: name -> what the manifest says of it; and K, the most outcomes of a row.
+
+        Args:
+            written: the same of the files that there are.
+        """
+        most = self.most()
+        successors = WIDE_SUCCESSORS if self.index_dtype.itemsize == 8 else SUCCESSORS
+        num_entries = written[PARTS[successors]]["bytes"] // self.index_dtype.itemsize
+        is_dense = MOST_PADDING[1] * (self.rows * most - num_entries) <= MOST_PADDING[0] * self.rows * most
+        dtypes = {successors: self.index_dtype.str}
+        if not is_dense:
+            dtypes[OFFSETS] = "<i8"
+        if self.palette is None:
+            dtypes[PROBABILITIES] = "<f8"
+        else:
+            dtypes |= {CODES: "|u1" if len(self.palette) <= 256 else "<u2", PALETTE: "<f8"}
+        stay = {successors, OFFSETS, PROBABILITIES} if not is_dense else set()
+        stay |= {CODES} if dtypes.get(CODES) == "<u2" else set()
+        stay &= {name for name in dtypes if PARTS[name] in written}
+        files = {name: GrowingFile(self.folder / name) for name in dtypes if name not in stay}
+        try:
+            self._fill(files, dtypes, most, is_dense)
+            for file in files.values():
+                file.sync()
+        finally:
+            for file in files.values():
+                file.close()
+        for name in stay:
+            _link(self.folder / PARTS[name], self.folder / name)
+        return {
+            name: {"dtype": dtype, **files[name].entry()} if name in files else written[PARTS[name]]
+            for name, dtype in dtypes.items()
+        }, most
+
+    def _fill(self, files: dict[str, GrowingFile], dtypes: dict[str, str], most: int, is_dense: bool) -> None:
+        if OFFSETS in files:
+            files[OFFSETS].append(np.zeros(1, np.int64))
+        if self.palette is not None:
+            files[PALETTE].append(self.palette[:, :most])
+        successors = next(iter(dtypes))
+        for part in self.parts():
+            if is_dense:
+                files[successors].append(_padded(part.successors, part.counts, most, fill_with_first=True))
+            if OFFSETS in files:
+                files[OFFSETS].append(part.first + np.cumsum(part.counts))
+            if PROBABILITIES in files:
+                files[PROBABILITIES].append(_padded(part.likely, part.counts, most, fill_with_first=False))
+            if CODES in files and part.codes is not None:
+                files[CODES].append(part.codes.astype(dtypes[CODES]))
+
+    def of_states(self, states: np.ndarray) -> dict[int, OutcomesOfState]:
+        """The outcomes of some states, ascending."""
+        found = {}
+        for row, first, codes, counts in self._counts():
+            for state in states[
+                (states >= row // self.num_actions) & (states < (row + len(counts)) // self.num_actions)
+            ]:
+                place = int(state) * self.num_actions - row
+                here = slice(place, place + self.num_actions)
+                before = first + int(counts[:place].sum())
+                part = self._part(row + place, before, None if codes is None else codes[here], counts[here])
+                ends = np.cumsum(part.counts)[:-1]
+                likely = np.split(part.likely.view(np.float64), ends)
+                found[int(state)] = list(zip(np.split(part.successors, ends), likely, strict=True))
+        return found
+
+
+def _padded(values: np.ndarray, counts: np.ndarray, most: int, *, fill_with_first: bool) -> np.ndarray:
+    out = np.empty((len(counts), most), values.dtype)
+    palettes.padded(values, counts, fill_with_first, out)
+    return out
+
+
+def _link(source: Path, target: Path) -> None:
+    """The same file by another name; a copy, where the file system has no such names."""
+    try:
+        os.link(source, target)
+    except OSError:
+        try:
+            shutil.copyfile(source, target)
+            with open(target, "rb+") as file:
+                os.fsync(file.fileno())
+        except OSError as error:
+            raise cannot_write(target, error) from error
