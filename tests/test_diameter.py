@@ -10,6 +10,8 @@ from hypothesis import strategies as st
 from naive_hardness import distances
 from pharos import TabularMDP, hardness, random_actions
 from pharos.errors import ParameterError
+from pharos.hardness.sum_sweep import Graph
+from pharos.kernels import graph
 
 
 @st.composite
@@ -175,6 +177,18 @@ def test_a_clock_with_layers_of_many_words_is_followed():
     assert "clock" in found.method
     # the walker crosses 89 rows in 89 steps, and misses the other end one step before
     assert (found.lower, found.upper) == (period + rows - 2, period + rows - 2)
+
+
+def test_following_a_clock_may_read_each_entry_of_the_table_200_times(monkeypatch):
+    limits = []
+    monkeypatch.setattr(graph, "last_gap", lambda *arguments: limits.append(arguments[-1]) or (-3, 0))
+    mdp = clocked(30, 9, np.zeros((30, 9), bool))
+    hardness.diameter(mdp)
+    assert limits == [200 * mdp.next_states.size + 10**8]
+
+
+def test_a_graph_takes_four_bytes_a_node():
+    assert Graph.of(ring(5, 0), restart=True).dtype == np.int32
 
 
 # Start eccentricity ---------------------------------------------------------------------------------------------------

@@ -14,6 +14,7 @@ from naive_gaps import naive_gaps
 from pharos import hardness
 from pharos.errors import ParameterError, PrecisionError
 from pharos.hardness.gaps import resolved_gaps
+from pharos.hardness.ties import same_outcomes
 from pharos.mdp import TabularMDP, random_actions, sticky_actions
 from strategies import deterministic_mdps, small_mdps
 
@@ -280,6 +281,18 @@ def test_the_interval_holds_the_truth_where_values_are_off_by_all_of_their_bound
     assert result.lower <= 4.0 <= result.upper
     minimal = result.certified_minimal
     assert minimal.lower <= 0.25 <= minimal.upper
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_two_actions_have_the_same_outcomes_where_their_rows_and_rewards_are_the_same(seed):
+    rng = np.random.default_rng(seed)
+    rows = np.array([[0.5, 0.25, 0.25], [0.25, 0.5, 0.25], [0.5, 0.5, 0.0], [0.5, 0.25, 0.0], [0.0, 0.0, 1.0]])
+    matrix, rewards = rows[rng.integers(0, 5, (3, 6))], rng.integers(0, 2, (3, 6)).astype(float)
+    mdp = TabularMDP.from_matrices(matrix, rewards)
+    state, action, other = (each.ravel() for each in np.indices((3, 6, 6)))
+    expected = (matrix[state, action] == matrix[state, other]).all(axis=1)
+    expected &= rewards[state, action] == rewards[state, other]
+    assert (same_outcomes(mdp, state, rewards[state], action, other) == expected).all()
 
 
 def test_a_tolerance_of_ones_own_is_part_of_what_is_asked_for():

@@ -155,6 +155,17 @@ def test_matrices_that_are_no_mdp_get_a_clear_error(P, R, message):
         TabularMDP.from_matrices(P, R)
 
 
+def test_other_rewards_leave_terminal_states_without_any():
+    mdp = TabularMDP.from_arrays([[1], [-1]], [[1.0], [0.0]])
+    assert mdp.with_rewards([[2.0], [0.0]]).rewards.tolist() == [[2.0], [0.0]]
+    with pytest.raises(ParameterError, match=r"rewards\[1, 0\] is 3.0, but state 1 is terminal"):
+        mdp.with_rewards([[2.0], [3.0]])
+
+
+def test_next_states_take_four_bytes_each():
+    assert TabularMDP.from_arrays(np.array([[1], [0]], np.int64), np.zeros((2, 1))).next_states.dtype == np.int32
+
+
 @pytest.mark.parametrize("p", [-0.1, 1.1, float("nan"), "often"])
 @pytest.mark.parametrize("randomize", [sticky_actions, random_actions])
 def test_a_probability_lies_between_zero_and_one(randomize, p):

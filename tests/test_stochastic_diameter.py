@@ -12,6 +12,10 @@ import naive_hitting
 import pharos
 from pharos import hardness
 from pharos.errors import UndefinedMeasure
+from pharos.hardness.choices import choices_of
+from pharos.hardness.hitting_times import HittingTimes
+from pharos.hardness.interval import Spending
+from pharos.hardness.stochastic_diameter import _Diameter
 from pharos.hardness.travel import TravelBounds
 from pharos.mdp import TabularMDP, random_actions, sticky_actions
 from strategies import deterministic_mdps, general_mdps, outcome_mdps
@@ -180,6 +184,23 @@ def test_progress_shows_bounds_that_squeeze():
     found = hardness.diameter(mdp, progress=seen.append)
     assert seen[-1].candidates == 0
     assert all(each.lower <= found.upper <= each.upper * (1 + 1e-9) for each in seen)
+
+
+@pytest.mark.parametrize(("enough", "seconds"), [(math.inf, 300), (0.0, 0)])
+def test_a_target_that_is_not_the_farthest_or_beyond_the_budget_costs_no_linear_system(enough, seconds, monkeypatch):
+    problem = HittingTimes(choices_of(ring(50, 0.9), restart=True))
+    monkeypatch.setattr(problem, "_factored", lambda _: pytest.fail("solves a linear system"))
+    j, count, _ = problem.open(0)
+    bounds = problem.solve(j, count, 1e-12, enough, Spending(hardness.Budget(seconds=seconds), None))
+    assert not bounds.meets(1e-12) and bounds.lower <= 490 <= bounds.upper
+
+
+def test_the_farthest_target_so_far_makes_the_guess_for_the_next():
+    """Every step of a lazy ring takes ten."""
+    mdp = ring(20, 0.9)
+    search = _Diameter(mdp, True, choices_of(mdp, restart=True), 1e-6, Spending(hardness.Budget(), None))
+    search.interval({})
+    assert search.targets.initial_scale == pytest.approx(10, rel=1e-3)
 
 
 # Large hitting times --------------------------------------------------------------------------------------------------
