@@ -13,8 +13,8 @@ import pharos
 from pharos import environments
 from pharos.agents import hyperparameters
 from pharos.drawing import human, scenery_of, text_drawing
-from pharos.environments import BuiltIn, catalog
-from pharos.errors import ParameterError, UnknownName
+from pharos.environments import BuiltIn, Scenery, catalog
+from pharos.errors import ParameterError, RuleError, UnknownName
 from pharos.observations import render
 
 figures = importlib.import_module("pharos.study.figures")
@@ -173,6 +173,24 @@ def test_the_list_says_what_the_classes_say():
         cls = getattr(environments, entry.class_name)
         version = max(0, cls.version - cls.first_version)
         assert entry == BuiltIn(cls.name, cls.__name__, " ".join(cls.instances), version)
+
+
+def test_the_conformance_kit_names_a_ground_or_shape_that_nobody_paints(corridor):
+    import dataclasses
+
+    cls = type(corridor)
+
+    def lost(**attributes):
+        return dataclasses.dataclass(frozen=True, kw_only=True)(type("Lost", (cls,), attributes))()
+
+    with pytest.raises(RuleError, match=r"Lost\.look\.ground: unknown ground 'rood'; did you mean 'road'"):
+        pharos.check_environment(lost(look=dataclasses.replace(cls.look, ground="rood")))
+    scenery = Scenery(cell=(8, 8), margin=(0, 0, 0, 0), ground="watr")
+    with pytest.raises(RuleError, match=r"Lost\.look\.scenery\.ground: unknown ground 'watr'"):
+        pharos.check_environment(lost(look=dataclasses.replace(cls.look, scenery=scenery)))
+    layers = {**cls.layers, "goal": dataclasses.replace(cls.layers["goal"], shape="bal")}
+    with pytest.raises(RuleError, match=r"Lost\.layers\['goal'\]\.shape: unknown shape 'bal'; did you mean 'ball'"):
+        pharos.check_environment(lost(layers=layers))
 
 
 def test_every_class_of_the_list_has_ids_a_colour_and_instances_that_can_be_made():

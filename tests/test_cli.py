@@ -267,6 +267,18 @@ def test_the_cache_is_listed_and_cleared(tmp_path, monkeypatch):
     assert not (tmp_path / "compiled").exists()
 
 
+def test_compiled_rules_in_the_folder_of_ones_own_are_listed_and_cleared(tmp_path, monkeypatch):
+    monkeypatch.setenv("PHAROS_CACHE_DIR", str(tmp_path))
+    run = CliRunner()
+    mine, anothers = tmp_path / f"compiled-{os.getuid()}", tmp_path / f"compiled-{os.getuid() + 1}"
+    for folder in (mine, anothers):
+        folder.mkdir()
+        (folder / "kernel").write_bytes(bytes(1000))
+    assert json.loads(run.invoke(app, ["cache", "list", "--json"]).stdout)["compiled_bytes"] == 1000
+    assert json.loads(run.invoke(app, ["cache", "clear", "--json"]).stdout)["bytes_freed"] == 1000
+    assert not mine.exists() and anothers.exists()
+
+
 # solve ---------------------------------------------------------------------------------------------------------------
 
 SOLVE_KEYS = {"value_at_start", "uniform_value_at_start", "error_bound", "sweeps", "seconds", "gamma", "horizon"}

@@ -154,6 +154,36 @@ def test_a_run_killed_while_it_replaces_its_checkpoint_loses_one_interval(moved,
     assert not list(run.glob("checkpoint*"))
 
 
+def test_a_checkpoint_is_on_the_disk_before_the_older_one_goes(tmp_path, monkeypatch):
+    class Learner:
+        def save(self, folder):
+            (folder / "network").mkdir()
+            (folder / "network" / "weights").write_bytes(b"weights")
+
+    synced, moves = set(), []
+    sync, replace = os.fsync, os.replace
+
+    def syncing(descriptor):
+        synced.add(os.fstat(descriptor).st_ino)
+        sync(descriptor)
+
+    def replacing(source, target):
+        moves.append((Path(source).name, Path(target).name))
+        if Path(source).name == "checkpoint.partial":
+            assert {path.stat().st_ino for path in (*Path(source).rglob("*"), Path(source))} <= synced
+        replace(source, target)
+
+    monkeypatch.setattr(os, "fsync", syncing)
+    monkeypatch.setattr(os, "replace", replacing)
+    checkpoint = _train._Checkpoint(tmp_path / "checkpoint", "id")
+    for _ in range(2):
+        synced.clear()
+        checkpoint.save(Learner(), [], 0.0)
+        assert tmp_path.stat().st_ino in synced
+    swap = ("checkpoint.partial", "checkpoint")
+    assert moves == [swap, ("checkpoint", "checkpoint.old"), swap]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("agent", ["dqn", "ppo"])
 def test_a_resumed_agent_does_not_repeat_its_first_random_numbers(agent, tmp_path):

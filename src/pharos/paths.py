@@ -14,3 +14,9 @@ def cache_directory() -> Path:
     if sys.platform == "win32":
         return Path(os.environ.get("LOCALAPPDATA", Path.home())) / "pharos" / "Cache"
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "pharos"
+
+
+def compiled_folders(cache: Path) -> list[Path]:
+    """Where compiled rules may be in a cache, the first choice first: `compiled-NUMBER` where another user has that."""
+    users = [cache / f"compiled-{os.getuid()}"] if hasattr(os, "getuid") else []
+    return [cache / "compiled", *users]

@@ -20,7 +20,7 @@ def list_(json: Json = False) -> None:
 
     directory = paths.cache_directory()
     spaces = _spaces(directory)
-    compiled = bytes_of(directory / "compiled")
+    compiled = sum(map(bytes_of, _compiled(directory)))
     total = compiled + sum(space["bytes"] for space in spaces)
     if json:
         print_json({"directory": directory, "spaces": spaces, "compiled_bytes": compiled, "total_bytes": total})
@@ -55,13 +55,19 @@ def clear(
                 shutil.rmtree(folder)
             removed.append(space["folder"])
             freed += space["bytes"]
-    if not environments and (directory / "compiled").is_dir():
-        freed += bytes_of(directory / "compiled")
-        shutil.rmtree(directory / "compiled")
+    for folder in _compiled(directory) if not environments else ():
+        freed += bytes_of(folder)
+        shutil.rmtree(folder)
     if json:
         print_json({"removed": removed, "bytes_freed": freed, "directory": directory})
         return
     print(f"{len(removed)} state space{'s' * (len(removed) != 1)} deleted, {size_text(freed)} freed in {directory}")
+
+
+def _compiled(directory: Path) -> list[Path]:
+    from pharos import paths
+
+    return [folder for folder in paths.compiled_folders(directory) if folder.is_dir()]
 
 
 def _spaces(directory: Path) -> list[dict[str, Any]]:

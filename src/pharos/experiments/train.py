@@ -29,6 +29,7 @@ from pharos.experiments.evaluation import evaluate_agent
 from pharos.experiments.learners import Learner, make_learner
 from pharos.experiments.task import Task, TaskValues
 from pharos.observations import own_observation
+from pharos.storage import sync
 
 Progress = Callable[[int, int, Mapping[str, Any]], None]
 CHECKPOINT_SECONDS = 10.0
@@ -364,11 +365,14 @@ class _Checkpoint:
         partial.mkdir(parents=True)
         learner.save(partial)
         (partial / "curve.json").write_text(json.dumps({"id": self.id, "rows": rows, "seconds": seconds}))
+        for path in (*partial.rglob("*"), partial):  # the older one goes only when this one is on the disk
+            sync(path)
         old = self.folder.with_name(f"{self.folder.name}.old")
         if self.folder.exists():
             shutil.rmtree(old, ignore_errors=True)
             os.replace(self.folder, old)
         os.replace(partial, self.folder)
+        sync(self.folder.parent)
         shutil.rmtree(old, ignore_errors=True)
         self._saved = time.monotonic()
 

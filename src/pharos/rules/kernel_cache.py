@@ -21,6 +21,7 @@ from numba.core.compiler import CompileResult
 from numba.core.serialize import dumps
 
 from pharos import paths, storage
+from pharos.paths import compiled_folders
 
 DIGEST_BYTES = 32
 
@@ -83,11 +84,8 @@ def private_folder(cache_directory: Path) -> Path | None:
     It is `compiled`, or, where several users share the cache, `compiled-` and the user's number. A warning says what is
     wrong with a folder that is refused.
     """
-    candidates = [cache_directory / "compiled"]
-    if hasattr(os, "getuid"):
-        candidates.append(cache_directory / f"compiled-{os.getuid()}")
     problems = []
-    for folder in candidates:
+    for folder in compiled_folders(cache_directory):
         problem = _problem_of(folder)
         if not problem:
             break

@@ -1,13 +1,15 @@
 """What `check_environment` demands of the declarations of a class: attributes, variables, start states, layers."""
 
+import contextlib
 import json
 import numbers
 import operator
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
+from pharos.drawing import ground_of, shape_of
 from pharos.environments import Environment, Layer, start_distribution
-from pharos.errors import ParameterError, RuleError
+from pharos.errors import ParameterError, RuleError, UnknownName
 
 SPRITE_LETTERS = set(".#123456789")
 
@@ -83,8 +85,14 @@ def check_layers(env: Environment, notes: list[str]) -> None:
                 f"{whose}.layers[{name!r}] has {len(glyphs)} glyphs and {len(colors)} colors; "
                 f"expected one color for all, or one for each"
             )
+        with _named(f"{whose}.layers[{name!r}].shape"):
+            shape_of(name, layer)
         if layer.sprite is not None:
             _check_sprites(f"{whose}.layers[{name!r}].sprite", layer.sprite, len(glyphs))
+    for place, look in (("look", env.look), ("look.scenery", env.look.scenery)):
+        if look is not None:
+            with _named(f"{whose}.{place}.ground"):
+                ground_of(look.ground)
     try:
         rows, columns = env.grid()
         fits = operator.index(rows) >= 1 and operator.index(columns) >= 1
@@ -94,6 +102,15 @@ def check_layers(env: Environment, notes: list[str]) -> None:
         raise RuleError(
             f"{env}: it has layers but grid() does not give (rows, columns); expected two integers, at least 1"
         )
+
+
+@contextlib.contextmanager
+def _named(whose: str) -> Iterator[None]:
+    """A name that nobody paints is a breach of the contract."""
+    try:
+        yield
+    except UnknownName as error:
+        raise RuleError(f"{whose}: {error}") from None
 
 
 def _check_sprites(whose: str, sprite: Any, num_values: int) -> None:
