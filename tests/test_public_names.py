@@ -23,8 +23,8 @@ HEAVY = ("numba", "scipy", "pandas", "matplotlib", "torch", "rich", "typer", "st
 
 # A part imports only what stands before it, at the top of a file and inside of functions alike.
 ORDER = (
-    *("errors", "paths", "storage", "sources", "workers", "kernels", "environments", "drawing", "rules", "state_space"),
-    *("mdp", "solvers"),
+    *("errors", "paths", "wording", "storage", "sources", "workers", "kernels", "environments", "drawing", "rules"),
+    *("state_space", "mdp", "solvers"),
     *("hardness", "importers", "exporters", "observations", "interaction", "policies", "agents", "experiments"),
     *("plots", "study", "sb3_env", "bisimulation", "cli", "__main__"),
 )

@@ -181,7 +181,12 @@ def test_runs_of_different_length_or_without_regret_leave_a_report(tmp_path):
     report = study.report(spec, tmp_path)
     page = report.html.read_text()
     assert "no cells of DQN with both" in page and "fewer than three cells that both DQN and PPO" in page
+    assert report.notes == [
+        "q_learning sees the index of the state: models are of agents that see observations",
+        "no cell of dqn has all measures: there are no models",
+    ]
     assert report.notes[-1] == "no cell of dqn has all measures: there are no models"
+    assert "3 of 3 runs are finished: 1 instance of 1 class" in page
 
 
 def test_numbers_are_short():

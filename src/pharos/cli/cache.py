@@ -9,6 +9,7 @@ import typer
 
 from pharos.cli.common import Json, bytes_of, console, print_json, size_text
 from pharos.errors import PharosError, StateSpaceLocked, UnknownName
+from pharos.wording import many
 
 app = typer.Typer(help="List or clear the cached state spaces.", no_args_is_help=False)
 
@@ -61,7 +62,7 @@ def clear(
     if json:
         print_json({"removed": removed, "bytes_freed": freed, "directory": directory})
         return
-    print(f"{len(removed)} state space{'s' * (len(removed) != 1)} deleted, {size_text(freed)} freed in {directory}")
+    print(f"{many(len(removed), 'state space')} deleted, {size_text(freed)} freed in {directory}")
 
 
 def _compiled(directory: Path) -> list[Path]:
@@ -117,7 +118,7 @@ def _print(directory: Path, spaces: list[dict[str, Any]], compiled: int, total: 
     if spaces:
         to.print(table)
     to.print(
-        f"{len(spaces)} state space{'s' * (len(spaces) != 1)} and {size_text(compiled)} of compiled rules: "
+        f"{many(len(spaces), 'state space')} and {size_text(compiled)} of compiled rules: "
         f"{size_text(total)} in {escape(str(directory))}",
         soft_wrap=True,
     )

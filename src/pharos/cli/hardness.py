@@ -21,6 +21,7 @@ from pharos.cli.common import (
     print_json,
     progress_line,
 )
+from pharos.wording import many
 
 # What the column "exact" says of each kind of certificate.
 PROVEN = {"exact": "yes", "interval": "interval", "float64": "float64"}
@@ -128,7 +129,7 @@ def _print(title: str, report: Any, chance: str, definitions: bool) -> None:
     to.print(f"[bold]{escape(title)}[/bold]", soft_wrap=True)
     horizon = "none" if conventions["horizon"] is None else conventions["horizon"]
     to.print(
-        f"{conventions['num_states']:,} states x {conventions['num_actions']} actions, "
+        f"{many(conventions['num_states'], 'state')} x {many(conventions['num_actions'], 'action')}, "
         f"discount {conventions['gamma']:g}, horizon {horizon}, chance: {chance}",
         style="dim",
         soft_wrap=True,

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pharos.cli.common import Json, print_facts, print_json
+from pharos.wording import many
 
 if TYPE_CHECKING:
     from pharos.mdp import TabularMDP
@@ -62,5 +63,5 @@ def _tell(name: str, mdp: "TabularMDP", out: Path, json: bool) -> None:
             }
         )
         return
-    size = f"{mdp.num_states:,} x {mdp.num_actions} actions"
+    size = f"{mdp.num_states:,} x {many(mdp.num_actions, 'action')}"
     print_facts(name, [("states", size), ("horizon", mdp.horizon), ("folder", out)])

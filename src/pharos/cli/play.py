@@ -11,6 +11,7 @@ import typer
 from pharos.cli.common import Json, Parameters, TargetArgument, console, parse_target, print_json
 from pharos.cli.render import environment_of, find_state
 from pharos.errors import PharosError
+from pharos.wording import many
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -57,7 +58,7 @@ def play(
             }
         )
     else:
-        print(f"{env.name}: {game.steps} steps, return {game.total:g}{', ended' if game.over else ''}")
+        print(f"{env.name}: {many(game.steps, 'step')}, return {game.total:g}{', ended' if game.over else ''}")
 
 
 class Game:

@@ -25,6 +25,7 @@ from pharos.cli.common import (
     print_json,
     progress_line,
 )
+from pharos.wording import many
 
 
 def solve(
@@ -86,7 +87,7 @@ def solve(
         ("error at most", f"{max(solution.error_bound, uniform.error_bound):.2g}"),
         ("discount", describe_discount(solution.gamma, solution.horizon)),
         ("chance", describe_chance(sticky, random)),
-        ("states", f"{mdp.num_states:,} x {mdp.num_actions} actions"),
+        ("states", f"{mdp.num_states:,} x {many(mdp.num_actions, 'action')}"),
         ("sweeps", f"{solution.sweeps} in {solution.seconds:.2f} s"),
     ]
     if out is not None:

@@ -13,6 +13,7 @@ import typer
 
 from pharos.cli.common import Json, Trust, complain, console, parse_parameters, print_json, progress_line
 from pharos.errors import UnknownName
+from pharos.wording import many
 
 app = typer.Typer(help="Run a grid of training runs, and make the paper's figures and tables of it.")
 
@@ -60,7 +61,7 @@ def show(spec: SpecArgument, trust: Trust = False, json: Json = False) -> None:
     to = console()
     to.print(f"[bold]{escape(study.name)}[/bold]  {escape(study.description)}", soft_wrap=True)
     to.print(table)
-    to.print(f"{len(runs):,} runs, {sum(_steps(runs)):,} steps", style="dim")
+    to.print(f"{many(len(runs), 'run')}, {many(sum(_steps(runs)), 'step')}", style="dim")
 
 
 @app.command("run")
@@ -199,7 +200,7 @@ def pack(
     if json:
         print_json({"file": str(to), "runs": number})
         return
-    print(f"{to}: {number} runs, {to.stat().st_size:,} bytes")
+    print(f"{to}: {many(number, 'run')}, {to.stat().st_size:,} bytes")
 
 
 @app.command("unpack")
@@ -220,7 +221,7 @@ def unpack(
     if json:
         print_json({"folder": str(folder), "added": number})
         return
-    print(f"{folder}: {number} runs added; `pharos study report {folder}` reports on them")
+    print(f"{folder}: {many(number, 'run')} added; `pharos study report {folder}` reports on them")
 
 
 def _answer(status: Any, json: bool) -> None:
@@ -229,7 +230,7 @@ def _answer(status: Any, json: bool) -> None:
         return
     print(status)
     if status.missing:
-        print(f"{status.missing} runs missing; `pharos study run` goes on from there")
+        print(f"{many(status.missing, 'run')} missing; `pharos study run` goes on from there")
     for error, count in Counter(status.errors.values()).most_common(5):
         complain(f"{count} x {error}")
     for problem in list(status.damaged.values())[:5]:

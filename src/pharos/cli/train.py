@@ -20,6 +20,7 @@ from pharos.cli.common import (
     print_json,
     progress_bar,
 )
+from pharos.wording import many
 
 if TYPE_CHECKING:
     from pharos.experiments import TrainingResult
@@ -123,7 +124,7 @@ def _facts(run: "TrainingResult", steps: int, chance: str) -> list[tuple[str, ob
         ("final regret", f"{result['final_regret']:.6g}"),
         ("cumulative regret", f"{learnt:.6g} of the learnt policies, {played:.6g} as played"),
         ("normalized regret", shown),
-        ("mean return", f"{result['mean_return']:.6g} over {result['episodes']:,} episodes"),
+        ("mean return", f"{result['mean_return']:.6g} over {many(result['episodes'], 'episode')}"),
         ("values", "exact" if result["exact"] else "some are estimates, see exact in curve.parquet"),
         ("chance", chance),
         ("seconds", f"{run.seconds:.1f} ({steps / run.seconds:,.0f} steps/s, evaluation included)"),
@@ -148,6 +149,6 @@ def _telling(show: Callable[[int, str], None] | None) -> Callable[[int, int, Any
         return None
 
     def tell(done: int, _steps: int, row: Any) -> None:
-        show(done, f"value {row['value']:.4g}, regret {row['expected_regret']:.4g}, {row['episodes']:,} episodes")
+        show(done, f"value {row['value']:.4g}, regret {row['expected_regret']:.4g}, {many(row['episodes'], 'episode')}")
 
     return tell

@@ -33,6 +33,7 @@ from pharos.experiments.search_space import allows, checked_space, default_value
 from pharos.experiments.task import Task
 from pharos.experiments.train import train_on
 from pharos.observations import own_observation
+from pharos.wording import many
 
 EVALUATIONS = 20  # of a run
 
@@ -133,7 +134,7 @@ def tune(
     if missing > 0:
         study.optimize(lambda trial: search.score(trial, optuna.TrialPruned), n_trials=missing, callbacks=[after])
     if not math.isfinite(_best(study)):
-        raise ParameterError(f"none of {trials} trials was finished; give more trials, or look at tuning.json")
+        raise ParameterError(f"none of {many(trials, 'trial')} was finished; give more trials, or look at tuning.json")
     records = _trials(study)
     return TuningResult(
         agent=agent,
@@ -309,7 +310,7 @@ def _write(folder: Path, search: _Search, study: Any) -> None:
 
         best = {**search.table, **study.best_params}
         record["best"] = {"trial": study.best_trial.number, "score": study.best_value, "hyperparameters": best}
-        head = f"# Mean normalised regret {study.best_value:.4f} after {_done(study)} trials, see tuning.json\n"
+        head = f"# Mean normalised regret {study.best_value:.4f} after {many(_done(study), 'trial')}, see tuning.json\n"
         text = head + yaml.safe_dump(
             {search.agent: {search.environment: {search.observation_name: best}}}, sort_keys=False
         )

@@ -15,6 +15,7 @@ from pharos.hardness.interval import Budget, Interval, Progress, Spending, conve
 from pharos.hardness.stochastic_diameter import stochastic_diameter, stochastic_start_eccentricity
 from pharos.hardness.sum_sweep import Graph, SumSweep
 from pharos.mdp import TabularMDP, takes_mdp
+from pharos.wording import many
 
 
 @takes_mdp
@@ -107,7 +108,7 @@ def start_eccentricity_interval(
     note, infinite, largest = "", False, 0
     for start, weight in zip(starts, weights, strict=True):
         if spending.is_over and spending.searches:
-            note = f"budget spent after the searches from {spending.searches} of {len(starts)} start states"
+            note = f"budget spent after the searches from {spending.searches} of {many(len(starts), 'start state')}"
             break
         reached, largest, _ = graph.search_forward(int(start), distance)
         spending.searches += 1

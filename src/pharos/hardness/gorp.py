@@ -19,6 +19,7 @@ from pharos.hardness.gorp_tails import Tails, knapsack, sequences_of
 from pharos.hardness.return_distribution import central_moments
 from pharos.hardness.steps import TIE, Steps, steps_of
 from pharos.mdp import TabularMDP, takes_mdp
+from pharos.wording import many
 
 METHODS = ("binomial", "berry_esseen", "bernstein", "bennett", "exact")
 MOST_SAMPLES = 10**100
@@ -156,7 +157,9 @@ class GorpRuns:
         }
 
     def __str__(self) -> str:
-        return f"{self.success_rate:.3g} of {len(self.returns)} runs optimal, {self.timesteps:,} steps each"
+        return (
+            f"{self.success_rate:.3g} of {many(len(self.returns), 'run')} optimal, {many(self.timesteps, 'step')} each"
+        )
 
 
 @takes_mdp

@@ -11,6 +11,7 @@ import numpy as np
 from pharos.hardness.interval import Interval, Spending
 from pharos.kernels import graph
 from pharos.mdp import TabularMDP
+from pharos.wording import many
 
 # Untyped, as starred arguments of compiled functions are not checked.
 kernels: Any = graph
@@ -115,7 +116,7 @@ class SumSweep:
         self._sweep()
         upper = self._upper()
         if upper > self.best:
-            note = f"budget spent: {self._open()[0]} states may have a larger eccentricity than {self.best}"
+            note = f"budget spent: {many(self._open()[0], 'state')} may have a larger eccentricity than {self.best}"
             if clock:
                 note += f"; {clock}"
         return self._result(self.best, upper, note)
@@ -311,7 +312,7 @@ def _infinite_diameter(graph: Graph, spending: Spending, conventions: dict[str, 
     counted = done == size
     note = "some states cannot be reached from others"
     if not counted:
-        note += f"; budget spent after the pairs from {done} of {size} states, so the counts are lower bounds"
+        note += f"; budget spent after the pairs from {done} of {many(size, 'state')}, so the counts are lower bounds"
         unreachable = max(unreachable, 1)
     return Interval(
         math.inf,

@@ -364,7 +364,8 @@ class TabularMDP:
         kind = "" if self.dynamics.is_deterministic else "general, "
         chance = "" if self.chance == Chance() else f", {self.chance}"
         horizon = "" if self.horizon is None else f", horizon={self.horizon}"
-        size = f"{self.num_states} states, {self.num_actions} actions"
+        states, actions = ("s" * (number != 1) for number in (self.num_states, self.num_actions))
+        size = f"{self.num_states} state{states}, {self.num_actions} action{actions}"
         return f"TabularMDP({kind}{size}, gamma={self.gamma}{horizon}{chance})"
 
 

@@ -7,6 +7,7 @@ import numpy as np
 
 from pharos.errors import ParameterError
 from pharos.plots.style import COLORS, plain_log, single, styled
+from pharos.wording import many
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -47,7 +48,7 @@ def growth(spaces: Mapping[str, "StateSpace"], *, axes: Any = None) -> "Figure":
     for number, (label, space) in enumerate(spaces.items()):
         within, color = states_by_depth(space).cumsum(), COLORS[number % len(COLORS)]
         distance = np.arange(1, len(within) + 1)
-        axis.plot(distance, within, color=color, label=f"{label}: {space.num_states:,} states")
+        axis.plot(distance, within, color=color, label=f"{label}: {many(space.num_states, 'state')}")
         axis.plot(distance[-1:], within[-1:], "o", color=color, markersize=5)
     axis.set(xscale="log", yscale="log", xlabel="steps from the start + 1", ylabel="states")
     for side in (axis.xaxis, axis.yaxis):

@@ -46,7 +46,7 @@ class Conformance:
 
     def __str__(self) -> str:
         which = f"all {self.num_states}" if self.complete else f"a sample of {self.num_states}"
-        first = f"{self.environment} keeps the contract in {which} states"
+        first = f"{self.environment} keeps the contract in {which} {'state' if self.num_states == 1 else 'states'}"
         return "\n".join([first, *(f"  note: {note}" for note in self.notes)])
 
 

@@ -26,6 +26,7 @@ from pharos.study.blocks import Run, Specification
 from pharos.study.processes import end_processes, one_thread, processors, worker_context
 from pharos.study.specification import Source
 from pharos.study.status import Status, claim, duration, opened, status
+from pharos.wording import many
 
 __all__ = ["Execution", "Options", "Status", "claim", "duration", "opened", "processors", "run", "shard_of", "status"]
 
@@ -248,7 +249,8 @@ class Execution:
         self.lost_servers += 1
         if self.lost_servers > LOST_SERVERS:
             raise PharosError(
-                f"the process that starts runs died {self.lost_servers} times in a row ({_worker.describe(error)}); "
+                f"the process that starts runs died {many(self.lost_servers, 'time')} in a row "
+                f"({_worker.describe(error)}); "
                 f"was there memory enough?"
             ) from error
         time.sleep(BUSY_SECONDS)

@@ -23,6 +23,7 @@ from pharos.study.specification import (
     study_folder,
     study_name,
 )
+from pharos.wording import many
 
 
 @dataclass(frozen=True)
@@ -63,7 +64,7 @@ class Status:
     def __str__(self) -> str:
         if self.preparing:
             return f"{self.name}: {self.preparing}"
-        text = f"{self.name}: {self.finished} of {self.total} runs finished"
+        text = f"{self.name}: {self.finished} of {many(self.total, 'run')} finished"
         if self.failed:
             text += f", {self.failed} failed"
         if self.damaged:

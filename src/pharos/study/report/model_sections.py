@@ -10,6 +10,7 @@ from pharos.study.regression import Fit
 from pharos.study.report.page import Figures, image, table
 from pharos.study.report.results import Results, coefficients
 from pharos.study.report.section import Section
+from pharos.wording import many
 
 
 def models_section(results: Results, figures: Figures, left_out: list[str]) -> Section | None:
@@ -92,7 +93,7 @@ def agreement_section(results: Results, figures: Figures, left_out: list[str]) -
             for value in ("return", "normalized_regret", "cumulative_regret"):
                 if (pair := agreement(results.cells, value, (one, two))) is not None:
                     names = f"{agent_name(one)} and {agent_name(two)}, {REGRETS.get(value, value)}"
-                    lines.append(f"{names}: r = {pair[0]:.2f} over {pair[1]} cells")
+                    lines.append(f"{names}: r = {pair[0]:.2f} over {many(pair[1], 'cell')}")
             caption = f"Normalised regret of {agent_name(two)} against that of {agent_name(one)}."
             drawn.append(image(figures, agents_figure(one, two), caption))
     if not lines:

@@ -56,7 +56,10 @@ class Results:
     @property
     def notes(self) -> list[str]:
         """What is left out of the report, and why."""
-        return list(dict.fromkeys([*self.damaged.values(), *(note for each in self.models for note in each.notes)]))
+        notes = list(self.damaged.values())
+        if not self.agents:
+            notes.append(f"{_listed(self.runs)} the index of the state: models are of agents that see observations")
+        return list(dict.fromkeys([*notes, *(note for each in self.models for note in each.notes)]))
 
 
 def results_of(study: Specification, place: Path, progress: Callable[[str], None] = lambda _: None) -> Results:
@@ -99,6 +102,12 @@ def results_of(study: Specification, place: Path, progress: Callable[[str], None
         comparison=compare(table, study.runs, fitted[: len(REGRETS)]) if of_the_paper else None,
         findings=findings(table, fitted[0]) if of_the_paper else None,
     )
+
+
+def _listed(runs: "pd.DataFrame") -> str:
+    """Whom a study without observations has: "q_learning sees", "q_learning and sarsa see"."""
+    names = sorted(runs["agent"].unique())
+    return f"{' and '.join(names)} {'sees' if len(names) == 1 else 'see'}"
 
 
 def observing_agents(runs: "pd.DataFrame") -> list[str]:

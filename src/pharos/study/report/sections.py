@@ -18,6 +18,7 @@ from pharos.study.report.results import Results
 from pharos.study.report.section import Section
 from pharos.study.specification import Specification
 from pharos.study.status import duration
+from pharos.wording import many
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -46,19 +47,15 @@ def sections_of(results: Results, figures: Figures) -> list[Section]:
     return [section for section in sections if section is not None]
 
 
-def _many(count: int, one: str, several: str | None = None) -> str:
-    return f"{count:,} {one if count == 1 else several or one + 's'}"
-
-
 def _summary(results: Results) -> Section:
     now, runs = results.status, results.runs
     failed = f", {now.failed} failed" if now.failed else ""
     lines = [
-        f"{now.finished:,} of {now.total:,} runs are finished{failed}: "
-        f"{_many(runs['instance'].nunique(), 'instance')} of "
-        f"{_many(runs['environment'].nunique(), 'class', 'classes')}, {_many(runs['chance'].nunique(), 'kind')} of "
+        f"{now.finished:,} of {many(now.total, 'run')} {'is' if now.total == 1 else 'are'} finished{failed}: "
+        f"{many(runs['instance'].nunique(), 'instance')} of "
+        f"{many(runs['environment'].nunique(), 'class', 'classes')}, {many(runs['chance'].nunique(), 'kind')} of "
         f"chance, "
-        f"{_many(runs['agent'].nunique(), 'agent')}, {_many(runs['seed'].nunique(), 'seed')}; "
+        f"{many(runs['agent'].nunique(), 'agent')}, {many(runs['seed'].nunique(), 'seed')}; "
         f"{int(runs['steps'].sum()):,} steps, which took one processor {duration(runs['seconds'].sum())}."
     ]
     if (estimated := _estimated(runs)) is not None:
@@ -77,7 +74,7 @@ def _summary(results: Results) -> Section:
         known = int(returns["ours"].notna().sum())
         lines.append(f"{known} of the {len(returns)} returns that the paper prints have their counterpart here.")
     missing = (
-        f"{_many(now.missing, 'run')} missing: every number below is of the runs that are there." if now.missing else ""
+        f"{many(now.missing, 'run')} missing: every number below is of the runs that are there." if now.missing else ""
     )
     errors = [f"{count} × {error}" for error, count in Counter(now.errors.values()).items()]
     damaged = list({**now.damaged, **results.damaged}.values())
@@ -92,7 +89,7 @@ def _estimated(runs: "pd.DataFrame") -> str | None:
     groups = estimates.groupby(["environment", "agent"], sort=True).size()
     of = ", ".join(f"{agent_name(agent)} on {title(name)} ({count})" for (name, agent), count in groups.items())
     return (
-        f"The regret of {_many(len(estimates), 'run')} of {len(runs):,} is estimated by playing, because the policy "
+        f"The regret of {many(len(estimates), 'run')} of {len(runs):,} is estimated by playing, because the policy "
         f"reaches too "
         f"many states for an exact value: {of}. Their normalised regret may be off by up to ± "
         f"{estimates['half_width'].max():.4f} "
