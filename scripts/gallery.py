@@ -25,6 +25,8 @@ INSTANCES = {
     "pocket_cube": (("pocket_cube/half", 0), ("pocket_cube/quarter", 8)),
     "sokoban": (("sokoban/pillar", 9), ("sokoban/storehouse", 12)),
     "mini_grid": (("mini_grid/key-corridor-s4r3", 7), ("mini_grid/lava-crossing-s9n2", 3)),
+    "mini_grid_empty": (("mini_grid_empty/8x8", 4),),
+    "mini_grid_rooms": (("mini_grid_rooms/9x4", 12),),
 }
 PLAYED = {
     "simple_grid": "simple_grid/6x6-decoy",
@@ -32,6 +34,8 @@ PLAYED = {
     "freeway": "freeway/16x7-speed1",
     "breakout": "breakout/12x8x3",
     "mini_grid": "mini_grid/unlock-pickup",
+    "mini_grid_empty": "mini_grid_empty/8x8",
+    "mini_grid_rooms": "mini_grid_rooms/9x4",
     "sliding_tiles": "sliding_tiles/3x3-hardest",
     "pocket_cube": "pocket_cube/quarter",
     "sokoban": "sokoban/storehouse",

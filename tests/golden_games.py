@@ -60,6 +60,16 @@ GAMES = {
         {"level": "##########/##>>BRAB##/##########", "target": "AB"},
         "pdtfp",
     ),
+    "mini_grid_empty_goal_pays_at_every_step": (
+        "mini_grid_empty",
+        {"size": 3},
+        ["turn right", "turn right", *["forward"] * 3, "turn right", "forward", "turn left", "forward"],
+    ),
+    "mini_grid_rooms_through_a_door": (
+        "mini_grid_rooms",
+        {"room_size": 2, "seed": 1},
+        [*(["turn left"] + ["forward"] * 2) * 2, "turn left", "forward", *(["turn right"] + ["forward"] * 3) * 2],
+    ),
     "mini_grid_lava": ("mini_grid/lava-gap-s5", {"seed": 1}, "rflfrf"),
     "sokoban_corner_solved": ("sokoban/corner", {}, "rdldr"),
     "sokoban_off_and_on_a_target": ("sokoban", {"level": "#######/#-@*--#/#---$-#/#---.-#/#######"}, "rddrruuld"),

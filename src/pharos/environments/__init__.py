@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from pharos.environments.frozen_lake import FrozenLake
     from pharos.environments.look import Color, Ground, Layer, Look, Margin, Scenery, Shape, Sprite
     from pharos.environments.mini_grid import MiniGrid
+    from pharos.environments.mini_grid_empty import MiniGridEmpty
+    from pharos.environments.mini_grid_rooms import MiniGridRooms
     from pharos.environments.parameters import (
         CELL,
         VALUED_CELLS,
@@ -93,6 +95,8 @@ __all__ = [
     "Look",
     "Margin",
     "MiniGrid",
+    "MiniGridEmpty",
+    "MiniGridRooms",
     "Parameter",
     "PocketCube",
     "Scenery",

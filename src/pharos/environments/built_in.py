@@ -64,6 +64,8 @@ BUILT_IN = (  # in the order in which they are listed
         "simple-crossing-s9n2 simple-crossing-s9n3 simple-crossing-s11n5 multi-room-n2-s4 multi-room-n4-s5 "
         "multi-room-n6-s5 multi-room-n6-s10 dist-shift1 dist-shift2",
     ),
+    BuiltIn("mini_grid_empty", "MiniGridEmpty", "8x8 8x8-lazy"),
+    BuiltIn("mini_grid_rooms", "MiniGridRooms", "4x3 9x4"),
 )
 
 _LISTENERS: list[Callable[[type["Environment"]], None]] = []

@@ -1,0 +1,242 @@
+"""`mini_grid_empty` and `mini_grid_rooms`: Colosseum's published diameters, and its layouts of a seed.
+
+Colosseum iterates in single precision and stops when no entry changes by 0.001 (by 0.01 in episodes, once a target adds
+less than a step to those before it), so what it prints lies below the exact number. Twins that stop as it does give
+what it prints; pharos gives the exact number, to which the twins converge.
+"""
+
+from collections import deque
+
+import numpy as np
+import pytest
+from scipy import sparse
+
+import pharos
+from pharos import TabularMDP, hardness
+from pharos.drawing import text_drawing
+from pharos.errors import ParameterError
+from pharos.hardness.colosseum import colosseum_diameter
+
+STOPS = (1e-3, 1e-2)  # where Colosseum stops
+ULPS = 8  # roundings of single precision that the order of its sums leaves open
+
+# size, p_lazy, p_rand, n_starting_states -> printed, all with seed 0
+EPISODIC = {
+    (6, 0.1, 0.05, 3): 16.600589752197266,
+    (6, 0.35, 0.0, 5): 52.685142517089844,
+    (6, 0.0, 0.0, 3): 11.666666984558105,
+    (8, 0.02, 0.4, 3): 83.5987777709961,
+    (8, 0.0, 0.3, 3): 46.404510498046875,
+    (10, 0.1, 0.0, 5): 23.599802017211914,
+    (10, 0.0, 0.3, 3): 64.3434066772461,
+}
+CONTINUOUS = {
+    (8, 0.7, 0.0, 3): 59.996017,
+    (10, 0.02, 0.7, 3): 79.23573,
+    (10, 0.1, 0.21, 3): 31.011705,
+    (12, 0.05, 0.495, 3): 55.483757,
+    (12, 0.1, 0.395, 3): 48.555496,
+    (12, 0.3, 0.0, 3): 37.141914,
+    (12, 0.7, 0.0, 3): 86.66201,
+    (14, 0.1, 0.6, 3): 86.7276,
+}
+
+
+def some(published, quick):
+    return [pytest.param(row, id=str(row), marks=() if row[0] <= quick else pytest.mark.slow) for row in published]
+
+
+def made(row):
+    size, p_lazy, p_rand, n = row
+    return pharos.make("mini_grid_empty", size=size, p_lazy=p_lazy, p_rand=p_rand, n_starting_states=n)
+
+
+def law(env):
+    """(states, P (S A, S) sparse, start distribution (S,)), by the interpreted rules."""
+    starts = dict(env.initial_states())
+    numbers = {state: i for i, state in enumerate(starts)}
+    rows, columns, probabilities = [], [], []
+    for state in (queue := list(starts)):
+        for action in range(env.num_actions):
+            for outcome in range(env.outcomes):
+                following = env.next_state(state, action, outcome)
+                if following not in numbers:
+                    numbers[following] = len(numbers)
+                    queue.append(following)
+                rows.append(numbers[state] * env.num_actions + action)
+                columns.append(numbers[following])
+                probabilities.append(env.probability(state, action, outcome))
+    size = len(numbers)
+    P = sparse.csr_matrix((probabilities, (rows, columns)), shape=(size * env.num_actions, size))
+    rho = np.zeros(size)
+    rho[: len(starts)] = list(starts.values())
+    return queue, P, rho
+
+
+def mdp_of(P, rho, **kwargs):
+    return TabularMDP.from_matrices(P, np.zeros((P.shape[1], P.shape[0] // P.shape[1])), initial=rho, **kwargs)
+
+
+def episodic_diameter(P, rho, horizon, targets, stop, kind):
+    """Colosseum's number by its iteration: backwards through the time-indexed states that can be reached, until no
+    entry changes by `stop`, for each of the targets; the largest.
+    """
+    P, rho = P.astype(kind), rho.astype(kind)
+    size, at = P.shape[1], np.arange(len(targets))
+    reached = np.zeros((horizon, size, 1), bool)
+    reached[0, :, 0] = rho > 0
+    for h in range(1, horizon):
+        reached[h, :, 0] = P.T @ np.repeat(reached[h - 1, :, 0], len(P.indptr[:-1]) // size).astype(kind) > 0
+    times, found = np.zeros((horizon, size, len(targets)), kind), np.full(len(targets), np.nan)
+    while np.isnan(found).any():
+        before = times.copy()
+        times[-1] = rho @ (1 + times[0])
+        for h in range(horizon - 2, -1, -1):
+            following = 1 + times[h + 1]
+            following[targets, at] = 1
+            times[h] = np.where(reached[h], (P @ following).reshape(size, -1, len(targets)).min(axis=1), 0)
+            times[h, targets, at] = 0
+        ends = (abs(times - before).max(axis=(0, 1)) < stop) & np.isnan(found)
+        found[ends] = np.where(times > 0, times, np.inf).min(axis=0).max(axis=0)[ends]
+    return found.max()
+
+
+def farthest(P, rho):
+    """The twelve states that are farthest from the start states, by the mean number of edges."""
+    size = P.shape[1]
+    actions = P.shape[0] // size
+    successors = [P.indices[P.indptr[s * actions] : P.indptr[(s + 1) * actions]] for s in range(size)]
+    mean = np.zeros(size)
+    for start in np.flatnonzero(rho):
+        distance, queue = {int(start): 0}, deque([int(start)])
+        while queue:
+            state = queue.popleft()
+            for following in successors[state]:
+                if int(following) not in distance:
+                    distance[int(following)] = distance[state] + 1
+                    queue.append(int(following))
+        mean += rho[start] * np.array([distance[s] for s in range(size)])
+    return np.argsort(-mean, kind="stable")[:12]
+
+
+def within_ulps(found, printed):
+    return abs(np.float32(found) - np.float32(printed)) <= ULPS * np.spacing(np.float32(printed))
+
+
+@pytest.mark.parametrize("row", some(EPISODIC, 6))
+def test_the_episodic_diameter_is_that_of_colosseum(row):
+    env = made(row)
+    _, P, rho = law(env)
+    horizon, printed = env.max_episode_steps, EPISODIC[row]
+    exact = colosseum_diameter(mdp_of(P, rho), horizon=horizon)
+    targets = farthest(P, rho)
+    assert any(within_ulps(episodic_diameter(P, rho, horizon, targets, stop, np.float32), printed) for stop in STOPS)
+    assert episodic_diameter(P, rho, horizon, targets, 1e-10, np.float64) == pytest.approx(exact, rel=1e-9)
+    assert printed <= exact * (1 + 1e-7)
+
+
+@pytest.mark.parametrize("row", some(CONTINUOUS, 8))
+def test_the_diameter_without_episodes_is_that_of_colosseum(row):
+    """Sweeps towards all targets that look up in the left half: the others are their mirror images and turns."""
+    states, P, rho = law(made(row))
+    targets = np.array([i for i, (_, column, way) in enumerate(states) if way == 0 and column < (row[0] + 1) // 2])
+    found = hardness.diameter(mdp_of(P, rho, gamma=1.0))
+    single, times = P.astype(np.float32), np.zeros((P.shape[1], len(targets)), np.float32)
+    at = np.arange(len(targets))
+    stopped = np.full(len(targets), np.nan, np.float32)
+    while np.isnan(stopped).any():
+        before, times = times, 1 + (single @ times).reshape(P.shape[1], -1, len(targets)).min(axis=1)
+        times[targets, at] = 0
+        ends = (abs(times - before).max(axis=0) < STOPS[0]) & np.isnan(stopped)
+        stopped[ends] = times.max(axis=0)[ends]
+    printed = CONTINUOUS[row]
+    assert within_ulps(stopped.max(), printed)
+    assert found.exact and found.lower * (1 + 1e-7) >= printed
+
+
+@pytest.mark.slow
+def test_a_built_state_space_has_the_same_diameters():
+    env = made((6, 0.1, 0.05, 3))
+    _, P, rho = law(env)
+    mdp, other = pharos.build(env, progress=False).mdp(gamma=1.0), mdp_of(P, rho, gamma=1.0)
+    horizon = env.max_episode_steps
+    assert colosseum_diameter(mdp, horizon=horizon) == pytest.approx(colosseum_diameter(other, horizon=horizon))
+    assert hardness.diameter(mdp).upper == pytest.approx(hardness.diameter(other).upper)
+
+
+def test_p_rand_is_random_actions():
+    """So a state space without it serves every `p_rand`."""
+    plain, chance = (law(made((4, 0.25, p_rand, 2))) for p_rand in (0.0, 0.3))
+    assert plain[0] == chance[0]
+    rewards = np.array([[made((4, 0, 0, 2)).reward(s, 0, s)] * 3 for s in plain[0]])
+    wrapped = pharos.random_actions(TabularMDP.from_matrices(plain[1], rewards, initial=plain[2], gamma=0.9), 0.3)
+    native = TabularMDP.from_matrices(chance[1], rewards, initial=chance[2], gamma=0.9)
+    one, other = pharos.value_iteration(wrapped), pharos.value_iteration(native)
+    assert (abs(one.v - other.v) <= one.error_bound + other.error_bound).all()
+
+
+# Layouts as Colosseum draws them ------------------------------------------------------------------------------------
+
+
+def test_rooms_have_one_opening_in_the_middle_of_each_wall():
+    env = pharos.make("mini_grid_rooms", n_rooms=9, room_size=4)
+    assert text_drawing(env, env.initial_state()).replace("v", ".") == ROOMS
+
+
+ROOMS = """\
+.G..#....#....
+..............
+....#....#....
+....#....#....
+##.####.####.#
+....#....#....
+..............
+....#....#....
+....#....#....
+##.####.####.#
+....#....#....
+..............
+....#....#....
+....#....#...."""
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_goal_and_starts_lie_on_opposite_sides_or_in_different_corner_rooms(seed):
+    env = pharos.make("mini_grid_empty", size=7, n_starting_states=4, seed=seed)
+    cells = {state[:2] for state, _ in env.initial_states()}
+    assert len(cells) == 4
+    sides = [(axis, end) for axis in (0, 1) for end in (0, 6) if all(cell[axis] == end for cell in cells)]
+    assert any(env.goal[axis] == 6 - end for axis, end in sides)
+    rooms = pharos.make("mini_grid_rooms", n_rooms=9, room_size=3, n_starting_states=5, seed=seed)
+    corners = {(row // 4, column // 4) for (row, column, _), _ in rooms.initial_states()}
+    goal = (rooms.goal[0] // 4, rooms.goal[1] // 4)
+    assert len(corners) == 1 and goal not in corners
+    assert {*corners, goal} <= {(0, 0), (0, 2), (2, 0), (2, 2)}
+
+
+@pytest.mark.parametrize("name", ["mini_grid_empty", "mini_grid_rooms"])
+def test_the_limit_is_the_farthest_state_from_the_side_or_room_of_the_start_and_one_more(name):
+    env = pharos.make(name)
+    states, P, _ = law(env)
+    numbers = {state: i for i, state in enumerate(states)}
+    top = len(env.is_free) - 1
+    possible = {numbers[top - y, x, direction] for x, y, direction in env.drawn.possible_starts}
+    distances = sparse.csgraph.dijkstra(
+        sum(P[action :: env.num_actions] for action in range(env.num_actions)), unweighted=True, indices=list(possible)
+    )
+    assert env.max_episode_steps == distances.max() + 1
+
+
+@pytest.mark.parametrize(
+    ("name", "parameters", "words"),
+    [
+        ("mini_grid_empty", {"size": 2}, "size=2"),
+        ("mini_grid_empty", {"p_lazy": 1.0}, "p_lazy=1.0; expected a finite number from 0 to 0.9999"),
+        ("mini_grid_rooms", {"n_rooms": 5}, "n_rooms=5; expected a square number"),
+        ("mini_grid_rooms", {"room_size": 2, "n_starting_states": 17}, "from 1 to 16"),
+    ],
+)
+def test_a_wrong_parameter_is_named(name, parameters, words):
+    with pytest.raises(ParameterError) as error:
+        pharos.make(name, **parameters)
+    assert words in str(error.value)
