@@ -16,6 +16,7 @@ import pharos
 from pharos.errors import ParameterError
 from pharos.interaction import GymEnv
 from pharos.observations import observe
+from pharos.observations.complex_image import _area_weights, _scaled
 
 SMALL = {
     "simple_grid": {"height": 4, "width": 5, "rewards": (((1, 1), 0.1),), "penalties": (((0, 2), -0.5),)},
@@ -57,6 +58,18 @@ def test_compiled_frames_are_the_interpreted_ones(env, name, options):
     assert found.dtype == compiled.space.dtype == np.uint8
     assert found.shape == (150, *compiled.space.shape)
     assert all(compiled.space.contains(frame) for frame in found)
+
+
+@pytest.mark.parametrize(
+    "shape",
+    [(64, 64, 4, 21, 16), (12, 20, 4, 10, 11), (96, 160, 3, 84, 84), (5, 7, 4, 9, 3), (1, 1, 4, 3, 3), (8, 8, 1, 8, 8)],
+)
+def test_pictures_are_scaled_as_the_formula_says_to_the_last_bit(shape):
+    height, width, channels, new_height, new_width = shape
+    values = 255 * np.random.default_rng(0).random((height, width, channels))
+    rows, columns = _area_weights(height, new_height), _area_weights(width, new_width)
+    expected = np.einsum("yh,hwc,xw->yxc", rows, values, columns)
+    np.testing.assert_array_equal(_scaled(values, new_height, new_width), expected)
 
 
 def test_a_simple_image_has_a_plane_for_each_layer(env):

@@ -92,10 +92,26 @@ def _bytes(values: np.ndarray) -> np.ndarray:
 
 
 def _scaled(values: np.ndarray, height: int, width: int) -> np.ndarray:
-    """(H, W, C) -> (height, width, C) by averaging areas."""
-    return np.einsum(
-        "yh,hwc,xw->yxc", _area_weights(len(values), height), values, _area_weights(values.shape[1], width)
-    )
+    """(H, W, C) -> (height, width, C) by averaging areas.
+
+    Each new pixel is a sum over the few old ones that it covers, row by row: to the last bit the sum over all of them.
+    """
+    rows, row_shares = _covered(len(values), height)
+    columns, column_shares = _covered(values.shape[1], width)
+    out = np.zeros((height, width, values.shape[2]))
+    for row, row_share in zip(rows, row_shares, strict=True):
+        weighted = row_share[:, None, None] * values[row]
+        for column, column_share in zip(columns, column_shares, strict=True):
+            out += weighted[:, column] * column_share[:, None]
+    return out
+
+
+def _covered(old: int, new: int) -> tuple[np.ndarray, np.ndarray]:
+    """(n, new): the old pixels, at most n, that each new one covers, and their shares in it, of which some are 0."""
+    weights = _area_weights(old, new)
+    pixels = np.argmax(weights > 0, axis=1) + np.arange(np.count_nonzero(weights, axis=1).max())[:, None]
+    shares = np.where(pixels < old, weights[np.arange(new), np.minimum(pixels, old - 1)], 0.0)
+    return np.minimum(pixels, old - 1), shares
 
 
 def _area_weights(old: int, new: int) -> np.ndarray:
