@@ -63,12 +63,26 @@ def test_the_harder_observation_is_found_in_each_class(shift, ours, grids, games
         assert row.verdict == (grids if environment in ("simple_grid", "frozen_lake") else games)
 
 
+@pytest.fixture(scope="module")
+def without_effect():
+    """Verdicts on 25 data sets in which nothing has an effect: noise of each cell, and noise that both observations of
+    a task share, as nothing else than the task decides on it."""
+    found = []
+    for seed in range(25):
+        cells = made(slopes=(0, 0, 0, 0), noise=0.1, seed=seed)
+        random = np.random.default_rng(seed)
+        shared = {key: random.normal() for key in cells.groupby(["instance", "chance"]).groups}
+        cells["cumulative_regret"] += [shared[row.instance, row.chance] for row in cells.itertuples()]
+        found.append(verdicts(cells))
+    return found
+
+
 @pytest.mark.slow
-def test_equal_observations_are_undecided_as_often_as_the_level_says():
+def test_equal_observations_are_undecided_as_often_as_the_level_says(without_effect):
     decided = [
         row.verdict != "undecided"
-        for seed in range(25)
-        for (finding, _), row in verdicts(made(seed=seed)).items()
+        for found in without_effect
+        for (finding, _), row in found.items()
         if finding == OBSERVATION
     ]
     assert len(decided) == 100 and sum(decided) <= 14  # 5 expected
@@ -132,16 +146,10 @@ def test_a_task_seen_twice_is_one_piece_of_evidence(finding):
 
 
 @pytest.mark.slow
-def test_tests_without_effect_are_significant_as_often_as_the_level_says():
-    """Noise that both observations of a task share, as nothing else than the task decides on it: 2.5 of 50 expected."""
+def test_tests_without_effect_are_significant_as_often_as_the_level_says(without_effect):
+    """2.5 of 50 expected."""
     names = ("one model explains next to nothing", "models by class explain more than one")
-    significant = 0
-    for seed in range(25):
-        cells = made(slopes=(0, 0, 0, 0), noise=0.1, seed=seed)
-        random = np.random.default_rng(seed)
-        shared = {key: random.normal() for key in cells.groupby(["instance", "chance"]).groups}
-        cells["cumulative_regret"] += [shared[row.instance, row.chance] for row in cells.itertuples()]
-        significant += sum(verdicts(cells)[name, "all"].p < 0.05 for name in names)
+    significant = sum(found[name, "all"].p < 0.05 for found in without_effect for name in names)
     assert significant <= 8
 
 
