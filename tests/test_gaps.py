@@ -283,6 +283,27 @@ def test_the_interval_holds_the_truth_where_values_are_off_by_all_of_their_bound
     assert minimal.lower <= 0.25 <= minimal.upper
 
 
+@pytest.mark.parametrize("gamma", [0.5, 0.9, 1.0])
+def test_intervals_of_gaps_of_every_step_hold_the_exact_fractions(gamma):
+    rng = np.random.default_rng(0)
+    table, rewards, horizon = rng.integers(0, 4, (4, 3)), 0.1 + rng.random((4, 3)), 6
+    mdp = TabularMDP.from_arrays(table, rewards, gamma=gamma, horizon=horizon)
+    result = hardness.gaps(mdp)
+    exact = [[Fraction(float(reward)) for reward in row] for row in rewards]
+    reached = [{0}]
+    for _ in range(horizon - 1):
+        reached.append({int(t) for s in reached[-1] for t in table[s]})
+    values, gaps = [Fraction(0)] * 4, []
+    for states in reversed(reached):
+        q = [[exact[s][a] + Fraction(gamma) * values[table[s, a]] for a in range(3)] for s in range(4)]
+        values = [max(row) for row in q]
+        gaps += [values[s] - q[s][a] for s in states for a in range(3) if q[s][a] < values[s]]
+    assert (result.count, result.unresolved) == (len(gaps), 0)
+    assert Fraction(result.lower) <= sum(1 / gap for gap in gaps) <= Fraction(result.upper)
+    assert Fraction(result.certified_minimal.lower) <= min(gaps) <= Fraction(result.certified_minimal.upper)
+    assert result.error >= 2 * pharos.value_iteration(mdp).error_bound > 0
+
+
 @pytest.mark.parametrize("seed", range(5))
 def test_two_actions_have_the_same_outcomes_where_their_rows_and_rewards_are_the_same(seed):
     rng = np.random.default_rng(seed)
