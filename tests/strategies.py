@@ -1,5 +1,6 @@
 """Small MDPs of every kind, for property tests."""
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -103,6 +104,32 @@ def outcome_mdps(draw, layouts=tuple(LAYOUTS)):
     starts = draw(st.lists(st.integers(0, num_states - 1), min_size=1, max_size=3))
     dynamics = outcome_table(lists, num_actions, ragged, palette, width)
     return replace(mdp, dynamics=dynamics, terminal=terminal).with_initial(starts[0] if len(starts) == 1 else starts)
+
+
+@st.composite
+def acyclic_mdps(draw):
+    """(MDP with any chance of choosing, age (S,)): no state can be visited twice; tables, outcomes or matrices."""
+    num_states, num_actions = draw(st.integers(1, 5)), 2
+    number = np.array(draw(st.permutations(range(num_states))))  # of the state at each place of the order
+    vectors = draw(st.lists(st.sampled_from([[1.0], [0.3, 0.7], [1 / 3, 2 / 3]]), min_size=10, max_size=10))
+    kind = draw(st.sampled_from(["table", "outcomes", "matrices"]))
+    lists = {}
+    for place, a in itertools.product(range(num_states), range(num_actions)):
+        later = st.sampled_from([-1, *number[place + 1 :].tolist()])
+        vector = [1.0] if kind == "table" else vectors[2 * place + a]
+        lists[number[place], a] = [(draw(later), p) for p in vector]
+    rows = [lists[s, a] for s in range(num_states) for a in range(num_actions)]
+    paid = draw(hnp.arrays(np.float64, (num_states, num_actions), elements=rewards_of_games))
+    paid *= draw(st.sampled_from([0.7, 1.0, 1e-3, 1e12]))
+    mdp = TabularMDP.from_arrays(np.array([row[0][0] for row in rows]).reshape(-1, num_actions), paid)
+    if kind != "table":
+        mdp = replace(mdp, dynamics=outcome_table(rows, num_actions, False, True, 2))
+    if kind == "matrices":
+        matrix = mdp.dynamics.matrix()[:, :-1]
+        mdp = TabularMDP.from_matrices(matrix, paid)
+    age = np.empty(num_states, np.int64)
+    age[number] = 3 * np.arange(num_states) - 4
+    return _with_chance(draw, mdp.with_gamma(draw(st.sampled_from([1.0, 1.0, 0.9, 1 - 1e-7])))), age
 
 
 @st.composite

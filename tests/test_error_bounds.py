@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 
 import naive_exact
 from pharos import hardness
-from pharos.errors import DivergenceError, PrecisionError
+from pharos.errors import DivergenceError, ParameterError, PrecisionError
 from pharos.mdp import TabularMDP, random_actions, sticky_actions
 from pharos.solvers import evaluate_policy, uniform_value, value_iteration, worst_value
-from strategies import hard_mdps
+from strategies import acyclic_mdps, hard_mdps
 
 often = settings(max_examples=150, deadline=None)
 
@@ -78,6 +78,46 @@ def test_values_of_a_deterministic_policy_are_within_their_bound(mdp, seed):
     solution = evaluate_policy(mdp, actions, 1e40)
     written_out = naive_exact.exact(np.eye(mdp.num_actions)[actions])[:, None]
     assert largest_error(solution, naive_exact.values_of(mdp, written_out)) <= Fraction(solution.error_bound)
+
+
+@pytest.mark.slow
+@often
+@given(acyclic_mdps(), st.integers(0, 2**32))
+def test_one_pass_gives_the_values_of_mdps_that_visit_no_state_twice(drawn, seed):
+    """By the age of the states, and without it at gamma = 1."""
+    plain, age = drawn
+    for mdp in [plain.with_age(age)] + [plain] * (plain.gamma == 1.0):
+        for solve, sign in ((value_iteration, 1), (worst_value, -1)):
+            solution = finest(solve, mdp)
+            assert solution.sweeps == 1
+            assert largest_error(solution, naive_exact.extreme_values(mdp, sign)) <= Fraction(solution.error_bound)
+        shape = (mdp.num_states, mdp.num_actions + 1) if mdp.is_sticky else (mdp.num_states,)
+        policy = np.random.default_rng(seed).dirichlet(np.ones(mdp.num_actions), shape)
+        solution = finest(evaluate_policy, mdp, policy)
+        written_out = naive_exact.exact(policy if mdp.is_sticky else policy[:, None])
+        assert largest_error(solution, naive_exact.values_of(mdp, written_out)) <= Fraction(solution.error_bound)
+
+
+def test_the_bound_of_one_pass_counts_the_longest_path_and_not_the_discount():
+    length, gamma = 1000, 1 - 1e-9
+    path = TabularMDP.from_arrays([[i + 1] for i in range(length - 1)] + [[-1]], np.full((length, 1), 0.1), gamma=gamma)
+    truth = sum(Fraction(0.1) * Fraction(gamma) ** t for t in range(length))
+    solution = value_iteration(path.with_age(np.arange(length)), 1e-8)
+    assert Fraction(1, 10**12) < abs(Fraction(float(solution.v[0])) - truth) <= Fraction(solution.error_bound)
+    with pytest.raises(PrecisionError, match="raise the tolerance"):  # rounding / (1 - gamma)
+        value_iteration(path, 1e-8)
+
+
+def test_ages_are_checked():
+    path = TabularMDP.from_arrays([[1, 2], [2, 2], [2, 2]], [[1.0, 0.0], [1.0, 1.0], [0.0, 0.0]], terminal=[0, 0, 1])
+    assert value_iteration(path.with_age([5, 7, 8]).with_gamma(1.0)).value_at_start == 2.0
+    with pytest.raises(ParameterError, match="state 1, of age 8, leads by action 0 to state 2, of age 8"):
+        path.with_age([5, 8, 8])
+    with pytest.raises(ParameterError, match=r"age has shape \(2,\)"):
+        path.with_age([1, 2])
+    with pytest.raises(DivergenceError, match="visited again"):
+        value_iteration(TabularMDP.from_arrays([[0]], [[1.0]], gamma=1.0))
+    assert path.with_age([5, 7, 8]).with_initial(1).within(1).age is None
 
 
 @pytest.mark.parametrize("gamma", [0.999, 0.9998, 1 - 1e-5, 1 - 1e-7])

@@ -3,8 +3,8 @@
 Common arguments: transitions: see kernels/outcomes.py; table, palette: see mdp/rewards.py; v (S + 1,) float64,
 under sticky actions (S + 1, A) by the previously executed action, with row S 0, so that index -1 reads 0; weights:
 (chosen, previous, uniform); sign: 1 maximises, -1 minimises; actions: a tuple of A zeros, whose length the compiler
-knows, so that the loops over actions are unrolled (a third faster). Each sweep goes from the last state to the first
-and returns the largest change of an entry.
+knows, so that the loops over actions are unrolled (a third faster). Each sweep goes from the last state to the first,
+of an order (S,) or, where that is None, of their numbers, and returns the largest change of an entry.
 """
 
 import numpy as np
@@ -12,6 +12,7 @@ from numba import njit
 from numba.extending import overload
 
 from pharos.kernels.outcomes import expectation, expectation_of_pair, size_of
+from pharos.kernels.paths import state_at
 
 UNROLLED = 128  # actions
 
@@ -47,10 +48,11 @@ def _backup(transitions, table, palette, gamma, uniform, sign, v, actions, s):
 
 
 @njit(cache=True, nogil=True)
-def optimal_sweep(transitions, table, palette, gamma, uniform, sign, v, actions):
+def optimal_sweep(transitions, table, palette, gamma, uniform, sign, v, actions, order):
     """v[s] = (1 - uniform) max_a q(s, a) + uniform mean_a q(s, a), in place."""
     change = 0.0
-    for s in range(size_of(transitions)[0] - 1, -1, -1):
+    for i in range(size_of(transitions)[0] - 1, -1, -1):
+        s = state_at(order, i)
         value = _backup(transitions, table, palette, gamma, uniform, sign, v, actions, s)
         change = max(change, abs(value - v[s]))
         v[s] = value
@@ -77,14 +79,15 @@ def _sticky_values(transitions, table, palette, gamma, sign, v, actions, q, s):
 
 
 @njit(cache=True, nogil=True)
-def sticky_sweep(transitions, table, palette, gamma, weights, sign, v, actions, q):
+def sticky_sweep(transitions, table, palette, gamma, weights, sign, v, actions, q, order):
     """v[s, b] = chosen max_a q(s, a) + previous q(s, b) + uniform mean_a q(s, a), in place.
 
     v (S + 1, A); q (A,) scratch.
     """
     chosen, previous, uniform = weights
     change = 0.0
-    for s in range(size_of(transitions)[0] - 1, -1, -1):
+    for i in range(size_of(transitions)[0] - 1, -1, -1):
+        s = state_at(order, i)
         best, total = _sticky_values(transitions, table, palette, gamma, sign, v, actions, q, s)
         shared = chosen * best + uniform * total / len(actions)
         for b in range(len(actions)):
@@ -107,12 +110,13 @@ def sticky_block(transitions, table, palette, gamma, weights, sign, v, out, acti
 
 
 @njit(cache=True, nogil=True)
-def policy_sweep(transitions, table, palette, gamma, chosen, uniform, policy, v):
+def policy_sweep(transitions, table, palette, gamma, chosen, uniform, policy, v, order):
     """v[s] = sum_a (chosen policy[s, a] + uniform / A) q(s, a), in place; policy (S, A): probabilities of choosing."""
     num_states, num_actions = size_of(transitions)
     each = uniform / num_actions
     change = 0.0
-    for s in range(num_states - 1, -1, -1):
+    for i in range(num_states - 1, -1, -1):
+        s = state_at(order, i)
         value = 0.0
         for a in range(num_actions):
             q = reward_at(table, palette, s, a) + gamma * expectation(transitions, v, s, a)
@@ -123,7 +127,7 @@ def policy_sweep(transitions, table, palette, gamma, chosen, uniform, policy, v)
 
 
 @njit(cache=True, nogil=True)
-def sticky_policy_sweep(transitions, table, palette, gamma, weights, policy, v, q):
+def sticky_policy_sweep(transitions, table, palette, gamma, weights, policy, v, q, order):
     """v[s, b] = sum_a (chosen policy[s, b, a] + uniform / A) q(s, a) + previous q(s, b), in place.
 
     v (S + 1, A). policy (S, B, A): B is A, or 1 where the previous action does not matter. q (A,) scratch.
@@ -133,7 +137,8 @@ def sticky_policy_sweep(transitions, table, palette, gamma, weights, policy, v, 
     each = uniform / num_actions
     looks_back = policy.shape[1] > 1
     change = 0.0
-    for s in range(num_states - 1, -1, -1):
+    for i in range(num_states - 1, -1, -1):
+        s = state_at(order, i)
         for a in range(num_actions):
             q[a] = reward_at(table, palette, s, a) + gamma * expectation_of_pair(transitions, v, s, a)
         shared = 0.0

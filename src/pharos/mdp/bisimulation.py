@@ -134,4 +134,5 @@ def _merged(mdp: TabularMDP, classes: np.ndarray, representatives: np.ndarray) -
         reward_table=Rewards.from_array(mdp.reward_table.rows(representatives)),
         terminal=np.asarray(mdp.terminal)[representatives],
         folder=None,
+        age=None,
     ).with_initial(start)

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from pharos.kernels import bellman, graph, occupancy, paths
-from pharos.mdp.dynamics import BellmanEquation, Dynamics, Play
+from pharos.kernels import bellman, graph, occupancy
+from pharos.mdp.dynamics import BellmanEquation, Dynamics, Order, Play
 from pharos.mdp.selection import Extreme, PolicyTable
 
 
@@ -42,19 +42,10 @@ class CompiledDynamics(Dynamics):
         )
 
     def sweep(self, equation: BellmanEquation, x: np.ndarray) -> float:
-        rewards, gamma, chance, select = equation
-        tables = (self.for_sweeps, rewards.table, rewards.palette, gamma)
-        actions = bellman.actions_of(self.num_actions)
-        if isinstance(select, PolicyTable):
-            if chance.is_sticky:
-                scratch = np.empty(self.num_actions)
-                return bellman.sticky_policy_sweep(*tables, chance.triple, select.later, x, scratch)
-            weights = (float(chance.chosen), float(chance.uniform))
-            return bellman.policy_sweep(*tables, *weights, select.later[:, 0], x[:, 0])
-        assert isinstance(select, Extreme)
-        if chance.is_sticky:
-            return bellman.sticky_sweep(*tables, chance.triple, select.sign, x, actions, np.empty(self.num_actions))
-        return bellman.optimal_sweep(*tables, chance.uniform, select.sign, x[:, 0], actions)
+        return swept(self.for_sweeps, self.num_actions, equation, x, None)
+
+    def sweep_once(self, equation: BellmanEquation, x: np.ndarray, order: Order) -> None:
+        swept(self.for_sweeps, self.num_actions, equation, x, order.states)
 
     def move(self, play: Play, now: np.ndarray, after: np.ndarray) -> float:
         if now.shape[1] != after.shape[1]:  # the first step of sticky actions
@@ -82,8 +73,26 @@ class CompiledDynamics(Dynamics):
             level += 1
         return is_reached
 
-    def longest_path(self, live: np.ndarray) -> int:
-        return int(paths.longest_path_of_table(self.for_kernels, live))
+    def _edges(self, live: np.ndarray) -> Any:
+        return self.for_kernels
+
+
+def swept(
+    transitions: Any, num_actions: int, equation: BellmanEquation, x: np.ndarray, order: np.ndarray | None
+) -> float:
+    """Replace each entry of x by its backup, from the last state of an order to the first; the largest change."""
+    rewards, gamma, chance, select = equation
+    tables = (transitions, rewards.table, rewards.palette, gamma)
+    actions, scratch = bellman.actions_of(num_actions), np.empty(num_actions)
+    if isinstance(select, PolicyTable):
+        if chance.is_sticky:
+            return bellman.sticky_policy_sweep(*tables, chance.triple, select.later, x, scratch, order)
+        weights = (float(chance.chosen), float(chance.uniform))
+        return bellman.policy_sweep(*tables, *weights, select.later[:, 0], x[:, 0], order)
+    assert isinstance(select, Extreme)
+    if chance.is_sticky:
+        return bellman.sticky_sweep(*tables, chance.triple, select.sign, x, actions, scratch, order)
+    return bellman.optimal_sweep(*tables, chance.uniform, select.sign, x[:, 0], actions, order)
 
 
 def _shared(block: Callable[[int, int], None], num_states: int) -> None:

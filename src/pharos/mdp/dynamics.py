@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from pharos.errors import ParameterError
 from pharos.kernels import paths
 from pharos.mdp.chance import Chance
 from pharos.mdp.rewards import Rewards
@@ -67,6 +68,18 @@ class Outcomes(NamedTuple):
     which: np.ndarray
     states: np.ndarray
     probabilities: np.ndarray
+
+
+class Order(NamedTuple):
+    """An order of states in which each comes before those that it may lead to.
+
+    Attributes:
+        states: (S,) all of them; None where it is that of their numbers.
+        longest: the steps of the longest way through them, or more.
+    """
+
+    states: np.ndarray | None
+    longest: int
 
 
 class Dynamics(ABC):
@@ -235,11 +248,39 @@ class Dynamics(ABC):
             result[outcomes.states, actions[outcomes.which]] = True
         return result[:-1]
 
+    def sweep_once(self, equation: BellmanEquation, x: np.ndarray, order: Order) -> None:
+        """Replace each entry of x by its backup, from the last state of an order to the first: the fixed point."""
+        states = np.arange(self.num_states) if order.states is None else order.states
+        for s in states[::-1]:
+            q = equation.rewards.rows(s[None]) + equation.gamma * self.expected(x, s[None])
+            x[s] = equation.value(q, s[None])[0]
+
+    def order(self, live: np.ndarray) -> Order | None:
+        """An order of states in which each live one (S,) bool stands before those it leads to; None: there is none."""
+        transitions = self._edges(live)
+        if paths.is_increasing(transitions, live, None)[0] < 0:
+            return Order(None, int(paths.longest_path(transitions, live, None)))
+        states, longest = paths.topological_order(transitions, live)
+        return Order(states, int(longest)) if longest >= 0 else None
+
+    def check_age(self, live: np.ndarray, age: np.ndarray) -> None:
+        """ParameterError unless each transition of a live state (S,) bool leads to one of larger age (S,)."""
+        s, a, t = paths.is_increasing(self._edges(live), live, age)
+        if s >= 0:
+            raise ParameterError(
+                f"age: state {s}, of age {age[s]}, leads by action {a} to state {t}, of age {age[t]}; expected more"
+            )
+
     def longest_path(self, live: np.ndarray) -> int:
         """The number of steps of the longest way through live states (S,) bool; -1 where one can be visited again."""
+        order = self.order(live)
+        return -1 if order is None else order.longest
+
+    def _edges(self, live: np.ndarray) -> Any:
+        """The argument `transitions` of kernels, where the end may be missing and probabilities do not matter."""
         matrix = self.matrix(live)
-        first = matrix.indptr[:: self.num_actions].astype(np.int64)
-        return int(paths.longest_path(first, matrix.indices.astype(np.int64), self.num_states))
+        inside = np.where(matrix.indices < self.num_states, matrix.indices, -1)
+        return inside, matrix.indptr, None, matrix.data, (self.num_states, self.num_actions), 0
 
     def matrix(self, live: np.ndarray | None = None) -> "csr_matrix":
         """(S A, S + 1): the probabilities of all outcomes, row s A + a, column S for the end.

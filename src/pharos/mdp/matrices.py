@@ -5,7 +5,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pharos.errors import ParameterError
-from pharos.mdp.dynamics import Dynamics, Outcomes, as_indices
+from pharos.mdp.compiled import swept
+from pharos.mdp.dynamics import BellmanEquation, Dynamics, Order, Outcomes, as_indices
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
@@ -98,6 +99,13 @@ class Matrices(Dynamics):
             order = np.argsort(which, kind="stable")
             which, following, probabilities = which[order], following[order], probabilities[order]
         return Outcomes(which, following, probabilities)
+
+    def sweep_once(self, equation: BellmanEquation, x: np.ndarray, order: Order) -> None:
+        swept(self._edges(np.empty(0)), self.num_actions, equation, x, order.states)
+
+    def _edges(self, live: np.ndarray) -> Any:
+        matrix = self.transitions  # what rows lack to 1 ends, and the end has no value
+        return matrix.indices, matrix.indptr, None, matrix.data, (self.num_states, self.num_actions), 0
 
     def restricted_to(self, states: np.ndarray) -> "Matrices":
         """These states alone; what leads out of them ends."""

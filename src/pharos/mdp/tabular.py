@@ -8,7 +8,7 @@ import numpy as np
 
 from pharos.errors import ParameterError
 from pharos.mdp.chance import Chance
-from pharos.mdp.dynamics import Dynamics
+from pharos.mdp.dynamics import Dynamics, Order
 from pharos.mdp.matrices import Matrices, expected_rewards, transitions_of
 from pharos.mdp.outcome_arrays import checked_outcomes, compact_outcomes
 from pharos.mdp.outcome_table import OutcomeTable
@@ -38,6 +38,8 @@ class TabularMDP:
         start_states, start_probabilities: the start distribution.
         chance: weights of the chosen, the previously executed and a uniform action.
         folder: of the state space, where there is one.
+        age: (S,) integers that each transition out of a state that is not terminal makes larger; None where they are
+            not known. Solvers take the states in this order then, once.
     """
 
     dynamics: Dynamics
@@ -49,6 +51,7 @@ class TabularMDP:
     start_probabilities: np.ndarray = field(default_factory=lambda: np.ones(1))
     chance: Chance = field(default_factory=Chance)
     folder: Any = None
+    age: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         _check_gamma(self.gamma)
@@ -333,6 +336,36 @@ class TabularMDP:
         states, probabilities = _start(initial, self.num_states)
         return replace(self, start_states=states, start_probabilities=probabilities)
 
+    def with_age(self, age: Any) -> "TabularMDP":
+        """The same MDP with an age (S,) of each state: an integer that every transition makes larger.
+
+        No state is visited twice then, so solvers need one pass over the states, oldest first.
+
+        Raises:
+            ParameterError: there is not one integer for each state, or a transition out of a state that is not terminal
+                leads to a state that is not older; the first one is named.
+        """
+        array = np.asarray(age)
+        if array.shape != (self.num_states,) or array.dtype.kind not in "iu":
+            raise ParameterError(
+                f"age has shape {array.shape} and type {array.dtype}; expected {self.num_states} integers"
+            )
+        self.dynamics.check_age(~np.asarray(self.terminal), array)
+        return replace(self, age=array)
+
+    def order(self) -> Order | None:
+        """An order of the states in which each stands before those it may lead to; None: some can be visited again.
+
+        Cost: from ages at most a sort; else O(S A) and 24 bytes a state.
+        """
+        if self.age is None:
+            return self.dynamics.order(~np.asarray(self.terminal))
+        states, age = None, self.age
+        if (age[1:] < age[:-1]).any():
+            states = np.argsort(age, kind="stable")
+            age = age[states]
+        return Order(states, int(np.count_nonzero(age[1:] != age[:-1])))
+
     def within(self, steps: int) -> "TabularMDP":
         """The same MDP with only those states that can be met within `steps` steps from a start; they keep their order.
 
@@ -358,6 +391,7 @@ class TabularMDP:
             terminal=np.asarray(self.terminal[states]),
             start_states=number[self.start_states],
             folder=None,
+            age=None,
         )
 
     def __repr__(self) -> str:

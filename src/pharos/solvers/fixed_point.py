@@ -2,8 +2,8 @@
 
 Sweeps go in place and in reverse order of discovery: breadth-first search numbers a state before those that it leads
 to, so a sweep from the last state to the first carries values back along whole paths. 20 to 40 sweeps solve games that
-take a thousand plain ones. Where sweeps are slow, because gamma is near 1, policy iteration gives a better x to go on
-from.
+take a thousand plain ones. Where no state can be visited twice, and gamma is 1 or the states have an age, one pass is
+enough. Where sweeps are slow, because gamma is near 1, policy iteration gives a better x to go on from.
 
 The bound. Let T be the backup, a contraction with factor rho, x* its fixed point, and let one sweep in place change
 entries by at most d, with rounding errors of at most e an entry. Every new entry is a backup of entries that are old or
@@ -93,8 +93,8 @@ def fixed_point(
         PrecisionError: 64-bit floats cannot reach the tolerance.
     """
     backup = Backup(mdp, select)
-    if mdp.gamma == 1.0:
-        return _without_cycles(backup, tolerance, progress)
+    if mdp.gamma == 1.0 or mdp.age is not None:
+        return _in_one_pass(backup, tolerance, progress)
     rho = backup.factor
     least = backup.rounding(0.0) / (1 - rho) if rho < 1 else math.inf
     if not least <= tolerance:
@@ -167,31 +167,29 @@ def largest_of(x: np.ndarray) -> float:
     return max(float(flat.max()), -float(flat.min())) if x.size else 0.0
 
 
-def _without_cycles(backup: Backup, tolerance: float, progress: Callable[[int, float], None] | None) -> FixedPoint:
-    """gamma = 1: allowed where no state can be visited again, so that values settle after finitely many sweeps.
+def _in_one_pass(backup: Backup, tolerance: float, progress: Callable[[int, float], None] | None) -> FixedPoint:
+    """Where no state can be visited again: each is backed up once, after all that it leads to.
 
-    A state with n steps at most before it has settled values after n + 1 sweeps. Rounding errors add up along the way.
+    Rounding adds up along the way: that of a state n steps before the end is at most e (1 + rho + ... + rho^n).
     """
-    mdp = backup.mdp
-    longest = mdp.dynamics.longest_path(~np.asarray(mdp.terminal))
-    if longest < 0:
+    mdp, rho = backup.mdp, backup.factor
+    order = mdp.order()
+    if order is None:
         raise DivergenceError(
             f"{mdp}: gamma is 1, there is no horizon, and some states can be visited again and again, so the "
             "value may be "
             f"infinite; give a horizon (the environment's time limit, say), or gamma < 1"
         )
-    x, sweeps = backup.zeros(), 0
-    while True:
-        change = backup.sweep(x)
-        sweeps += 1
-        if progress is not None:
-            progress(sweeps, math.inf if change else 0.0)
-        if change == 0.0 or sweeps > longest + 2 or not math.isfinite(change):
-            break
-    bound = backup.rounding(largest_of(x)) * (longest + 1) * max(1.0, backup.factor) ** longest * _MARGIN
+    x, backups = backup.zeros(), order.longest + 1
+    with np.errstate(over="ignore", invalid="ignore"):
+        mdp.dynamics.sweep_once(backup.equation, x, order)
+        series = min(backups, 1 / (1 - rho)) if rho < 1 else backups * np.float64(rho) ** order.longest
+        bound = float(backup.rounding(largest_of(x)) * series * _MARGIN)
+    if progress is not None:
+        progress(1, bound)
     if not bound <= tolerance:
         raise _imprecise(mdp, bound, tolerance)
-    return FixedPoint(x, bound, sweeps)
+    return FixedPoint(x, bound, 1)
 
 
 def _imprecise(mdp: TabularMDP, bound: float, tolerance: float) -> PrecisionError:

@@ -49,10 +49,6 @@ def evaluate_policy(
     select = PolicyTable.of(mdp, policy)
     if select.actions is not None and mdp.is_deterministic and horizon is None:
         return _on_its_graph(mdp, select, began)
-    if horizon is None and mdp.gamma == 1.0:
-        raise DivergenceError(
-            f"{mdp}: gamma is 1 and there is no horizon, so the value may be infinite; give one, or gamma < 1"
-        )
     return solution_of(mdp, select, tolerance, horizon)
 
 
