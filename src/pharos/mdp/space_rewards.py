@@ -67,9 +67,8 @@ def _blocks(space: "StateSpace", env: Environment, workers: int | None) -> Itera
         stop = min(start + _ROWS, space.num_states)
         if successors is not None:
             return rules.block(states, successors, terminal, start, stop)
-        pairs = np.arange(start * space.num_actions, stop * space.num_actions)
-        outcomes = space.dynamics.outcomes(*np.divmod(pairs, space.num_actions))
-        return rules.expected_block(states, tuple(outcomes), terminal, start, stop)
+        outcomes = space.outcomes.entries(start, stop, space.num_actions)
+        return rules.expected_block(states, outcomes, terminal, start, stop)
 
     threads = rules.threads(usable_workers(workers))
     with ThreadPoolExecutor(threads) as pool:

@@ -147,7 +147,7 @@ class OutcomeJournal(Journal):
         offsets.append(np.zeros(1, np.int64))
         for part in parts.parts():
             offsets.append(part.first + np.cumsum(part.counts))
-            probabilities.append(part.likely)
+            probabilities.append(parts.likely(part))
         self._files |= {PARTS[OFFSETS]: offsets, PARTS[PROBABILITIES]: probabilities}
         self.palette = None
         arrays = {name: {"dtype": dtype, **self._files[name].entry()} for name, dtype in self._dtypes().items()}

@@ -21,13 +21,13 @@ from pharos.state_space.stored_outcomes import OutcomesOfState
 MOST_PADDING = (3, 10)
 """The share of (S, A, K) that may be padding, as a fraction."""
 
-ENTRIES = 1 << 21  # of rows of K, as many as are copied at a time
+ENTRIES = 1 << 18  # of rows of K, as many as are copied at a time
 
 
 class Part(NamedTuple):
     """Some rows: the number of the first one, and that of its first outcome; then R rows of N outcomes in all.
 
-    counts (R,); codes (R,), None where probabilities are spelled out; successors (N,); likely (N,), bits of float64.
+    counts (R,); codes (R,), None where probabilities are spelled out; successors (N,).
     """
 
     row: int
@@ -35,7 +35,6 @@ class Part(NamedTuple):
     counts: np.ndarray
     codes: np.ndarray | None
     successors: np.ndarray
-    likely: np.ndarray
 
 
 @dataclass
@@ -80,13 +79,16 @@ class OutcomeParts:
         name = WIDE_SUCCESSORS if self.index_dtype.itemsize == 8 else SUCCESSORS
         place = first * self.index_dtype.itemsize
         successors = np.fromfile(self.folder / PARTS[name], self.index_dtype, entries, offset=place)
+        return Part(row, first, counts, codes, successors)
+
+    def likely(self, part: Part) -> np.ndarray:
+        """(N,) uint64, the bits of the probabilities of its outcomes."""
         if self.palette is None:
-            likely = np.fromfile(self.folder / PARTS[PROBABILITIES], "<u8", entries, offset=8 * first)
-        else:
-            assert codes is not None
-            vectors = self.palette[codes]
-            likely = vectors[vectors != 0]
-        return Part(row, first, counts, codes, successors, likely)
+            entries = len(part.successors)
+            return np.fromfile(self.folder / PARTS[PROBABILITIES], "<u8", entries, offset=8 * part.first)
+        assert part.codes is not None
+        vectors = self.palette[part.codes]
+        return vectors[vectors != 0]
 
     def most(self) -> int:
         """K, the most possible outcomes of a row."""
@@ -141,7 +143,7 @@ class OutcomeParts:
             if OFFSETS in files:
                 files[OFFSETS].append(part.first + np.cumsum(part.counts))
             if PROBABILITIES in files:
-                files[PROBABILITIES].append(_padded(part.likely, part.counts, most, fill_with_first=False))
+                files[PROBABILITIES].append(_padded(self.likely(part), part.counts, most, fill_with_first=False))
             if CODES in files and part.codes is not None:
                 files[CODES].append(part.codes.astype(dtypes[CODES]))
 
@@ -157,7 +159,7 @@ class OutcomeParts:
                 before = first + int(counts[:place].sum())
                 part = self._part(row + place, before, None if codes is None else codes[here], counts[here])
                 ends = np.cumsum(part.counts)[:-1]
-                likely = np.split(part.likely.view(np.float64), ends)
+                likely = np.split(self.likely(part).view(np.float64), ends)
                 found[int(state)] = list(zip(np.split(part.successors, ends), likely, strict=True))
         return found
 

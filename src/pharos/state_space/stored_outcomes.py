@@ -53,6 +53,39 @@ class StoredOutcomes(NamedTuple):
         assert successors is not None
         return StoredOutcomes(successors, array(OFFSETS), array(CODES), array(PALETTE), array(PROBABILITIES))
 
+    def entries(self, start: int, stop: int, num_actions: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """All possible outcomes of states [start, stop), N of them.
+
+        Returns:
+            which (N,) int64, ascending, (s - start) A + a; successors (N,) int64; probabilities (N,) float64.
+        """
+        from pharos.kernels import palettes
+
+        if self.offsets is None:
+            following = np.asarray(self.successors[start:stop])
+            rows, most = following.shape[0] * following.shape[1], following.shape[2]
+            if self.palette is None:
+                assert self.probabilities is not None
+                vectors, codes = np.asarray(self.probabilities[start:stop]).reshape(-1, most), np.arange(rows)
+            else:
+                vectors, codes = np.asarray(self.palette), np.asarray(self.codes[start:stop]).ravel()  # type: ignore[index]
+            which, successors = np.empty(rows * most, np.int64), np.empty(rows * most, np.int64)
+            likely = np.empty(rows * most)
+            arrays = which, successors, likely
+            n = palettes.entries_of_padded(following.reshape(-1, most), vectors, codes, *arrays)
+            return which[:n], successors[:n], likely[:n]
+        offsets = np.asarray(self.offsets[start * num_actions : stop * num_actions + 1])
+        part = slice(int(offsets[0]), int(offsets[-1]))
+        successors = np.asarray(self.successors[part], np.int64)
+        if self.palette is None:
+            assert self.probabilities is not None
+            which = np.repeat(np.arange(len(offsets) - 1), np.diff(offsets))
+            return which, successors, np.asarray(self.probabilities[part])
+        which, likely = np.empty(len(successors), np.int64), np.empty(len(successors))
+        codes = np.asarray(self.codes[start:stop]).ravel()  # type: ignore[index]
+        palettes.entries_of_ragged(offsets, np.asarray(self.palette), codes, which, likely)
+        return which, successors, likely
+
     def of_states(self, states: np.ndarray, num_actions: int) -> dict[int, OutcomesOfState]:
         """The outcomes of some states."""
         return {int(s): [self._of_pair(int(s), a, num_actions) for a in range(num_actions)] for s in states}
