@@ -13,6 +13,7 @@ from chance_worlds import ChanceWorld, chance_worlds
 search = importlib.import_module("pharos.state_space.search")
 table = importlib.import_module("pharos.state_space.table")
 rules = importlib.import_module("pharos.rules.rules")
+stepping = importlib.import_module("pharos.rules.stepping")
 rules_traced = importlib.import_module("pharos.rules.traced")
 
 
@@ -95,3 +96,47 @@ def test_files_do_not_depend_on_the_engine(traced, tmp_path, undisturbed, monkey
     interpreted = space.mdp().rewards
     monkeypatch.undo()
     assert (space.mdp().rewards == interpreted).all()
+
+
+# Drawing outcomes -----------------------------------------------------------------------------------------------------
+
+
+def test_compiled_and_interpreted_outcomes_are_drawn_alike_and_as_often_as_they_should():
+    env = ChanceWorld(num_positions=40, seed=5)
+    compiled, interpreted = rules.rules_of(env).stepping, stepping.InterpretedStepping(env)
+    assert compiled.is_compiled
+    numbers = np.random.default_rng(0).random(2000)
+    for position in range(3):
+        state = np.array([position])
+        drawn = [compiled.outcome_one(compiled.parameters, state, 1, u) for u in numbers]
+        assert drawn == [interpreted.outcome_one(None, state, 1, u) for u in numbers]
+        for outcome, probability in enumerate(env.likely[position, 1]):
+            share = np.mean([each == outcome for each, _ in drawn])
+            assert abs(share - probability) <= 4 * (probability * (1 - probability) / 2000) ** 0.5
+            assert all(likely == probability for each, likely in drawn if each == outcome)
+    assert compiled.outcome_one(compiled.parameters, np.array([0]), 0, 1 - 2**-53)[1] > 0
+
+
+def test_many_environments_draw_outcomes_compiled_as_interpreted():
+    env = ChanceWorld(num_positions=40, seed=5)
+    ranges = np.stack([env.components.low, env.components.high])
+    starts = np.array([state for state, _ in env.initial_states()])
+    setting = (ranges, np.zeros(0), (0.7, 0.2, 0.1, 0.8), 50, 0, -1, starts, np.ones(1))
+    visited = []
+    for engine in (rules.rules_of(env).stepping, stepping.InterpretedStepping(env)):
+        rng, integers = np.arange(8, dtype=np.uint64), [np.zeros(8, np.int64) for _ in range(3)]
+        states, flags = np.repeat(starts[:1], 8, axis=0), [np.zeros(8, bool) for _ in range(3)]
+        actions, previous, elapsed = integers[0], np.full(8, -1), integers[1]
+        rewards, executed, final = np.zeros(8), integers[2], np.zeros((8, 1), np.int64)
+        ended, terminated, truncated = flags
+        batch = (rng, actions, states, previous, elapsed, ended, rewards, terminated, truncated, executed, final)
+        batch = (*batch, np.zeros((0, 1), np.float32))
+        found = []
+        for step in range(60):
+            actions[:] = step % 2
+            assert engine.step_many(engine.parameters, setting, batch, 0, 8) == -1
+            found.append((states.copy(), rewards.copy(), terminated.copy(), executed.copy()))
+        visited.append(found)
+    for one, other in zip(*visited, strict=True):
+        for a, b in zip(one, other, strict=True):
+            np.testing.assert_array_equal(a, b)

@@ -56,6 +56,8 @@ class GymEnv(SimulatedEnv, gymnasium.Env):
         self._previous = NO_ACTION
         self._elapsed = 0
         self._terminated = False
+        if simulator.env.has_chance:
+            raise ParameterError(f"{simulator.env}: a single environment draws no outcomes yet; use make_vec")
         # What a step needs, without a chain of attributes
         self._step_one, self._parameters = simulator.rules.step_one, simulator.rules.parameters
         self._ranges, self._num_actions = simulator.ranges, simulator.env.num_actions

@@ -130,8 +130,7 @@ class CompiledRewards(_Compiled):
 
     def _expected_rewards_of(self, states, outcomes, terminal, start: int, stop: int) -> np.ndarray:
         out = np.zeros((stop - start, self.env.num_actions))
-        which, following, probabilities = outcomes
-        arrays = states, which, following, probabilities, terminal
+        arrays = (_read_only(array) for array in (states, *outcomes, terminal))
         self.kernels.rewards_of(self.parameters, self.layout.tables, *arrays, start, out)
         return out
 
@@ -168,11 +167,14 @@ class CompiledStepping:
         self.env = env
         kernels = interaction_kernels(_class_of(env), names, env.num_actions, int(env.outcomes))
         self.step_one, self.step_many = kernels.step_one, kernels.step_many
-        self.is_terminal_one = kernels.is_terminal_one
+        self.outcome_one, self.is_terminal_one = kernels.outcome_one, kernels.is_terminal_one
         self._step_and_draw_one = kernels.step_and_draw_one
         state = np.array(env.initial_states()[0][0], np.int64)
         ranges = np.stack([env.components.low, env.components.high])
-        self.step_one(self.parameters, ranges, np.zeros(0), state, 0, state.copy(), np.empty(0, np.float32))
+        outcome = 0
+        if env.has_chance:
+            outcome, _ = self.outcome_one(self.parameters, state, 0, 0.0)
+        self.step_one(self.parameters, ranges, np.zeros(0), state, outcome, state.copy(), np.empty(0, np.float32))
 
     def __reduce__(self):
         return CompiledStepping, (self.env,)

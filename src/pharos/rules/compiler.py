@@ -88,7 +88,7 @@ def exploration_kernels(
 def interaction_kernels(cls: Any, names: tuple[str, ...], num_actions: int, outcomes: int = 1) -> InteractionKernels:
     """The kernels of `interaction.py`."""
     compiler, rules, parameters = _compiler_of(cls, names, outcomes, 0, num_actions)
-    return interaction(compiler, rules, parameters, num_actions)
+    return interaction(compiler, rules, parameters, num_actions, outcomes)
 
 
 def _compiler_of(

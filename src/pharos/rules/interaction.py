@@ -1,7 +1,11 @@
 """Makers of the kernels of interaction: they call the rules of one class on states that are rows of int64.
 
 As in exploration.py, what the inner functions take from their makers are constants for Numba: the rules; `Parameters`,
-what the rules see as `self`; A actions. `ranges` (2, D) int64: lowest and highest value of each component.
+what the rules see as `self`; A actions of at most K outcomes. `ranges` (2, D) int64: lowest and highest value of each
+component.
+
+One environment takes a branch a K + k, outcome k of action a, which `outcome_one` draws before; many draw it
+themselves. Without chance K is 1, so a branch is an action.
 """
 
 from typing import Any, NamedTuple
@@ -9,13 +13,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import int64
 
-from pharos.kernels.stepping import SAME_STEP, drawn_start, executed_action
+from pharos.kernels.stepping import SAME_STEP, drawn_start, executed_action, uniform_number
 
 
 class InteractionKernels(NamedTuple):
     """The compiled kernels; see the makers below."""
 
     step_one: Any
+    outcome_one: Any
     step_and_draw_one: Any
     step_many: Any
     is_terminal_one: Any
@@ -24,15 +29,18 @@ class InteractionKernels(NamedTuple):
     draw_planes: Any
 
 
-def interaction(compiler: Any, rules: Any, Parameters: Any, A: int) -> InteractionKernels:
-    """The kernels of a class of environments with A actions."""
-    step, drawing = compiler.calling("transition", "is_terminal", "reward"), compiler.calling("draw")
-    advance = advance_function(step, rules)
+def interaction(compiler: Any, rules: Any, Parameters: Any, A: int, K: int = 1) -> InteractionKernels:
+    """The kernels of a class of environments with A actions of at most K outcomes."""
+    chance = ("probability",) * (K > 1)
+    step, drawing = compiler.calling("transition", "is_terminal", "reward", *chance), compiler.calling("draw")
+    advance = advance_function(step, rules, K)
+    drawn_outcome = drawn_outcome_function(step, rules, K)
     draw_flat = draw_flat_function(drawing, rules)
     return InteractionKernels(
         step_one=step_one_kernel(step, Parameters, advance),
+        outcome_one=outcome_one_kernel(step, Parameters, drawn_outcome),
         step_and_draw_one=step_and_draw_one_kernel(compiler, Parameters, advance, draw_flat),
-        step_many=step_many_kernel(step, Parameters, advance, A),
+        step_many=step_many_kernel(step, Parameters, advance, drawn_outcome, A, K),
         is_terminal_one=is_terminal_one_kernel(compiler.calling("is_terminal"), rules, Parameters),
         draw_simple=draw_simple_kernel(drawing, rules, Parameters, draw_flat),
         draw_complex=draw_complex_kernel(drawing, rules, Parameters),
@@ -40,35 +48,78 @@ def interaction(compiler: Any, rules: Any, Parameters: Any, A: int) -> Interacti
     )
 
 
-def advance_function(compiler: Any, rules: Any) -> Any:
+def advance_function(compiler: Any, rules: Any, K: int) -> Any:
     """One step by the rules, checked."""
     transition, is_terminal, reward = rules["transition"], rules["is_terminal"], rules["reward"]
 
     @compiler.inlined
-    def advance(self, ranges, state, action, following):
+    def go(self, state, branch, following):
+        transition(self, state, branch, following)
+
+    @compiler.inlined
+    def go_by_outcome(self, state, branch, following):
+        transition(self, state, branch // K, branch % K, following)
+
+    move = go if K == 1 else go_by_outcome
+
+    @compiler.inlined
+    def advance(self, ranges, state, branch, following):
         """Write the successor of `state`; return the reward and 0 (goes on), 1 (terminal) or 2 + i (component i left
         its range).
         """
         for i in range(len(state)):
             following[i] = state[i]
-        transition(self, state, action, following)
+        move(self, state, branch, following)
         for i in range(len(state)):
             if following[i] < ranges[0, i] or following[i] > ranges[1, i]:
                 return 0.0, 2 + i
-        return float(reward(self, state, action, following)), int64(is_terminal(self, following))
+        return float(reward(self, state, branch // K, following)), int64(is_terminal(self, following))
 
     return advance
+
+
+def drawn_outcome_function(compiler: Any, rules: Any, K: int) -> Any:
+    """Which outcome a number from 0 to 1 stands for."""
+    probability = rules.get("probability")
+
+    @compiler.inlined
+    def only_outcome(self, state, action, u):
+        return 0, 1.0
+
+    @compiler.inlined
+    def drawn_outcome(self, state, action, u):
+        """(outcome, its probability): the first one with which the probabilities so far are more than u in [0, 1)."""
+        drawn, likely, passed = 0, 0.0, 0.0
+        for outcome in range(K):
+            chance = float(probability(self, state, action, outcome))
+            if chance > 0.0 and passed <= u:  # else it is drawn already
+                drawn, likely = outcome, chance
+                passed += chance
+        return drawn, likely
+
+    return only_outcome if K == 1 else drawn_outcome
+
+
+def outcome_one_kernel(compiler: Any, Parameters: Any, drawn_outcome: Any) -> Any:
+    """The outcome of one step of one environment."""
+
+    @compiler.kernel
+    def outcome_one(parameters, state, action, u):
+        """(outcome, its probability) of `action` in `state`, by a number u in [0, 1)."""
+        return drawn_outcome(Parameters(*parameters), state, action, u)
+
+    return outcome_one
 
 
 def step_one_kernel(compiler: Any, Parameters: Any, advance: Any) -> Any:
     """One step of one environment."""
 
     @compiler.kernel
-    def step_one(parameters, ranges, scale, state, action, following, vector):
+    def step_one(parameters, ranges, scale, state, branch, following, vector):
         """One step: `advance`, and vector[i] = (following[i] - low[i]) * scale[i] where `vector` has room (0 entries:
         not wanted).
         """
-        value, code = advance(Parameters(*parameters), ranges, state, action, following)
+        value, code = advance(Parameters(*parameters), ranges, state, branch, following)
         if len(vector) > 0:
             for i in range(len(state)):
                 vector[i] = (following[i] - ranges[0, i]) * scale[i]
@@ -103,13 +154,13 @@ def step_and_draw_one_kernel(compiler: Any, Parameters: Any, advance: Any, draw_
     """One step of one environment, and its image."""
 
     @compiler.kernel
-    def step_and_draw_one(parameters, ranges, state, action, following, shades, image):
+    def step_and_draw_one(parameters, ranges, state, branch, following, shades, image):
         """One step: `advance`, and the simple image of the successor, a pixel for each cell, on planes of their own.
 
         shades (L, 256) uint8 as in `draw_simple`; image (L, rows, columns) uint8, zero.
         """
         self = Parameters(*parameters)
-        value, code = advance(self, ranges, state, action, following)
+        value, code = advance(self, ranges, state, branch, following)
         if code <= 1:
             draw_flat(self, following, shades, image)
         return value, code
@@ -117,7 +168,7 @@ def step_and_draw_one_kernel(compiler: Any, Parameters: Any, advance: Any, draw_
     return step_and_draw_one
 
 
-def step_many_kernel(compiler: Any, Parameters: Any, advance: Any, A: int) -> Any:
+def step_many_kernel(compiler: Any, Parameters: Any, advance: Any, drawn_outcome: Any, A: int, K: int) -> Any:
     """One step of many environments."""
 
     @compiler.kernel
@@ -138,7 +189,11 @@ def step_many_kernel(compiler: Any, Parameters: Any, advance: Any, A: int) -> An
             restart = ended[i]
             if not restart:
                 action = executed_action(actions[i], previous[i], chance, A, rng, i)
-                value, code = advance(self, ranges, states[i], action, following)
+                branch = action
+                if K > 1:  # nothing is drawn where an action has one outcome
+                    outcome, _ = drawn_outcome(self, states[i], action, uniform_number(rng, i))
+                    branch = action * K + outcome
+                value, code = advance(self, ranges, states[i], branch, following)
                 if code > 1:
                     executed[i] = action
                     return i * length + code - 2

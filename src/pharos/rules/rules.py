@@ -19,7 +19,6 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 
 from pharos.environments import Environment
-from pharos.errors import RuleError
 from pharos.rules.compiled import (
     CompiledAges,
     CompiledDrawing,
@@ -135,8 +134,11 @@ class Stepping(Protocol):
     is_compiled: bool
     parameters: Any
 
+    def outcome_one(self, *arguments: Any) -> Any:
+        """(outcome, its probability) of an action, by a number in [0, 1)."""
+
     def step_one(self, *arguments: Any) -> Any:
-        """(reward, code) of one step."""
+        """(reward, code) of one step, by an action, or by the branch a K + k for outcome k of K of action a."""
 
     def step_many(self, *arguments: Any) -> Any:
         """One step of many environments; -1, or which component of which left its range."""
@@ -192,8 +194,6 @@ class Rules:
 
     @cached_property
     def stepping(self) -> Stepping:
-        if self.env.has_chance:
-            raise RuleError(f"{self.env}: outcomes are not drawn yet, so it can be built and solved but not stepped")
         compiled = compiled_or_none(CompiledStepping, self.env)
         if compiled is not None:
             return compiled

@@ -26,9 +26,24 @@ class InterpretedStepping:
         """None: steps and drawings are two calls."""
         return None
 
-    def step_one(self, parameters, ranges, scale, state, action, following, vector) -> tuple[float, int]:
+    def outcome_one(self, parameters, state, action, u) -> tuple[int, float]:
+        return self._drawn_outcome(tuple(state.tolist()), action, u)
+
+    def _drawn_outcome(self, state: tuple[int, ...], action: int, u: float) -> tuple[int, float]:
+        if not self.env.has_chance:
+            return 0, 1.0
+        drawn, likely, passed = 0, 0.0, 0.0
+        for outcome in range(self.env.outcomes):
+            chance = float(self.env.probability(state, action, outcome))
+            if chance > 0 and passed <= u:
+                drawn, likely = outcome, chance
+                passed += chance
+        return drawn, likely
+
+    def step_one(self, parameters, ranges, scale, state, branch, following, vector) -> tuple[float, int]:
         before = tuple(state.tolist())
-        after = self.env.next_state(before, action)
+        action, outcome = divmod(branch, self.env.outcomes)
+        after = self.env.next_state(before, action, outcome)
         for i, value in enumerate(after):
             if not ranges[0, i] <= value <= ranges[1, i]:
                 return 0.0, 2 + i
@@ -49,7 +64,8 @@ class InterpretedStepping:
             if not restart:
                 action = self._executed(int(actions[i]), int(previous[i]), chance, rng, i)
                 before = tuple(states[i].tolist())
-                after = self.env.next_state(before, action)
+                u = _uniform_number(rng, i) if self.env.has_chance else 0.0
+                after = self.env.next_state(before, action, self._drawn_outcome(before, action, u)[0])
                 executed[i] = action
                 for c, value in enumerate(after):
                     if not ranges[0, c] <= value <= ranges[1, c]:
