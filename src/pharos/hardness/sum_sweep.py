@@ -9,16 +9,19 @@ from typing import Any
 import numpy as np
 
 from pharos.hardness.interval import Interval, Spending
-from pharos.kernels import graph
+from pharos.kernels import dense_search, graph
 from pharos.mdp import TabularMDP
 from pharos.wording import many
 
 # Untyped, as starred arguments of compiled functions are not checked.
 kernels: Any = graph
+dense: Any = dense_search
 # Nodes of a layer beyond which layers are not narrow: a set of them no longer fits into a core's cache.
 _WIDE = 1024
 # Widths of searches from many nodes, in words of 64 sources: eight words are a cache line.
 _WORDS = (1, 8)
+# Levels up to which every node is asked on every level. Breakout has six times as many, puzzles half of them.
+_FEW_LEVELS = 100
 # Bytes that searches from many nodes may take.
 _BATCH_MEMORY = 2**31
 
@@ -186,8 +189,8 @@ class SumSweep:
         """Search where it pays: the kind that closed most nodes for its cost, the others now and then.
 
         The kinds: from the node of the largest upper bound forward, or backward; from the middle in both directions;
-        from up to 512 open nodes at once. Costs are counted in table entries read, not in seconds, so that the searches
-        made are the same on every machine.
+        from up to 512 open nodes at once, telling their neighbours or, where levels are few, asking them. Costs are
+        counted in table entries read, not in seconds, so that the searches made are the same on every machine.
         """
         one = max(1, self.graph.num_nodes * self.graph.next_states.shape[1])
         worth = {"out": math.inf, "in": math.inf, "middle": math.inf}
@@ -195,6 +198,8 @@ class SumSweep:
         while still_open and not self.spending.is_over:
             if len(worth) == 3 and self.spending.searches >= 12 and still_open >= 16:
                 worth |= {f"many {words}": math.inf for words in _WORDS if self._fits(words)}
+                if self.best <= _FEW_LEVELS and self._fits(dense.WORDS):
+                    worth["dense"] = math.inf
             kind = max(worth, key=lambda name: worth[name])
             cost = 1.0
             if kind == "out":
@@ -204,6 +209,8 @@ class SumSweep:
             elif kind == "middle":
                 self._pivot(middle)
                 cost = 2.0
+            elif kind == "dense":
+                cost = self._search_densely() / one
             else:
                 cost = self._search_many(num_out <= num_in, int(kind.split()[1])) / one
             before = still_open
@@ -242,6 +249,34 @@ class SumSweep:
         self.spending.searches += len(sources)
         self.method = "directed ExactSumSweep, then searches from many states at once"
         return int(reads) * (1 + words)
+
+    def _search_densely(self) -> int:
+        """The exact in(v) of up to 512 open nodes, and what follows along edges; the cost, in table entries.
+
+        Where most eccentricities are nearly equal, as in puzzles whose moves can be taken back, no pivot rules many
+        nodes out; but a node with in(u) < D does so for its successors, as in(v) <= 1 + in(u). So none of the nodes is
+        a successor of another one, and those with many successors come first: they lie in the middle and close most.
+        A line asked for takes an eighth of the time of one told (0.25 s for 512 nodes of the 8-puzzle, 2.8 s).
+        """
+        graph = self.graph
+        table, ends, start = graph.next_states, graph.ends, graph.start
+        nodes = np.flatnonzero(np.greater(self.in_upper, self.best)).astype(graph.dtype)
+        degrees = dense.num_successors(table, ends, graph.num_nodes)[nodes]
+        order = nodes[np.lexsort((-self.in_upper[nodes].astype(np.int64), -degrees.astype(np.int64)))]
+        limit = int(min(64 * dense.WORDS, max(1, self.spending.budget.searches - self.spending.searches)))
+        blocked, active, arriving = (np.zeros(graph.num_nodes, np.bool_) for _ in range(3))
+        sources = np.sort(dense.spread_out(table, ends, order, blocked, limit))
+        bits = [np.zeros((graph.num_nodes, dense.WORDS), np.uint64) for _ in range(3)]
+        largest = np.empty(len(sources), np.int64)
+        reads = dense.dense_search_backward(table, ends, start, sources, *bits, active, arriving, largest)
+        self.in_upper[sources] = self.in_lower[sources] = largest
+        self.best = max(self.best, int(largest.max()))
+        passes = 1
+        while dense.lower_along_edges(table, ends, start, self.in_upper, self.out_upper):
+            passes += 1
+        self.spending.searches += len(sources)
+        self.method = "directed ExactSumSweep, then searches from many states at once"
+        return int(reads) * (1 + dense.WORDS) // 8 + passes * table.size
 
     # Clocks -----------------------------------------------------------------------------------------------------------
 

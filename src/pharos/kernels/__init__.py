@@ -5,6 +5,7 @@ The package announces its files; each is loaded where it is used, and loads Numb
 
 __all__ = [
     "bellman",
+    "dense_search",
     "disk_table",
     "elimination",
     "gaps",
