@@ -238,14 +238,14 @@ def test_a_tolerance_below_what_floats_can_reach_is_refused():
 
 
 def test_linear_systems_that_are_too_large_are_left_to_sweeps_however_many():
-    """3,000 states at most, and under sticky actions pairs; a sweep that changes as much as one of half as many."""
-    size = 2000
-    slow = TabularMDP.from_arrays(
-        np.tile((np.arange(size) + 1)[:, None] % size, 2), np.ones((size, 2)), gamma=1 - 1e-12
-    )
+    """2 million nodes times actions at most; under sticky actions nodes are pairs. Of two sweeps the second changes as
+    much as the first."""
+    size, actions = 5000, 21
+    table = np.tile((np.arange(size) + 1)[:, None] % size, actions)
+    slow = TabularMDP.from_arrays(table, np.ones((size, actions)), gamma=1 - 1e-12)
     for mdp, expected in ((random_actions(slow, 0.5), True), (sticky_actions(slow, 0.5), False)):
         decision = PolicyIteration(mdp, BEST)
-        assert [decision.is_worth_it(sweeps, 1.0, 1e-6) for sweeps in (32, 64)] == [False, expected]
+        assert [decision.is_worth_it(sweeps, 1.0, 1e-6) for sweeps in (256, 512)] == [False, expected]
 
 
 @pytest.mark.parametrize("tolerance", [0, -1, float("nan"), "small"])
