@@ -143,8 +143,8 @@ def test_the_folder_of_compiled_rules_is_private(filled):
 
 
 def test_kernels_do_not_depend_on_rules_that_they_do_not_call():
-    def places(**rules):
-        cls = corridor_class(**rules)
+    def places(cls=None, **rules):
+        cls = cls or corridor_class(**rules)
         names = numeric_attributes(cls())[0]
         explored, played = exploration_kernels(cls, names, 1, 2), interaction_kernels(cls, names, 2)
         return {name: kernel._cache.path for each in (explored, played) for name, kernel in each._asdict().items()}
@@ -158,7 +158,11 @@ def test_kernels_do_not_depend_on_rules_that_they_do_not_call():
     def changed(**rules):
         return {name for name, path in places(**rules).items() if path != before[name]}
 
+    class Heir(corridor_class()):
+        """It inherits all rules."""
+
     before = places()
+    assert places(Heir) == before
     drawings = {"step_and_draw_one", "draw_simple", "draw_complex", "draw_planes"}
     assert changed() == set()
     assert changed(reward=reward) == {"rewards_of", "step_one", "step_many", "step_and_draw_one"}

@@ -9,7 +9,9 @@ from pathlib import Path
 
 import pytest
 
+from pharos import paths
 from pharos.environments import catalog
+from pharos.rules.kernel_cache import private_folder
 
 PAGE = Path(__file__).parents[1] / "docs" / "adding-an-environment.md"
 BLOCK = re.compile(r"^```(python|text)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
@@ -21,10 +23,12 @@ def blocks():
 
 @pytest.fixture
 def page(monkeypatch, tmp_path):
-    """A module to run the page in, away from the user's cache and from the list of environments."""
+    """A module to run the page in, away from the user's cache (but for compiled rules) and from the list of
+    environments."""
     module = types.ModuleType("tutorial_page")
     monkeypatch.setitem(sys.modules, module.__name__, module)
     monkeypatch.setattr(catalog, "_REGISTERED", {})
+    (tmp_path / "compiled").symlink_to(private_folder(paths.cache_directory()))
     monkeypatch.setenv("PHAROS_CACHE_DIR", str(tmp_path))
     return module
 

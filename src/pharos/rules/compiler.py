@@ -100,12 +100,17 @@ def _compiler_of(
     """
     rule_compiler = _RuleCompiler()
     rules = {rule: rule_compiler.compiled(getattr(cls, rule)) for rule in rules_of_class(cls)}
-    texts = {rule: function_text(getattr(cls, rule), {}) for rule in rules}
+    texts = {rule: (_home(cls, rule), function_text(getattr(cls, rule), {})) for rule in rules}
     key = (names, numbers, *((outcomes,) if outcomes > 1 else ()))
-    compiler = Compiler(cls.__name__.lower(), texts, key)
+    compiler = Compiler(texts, key)
     if outcomes == 1 and cls.takes_outcomes():
         rules["transition"] = one_outcome(compiler.calling("transition"), rules["transition"])
     return compiler, rules, namedtuple("Parameters", names)
+
+
+def _home(cls: type[Environment], rule: str) -> str:
+    """The name of the class that has the rule: those that inherit it share what is compiled."""
+    return next(base.__name__ for base in cls.__mro__ if rule in vars(base)).lower()
 
 
 @cache
@@ -120,17 +125,19 @@ class Compiler:
     processes, is loaded into one.
 
     Args:
-        label: how names begin. texts: of the rules that the functions call. key: what else they depend on.
+        texts: of the rules that the functions call, each with the name of its class; the name begins with the first of
+            these. key: what else they depend on.
     """
 
-    def __init__(self, label: str, texts: dict[str, Any], key: tuple):
-        self.label, self.texts, self.key = label, texts, key
-        everything = (_machinery(), list(texts.values()), *key, numba.__version__)
+    def __init__(self, texts: dict[str, tuple[str, Any]], key: tuple):
+        self.texts, self.key = texts, key
+        everything = (_machinery(), [text for _, text in texts.values()], *key, numba.__version__)
+        label = next(iter(texts.values()))[0]
         self.name = f"{label}_{hashlib.sha256(repr(everything).encode()).hexdigest()[:20]}"
 
     def calling(self, *rules: str) -> "Compiler":
         """The compiler of functions that call these rules alone: when another one is edited, they stay compiled."""
-        return Compiler(self.label, {rule: self.texts[rule] for rule in rules}, self.key)
+        return Compiler({rule: self.texts[rule] for rule in rules}, self.key)
 
     def inlined(self, function: Callable) -> Any:
         """A function that becomes part of its callers."""
