@@ -10,6 +10,7 @@ from pharos.environments.built_in import BUILT_IN, BuiltIn, on_registration
 
 if TYPE_CHECKING:
     from pharos.environments.base import Components, Environment, State, start_distribution
+    from pharos.environments.blackjack import Blackjack
     from pharos.environments.breakout import Breakout
     from pharos.environments.catalog import (
         class_called,
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
         register,
         source_of,
     )
+    from pharos.environments.cliff_walking import CliffWalking
     from pharos.environments.freeway import Freeway
     from pharos.environments.frozen_lake import FrozenLake
     from pharos.environments.look import Color, Ground, Layer, Look, Margin, Scenery, Shape, Sprite
@@ -30,6 +32,7 @@ if TYPE_CHECKING:
     from pharos.environments.mini_grid_rooms import MiniGridRooms
     from pharos.environments.parameters import (
         CELL,
+        CELLS,
         VALUED_CELLS,
         Kind,
         Parameter,
@@ -43,10 +46,12 @@ if TYPE_CHECKING:
     from pharos.environments.simple_grid import SimpleGrid
     from pharos.environments.sliding_tiles import SlidingTiles
     from pharos.environments.sokoban import Sokoban
+    from pharos.environments.taxi import Taxi
 
 _FILES = {
     **{entry.class_name: entry.name for entry in BUILT_IN},
     "CELL": "parameters",
+    "CELLS": "parameters",
     "VALUED_CELLS": "parameters",
     "Color": "look",
     "Components": "base",
@@ -81,9 +86,12 @@ _FILES = {
 __all__ = [
     "BUILT_IN",
     "CELL",
+    "CELLS",
     "VALUED_CELLS",
+    "Blackjack",
     "Breakout",
     "BuiltIn",
+    "CliffWalking",
     "Color",
     "Components",
     "Environment",
@@ -106,6 +114,7 @@ __all__ = [
     "Sokoban",
     "Sprite",
     "State",
+    "Taxi",
     "as_tuples",
     "class_called",
     "class_of",

@@ -66,6 +66,9 @@ BUILT_IN = (  # in the order in which they are listed
     ),
     BuiltIn("mini_grid_empty", "MiniGridEmpty", "8x8 8x8-lazy"),
     BuiltIn("mini_grid_rooms", "MiniGridRooms", "4x3 9x4"),
+    BuiltIn("cliff_walking", "CliffWalking", "4x12 4x12-slippery 8x24 8x24-slippery"),
+    BuiltIn("taxi", "Taxi", "5x5 5x5-rainy 5x5-fickle 5x5-rainy-fickle 10x10"),
+    BuiltIn("blackjack", "Blackjack", "sutton-barto plain natural"),
 )
 
 _LISTENERS: list[Callable[[type["Environment"]], None]] = []

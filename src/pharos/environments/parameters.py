@@ -194,7 +194,16 @@ def _valued_cells(env: Any, name: str, value: Any) -> tuple[tuple[tuple[int, int
     return tuple((_cell(env, name, place), float(number)) for place, number in pairs)
 
 
+def _cells(env: Any, name: str, value: Any) -> tuple[tuple[int, int], ...]:
+    """Cells, from pairs (row, column) or text such as "0,1; 2,3"."""
+    places = [part for part in value.split(";") if part.strip()] if isinstance(value, str) else value
+    if not isinstance(places, Iterable):
+        raise ParameterError(f"{type(env).__name__}: {name}={value!r}; expected cells, such as '0,1; 2,3'")
+    return tuple(_cell(env, name, place) for place in places)
+
+
 CELL = Kind("row,column", _cell)
+CELLS = Kind("row,column; ...", _cells)
 VALUED_CELLS = Kind("row,column:value; ...", _valued_cells)
 
 

@@ -1,0 +1,107 @@
+"""Cliff walking: the short way along the edge or the long way round. Source: Sutton and Barto (2018), example 6.6."""
+
+from dataclasses import dataclass
+
+from pharos.environments.base import Environment
+from pharos.environments.look import Layer, Look
+from pharos.environments.parameters import parameter
+
+ROW, COLUMN = range(2)
+UP, RIGHT, DOWN, LEFT = range(4)
+
+FALL, STEP = -100.0, -1.0
+SLIPPERY = "write slippery=true"
+
+
+@dataclass(frozen=True, kw_only=True)
+class CliffWalking(Environment):
+    """Walk from the bottom left to the bottom right of a grid; between the two the bottom row is a cliff.
+
+    State    (row, column), counted from the top-left corner.
+    Actions  up, right, down, left, numbered as in Gymnasium; walking into a wall changes nothing.
+    Chance   where it is slippery, an action is executed as itself or as one of the two perpendicular ones, 1/3 each.
+    Reward   -1 a step; a fall over the cliff pays -100 and leads back to the start.
+    Ends     on reaching the goal.
+    Limit    none in Gymnasium; here 25 steps for each cell of the longer side.
+    Ours     size and limit. One step of a slippery walk can both fall and be stopped by a wall, only at the start: then
+             the two lead to the same state, and either pays the mean of what Gymnasium pays for them (-50.5 where one
+             of each leads there, -34 where two walls do). So expected rewards are Gymnasium's, everywhere.
+    Source   Gymnasium CliffWalking-v1; Sutton and Barto (2018), "Reinforcement Learning", example 6.6.
+
+    Attributes:
+        height, width: of the grid; at least 2 and 3.
+        slippery: whether actions slip.
+    """
+
+    height: int = parameter(4, low=2)
+    width: int = parameter(12, low=3)
+    slippery: bool = parameter(False)
+
+    name = "cliff_walking"
+    actions = ("up", "right", "down", "left")
+    version = 1
+    layers = {
+        "cliff": Layer("x", (96, 66, 58)),
+        "goal": Layer("G", (236, 236, 236)),
+        "agent": Layer("A", (66, 72, 200)),
+    }
+
+    look = Look(ground="tiles", color="#7F7F7F")
+    instances = {
+        "4x12": {},
+        "4x12-slippery": {"slippery": True},
+        "8x24": {"height": 8, "width": 24},
+        "8x24-slippery": {"height": 8, "width": 24, "slippery": True},
+    }
+    foreign_parameters = {"is_slippery": SLIPPERY}
+    hyperparameters = {  # chosen by hand
+        "q_learning": {"default": {"initial_q": 0.0}},
+        "dqn": {"default": {"learning_rate": 0.001, "target_update_interval": 250, "exploration_final_eps": 0.02}},
+    }
+
+    @property
+    def outcomes(self) -> int:  # type: ignore[override]
+        return 3 if self.slippery else 1
+
+    @property
+    def max_episode_steps(self) -> int:  # type: ignore[override]
+        return 25 * max(self.height, self.width)
+
+    def variables(self):
+        return {"row": range(self.height), "column": range(self.width)}
+
+    def initial_state(self):
+        return (self.height - 1, 0)
+
+    def probability(self, state, action, outcome):
+        return 1 / 3 if self.slippery else 1.0
+
+    def transition(self, state, action, outcome, out):
+        way = (action + outcome - 1) % 4 if self.slippery else action
+        row = min(max(state[ROW] + (way == DOWN) - (way == UP), 0), self.height - 1)
+        column = min(max(state[COLUMN] + (way == RIGHT) - (way == LEFT), 0), self.width - 1)
+        falls = row == self.height - 1 and 0 < column < self.width - 1
+        out[ROW] = row
+        out[COLUMN] = 0 if falls else column
+
+    def is_terminal(self, state):
+        return state[ROW] == self.height - 1 and state[COLUMN] == self.width - 1
+
+    def reward(self, state, action, next_state):
+        if next_state[ROW] != self.height - 1 or next_state[COLUMN] != 0:
+            return STEP
+        if state[ROW] != self.height - 1:  # down from above: beside the start it walks, elsewhere it falls
+            return STEP if state[COLUMN] == 0 else FALL
+        if not self.slippery:
+            return FALL if action == RIGHT else STEP
+        falls = action != LEFT
+        walls = 2 if action == LEFT or action == DOWN else 1
+        return (falls * FALL + walls * STEP) / (falls + walls)
+
+    def grid(self):
+        return self.height, self.width
+
+    def draw(self, state, planes):
+        planes[0, self.height - 1, 1 : self.width - 1] = 1
+        planes[1, self.height - 1, self.width - 1] = 1
+        planes[2, state[ROW], state[COLUMN]] = 1
