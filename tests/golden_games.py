@@ -4,6 +4,7 @@ anew.
 Look at every frame that changed: a golden game is right because someone has read it.
 """
 
+import re
 from pathlib import Path
 
 import pharos
@@ -73,6 +74,14 @@ GAMES = {
     "mini_grid_lava": ("mini_grid/lava-gap-s5", {"seed": 1}, "rflfrf"),
     "sokoban_corner_solved": ("sokoban/corner", {}, "rdldr"),
     "sokoban_off_and_on_a_target": ("sokoban", {"level": "#######/#-@*--#/#---$-#/#---.-#/#######"}, "rddrruuld"),
+    "cliff_walking_slips_over_the_edge": ("cliff_walking/4x12-slippery", {"width": 5}, "u1r1r1r2r1r1d1"),
+    "taxi_in_the_rain_with_a_fickle_passenger": (
+        "taxi/5x5-rainy-fickle",
+        {"size": 3, "landmarks": "0,0; 2,2; 0,2", "walls": "0,0"},
+        "p0d3r0u2s0u0s0",
+    ),
+    "blackjack_hits_and_sticks": ("blackjack", {}, "h1h3s3"),
+    "blackjack_busts": ("blackjack/natural", {}, "h9h9h9"),
 }
 
 
@@ -85,11 +94,12 @@ def played(game: str) -> str:
     name, parameters, letters = GAMES[game]
     env = pharos.make(name, **parameters)
     lines = [str(env), ""]
-    state, total = tuple(env.initial_state()), 0.0
+    state, total = tuple(env.initial_states()[0][0]), 0.0
     lines += [f"state {state}", text_drawing(env, state), ""]
-    for step, letter in enumerate(letters, start=1):
-        action = next(i for i, action in enumerate(env.actions) if action.startswith(letter))
-        following = env.next_state(state, action)
+    moves = re.findall("([a-z])([0-9]?)", letters) if isinstance(letters, str) else [(name, "") for name in letters]
+    for step, (begin, digit) in enumerate(moves, start=1):
+        action = next(i for i, action in enumerate(env.actions) if action.startswith(begin))
+        following = env.next_state(state, action, int(digit or 0))
         reward = env.reward(state, action, following)
         state, total = following, total + reward
         lines += [f"{step}. {env.actions[action]}, reward {reward:g}", f"state {state}", text_drawing(env, state), ""]

@@ -95,7 +95,7 @@ class CliffWalking(Environment):
         if not self.slippery:
             return FALL if action == RIGHT else STEP
         falls = action != LEFT
-        walls = 2 if action == LEFT or action == DOWN else 1
+        walls = 2 if action in (LEFT, DOWN) else 1
         return (falls * FALL + walls * STEP) / (falls + walls)
 
     def grid(self):

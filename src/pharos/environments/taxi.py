@@ -12,7 +12,7 @@ from pharos.environments.parameters import CELLS, parameter, store
 from pharos.errors import ParameterError
 
 ROW, COLUMN, PASSENGER, DESTINATION, UNDECIDED = range(5)
-DOWN, UP, RIGHT, LEFT, PICK_UP, DROP_OFF = range(6)
+DOWN, UP, RIGHT, LEFT, PICK_UP, SET_DOWN = range(6)
 
 # Of Gymnasium's map: the places R, G, Y and B, and the cells that have a wall to their right.
 LANDMARKS = ((0, 0), (0, 4), (4, 0), (4, 3))
@@ -25,20 +25,20 @@ RIDER = ("...##...", "...##...", "..####..", "...##...", "...##...", "..#..#..",
 
 @dataclass(frozen=True, kw_only=True)
 class Taxi(Environment):
-    """Drive a taxi over a square town: fetch the passenger at a landmark, and drop him off at another one.
+    """Drive a taxi over a square town: fetch the passenger at a landmark, and set him down at another one.
 
     State    (row, column) of the taxi, the landmark where the passenger is (or their number: in the taxi), his
              destination, and whether he may still change his mind.
     Start    the taxi anywhere, the passenger at a landmark, his destination another one; each with the same
              probability.
-    Actions  down, up, right, left, pick up, drop off, numbered as in Gymnasium; walls stop the taxi.
+    Actions  down, up, right, left, pick up, set down, numbered as in Gymnasium; walls stop the taxi.
     Chance   rainy: a move that no wall stops goes its way with `rainy_probability`, else to its left or right, with the
              same probability, where walls do not stop that.
              fickle: the first time that the taxi changes its cell with the passenger in it, he takes another
              destination with `fickle_probability`, each with the same probability.
-    Reward   -1 a step, -10 for picking up or dropping off where that is impossible, 20 for dropping him off at his
-             destination. Elsewhere he can only be dropped off at landmarks.
-    Ends     when he is dropped off at his destination.
+    Reward   -1 a step, -10 for picking up or setting down where that is impossible, 20 for setting him down at his
+             destination. He can be set down at landmarks only.
+    Ends     when he is set down at his destination.
     Limit    200 steps on 5 x 5 cells, as in Gymnasium; 8 for each cell.
     Ours     sizes. Gymnasium draws before the first step whether he will change his mind, and hides it; here it is
              drawn when it shows, which is the same in law, and the state says whether that is still to come.
@@ -62,7 +62,7 @@ class Taxi(Environment):
     fickle_probability: float = parameter(0.3, low=0.0, high=1.0)
 
     name = "taxi"
-    actions = ("down", "up", "right", "left", "pick up", "drop off")
+    actions = ("down", "up", "right", "left", "pick up", "set down")
     version = 1
     layers = {
         "walls": Layer("|", (150, 150, 150), ("..####..",) * 8),
@@ -179,7 +179,7 @@ class Taxi(Environment):
             if state[PASSENGER] < places and is_at(self, state, state[PASSENGER]):
                 out[PASSENGER] = places
             return
-        if action == DROP_OFF:
+        if action == SET_DOWN:
             if state[PASSENGER] == places:
                 for place in range(places):
                     if is_at(self, state, place):
