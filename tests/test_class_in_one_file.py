@@ -138,8 +138,8 @@ def test_it_brings_its_hyperparameters_and_its_colour(corridor):
     usual = hyperparameters("dqn", "nobody", "vector")
     assert hyperparameters("dqn", "corridor", "vector") == {**usual, "gamma": 0.5, "batch_size": 7}
     assert hyperparameters("dqn", "corridor", "simple_image", {"gamma": 0.1}) == {**usual, "gamma": 0.1}
-    assert figures.class_color("corridor", ["corridor", "taxi"]) == "#123456"
-    assert figures.class_color("taxi", ["corridor", "taxi"]) == figures.MORE_COLORS[0]
+    assert figures.class_color("corridor", ["corridor", "another"]) == "#123456"
+    assert figures.class_color("another", ["corridor", "another"]) == figures.MORE_COLORS[0]
 
 
 def test_its_parameters_are_checked_by_what_it_declares(corridor):

@@ -20,6 +20,7 @@ from pharos.errors import ParameterError, UnknownName
 
 GRIDS = ("simple_grid", "frozen_lake")
 SMALL = (  # beside them, spaces of at most 120 states
+    *("cliff_walking", "cliff_walking/4x12", "cliff_walking/4x12-slippery"),
     *("sliding_tiles/2x2", "sokoban", "sokoban/corridor", "sokoban/corner"),
     *(f"mini_grid/{name}" for name in ("empty-5x5", "empty-6x6", "empty-random-5x5", "empty-random-6x6")),
     *(f"mini_grid/{name}" for name in ("lava-gap-s5", "lava-gap-s6", "lava-gap-s7", "multi-room-n2-s4")),
@@ -507,7 +508,7 @@ def test_listing_environments_loads_nothing_heavy():
 def test_drawings_fill_the_declared_grid(name):
     env = pharos.make(name)
     rows, columns = env.grid()
-    lines = text_drawing(env, env.initial_state()).splitlines()
+    lines = text_drawing(env, env.initial_states()[0][0]).splitlines()
     assert len(lines) == rows
     assert {len(line) for line in lines} == {columns}
 

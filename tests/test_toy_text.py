@@ -165,7 +165,7 @@ def test_values_of_blackjack_are_those_of_a_recursion_over_cards(blackjack):
     for index in range(space.num_states):
         total, dealer, ace, _, result = space.state(index)
         if result == PLAYING:
-            assert solution.values[index] == pytest.approx(naive_value(total, dealer, ace)[0], abs=1e-12)
+            assert solution.v[index] == pytest.approx(naive_value(total, dealer, ace)[0], abs=1e-12)
     starts, probabilities = start_distribution(space.environment)
     expected = sum(p * naive_value(*state[:3])[0] for state, p in zip(starts, probabilities, strict=True))
     assert solution.value_at_start == pytest.approx(expected, abs=1e-12)

@@ -17,7 +17,11 @@ DOWN, UP, RIGHT, LEFT, PICK_UP, SET_DOWN = range(6)
 # Of Gymnasium's map: the places R, G, Y and B, and the cells that have a wall to their right.
 LANDMARKS = ((0, 0), (0, 4), (4, 0), (4, 3))
 WALLS = ((0, 1), (1, 1), (3, 0), (3, 2), (4, 0), (4, 2))
-MOST_LANDMARKS = 9
+PLACES = (
+    *((214, 68, 58), (74, 164, 84), (226, 190, 62), (66, 108, 216), (60, 180, 190), (190, 120, 70)),
+    *((150, 90, 190), (230, 140, 60), (120, 120, 120)),
+)
+MOST_LANDMARKS = len(PLACES)
 
 CAB = (".######.", "########", "#.####.#", "########", "1######1", "########", "########", ".#....#.")
 RIDER = ("...##...", "...##...", "..####..", "...##...", "...##...", "..#..#..", "........", "........")
@@ -66,7 +70,7 @@ class Taxi(Environment):
     version = 1
     layers = {
         "walls": Layer("|", (150, 150, 150), ("..####..",) * 8),
-        "landmarks": Layer(tuple("RGYBCPOMW"), ((214, 68, 58), (74, 164, 84), (226, 190, 62), (66, 108, 216))),
+        "landmarks": Layer(tuple("RGYBCPOMW"), PLACES),
         "destination": Layer("D", (230, 120, 200), shape="goal"),
         "taxi": Layer("T", (240, 200, 60), CAB),
         "passenger": Layer(("p", "q"), ((30, 60, 160), (150, 40, 150)), RIDER),
