@@ -192,6 +192,7 @@ def test_support_is_where_the_walk_may_be(mdp, seed):
     assert (_occupancy.support_with_ends(mdp, policy) == states).all()
 
 
+@pytest.mark.slow
 def test_the_mismatch_of_the_optimal_policy_with_itself_is_one():
     mdp = pharos.build(pharos.make("frozen_lake/4x4")).mdp(gamma=0.9)
     solution = pharos.value_iteration(mdp, 1e-9)

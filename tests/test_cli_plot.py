@@ -49,6 +49,7 @@ def test_what_a_run_has_learnt_has_the_value_that_the_run_wrote_down(folders, na
     assert found["regret_relative_to_worst"] == pytest.approx(found["regret"] / lost)
 
 
+@pytest.mark.slow
 def test_an_agent_is_read_back_with_its_task(folders):
     task, agent = load_agent(folders["ppo-0"])
     assert (task.env.name, task.random, task.horizon, task.observation) == ("frozen_lake", 0.1, 100, "vector")
@@ -64,6 +65,7 @@ def test_regret_of_runs_is_drawn(folders, tmp_path):
     assert run("plot", "regret", folders["ppo-0"], "--out", tmp_path / "regret.svg").stdout.strip().endswith(".svg")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("policy", ["optimal", "uniform", "worst", "table", "ppo-0"])
 def test_values_of_any_policy_are_drawn(folders, tmp_path, policy):
     given = policy
@@ -96,6 +98,7 @@ def test_policies_of_runs_play_beside_the_best_and_a_random_one(folders, tmp_pat
         assert 2 <= gif.n_frames <= 6
 
 
+@pytest.mark.slow
 def test_mistakes_are_one_line(folders, tmp_path):
     for words, said in (
         (("plot", "regret", tmp_path, "--out", tmp_path / "r.png"), "expected the folder of a run"),

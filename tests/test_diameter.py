@@ -57,6 +57,7 @@ def strongly_connected(rng, num_states, num_actions):
     return TabularMDP.from_arrays(table, np.zeros(table.shape), initial=int(order[0]))
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 60), st.integers(1, 3), st.integers(0, 40))
 def test_every_budget_gives_an_interval_that_holds_the_diameter_and_larger_budgets_narrower_ones(

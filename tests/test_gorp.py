@@ -36,7 +36,9 @@ def test_the_published_bound_of_key_corridor_is_reproduced(corridor):
     assert not found.proven
 
 
-@pytest.mark.parametrize("name, horizon", [("freeway_10_fs30", 10), ("maze_easy_l0_30_fs1", 30)])
+@pytest.mark.parametrize(
+    "name, horizon", [pytest.param("freeway_10_fs30", 10, marks=pytest.mark.slow), ("maze_easy_l0_30_fs1", 30)]
+)
 def test_the_published_bounds_of_other_games_are_reproduced(name, horizon):
     published = json.loads((DATA / f"{name}_gorp_bounds.json").read_text())["k_results"]
     found = hardness.gorp_bound(importers.bridge(DATA / f"{name}.npz", horizon=horizon), max_k=len(published))

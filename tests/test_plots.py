@@ -73,6 +73,7 @@ def test_a_value_map_shows_values_in_their_cells_and_arrows_of_optimal_actions()
     assert sorted(starts) == [(0, 0), (0, 0), (0, 1), (1, 0), (1, 0), (1, 1), (2, 0)]
 
 
+@pytest.mark.slow
 def test_a_given_policy_has_arrows_as_long_as_its_probabilities():
     space = pharos.build(pharos.make("simple_grid", height=2, width=2))
     policy = np.tile([0.0, 0.75, 0.25, 0.0], (4, 1))  # up, right, down, left
