@@ -14,7 +14,7 @@ import numpy as np
 from pharos.environments import Environment
 from pharos.errors import ParameterError
 from pharos.interaction.simulator import SimulatedEnv, Simulator, split_options
-from pharos.observations import NO_ACTION, Index, SimpleImage
+from pharos.observations import NO_ACTION, Index
 
 if TYPE_CHECKING:
     from pharos.drawing import Window
@@ -197,8 +197,8 @@ def _window(simulator: Simulator, fps: int) -> "Window":
 
 def _step_and_draw(simulator: Simulator) -> Any:
     """The compiled step that draws as well, for simple images with a pixel for each cell; else None."""
-    observation = simulator.context.observation
-    if not simulator.context.is_plain or not isinstance(observation, SimpleImage) or not observation.is_flat:
+    observation: Any = simulator.context.observation
+    if not simulator.context.is_plain or not observation.is_flat:
         return None
     state, image = simulator.start_states[0], observation.one(simulator.start_states[0])
     return simulator.rules.step_and_draw_one(simulator.ranges, state, 0, state.copy(), observation.shades, image)

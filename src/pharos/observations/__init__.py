@@ -1,28 +1,34 @@
 """What an agent sees: pure functions of the state with a Gymnasium space, chosen at the moment of interaction.
 
 `observe(env, "vector")` gives one; calling it with states (N, D) gives N observations. Nothing is stored with the
-states. Pictures (rendered.py) are loaded when they are first asked for.
+states. Images are loaded when they are first asked for.
 """
 
 import importlib
 from typing import TYPE_CHECKING, Any
 
 from pharos.observations.blocks import in_blocks
-from pharos.observations.complex_image import ComplexImage
 from pharos.observations.context import NO_ACTION, ObservationInContext
-from pharos.observations.observation import FunctionObservation, Observation, add_built_in, names, observe, register
-from pharos.observations.own import OwnObservation, imported, observation_of, own_observation
-from pharos.observations.simple_image import SimpleImage
+from pharos.observations.observation import FunctionObservation, Observation, names, observe, register
 from pharos.observations.vector import Index, OneHot, Vector
 
 if TYPE_CHECKING:
+    from pharos.observations.complex_image import ComplexImage
+    from pharos.observations.own import OwnObservation, imported, observation_of, own_observation
     from pharos.observations.rendered import RENDERERS, render, renderers
+    from pharos.observations.simple_image import SimpleImage
 
-add_built_in("vector", Vector)
-add_built_in("simple_image", SimpleImage)
-add_built_in("complex_image", ComplexImage)
-add_built_in("one_hot", OneHot)
-add_built_in("index", Index)
+_FILES = {
+    "ComplexImage": "complex_image",
+    "OwnObservation": "own",
+    "RENDERERS": "rendered",
+    "SimpleImage": "simple_image",
+    "imported": "own",
+    "observation_of": "own",
+    "own_observation": "own",
+    "render": "rendered",
+    "renderers": "rendered",
+}
 
 __all__ = [
     "NO_ACTION",
@@ -49,6 +55,8 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    if name not in ("RENDERERS", "render", "renderers"):
+    if name not in _FILES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module("pharos.observations.rendered"), name)
+    value = getattr(importlib.import_module(f"{__name__}.{_FILES[name]}"), name)
+    globals()[name] = value
+    return value

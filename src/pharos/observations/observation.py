@@ -1,5 +1,6 @@
 """What an observation is: a pure function of the state with a Gymnasium space, for one environment."""
 
+import importlib
 import inspect
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
@@ -26,12 +27,14 @@ class Observation:
         env: the environment.
         space: Gymnasium space of one observation.
         names: of the entries of a one-dimensional observation; None for others.
+        is_flat: whether a compiled step may draw it: a pixel is a cell, and each layer has a plane of its own.
     """
 
     name: str
     env: Environment
     space: "gymnasium.Space"
     names: tuple[str, ...] | None = None
+    is_flat: bool = False
 
     def __call__(self, states: np.ndarray) -> np.ndarray:
         """(N, D) int64 states -> (N, *space.shape) of space.dtype, a fresh array."""
@@ -92,13 +95,20 @@ class FunctionObservation(Observation):
         return np.array(found, dtype)  # a copy: functions may return the same buffer twice
 
 
-_built_in: dict[str, Callable[..., Observation]] = {}
+# Name of one of pharos' own -> its file and class, which is loaded when it is first asked for
+_BUILT_IN = {
+    "vector": "vector:Vector",
+    "simple_image": "simple_image:SimpleImage",
+    "complex_image": "complex_image:ComplexImage",
+    "one_hot": "vector:OneHot",
+    "index": "vector:Index",
+}
 _registered: dict[str, tuple[Function, Any]] = {}
 
 
 def names() -> list[str]:
     """The names that `observation=` knows, the registered ones last."""
-    return [*_built_in, *_registered]
+    return [*_BUILT_IN, *_registered]
 
 
 def register(name: str, function: Function, space: Any) -> None:
@@ -111,7 +121,7 @@ def register(name: str, function: Function, space: Any) -> None:
     Raises:
         ParameterError: the name belongs to a built-in observation.
     """
-    if name in _built_in:
+    if name in _BUILT_IN:
         raise ParameterError(f"observations.register: {name!r} is built in; choose another name")
     _registered[name] = (function, space)
 
@@ -123,12 +133,7 @@ def registered(name: str) -> tuple[Function, Any] | None:
 
 def is_built_in(name: str) -> bool:
     """Whether the name is that of one of pharos' own observations."""
-    return name in _built_in
-
-
-def add_built_in(name: str, make: Callable[..., Observation]) -> None:
-    """Put one of pharos' own among the known names; `make` takes the environment, and options as keywords."""
-    _built_in[name] = make
+    return name in _BUILT_IN
 
 
 def observe(
@@ -167,8 +172,8 @@ def observe(
         )
     elif observation in _registered:
         made, known = FunctionObservation(env, *_registered[observation], name=observation), []
-    elif observation in _built_in:
-        made, known = _made(_built_in[observation], env, state_space, options)
+    elif observation in _BUILT_IN:
+        made, known = _made(_built_in(observation), env, state_space, options)
     else:
         raise UnknownName("observation", observation, names())
     for option in options:
@@ -187,8 +192,15 @@ def _made(
     return make(env, **space, **{name: value for name, value in options.items() if name in known}), known
 
 
+def _built_in(name: str) -> Callable[..., Observation]:
+    file, _, class_name = _BUILT_IN[name].partition(":")
+    return getattr(importlib.import_module(f"pharos.observations.{file}"), class_name)
+
+
 def _own(observation: Any) -> Any:
     """The user's own observation, where that is what `observation` names."""
+    if isinstance(observation, str) and not is_reference(observation):
+        return None
     from pharos.observations.own import OwnObservation, imported
 
     if isinstance(observation, OwnObservation):

@@ -24,7 +24,6 @@ class SimpleImage(Observation):
             because Stable-Baselines3 takes the smallest dimension for the channels.
     Attributes:
         shades: (L, 256) uint8, the shade of every value on the plane of every layer.
-        is_flat: a pixel is a cell, and each layer has a plane of its own.
     Raises:
         ParameterError: the environment cannot be drawn, or there are more planes than pixels on a side.
     """
