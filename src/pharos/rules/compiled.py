@@ -11,9 +11,7 @@ import numpy as np
 
 from pharos.environments import Environment
 from pharos.errors import RuleError
-from pharos.kernels.hash_table import COUNT, FAULT, FIRST
 from pharos.rules.compiler import exploration_kernels, interaction_kernels, numeric_attributes, type_text
-from pharos.rules.interpreted import InterpretedRewards, blame
 from pharos.rules.layout import Layout
 
 _SUSPECTS = 16  # states of which a kernel cannot say in which one a rule failed
@@ -55,9 +53,7 @@ class CompiledExploration(_Compiled):
             )
         except Exception as error:  # of the rules, such as a division by zero
             failure = error
-        if failure or progress[FAULT]:
-            first, count = int(progress[FIRST]), int(progress[COUNT])
-            blame(self.env, self.layout, states[first : min(first + _SUSPECTS, count)], failure)
+        self._check(states, None, progress, failure)
 
     def expand_and_find(self, states, start, stop, base, keys, found, terminal, probabilities, table) -> None:
         progress = np.zeros(5, np.int64)
@@ -66,8 +62,16 @@ class CompiledExploration(_Compiled):
             self._expand(states, start, stop, base, keys, found, self._rows(terminal, probabilities), table, progress)
         except Exception as error:
             failure = error
+        self._check(states, stop, progress, failure)
+
+    def _check(self, states, stop: int | None, progress, failure: Exception | None) -> None:
+        """RuleError where a rule failed or left the ranges in a state before `stop`; None: in any of them."""
+        from pharos.kernels.hash_table import COUNT, FAULT, FIRST  # which stepping does without
+
         if failure or progress[FAULT]:
-            first = int(progress[FIRST])
+            from pharos.rules.interpreted import blame
+
+            first, stop = int(progress[FIRST]), int(progress[COUNT]) if stop is None else stop
             blame(self.env, self.layout, states[first : min(first + _SUSPECTS, stop)], failure)
 
     def _rows(self, terminal, probabilities) -> Any:
@@ -82,10 +86,13 @@ class CompiledExploration(_Compiled):
 
         The number of components stands for one that does not exist, the next one for a probability or an age.
         """
+        from pharos.kernels.hash_table import FAULT
+
         progress, found = np.zeros(5, np.int64), np.empty(len(keys), np.int64)
         rows = self._rows(terminal, probabilities)
         self._expand(states, i, i + 1, 0, keys, found, rows, np.full(64, -1, np.int32), progress)
-        return int(progress[FAULT]) - 1 if progress[FAULT] else None
+        fault = int(progress[FAULT])
+        return fault - 1 if fault else None
 
     def close(self) -> None:
         """Nothing to end."""
@@ -117,6 +124,8 @@ class CompiledRewards(_Compiled):
         try:
             return compiled(*arguments)
         except Exception as error:  # of the rule, such as a division by zero: name the state
+            from pharos.rules.interpreted import InterpretedRewards
+
             out = getattr(InterpretedRewards(self.env, self.layout), name)(*arguments)
             if np.isfinite(out).all():
                 raise RuleError(f"{self.env}: compiled, reward raises {error!r}; interpreted it does not") from error

@@ -13,19 +13,22 @@ from collections import namedtuple
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numba
 import numpy as np
 from numba.extending import overload
 
 from pharos.environments import Environment
-from pharos.rules.branching import BranchingKernels, branching, one_outcome
-from pharos.rules.exploration import ExplorationKernels, exploration
 from pharos.rules.fingerprint import closure_of, function_text, mentioned_names, names_in, plain_function
-from pharos.rules.interaction import InteractionKernels, interaction
 from pharos.rules.kernel_cache import cache_of_kernel
 
+if TYPE_CHECKING:
+    from pharos.rules.branching import BranchingKernels
+    from pharos.rules.exploration import ExplorationKernels
+    from pharos.rules.interaction import InteractionKernels
+
+# Makers of kernels are imported where they are called: a script that steps does not load those that search.
 RULES = ("transition", "is_terminal", "reward", "draw")
 _HERE = Path(__file__).parent
 _KERNELS = _HERE.parent / "kernels"
@@ -74,19 +77,25 @@ def _plain(value: Any) -> Any:
 @cache
 def exploration_kernels(
     cls: Any, names: tuple[str, ...], num_words: int, num_actions: int, outcomes: int = 1
-) -> ExplorationKernels | BranchingKernels:
+) -> "ExplorationKernels | BranchingKernels":
     """The kernels of `exploration.py` for the rules of a class that mention the attributes `names`; those of
     `branching.py` where there is chance or an age.
     """
     compiler, rules, parameters = _compiler_of(cls, names, outcomes, num_words, num_actions)
     if outcomes == 1 and "age" not in rules:
+        from pharos.rules.exploration import exploration
+
         return exploration(compiler, rules, parameters, num_words, num_actions)
+    from pharos.rules.branching import branching
+
     return branching(compiler, rules, parameters, num_words, num_actions, outcomes)
 
 
 @cache
-def interaction_kernels(cls: Any, names: tuple[str, ...], num_actions: int, outcomes: int = 1) -> InteractionKernels:
+def interaction_kernels(cls: Any, names: tuple[str, ...], num_actions: int, outcomes: int = 1) -> "InteractionKernels":
     """The kernels of `interaction.py`."""
+    from pharos.rules.interaction import interaction
+
     compiler, rules, parameters = _compiler_of(cls, names, outcomes, 0, num_actions)
     return interaction(compiler, rules, parameters, num_actions, outcomes)
 
@@ -104,6 +113,8 @@ def _compiler_of(
     key = (names, numbers, *((outcomes,) if outcomes > 1 else ()))
     compiler = Compiler(texts, key)
     if outcomes == 1 and cls.takes_outcomes():
+        from pharos.rules.branching import one_outcome
+
         rules["transition"] = one_outcome(compiler.calling("transition"), rules["transition"])
     return compiler, rules, namedtuple("Parameters", names)
 
