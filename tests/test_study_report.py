@@ -6,6 +6,7 @@ import subprocess
 import sys
 from html.parser import HTMLParser
 
+import pandas as pd
 import pytest
 
 import fake_training
@@ -15,6 +16,7 @@ from pharos.study.execution import claim
 from pharos.study.figures import _tasks
 from pharos.study.latex import escape
 from pharos.study.report import files, number
+from pharos.study.report.page import table
 
 SPECIFICATION = {
     "name": "lakes",
@@ -388,3 +390,10 @@ def test_a_report_says_which_images_hide_something(tmp_path, sketched):
     assert len(list(tmp_path.glob("aliasing/*.json"))) == 4
     aliasing = next(file for file in report.tables if file.name == "aliasing.csv").read_text()
     assert ",1658,1068,0.62" in aliasing and ",1658,1658,0.0" in aliasing
+
+
+def test_columns_that_say_nothing_are_left_out_of_a_table():
+    rows = pd.DataFrame({"model": ["single", "class"], "notes": ["", ""], "left_out": ["", "diameter"], "R2": [0.5, 0]})
+    shown = table(rows)
+    assert [column.title for column in shown.columns] == ["model", "left out", "R2"]
+    assert shown.rows == [["single", "", "0.500"], ["class", "diameter", "0.000"]]

@@ -80,7 +80,8 @@ def data_url(png: bytes) -> str:
 
 
 def table(data: "pd.DataFrame", caption: str = "", *, digits: int = 3) -> Table:
-    """A frame as a table: numbers short and to the right, whole ones without digits."""
+    """A frame as a table: numbers short and to the right, whole ones without digits; no column that says nothing."""
+    data = data[[name for name in data.columns if len(data) == 0 or not (data[name] == "").all()]]
     columns, digits_of = [], []
     for name in data.columns:
         is_number = data[name].dtype.kind in "fiu"

@@ -103,7 +103,7 @@ def _findings(results: Results) -> Section | None:
     decided = results.findings[results.findings["verdict"] != "no data"]
     if len(decided) == 0:
         return None
-    counts = ", ".join(f"{number} {verdict}" for verdict, number in decided["verdict"].value_counts().items())
+    counts = "; ".join(f"{number} x {verdict}" for verdict, number in decided["verdict"].value_counts().items())
     return Section.of(
         "Findings of the paper",
         "findings",
