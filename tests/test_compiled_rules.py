@@ -168,7 +168,8 @@ def test_kernels_do_not_depend_on_rules_that_they_do_not_call():
     assert changed(reward=reward) == {"rewards_of", "step_one", "step_many", "step_and_draw_one"}
     assert changed(draw=draw) == drawings
     assert changed(is_terminal=lambda self, state: state[0] >= self.length - 1) == set(before) - drawings - {
-        "rewards_of"
+        "rewards_of",
+        "outcome_one",
     } | {"step_and_draw_one"}
 
 

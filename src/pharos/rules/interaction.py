@@ -34,11 +34,12 @@ def interaction(compiler: Any, rules: Any, Parameters: Any, A: int, K: int = 1) 
     chance = ("probability",) * (K > 1)
     step, drawing = compiler.calling("transition", "is_terminal", "reward", *chance), compiler.calling("draw")
     advance = advance_function(step, rules, K)
-    drawn_outcome = drawn_outcome_function(step, rules, K)
+    outcome = compiler.calling("transition", *chance)
+    drawn_outcome = drawn_outcome_function(outcome, rules, K)
     draw_flat = draw_flat_function(drawing, rules)
     return InteractionKernels(
         step_one=step_one_kernel(step, Parameters, advance),
-        outcome_one=outcome_one_kernel(step, Parameters, drawn_outcome),
+        outcome_one=outcome_one_kernel(outcome, Parameters, drawn_outcome),
         step_and_draw_one=step_and_draw_one_kernel(compiler, Parameters, advance, draw_flat),
         step_many=step_many_kernel(step, Parameters, advance, drawn_outcome, A, K),
         is_terminal_one=is_terminal_one_kernel(compiler.calling("is_terminal"), rules, Parameters),
