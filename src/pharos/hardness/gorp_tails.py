@@ -123,8 +123,18 @@ class Tails:
         kept = np.ones(edges.shape, np.bool_)
         kept[..., 1:] = edges[..., 1:] > edges[..., :-1]  # cells that are not empty
         where, own, _ = np.nonzero(kept)
-        cdf = bdtr(edges[kept][:, None], m, p[where])
         first = np.flatnonzero(np.concatenate([[True], (np.diff(where) != 0) | (np.diff(own) != 0)]))
+        # the distribution function is what costs: once for sequences with the same mean, the first of which leads
+        leader = (p[:, :, None] == p[:, None, :]).argmax(axis=2)
+        leads, begin = leader == np.arange(n), first.reshape(rows, n)
+        if leads.all():
+            cdf = bdtr(edges[kept][:, None], m, p[where])
+        else:
+            asked = leads[where] & leads[where, own][:, None]
+            cdf = np.zeros(asked.shape)
+            cdf[asked] = bdtr(np.broadcast_to(edges[kept][:, None], asked.shape)[asked], m, p[where][asked])
+            led = np.arange(len(own)) - begin[where, own] + begin[where, leader[where, own]]
+            cdf = np.take_along_axis(cdf[led], leader[where], axis=1)
         lows = np.roll(cdf, 1, axis=0)
         cells = (cdf - lows)[np.arange(len(own)), own]
         cells[first] = 0.0
