@@ -100,9 +100,10 @@ def state_of(env, objects):
     doors, things = objects
     state = [int(env.agent_pos[1]), int(env.agent_pos[0]), env.agent_dir]
     state += [0 if door.is_open else 2 if door.is_locked else 1 for door in doors]
-    places = {id(thing): divmod(i, env.width) for i, thing in enumerate(env.grid.grid) if thing is not None}
     for thing in things:
-        state += (0, 0) if thing is env.carrying else places.get(id(thing), (0, env.width - 1))
+        column, row = (int(part) for part in thing.cur_pos)
+        is_there = column >= 0 and env.grid.get(column, row) is thing
+        state += (0, 0) if thing is env.carrying else (row, column) if is_there else (0, env.width - 1)
     return tuple(state)
 
 
@@ -237,7 +238,9 @@ class Own(MiniGridEnv):
                 if text in (">>", "vv", "<<", "^^"):
                     self.agent_pos, self.agent_dir = (column, row), (">>", "vv", "<<", "^^").index(text)
                 else:
-                    self.grid.set(column, row, thing := made(text))
+                    thing = made(text)
+                    if thing is not None:
+                        self.put_obj(thing, column, row)
                     self.wanted = thing if text == self.target else self.wanted
 
     def step(self, action):

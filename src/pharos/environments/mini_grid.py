@@ -89,10 +89,10 @@ class MiniGrid(Environment):
             largest room (multi_room, on 25 x 25 cells). The grid of dist_shift is size - 2 high. None: that of
             minigrid.
         seed: of the layout, as given to minigrid's `reset`; None stands for 0.
-        rows: of rooms in key_corridor.
-        rooms: of multi_room.
-        crossings: obstacles of the crossings.
-        strip: the row of the second strip of lava in dist_shift.
+        rows: of rooms, in key_corridor; None stands for 3.
+        rooms: how many, in multi_room; None stands for 6.
+        crossings: obstacles to cross, in lava_crossing and simple_crossing; None stands for 1.
+        strip: the row of the second strip of lava, in dist_shift; None stands for 2.
         level: a layout of one's own, in place of the above: two characters a cell (see mini_grid_canvas.py), rows
             separated by "/" or line ends, with walls around.
         target: of a level: what to pick up, such as "BR" for the red box, or which door to open, such as "LY"; None:
