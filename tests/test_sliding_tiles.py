@@ -18,6 +18,7 @@ from solution_lengths import solution_lengths
 # Integer Sequences, by H. Pfoertner (2003) and others; 2x2 by hand.
 COUNTS = {
     (2, 2): (1, 2, 2, 2, 2, 2, 1),
+    (2, 3): (1, 2, 3, 5, 6, 7, 10, 12, 12, 16, 23, 25, 28, 39, 44, 40, 29, 21, 18, 12, 6, 1),  # A090034
     (2, 4): (  # A090035
         *(1, 2, 3, 6, 10, 14, 19, 28, 42, 61, 85, 119, 161, 215, 293, 396, 506, 632, 788, 985, 1194, 1414, 1664),
         *(1884, 1999, 1958, 1770, 1463, 1076, 667, 361, 190, 88, 39, 19, 7, 1),
@@ -27,6 +28,11 @@ COUNTS = {
         *(17110, 23952, 20224, 24047, 15578, 14560, 6274, 3910, 760, 221, 2),
     ),
 }
+COUNTS_OF_2X5 = (  # A090036
+    *(1, 2, 3, 6, 11, 19, 30, 44, 68, 112, 176, 271, 411, 602, 851, 1232, 1783, 2530, 3567, 4996, 6838, 9279, 12463),
+    *(16597, 21848, 28227, 35682, 44464, 54597, 65966, 78433, 91725, 104896, 116966, 126335, 131998, 133107, 128720),
+    *(119332, 106335, 91545, 75742, 60119, 45840, 33422, 23223, 15140, 9094, 5073, 2605, 1224, 528, 225, 75, 20, 2),
+)
 # Korf and Schultze (2005), table 1, as corrected in A151943: positions within reach, and the most moves that one needs
 RADIUS = {(2, 2): 6, (2, 3): 21, (2, 4): 36, (3, 3): 31, (2, 5): 55}
 
@@ -122,7 +128,8 @@ def test_the_named_hardest_start_needs_31_moves():
 def test_the_tray_of_two_by_five_has_1814400_positions_and_radius_55():
     space = pharos.build(pharos.make("sliding_tiles/2x5"), progress=False)
     assert space.num_states == 1_814_400
-    assert solution_lengths(space).max() == RADIUS[2, 5]
+    assert tuple(np.bincount(solution_lengths(space))) == COUNTS_OF_2X5
+    assert len(COUNTS_OF_2X5) - 1 == RADIUS[2, 5]
 
 
 def test_the_fifteen_puzzle_takes_one_word():
