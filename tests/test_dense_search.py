@@ -2,7 +2,6 @@
 eccentricities."""
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -71,24 +70,9 @@ def test_nodes_that_are_spread_out_are_no_successors_of_those_before(drawn, limi
     assert counted[: len(graph.ends)][~graph.ends].tolist() == np.array(num_successors)[~graph.ends].tolist()
 
 
-@pytest.mark.parametrize("bits", [6, 10])
-def test_a_cube_of_many_dimensions_looks_the_same_from_every_corner(bits):
-    corners = np.arange(2**bits)
-    table = corners[:, None] ^ (1 << np.arange(bits))
-    found = hardness.diameter(TabularMDP.from_arrays(table, np.zeros(table.shape)))
-    assert (found.lower, found.upper, found.exact) == (bits, bits, True)
-
-
-@pytest.mark.parametrize("restart", [True, False])
-def test_the_diameter_of_small_trays_is_the_largest_of_all_distances(restart):
+def test_the_diameter_of_a_small_tray_is_the_largest_of_all_distances():
     space = pharos.build(pharos.make("sliding_tiles/2x3"), progress=False)
     mdp = space.mdp(gamma=0.9)
-    if not restart:  # the solved position goes on, too
-        env, table = space.environment, np.array(space.successors)
-        (solved,) = np.flatnonzero(space.terminal)
-        position = space.state(int(solved))
-        table[solved] = [space.index(env.next_state(position, action)) for action in range(4)]
-        mdp = TabularMDP.from_arrays(table, np.zeros(table.shape))
     found = hardness.diameter(mdp)
     assert found.exact
     assert found.upper == distances(mdp).max()

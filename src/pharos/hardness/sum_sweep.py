@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from pharos.hardness.interval import Interval, Spending
+from pharos.hardness.orbits import orbits
 from pharos.kernels import dense_search, graph
 from pharos.mdp import TabularMDP
 from pharos.wording import many
@@ -22,6 +23,8 @@ _WIDE = 1024
 _WORDS = (1, 8)
 # Levels up to which every node is asked on every level. Breakout has six times as many, puzzles half of them.
 _FEW_LEVELS = 100
+# Orbits from each of which a search is made.
+_FEW_ORBITS = 64
 # Bytes that searches from many nodes may take.
 _BATCH_MEMORY = 2**31
 
@@ -116,6 +119,7 @@ class SumSweep:
         clock = self._from_clock()
         if isinstance(clock, Interval):
             return clock
+        self._search_orbits()
         self._sweep()
         upper = self._upper()
         if upper > self.best:
@@ -277,6 +281,22 @@ class SumSweep:
         self.spending.searches += len(sources)
         self.method = "directed ExactSumSweep, then searches from many states at once"
         return int(reads) * (1 + dense.WORDS) // 8 + passes * table.size
+
+    # Symmetries -------------------------------------------------------------------------------------------------------
+
+    def _search_orbits(self) -> None:
+        """Where symmetries leave few orbits of states, the exact out(v) of all, by a search from one of each."""
+        graph = self.graph
+        orbit = orbits(graph.next_states, graph.ends, graph.start, graph.pivot, lambda: self.spending.is_over)
+        representatives = np.flatnonzero(orbit == np.arange(len(orbit)))
+        if len(representatives) > _FEW_ORBITS:
+            return
+        for v in representatives:
+            if self.spending.is_over:
+                return
+            self._search_out(int(v))
+            self.out_upper[: len(orbit)][orbit == v] = self.out_upper[v]
+        self.method = f"searches from one state of each of {len(representatives)} orbits of symmetries"
 
     # Clocks -----------------------------------------------------------------------------------------------------------
 

@@ -22,6 +22,7 @@ __all__ = [
     "partition",
     "paths",
     "stepping",
+    "symmetry",
     "tails",
     "ties",
     "travel",
