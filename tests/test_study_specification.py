@@ -197,10 +197,10 @@ HOSTILE = {
 @pytest.mark.parametrize("text", HOSTILE, ids=lambda text: repr(text[:20]))
 def test_a_hostile_file_is_one_line_at_once(tmp_path, text):
     (tmp_path / "study.yaml").write_bytes(text)
-    began = time.perf_counter()
+    began = time.process_time()
     with pytest.raises(ParameterError) as caught:
         study.specification(tmp_path)
-    assert time.perf_counter() - began < 5
+    assert time.process_time() - began < 5
     assert HOSTILE[text] in str(caught.value) and "\n" not in str(caught.value) and len(str(caught.value)) < 400
 
 
