@@ -201,9 +201,10 @@ class SumSweep:
         still_open, (num_out, num_in, far_out, far_in, middle) = self._open()
         while still_open and not self.spending.is_over:
             if len(worth) == 3 and self.spending.searches >= 12 and still_open >= 16:
-                worth |= {f"many {words}": math.inf for words in _WORDS if self._fits(words)}
                 if self.best <= _FEW_LEVELS and self._fits(dense.WORDS):
                     worth["dense"] = math.inf
+                else:
+                    worth |= {f"many {words}": math.inf for words in _WORDS if self._fits(words)}
             kind = max(worth, key=lambda name: worth[name])
             cost = 1.0
             if kind == "out":
