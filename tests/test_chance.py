@@ -1,6 +1,7 @@
 """Chance in the rules: what is built of a class with outcomes, against a plain enumeration and against matrices."""
 
 import importlib
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -9,6 +10,8 @@ from hypothesis import given, settings
 import naive
 import pharos
 from chance_worlds import ChanceWorld, chance_worlds
+from pharos.environments import Environment
+from pharos.errors import RuleError, StateSpaceError
 
 search = importlib.import_module("pharos.state_space.search")
 table = importlib.import_module("pharos.state_space.table")
@@ -140,3 +143,115 @@ def test_many_environments_draw_outcomes_compiled_as_interpreted():
     for one, other in zip(*visited, strict=True):
         for a, b in zip(one, other, strict=True):
             np.testing.assert_array_equal(a, b)
+
+
+# Rules that break their contract while they are built ----------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class Dice(Environment):
+    """Add what a die of three sides shows, until 30. Broken from position 12 on, where `broken` says so."""
+
+    broken: int = 0
+
+    name = "dice"
+    actions = ("roll", "pass")
+    outcomes = 3
+    SUM, NEGATIVE, NONE, RANGE, AGE = range(1, 6)
+
+    def variables(self):
+        return {"total": range(33)}
+
+    def initial_state(self):
+        return (0,)
+
+    def probability(self, state, action, outcome):
+        wrong = self.broken if state[0] >= 12 else 0
+        if wrong == self.NONE and outcome == 1:
+            return float("nan")
+        if wrong == self.NEGATIVE:
+            return 1.5 if outcome == 0 else -0.25
+        return 0.5 if outcome == 0 else 0.25 + (0.01 if wrong == self.SUM else 0.0)
+
+    def transition(self, state, action, outcome, out):
+        wrong = self.broken if state[0] >= 12 else 0
+        out[0] = state[0] + 1 + outcome
+        if wrong == self.RANGE and outcome == 2:
+            out[0] = 33 + action
+        if wrong == self.AGE and outcome == 1:
+            out[0] = state[0]
+
+    def is_terminal(self, state):
+        return state[0] >= 30
+
+    def reward(self, state, action, next_state):
+        return float(next_state[0] == 30)
+
+    def age(self, state):
+        return state[0] - 5
+
+
+WRONG = (
+    (Dice.SUM, "the probabilities of outcomes 0 to 2 of action 'roll' in state (12,) sum to 1.02; expected 1"),
+    (Dice.NEGATIVE, "probability of outcome 0 of action 'roll' in state (12,) is 1.5; expected a number from 0 to 1"),
+    (Dice.NONE, "probability of outcome 1 of action 'roll' in state (12,) is nan; expected a number from 0 to 1"),
+    (Dice.RANGE, "outcome 2 of action 'roll' in state (12,) leads to total = 33; declared: 0 to 32"),
+    (Dice.AGE, "outcome 1 of action 'roll' leads from state (12,) of age 7 to state (12,) of age 7; expected a larger"),
+)
+
+
+@pytest.mark.parametrize("engine", ("compiled", "threads", "traced", "interpreted"))
+@pytest.mark.parametrize(("broken", "expected"), WRONG)
+def test_a_rule_that_breaks_the_contract_is_named_with_its_outcome(broken, expected, engine, tmp_path, monkeypatch):
+    if engine == "threads":
+        monkeypatch.setattr(search, "WIDE", 1)
+    elif engine != "compiled":
+        monkeypatch.setattr(rules, "compiled_or_none", lambda *_: None)
+    if engine == "interpreted":
+        monkeypatch.setattr(rules_traced.TracedRules, "branches", lambda self, states: None)
+    env = Dice(broken=broken)
+    with pytest.raises(RuleError) as error:
+        build(env, tmp_path / "space", workers=2)
+    assert str(error.value).startswith(f"{env}: {expected}") and "\n" not in str(error.value)
+    assert pharos.state_space.read_manifest(tmp_path / "space")["complete"] is False  # what was found is kept
+
+
+def test_ages_are_those_of_the_rule(tmp_path, monkeypatch):
+    space = build(Dice(), tmp_path / "space")
+    assert (space.ages == space.states()[:, 0] - 5).all()
+    monkeypatch.setattr(rules, "compiled_or_none", lambda *_: None)
+    again = pharos.load(tmp_path / "space", environment=Dice())
+    assert (again.ages == space.ages).all()
+    with pytest.raises(StateSpaceError, match="frozen_lake declares no age"):
+        build(pharos.make("frozen_lake/4x4"), tmp_path / "lake").ages  # noqa: B018
+
+
+def test_an_age_without_chance_is_checked_too(tmp_path):
+    @dataclass(frozen=True, kw_only=True)
+    class Steps(Environment):
+        back: bool = False
+        name = "steps"
+        actions = ("on", "on_too")
+
+        def variables(self):
+            return {"step": range(100)}
+
+        def initial_state(self):
+            return (0,)
+
+        def transition(self, state, action, out):
+            out[0] = 3 if self.back and state[0] == 50 and action == 1 else state[0] + 1 + action
+
+        def is_terminal(self, state):
+            return state[0] >= 97
+
+        def reward(self, state, action, next_state):
+            return 1.0
+
+        def age(self, state):
+            return state[0]
+
+    space = build(Steps(), tmp_path / "space")
+    assert space.manifest["format_version"] == 1 and (space.ages == space.states()[:, 0]).all()
+    with pytest.raises(RuleError, match=r"action 'on_too' leads from state \(50,\) of age 50 to state \(3,\) of age 3"):
+        build(Steps(back=True), tmp_path / "back")

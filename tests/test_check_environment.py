@@ -1,6 +1,7 @@
 """check_environment accepts what keeps the contract, and names the rule and the state of every kind of breach."""
 
 import itertools
+import random
 from dataclasses import dataclass
 
 import numpy as np
@@ -449,3 +450,112 @@ def test_truths_and_numbers_of_numpy_are_accepted():
         return np.bool_(state[0] == self.length - 1)
 
     assert pharos.check_environment(corridor(reward=reward, is_terminal=is_terminal)).complete
+
+
+# Chance and ages ------------------------------------------------------------------------------------------------------
+
+
+class Windy(Corridor):
+    """With chance: outcome 1 leads two cells to the right; in the last cell but one it is impossible."""
+
+    outcomes = 2
+
+    def probability(self, state, action, outcome):
+        if state[0] == self.length - 2:
+            return 1.0 - outcome
+        return 0.25 if outcome == 1 else 0.75
+
+    def transition(self, state, action, outcome, out):
+        out[0] = state[0] + 1 + outcome if action == 1 else max(state[0] - 1, 0)
+
+
+def windy(**attributes):
+    return dataclass(frozen=True, kw_only=True)(type("Broken", (Windy,), attributes))()
+
+
+def test_a_good_class_with_chance_passes():
+    done = pharos.check_environment(pharos.make("frozen_lake", slippery=True))
+    assert done.complete and done.compiled and (done.num_states, done.num_transitions) == (16, 11 * 4 * 3)
+
+
+@pytest.mark.slow
+def test_a_good_class_with_an_age_passes():
+    def age(self, state):
+        return 3 * state[0]
+
+    forward = {"actions": ("right",), "transition": lambda self, state, action, outcome, out: _go(state, outcome, out)}
+    assert pharos.check_environment(windy(**forward, age=age)).compiled
+
+
+def _go(state, outcome, out):
+    out[0] = state[0] + 1 + outcome
+
+
+OUTCOME_0 = r"Broken(length=5): probability of outcome 0 of action 'left' in state (position=0)"
+
+
+@pytest.mark.parametrize(
+    ("rule", "expected"),
+    (
+        (lambda self, s, a, k: 0.6, "Broken(length=5): probability of action 'left' in state (position=0): those of "),
+        (lambda self, s, a, k: -0.5 if k else 1.5, f"{OUTCOME_0} is 1.5; expected a number from 0 to 1"),
+        (lambda self, s, a, k: float("nan"), f"{OUTCOME_0} is nan; expected a number from 0 to 1"),
+        (lambda self, s, a, k: "half", f"{OUTCOME_0} is 'half'; expected a number from 0 to 1"),
+        (lambda self, s, a, k: 1 / (k - k), f"{OUTCOME_0} raises ZeroDivisionError"),
+        (lambda self, s, a, k: 0.5 + 2e-9 * k, "sum to 1.0000000020000002; expected 1"),
+    ),
+)
+def test_probabilities_that_are_none_are_named_with_state_action_and_outcome(rule, expected):
+    assert expected in message(windy(probability=rule))
+
+
+def test_probabilities_must_not_draw_lots():
+    lots = random.Random(0)
+    found = message(windy(probability=lambda self, s, a, k: lots.random()))
+    assert found.startswith(f"{OUTCOME_0} is 0.844") and "expected the same answer to the same question" in found
+
+
+def test_an_outcome_that_leaves_the_range_is_named():
+    where = "Broken(length=5): transition of outcome 1 of action 'right' in state (position=3) writes position = 5"
+    assert where in message(windy(probability=lambda self, s, a, k: 0.5))
+
+
+@pytest.mark.slow
+def test_an_impossible_outcome_is_not_followed():
+    done = pharos.check_environment(windy())
+    assert done.complete and done.compiled and (done.num_states, done.num_transitions) == (5, 14)
+
+
+@pytest.mark.parametrize(
+    ("age", "expected"),
+    (
+        (lambda self, s: s[0] // 2, "transition of outcome 0 of action 'left' in state (position=0) leads from age 0"),
+        (lambda self, s: 0.5, "age in state (position=0) is 0.5; expected an integer"),
+    ),
+)
+def test_an_age_that_does_not_increase_is_named(age, expected):
+    assert expected in message(windy(age=age))
+
+
+@pytest.mark.parametrize("outcomes", (0, 1.5, None))
+def test_outcomes_must_be_a_number_of_them(outcomes):
+    assert f"outcomes is {outcomes!r}; expected an integer of at least 1" in message(windy(outcomes=outcomes))
+
+
+def test_one_outcome_is_certain():
+    assert "those of outcomes 0 to 0 sum to 0.75; expected 1" in message(windy(outcomes=1))
+
+
+@pytest.mark.slow
+def test_chance_must_be_the_same_compiled():
+    def probability(self, state, action, outcome):
+        return 0.25 if ((1 + state[0]) << LAST_BIT > 0) == (outcome == 0) else 0.75
+
+    assert "probability of outcome 0 of action 'left' in state (position=0) is 0.75 compiled, 0.25" in message(
+        windy(probability=probability, transition=lambda self, s, a, k, out: _go(s, 0, out))
+    )
+
+    def reward(self, state, action, next_state):
+        return float((1 + state[0]) << LAST_BIT)
+
+    assert "reward of outcome 0 of action 'left' in state (position=0) is -9" in message(windy(reward=reward))

@@ -195,6 +195,44 @@ def test_frozen_lake_has_the_limit_of_gymnasium(size):
 
 
 @pytest.mark.parametrize("size", [4, 8])
+def test_slippery_frozen_lake_has_every_entry_of_gymnasium(size):
+    """In the order of Gymnasium's P, outcome by outcome: probability, next state, reward and end."""
+    env = pharos.make("frozen_lake", size=size, slippery=True)
+    theirs = gymnasium.make("FrozenLake-v1", map_name=f"{size}x{size}", is_slippery=True).unwrapped
+    assert (env.outcomes, env.max_episode_steps) == (3, 100 if size == 4 else 200)
+    for index, by_action in theirs.P.items():
+        state = divmod(index, size)
+        if env.is_terminal(state):
+            continue
+        for action, expected in by_action.items():
+            assert len(expected) == env.outcomes
+            for outcome, (probability, place, reward, ended) in enumerate(expected):
+                following = env.next_state(state, action, outcome)
+                assert abs(env.probability(state, action, outcome) - probability) < 1e-16  # they have (1 - 1 / 3) / 2
+                assert following[0] * size + following[1] == place
+                assert env.reward(state, action, following) == reward
+                assert env.is_terminal(following) == ended
+    theirs.close()
+
+
+@pytest.mark.parametrize(("size", "expected"), [(4, 0.8235294117647058), (8, 1.0)])
+def test_slippery_frozen_lake_is_solved_as_quantecon_solves_it(size, expected, tmp_path):
+    """From Gymnasium's P, by QuantEcon's policy iteration; without discount the 4x4 lake is worth 14/17."""
+    quantecon = pytest.importorskip("quantecon")
+    table, rewards, _ = gymnasium_law(size, slippery=True)
+    space = pharos.build(pharos.make("frozen_lake", size=size, slippery=True), tmp_path / "space", progress=False)
+    mdp = space.mdp(gamma=0.99)
+    theirs = quantecon.markov.DiscreteDP((table * rewards).sum(axis=2), table, 0.99).solve(method="policy_iteration")
+    solution = pharos.value_iteration(mdp, 1e-9)
+    cells = [row * size + column for row, column in space.states()]
+    np.testing.assert_allclose(solution.v, theirs.v[cells], rtol=0, atol=solution.error_bound + 1e-12)
+    if size == 4:
+        assert abs(solution.value_at_start - 0.5420) < 5e-5
+    reached = pharos.value_iteration(space.mdp(gamma=1.0).with_horizon(20_000))
+    assert abs(reached.value_at_start - expected) < 1e-6
+
+
+@pytest.mark.parametrize("size", [4, 8])
 def test_slippery_ice_is_four_thirds_of_uniform_minus_a_third_of_the_opposite_action(size):
     """The formula of random_actions(p) with p = 4/3 and the opposite action: a law, but no mixture for any p in [0,
     1].

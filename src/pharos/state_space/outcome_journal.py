@@ -143,12 +143,13 @@ class OutcomeJournal(Journal):
         assert self._written is not None
         self._vectors = known
         parts = self._parts(self._written["num_expanded"])
-        offsets, probabilities = (GrowingFile(self.path / PARTS[name]) for name in (OFFSETS, PROBABILITIES))
+        for name in (OFFSETS, PROBABILITIES):
+            self._files[PARTS[name]] = GrowingFile(self.path / PARTS[name])  # closed with the others, come what may
+        offsets, probabilities = (self._files[PARTS[name]] for name in (OFFSETS, PROBABILITIES))
         offsets.append(np.zeros(1, np.int64))
         for part in parts.parts():
             offsets.append(part.first + np.cumsum(part.counts))
             probabilities.append(parts.likely(part))
-        self._files |= {PARTS[OFFSETS]: offsets, PARTS[PROBABILITIES]: probabilities}
         self.palette = None
         arrays = {name: {"dtype": dtype, **self._files[name].entry()} for name, dtype in self._dtypes().items()}
         self._written = {**self._written, "arrays": arrays}

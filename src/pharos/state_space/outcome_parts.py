@@ -116,8 +116,10 @@ class OutcomeParts:
         stay = {successors, OFFSETS, PROBABILITIES} if not is_dense else set()
         stay |= {CODES} if dtypes.get(CODES) == "<u2" else set()
         stay &= {name for name in dtypes if PARTS[name] in written}
-        files = {name: GrowingFile(self.folder / name) for name in dtypes if name not in stay}
+        files: dict[str, GrowingFile] = {}
         try:
+            for name in dtypes.keys() - stay:
+                files[name] = GrowingFile(self.folder / name)
             self._fill(files, dtypes, most, is_dense)
             for file in files.values():
                 file.sync()
