@@ -364,24 +364,6 @@ def test_the_page_escapes_whatever_a_study_says(tmp_path, sketched):
 
 
 @pytest.mark.slow
-def test_states_that_share_an_image_are_counted(tmp_path):
-    import numpy as np
-
-    from pharos import build, make, observe
-    from pharos.study.aliasing import aliasing
-
-    env = make("breakout", height=7, columns=4, brick_rows=1)
-    space = build(env, progress=False)
-    image = aliasing(space, observe(env, "simple_image"))
-    assert (image.num_states, image.num_observations) == (1658, 1068)
-    assert round(100 * image.share, 1) == 62.5
-    assert aliasing(space, observe(env, "vector")).share == 0
-    pixels = observe(env, "simple_image")(space.states())
-    _, counts = np.unique(pixels.reshape(len(pixels), -1), axis=0, return_counts=True)
-    assert image.num_sharing == counts[counts > 1].sum()
-
-
-@pytest.mark.slow
 def test_a_report_says_which_images_hide_something(tmp_path, sketched):
     small = {"name": "breakout", "parameters": {"height": 7, "columns": 4, "brick_rows": 1}}
     report, page = report_of(tmp_path, agents=["ppo"], environments=[small, "frozen_lake/4x4"])

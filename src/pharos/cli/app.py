@@ -15,6 +15,7 @@ from pharos.cli import (
     export,
     hardness,
     import_,
+    observations,
     play,
     plot,
     render,
@@ -115,6 +116,7 @@ app.command("build")(build.build)
 app.command("solve")(solve.solve)
 app.command("hardness")(hardness.hardness)
 app.command("evaluate")(evaluate.evaluate)
+app.command("observations")(observations.observations)
 app.command("render")(render.render)
 app.command("play")(play.play)
 app.command("train")(train.train)

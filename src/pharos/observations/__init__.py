@@ -14,16 +14,20 @@ from pharos.observations.vector import Index, OneHot, Vector
 
 if TYPE_CHECKING:
     from pharos.observations.complex_image import ComplexImage
+    from pharos.observations.look_alikes import Aliasing, aliasing, observation_classes
     from pharos.observations.own import OwnObservation, imported, observation_of, own_observation
     from pharos.observations.rendered import RENDERERS, render, renderers
     from pharos.observations.simple_image import SimpleImage
 
 _FILES = {
+    "Aliasing": "look_alikes",
     "ComplexImage": "complex_image",
     "OwnObservation": "own",
     "RENDERERS": "rendered",
     "SimpleImage": "simple_image",
+    "aliasing": "look_alikes",
     "imported": "own",
+    "observation_classes": "look_alikes",
     "observation_of": "own",
     "own_observation": "own",
     "render": "rendered",
@@ -33,6 +37,7 @@ _FILES = {
 __all__ = [
     "NO_ACTION",
     "RENDERERS",
+    "Aliasing",
     "ComplexImage",
     "FunctionObservation",
     "Index",
@@ -42,9 +47,11 @@ __all__ = [
     "OwnObservation",
     "SimpleImage",
     "Vector",
+    "aliasing",
     "imported",
     "in_blocks",
     "names",
+    "observation_classes",
     "observation_of",
     "observe",
     "own_observation",

@@ -1,9 +1,8 @@
-"""How many states of an environment look alike: an observation that some states share does not tell the agent the
-state."""
+"""Which states of a study's instances look alike, counted once and kept in its folder."""
 
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,54 +10,16 @@ import numpy as np
 
 from pharos.agents import TABULAR_OBSERVATION
 from pharos.errors import FileFormatError, PharosError
+from pharos.observations import Aliasing, aliasing
 from pharos.storage import digest_of_json, is_intact, read_json, replace_json, sealed
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from pharos.observations import Observation
-    from pharos.state_space import StateSpace
     from pharos.study.specification import Specification
 
-BLOCK = 4096
 # Instances with more states are not counted for a report
 MOST_STATES = 100_000
-
-
-@dataclass(frozen=True)
-class Aliasing:
-    """How many of the reachable states share their observation with another state.
-
-    Attributes:
-        num_states: reachable states, terminal ones included.
-        num_observations: different observations among them.
-        num_sharing: states whose observation another state has as well.
-    """
-
-    num_states: int
-    num_observations: int
-    num_sharing: int
-
-    @property
-    def share(self) -> float:
-        """The part of the states that share their observation; 0 where the observation tells the state."""
-        return self.num_sharing / self.num_states
-
-
-def aliasing(space: "StateSpace", observation: "Observation") -> Aliasing:
-    """Count the states of a state space that an observation does not tell apart.
-
-    Cost: one observation and 16 bytes for each state.
-    """
-    import xxhash
-
-    digests = np.empty(space.num_states, "V16")
-    for start in range(0, space.num_states, BLOCK):
-        observations = observation(space.states(slice(start, start + BLOCK)))
-        rows = np.ascontiguousarray(observations).reshape(len(observations), -1).view(np.uint8)
-        digests[start : start + len(rows)] = [xxhash.xxh3_128_digest(row.data) for row in rows]
-    _, counts = np.unique(digests.view(np.uint64).reshape(-1, 2), axis=0, return_counts=True)
-    return Aliasing(space.num_states, len(counts), int(counts[counts > 1].sum()))
 
 
 def aliasing_table(
