@@ -15,6 +15,9 @@ from pharos.mdp.arguments import takes_mdp
 from pharos.mdp.rewards import Rewards
 from pharos.mdp.tabular import TabularMDP
 
+# Rows of as many entries as the longest are compared in one go where that takes at most so many times the entries.
+_PADDING = 8
+
 
 @dataclass(frozen=True, eq=False)
 class Minimization:
@@ -106,21 +109,37 @@ def _refined_general(mdp: TabularMDP, classes: np.ndarray) -> tuple[np.ndarray, 
     rounds, count = 0, int(classes.max()) + 1
     while True:
         reached = mdp.dynamics.to_classes(classes, count)
-        whole = np.rint(reached.data * 2.0**40).astype(np.int64)
-        keep = whole > 0
-        edges = np.concatenate([[0], np.cumsum(keep)])[reached.indptr]
-        columns, weights = reached.indices[keep].astype(np.int64), whole[keep]
-        numbers: dict[tuple[Any, ...], int] = {}
-        refined = np.empty_like(classes)
-        for s in range(mdp.num_states):
-            ends = edges[s * mdp.num_actions : (s + 1) * mdp.num_actions + 1]
-            inside = slice(ends[0], ends[-1])
-            key = (int(classes[s]), (ends - ends[0]).tobytes(), columns[inside].tobytes(), weights[inside].tobytes())
-            refined[s] = numbers.setdefault(key, len(numbers))
+        refined, number = _numbered_by_outcomes(reached, classes)
         classes, rounds = refined, rounds + 1
-        if len(numbers) == count:
+        if number == count:
             return classes, rounds
-        count = len(numbers)
+        count = number
+
+
+def _numbered_by_outcomes(reached: Any, classes: np.ndarray) -> tuple[np.ndarray, int]:
+    """((S,) numbers, how many) of equal pairs (class, rows of the state in `reached`, (S A, C) with sorted columns)."""
+    num_states = len(classes)
+    num_actions = reached.shape[0] // num_states
+    whole = np.rint(reached.data * 2.0**40).astype(np.int64)
+    keep = whole > 0
+    edges = np.concatenate([[0], np.cumsum(keep)])[reached.indptr]
+    columns, weights = reached.indices[keep].astype(np.int64), whole[keep]
+    counts = np.diff(edges)
+    width = int(counts.max(initial=0))
+    if len(counts) * width <= _PADDING * max(len(columns), 1):
+        from pharos.kernels import partition
+
+        padded = np.full((len(counts), width, 2), -1, np.int64)
+        padded[np.arange(width) < counts[:, None]] = np.stack([columns, weights], axis=1)
+        return partition.numbered_rows(padded.reshape(num_states, -1), classes)
+    numbers: dict[tuple[Any, ...], int] = {}
+    refined = np.empty_like(classes)
+    for s in range(num_states):
+        ends = edges[s * num_actions : (s + 1) * num_actions + 1]
+        inside = slice(ends[0], ends[-1])
+        key = (int(classes[s]), (ends - ends[0]).tobytes(), columns[inside].tobytes(), weights[inside].tobytes())
+        refined[s] = numbers.setdefault(key, len(numbers))
+    return refined, len(numbers)
 
 
 def _merged(mdp: TabularMDP, classes: np.ndarray, representatives: np.ndarray) -> TabularMDP:
