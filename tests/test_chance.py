@@ -1,7 +1,7 @@
 """Chance in the rules: what is built of a class with outcomes, against a plain enumeration and against matrices."""
 
 import importlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -224,6 +224,16 @@ def test_ages_are_those_of_the_rule(tmp_path, monkeypatch):
     assert (again.ages == space.ages).all()
     with pytest.raises(StateSpaceError, match="frozen_lake declares no age"):
         build(pharos.make("frozen_lake/4x4"), tmp_path / "lake").ages  # noqa: B018
+
+
+def test_the_mdp_of_a_class_with_an_age_is_solved_in_one_pass(tmp_path):
+    space = build(Dice(), tmp_path / "space")
+    mdp = space.mdp(gamma=0.9)
+    assert (mdp.age == space.ages).all()
+    found, swept = (pharos.value_iteration(each, 1e-9) for each in (mdp, replace(mdp, age=None)))
+    assert found.sweeps == 1
+    assert np.abs(found.v - swept.v).max() <= found.error_bound + swept.error_bound
+    assert build(pharos.make("frozen_lake/4x4"), tmp_path / "lake").mdp().age is None
 
 
 def test_an_age_without_chance_is_checked_too(tmp_path):

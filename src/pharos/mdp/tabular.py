@@ -190,8 +190,14 @@ class TabularMDP:
 
     @staticmethod
     def from_space(space: "StateSpace", rewards: Rewards, gamma: float = 0.99) -> "TabularMDP":
-        """The MDP on the states of a state space; `StateSpace.mdp` computes the rewards."""
-        return TabularMDP(
+        """The MDP on the states of a state space, with their ages where the class declares one.
+
+        `StateSpace.mdp` computes the rewards.
+
+        Raises:
+            ParameterError: a transition leads to a state that is not older.
+        """
+        mdp = TabularMDP(
             space.dynamics,
             rewards,
             space.terminal,
@@ -201,6 +207,8 @@ class TabularMDP:
             space.start_probabilities,
             folder=space.folder,
         )
+        has_age = space.environment is not None and space.environment.has_age
+        return mdp.with_age(space.ages) if has_age else mdp
 
     # What it is -----------------------------------------------------------------------------------------------------
 
