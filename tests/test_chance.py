@@ -133,7 +133,7 @@ def test_many_environments_draw_outcomes_compiled_as_interpreted():
         rewards, executed, final = np.zeros(8), integers[2], np.zeros((8, 1), np.int64)
         ended, terminated, truncated = flags
         batch = (rng, actions, states, previous, elapsed, ended, rewards, terminated, truncated, executed, final)
-        batch = (*batch, np.zeros((0, 1), np.float32))
+        batch = (*batch, np.zeros((0, 1), np.float32), np.zeros(8))
         found = []
         for step in range(60):
             actions[:] = step % 2

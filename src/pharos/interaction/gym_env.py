@@ -13,7 +13,7 @@ import numpy as np
 
 from pharos.environments import Environment
 from pharos.errors import ParameterError
-from pharos.interaction.simulator import SimulatedEnv, Simulator, split_options
+from pharos.interaction.simulator import SimulatedEnv, Simulator, Stream, split_options
 from pharos.observations import NO_ACTION, Index
 
 if TYPE_CHECKING:
@@ -24,8 +24,13 @@ class GymEnv(SimulatedEnv, gymnasium.Env):
     """An environment of pharos as a Gymnasium environment.
 
     Actions are 0 .. A-1, named by `action_names`. `info` has "state" (D,) int64, "executed_action" (-1 after reset),
-    and "index" where a state space was given. `reset(options={"state": ...})` starts in any state. Chance draws one
-    number from `np_random` a step.
+    and "index" where a state space was given. `reset(options={"state": ...})` starts in any state. Sticky and random
+    actions draw one number from `np_random` a step.
+
+    Where the rules have chance, an outcome of the executed action is drawn and its reward paid; `info["prob"]` is the
+    probability of that outcome, 1.0 after reset, as in Gymnasium's toy text. All numbers, for the start, for sticky and
+    random actions and, after these, for the outcome, then come from the stream that environment 0 of a `VectorEnv` has
+    with the same seed: one seed, the same episodes in both. Without a seed, `np_random` seeds that stream.
 
     Args:
         environment: a name that `pharos.make` knows, or an Environment.
@@ -56,8 +61,6 @@ class GymEnv(SimulatedEnv, gymnasium.Env):
         self._previous = NO_ACTION
         self._elapsed = 0
         self._terminated = False
-        if simulator.env.has_chance:
-            raise ParameterError(f"{simulator.env}: a single environment draws no outcomes yet; use make_vec")
         # What a step needs, without a chain of attributes
         self._step_one, self._parameters = simulator.rules.step_one, simulator.rules.parameters
         self._ranges, self._num_actions = simulator.ranges, simulator.env.num_actions
@@ -74,16 +77,22 @@ class GymEnv(SimulatedEnv, gymnasium.Env):
         if self._step_and_draw is not None:
             self._shades, self._blank = observation.shades, np.zeros(observation.space.shape, np.uint8)
         self._has_chance, self._stays = simulator.has_chance, simulator.chance[0]
+        self._has_outcomes, self._num_outcomes = simulator.has_outcomes, int(simulator.env.outcomes)
+        self._outcome_one = simulator.rules.outcome_one
+        self._stream: Stream | None = None  # of random numbers, where the rules have chance
         self._is_index = simulator.context.is_plain and isinstance(observation, Index)
-        self._successors = simulator.state_space.successors if simulator.state_space is not None else None
+        space = simulator.state_space
+        self._successors = None if space is None or self._has_outcomes else space.successors
 
     def __getstate__(self) -> dict[str, Any]:
         """Without compiled functions: where the copy is made they are taken from the cache, not compiled anew."""
-        return {**self.__dict__, "_step_one": None, "_step_and_draw": None}
+        return {**self.__dict__, "_step_one": None, "_outcome_one": None, "_step_and_draw": None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
-        self._step_one, self._step_and_draw = self.simulator.rules.step_one, _step_and_draw(self.simulator)
+        rules = self.simulator.rules
+        self._step_one, self._outcome_one = rules.step_one, rules.outcome_one
+        self._step_and_draw = _step_and_draw(self.simulator)
 
     @property
     def state(self) -> tuple[int, ...]:
@@ -94,19 +103,21 @@ class GymEnv(SimulatedEnv, gymnasium.Env):
         """Start an episode; `options={"state": ...}` says where (D integers)."""
         super().reset(seed=seed)
         simulator = self.simulator
+        if self._has_outcomes and (seed is not None or self._stream is None):
+            self._stream = Stream(int(self.np_random.integers(1 << 63)) if seed is None else seed)
         if options is not None and options.get("state") is not None:
             self._state = simulator.checked_state(options["state"])
             self._terminated = simulator.rules.is_terminal_one(self._parameters, self._state)
             observation = None
         else:
-            start = simulator.drawn_start(self.np_random)
+            start = simulator.drawn_start(self._stream or self.np_random)
             self._state = simulator.start_states[start].copy()
             self._terminated = False
             observation = None if self._start_observations is None else self._start_observations[start].copy()
         self._previous = simulator.first_previous
         self._elapsed = 0
         if simulator.state_space is not None:
-            self._index = int(simulator.state_space.indices(self._state[None])[0])
+            self._index = self._index_of(self._state)
         if self._window is not None:
             self.render()
         return self._observation() if observation is None else observation, self._info(self._state)
@@ -119,17 +130,21 @@ class GymEnv(SimulatedEnv, gymnasium.Env):
         state = self._state
         if state is None or self._terminated:
             return self._step_after_the_end()
-        if self._has_chance and (u := self.np_random.random()) >= self._stays:
+        if self._has_chance and (u := (self._stream or self.np_random).random()) >= self._stays:
             chosen = self.simulator.executed(chosen, self._previous, u)
+        branch, likely = chosen, 1.0
+        if self._stream is not None:
+            outcome, likely = self._outcome_one(self._parameters, state, chosen, self._stream.random())
+            branch = chosen * self._num_outcomes + outcome
         following = self._spare
         observation: Any = self._blank.copy()
         if self._step_and_draw is not None:
             reward, code = self._step_and_draw(
-                self._parameters, self._ranges, state, chosen, following, self._shades, observation
+                self._parameters, self._ranges, state, branch, following, self._shades, observation
             )
         else:
             reward, code = self._step_one(
-                self._parameters, self._ranges, self._scale, state, chosen, following, observation
+                self._parameters, self._ranges, self._scale, state, branch, following, observation
             )
         if code:
             if code > 1:
@@ -138,9 +153,13 @@ class GymEnv(SimulatedEnv, gymnasium.Env):
         self._state, self._spare = following, state
         self._previous = chosen
         self._elapsed += 1
-        info = {"state": following.copy(), "executed_action": chosen}
+        info: dict[str, Any] = {"state": following.copy(), "executed_action": chosen}
         if self._successors is not None:
             info["index"] = self._index = int(self._successors[self._index, chosen])
+        if self._has_outcomes:
+            info["prob"] = likely
+            if self.simulator.state_space is not None:
+                info["index"] = self._index = self._index_of(following)
         if not self._is_written:
             observation = self._observation()
         if self._window is not None:
@@ -174,9 +193,15 @@ class GymEnv(SimulatedEnv, gymnasium.Env):
 
     def _info(self, state: np.ndarray) -> dict[str, Any]:
         info: dict[str, Any] = {"state": state.copy(), "executed_action": NO_ACTION}
-        if self._successors is not None:
+        if self.simulator.state_space is not None:
             info["index"] = self._index
+        if self._has_outcomes:
+            info["prob"] = 1.0
         return info
+
+    def _index_of(self, state: np.ndarray) -> int:
+        assert self.simulator.state_space is not None
+        return int(self.simulator.state_space.indices(state[None])[0])
 
     def _started(self) -> np.ndarray:
         if self._state is None:

@@ -60,6 +60,7 @@ class Simulator:
         chance: (chosen, previous, uniform), weights of the executed action; they sum to 1.
         first_chosen: the weight of the chosen action where there is no previous one; the rest is uniform.
         has_chance: whether another than the chosen action may be executed.
+        has_outcomes: whether the rules have chance, so that an outcome is drawn after the action.
         start_states (K, D), start_cumulative (K,): start states and the cumulative sum of their probabilities.
         ranges: (2, D) int64, lowest and highest value of each component.
     """
@@ -81,6 +82,7 @@ class Simulator:
         self.chance, self.first_chosen = chance.triple, float(chance.first_chosen)
         self._weights = (*self.chance, self.first_chosen)
         self.has_chance = self.chance != (1.0, 0.0, 0.0)
+        self.has_outcomes = self.env.has_chance
         self.first_previous = _first_previous(options.initial_previous_action, self.env)
         states, probabilities = start_distribution(self.env)
         self.start_states = np.array(states, np.int64)
@@ -95,7 +97,7 @@ class Simulator:
         limit = self.limit if self.limit is not None else 1 << 62
         return Setting(ranges, scale, self._weights, limit, mode, self.first_previous, starts, self.start_cumulative)
 
-    def drawn_start(self, rng: np.random.Generator) -> int:
+    def drawn_start(self, rng: "np.random.Generator | Stream") -> int:
         """Which of the start states; draws one number where there are several."""
         if len(self.start_states) == 1:
             return 0
@@ -130,6 +132,26 @@ class Simulator:
             f"{self.env.components.names[component]} out of its range {self.ranges[0, component]} to "
             f"{self.ranges[1, component]}; declare a wider range in variables(), or mend transition()"
         )
+
+
+class Stream:
+    """The random numbers of one environment, as a vector environment draws them for each of its own.
+
+    Attributes:
+        words: (1,) uint64, its state.
+    """
+
+    def __init__(self, seed: int):
+        self.words = stream_of(seed)
+
+    def random(self) -> float:
+        """The next number, uniform in [0, 1)."""
+        return stepping.next_number(self.words)
+
+
+def stream_of(seed: int | None) -> np.ndarray:
+    """(1,) uint64, the stream of random numbers of an environment that is seeded with `seed`."""
+    return np.random.SeedSequence(seed).generate_state(1, np.uint64)
 
 
 class SimulatedEnv:

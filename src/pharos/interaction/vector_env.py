@@ -2,7 +2,8 @@
 
 `make_vec("breakout", 1024, observation="vector", sticky=0.25)`, or
 `gymnasium.make_vec("pharos/Breakout-v0", num_envs=1024)`. Chance is drawn inside the loop, from one stream of random
-numbers for each environment.
+numbers for each environment: the start where there are several, then for each step what is executed under sticky or
+random actions, then the outcome where the rules have chance. Where there is but one possibility nothing is drawn.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,7 +16,7 @@ from gymnasium.vector.utils import batch_space
 
 from pharos.environments import Environment
 from pharos.errors import ParameterError
-from pharos.interaction.simulator import SimulatedEnv, Simulator, split_options
+from pharos.interaction.simulator import SimulatedEnv, Simulator, split_options, stream_of
 from pharos.interaction.walks import RulesWalk, TableWalk
 from pharos.kernels.stepping import DISABLED, SAME_STEP, Batch, first_outside
 from pharos.observations import NO_ACTION
@@ -27,7 +28,8 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
     """`num_envs` copies of one environment as a Gymnasium vector environment.
 
     With `space` the built state space is walked as a table, and the rules are not run: `info` has "index" (N,) in place
-    of "state" (N, D). It always has "executed_action" (N,), -1 after a reset. Arrays are fresh at every step.
+    of "state" (N, D). It always has "executed_action" (N,), -1 after a reset; and where the rules have chance "prob"
+    (N,), the probability of the outcome that was drawn, 1 after a reset. Arrays are fresh at every step.
 
     Args:
         environment: a name that `pharos.make` knows, or an Environment.
@@ -79,6 +81,7 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
         self._previous = np.full(n, NO_ACTION, np.int64)
         self._elapsed = np.zeros(n, np.int64)
         self._ended = np.zeros(n, np.bool_)
+        self._num_drawn = n if simulator.has_outcomes else 0  # outcomes that are drawn in a step
         walk = RulesWalk if simulator.state_space is None else TableWalk
         self._walk: Any = walk(simulator, n, self._mode)
 
@@ -115,7 +118,8 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
         self._elapsed[mask] = 0
         self._ended[mask] = False
         executed = np.full(self.num_envs, NO_ACTION, np.int64)
-        return self._walk.observations(self._previous, self._elapsed), self._info(executed)
+        info = self._info(executed, np.ones(self._num_drawn))
+        return self._walk.observations(self._previous, self._elapsed), info
 
     def step(self, actions: Any) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Choose an action (N,) for every environment."""
@@ -128,35 +132,38 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
                 f"call reset(options={{'reset_mask': terminated | truncated}}), or choose another autoreset_mode"
             )
         n = self.num_envs
-        rewards, executed = np.empty(n), np.empty(n, np.int64)
+        rewards, executed, likely = np.empty(n), np.empty(n, np.int64), np.empty(self._num_drawn)
         terminated, truncated = np.empty(n, np.bool_), np.empty(n, np.bool_)
         walk = self._walk
         walk.step(
             Batch(
                 self._rng, actions, walk.current, self._previous, self._elapsed, self._ended,
-                rewards, terminated, truncated, executed, walk.final, walk.vectors(),
+                rewards, terminated, truncated, executed, walk.final, walk.vectors(), likely,
             )
         )  # fmt: skip
-        info = self._info(executed)
+        info = self._info(executed, likely)
         if self._mode == SAME_STEP:
             done = terminated | truncated
             if done.any():
-                self._add_final(info, done, executed)
+                self._add_final(info, done)
         return self._walk.observations(self._previous, self._elapsed), rewards, terminated, truncated, info
 
-    def _info(self, executed: np.ndarray) -> dict[str, Any]:
+    def _info(self, executed: np.ndarray, likely: np.ndarray) -> dict[str, Any]:
         everywhere = np.ones(self.num_envs, np.bool_)
         name = self._walk.name
-        return {
+        info = {
             name: self._walk.current.copy(),
             f"_{name}": everywhere,
             "executed_action": executed,
             "_executed_action": everywhere,
         }
+        if len(likely):
+            info["prob"], info["_prob"] = likely, everywhere
+        return info
 
-    def _add_final(self, info: dict[str, Any], done: np.ndarray, executed: np.ndarray) -> None:
+    def _add_final(self, info: dict[str, Any], done: np.ndarray) -> None:
         """The last observations and infos, as Gymnasium's own vector environments give them."""
-        rows = np.flatnonzero(done)
+        rows, executed = np.flatnonzero(done), info["executed_action"]
         last = self._walk.final_observations(rows, executed[rows], self._walk.final_elapsed[rows])
         final = np.full(self.num_envs, None, object)
         for row, observation in zip(rows, _rows_of(last, len(rows)), strict=True):
@@ -173,6 +180,9 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
         }
         info["_final_info"] = done
         info["executed_action"] = np.where(done, NO_ACTION, executed)
+        if "prob" in info:
+            info["final_info"].update(prob=np.where(done, info["prob"], 0.0), _prob=done)
+            info["prob"] = np.where(done, 1.0, info["prob"])
 
     def _seed_streams(self, seed: int | Sequence[int | None] | None) -> None:
         n = self.num_envs
@@ -189,7 +199,7 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
             self._rng = np.random.SeedSequence().generate_state(n, np.uint64)
         for i, one in enumerate(seeds):
             if one is not None:
-                self._rng[i] = np.random.SeedSequence(one).generate_state(1, np.uint64)[0]
+                self._rng[i] = stream_of(one)[0]
 
     def _checked_mask(self, mask: Any) -> np.ndarray:
         if mask is None:

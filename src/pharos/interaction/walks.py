@@ -3,14 +3,18 @@
 Kernels get Setting and Batch as plain tuples: named ones cost Numba a microsecond a call more.
 """
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pharos.errors import ParameterError
 from pharos.interaction.simulator import Simulator
 from pharos.kernels import stepping
+from pharos.mdp import rewards_of_outcomes
 from pharos.observations import Index, in_blocks
+
+if TYPE_CHECKING:
+    from pharos.state_space import StateSpace
 
 BLOCK = 4096  # steps that are worth a thread's while
 LARGEST_TABLE = 1 << 28  # bytes of observations that are computed beforehand
@@ -98,8 +102,7 @@ class TableWalk:
         self.current = np.zeros(num_envs, np.int64)
         self.final = np.zeros(num_envs, np.int64)
         self.final_elapsed = np.zeros(num_envs, np.int64)
-        self._successors = np.asarray(self.space.successors)
-        self._rewards = np.ascontiguousarray(self.space.mdp().rewards, np.float64)
+        self._transitions, self._rewards = _tables(self.space)
         self._starts = self.space.indices(simulator.start_states)
         self._setting = tuple(simulator.setting(mode, np.zeros((2, 0), np.int64), np.zeros(0), self._starts))
         context: Any = simulator.context
@@ -133,7 +136,7 @@ class TableWalk:
         terminal, setting, arrays = self.space.terminal, self._setting, tuple(batch)
 
         def run(first: int, last: int) -> None:
-            walk_table(self._successors, self._rewards, terminal, setting, arrays, first, last)
+            walk_table(self._transitions, self._rewards, terminal, setting, arrays, first, last)
 
         in_blocks(run, len(self.current), BLOCK)
 
@@ -149,6 +152,14 @@ class TableWalk:
         if self._table is not None:
             return self._table.take(index, axis=0)
         return self.simulator.context(self.space.states(index), previous, elapsed)
+
+
+def _tables(space: "StateSpace") -> tuple[Any, Any]:
+    """What executing an action leads to, and what that pays, as `stepping.walk_table` takes them."""
+    if not space.has_chance:
+        return np.asarray(space.successors), np.ascontiguousarray(space.mdp().rewards, np.float64)
+    dynamics: Any = space.dynamics
+    return dynamics.for_kernels, dynamics.for_kernels_with(rewards_of_outcomes(space))
 
 
 def _states_of(simulator: Simulator, state: Any, num_envs: int) -> np.ndarray:

@@ -2,7 +2,10 @@
 
 from typing import Any, NamedTuple
 
-from numba import float64, njit, uint64
+from numba import float64, njit, types, uint64
+from numba.extending import overload
+
+from pharos.kernels.outcomes import outcome, outcomes_of, size_of
 
 NEXT_STEP, SAME_STEP, DISABLED = range(3)  # when an environment that has ended is reset
 
@@ -43,6 +46,8 @@ class Batch(NamedTuple):
         rewards, terminated, truncated, executed: (N,) of this step; executed is -1 after a reset.
         final: as states; the last state of an episode that was over and reset in the same step.
         vector: (N, D) float32, the states as vectors; (0, D) where they are not wanted.
+        probabilities: (N,) float64, of the outcomes that were drawn, 1 after a reset; (0,) where the rules have no
+            chance.
     """
 
     rng: Any
@@ -57,6 +62,7 @@ class Batch(NamedTuple):
     executed: Any
     final: Any
     vector: Any
+    probabilities: Any
 
 
 @njit(forceinline=True)
@@ -68,6 +74,12 @@ def uniform_number(rng, i):
     z = (z ^ (z >> uint64(27))) * uint64(0x94D049BB133111EB)
     z ^= z >> uint64(31)
     return float64(z >> uint64(11)) * 2.0**-53
+
+
+@njit(cache=True, nogil=True)
+def next_number(rng):
+    """The next number of the only stream of rng (1,)."""
+    return uniform_number(rng, 0)
 
 
 @njit(forceinline=True)
@@ -123,21 +135,54 @@ def first_outside(actions, num_actions):
     return -1
 
 
+def outcome_on_table(transitions, rewards, s, a, rng, i):
+    """(next state, reward, probability) of the outcome of (s, a) that stream i draws; nothing is drawn where there is
+    one.
+    """
+
+
+@overload(outcome_on_table)
+def _outcome_on_table(transitions, rewards, s, a, rng, i):
+    if isinstance(transitions, types.Array):
+        return lambda transitions, rewards, s, a, rng, i: (transitions[s, a], rewards[s, a], 1.0)
+
+    def drawn(transitions, rewards, s, a, rng, i):  # as the rules draw it, see rules/interaction.py
+        u = uniform_number(rng, i)
+        k, likely, passed = 0, 0.0, 0.0
+        for j in outcomes_of(transitions, s, a):
+            p = outcome(transitions, s, a, j)[1]
+            if p > 0.0 and passed <= u:
+                k, likely = j, p
+                passed += p
+        return outcome(transitions, s, a, k)[0], outcome(rewards, s, a, k)[0], likely
+
+    return drawn
+
+
 @njit(cache=True, nogil=True)
-def walk_table(successors, table_rewards, is_terminal, setting, batch, first, last):
+def walk_table(transitions, table_rewards, is_terminal, setting, batch, first, last):
     """One step of environments first .. last - 1 on a tabulated state space; as `step_many`, with indices for
-    states."""
+    states.
+
+    transitions: see kernels/outcomes.py; table_rewards: what they pay, (S, A), or with chance as `transitions`, with
+    rewards in the place of the successors.
+    """
     _, _, chance, limit, mode, first_previous, starts, cumulative = setting
-    rng, actions, index, previous, elapsed, ended, rewards, terminated, truncated, executed, final, _ = batch
+    rng, actions, index, previous, elapsed, ended, rewards, terminated, truncated, executed, final = batch[:11]
+    likely = batch[12]
+    num_actions = size_of(transitions)[1]
     for i in range(first, last):
         rewards[i], terminated[i], truncated[i], executed[i] = 0.0, False, False, -1
+        if len(likely) > 0:
+            likely[i] = 1.0
         if ended[i]:
             index[i] = starts[drawn_start(cumulative, rng, i)]
             previous[i], elapsed[i], ended[i] = first_previous, 0, False
             continue
-        action = executed_action(actions[i], previous[i], chance, successors.shape[1], rng, i)
-        rewards[i] = table_rewards[index[i], action]
-        index[i] = successors[index[i], action]
+        action = executed_action(actions[i], previous[i], chance, num_actions, rng, i)
+        index[i], rewards[i], p = outcome_on_table(transitions, table_rewards, index[i], action, rng, i)
+        if len(likely) > 0:
+            likely[i] = p
         previous[i] = executed[i] = action
         elapsed[i] += 1
         terminated[i] = is_terminal[index[i]]

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from pharos.mdp.outcome_table import OutcomeTable
     from pharos.mdp.rewards import Rewards
     from pharos.mdp.selection import BEST, WORST, Extreme, PolicyTable, Selection, chosen_mass
-    from pharos.mdp.space_rewards import rewards_of_space
+    from pharos.mdp.space_rewards import rewards_of_outcomes, rewards_of_space
     from pharos.mdp.table import Table
     from pharos.mdp.tabular import TabularMDP
 
@@ -39,6 +39,7 @@ _FILES = {
     "chosen_mass": "selection",
     "minimize": "bisimulation",
     "random_actions": "chance",
+    "rewards_of_outcomes": "space_rewards",
     "rewards_of_space": "space_rewards",
     "sticky_actions": "chance",
     "takes_mdp": "arguments",
@@ -64,6 +65,7 @@ __all__ = [
     "chosen_mass",
     "minimize",
     "random_actions",
+    "rewards_of_outcomes",
     "rewards_of_space",
     "sticky_actions",
     "takes_mdp",

@@ -88,6 +88,17 @@ class OutcomeTable(CompiledDynamics):
         flat = None if codes is None else codes.reshape(-1)
         return self.successors.reshape(-1), self.offsets, flat, weights, shape, self.num_outcomes
 
+    def for_kernels_with(self, values: np.ndarray) -> tuple[Any, ...]:
+        """`for_kernels` with other values, (N,) of all possible outcomes in order, in the place of the successors."""
+        if self.offsets is None:
+            chances = self.probabilities
+            if chances is None:
+                chances = np.asarray(self.palette)[np.asarray(self.codes)]
+            padded = np.zeros(self.successors.shape, values.dtype)
+            padded[np.asarray(chances) > 0] = values
+            values = padded.reshape(-1)
+        return (values, *self.for_kernels[1:])
+
     @cached_property
     def for_sweeps(self) -> tuple[Any, ...]:  # type: ignore[override]
         return (*self.for_kernels[:-1], kernels.each_of(self.num_outcomes))

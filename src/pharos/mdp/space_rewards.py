@@ -54,6 +54,31 @@ def rewards_of_space(space: "StateSpace", rewards: Any = None, *, workers: int |
     return collector.finish()
 
 
+def rewards_of_outcomes(space: "StateSpace") -> np.ndarray:
+    """What each possible outcome of a state space with chance pays when it is drawn: (N,) float64, in their order.
+
+    Raises:
+        RuleError: the reward function raised an exception.
+    """
+    from pharos.rules import rules_of
+
+    assert space.environment is not None
+    rules, num_actions = rules_of(space.environment).rewards, space.num_actions
+    blocks = [np.empty(0)]
+    for start in range(0, space.num_states, _ROWS):
+        stop = min(start + _ROWS, space.num_states)
+        which, successors, _ = space.outcomes.entries(start, stop, num_actions)
+        number = np.arange(len(which)) - np.searchsorted(which, which)  # of each outcome within its row
+        paid = np.zeros(len(which))
+        for k in range(int(number.max(initial=-1)) + 1):  # as if the k-th were the only one
+            now = number == k
+            outcomes = which[now], successors[now], np.ones(int(now.sum()))
+            means = rules.expected_block(space.packed_states, outcomes, space.terminal, start, stop)
+            paid[now] = means.reshape(-1)[which[now]]
+        blocks.append(paid)
+    return np.concatenate(blocks)
+
+
 def _blocks(space: "StateSpace", env: Environment, workers: int | None) -> Iterator[tuple[int, np.ndarray]]:
     """(start, rewards of the states from start on), in order."""
     from pharos.rules import rules_of

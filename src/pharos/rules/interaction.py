@@ -181,18 +181,21 @@ def step_many_kernel(compiler: Any, Parameters: Any, advance: Any, drawn_outcome
         SAME_STEP it is reset at once, and `final` gets its last state. See `kernels.stepping` for Setting and Batch.
         """
         ranges, scale, chance, limit, mode, first_previous, starts, cumulative = setting
-        rng, actions, states, previous, elapsed, ended, rewards, terminated, truncated, executed, final, vector = batch
+        rng, actions, states, previous, elapsed, ended, rewards, terminated, truncated, executed, final = batch[:11]
+        vector, likely = batch[11:]
         self = Parameters(*parameters)
         length = states.shape[1]
         following = np.empty(length, np.int64)
         for i in range(first, last):
             rewards[i], terminated[i], truncated[i], executed[i] = 0.0, False, False, -1
+            if K > 1:
+                likely[i] = 1.0
             restart = ended[i]
             if not restart:
                 action = executed_action(actions[i], previous[i], chance, A, rng, i)
                 branch = action
                 if K > 1:  # nothing is drawn where an action has one outcome
-                    outcome, _ = drawn_outcome(self, states[i], action, uniform_number(rng, i))
+                    outcome, likely[i] = drawn_outcome(self, states[i], action, uniform_number(rng, i))
                     branch = action * K + outcome
                 value, code = advance(self, ranges, states[i], branch, following)
                 if code > 1:

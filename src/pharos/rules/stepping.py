@@ -57,15 +57,19 @@ class InterpretedStepping:
 
     def step_many(self, parameters, setting, batch, first, last) -> int:
         ranges, scale, chance, limit, mode, first_previous, starts, cumulative = setting
-        rng, actions, states, previous, elapsed, ended, rewards, terminated, truncated, executed, final, vector = batch
+        rng, actions, states, previous, elapsed, ended, rewards, terminated, truncated, executed, final = batch[:11]
+        vector, likely = batch[11:]
         for i in range(first, last):
             rewards[i], terminated[i], truncated[i], executed[i] = 0.0, False, False, NO_ACTION
+            likely[i : i + 1] = 1.0  # no entry without chance
             restart = bool(ended[i])
             if not restart:
                 action = self._executed(int(actions[i]), int(previous[i]), chance, rng, i)
                 before = tuple(states[i].tolist())
-                u = _uniform_number(rng, i) if self.env.has_chance else 0.0
-                after = self.env.next_state(before, action, self._drawn_outcome(before, action, u)[0])
+                outcome = 0
+                if self.env.has_chance:
+                    outcome, likely[i] = self._drawn_outcome(before, action, _uniform_number(rng, i))
+                after = self.env.next_state(before, action, outcome)
                 executed[i] = action
                 for c, value in enumerate(after):
                     if not ranges[0, c] <= value <= ranges[1, c]:
