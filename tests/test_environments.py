@@ -21,6 +21,9 @@ from pharos.errors import ParameterError, UnknownName
 GRIDS = ("simple_grid", "frozen_lake")
 SMALL = (  # beside them, spaces of at most 120 states
     *("cliff_walking", "cliff_walking/4x12", "cliff_walking/4x12-slippery"),
+    *("corner_grid", "corner_grid/8x8", "corner_grid/8x8-random", "memory_chain", "memory_chain/length-10"),
+    *("river_swim", *(f"river_swim/{name}" for name in ("strehl-littman", "osband", "colosseum"))),
+    *("deep_sea", "deep_sea/10x10", "deep_sea/10x10-stochastic", "umbrella_chain", "umbrella_chain/length-10"),
     *("sliding_tiles/2x2", "sokoban", "sokoban/corridor", "sokoban/corner"),
     *(f"mini_grid/{name}" for name in ("empty-5x5", "empty-6x6", "empty-random-5x5", "empty-random-6x6")),
     *(f"mini_grid/{name}" for name in ("lava-gap-s5", "lava-gap-s6", "lava-gap-s7", "multi-room-n2-s4")),

@@ -23,10 +23,15 @@ if TYPE_CHECKING:
         register,
         source_of,
     )
+    from pharos.environments.catch import Catch
     from pharos.environments.cliff_walking import CliffWalking
+    from pharos.environments.corner_grid import CornerGrid
+    from pharos.environments.deep_sea import DeepSea
+    from pharos.environments.discounting_chain import DiscountingChain
     from pharos.environments.freeway import Freeway
     from pharos.environments.frozen_lake import FrozenLake
     from pharos.environments.look import Color, Ground, Layer, Look, Margin, Scenery, Shape, Sprite
+    from pharos.environments.memory_chain import MemoryChain
     from pharos.environments.mini_grid import MiniGrid
     from pharos.environments.mini_grid_empty import MiniGridEmpty
     from pharos.environments.mini_grid_rooms import MiniGridRooms
@@ -43,10 +48,12 @@ if TYPE_CHECKING:
         parameter,
     )
     from pharos.environments.pocket_cube import PocketCube
+    from pharos.environments.river_swim import RiverSwim
     from pharos.environments.simple_grid import SimpleGrid
     from pharos.environments.sliding_tiles import SlidingTiles
     from pharos.environments.sokoban import Sokoban
     from pharos.environments.taxi import Taxi
+    from pharos.environments.umbrella_chain import UmbrellaChain
 
 _FILES = {
     **{entry.class_name: entry.name for entry in BUILT_IN},
@@ -91,9 +98,13 @@ __all__ = [
     "Blackjack",
     "Breakout",
     "BuiltIn",
+    "Catch",
     "CliffWalking",
     "Color",
     "Components",
+    "CornerGrid",
+    "DeepSea",
+    "DiscountingChain",
     "Environment",
     "Freeway",
     "FrozenLake",
@@ -102,11 +113,13 @@ __all__ = [
     "Layer",
     "Look",
     "Margin",
+    "MemoryChain",
     "MiniGrid",
     "MiniGridEmpty",
     "MiniGridRooms",
     "Parameter",
     "PocketCube",
+    "RiverSwim",
     "Scenery",
     "Shape",
     "SimpleGrid",
@@ -115,6 +128,7 @@ __all__ = [
     "Sprite",
     "State",
     "Taxi",
+    "UmbrellaChain",
     "as_tuples",
     "class_called",
     "class_of",

@@ -69,6 +69,13 @@ BUILT_IN = (  # in the order in which they are listed
     BuiltIn("cliff_walking", "CliffWalking", "4x12 4x12-slippery 8x24 8x24-slippery"),
     BuiltIn("taxi", "Taxi", "5x5 5x5-rainy 5x5-fickle 5x5-rainy-fickle 10x10"),
     BuiltIn("blackjack", "Blackjack", "sutton-barto plain natural"),
+    BuiltIn("corner_grid", "CornerGrid", "8x8 8x8-random"),
+    BuiltIn("river_swim", "RiverSwim", "strehl-littman osband colosseum"),
+    BuiltIn("deep_sea", "DeepSea", "10x10 50x50 10x10-stochastic 20x20-restarts"),
+    BuiltIn("catch", "Catch", "10x5"),
+    BuiltIn("memory_chain", "MemoryChain", "length-10 bits-4"),
+    BuiltIn("umbrella_chain", "UmbrellaChain", "length-10 length-100"),
+    BuiltIn("discounting_chain", "DiscountingChain", "bonus-1 bonus-100"),
 )
 
 _LISTENERS: list[Callable[[type["Environment"]], None]] = []
