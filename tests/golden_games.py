@@ -81,6 +81,8 @@ GAMES = {
         "p0d3r0u2s0u0s0",
     ),
     "blackjack_hits_and_sticks": ("blackjack", {}, "h1h3s3"),
+    "game_2048_to_16_on_turned_boards": ("game_2048/2x2-to-32", {"target": 16}, "u1u1u3u0u0"),
+    "game_2048_stuck": ("game_2048/2x2", {"canonical": False}, "u0u2r0d1u0l1r0u0u0"),
     "blackjack_busts": ("blackjack/natural", {}, "h9h9h9"),
     "corner_grid_stays_in_two_corners": ("corner_grid/8x8-random", {"size": 3}, "u0r0s0u5l0l2s0s1"),
     "deep_sea_loses_the_treasure": ("deep_sea", {"size": 4, "stochastic": True, "mapping_seed": 42}, "f0f1s0f0"),

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from pharos.environments.discounting_chain import DiscountingChain
     from pharos.environments.freeway import Freeway
     from pharos.environments.frozen_lake import FrozenLake
+    from pharos.environments.game_2048 import Game2048
     from pharos.environments.look import Color, Ground, Layer, Look, Margin, Scenery, Shape, Sprite
     from pharos.environments.memory_chain import MemoryChain
     from pharos.environments.mini_grid import MiniGrid
@@ -108,6 +109,7 @@ __all__ = [
     "Environment",
     "Freeway",
     "FrozenLake",
+    "Game2048",
     "Ground",
     "Kind",
     "Layer",
