@@ -23,7 +23,19 @@ HEAVY = ("numba", "scipy", "pandas", "matplotlib", "torch", "rich", "typer", "st
 
 # A part imports only what stands before it, at the top of a file and inside of functions alike.
 ORDER = (
-    *("errors", "paths", "wording", "storage", "sources", "workers", "kernels", "environments", "drawing", "rules"),
+    *(
+        "errors",
+        "paths",
+        "wording",
+        "storage",
+        "mdp_files",
+        "sources",
+        "workers",
+        "kernels",
+        "environments",
+        "drawing",
+        "rules",
+    ),
     *("state_space", "mdp", "solvers"),
     *("hardness", "importers", "exporters", "observations", "interaction", "policies", "agents", "experiments"),
     *("plots", "study", "sb3_env", "bisimulation", "cli", "__main__"),

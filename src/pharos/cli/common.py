@@ -130,11 +130,9 @@ class Target:
         """The state space: built (or taken from the cache) for an environment, loaded from a folder."""
         from pharos.state_space import build, load
 
-        if self.environment is not None:
-            return build(self.environment, out, memory=memory, workers=workers, max_states=max_states)
+        if self.environment is not None or self.is_imported:
+            return build(self.found_environment(), out, memory=memory, workers=workers, max_states=max_states)
         assert self.path is not None
-        if self.path.is_file():
-            raise ParameterError(f"{self.path}: is an imported file, which has no environment to build")
         space = load(self.path)
         if max_states is not None and space.num_states > max_states:
             raise ParameterError(f"{self.path}: has {space.num_states} states; expected at most {max_states}")
@@ -163,6 +161,32 @@ class Target:
                 f"so not its rewards; name it as module:Class instead of its folder"
             )
         return chance.of(space.mdp(gamma=discount(gamma, horizon)).with_horizon(horizon))
+
+    def found_environment(self) -> "Environment":
+        """The environment, also of a folder: the one it was built from, or that of the imported MDP.
+
+        Raises:
+            ParameterError: a file, or the folder of a class that pharos does not know.
+        """
+        if self.environment is not None:
+            return self.environment
+        assert self.path is not None
+        if self.path.is_file():
+            raise ParameterError(
+                f"{self.path}: a file is no environment; bring it into a folder: "
+                f"pharos import bridge {self.path} --out FOLDER"
+            )
+        if self.is_imported:
+            from pharos.environments import make
+
+            return make("imported", folder=str(self.path))
+        space = self.space()
+        if space.environment is None:
+            raise ParameterError(
+                f"{self.text}: pharos does not know the class {space.manifest['class']} of this environment; "
+                f"name it as module:Class instead of its folder"
+            )
+        return space.environment
 
     @property
     def is_imported(self) -> bool:
@@ -222,13 +246,7 @@ def parse_target(text: str, words: Iterable[str] | None = None) -> Target:
 
 def parse_environment(text: str, words: Iterable[str] | None = None) -> "Environment":
     """Like `parse_target`, where an environment is needed: a folder stands for the one that it was built from."""
-    target = parse_target(text, words)
-    if target.environment is not None:
-        return target.environment
-    environment = target.space().environment
-    if environment is None:
-        raise ParameterError(f"{text}: pharos does not know the class of this environment; name it as module:Class")
-    return environment
+    return parse_target(text, words).found_environment()
 
 
 # Answers --------------------------------------------------------------------------------------------------------------

@@ -1,11 +1,12 @@
-"""pharos import: MDPs from elsewhere, as folders that every command takes."""
+"""pharos import: MDPs from elsewhere, as folders that every command takes as environments."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pharos.cli.common import Json, print_facts, print_json
+from pharos.cli.common import Json, parse_parameters, print_facts, print_json
+from pharos.errors import ParameterError
 from pharos.wording import many
 
 if TYPE_CHECKING:
@@ -27,7 +28,8 @@ def bridge(
     from pharos import importers
 
     mdp = importers.bridge(file, horizon)
-    importers.save(mdp, out, source=f"BRIDGE: {file.name}")
+    screens = importers.bridge_screens(file) if importers.has_screens(file) else None
+    importers.save(mdp, out, source=f"BRIDGE: {file.name}", observations=screens)
     _tell(file.name, mdp, out, json)
 
 
@@ -45,9 +47,44 @@ def minigrid(
     """Enumerate an environment of MiniGrid, by playing it from every state."""
     from pharos import importers
 
-    mdp = importers.minigrid(name, seed=seed, horizon=horizon, remember_carried=remember_carried)
-    importers.save(mdp, out, source=f"{name}, seed {seed}" + (", objects remember" if remember_carried else ""))
+    mdp, grids, actions = importers.minigrid_recording(
+        name, seed=seed, horizon=horizon, remember_carried=remember_carried
+    )
+    source = f"{name}, seed {seed}" + (", objects remember" if remember_carried else "")
+    importers.save(mdp, out, source=source, actions=actions, observations=grids, observed="grid")
     _tell(name, mdp, out, json)
+
+
+@app.command("gymnasium")
+def gymnasium(
+    name: Annotated[str, typer.Argument(metavar="ID", help="Such as Taxi-v4: an environment with a table P.")],
+    out: Annotated[Path, typer.Option("--out", help="Folder for the MDP.")],
+    option: Annotated[
+        list[str] | None,
+        typer.Option("--option", metavar="NAME=VALUE", help="Of the environment, such as is_slippery=false."),
+    ] = None,
+    gamma: Annotated[float, typer.Option("--gamma", min=0, max=1, help="Discount of the MDP.")] = 0.99,
+    horizon: Annotated[
+        int | None, typer.Option("--horizon", min=1, help="Steps of an episode; without end when not given.")
+    ] = None,
+    check: Annotated[bool, typer.Option("--check/--no-check", help="Compare sampled steps with the table.")] = True,
+    json: Json = False,
+) -> None:
+    """Import the table P of an environment of Gymnasium; training takes its time limit."""
+    import gymnasium as package
+
+    from pharos import importers
+
+    given = parse_parameters(option)
+    try:
+        env = package.make(name, disable_env_checker=True, **given)
+    except Exception as error:  # whatever an environment does with options that are none of its own
+        said = " ".join(str(error).split())
+        raise ParameterError(f"{name}: Gymnasium cannot make it: {said or type(error).__name__}") from None
+    mdp = importers.gymnasium(env, gamma=gamma, horizon=horizon, check=check)
+    words = " ".join((name, *(option or ())))
+    importers.save(mdp, out, source=f"Gymnasium: {words}", time_limit=env.spec.max_episode_steps if env.spec else None)
+    _tell(words, mdp, out, json)
 
 
 def _tell(name: str, mdp: "TabularMDP", out: Path, json: bool) -> None:

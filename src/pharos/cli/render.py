@@ -121,15 +121,7 @@ def _captions(env: "Environment", played: Sequence[tuple]) -> list[str]:
 
 def environment_of(target: Target) -> "Environment":
     """The environment of a target; ParameterError where there is none to draw."""
-    if target.environment is not None:
-        return target.environment
-    space = target.space()
-    if space.environment is None:
-        raise ParameterError(
-            f"{target.text}: pharos does not know the class {space.manifest['class']} of this environment; "
-            f"name it as module:Class instead of its folder"
-        )
-    return space.environment
+    return target.found_environment()
 
 
 def find_state(target: Target, env: "Environment", text: str | None) -> "State":

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 HEIGHT, WIDTH = 720, 960  # pixels that a picture takes at most, where its cells are not smaller than CELLS[0] for it
 CELLS = (8, 16, 24, 32, 40, 48, 64)  # pixels of a cell; multiples of 8, so that sprites of 8 x 8 stay sharp
+LEAST_PICTURE = 400  # pixels of the longer side of a picture that a class has of its own
 NIGHT, INK = (16, 18, 24), (226, 228, 232)
 
 # States -> pictures -------------------------------------------------------------------------------------------------
@@ -36,6 +37,8 @@ def human(env: Environment, state: Sequence[int], *, cell: int | None = None) ->
         cell: pixels of a cell; None for as many as fit into a picture of 960 x 720.
     """
     planes = planes_of(env, state)
+    if (own := env.picture(state)) is not None:
+        return _enlarged(own, LEAST_PICTURE)
     _, rows, columns = planes.shape
     cell = cell or _fitting_cell(rows, columns)
     margin = cell // 2

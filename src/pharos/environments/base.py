@@ -168,6 +168,10 @@ class Environment:
         """Write 1, 2, ... into planes (L, rows, columns) uint8 where the thing of each layer is."""
         raise NotImplementedError(f"{type(self).__name__} must define draw() to be drawn")
 
+    def picture(self, state) -> np.ndarray | None:
+        """A picture of `state` for people, (H, W, 3) uint8, in place of the drawing; here None: there is no other."""
+        return None
+
     # Derived --------------------------------------------------------------------------------------------------------
 
     @property

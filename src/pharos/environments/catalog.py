@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from pharos import sources
+from pharos import mdp_files, sources
 from pharos.environments.base import Environment
 from pharos.environments.built_in import BUILT_IN, announce
 from pharos.environments.parameters import as_tuples
@@ -19,6 +19,8 @@ from pharos.errors import ParameterError, UnknownName
 from pharos.sources import Source
 
 _CLASS_NAMES = {entry.name: entry.class_name for entry in BUILT_IN}
+_IMPORTED = {"imported": "ImportedWorld"}  # named by its folder, so it stands in no list
+_OWN = _CLASS_NAMES | _IMPORTED
 _REGISTERED: dict[str, type[Environment]] = {}
 
 
@@ -26,8 +28,9 @@ def make(name: str, **parameters: Any) -> Environment:
     """Return the environment called `name`, with `parameters` for its class.
 
     Args:
-        name: a class (`"breakout"`), a named instance (`"breakout/12x10x1"`, see `list_environments`), or where
-            your own class is (`"my_module:MyClass"`, `"folder/my_file.py:MyClass"`), which registers it.
+        name: a class (`"breakout"`), a named instance (`"breakout/12x10x1"`, see `list_environments`), a folder with an
+            imported MDP, or where your own class is (`"my_module:MyClass"`, `"folder/my_file.py:MyClass"`), which
+            registers it.
         parameters: of the class; those of a named instance may be overridden.
     Raises:
         UnknownName: no such environment or parameter; the nearest name is suggested.
@@ -35,6 +38,9 @@ def make(name: str, **parameters: Any) -> Environment:
     """
     class_name, slash, instance = name.partition("/")
     cls = class_called(class_name)
+    if (cls is None or (slash and instance not in cls.instances)) and mdp_files.is_folder(Path(name).expanduser()):
+        parameters, name, slash = {"folder": name, **parameters}, "imported", ""
+        class_name, cls = name, class_called(name)
     if cls is None or (slash and instance not in cls.instances):
         if not sources.is_reference(name):
             shown = f"known: {', '.join(sorted(classes()))}; `pharos list` shows their parameters and named instances"
@@ -60,7 +66,7 @@ def list_environments() -> list[str]:
 
 def class_called(name: str) -> type[Environment] | None:
     """The class with this name; None where there is none."""
-    return _built_in(name) if name in _CLASS_NAMES else _REGISTERED.get(name)
+    return _built_in(name) if name in _OWN else _REGISTERED.get(name)
 
 
 def classes() -> dict[str, type[Environment]]:
@@ -69,7 +75,7 @@ def classes() -> dict[str, type[Environment]]:
 
 
 def _built_in(name: str) -> type[Environment]:
-    return getattr(importlib.import_module(f"pharos.environments.{name}"), _CLASS_NAMES[name])
+    return getattr(importlib.import_module(f"pharos.environments.{name}"), _OWN[name])
 
 
 def named_instances() -> dict[str, tuple[str, Mapping[str, Any]]]:
@@ -136,7 +142,7 @@ def register(cls: type[Environment]) -> type[Environment]:
     name = getattr(cls, "name", None)
     if not isinstance(name, str) or not name or "/" in name or ":" in name:
         raise ParameterError(f"register: {cls.__name__}.name is {name!r}; expected a text without '/' and ':'")
-    if name in _CLASS_NAMES:
+    if name in _OWN:
         raise ParameterError(f"register: {name!r} is the name of a built-in class; choose another name")
     _REGISTERED[name] = cls
     announce(cls)
@@ -144,4 +150,4 @@ def register(cls: type[Environment]) -> type[Environment]:
 
 
 def _is_built_in(cls: Any) -> bool:
-    return getattr(cls, "name", None) in _CLASS_NAMES and cls is class_called(cls.name)
+    return getattr(cls, "name", None) in _OWN and cls is class_called(cls.name)

@@ -72,9 +72,8 @@ class Task:
             raise ParameterError(f"env is {self.env!r}; expected an Environment: use Task.of")
         if isinstance(self.env, TabularMDP):
             raise ParameterError(
-                f"env is {self.env!r}, a table without an environment, which can be solved and measured "
-                f"but not trained on; "
-                f"expected an Environment"
+                f"env is {self.env!r}, a table; expected an Environment: pharos.importers.environment(mdp) makes one "
+                f"of a table without sticky or random actions"
             )
         if not isinstance(self.env, Environment):
             raise ParameterError(f"env is {self.env!r}; expected an Environment, or its name")

@@ -3,19 +3,22 @@
 Nothing here unpickles: files hold plain arrays and JSON, or are refused.
 """
 
-from pharos.importers.bridge import bridge, bridge_screens
-from pharos.importers.folder import is_folder, load, save
+from pharos.importers.bridge import bridge, bridge_screens, has_screens
+from pharos.importers.folder import environment, is_folder, load, save
 from pharos.importers.gymnasium import gymnasium, matrices
-from pharos.importers.minigrid import minigrid, minigrid_grids
+from pharos.importers.minigrid import minigrid, minigrid_grids, minigrid_recording
 
 __all__ = [
     "bridge",
     "bridge_screens",
+    "environment",
     "gymnasium",
+    "has_screens",
     "is_folder",
     "load",
     "matrices",
     "minigrid",
     "minigrid_grids",
+    "minigrid_recording",
     "save",
 ]

@@ -2,6 +2,7 @@
 
 import os
 import re
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -66,6 +67,15 @@ def bridge_screens(path: str | os.PathLike) -> np.ndarray:
             f"{path}: screen_mapping names a screen that is not there; expected 0 to {len(screens) - 1}"
         )
     return screens[mapping]
+
+
+def has_screens(path: str | os.PathLike) -> bool:
+    """Whether a file of BRIDGE has the screens of its states; only the list of its members is read."""
+    try:
+        with zipfile.ZipFile(path) as file:
+            return {"screens.npy", "screen_mapping.npy"} <= set(file.namelist())
+    except (OSError, zipfile.BadZipFile):
+        return False
 
 
 def _members(path: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:

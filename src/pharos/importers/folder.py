@@ -1,48 +1,56 @@
 """Imported MDPs kept in folders: plain .npy arrays, and a manifest with checksums and a digest that is written last."""
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from pharos import storage
+from pharos import mdp_files, paths, storage
+from pharos.environments import Environment, make
 from pharos.errors import FileFormatError, ParameterError
 from pharos.mdp import OutcomeTable, TabularMDP
+from pharos.mdp_files import AGAIN, COMMON, FORMAT, MANIFEST, MATRIX, OBSERVATIONS, OUTCOMES, TABLE, is_folder
 
-FORMAT, VERSION, MANIFEST = "pharos mdp", 1, "manifest.json"
-COMMON = ("rewards", "terminal", "start_states", "start_probabilities")
-TABLE = ("next_states",)
-MATRIX = ("transitions_data", "transitions_indices", "transitions_indptr")
-OUTCOMES = ("successors",)  # and, where they are: offsets; probabilities, or codes and palette
-AGAIN = "import it again"
+IMAGE, GRID, VECTOR = "image", "grid", "vector"
+OBSERVED = {IMAGE: 4, GRID: 4, VECTOR: 2}
+"""Kinds of observations that a source may show -> dimensions of their array."""
 
 
-def save(mdp: TabularMDP, folder: str | os.PathLike, *, source: str = "") -> Path:
+def save(
+    mdp: TabularMDP,
+    folder: str | os.PathLike,
+    *,
+    source: str = "",
+    actions: Sequence[str] | None = None,
+    time_limit: int | None = None,
+    observations: np.ndarray | None = None,
+    observed: str | None = None,
+) -> Path:
     """Write an MDP without chance into a folder.
 
     Args:
         folder: made where it is not there; an MDP that lies there is replaced, file by file and the manifest last.
         source: where the MDP comes from, for people.
+        actions: names of the actions; None: their numbers.
+        time_limit: steps after which training cuts an episode off where the MDP has no horizon; None: 1,000.
+        observations: what the source shows of each state, which agents may see as the observation "recorded".
+        observed: what they are: "image", (S, H, W, 3) uint8; "grid", (S, columns, rows, C) uint8 codes of things;
+            "vector", (S, N) numbers; None: "image" where they are (S, H, W, 3), else "vector".
     Raises:
         ParameterError: the folder holds something else, or the MDP has sticky or random actions (add them after
-            loading).
+            loading); or names, limit or observations do not fit it.
     """
+    told = _told(mdp, actions, time_limit, observations, observed)
     folder = Path(folder)
     if mdp.is_sticky or mdp.is_random:
         raise ParameterError("an MDP is kept without sticky or random actions; add them when it is loaded")
     if folder.is_dir() and any(folder.iterdir()) and not is_folder(folder):
         raise ParameterError(f"{folder}: is not empty and holds no imported MDP; choose another folder")
     folder.mkdir(parents=True, exist_ok=True)
-    arrays = {
-        "rewards": mdp.rewards,
-        "terminal": np.asarray(mdp.terminal),
-        "start_states": mdp.start_states,
-        "start_probabilities": mdp.start_probabilities,
-        **mdp.dynamics.arrays(),
-    }
+    arrays = _arrays_of(mdp) | ({} if observations is None else {OBSERVATIONS: np.asarray(observations)})
     checksums = {}
     for name, array in arrays.items():
         path = folder / f"{name}.npy"
@@ -50,25 +58,77 @@ def save(mdp: TabularMDP, folder: str | os.PathLike, *, source: str = "") -> Pat
         checksums[name] = storage.digest_of_file(path)
     manifest = {
         "format": FORMAT,
-        "format_version": VERSION,
+        "format_version": mdp_files.VERSION if observations is None else mdp_files.OBSERVED_VERSION,
         "source": source,
         "num_states": mdp.num_states,
         "num_actions": mdp.num_actions,
         "gamma": mdp.gamma,
         "horizon": None if mdp.horizon is None else int(mdp.horizon),
         "arrays": checksums,
+        **told,
     }
     storage.replace_json(folder / MANIFEST, storage.sealed(manifest))
     return folder
 
 
-def is_folder(folder: str | os.PathLike) -> bool:
-    """Whether an imported MDP lies there."""
-    try:
-        manifest = storage.read_json(Path(folder) / MANIFEST)
-    except (OSError, FileFormatError):
-        return False
-    return isinstance(manifest, dict) and manifest.get("format") == FORMAT
+def _told(
+    mdp: TabularMDP,
+    actions: Sequence[str] | None,
+    time_limit: int | None,
+    observations: np.ndarray | None,
+    observed: str | None,
+) -> dict[str, Any]:
+    """What the manifest says beside the MDP; ParameterError where it does not fit."""
+    told: dict[str, Any] = {}
+    if actions is not None:
+        if len(actions) != mdp.num_actions or not all(isinstance(name, str) and name for name in actions):
+            raise ParameterError(f"actions are {actions!r}; expected {mdp.num_actions} names")
+        told["actions"] = list(actions)
+    if time_limit is not None:
+        if not isinstance(time_limit, int | np.integer) or time_limit < 1:
+            raise ParameterError(f"time_limit is {time_limit!r}; expected a number of steps of at least 1")
+        told["time_limit"] = int(time_limit)
+    if observations is not None:
+        shown = np.asarray(observations)
+        kind = observed or (IMAGE if shown.ndim == 4 else VECTOR)
+        fits = kind in OBSERVED and shown.ndim == OBSERVED[kind] and len(shown) == mdp.num_states and shown.size
+        if not fits or (shown.dtype.kind not in "biuf" if kind == VECTOR else shown.dtype != np.uint8):
+            raise ParameterError(
+                f"observations have shape {shown.shape} and type {shown.dtype}; expected {mdp.num_states} images "
+                f"(S, H, W, 3) uint8, grids (S, columns, rows, C) uint8, or vectors (S, N)"
+            )
+        told[OBSERVATIONS] = kind
+    return told
+
+
+def environment(mdp: TabularMDP | str | os.PathLike) -> Environment:
+    """Return the environment whose rules are the table of an imported MDP: to train on, to step and to draw.
+
+    Args:
+        mdp: a folder that `save` wrote; or an MDP without sticky or random actions, which is kept in the user's cache
+            where it has no such folder. Its discount is left to the task.
+    Raises:
+        FileFormatError: the folder holds none, or was changed. ParameterError: the MDP has sticky or random actions.
+    """
+    if not isinstance(mdp, TabularMDP):
+        return make("imported", folder=os.fspath(mdp))
+    if mdp.folder is not None and is_folder(mdp.folder):
+        return make("imported", folder=os.fspath(mdp.folder))
+    place = paths.cache_directory() / "imported"
+    parts = {name: storage.digest_of_bytes(np.ascontiguousarray(each).data) for name, each in _arrays_of(mdp).items()}
+    said = [mdp.num_states, mdp.num_actions, mdp.gamma, mdp.horizon, str(mdp.chance), sorted(parts.items())]
+    folder = place / storage.digest_of_json(said)
+    return make("imported", folder=os.fspath(folder if is_folder(folder) else save(mdp, folder)))
+
+
+def _arrays_of(mdp: TabularMDP) -> dict[str, np.ndarray]:
+    return {
+        "rewards": mdp.rewards,
+        "terminal": np.asarray(mdp.terminal),
+        "start_states": mdp.start_states,
+        "start_probabilities": mdp.start_probabilities,
+        **mdp.dynamics.arrays(),
+    }
 
 
 def load(folder: str | os.PathLike) -> TabularMDP:
@@ -78,65 +138,15 @@ def load(folder: str | os.PathLike) -> TabularMDP:
         FileFormatError: there is none, or a file is missing, damaged or changed.
     """
     folder = Path(folder)
-    manifest = _manifest(folder)
+    manifest = mdp_files.read_manifest(folder)
     try:
-        mdp = _mdp(manifest, _arrays(folder, manifest["arrays"]))
+        mdp = _mdp(manifest, mdp_files.read_arrays(folder, manifest))
     except FileFormatError:
         raise
     except (KeyError, TypeError, ValueError, IndexError, OverflowError, MemoryError) as error:
         reason = f"lacks {error}" if isinstance(error, KeyError) else str(error)
         raise FileFormatError(f"{folder}: the imported MDP is damaged: {reason}; {AGAIN}") from None
     return replace(mdp, folder=folder)
-
-
-def _manifest(folder: Path) -> dict[str, Any]:
-    path = folder / MANIFEST
-    try:
-        manifest = storage.read_json(path, FileFormatError, AGAIN)
-    except FileNotFoundError:
-        raise FileFormatError(f"{path}: no such file; expected a folder that `pharos import` wrote") from None
-    if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
-        raise FileFormatError(f"{folder}: is no imported MDP; expected a folder that `pharos import` wrote")
-    if manifest.get("format_version") != VERSION:
-        raise FileFormatError(
-            f"{folder}: format version {manifest.get('format_version')!r}; this pharos reads version {VERSION}; {AGAIN}"
-        )
-    if not storage.is_intact(manifest):
-        raise FileFormatError(f"{path}: was changed after it was written; {AGAIN}")
-    if not isinstance(manifest.get("arrays"), dict):
-        raise FileFormatError(
-            f"{path}: arrays is {manifest.get('arrays')!r}; expected a checksum for each array; {AGAIN}"
-        )
-    return manifest
-
-
-def _arrays(folder: Path, checksums: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    kind = TABLE if TABLE[0] in checksums else MATRIX
-    if OUTCOMES[0] in checksums:
-        offsets = ("offsets",) if "offsets" in checksums else ()
-        kind = (*OUTCOMES, *offsets, *(("probabilities",) if "probabilities" in checksums else ("codes", "palette")))
-    names = (*COMMON, *kind)
-    if set(checksums) != set(names):
-        raise ValueError(f"its arrays are {', '.join(checksums)}; expected {', '.join(names)}")
-    return {name: _array(folder / f"{name}.npy", checksums[name]) for name in names}
-
-
-def _array(path: Path, checksum: Any) -> np.ndarray:
-    try:
-        digest = storage.digest_of_file(path)
-    except OSError as error:
-        wrong = "no such file" if isinstance(error, FileNotFoundError) else f"cannot be read: {error.strerror}"
-        raise FileFormatError(f"{path}: {wrong}; {AGAIN}") from None
-    if digest != checksum:
-        raise FileFormatError(f"{path} was changed after it was written; {AGAIN}")
-    try:
-        array = np.load(path, allow_pickle=False)
-    except Exception as error:  # headers are read as Python literals: whatever that may raise
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
-        raise FileFormatError(f"{path}: cannot be read as plain numbers: {reason}; {AGAIN}") from None
-    if not isinstance(array, np.ndarray) or array.dtype.kind not in "biuf":
-        raise FileFormatError(f"{path}: holds no plain numbers; {AGAIN}")
-    return array
 
 
 def _mdp(manifest: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> TabularMDP:

@@ -1,6 +1,7 @@
 """MDPs from Gymnasium's `P` tables and from matrices."""
 
 import copy
+from collections import Counter
 from typing import Any
 
 import numpy as np
@@ -14,15 +15,23 @@ SAMPLED_STEPS = 10_000
 SAMPLED_EPISODE = 200
 
 
-def gymnasium(env: Any, *, gamma: float = 0.99, horizon: int | None = None) -> TabularMDP:
+NATIVE = {"Blackjack": "blackjack", "CliffWalking": "cliff_walking", "FrozenLake": "frozen_lake", "Taxi": "taxi"}
+"""Environments of Gymnasium -> the classes of pharos with the same rules."""
+
+LEAST_PROBABILITY = 1e-6
+"""A table is refused where outcomes as rare as those sampled were less likely than this, all comparisons together."""
+
+
+def gymnasium(env: Any, *, gamma: float = 0.99, horizon: int | None = None, check: bool = True) -> TabularMDP:
     """Return the MDP of an environment with a `P` table, such as FrozenLake, Taxi or CliffWalking.
 
     Args:
         env: a Gymnasium environment, wrapped or not, or a table P[s][a] = [(probability, next state, reward,
             terminated), ...]. The start distribution is `initial_state_distrib` where there is one, else state 0.
         gamma, horizon: of the MDP; Gymnasium's time limit is not taken over.
-            An environment is stepped, as a copy where it can be copied: some have chance that is not in their table,
-            such as Taxi with `fickle_passenger=True`.
+        check: whether an environment is stepped SAMPLED_STEPS times, as a copy where it can be copied, and compared
+            with its table: some have chance that is not in it, such as Taxi with `fickle_passenger=True`. Outcomes that
+            the table does not hold are refused, and frequencies that it makes too unlikely (chi-square tests).
     Returns:
         A table of next states where every action has one outcome, else a general MDP. A transition that terminates ends
         the episode after its reward, wherever it leads.
@@ -36,6 +45,8 @@ def gymnasium(env: Any, *, gamma: float = 0.99, horizon: int | None = None) -> T
         states, actions = len(table), len(table[0])
         rows = [[list(table[s][a]) for a in range(actions)] for s in range(states)]
     except (TypeError, KeyError, IndexError) as error:
+        if inner is env or not hasattr(inner, "P"):
+            raise FileFormatError(f"{env}: has no table P[s][a] of its transitions{_native(inner)}") from None
         raise FileFormatError(
             f"{env}: has no table P[s][a] with states 0, 1, ... and the same actions everywhere "
             f"({type(error).__name__}: {error})"
@@ -54,7 +65,7 @@ def gymnasium(env: Any, *, gamma: float = 0.99, horizon: int | None = None) -> T
                     entries.append((s * actions + a, following, p))
                     next_states[s, a] = following
     start = _start(env, inner, states)
-    if hasattr(inner, "step") and hasattr(inner, "reset"):
+    if check and hasattr(inner, "step") and hasattr(inner, "reset"):
         _compare_with_steps(env, inner, rows)
     initial: Any = int(start.argmax()) if start.max() == 1 else start / start.sum()
     if single:
@@ -102,30 +113,85 @@ def _compare_with_steps(env: Any, inner: Any, rows: list[list[list]]) -> None:
 
     Each state's actions are tried in turn, so that few steps try many of them.
     """
-    inner = _copy(inner)
-    outcomes = [
-        [{(int(t), float(r), bool(ended)) for p, t, r, ended in options if p > 0} for options in row] for row in rows
-    ]
+    stepped = _copy(inner)
+    likely = [[_likely(options) for options in row] for row in rows]
+    met: dict[tuple[int, int], Counter] = {}
     tries = np.zeros((len(rows), len(rows[0])), np.int64)
     rng = np.random.default_rng(0)
     state = None
     for step in range(SAMPLED_STEPS):
         if state is None or step % SAMPLED_EPISODE == 0:
-            state = _state_number(inner.reset(seed=0 if step == 0 else None)[0], len(rows))
+            state = _state_number(stepped.reset(seed=0 if step == 0 else None)[0], len(rows))
         if state is None:  # what is observed is no number of a state: nothing to compare
             return
         least = np.flatnonzero(tries[state] == tries[state].min())
         action = int(least[rng.integers(len(least))])
         tries[state, action] += 1
-        observation, reward, ended, _, _ = inner.step(action)
+        observation, reward, ended, _, _ = stepped.step(action)
         following = _state_number(observation, len(rows))
-        if (following, float(reward), bool(ended)) not in outcomes[state][action]:
+        outcome = (following, float(reward), bool(ended))
+        if outcome not in likely[state][action]:
             raise FileFormatError(
                 f"{env}: in state {state}, action {action} led to state {following} with reward {reward}, which its "
                 f"table P[{state}][{action}] does not hold; its chance is not in the table (as that of Taxi with "
-                f"fickle_passenger=True), so the table is another MDP: switch that chance off"
+                f"fickle_passenger=True), so the table is another MDP: switch that chance off{_native(inner)}"
             )
+        met.setdefault((state, action), Counter())[outcome] += 1
         state = None if ended else following
+    _compare_frequencies(env, inner, likely, met)
+
+
+def _likely(options: list) -> dict[tuple[int, float, bool], float]:
+    """Outcome (next state, reward, terminated) -> probability, of the possible ones."""
+    likely: dict[tuple[int, float, bool], float] = {}
+    for p, following, reward, ended in options:
+        if p > 0:
+            outcome = (int(following), float(reward), bool(ended))
+            likely[outcome] = likely.get(outcome, 0.0) + float(p)
+    return likely
+
+
+def _compare_frequencies(env: Any, inner: Any, likely: list, met: dict[tuple[int, int], Counter]) -> None:
+    """FileFormatError where the sampled frequencies of a state and action, or of all with the same probabilities in the
+    table, are too unlikely.
+
+    Pearson's chi-square test where each outcome is expected five times; the first test that fails is named.
+    """
+    from scipy.special import chdtrc
+
+    groups: dict[tuple[float, ...], np.ndarray] = {}
+    named: dict[tuple[float, ...], tuple[int, int]] = {}
+    tests: list[tuple[int, int, tuple[float, ...], np.ndarray]] = []
+    for (state, action), counts in met.items():
+        expected = likely[state][action]
+        if len(expected) == 1:
+            continue
+        shares = tuple(expected.values())
+        sampled = np.array([counts[outcome] for outcome in expected])
+        tests.append((state, action, shares, sampled))
+        groups[shares] = groups.get(shares, 0) + sampled
+        named.setdefault(shares, (state, action))
+    tests += [(*named[shares], shares, sampled) for shares, sampled in groups.items()]
+    tests = [each for each in tests if each[3].sum() * min(each[2]) >= 5]
+    for state, action, shares, sampled in tests:
+        expected = sampled.sum() * np.array(shares) / sum(shares)
+        chance = float(chdtrc(len(shares) - 1, ((sampled - expected) ** 2 / expected).sum()))
+        if chance < LEAST_PROBABILITY / len(tests):
+            raise FileFormatError(
+                f"{env}: in state {state}, action {action} (and those with the same probabilities) had its outcomes "
+                f"{', '.join(map(str, sampled))} times in {sampled.sum()} steps, but its table P[{state}][{action}] "
+                f"gives them {', '.join(f'{p:.3g}' for p in shares)}: that is as likely as {chance:.1g}, so the table "
+                f"is another MDP{_native(inner)}"
+            )
+
+
+def _native(inner: Any) -> str:
+    """What pharos has in place of an environment, for the end of a message."""
+    name = type(inner).__name__.removesuffix("Env")
+    if name not in NATIVE:
+        return ""
+    option = " fickle=true" if getattr(inner, "fickle_passenger", False) else ""
+    return f"; pharos has it as `{NATIVE[name]}{option}`"
 
 
 def _copy(inner: Any) -> Any:

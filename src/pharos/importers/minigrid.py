@@ -76,6 +76,26 @@ def minigrid(
     return TabularMDP.from_arrays(table, rewards, gamma=gamma, horizon=horizon)
 
 
+def minigrid_recording(
+    env: Any,
+    *,
+    seed: int = 0,
+    gamma: float = 1.0,
+    horizon: int | None = MINIGRID_STEPS,
+    max_states: int = 1_000_000,
+    remember_carried: bool = False,
+) -> tuple[TabularMDP, np.ndarray, tuple[str, ...]]:
+    """Return what `minigrid` and `minigrid_grids` give, by one exploration, and the names of the actions.
+
+    Args, errors and cost: as of `minigrid`, with all actions.
+    """
+    driver = _Driver(env, seed, remember_carried)
+    table, rewards = driver.explore(None, max_states)
+    names = tuple(action.name for action in driver.env.actions)[: table.shape[1]]
+    grids = np.stack([driver.seen(state) for state in driver.snapshots])
+    return TabularMDP.from_arrays(table, rewards, gamma=gamma, horizon=horizon), grids, names
+
+
 def minigrid_grids(
     env: Any,
     *,

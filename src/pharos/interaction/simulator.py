@@ -204,8 +204,8 @@ def _environment(environment: Environment | str, parameters: Mapping[str, Any]) 
     else:
         from pharos.mdp import TabularMDP  # which loads its kernels
 
-        table = ", and a table of an MDP has no environment to step" if isinstance(environment, TabularMDP) else ""
-        raise ParameterError(f"environment is {environment!r}; expected a name or a pharos Environment{table}")
+        advice = ": pharos.importers.environment(mdp) makes one" if isinstance(environment, TabularMDP) else ""
+        raise ParameterError(f"environment is {environment!r}; expected a name or a pharos Environment{advice}")
     clashes = sorted(set(env.parameters) & set(Interaction.__dataclass_fields__))
     if clashes:
         raise ParameterError(

@@ -53,9 +53,9 @@ def read_manifest(folder: Path) -> dict[str, Any] | None:
         return None
     if isinstance(manifest, dict) and manifest.get("format") == IMPORTED_FORMAT:
         raise StateSpaceError(
-            f"{folder}: holds an imported MDP, a table without an environment; it can be solved, measured and exported "
-            f"(`pharos solve|hardness|export {folder}`, pharos.importers.load), but not built, trained on, played or "
-            f"drawn"
+            f"{folder}: holds an imported MDP, no built state space; it is an environment by its folder "
+            f"(`pharos solve|hardness|train|render {folder}`, pharos.make({str(folder)!r})), and "
+            f"pharos.importers.load reads it"
         )
     try:
         if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:

@@ -1,0 +1,242 @@
+"""An imported MDP as an environment: its rules look up the table that a folder keeps, so whatever takes environments
+takes it.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pharos import mdp_files, storage
+from pharos.environments.base import Environment
+from pharos.environments.look import Layer
+from pharos.environments.parameters import store
+from pharos.errors import FileFormatError, ParameterError
+
+TIME_LIMIT = 1000  # of an MDP that has no horizon, and whose source has no limit
+MOST_ENTRIES = 1 << 28  # of a table of outcomes, written out
+DIGITS = (
+    ("###", "#.#", "#.#", "#.#", "###"),
+    (".#.", "##.", ".#.", ".#.", "###"),
+    ("###", "..#", "###", "#..", "###"),
+    ("###", "..#", ".##", "..#", "###"),
+    ("#.#", "#.#", "###", "..#", "..#"),
+    ("###", "#..", "###", "..#", "###"),
+    ("###", "#..", "###", "#.#", "###"),
+    ("###", "..#", "..#", ".#.", ".#."),
+    ("###", "#.#", "###", "#.#", "###"),
+    ("###", "#.#", "###", "..#", "###"),
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImportedWorld(Environment):
+    """The MDP of a folder that `pharos import` or `importers.save` wrote.
+
+    State    its number in the folder; where transitions end an episode without a next state, S is the end.
+    Actions  those of the source by their names, where the import recorded them, else by their numbers.
+    Reward   of the state and action, on average: the folder keeps no other.
+    Ends     in terminal states, and where the source ends.
+    Chance   that of the table.
+    """
+
+    folder: str = ""
+    digest: str = ""
+
+    name = "imported"
+    version = 1
+    layers = {"digit": Layer(tuple("0123456789"), (226, 228, 232), sprite=DIGITS)}
+
+    def validate(self) -> None:
+        store(self, "folder", str(Path(self.folder).expanduser().absolute()))
+        digest = str(self.manifest.get(storage.DIGEST) or storage.digest_of_json(self.manifest))
+        if self.digest not in ("", digest):
+            raise ParameterError(
+                f"{self.folder}: holds another MDP than it did (digest {digest}, then {self.digest}); "
+                f"bring the folder of then back, or start anew"
+            )
+        store(self, "digest", digest)
+        for entry, least in (("num_states", 1), ("num_actions", 1)):
+            if not isinstance(self.manifest.get(entry), int) or self.manifest[entry] < least:
+                raise FileFormatError(f"{self.folder}: {entry} is {self.manifest.get(entry)!r}; {mdp_files.AGAIN}")
+
+    @cached_property
+    def manifest(self) -> Mapping[str, Any]:
+        """What the folder says of itself."""
+        return mdp_files.read_manifest(self.folder)
+
+    @property
+    def actions(self) -> tuple[str, ...]:  # type: ignore[override]
+        """Their names."""
+        return tuple(self.manifest.get("actions") or map(str, range(self.manifest["num_actions"])))
+
+    @property
+    def max_episode_steps(self) -> int:  # type: ignore[override]
+        """The horizon of the MDP; else the time limit of its source; else 1,000."""
+        return int(self.manifest["horizon"] or self.manifest.get("time_limit") or TIME_LIMIT)
+
+    @property
+    def outcomes(self) -> int:  # type: ignore[override]
+        """K, the most outcomes of an action."""
+        return self.successors.shape[2]
+
+    def variables(self):
+        return {"state": range(len(self.successors))}
+
+    def initial_states(self):
+        starts, likely = self._arrays["start_states"], self._arrays["start_probabilities"]
+        total = float(likely.sum())
+        return [((int(s),), float(p) / total) for s, p in zip(starts, likely, strict=True) if p > 0]
+
+    def probability(self, state, action, outcome):
+        return self.probabilities[state[0], action, outcome]
+
+    def transition(self, state, action, outcome, out):
+        out[0] = self.successors[state[0], action, outcome]
+
+    def is_terminal(self, state):
+        return self.terminal[state[0]]
+
+    def reward(self, state, action, next_state):
+        return self.rewards[state[0], action]
+
+    def grid(self):
+        return 1, len(str(len(self.successors) - 1))
+
+    def draw(self, state, planes):
+        rest = state[0]
+        columns = planes.shape[2]
+        for i in range(columns):
+            planes[0, 0, columns - 1 - i] = rest % 10 + 1
+            rest = rest // 10
+
+    def picture(self, state) -> np.ndarray | None:
+        """What the source shows of a state, (H, W, 3) uint8, where the import recorded images or grids; else None.
+
+        Codes of a grid are shown as colours.
+        """
+        kind, shown = self.manifest.get(mdp_files.OBSERVATIONS), self.recorded
+        if kind not in ("image", "grid") or shown is None or shown.ndim != 4 or shown.shape[-1] != 3:
+            return None
+        if kind == "image":
+            return shown[state[0]]
+        stretched = shown[state[0]] * (255 // np.maximum(shown.max(axis=(0, 1, 2)), 1)).astype(np.uint8)
+        return np.ascontiguousarray(stretched.transpose(1, 0, 2))
+
+    # The table ------------------------------------------------------------------------------------------------------
+
+    @property
+    def successors(self) -> np.ndarray:
+        """(S, A, K) int64, where outcomes lead; with a row for the end, where there is one."""
+        return self._table[0]
+
+    @property
+    def probabilities(self) -> np.ndarray:
+        """(S, A, K) float64, of the outcomes."""
+        return self._table[1]
+
+    @cached_property
+    def terminal(self) -> np.ndarray:
+        """(S,) bool."""
+        return self._with_end(np.asarray(self._arrays["terminal"], np.bool_), True)
+
+    @cached_property
+    def rewards(self) -> np.ndarray:
+        """(S, A) float64."""
+        return self._with_end(np.asarray(self._arrays["rewards"], np.float64), 0.0)
+
+    @cached_property
+    def recorded(self) -> np.ndarray | None:
+        """(S, ...) what the source shows of each state, zeros for the end; None where the import recorded nothing."""
+        if mdp_files.OBSERVATIONS not in self.manifest["arrays"]:
+            return None
+        shown = mdp_files.read_array(self.folder, self.manifest, mdp_files.OBSERVATIONS)
+        if len(shown) != self.manifest["num_states"]:
+            raise FileFormatError(f"{self.folder}: {len(shown)} observations for {self.manifest['num_states']} states")
+        return self._with_end(shown, 0)
+
+    def _with_end(self, rows: np.ndarray, value: Any) -> np.ndarray:
+        more = len(self.successors) - len(rows)
+        return rows if more == 0 else np.concatenate([rows, np.full((more, *rows.shape[1:]), value, rows.dtype)])
+
+    @cached_property
+    def _arrays(self) -> dict[str, np.ndarray]:
+        try:
+            return mdp_files.read_arrays(self.folder, self.manifest)
+        except (KeyError, ValueError) as error:
+            raise FileFormatError(f"{self.folder}: the imported MDP is damaged: {error}; {mdp_files.AGAIN}") from None
+
+    @cached_property
+    def _table(self) -> tuple[np.ndarray, np.ndarray]:
+        states, actions = self.manifest["num_states"], self.manifest["num_actions"]
+        try:
+            table = written_out(*outcomes_of(self._arrays, states, actions), states, actions)
+        except (ValueError, IndexError, TypeError, OverflowError) as error:
+            raise FileFormatError(f"{self.folder}: the imported MDP is damaged: {error}; {mdp_files.AGAIN}") from None
+        return table
+
+
+def outcomes_of(
+    arrays: Mapping[str, np.ndarray], states: int, actions: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(rows (N,), successors (N,), probabilities (N,)): the outcomes of row s A + a, in any of the forms of a folder.
+
+    The end of an episode is the successor -1. Raises ValueError where they are no table of an MDP.
+    """
+    number = states * actions
+    if mdp_files.TABLE[0] in arrays:
+        successors = arrays[mdp_files.TABLE[0]].reshape(number)
+        return np.arange(number), successors, np.ones(number)
+    if mdp_files.OUTCOMES[0] in arrays:
+        successors = arrays["successors"]
+        most = successors.size // number  # K, where there are no offsets
+        counts = np.diff(arrays["offsets"]) if "offsets" in arrays else np.full(number, most)
+        rows = np.repeat(np.arange(number), counts)
+        if "probabilities" in arrays:
+            likely = arrays["probabilities"].reshape(-1)
+        else:
+            place = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
+            likely = arrays["palette"][arrays["codes"].reshape(-1)[rows], place]
+        return rows, successors.reshape(-1), likely
+    data, indices, indptr = (arrays[name] for name in mdp_files.MATRIX)
+    rows = np.repeat(np.arange(number), np.diff(indptr))
+    rest = 1.0 - np.bincount(rows, data, minlength=number)
+    ends = np.flatnonzero(rest > 1e-9)
+    rows, indices = np.concatenate([rows, ends]), np.concatenate([indices, np.full(len(ends), -1, indices.dtype)])
+    return rows, indices, np.concatenate([data, rest[ends]])
+
+
+def written_out(
+    rows: np.ndarray, successors: np.ndarray, likely: np.ndarray, states: int, actions: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """(S, A, K) successors and probabilities that sum to 1, what is impossible left out; S is the end, where there is.
+
+    Raises:
+        ParameterError: they are more than MOST_ENTRIES numbers. ValueError: they are no table of an MDP.
+    """
+    if not len(rows) == len(successors) == len(likely) or not (np.isfinite(likely) & (likely >= 0)).all():
+        raise ValueError("successors and probabilities do not fit")
+    order = np.argsort(rows, kind="stable")
+    order = order[likely[order] > 0]
+    rows, successors, likely = rows[order], successors[order].astype(np.int64), likely[order]
+    if len(successors) == 0 or successors.min() < -1 or successors.max() >= states:
+        raise ValueError(f"a successor is not among the {states} states")
+    counts = np.bincount(rows, minlength=states * actions)
+    has_end = bool((successors == -1).any())
+    most, count = int(counts.max()), states + has_end
+    if count * actions * most > MOST_ENTRIES:
+        raise ParameterError(
+            f"the table has {count:,} states, {actions} actions and up to {most:,} outcomes of each; expected at most "
+            f"{MOST_ENTRIES:,} numbers in all: it can be solved and measured, but not stepped"
+        )
+    place = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
+    table = np.zeros((count * actions, most), np.int64)
+    chances = np.zeros((count * actions, most))
+    table[rows, place] = np.where(successors == -1, states, successors)
+    chances[rows, place] = likely / np.bincount(rows, likely, minlength=states * actions)[rows]
+    if has_end:
+        table[states * actions :], chances[states * actions :, 0] = states, 1.0
+    return table.reshape(count, actions, most), chances.reshape(count, actions, most)
