@@ -12,6 +12,7 @@ import pharos
 from chance_worlds import ChanceWorld, chance_worlds
 from pharos.environments import Environment
 from pharos.errors import RuleError, StateSpaceError
+from pharos.plots import states_by_depth
 
 search = importlib.import_module("pharos.state_space.search")
 table = importlib.import_module("pharos.state_space.table")
@@ -216,9 +217,27 @@ def test_a_rule_that_breaks_the_contract_is_named_with_its_outcome(broken, expec
     assert pharos.state_space.read_manifest(tmp_path / "space")["complete"] is False  # what was found is kept
 
 
+def test_growth_counts_states_by_their_distance(tmp_path):
+    for env in (WORLD, pharos.make("simple_grid")):
+        space = build(env, tmp_path / env.name)
+        twin = naive.build_outcomes(env)
+        assert states_by_depth(space).tolist() == np.bincount(twin.levels).tolist()
+
+
+def test_the_arrays_that_a_space_does_not_have_are_refused_in_one_line(tmp_path):
+    lake, grid = (build(pharos.make(name), tmp_path / name) for name in ("frozen_lake", "simple_grid"))
+    slippery = build(pharos.make("frozen_lake", slippery=True), tmp_path / "slippery")
+    assert (lake.has_chance, slippery.has_chance) == (False, True)
+    with pytest.raises(StateSpaceError, match="several outcomes, in `outcomes`; there are no `successors`"):
+        slippery.successors  # noqa: B018
+    with pytest.raises(StateSpaceError, match="each action has one outcome, in `successors`; there are no `outcomes`"):
+        grid.outcomes  # noqa: B018
+
+
 def test_ages_are_those_of_the_rule(tmp_path, monkeypatch):
     space = build(Dice(), tmp_path / "space")
     assert (space.ages == space.states()[:, 0] - 5).all()
+    assert (space.mdp().age == space.ages).all()
     monkeypatch.setattr(rules, "compiled_or_none", lambda *_: None)
     again = pharos.load(tmp_path / "space", environment=Dice())
     assert (again.ages == space.ages).all()

@@ -53,6 +53,12 @@ class Table(CompiledDynamics):
         np.add.at(after, (t[inside], column), mass[s, a][inside])
         return after
 
+    def successors_of(self, states: np.ndarray) -> np.ndarray:
+        following = np.unique(self.next_states[states])
+        if len(following) and following[0] == -1:
+            return np.append(following[1:], self.num_states)
+        return following
+
     def outcomes(self, states: np.ndarray, actions: np.ndarray) -> Outcomes:
         following = self.next_states[states, actions].astype(np.int64)
         following[following < 0] = self.num_states

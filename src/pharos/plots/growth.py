@@ -26,7 +26,7 @@ def states_by_depth(space: "StateSpace") -> np.ndarray:
     counts = []
     while frontier.size:
         counts.append(frontier.size)
-        following = np.unique(space.successors[frontier])
+        following = space.dynamics.successors_of(frontier)
         frontier = following[~reached[following]]
         reached[frontier] = True
     return np.array(counts, np.int64)
