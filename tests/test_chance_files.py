@@ -2,13 +2,16 @@
 
 import importlib
 import json
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import pharos
 from chance_worlds import ChanceWorld
-from pharos.errors import DiskFull, StateSpaceCorrupted, StateSpaceMismatch, StateSpaceTooLarge
+from pharos.errors import DiskFull, PharosError, StateSpaceCorrupted, StateSpaceMismatch, StateSpaceTooLarge
 from pharos.state_space import read_manifest
 from test_hostile_spaces import edited, refused, sealed
 from test_resuming import FullDisk, _build_and_die_at, _InterruptAtLine, build, files_of, in_a_child
@@ -257,3 +260,69 @@ def test_other_rules_are_noticed(folder):
         StateSpaceMismatch, match=r"was built with other rules: from state .* leads to .*, by the rules"
     ):
         pharos.load(folder, environment=other)
+
+
+# Many mutations, in a process of their own, which must live ----------------------------------------------------------
+
+
+def naive_value(folder, rewards, gamma) -> float:
+    """The value at the start, from the files alone, row by row."""
+    manifest = read_manifest(folder)
+    arrays = {name: np.fromfile(folder / name, entry["dtype"]) for name, entry in manifest["arrays"].items()}
+    pairs, most = rewards.size, manifest["num_outcomes"]
+    first = arrays["offsets.bin"] if "offsets.bin" in arrays else most * np.arange(pairs + 1)
+    P = np.zeros((pairs, len(rewards)))
+    for row in range(pairs):
+        successors = arrays["successors.bin"][first[row] : first[row + 1]]
+        if "codes.bin" in arrays:
+            likely = arrays["palette.bin"].reshape(-1, most)[arrays["codes.bin"][row]]
+        else:
+            likely = arrays["probabilities.bin"][first[row] : first[row + 1]]
+        np.add.at(P[row], successors, likely[: len(successors)])
+    v = np.zeros(len(rewards))
+    for _ in range(300):
+        v = (rewards + gamma * (P @ v).reshape(rewards.shape)).max(axis=1)
+    return v[0]
+
+
+def survive(folder, which, mutations) -> None:
+    """Read and solve each mutant; anything but one line of pharos, or the right value, ends the process."""
+    world, outcome_journal.MOST_CODES = FOLDERS[which]
+    world = ChanceWorld(**{**world.parameters, "num_positions": 120, "end_share": 0.0})
+    outcome_journal.MOST_CODES = min(outcome_journal.MOST_CODES, 2**16 if "spelled" not in which else 10)
+    pharos.build(world, folder, progress=False)
+    files = {path.name: path.read_bytes() for path in folder.iterdir()}
+    rewards = pharos.load(folder, environment=world).mdp().rewards
+    names = sorted(json.loads(files["manifest.json"])["arrays"])
+    rng, right, wrong = np.random.default_rng(7), 0, 0
+    for _ in range(mutations):
+        for name, data in files.items():
+            (folder / name).write_bytes(data)
+        name = names[rng.integers(len(names))]
+        data = bytearray(files[name])
+        for _ in range(rng.integers(1, 3)):
+            data[rng.integers(len(data))] ^= 1 << int(rng.integers(8))
+        (folder / name).write_bytes(data)
+        sealed(folder)
+        try:
+            space = pharos.load(folder, environment=world if rng.random() < 0.5 else None)
+            solution = pharos.value_iteration(space.mdp(0.9, rewards), 1e-9)
+            space.indices(space.states(slice(0, 50)))
+        except PharosError as error:
+            assert "\n" not in str(error), error
+            wrong += 1
+            continue
+        assert abs(solution.value_at_start - naive_value(folder, rewards, 0.9)) <= solution.error_bound + 1e-8
+        right += 1
+    print(right, wrong)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("which", FOLDERS)
+def test_mutants_never_end_the_process(which, tmp_path):
+    code = f"import sys, pathlib; sys.path.insert(0, {str(Path(__file__).parent)!r}); import test_chance_files as t\n"
+    code += f"t.survive(pathlib.Path({str(tmp_path / 'space')!r}), {which!r}, 150)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-2000:]
+    right, wrong = map(int, done.stdout.split())
+    assert right + wrong == 150 and right > 0 and wrong > 50
