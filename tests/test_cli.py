@@ -450,3 +450,11 @@ def test_help_and_list_load_nothing_heavy(words):
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stderr
+
+
+def test_a_build_with_chance_says_how_many_outcomes_there_are(pharos, tmp_path):
+    done = pharos("build", "frozen_lake", "slippery=true", "--out", str(tmp_path / "space"))
+    assert done.exit_code == 0, done.stderr
+    assert "outcomes     at most 3 of an action, 152 in all" in done.stdout
+    again = pharos("build", "frozen_lake", "slippery=true", "--out", str(tmp_path / "space"), "--json")
+    assert json.loads(again.stdout)["num_transitions"] == 152 == 11 * 4 * 3 + 5 * 4

@@ -2,7 +2,7 @@
 
 import time
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -22,6 +22,9 @@ from pharos.cli.common import (
     print_json,
     size_text,
 )
+
+if TYPE_CHECKING:
+    from pharos.state_space import StateSpace
 
 
 def build(
@@ -49,6 +52,7 @@ def build(
         "parameters": space.parameters,
         "num_states": space.num_states,
         "num_actions": space.num_actions,
+        **({"num_transitions": space.manifest["num_transitions"]} if space.has_chance else {}),
         "num_terminal_states": space.num_terminal_states,
         "depth": space.depth,
         "seconds": seconds,
@@ -66,6 +70,7 @@ def build(
         [
             ("states", f"{space.num_states:,} ({space.num_terminal_states:,} terminal)"),
             ("actions", f"{space.num_actions} ({', '.join(env.actions)})"),
+            *_outcomes(space),
             ("depth", f"{space.depth:,}"),
             ("seconds", f"{seconds:.2f} (it was there already)" if found else f"{seconds:.2f} ({rate:,.0f} states/s)"),
             ("peak memory", size_text(peak)),
@@ -73,6 +78,14 @@ def build(
             ("folder", space.folder),
         ],
     )
+
+
+def _outcomes(space: "StateSpace") -> list[tuple[str, str]]:
+    """How many outcomes actions have, where the rules have chance."""
+    if not space.has_chance:
+        return []
+    manifest = space.manifest
+    return [("outcomes", f"at most {manifest['num_outcomes']} of an action, {manifest['num_transitions']:,} in all")]
 
 
 def _is_there(folder: Path) -> bool:
