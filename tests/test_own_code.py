@@ -25,7 +25,7 @@ from pharos.environments import SimpleGrid
 
 @dataclass(frozen=True, kw_only=True)
 class Taxi(SimpleGrid):
-    name = "taxi"
+    name = "cab"
 """
 CORNER = """
 import numpy as np
@@ -65,7 +65,7 @@ def lab(tmp_path_factory):
     (folder / "code").mkdir()
     (folder / "elsewhere").mkdir()
     (folder / "code" / "taxi_of_mine.py").write_text(TAXI)
-    (folder / "taxi_module.py").write_text(TAXI.replace('"taxi"', '"taxi_of_module"'))
+    (folder / "taxi_module.py").write_text(TAXI.replace('"cab"', '"cab_of_module"'))
     (folder / "corners.py").write_text(CORNER)
     (folder / "code" / "corners_file.py").write_text(CORNER.replace("register(", "# register("))
     (folder / "learner_module.py").write_text(LEARNER)
@@ -121,7 +121,7 @@ def test_a_study_keeps_where_its_code_comes_from(lab):
     }
     assert found["observation"].file == str((lab / "code" / "corners_file.py").resolve())
     assert not any(source.is_changed for source in found.values())
-    assert records["index"]["config"]["environment"] == "taxi"
+    assert records["index"]["config"]["environment"] == "cab"
 
 
 @pytest.mark.slow
@@ -158,7 +158,7 @@ def test_a_run_can_be_read_in_python(lab, monkeypatch):
     record = runs_of(lab)["index"]
     run = lab / "elsewhere" / "results" / "runs" / record["id"]
     task, agent = load_agent(run, trust=True)
-    assert (task.env.name, len(agent)) == ("taxi", task.space.num_states)
+    assert (task.env.name, len(agent)) == ("cab", task.space.num_states)
     again, _ = load_agent(run)  # it was imported, so it needs no trust
     assert again.env == task.env
 
@@ -180,7 +180,7 @@ def test_changed_code_is_told(lab, tmp_path):
 def test_a_file_that_changes_between_the_study_and_its_worker_fails_the_run(tmp_path):
     (tmp_path / "shifting.py").write_text(TAXI)
     config = config_of(tmp_path / "shifting.py")
-    (tmp_path / "shifting.py").write_text(TAXI.replace('"taxi"', '"taxi" ""'))
+    (tmp_path / "shifting.py").write_text(TAXI.replace('"cab"', '"cab" ""'))
     sources._LOADED.clear()
     with pytest.raises(ParameterError, match=r"shifting\.py has changed since"):
         RunConfig.from_dict(config).task(trust=True, strict=True)

@@ -376,7 +376,7 @@ def test_a_rule_that_fails_is_blamed_with_the_table_on_disk(tmp_path, little_mem
 def interpreted(monkeypatch):
     """Rules that are neither compiled nor traced: each state is asked."""
     monkeypatch.setattr("pharos.rules.rules.compiled_or_none", lambda *args: None)
-    monkeypatch.setattr("pharos.rules.traced.TracedRules.successors", lambda self, states: None)
+    monkeypatch.setattr("pharos.rules.traced.TracedRules.branches", lambda self, states: None)
 
 
 @pytest.mark.slow

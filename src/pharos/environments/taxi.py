@@ -54,7 +54,8 @@ class Taxi(Environment):
         landmarks: own ones, from 2 to 9 cells (row, column). As text: "0,0; 0,4; 4,0".
         walls: own ones, cells (row, column) with a wall to their right. As text likewise.
         rainy, fickle: the two kinds of chance.
-        rainy_probability: of going the intended way in the rain. fickle_probability: of another destination.
+        rainy_probability: of going the intended way in the rain.
+        fickle_probability: of another destination.
     """
 
     size: int = parameter(5, low=2)
