@@ -7,7 +7,6 @@ from pathlib import Path
 from pharos.errors import PharosError
 from pharos.experiments import read_record
 from pharos.study.specification import Specification
-from pharos.wording import many
 
 
 def warn_of_changes(study: Specification, folder: Path) -> None:
@@ -28,8 +27,7 @@ def warn_of_changes(study: Specification, folder: Path) -> None:
     for file, count in changed.items():
         if count:
             warnings.warn(
-                f"{file} has changed since {many(count, 'run')} in {folder} "
-                f"{'was' if count == 1 else 'were'} trained with it; "
+                f"{file} has changed since {count} runs in {folder} were trained with it; "
                 f"another --out trains them anew",
                 stacklevel=3,
             )
