@@ -3,6 +3,7 @@
 import io
 import json
 import os
+import random
 import subprocess
 import sys
 
@@ -12,7 +13,8 @@ from typer.testing import CliRunner
 
 from pharos.cli import app, common
 from pharos.cli.common import parse_parameters, parse_size, parse_value
-from pharos.environments import classes
+from pharos.cli.play import Game
+from pharos.environments import classes, make
 from pharos.errors import ParameterError
 
 BUILD_KEYS = set(
@@ -458,3 +460,11 @@ def test_a_build_with_chance_says_how_many_outcomes_there_are(pharos, tmp_path):
     assert "outcomes     at most 3 of an action, 152 in all" in done.stdout
     again = pharos("build", "frozen_lake", "slippery=true", "--out", str(tmp_path / "space"), "--json")
     assert json.loads(again.stdout)["num_transitions"] == 152 == 11 * 4 * 3 + 5 * 4
+
+
+def test_a_game_that_is_played_draws_the_outcomes_of_chance_in_the_rules(monkeypatch):
+    game = Game(make("cliff_walking/4x12-slippery"), (3, 0))
+    for u, state in ((0.2, (3, 0)), (0.5, (2, 0)), (0.9, (2, 1))):  # up: slips to the left, goes up, slips to the right
+        monkeypatch.setattr(random, "random", lambda u=u: u)
+        game.press("w")
+        assert game.state == state

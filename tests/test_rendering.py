@@ -133,6 +133,26 @@ def test_an_episode_ends_with_the_state_it_reaches():
     assert [state for state, _, _ in fell] == [(0, 0), (0, 1), (1, 1)]
 
 
+def test_episodes_draw_the_outcomes_of_chance_in_the_rules():
+    """The first card of a hit at blackjack, from a total of 4: 400 seeds, each card near its probability."""
+    env, start = make("blackjack/plain"), (4, 2, 0, 0, 0)
+    seen = np.zeros(10)
+    for seed in range(400):
+        (total, *_), _, _ = episode(env, lambda _: 1, start, steps=1, seed=seed)[-1]
+        seen[0 if total == 15 else total - 5] += 1
+    likely = np.array([1 / 13] * 9 + [4 / 13])
+    assert (abs(seen - 400 * likely) < 4 * np.sqrt(400 * likely)).all()
+    again = [episode(env, lambda _: 1, start, steps=9, seed=7) for _ in range(2)]
+    assert again[0] == again[1]
+
+
+def test_a_number_of_the_unit_interval_stands_for_an_outcome():
+    env = make("cliff_walking/4x12-slippery")
+    drawn = [env.drawn_outcome((3, 0), 1, u) for u in (0.0, 0.3, 0.34, 0.6, 0.67, 1 - 2**-53)]
+    assert drawn == [0, 0, 1, 1, 2, 2]
+    assert make("cliff_walking/4x12").drawn_outcome((3, 0), 1, 0.9) == 0
+
+
 def test_observations_can_be_plugged_in(monkeypatch):
     monkeypatch.setitem(RENDERERS, "dot", lambda env, state: np.full((2, 3), 7, np.uint8))
     picture = render(Lamp(), (0,), "dot")

@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import random
 import sys
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Annotated
@@ -93,7 +94,8 @@ class Game:
             self.state = self.history.pop()[0]
         elif key in self.keys and not self.over:
             action = self.keys[key]
-            following = self.env.next_state(self.state, action)
+            outcome = self.env.drawn_outcome(self.state, action, random.random()) if self.env.has_chance else 0
+            following = self.env.next_state(self.state, action, outcome)
             self.history.append((self.state, action, float(self.env.reward(self.state, action, following))))
             self.state = following
 

@@ -49,7 +49,7 @@ def render(
         str, typer.Option("--policy", help="optimal, uniform, or auto: optimal where that is quick to find.")
     ] = "auto",
     gamma: Annotated[float, typer.Option("--gamma", min=0, max=1, help="Discount of the optimal policy.")] = 0.99,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Of the uniform policy.")] = 0,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Of the uniform policy, and of chance in the rules.")] = 0,
     fps: Annotated[float, typer.Option("--fps", min=0.1, max=50, help="Frames a second of a GIF.")] = 10.0,
     json: Json = False,
 ) -> None:
@@ -68,7 +68,7 @@ def render(
     if steps is None:
         steps = min(env.max_episode_steps, 200) if suffix == ".gif" else 0
     used, choose = (policy, None) if steps == 0 else find_policy(goal, env, policy, gamma, seed)
-    played = drawing.episode(env, choose or (lambda _: 0), start, steps=steps)
+    played = drawing.episode(env, choose or (lambda _: 0), start, steps=steps, seed=seed)
 
     returned = sum(reward for _, _, reward in played)
     last = played[-1][0]

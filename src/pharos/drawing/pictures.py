@@ -123,18 +123,24 @@ def _fitting_cell(rows: int, columns: int) -> int:
 Policy = Callable[[State], int]
 
 
-def episode(env: Environment, policy: Policy, start: Sequence[int], *, steps: int) -> list[tuple[State, int, float]]:
+def episode(
+    env: Environment, policy: Policy, start: Sequence[int], *, steps: int, seed: int = 0
+) -> list[tuple[State, int, float]]:
     """Play from `start`: (state, action, reward) for each step, then (last state, -1, 0.0); at most `steps` steps.
+
+    `seed` is of the chance in the rules; without chance nothing is drawn.
 
     The rules run interpreted: a few microseconds to a millisecond a step.
     """
     state: State = tuple(int(value) for value in start)
+    rng = np.random.default_rng((seed, 1))  # not the draws of a policy with that seed
     played = []
     for _ in range(steps):
         if env.is_terminal(state):
             break
         action = int(policy(state))
-        following = env.next_state(state, action)
+        outcome = env.drawn_outcome(state, action, rng.random()) if env.has_chance else 0
+        following = env.next_state(state, action, outcome)
         played.append((state, action, float(env.reward(state, action, following))))
         state = following
     played.append((state, -1, 0.0))

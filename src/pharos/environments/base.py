@@ -258,6 +258,15 @@ class Environment:
             raise ParameterError(f"{self}: an action has one outcome; found outcome {outcome}, expected 0")
         return tuple(int(value) for value in out)
 
+    def drawn_outcome(self, state: Sequence[int], action: int, u: float) -> int:
+        """The outcome that a number drawn from [0, 1) stands for: those before it add up to u at most; interpreted."""
+        drawn, passed = 0, 0.0
+        for outcome in range(self.outcomes if self.has_chance else 0):
+            likely = float(self.probability(tuple(state), action, outcome))
+            if likely > 0 and passed <= u:
+                drawn, passed = outcome, passed + likely
+        return drawn
+
     def __str__(self) -> str:
         fields = ", ".join(f"{name}={value!r}" for name, value in self.parameters.items())
         return f"{type(self).__name__}({fields})"
