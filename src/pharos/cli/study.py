@@ -13,6 +13,7 @@ import typer
 
 from pharos.cli.common import Json, Trust, complain, console, parse_parameters, print_json, progress_line
 from pharos.errors import UnknownName
+from pharos.observations import title
 from pharos.wording import many
 
 app = typer.Typer(help="Run a grid of training runs, and make the paper's figures and tables of it.")
@@ -48,7 +49,7 @@ def show(spec: SpecArgument, trust: Trust = False, json: Json = False) -> None:
         group = groups.setdefault((run.instance, config["steps"]), {"chance": {}, "agent": {}, "observation": {}})
         group["chance"][run.chance] = None
         group["agent"][config["agent"]] = None
-        group["observation"][config["observation"]] = None
+        group["observation"][title(config["observation"], config["observation_options"])] = None
     counts = Counter((run.instance, run.config["steps"]) for run in runs)
     table = Table(box=None, pad_edge=False, header_style="bold")
     for name in ("instance", "chance", "agents", "observations"):

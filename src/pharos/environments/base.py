@@ -66,6 +66,7 @@ class Environment:
         hyperparameters: dict       agent -> observation, or "default" for all -> values that suit the class; they go
                                     before those of agents/hyperparameters.yaml
         foreign_parameters: dict    name that other libraries have -> what to do here instead; for the error message
+        motion_layers: dict         how each plane of `draw_motion` looks; an attribute or a property
         first_version: int          the `version` that the Gymnasium id pharos/ClassName-v0 stands for
         outcomes: int               K, how many outcomes an action has at most: of classes with chance; an attribute or
                                     a property. 1 in the base class
@@ -90,7 +91,10 @@ class Environment:
                                                     1 over the outcomes, up to 1e-9
         transition(self, state, action, outcome, out)    where this outcome leads; asked for possible ones only
 
-    Rule that may be left out
+    Rules that may be left out
+        draw_motion(self, state, planes)    what one picture of `draw` does not tell, such as where a ball comes from:
+                                    planes (M, rows, columns) uint8, zero, for the M motion_layers. Images have it with
+                                    `motion=True`; with it no two states should look alike
         age(self, state) -> int     a number that every transition out of a state that is not terminal increases, such
                                     as the steps taken: values are then solved in one backward pass
 
@@ -111,6 +115,7 @@ class Environment:
     hyperparameters: ClassVar[Mapping[str, Mapping[str, Mapping[str, Any]]]] = {}
     foreign_parameters: ClassVar[Mapping[str, str]] = {}
     first_version: ClassVar[int] = 1
+    motion_layers: Any = {}
     outcomes: Any = 1
 
     def __post_init__(self) -> None:
@@ -172,6 +177,9 @@ class Environment:
         """A picture of `state` for people, (H, W, 3) uint8, in place of the drawing; here None: there is no other."""
         return None
 
+    def draw_motion(self, state, planes) -> None:
+        """Write 1, 2, ... into planes (M, rows, columns) uint8: what `draw` does not tell of the state."""
+
     # Derived --------------------------------------------------------------------------------------------------------
 
     @property
@@ -202,6 +210,11 @@ class Environment:
     def has_age(self) -> bool:
         """Whether the class defines `age`."""
         return type(self).age is not Environment.age
+
+    @property
+    def has_motion(self) -> bool:
+        """Whether the class defines `draw_motion`."""
+        return type(self).draw_motion is not Environment.draw_motion
 
     @property
     def parameters(self) -> dict[str, Any]:

@@ -14,6 +14,7 @@ LEFT, STAY, RIGHT = range(3)
 ROW_COLORS = ((66, 72, 200), (200, 72, 72), (198, 108, 58), (180, 122, 48), (162, 162, 42), (72, 160, 72))
 WIDE_BRICK = ("#" * 16,) * 11 + ("." * 16,)
 WIDE_PADDLE = ("." * 16,) * 2 + ("#" * 16,) * 5 + ("." * 16,) * 5
+WIDE_TRAIL = ("." * 16,) * 4 + ("." * 6 + "#" * 4 + "." * 6,) * 4 + ("." * 16,) * 4
 WIDE_BALL = ("." * 16,) * 3 + ("." * 6 + "#" * 4 + "." * 6,) * 6 + ("." * 16,) * 3
 
 # (height, columns, paddle width): those of the paper's table, then those that its appendix B draws
@@ -71,6 +72,7 @@ class Breakout(Environment):
         "paddle": Layer("=", (66, 158, 130)),
         "ball": Layer("o", (236, 236, 236)),
     }
+    motion_layers = {"ball_trail": Layer(".", (190, 190, 190), WIDE_TRAIL)}
 
     look = Look(
         ground="court",
@@ -174,6 +176,12 @@ class Breakout(Environment):
         for i in range(self.paddle_width):
             planes[1, self.height - 1, state[PADDLE] + i] = 1
         planes[2, state[BALL_ROW], state[BALL_COLUMN]] = 1
+
+    def draw_motion(self, state, planes):
+        # the cell from which the ball goes as it does, or, where that lies in a wall, the one beside it
+        row = min(max(state[BALL_ROW] - 2 * state[BALL_DOWN] + 1, 0), self.height - 1)
+        column = min(max(state[BALL_COLUMN] - 2 * state[BALL_RIGHT] + 1, 0), self.columns - 1)
+        planes[0, row, column] = 1
 
 
 def no_brick_is_left(num_bricks, state):

@@ -55,6 +55,8 @@ WIDE_CHICKEN = (
     "........7..7........",
     "......777.777.......",
 )
+CLOCK = ("." * 20,) * 9 + ("#" * 20,) * 3  # below the car, or the player, whose timer it shows
+MOST_SHOWN = 255  # values of a timer
 
 INSTANCES = {
     f"{cars}x{length}-speed{speed}": {"num_cars": cars, "lane_length": length, "player_speed": speed}
@@ -151,6 +153,12 @@ class Freeway(Environment):
         """The row below the lanes."""
         return self.num_cars + 1
 
+    @property
+    def motion_layers(self) -> dict[str, Layer]:  # type: ignore[override]
+        """The timers: the later it is, the darker."""
+        periods = {"car_timers": int(self.car_periods.max()), "player_timer": self.player_speed}
+        return {name: clock(min(period, MOST_SHOWN)) for name, period in periods.items()}
+
     @cached_property
     def car_periods(self) -> np.ndarray:
         """(num_cars,) int64: steps between two moves of each car."""
@@ -214,6 +222,18 @@ class Freeway(Environment):
             goes_left = self.car_directions[i] < 0
             planes[1, 1 + i, state[CARS + i]] = 1 + i % NUM_COLORS + NUM_COLORS * goes_left
         planes[2, state[PLAYER_ROW], self.column] = 1
+
+    def draw_motion(self, state, planes):
+        timers = CARS + self.num_cars
+        for i in range(self.num_cars):
+            planes[0, 1 + i, state[CARS + i]] = 1 + min(state[timers + i], MOST_SHOWN - 1)
+        planes[1, state[PLAYER_ROW], self.column] = 1 + min(state[PLAYER_TIMER], MOST_SHOWN - 1)
+
+
+def clock(period: int) -> Layer:
+    """A bar under a thing that grows from white to blue until the thing moves."""
+    shades = np.linspace(255, 0, period).round().astype(int).tolist()
+    return Layer((".",) * period, tuple((shade, shade, 255) for shade in shades), CLOCK)
 
 
 def row_after_move(row, timer, action, start_row):

@@ -76,6 +76,7 @@ class Taxi(Environment):
         "taxi": Layer("T", (240, 200, 60), CAB),
         "passenger": Layer(("p", "q"), ((30, 60, 160), (150, 40, 150)), RIDER),
     }
+    motion_layers = {"occupied": Layer("!", (80, 200, 120), ("########", *("........",) * 7))}
 
     look = Look(ground="tiles", color="#BCBD22")
     instances = {
@@ -229,6 +230,10 @@ class Taxi(Environment):
         row = state[ROW] if place == places else self.landmark_rows[place]
         column = state[COLUMN] if place == places else self.landmark_columns[place]
         planes[4, row, 2 * column] = 1 + state[UNDECIDED]
+
+    def draw_motion(self, state, planes):
+        if state[PASSENGER] == len(self.landmark_rows):  # else the passenger may stand where the taxi is
+            planes[0, state[ROW], 2 * state[COLUMN]] = 1
 
 
 def is_at(self, state, place):

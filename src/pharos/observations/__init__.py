@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from pharos.observations.blocks import in_blocks
 from pharos.observations.context import NO_ACTION, ObservationInContext
-from pharos.observations.observation import FunctionObservation, Observation, names, observe, register
+from pharos.observations.observation import FunctionObservation, Observation, names, observe, register, title
 from pharos.observations.vector import Index, OneHot, Vector
 
 if TYPE_CHECKING:
@@ -58,6 +58,7 @@ __all__ = [
     "register",
     "render",
     "renderers",
+    "title",
 ]
 
 

@@ -1,5 +1,6 @@
 """Complex images: sprites on a ground, like the screen of an Atari game."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -9,6 +10,7 @@ from pharos.drawing import color_of, glyph_of, ground_of, scenery_of, shape_of, 
 from pharos.environments import Environment, Layer, Scenery
 from pharos.errors import ParameterError
 from pharos.observations.drawn import Drawing, num_values
+from pharos.observations.hiding import hidden_names
 from pharos.observations.observation import Observation
 
 LARGEST = 1024  # pixels on a side
@@ -26,16 +28,27 @@ class ComplexImage(Observation):
             are.
         grey: one channel of luminance instead of three of colour.
         channels_first: (C, height, width).
+        motion: the M motion layers are laid over the others, as in simple images.
+        hide: names of layers that the agent does not see.
     Raises:
         ParameterError: the environment cannot be drawn, or the size is too small for a pixel a cell.
     """
 
-    def __init__(self, env: Environment, *, size: Any = (84, 84), grey: bool = False, channels_first: bool = False):
+    def __init__(
+        self,
+        env: Environment,
+        *,
+        size: Any = (84, 84),
+        grey: bool = False,
+        channels_first: bool = False,
+        motion: bool = False,
+        hide: str | Sequence[str] = (),
+    ):
         from gymnasium.spaces import Box
 
         self.name = "complex_image"
         self.env = env
-        self._drawing = Drawing(env, "draw_complex", _compose, block=64)
+        self._drawing = Drawing(env, "draw_complex", _compose, block=64, motion=motion)
         self._channels_first = bool(channels_first)
         scenery = scenery_of(env)
         natural = _natural_size(scenery, self._drawing.rows, self._drawing.columns)
@@ -50,7 +63,10 @@ class ComplexImage(Observation):
         ground = np.zeros((*natural, 3))
         ground_of(scenery.ground)(ground, scenery.cell, scenery.margin)
         picture = _scaled(ground, height, width)
-        sprite, place, color, keep = _sprite_tables(env, scenery, np.diff(top), np.diff(left))
+        layers = self._drawing.layers
+        sprite, place, color, keep = _sprite_tables(layers, scenery, np.diff(top), np.diff(left))
+        hidden = hidden_names(hide, f"layer that complex_image of {env.name} can hide", layers)
+        sprite[[name in hidden for name in layers]] = -1
         if grey:
             picture, color = (values @ np.array(LUMINANCE)[:, None] for values in (picture, color))
         self._tables = (_bytes(picture), top, left, sprite, place, _bytes(color), keep)
@@ -123,13 +139,13 @@ def _area_weights(old: int, new: int) -> np.ndarray:
 
 
 def _sprite_tables(
-    env: Environment, scenery: Scenery, heights: np.ndarray, widths: np.ndarray
+    layers: Mapping[str, Layer], scenery: Scenery, heights: np.ndarray, widths: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """sprite, place, color and keep, as `draw_complex` takes them; color still (P, 3) float64."""
     rows = len(heights)
-    sprite = np.full((len(env.layers), rows, 256), -1, np.int64)
+    sprite = np.full((len(layers), rows, 256), -1, np.int64)
     images: list[np.ndarray] = []
-    for number, (name, layer) in enumerate(env.layers.items()):
+    for number, (name, layer) in enumerate(layers.items()):
         if name in scenery.sprites and scenery.sprites[name] is None:
             continue
         count = num_values(layer)

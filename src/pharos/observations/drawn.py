@@ -22,16 +22,20 @@ class Drawing:
 
     Attributes:
         env: the environment; rows, columns: of its grid. `block` frames are worth a thread's while.
+        motion: whether the planes of `draw_motion` follow those of `draw`; not where the class defines none.
+        layers: those of all planes.
     Raises:
         ParameterError: the environment declares no grid, no layers or no draw().
     """
 
-    def __init__(self, env: Environment, kernel: str, interpreted: Callable[..., None], block: int):
+    def __init__(self, env: Environment, kernel: str, interpreted: Callable[..., None], block: int, motion: bool):
         self.env, self._block = env, block
+        self.motion = bool(motion) and env.has_motion
+        self.layers: dict[str, Layer] = {**env.layers, **(env.motion_layers if self.motion else {})}
         try:
             self.rows, self.columns = env.grid()
-            planes = np.zeros((len(env.layers), self.rows, self.columns), np.uint8)
-            env.draw(tuple(env.initial_states()[0][0]), planes)
+            planes = np.zeros((len(self.layers), self.rows, self.columns), np.uint8)
+            self._draw(tuple(env.initial_states()[0][0]), planes)
         except NotImplementedError as error:
             raise ParameterError(f"{env}: cannot be drawn: {error}") from None
         if not env.layers:
@@ -68,10 +72,16 @@ class Drawing:
         from pharos.rules import rules_of
 
         nothing = (states, 0, 0, self._planes(), *tables, out)
-        return rules_of(self.env).drawing(self._kernel, self._interpret, *nothing)
+        return rules_of(self.env).drawing(self._kernel, self._interpret, *nothing, motion=self.motion)
 
     def _interpret(self, states, first, last, planes, *tables_and_out) -> None:
         for n in range(first, last):
             planes[:] = 0
-            self.env.draw(tuple(states[n].tolist()), planes)
+            self._draw(tuple(states[n].tolist()), planes)
             self._interpreted(planes, *tables_and_out[:-1], tables_and_out[-1][n])
+
+    def _draw(self, state: tuple[int, ...], planes: np.ndarray) -> None:
+        things = len(self.env.layers)
+        self.env.draw(state, planes[:things])
+        if self.motion:
+            self.env.draw_motion(state, planes[things:])

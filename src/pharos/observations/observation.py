@@ -106,10 +106,25 @@ _BUILT_IN = {
 }
 _registered: dict[str, tuple[Function, Any]] = {}
 
+# Options that change what an agent is told, not how
+TELLING = ("motion", "hide")
+
 
 def names() -> list[str]:
     """The names that `observation=` knows, the registered ones last."""
     return [*_BUILT_IN, *_registered]
+
+
+def title(name: str, options: Mapping[str, Any]) -> str:
+    """The name of an observation in tables and figures, with the options that change what the agent is told:
+    "simple_image(motion=True)".
+    """
+    words = (f"{option}={_words(options[option])}" for option in TELLING if options.get(option))
+    return f"{name}({', '.join(words)})".removesuffix("()")
+
+
+def _words(value: Any) -> str:
+    return str(value) if isinstance(value, str | bool | int) else "+".join(map(str, value))
 
 
 def register(name: str, function: Function, space: Any) -> None:

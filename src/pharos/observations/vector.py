@@ -1,11 +1,13 @@
 """Vectors: every component of the state, normalized by its declared range; one-hot; the number of the state."""
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pharos.environments import Environment
 from pharos.errors import ParameterError
+from pharos.observations.hiding import hidden_names
 from pharos.observations.observation import Observation
 
 if TYPE_CHECKING:
@@ -20,13 +22,16 @@ class Vector(Observation):
 
     Complete: different states have different vectors. A component with one value only is always 0.
 
+    Args:
+        hide: variables that the agent does not see, such as "ball_goes_right" or "bricks", or single components of
+            them, such as "bricks[0,3]": their entries stay, and are always 0.
     Attributes:
         low, scale: (D,), the observation is (state - low) * scale.
     Raises:
         ParameterError: a component has more values than float32 tells apart.
     """
 
-    def __init__(self, env: Environment):
+    def __init__(self, env: Environment, *, hide: str | Sequence[str] = ()):
         from gymnasium.spaces import Box
 
         components = env.components
@@ -41,6 +46,9 @@ class Vector(Observation):
         self.names = components.names
         self.low = components.low
         self.scale = np.where(components.size > 1, 1 / np.maximum(components.size - 1, 1), 0.0)
+        whose = f"variable that the vector of {env.name} can hide"
+        for name in hidden_names(hide, whose, components.variables, components.names):
+            self.scale[components.variables.get(name) or components.names.index(name)] = 0.0
         self.space = Box(0.0, 1.0, (len(components),), np.float32)
 
     def __call__(self, states: np.ndarray) -> np.ndarray:

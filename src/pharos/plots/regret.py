@@ -11,6 +11,7 @@ from pharos.agents import agent_kind
 from pharos.environments import as_tuples, class_called, make
 from pharos.errors import ParameterError
 from pharos.experiments import bootstrap_interval, read_curve, read_record
+from pharos.observations import title
 from pharos.plots.style import COLORS, INK, figure, styled, thousands
 
 if TYPE_CHECKING:
@@ -90,7 +91,7 @@ def _label(config: dict[str, Any], configs: list[dict[str, Any]]) -> str:
 
     parts = [config["agent"]]
     if not agent_kind(config["agent"]).is_tabular:
-        parts.append(config["observation"].replace("_", " "))
+        parts.append(title(config["observation"], config.get("observation_options", {})).replace("_", " "))
     if differ("environment", "parameters"):
         parts.append(_instance(config["environment"], config["parameters"]))
     if differ("chance"):

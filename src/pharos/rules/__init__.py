@@ -9,7 +9,7 @@ from pharos.rules.fingerprint import fingerprint_of_rules
 from pharos.rules.layout import Layout, layout_of, pack, unpack
 
 if TYPE_CHECKING:
-    from pharos.rules.compiled import CompiledDrawing, CompiledExploration
+    from pharos.rules.compiled import CompiledDrawing, CompiledExploration, CompiledMotion
     from pharos.rules.compiler import reason_of
     from pharos.rules.interpreted import refused_reward
     from pharos.rules.rules import Rules, not_compiled, rules_of
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 _LAZY = {
     "CompiledDrawing": "compiled",
     "CompiledExploration": "compiled",
+    "CompiledMotion": "compiled",
     "InterpretedStepping": "stepping",
     "Rules": "rules",
     "not_compiled": "rules",
@@ -29,6 +30,7 @@ _LAZY = {
 __all__ = [
     "CompiledDrawing",
     "CompiledExploration",
+    "CompiledMotion",
     "InterpretedStepping",
     "Layout",
     "Rules",

@@ -38,7 +38,7 @@ class BranchingKernels(NamedTuple):
 
 def branching(compiler: Any, rules: Any, Parameters: Any, W: int, A: int, K: int) -> BranchingKernels:
     """The kernels of a class of environments whose states take W words, with A actions of at most K outcomes."""
-    search = compiler.calling(*(rule for rule in rules if rule not in ("reward", "draw")))
+    search = compiler.calling(*(rule for rule in rules if rule not in ("reward", "draw", "draw_motion")))
     words = words_functions(search, W)
     expand = expand_function(search, rules, Parameters, words, W, A, K)
     prefetch_states = prefetch_function(search, A * K)

@@ -204,16 +204,22 @@ class CompiledDrawing:
         kernel: its name in interaction.py. arguments: those of the first call, for no states.
     """
 
-    is_compiled = True
+    is_compiled, motion = True, False
 
     def __init__(self, env: Environment, kernel: str, *arguments: Any):
         names, self.parameters = numeric_attributes(env)
-        kernels = interaction_kernels(_class_of(env), names, env.num_actions, int(env.outcomes))
+        kernels = interaction_kernels(_class_of(env), names, env.num_actions, int(env.outcomes), self.motion)
         self._kernel = getattr(kernels, kernel)
         self(*arguments)
 
     def __call__(self, *arguments: Any) -> None:
         self._kernel(self.parameters, *arguments)
+
+
+class CompiledMotion(CompiledDrawing):
+    """The same with the planes of `draw_motion` behind those of `draw`."""
+
+    motion = True
 
 
 def signature_of(env: Environment) -> tuple:

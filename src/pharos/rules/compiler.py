@@ -39,10 +39,13 @@ _MACHINERY = (
 
 
 def rules_of_class(cls: Any) -> tuple[str, ...]:
-    """The names of the rules that a class has: those of every class, and `probability` and `age` where it defines
-    them.
-    """
-    return RULES + ("probability",) * cls.takes_outcomes() + ("age",) * (cls.age is not Environment.age)
+    """The names of the rules that a class has: those of every class, and those others that it defines."""
+    own = {
+        "probability": cls.takes_outcomes(),
+        "age": cls.age is not Environment.age,
+        "draw_motion": cls.draw_motion is not Environment.draw_motion,
+    }
+    return RULES + tuple(rule for rule, is_defined in own.items() if is_defined)
 
 
 def numeric_attributes(env: Environment) -> tuple[tuple[str, ...], tuple[Any, ...]]:
@@ -92,12 +95,15 @@ def exploration_kernels(
 
 
 @cache
-def interaction_kernels(cls: Any, names: tuple[str, ...], num_actions: int, outcomes: int = 1) -> "InteractionKernels":
-    """The kernels of `interaction.py`."""
+def interaction_kernels(
+    cls: Any, names: tuple[str, ...], num_actions: int, outcomes: int = 1, motion: bool = False
+) -> "InteractionKernels":
+    """The kernels of `interaction.py`; with motion they draw the planes of `draw_motion` behind those of `draw`."""
     from pharos.rules.interaction import interaction
 
-    compiler, rules, parameters = _compiler_of(cls, names, outcomes, 0, num_actions)
-    return interaction(compiler, rules, parameters, num_actions, outcomes)
+    layers = len(cls.layers) if motion else 0
+    compiler, rules, parameters = _compiler_of(cls, names, outcomes, 0, num_actions, *((layers,) if motion else ()))
+    return interaction(compiler, rules, parameters, num_actions, outcomes, layers)
 
 
 def _compiler_of(

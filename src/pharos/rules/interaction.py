@@ -29,18 +29,25 @@ class InteractionKernels(NamedTuple):
     draw_planes: Any
 
 
-def interaction(compiler: Any, rules: Any, Parameters: Any, A: int, K: int = 1) -> InteractionKernels:
-    """The kernels of a class of environments with A actions of at most K outcomes."""
+def interaction(compiler: Any, rules: Any, Parameters: Any, A: int, K: int = 1, L: int = 0) -> InteractionKernels:
+    """The kernels of a class of environments with A actions of at most K outcomes.
+
+    L: how many layers `draw` has, where the planes of `draw_motion` are to follow; else 0.
+    """
     chance = ("probability",) * (K > 1)
     step, drawing = compiler.calling("transition", "is_terminal", "reward", *chance), compiler.calling("draw")
+    if L:
+        drawing = compiler.calling("draw", "draw_motion")
+        rules = {**rules, "draw": draw_all_function(drawing, rules, L)}
     advance = advance_function(step, rules, K)
     outcome = compiler.calling("transition", *chance)
     drawn_outcome = drawn_outcome_function(outcome, rules, K)
     draw_flat = draw_flat_function(drawing, rules)
+    stepped = compiler.calling(*(rule for rule in rules if rule != "draw_motion" or L))
     return InteractionKernels(
         step_one=step_one_kernel(step, Parameters, advance),
         outcome_one=outcome_one_kernel(outcome, Parameters, drawn_outcome),
-        step_and_draw_one=step_and_draw_one_kernel(compiler, Parameters, advance, draw_flat),
+        step_and_draw_one=step_and_draw_one_kernel(stepped, Parameters, advance, draw_flat),
         step_many=step_many_kernel(step, Parameters, advance, drawn_outcome, A, K),
         is_terminal_one=is_terminal_one_kernel(compiler.calling("is_terminal"), rules, Parameters),
         draw_simple=draw_simple_kernel(drawing, rules, Parameters, draw_flat),
@@ -127,6 +134,19 @@ def step_one_kernel(compiler: Any, Parameters: Any, advance: Any) -> Any:
         return value, code
 
     return step_one
+
+
+def draw_all_function(compiler: Any, rules: Any, L: int) -> Any:
+    """Where things are, and behind these planes their motion."""
+    draw, draw_motion = rules["draw"], rules["draw_motion"]
+
+    @compiler.inlined
+    def draw_all(self, state, planes):
+        """planes (L + M, rows, columns) uint8, zero."""
+        draw(self, state, planes[:L])
+        draw_motion(self, state, planes[L:])
+
+    return draw_all
 
 
 def draw_flat_function(compiler: Any, rules: Any) -> Any:

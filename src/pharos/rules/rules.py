@@ -23,6 +23,7 @@ from pharos.rules.compiled import (
     CompiledAges,
     CompiledDrawing,
     CompiledExploration,
+    CompiledMotion,
     CompiledRewards,
     CompiledStepping,
     signature_of,
@@ -201,15 +202,19 @@ class Rules:
 
         return InterpretedStepping(self.env)
 
-    def drawing(self, kernel: str, interpreted: Callable[..., None], *arguments: Any) -> Callable[..., None]:
+    def drawing(
+        self, kernel: str, interpreted: Callable[..., None], *arguments: Any, motion: bool = False
+    ) -> Callable[..., None]:
         """A function that draws states.
 
         Args:
             kernel: its name in interaction.py.
             interpreted: what runs where Numba does not compile it.
             arguments: of a first call, for no states, which compiles it.
+            motion: whether the planes of `draw_motion` follow those of `draw`.
         """
-        compiled = compiled_or_none(CompiledDrawing, self.env, kernel, *arguments)
+        engine = CompiledMotion if motion else CompiledDrawing
+        compiled = compiled_or_none(engine, self.env, kernel, *arguments)
         return interpreted if compiled is None else compiled
 
     def reason_not_compiled(self) -> str:

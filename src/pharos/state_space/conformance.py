@@ -240,11 +240,12 @@ def _check_compiled_rewards(check: InterpretedCheck, rules: "Rules", states: lis
 
 
 def _check_compiled_drawings(check: InterpretedCheck, states: list[State], notes: list[str]) -> None:
-    from pharos.rules import CompiledDrawing, reason_of
+    from pharos.rules import CompiledDrawing, CompiledMotion, reason_of
 
     planes = np.zeros((len(states), *check.drawings[states[0]].shape), np.uint8)
     try:
-        CompiledDrawing(check.env, "draw_planes", np.array(states, np.int64), planes)
+        engine = CompiledMotion if check.env.has_motion else CompiledDrawing
+        engine(check.env, "draw_planes", np.array(states, np.int64), planes)
     except Exception as error:  # Numba raises its own errors, and others from inside of it
         notes.append(f"Numba cannot compile draw, so drawing runs interpreted: {reason_of(error)}")
         return

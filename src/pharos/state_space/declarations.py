@@ -69,26 +69,16 @@ def check_layers(env: Environment, notes: list[str]) -> None:
         notes.append("it declares no layers: it cannot be drawn, and has no image observations")
         return
     for name, layer in env.layers.items():
-        if not isinstance(layer, Layer):
-            raise RuleError(f"{whose}.layers[{name!r}] is {layer!r}; expected a Layer")
-        glyphs = layer.glyph if isinstance(layer.glyph, tuple) else (layer.glyph,)
-        if not glyphs or not all(isinstance(glyph, str) and len(glyph) == 1 for glyph in glyphs):
-            raise RuleError(
-                f"{whose}.layers[{name!r}].glyph is {layer.glyph!r}; expected one character, or a tuple of them"
-            )
-        colors: Sequence[Any] = layer.color if isinstance(layer.color[0], tuple) else (layer.color,)
-        for color in colors:
-            if len(color) != 3 or not all(isinstance(part, int) and 0 <= part <= 255 for part in color):
-                raise RuleError(f"{whose}.layers[{name!r}].color has {color!r}; expected (red, green, blue), 0 to 255")
-        if len(colors) not in (1, len(glyphs)):
-            raise RuleError(
-                f"{whose}.layers[{name!r}] has {len(glyphs)} glyphs and {len(colors)} colors; "
-                f"expected one color for all, or one for each"
-            )
-        with _named(f"{whose}.layers[{name!r}].shape"):
-            shape_of(name, layer)
-        if layer.sprite is not None:
-            _check_sprites(f"{whose}.layers[{name!r}].sprite", layer.sprite, len(glyphs))
+        _check_layer(f"{whose}.layers[{name!r}]", name, layer)
+    motion = env.motion_layers
+    names = set(motion) if isinstance(motion, dict) else set()
+    if bool(names) != env.has_motion or names & set(env.layers):
+        raise RuleError(
+            f"{whose}.motion_layers is {motion!r}; expected a dict of name -> Layer, with other names than layers, "
+            f"where the class defines draw_motion, and {{}} elsewhere"
+        )
+    for name, layer in motion.items():
+        _check_layer(f"{whose}.motion_layers[{name!r}]", name, layer)
     for place, look in (("look", env.look), ("look.scenery", env.look.scenery)):
         if look is not None:
             with _named(f"{whose}.{place}.ground"):
@@ -102,6 +92,27 @@ def check_layers(env: Environment, notes: list[str]) -> None:
         raise RuleError(
             f"{env}: it has layers but grid() does not give (rows, columns); expected two integers, at least 1"
         )
+
+
+def _check_layer(where: str, name: Any, layer: Any) -> None:
+    """RuleError where a layer, which a message calls `where`, is not as the contract says."""
+    if not isinstance(name, str) or not isinstance(layer, Layer):
+        raise RuleError(f"{where} is {layer!r}; expected a Layer")
+    glyphs = layer.glyph if isinstance(layer.glyph, tuple) else (layer.glyph,)
+    if not glyphs or not all(isinstance(glyph, str) and len(glyph) == 1 for glyph in glyphs):
+        raise RuleError(f"{where}.glyph is {layer.glyph!r}; expected one character, or a tuple of them")
+    colors: Sequence[Any] = layer.color if isinstance(layer.color[0], tuple) else (layer.color,)
+    for color in colors:
+        if len(color) != 3 or not all(isinstance(part, int) and 0 <= part <= 255 for part in color):
+            raise RuleError(f"{where}.color has {color!r}; expected (red, green, blue), 0 to 255")
+    if len(colors) not in (1, len(glyphs)):
+        raise RuleError(
+            f"{where} has {len(glyphs)} glyphs and {len(colors)} colors; expected one color for all, or one for each"
+        )
+    with _named(f"{where}.shape"):
+        shape_of(name, layer)
+    if layer.sprite is not None:
+        _check_sprites(f"{where}.sprite", layer.sprite, len(glyphs))
 
 
 @contextlib.contextmanager

@@ -3,12 +3,12 @@
 import math
 import numbers
 import operator
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 
-from pharos.environments import Environment, State
+from pharos.environments import Environment, Layer, State
 from pharos.errors import RuleError
 
 SUM_TOLERANCE = 1e-9
@@ -117,22 +117,29 @@ class InterpretedCheck:
                 )
 
     def drawing(self, state: State) -> None:
-        shape = (len(self.env.layers), *self.env.grid())
-        where = self.where("draw", state)
-        found = []
+        self.drawings[state] = self._planes("draw", self.env.layers, state)
+        if self.env.has_motion:
+            motion = self._planes("draw_motion", self.env.motion_layers, state)
+            self.drawings[state] = np.concatenate([self.drawings[state], motion])
+
+    def _planes(self, rule: str, layers: Mapping[str, Layer], state: State) -> np.ndarray:
+        """(L, rows, columns) uint8: what a rule draws, checked."""
+        shape = (len(layers), *self.env.grid())
+        where = self.where(rule, state)
+        drawn = []
         for _ in range(2):
             planes = _Planes(shape)
-            self._call(where, self.env.draw, _ReadOnly(state), planes)
-            found.append(planes.array)
-        if (found[0] != found[1]).any():
+            self._call(where, getattr(self.env, rule), _ReadOnly(state), planes)
+            drawn.append(planes.array)
+        if (drawn[0] != drawn[1]).any():
             raise RuleError(f"{where} draws two different things; {SAME}")
-        for plane, (name, layer) in zip(found[0], self.env.layers.items(), strict=True):
+        for plane, (name, layer) in zip(drawn[0], layers.items(), strict=True):
             num_values = len(layer.glyph) if isinstance(layer.glyph, tuple) else 1
             if plane.max() > num_values:
                 raise RuleError(
                     f"{where} writes {plane.max()} on layer {name!r}; expected 0 to {num_values}, its glyphs"
                 )
-        self.drawings[state] = found[0]
+        return drawn[0]
 
     def _is_terminal(self, state: State) -> bool:
         where = self.where("is_terminal", state)

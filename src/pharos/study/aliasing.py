@@ -10,7 +10,7 @@ import numpy as np
 
 from pharos.agents import TABULAR_OBSERVATION
 from pharos.errors import FileFormatError, PharosError
-from pharos.observations import Aliasing, aliasing
+from pharos.observations import Aliasing, aliasing, title
 from pharos.storage import digest_of_json, is_intact, read_json, replace_json, sealed
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ def aliasing_table(
 
     rows: dict[tuple[str, str], dict[str, Any]] = {}
     for run in study.runs:
-        key = (run.instance, run.config["observation"])
+        key = (run.instance, title(run.config["observation"], run.config["observation_options"]))
         known = num_states.get(run.instance, np.inf)
         if key in rows or key[1] == TABULAR_OBSERVATION or not known <= MOST_STATES:
             continue

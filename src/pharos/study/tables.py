@@ -17,6 +17,7 @@ import numpy as np
 from pharos import experiments
 from pharos.errors import FileFormatError, ParameterError, UnknownName
 from pharos.experiments import ChanceSetting
+from pharos.observations import title
 from pharos.storage import is_intact, read_json, replace_json, sealed
 from pharos.study import worker as _worker
 from pharos.study.blocks import Run, Specification
@@ -178,7 +179,7 @@ def _described(run: Run) -> dict[str, Any]:
         "instance": run.instance,
         "chance": run.chance,
         "agent": config["agent"],
-        "observation": config["observation"],
+        "observation": title(config["observation"], config["observation_options"]),
         "seed": config["seed"],
         "steps": config["steps"],
     }

@@ -1,0 +1,23 @@
+"""What an agent is not to see: names that the option `hide` of an observation takes."""
+
+from collections.abc import Collection, Sequence
+
+from pharos.errors import ParameterError, UnknownName
+
+
+def hidden_names(hide: str | Sequence[str], what: str, known: Collection[str], also: Collection[str] = ()) -> set[str]:
+    """The names that `hide` has, a sequence or a text with commas.
+
+    Args:
+        what: of the message, such as "variable that the vector of breakout can hide".
+        known: what can be hidden, as a message lists it. also: further names.
+    Raises:
+        UnknownName: one of them cannot be hidden; the message says what can. ParameterError: they are no names.
+    """
+    names = [name.strip() for name in hide.split(",") if name.strip()] if isinstance(hide, str) else hide
+    if not isinstance(names, Sequence) or not all(isinstance(name, str) for name in names):
+        raise ParameterError(f"hide is {hide!r}; expected names, some of {', '.join(known)}")
+    for name in names:
+        if name not in known and name not in also:
+            raise UnknownName(what, name, known)
+    return set(names)
