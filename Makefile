@@ -2,7 +2,7 @@
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 
-.PHONY: quickstart test test-fast lint clean
+.PHONY: quickstart test test-fast test-long lint clean
 
 .venv/.ok: pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
@@ -13,10 +13,13 @@ quickstart: .venv/.ok
 	$(BIN)/python scripts/quickstart.py
 
 test: .venv/.ok
-	$(BIN)/python -m pytest -n auto --dist worksteal
+	$(BIN)/python -m pytest -n auto --dist worksteal -m "not long"
 
 test-fast: .venv/.ok
-	$(BIN)/python -m pytest -n auto --dist worksteal -m "not slow"
+	$(BIN)/python -m pytest -n auto --dist worksteal -m "not slow and not long"
+
+test-long: .venv/.ok
+	$(BIN)/python -m pytest -n auto --dist worksteal -m long
 
 lint: .venv/.ok
 	$(BIN)/ruff check .

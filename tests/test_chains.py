@@ -10,6 +10,8 @@ import pharos
 from pharos.environments import start_distribution
 from pharos.errors import ParameterError
 
+pytestmark = pytest.mark.long  # with each class compiled and walked through in full
+
 
 def assert_plays_like(env, twin, actions):
     """Environment and twin agree on every state, reward and end up to the end of the game."""

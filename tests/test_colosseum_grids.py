@@ -18,6 +18,8 @@ from pharos.drawing import text_drawing
 from pharos.errors import ParameterError
 from pharos.hardness.colosseum import colosseum_diameter
 
+pytestmark = pytest.mark.long  # with each class compiled and walked through in full
+
 # size, p_lazy, p_rand, n_starting_states -> printed, all with seed 0
 EPISODIC = {
     (6, 0.1, 0.05, 3): 16.600589752197266,

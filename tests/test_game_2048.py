@@ -12,6 +12,8 @@ from hypothesis import strategies as st
 import pharos
 from pharos.errors import ParameterError
 
+pytestmark = pytest.mark.long  # with each class compiled and walked through in full
+
 # The twin: boards are tuples of rows of face values (0: empty); chance is in fractions -----------------------------
 
 

@@ -19,6 +19,8 @@ from pharos import importers
 from pharos.drawing import planes_of
 from pharos.errors import ParameterError
 
+pytestmark = pytest.mark.long  # with each class compiled and walked through in full
+
 # Named instance -> what minigrid calls it
 IDS = {
     **{f"empty-{n}x{n}": f"Empty-{n}x{n}-v0" for n in (5, 6, 8, 16)},

@@ -13,6 +13,8 @@ from pharos.drawing import text_drawing
 from pharos.errors import ParameterError
 from solution_lengths import solution_lengths
 
+pytestmark = pytest.mark.long  # with each class compiled and walked through in full
+
 SOLVED = (*range(7), *[0] * 7)
 # Positions that need 0, 1, 2, ... turns: Jaap Scherphuis, "Mini Cube, the 2x2x2 Rubik's Cube", number of positions;
 # the same table is in Wikipedia's "Pocket Cube"

@@ -9,6 +9,8 @@ import pharos
 from pharos.drawing import text_drawing
 from pharos.errors import ParameterError
 
+pytestmark = pytest.mark.long  # with each class compiled and walked through in full
+
 # Levels with a solution by hand: the steps by their first letters
 SOLVED_BY_HAND = {"corridor": "rrr", "corner": "rdldr", "two-rooms": "rrrurd"}
 # Least steps, and states within reach
