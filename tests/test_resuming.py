@@ -101,6 +101,8 @@ def test_a_build_killed_again_and_again_ends_in_the_same_files(tmp_path, undistu
     rng = np.random.default_rng(0)
     for _ in range(8):  # 55 blocks that take 0.02 s each are more than 8 times 0.12 s
         process = in_a_child(_build_slowly, BREAKOUT, folder)
+        while process.is_alive() and not (folder / "manifest.json").exists():  # the first child's first checkpoint
+            time.sleep(0.001)
         process.join(timeout=rng.uniform(0.03, 0.12))
         os.kill(process.pid, signal.SIGKILL)
         process.join()
