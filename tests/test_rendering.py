@@ -9,6 +9,7 @@ from PIL import Image
 
 from pharos import Environment, Layer, make
 from pharos.drawing import (
+    SHAPES,
     colored_text,
     episode,
     human,
@@ -146,11 +147,33 @@ def test_episodes_draw_the_outcomes_of_chance_in_the_rules():
     assert again[0] == again[1]
 
 
+@pytest.mark.parametrize(("glyph", "text"), [("1", "2"), ("6", "64"), ("A", "1024"), ("H", "131072")])
+def test_tiles_of_2048_are_written_as_powers_of_two(glyph, text):
+    """With as many dark columns, gaps included, as three for each digit and one between digits."""
+    color = np.array((200.0, 200.0, 200.0))
+    dark = (SHAPES["power"](color, 8 * len(text), glyph)[..., 0] == 24).any(axis=0)
+    first, last = np.flatnonzero(dark)[[0, -1]]
+    scale = 8 * len(text) // max(8, 4 * len(text) + 1)
+    assert (4 * len(text) - 3) * scale <= last - first + 1 <= (4 * len(text) - 1) * scale
+    small = SHAPES["power"](color, 4, glyph)
+    np.testing.assert_array_equal(small, SHAPES["lettered"](color, 4, glyph))
+
+
 def test_a_number_of_the_unit_interval_stands_for_an_outcome():
     env = make("cliff_walking/4x12-slippery")
     drawn = [env.drawn_outcome((3, 0), 1, u) for u in (0.0, 0.3, 0.34, 0.6, 0.67, 1 - 2**-53)]
     assert drawn == [0, 0, 1, 1, 2, 2]
     assert make("cliff_walking/4x12").drawn_outcome((3, 0), 1, 0.9) == 0
+
+
+@pytest.mark.parametrize(("rows", "columns"), [(3, 3), (2, 3), (1, 3), (3, 2), (3, 1)])
+def test_planes_of_three_columns_are_no_colors(rows, columns):
+    env = make("game_2048", rows=rows, columns=columns, canonical=False)
+    state = (1, 2, *[0] * (rows * columns - 2))
+    plane = np.array(state).reshape(rows, columns) > 0
+    picture = render(env, state, "simple_image")
+    assert picture.shape == (rows, columns, 3)
+    assert ((picture > 0) == plane[..., None]).all() and (picture[..., 0] == picture[..., 2]).all()
 
 
 def test_observations_can_be_plugged_in(monkeypatch):

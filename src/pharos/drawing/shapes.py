@@ -184,14 +184,25 @@ def _car(color: np.ndarray, cell: int, glyph: str) -> np.ndarray:
 
 def _lettered(color: np.ndarray, cell: int, glyph: str) -> np.ndarray:
     """A block with its glyph, a digit or a capital, in the middle."""
-    tile = block(color, cell, glyph)
-    if glyph in FONT:
-        scale = max(1, cell // 8)
-        letter = np.array([[FONT[glyph] >> (14 - 3 * y - x) & 1 for x in range(3)] for y in range(5)], bool)
-        letter = letter.repeat(scale, axis=0).repeat(scale, axis=1)[:cell, :cell]
-        top, left = ((cell - size) // 2 for size in letter.shape)
-        part = tile[top : top + letter.shape[0], left : left + letter.shape[1]]
-        part[letter, :3] = 24.0 if color.mean() > 110 else 240.0
+    return _written(color, cell, glyph)
+
+
+def _power(color: np.ndarray, cell: int, glyph: str) -> np.ndarray:
+    """A block with a power of two, whose exponent in base 36 is the glyph; with the glyph where the cell is small."""
+    number = str(2 ** int(glyph, 36))
+    return _written(color, cell, number if 4 * len(number) < cell else glyph)
+
+
+def _written(color: np.ndarray, cell: int, text: str) -> np.ndarray:
+    tile = block(color, cell, text)
+    if all(letter in FONT for letter in text):
+        scale = max(1, cell // max(8, 4 * len(text) + 1))
+        bits = [[[FONT[letter] >> (14 - 3 * y - x) & 1 for x in range(3)] for y in range(5)] for letter in text]
+        letters = np.concatenate([np.pad(letter, ((0, 0), (0, 1))) for letter in bits], axis=1)[:, :-1].astype(bool)
+        letters = letters.repeat(scale, axis=0).repeat(scale, axis=1)[:cell, :cell]
+        top, left = ((cell - size) // 2 for size in letters.shape)
+        part = tile[top : top + letters.shape[0], left : left + letters.shape[1]]
+        part[letters, :3] = 24.0 if color.mean() > 110 else 240.0
     return tile
 
 
@@ -213,5 +224,6 @@ SHAPES: dict[str, Shape] = {
     "paddle": _bar,
     "car": _car,
     "lettered": _lettered,
+    "power": _power,
 }
 """Name of a shape, and of layers that look like it by default -> function (colour, pixels, glyph) -> tile."""

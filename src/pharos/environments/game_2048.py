@@ -61,14 +61,13 @@ class Game2048(Environment):
     name = "game_2048"
     actions = ("up", "right", "down", "left")
     version = 1
-    layers = {"tiles": Layer(tuple(GLYPHS), COLORS, shape="lettered")}
+    layers = {"tiles": Layer(tuple(GLYPHS), COLORS, shape="power")}
 
     look = Look(color="#E8A33D")
     instances = {
         **{f"{rows}x{columns}": {"rows": rows, "columns": columns} for rows, columns in ((2, 2), (2, 3), (3, 3))},
         "2x2-to-32": {"rows": 2, "columns": 2, "target": 32, "objective": "target"},
         **{f"3x3-to-{target}": {"target": target, "objective": "target"} for target in (64, 256, 512, 1024)},
-        "3x3-to-64-unturned": {"target": 64, "objective": "target", "canonical": False},
     }
     hyperparameters = {  # chosen by hand
         "q_learning": {"default": {"initial_q": 0.0}},

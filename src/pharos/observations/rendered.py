@@ -52,16 +52,19 @@ def _observer(env: Environment, name: str, options: tuple[tuple[str, Any], ...])
 
 
 def _side_by_side(values: np.ndarray, name: str) -> np.ndarray:
-    """An image (H, W, 3), (H, W, 1) or (H, W) as it is; planes (L, H, W) beside each other with a line between them."""
+    """An image (H, W, 3), (H, W, 1) or (H, W) as it is; planes (L, H, W) beside each other with a line between them.
+
+    There are never more planes than columns (see `SimpleImage`), so a board of three columns is not taken for colours.
+    """
     if values.dtype != np.uint8 or values.ndim not in (2, 3):
         raise ParameterError(
             f"observation {name!r} is no image: shape {values.shape}, type {values.dtype}; "
             f"expected one of {', '.join(renderers())}"
         )
-    if values.ndim == 2 or values.shape[2] == 3:
+    if values.ndim == 2:
         return values
-    if values.shape[2] == 1:
-        return values[..., 0]
+    if values.shape[2] in (1, 3) and values.shape[0] > values.shape[2]:
+        return values if values.shape[2] == 3 else values[..., 0]
     line = np.full((values.shape[1], 1), 64, np.uint8)
     parts = [part for plane in values for part in (line, plane)][1:]
     return np.concatenate(parts, axis=1)
