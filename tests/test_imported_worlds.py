@@ -147,6 +147,46 @@ def test_observations_raise_the_version_and_nothing_else_does(folders, tmp_path)
     assert importers.load(folders["matrices"]).rewards.tolist() == R.tolist()
 
 
+def test_count_says_states_transitions_and_depth_and_keeps_nothing(folders, monkeypatch, tmp_path):
+    monkeypatch.setenv("PHAROS_CACHE_DIR", str(tmp_path))
+    for folder in folders.values():
+        answer = json.loads(run("count", folder, "--json").stdout)
+        del answer["seconds"], answer["target"]
+        expected = {"states": 4, "reachable_states": 3, "terminal_states": 1, "actions": 2, "transitions": 8}
+        assert answer == {f"num_{name}": number for name, number in expected.items()} | {"depth": 1}
+    assert run("count", folders["matrices"]).stdout.startswith(f"{folders['matrices']}: 4 states (1 terminal, 1 never")
+    assert run("count", folders["matrices"], "--max-states", 3).exit_code == 1
+    file = tmp_path / "nameless.npz"
+    np.savez(file, transitions=np.array([[1, 0], [-1, 1]]), rewards=np.zeros((2, 2)))
+    assert "2 states (0 terminal), 2 actions, 4 transitions, depth 1" in run("count", file).stdout
+
+
+@pytest.mark.slow
+def test_count_of_an_environment_uses_the_cache_or_leaves_nothing_there(monkeypatch, tmp_path):
+    kept = json.loads(run("build", "simple_grid", "--json").stdout)
+    counted = json.loads(run("count", "simple_grid", "--json").stdout)
+    folder = json.loads(run("count", kept["folder"], "--json").stdout)
+    monkeypatch.setenv("PHAROS_CACHE_DIR", str(tmp_path))
+    anew = json.loads(run("count", "simple_grid", "--json").stdout)
+    assert counted["num_states"] == anew["num_states"] == folder["num_states"] == kept["num_states"] == 16
+    assert counted["num_transitions"] == anew["num_transitions"] == 15 * 4
+    assert not [path for path in tmp_path.iterdir() if path.name != "compiled"]
+    assert run("count", "simple_grid", "--max-states", 3).exit_code == 1
+
+
+@pytest.mark.slow
+def test_what_was_learnt_on_a_folder_is_evaluated_on_it(folders, tmp_path):
+    words = ("train", folders["matrices"], "--steps", 200, "--interval", 200, "--out", tmp_path / "run", "--json")
+    learnt = json.loads(run(*words).stdout)
+    assert learnt["config"]["environment"] == "imported"
+    answer = json.loads(run("evaluate", folders["matrices"], "--policy", tmp_path / "run", "--json").stdout)
+    mdp = in_every_form()["matrices"]
+    assert answer["optimal_value_at_start"] == pytest.approx(pharos.value_iteration(mdp).value_at_start, abs=2e-6)
+    assert (answer["gamma"], answer["horizon"]) == (0.9, None)
+    words = ("evaluate", folders["matrices"], "--policy", tmp_path / "run", "--gamma", 1, "--horizon", 20, "--json")
+    assert json.loads(run(*words).stdout)["regret"] == pytest.approx(learnt["final_regret"], abs=4e-6)
+
+
 # From Gymnasium ------------------------------------------------------------------------------------------------------
 
 

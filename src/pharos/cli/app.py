@@ -11,6 +11,7 @@ from typer.core import TyperGroup
 from pharos.cli import (
     build,
     cache,
+    count,
     evaluate,
     export,
     hardness,
@@ -113,6 +114,7 @@ def _options(
 
 app.command("list")(list_.list_)
 app.command("build")(build.build)
+app.command("count")(count.count)
 app.command("solve")(solve.solve)
 app.command("hardness")(hardness.hardness)
 app.command("evaluate")(evaluate.evaluate)

@@ -14,6 +14,7 @@ from pharos.cli.common import (
     Parameters,
     Random,
     Sticky,
+    Target,
     TargetArgument,
     Tolerance,
     Trust,
@@ -62,6 +63,10 @@ def evaluate(
     building = build_options(memory, workers, max_states)
     goal = parse_target(target, parameters)
     given = None if policy in POLICIES else read_policy(policy, trust=trust)
+    if goal.is_imported and Path(policy).expanduser().is_dir():  # what was learnt on the environment of the table
+        table = goal.mdp()
+        gamma, horizon = table.gamma if gamma is None else gamma, table.horizon if horizon is None else horizon
+        goal = Target(target, environment=goal.found_environment())
     mdp = goal.mdp(gamma=gamma, horizon=horizon, sticky=sticky, random=random, **building)
     with progress_line("evaluating"):
         values = _values(mdp, policy, given, tolerance)

@@ -1,0 +1,123 @@
+"""pharos count: how many states there are, in one line."""
+
+import shutil
+import tempfile
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pharos.cli.common import (
+    Json,
+    MaxStates,
+    Memory,
+    Parameters,
+    Target,
+    TargetArgument,
+    Workers,
+    parse_size,
+    parse_target,
+    print_json,
+)
+from pharos.errors import ParameterError, StateSpaceTooLarge
+from pharos.wording import many
+
+if TYPE_CHECKING:
+    from pharos.mdp import TabularMDP
+    from pharos.state_space import StateSpace
+
+
+def count(
+    target: TargetArgument,
+    parameters: Parameters = None,
+    memory: Memory = None,
+    workers: Workers = None,
+    max_states: MaxStates = None,
+    json: Json = False,
+) -> None:
+    """Count the states that can be reached, their transitions and the depth, and keep nothing."""
+    began = time.perf_counter()
+    goal = parse_target(target, parameters)
+    if goal.is_imported:
+        counted = counts_of_table(_table_of(goal))
+        if max_states is not None and counted["num_states"] > max_states:
+            raise StateSpaceTooLarge(f"{target}: has {counted['num_states']:,} states; expected at most {max_states:,}")
+    else:
+        counted = _counts_of_space(goal, memory=parse_size(memory), workers=workers, max_states=max_states)
+    answer = {"target": target, **counted, "seconds": time.perf_counter() - began}
+    if json:
+        print_json(answer)
+        return
+    apart = answer["num_states"] - answer["num_reachable_states"]
+    extra = f", {apart:,} never reached" if apart else ""
+    print(
+        f"{' '.join((target, *(parameters or ())))}: {many(answer['num_states'], 'state')} "
+        f"({answer['num_terminal_states']:,} terminal{extra}), {many(answer['num_actions'], 'action')}, "
+        f"{many(answer['num_transitions'], 'transition')}, depth {answer['depth']:,}, {answer['seconds']:.2f} s"
+    )
+
+
+def _table_of(goal: Target) -> "TabularMDP":
+    """The imported table; the horizon, which a file of BRIDGE may not tell, does not matter here."""
+    try:
+        return goal.mdp()
+    except ParameterError:
+        return goal.mdp(horizon=1)
+
+
+def _counts_of_space(goal: Target, **options: Any) -> dict[str, int]:
+    """Counts of a folder, or of the cache where the space is there; else it is built beside the cache and removed."""
+    from pharos import paths
+    from pharos.state_space import cached_folder, load, read_manifest
+
+    if goal.environment is None:
+        assert goal.path is not None
+        return counts_of(load(goal.path, verify=False))
+    manifest = read_manifest(cached_folder(goal.environment))
+    if manifest is not None and manifest["complete"]:
+        return counts_of(goal.space(**options))
+    place = paths.cache_directory()
+    place.mkdir(parents=True, exist_ok=True)
+    temporary = Path(tempfile.mkdtemp(prefix="count-", dir=place))
+    try:
+        return counts_of(goal.space(out=temporary, **options))
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def counts_of(space: "StateSpace") -> dict[str, int]:
+    """Of a built state space: all of its states can be reached."""
+    rows = space.manifest["num_transitions"] if space.has_chance else space.num_states * space.num_actions
+    return {
+        "num_states": space.num_states,
+        "num_reachable_states": space.num_states,
+        "num_terminal_states": space.num_terminal_states,
+        "num_actions": space.num_actions,
+        "num_transitions": rows - space.num_terminal_states * space.num_actions,
+        "depth": space.depth,
+    }
+
+
+def counts_of_table(mdp: "TabularMDP") -> dict[str, int]:
+    """Of a table: transitions are possible outcomes in states that are not terminal, the end of an episode included."""
+    import numpy as np
+
+    terminal = np.asarray(mdp.terminal)
+    reached, transitions, depth = np.zeros(mdp.num_states + 1, np.bool_), 0, -1
+    reached[-1] = True
+    frontier = mdp.starts
+    while frontier.size:
+        depth += 1
+        reached[frontier] = True
+        live = frontier[~terminal[frontier]]
+        actions = np.tile(np.arange(mdp.num_actions), len(live))
+        outcomes = mdp.dynamics.outcomes(np.repeat(live, mdp.num_actions), actions)
+        transitions += int((outcomes.probabilities > 0).sum())
+        frontier = np.unique(outcomes.states[(outcomes.probabilities > 0) & ~reached[outcomes.states]])
+    return {
+        "num_states": mdp.num_states,
+        "num_reachable_states": int(reached[:-1].sum()),
+        "num_terminal_states": int(terminal.sum()),
+        "num_actions": mdp.num_actions,
+        "num_transitions": transitions,
+        "depth": depth,
+    }
