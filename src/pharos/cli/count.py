@@ -43,7 +43,7 @@ def count(
             raise StateSpaceTooLarge(f"{target}: has {counted['num_states']:,} states; expected at most {max_states:,}")
     else:
         counted = _counts_of_space(goal, memory=parse_size(memory), workers=workers, max_states=max_states)
-    answer = {"target": target, **counted, "seconds": time.perf_counter() - began}
+    answer: dict[str, Any] = {"target": target, **counted, "seconds": time.perf_counter() - began}
     if json:
         print_json(answer)
         return
