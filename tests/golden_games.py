@@ -86,7 +86,7 @@ GAMES = {
     "blackjack_busts": ("blackjack/natural", {}, "h9h9h9"),
     "corner_grid_stays_in_two_corners": ("corner_grid/8x8-random", {"size": 3}, "u0r0s0u5l0l2s0s1"),
     "deep_sea_loses_the_treasure": ("deep_sea", {"size": 4, "stochastic": True, "mapping_seed": 42}, "f0f1s0f0"),
-    "deep_sea_dives_twice": ("deep_sea", {"size": 3, "restarts": True, "left_reward": 1 / 9}, "s0s0s0f0s0f0"),
+    "endless_sea_dives_twice": ("endless_sea", {"size": 3}, "s0s0s0f0s0f0"),
     "river_swim_against_the_current": ("river_swim", {"length": 4}, "r2r1r2r0r2r1l0l0l1r1"),
     "catch_missed": ("catch", {"rows": 5, "columns": 4}, "lllr"),
     "memory_chain_of_three_bits": ("memory_chain", {"memory_length": 2, "num_bits": 3}, ["one", "one", "zero"]),

@@ -34,8 +34,7 @@ def test_deep_sea_has_the_published_diameter():
     assert colosseum_diameter(deep_sea(5), horizon=5) == pytest.approx(5.0)
 
 
-# size, p_lazy, p_rand -> printed for the episodic RiverSwim, with seed 0. Beyond some 200 steps the roundings of its
-# single precision add up to more than its last digits: for p_lazy = 0.4286 it prints 1539.907, and exact is 1540.061.
+# size, p_lazy, p_rand -> printed for the episodic RiverSwim, with seed 0; all of them: tests/test_colosseum_chains.py.
 RIVERS = {
     (10, 0.1715, 0.0): 54.36714172363281,
     (10, 0.0, 0.0001): 10.004501342773438,

@@ -5,14 +5,12 @@ less than a step to those before it), so what it prints lies below the exact num
 what it prints; pharos gives the exact number, to which the twins converge.
 """
 
-from collections import deque
-
 import numpy as np
 import pytest
 from scipy import sparse
 
 import pharos
-from naive_colosseum import STOPS, episodic_diameter, within_ulps
+from naive_colosseum import STOPS, diameter, episodic_diameter, farthest, law, within_ulps
 from pharos import TabularMDP, hardness
 from pharos.drawing import text_drawing
 from pharos.errors import ParameterError
@@ -51,48 +49,8 @@ def made(row):
     return pharos.make("mini_grid_empty", size=size, p_lazy=p_lazy, p_rand=p_rand, n_starting_states=n)
 
 
-def law(env):
-    """(states, P (S A, S) sparse, start distribution (S,)), by the interpreted rules."""
-    starts = dict(env.initial_states())
-    numbers = {state: i for i, state in enumerate(starts)}
-    rows, columns, probabilities = [], [], []
-    for state in (queue := list(starts)):
-        for action in range(env.num_actions):
-            for outcome in range(env.outcomes):
-                following = env.next_state(state, action, outcome)
-                if following not in numbers:
-                    numbers[following] = len(numbers)
-                    queue.append(following)
-                rows.append(numbers[state] * env.num_actions + action)
-                columns.append(numbers[following])
-                probabilities.append(env.probability(state, action, outcome))
-    size = len(numbers)
-    P = sparse.csr_matrix((probabilities, (rows, columns)), shape=(size * env.num_actions, size))
-    rho = np.zeros(size)
-    rho[: len(starts)] = list(starts.values())
-    return queue, P, rho
-
-
 def mdp_of(P, rho, **kwargs):
     return TabularMDP.from_matrices(P, np.zeros((P.shape[1], P.shape[0] // P.shape[1])), initial=rho, **kwargs)
-
-
-def farthest(P, rho):
-    """The twelve states that are farthest from the start states, by the mean number of edges."""
-    size = P.shape[1]
-    actions = P.shape[0] // size
-    successors = [P.indices[P.indptr[s * actions] : P.indptr[(s + 1) * actions]] for s in range(size)]
-    mean = np.zeros(size)
-    for start in np.flatnonzero(rho):
-        distance, queue = {int(start): 0}, deque([int(start)])
-        while queue:
-            state = queue.popleft()
-            for following in successors[state]:
-                if int(following) not in distance:
-                    distance[int(following)] = distance[state] + 1
-                    queue.append(int(following))
-        mean += rho[start] * np.array([distance[s] for s in range(size)])
-    return np.argsort(-mean, kind="stable")[:12]
 
 
 @pytest.mark.parametrize("row", some(EPISODIC, 6))
@@ -113,16 +71,8 @@ def test_the_diameter_without_episodes_is_that_of_colosseum(row):
     states, P, rho = law(made(row))
     targets = np.array([i for i, (_, column, way) in enumerate(states) if way == 0 and column < (row[0] + 1) // 2])
     found = hardness.diameter(mdp_of(P, rho, gamma=1.0))
-    single, times = P.astype(np.float32), np.zeros((P.shape[1], len(targets)), np.float32)
-    at = np.arange(len(targets))
-    stopped = np.full(len(targets), np.nan, np.float32)
-    while np.isnan(stopped).any():
-        before, times = times, 1 + (single @ times).reshape(P.shape[1], -1, len(targets)).min(axis=1)
-        times[targets, at] = 0
-        ends = (abs(times - before).max(axis=0) < STOPS[0]) & np.isnan(stopped)
-        stopped[ends] = times.max(axis=0)[ends]
     printed = CONTINUOUS[row]
-    assert within_ulps(stopped.max(), printed)
+    assert within_ulps(diameter(P, targets), printed)
     assert found.exact and found.lower * (1 + 1e-7) >= printed
 
 

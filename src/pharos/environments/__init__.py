@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from pharos.environments.corner_grid import CornerGrid
     from pharos.environments.deep_sea import DeepSea
     from pharos.environments.discounting_chain import DiscountingChain
+    from pharos.environments.endless_sea import EndlessSea
     from pharos.environments.freeway import Freeway
     from pharos.environments.frozen_lake import FrozenLake
     from pharos.environments.game_2048 import Game2048
@@ -106,6 +107,7 @@ __all__ = [
     "CornerGrid",
     "DeepSea",
     "DiscountingChain",
+    "EndlessSea",
     "Environment",
     "Freeway",
     "FrozenLake",

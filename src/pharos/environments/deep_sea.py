@@ -21,17 +21,17 @@ class DeepSea(Environment):
     Actions  first, second: one of them goes right and the other one left, which one is drawn for each cell by
              `mapping_seed`.
     Chance   stochastic: going right stays in its column with probability 1 / size. With `p_rand` an action that is
-             drawn evenly is executed.
+             drawn evenly is executed, while the choice pays.
     Reward   1 for choosing right in the last column, -move_cost / size for choosing right anywhere, left_reward for
              choosing left.
-    Ends     after the last row; with `restarts` the next dive begins instead.
+    Ends     after the last row.
     Limit    `size` steps: a dive.
     Ours     bsuite's stochastic sea adds noise with mean 0 to the rewards in both corners of the last row; rewards here
              are the means. Its optimal return, (1 - 1/size)^(size - 1) - move_cost, is that of going right every time,
              also when the treasure is lost; the optimum saves the cost from then on and has move_cost (1 - 1/size)^size
              more.
     Source   bsuite deep_sea; Osband, Van Roy, Russo and Wen (2019), "Deep Exploration via Randomized Value Functions".
-             Colosseum's DeepSea is `restarts=True, move_cost=0` with left_reward 1 / size^2.
+             Colosseum's DeepSea is `endless_sea`.
 
     Attributes:
         size: rows and columns; at least 2.
@@ -39,7 +39,6 @@ class DeepSea(Environment):
         mapping_seed: of the actions, as bsuite draws them; None: the second action goes right everywhere.
         move_cost: of going right every time.
         left_reward: for each choice of left.
-        restarts: whether a dive follows another one.
         p_rand: from 0 to 0.9999.
     """
 
@@ -48,19 +47,18 @@ class DeepSea(Environment):
     mapping_seed: Any = parameter(None, kind=int, low=0, high=2**32 - 1)
     move_cost: float = parameter(0.01, low=0.0)
     left_reward: float = parameter(0.0)
-    restarts: bool = parameter(False)
     p_rand: float = parameter(0.0, low=0.0, high=0.9999)
 
     name = "deep_sea"
     actions = ("first", "second")
     version = 1
+    restarts = False  # whether a dive follows another one
     layers = {"treasure": Layer("T", (226, 190, 62), shape="goal"), "diver": Layer("D", (66, 72, 200), shape="agent")}
     look = Look(color="#332288")
     instances = {
         "10x10": {"mapping_seed": 42},
         "50x50": {"size": 50, "mapping_seed": 42},
         "10x10-stochastic": {"stochastic": True, "mapping_seed": 42},
-        "20x20-restarts": {"size": 20, "restarts": True, "move_cost": 0.0, "left_reward": 1 / 400, "p_rand": 0.1},
     }
     foreign_parameters = {"deterministic": "write stochastic=true", "unscaled_move_cost": "write move_cost"}
     hyperparameters = {  # chosen by hand: hopeful values make Q-learning dive everywhere
@@ -76,10 +74,6 @@ class DeepSea(Environment):
     @property
     def max_episode_steps(self) -> int:  # type: ignore[override]
         return self.size
-
-    @property
-    def has_age(self) -> bool:
-        return not self.restarts
 
     @cached_property
     def right(self) -> np.ndarray:
