@@ -8,6 +8,7 @@ import pytest
 from PIL import Image
 
 from pharos import Environment, Layer, make
+from pharos.cli.play import Game
 from pharos.drawing import (
     SHAPES,
     colored_text,
@@ -174,6 +175,30 @@ def test_planes_of_three_columns_are_no_colors(rows, columns):
     picture = render(env, state, "simple_image")
     assert picture.shape == (rows, columns, 3)
     assert ((picture > 0) == plane[..., None]).all() and (picture[..., 0] == picture[..., 2]).all()
+
+
+def test_an_episode_and_a_game_draw_outcomes_that_are_possible_by_their_seed():
+    env = make("taxi", size=3, rainy=True)
+    start = (1, 1, 0, 1, 0)
+
+    def driven(seed):
+        return [state for state, _, _ in episode(env, lambda _: 0, start, steps=40, seed=seed)]
+
+    assert driven(1) == driven(1) != driven(2)
+    moved = {following[:2] for seed in range(60) for following in [driven(seed)[1]]}
+    assert moved == {(2, 1), (1, 0), (1, 2)}  # down, or to either side
+    games = [Game(env, start, seed) for seed in (1, 1, 2)]
+    for game in games:
+        for _ in range(30):
+            game.press("down")
+            game.press("up")
+    states = [[state for state, _, _ in game.history] for game in games]
+    assert states[0] == states[1] != states[2]
+    for game in games:  # every step is one that the rules know
+        for (state, action, reward), (following, _, _) in zip(game.history, game.history[1:], strict=False):
+            possible = [k for k in range(env.outcomes) if env.probability(state, action, k) > 0]
+            assert following in [env.next_state(state, action, k) for k in possible]
+            assert reward == env.reward(state, action, following)
 
 
 def test_observations_can_be_plugged_in(monkeypatch):

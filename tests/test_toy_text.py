@@ -49,6 +49,43 @@ def test_cliff_walking_has_gymnasiums_table(slippery):
     assert_table_is_gymnasiums(env, table, lambda number: divmod(int(number), 12), range(37))  # 37 .. 46 are the cliff
 
 
+def test_the_exported_table_of_slippery_cliff_walking_is_gymnasiums():
+    theirs = gymnasium.make("CliffWalking-v1", is_slippery=True).unwrapped.P
+    space = pharos.build("cliff_walking/4x12-slippery", progress=False)
+    mine = pharos.exporters.gym_p(space.mdp(gamma=1.0))
+    assert_table_is_gymnasiums(
+        space.environment,
+        {int(np.ravel_multi_index(space.state(s), (4, 12))): rows for s, rows in numbered(mine, space).items()},
+        lambda number: divmod(int(number), 12),
+        range(37),
+    )
+    for s in np.flatnonzero(~space.terminal):
+        number = np.ravel_multi_index(space.state(s), (4, 12))
+        for action in range(4):
+            assert summed(numbered(mine, space)[s][action]) == pytest.approx(summed(theirs[number][action]), abs=1e-12)
+
+
+def test_rewards_that_are_not_the_environments_are_exported_as_they_are():
+    space = pharos.build("cliff_walking/4x12-slippery", progress=False)
+    table = pharos.exporters.gym_p(space.mdp(rewards=np.full((38, 4), 0.5)))
+    assert {reward for rows in table.values() for row in rows.values() for _, _, reward, _ in row} == {0.5, 0.0}
+
+
+def numbered(table, space):
+    """A table of ours with Gymnasium's numbers of next states."""
+    number = [int(np.ravel_multi_index(space.state(s), (4, 12))) for s in range(space.num_states)]
+    return {s: {a: [(p, number[t], r, end) for p, t, r, end in row] for a, row in table[s].items()} for s in table}
+
+
+def summed(row):
+    """(next state, terminated, 0 or 1) -> probability, or reward times it."""
+    sums = Counter()
+    for probability, following, reward, terminated in row:
+        sums[int(following), bool(terminated), 0] += probability
+        sums[int(following), bool(terminated), 1] += probability * reward
+    return dict(sums)
+
+
 def test_cliff_walking_takes_thirteen_steps_along_the_edge():
     """Sutton and Barto (2018), example 6.6: the optimal path is worth -13 without discount."""
     space = pharos.build("cliff_walking", progress=False)

@@ -31,6 +31,9 @@ def play(
     state: Annotated[
         str | None, typer.Option("--state", help="Number of a state, or its values 2,3,1; the start when not given.")
     ] = None,
+    seed: Annotated[
+        int | None, typer.Option("--seed", min=0, help="Of chance in the rules; another game each time without it.")
+    ] = None,
     json: Json = False,
 ) -> None:
     """Play with the keyboard, in the terminal; one key is one step."""
@@ -39,7 +42,7 @@ def play(
     target = parse_target(environment, parameters)
     env = environment_of(target)
     start = find_state(target, env, state)
-    game = Game(env, start)
+    game = Game(env, start, seed)
     with _screen() as show, _keys() as next_key:
         while True:
             show(_picture(game))
@@ -65,8 +68,8 @@ def play(
 class Game:
     """A game being played: what has happened, and which key does what."""
 
-    def __init__(self, env: "Environment", start: "State"):
-        self.env = env
+    def __init__(self, env: "Environment", start: "State", seed: int | None = None):
+        self.env, self.rng = env, random.Random(seed)
         self.keys = keys_of(env.actions)
         self.history: list[tuple[State, int, float]] = []
         self.start = self.state = start
@@ -94,7 +97,7 @@ class Game:
             self.state = self.history.pop()[0]
         elif key in self.keys and not self.over:
             action = self.keys[key]
-            outcome = self.env.drawn_outcome(self.state, action, random.random()) if self.env.has_chance else 0
+            outcome = self.env.drawn_outcome(self.state, action, self.rng.random()) if self.env.has_chance else 0
             following = self.env.next_state(self.state, action, outcome)
             self.history.append((self.state, action, float(self.env.reward(self.state, action, following))))
             self.state = following

@@ -1,9 +1,12 @@
 """Gymnasium's `P` table."""
 
+from collections.abc import Callable
+
 import numpy as np
 
 from pharos.errors import ParameterError
 from pharos.mdp import TabularMDP, takes_mdp
+from pharos.state_space import load
 
 Outcome = tuple[float, int, float, bool]
 
@@ -12,8 +15,9 @@ Outcome = tuple[float, int, float, bool]
 def gym_p(mdp: TabularMDP) -> dict[int, dict[int, list[Outcome]]]:
     """Return P[s][a] = [(probability, next state, reward, terminated), ...], as Gymnasium's toy texts have it.
 
-    The implicit end becomes one more state S, where there is one. Random actions are written out as outcomes; rewards
-    of a choice with several outcomes are those of what is executed.
+    The implicit end becomes one more state S, where there is one. Random actions are written out as outcomes. Each
+    outcome has its own reward where the MDP is of an environment and has its rewards; else the expected one of what is
+    executed.
 
     Raises:
         ParameterError: under sticky actions the state is a pair, which this table has no room for.
@@ -25,6 +29,7 @@ def gym_p(mdp: TabularMDP) -> dict[int, dict[int, list[Outcome]]]:
         )
     end, num_actions, rewards, terminal = mdp.num_states, mdp.num_actions, mdp.rewards, np.asarray(mdp.terminal)
     chosen, _, uniform = mdp.chance.triple
+    own = _rewards_of_environment(mdp)
     table: dict[int, dict[int, list[Outcome]]] = {}
     for s in range(mdp.num_states):
         if terminal[s]:
@@ -33,7 +38,10 @@ def gym_p(mdp: TabularMDP) -> dict[int, dict[int, list[Outcome]]]:
         outcomes = mdp.dynamics.outcomes(np.full(num_actions, s), np.arange(num_actions))
         executed: list[list[Outcome]] = [[] for _ in range(num_actions)]
         for x, t, p in zip(*(each.tolist() for each in outcomes), strict=True):
-            executed[x].append((p, t, float(rewards[s, x]), t == end or bool(terminal[t])))
+            executed[x].append((p, t, own(s, x, t), t == end or bool(terminal[t])))
+        for a, row in enumerate(executed):
+            if abs(sum(p * r for p, _, r, _ in row) - rewards[s, a]) > 1e-9 * max(1.0, *(abs(r) for _, _, r, _ in row)):
+                executed[a] = [(p, t, float(rewards[s, a]), ended) for p, t, _, ended in row]
         mixed = [(uniform / num_actions * p, t, r, e) for each in executed for p, t, r, e in each] if uniform else []
         table[s] = {
             a: ([(chosen * p, t, r, e) for p, t, r, e in executed[a]] if chosen else []) + mixed
@@ -42,3 +50,14 @@ def gym_p(mdp: TabularMDP) -> dict[int, dict[int, list[Outcome]]]:
     if mdp.has_ends:
         table[end] = {a: [(1.0, end, 0.0, True)] for a in range(num_actions)}
     return table
+
+
+def _rewards_of_environment(mdp: TabularMDP) -> Callable[[int, int, int], float]:
+    """A function (state, action, next state) -> reward: by the rules where the MDP has chance and is of an environment,
+    else what the MDP says.
+    """
+    space = None if mdp.folder is None or mdp.dynamics.is_deterministic else load(mdp.folder, verify=False)
+    if space is None or space.environment is None:
+        return lambda s, a, t: float(mdp.rewards[s, a])
+    reward, states = space.environment.reward, [tuple(state) for state in space.states().tolist()]
+    return lambda s, a, t: float(reward(states[s], a, states[t]))
