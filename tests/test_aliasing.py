@@ -1,5 +1,6 @@
-"""Observations that several states share: how many there are."""
+"""Observations that several states share: how many there are, and what they cost an agent without memory."""
 
+import itertools
 import json
 
 import numpy as np
@@ -9,7 +10,7 @@ from typer.testing import CliRunner
 
 import pharos
 from pharos.cli import app
-from pharos.observations import aliasing, observation_classes, observe
+from pharos.observations import aliasing, memoryless_loss, observation_classes, observe
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +35,7 @@ def test_states_that_share_an_image_are_counted(breakout):
 
 
 def answer(folder, *words):
-    result = CliRunner().invoke(app, ["observations", str(folder), *words, "--json"])
+    result = CliRunner().invoke(app, ["observations", str(folder), *map(str, words), "--json"])
     assert (result.exit_code, result.stderr) == (0, ""), result.output
     return json.loads(result.stdout)
 
@@ -47,8 +48,16 @@ def test_the_command_line_counts_them_for_each_observation(breakout):
     for name in ("simple_image", "complex_image"):
         assert (entries[name]["num_observations"], entries[name]["num_sharing"]) == (1068, 1037)
     assert (entries["vector"]["shape"], entries["vector"]["dtype"]) == ([9], "float32")
-    (one,) = answer(breakout.folder, "--observation", "simple_image", "--option", "scale=2")["observations"]
+    for entry in told["observations"]:  # what images share does not matter in this game, and none is shared with motion
+        assert entry["loss"]["exact"]
+        assert 0 <= entry["loss"]["lower"] <= entry["loss"]["upper"] <= 1e-6
+        assert entry["num_sharing"] == (0 if entry["options"] else entries[entry["observation"]]["num_sharing"])
+    assert sum(entry["options"] == {"motion": True} for entry in told["observations"]) == 2
+    (one,) = answer(breakout.folder, "--budget", 0, "--observation", "simple_image", "--option", "scale=2")[
+        "observations"
+    ]
     assert (one["options"], one["shape"], one["num_sharing"]) == ({"scale": 2}, [3, 14, 8], 1037)
+    assert one["loss"] is None
 
 
 def test_an_observation_of_ones_own_is_counted_too(breakout):
@@ -60,3 +69,36 @@ def test_an_observation_of_ones_own_is_counted_too(breakout):
     result = CliRunner().invoke(app, ["observations", str(breakout.folder), "--option", "scale=2"])
     assert result.exit_code == 2
     assert "--option goes with --observation" in result.stderr
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_the_loss_is_that_of_the_best_of_all_policies(seed):
+    rng = np.random.default_rng(seed)
+    P, R = rng.dirichlet(np.full(6, 0.4), (6, 2)), rng.normal(size=(6, 2))
+    classes = np.array([0, 0, 0, 1, 1, 2])[rng.permutation(6)]
+    if seed % 2:
+        table = rng.integers(6, size=(6, 2))
+        mdp = pharos.TabularMDP.from_arrays(table, R, gamma=0.9)
+    else:
+        mdp = pharos.TabularMDP.from_matrices(P, R, gamma=0.9)
+    every = (
+        pharos.evaluate_policy(mdp, np.array(policy)[classes], 1e-9) for policy in itertools.product((0, 1), repeat=3)
+    )
+    expected = pharos.value_iteration(mdp, 1e-9).value_at_start - max(each.value_at_start for each in every)
+    loss = memoryless_loss(mdp, classes)
+    assert loss.exact
+    assert loss.lower - 2e-9 <= expected <= loss.upper + 2e-9
+    hurried = memoryless_loss(mdp, classes, budget=0)
+    assert hurried.lower - 2e-9 <= expected <= hurried.upper + 2e-9
+
+
+def test_two_rooms_that_look_alike_cost_half_of_the_prizes():
+    """From the start to one of two rooms; each pays for another action, so one of them must be missed."""
+    successors, probabilities = np.full((3, 2, 2), -1), np.zeros((3, 2, 2))
+    successors[0], probabilities[0] = (1, 2), 0.5
+    probabilities[1:, :, 0] = 1.0
+    mdp = pharos.TabularMDP.from_outcomes(successors, probabilities, [[0, 0], [4, 0], [0, 2]], gamma=0.5)
+    loss = memoryless_loss(mdp, np.array([0, 1, 1]))
+    assert loss.exact
+    assert loss.lower <= 0.5 * 0.5 * 2 <= loss.upper
+    assert memoryless_loss(mdp, np.arange(3)).upper <= 1e-6

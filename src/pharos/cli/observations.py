@@ -1,10 +1,12 @@
-"""pharos observations: what an agent sees, and which states it cannot tell apart."""
+"""pharos observations: what an agent sees, which states it cannot tell apart, and what that costs."""
 
+from functools import cached_property
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from pharos.cli.common import (
+    Gamma,
     Json,
     MaxStates,
     Memory,
@@ -13,16 +15,23 @@ from pharos.cli.common import (
     Workers,
     build_options,
     console,
+    discount,
     parse_parameters,
     parse_target,
     print_json,
     progress_bar,
+    progress_line,
 )
 from pharos.errors import ParameterError
 from pharos.wording import many
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from pharos.state_space import StateSpace
+
+# States of the largest space that is solved to say what an observation costs
+MOST_SOLVED = 5_000_000
 
 # What is counted when nothing is asked for
 COUNTED: tuple[tuple[str, dict[str, Any]], ...] = (
@@ -31,6 +40,8 @@ COUNTED: tuple[tuple[str, dict[str, Any]], ...] = (
     ("index", {}),
     ("simple_image", {}),
     ("complex_image", {}),
+    ("simple_image", {"motion": True}),
+    ("complex_image", {"motion": True}),
 )
 
 
@@ -45,12 +56,16 @@ def observations(
         list[str] | None,
         typer.Option("--option", metavar="NAME=VALUE", help="Option of the observations that were named."),
     ] = None,
+    gamma: Gamma = None,
+    budget: Annotated[
+        float, typer.Option("--budget", min=0, help="Seconds to bound what one observation costs; 0: do not.")
+    ] = 10.0,
     memory: Memory = None,
     workers: Workers = None,
     max_states: MaxStates = None,
     json: Json = False,
 ) -> None:
-    """Count the states that share their observation with another state."""
+    """Count the states that share their observation with another state, and bound what that costs."""
     options = parse_parameters(option)
     if options and not observation:
         raise ParameterError("--option goes with --observation NAME")
@@ -58,21 +73,62 @@ def observations(
     space = parse_target(target, parameters).space(**build_options(memory, workers, max_states))
     if space.environment is None:
         raise ParameterError(f"{target}: pharos does not know the class of this environment; name it as module:Class")
-    entries = [_entry(space, name, options, strict=bool(observation)) for name, options in asked]
+    if not observation and not space.environment.has_motion:
+        asked = tuple((name, options) for name, options in asked if "motion" not in options)
+    price = _Price(space, discount(gamma, None), budget)
+    entries = [_entry(space, name, options, price, strict=bool(observation)) for name, options in asked]
     if json:
         answer = {"environment": space.environment.name, "parameters": space.environment.parameters}
-        print_json({**answer, "num_states": space.num_states, "observations": entries})
+        terminal = int(space.terminal.sum())
+        print_json(
+            {
+                **answer,
+                "num_states": space.num_states,
+                "num_terminal_states": terminal,
+                "gamma": price.gamma,
+                "observations": entries,
+            }
+        )
         return
-    _print(" ".join((target, *(parameters or ()))), space, entries)
+    _print(" ".join((target, *(parameters or ()))), space, entries, price.gamma)
 
 
-def _entry(space: "StateSpace", name: str, options: dict[str, Any], *, strict: bool) -> dict[str, Any]:
+class _Price:
+    """What observations cost an agent without memory; the space is solved once, when it is first asked."""
+
+    def __init__(self, space: "StateSpace", gamma: float, budget: float):
+        self.space, self.gamma, self.budget = space, gamma, budget
+
+    def of(self, classes: "np.ndarray", num_confused: int) -> dict[str, Any] | None:
+        """Bounds of the loss; None where they were not wanted, or the space is too large."""
+        if num_confused == 0:
+            return {"lower": 0.0, "upper": 0.0, "exact": True}
+        if self.budget <= 0 or self.gamma >= 1 or self.space.num_states > MOST_SOLVED:
+            return None
+        from pharos.observations import memoryless_loss
+
+        with progress_line("bounding what it costs"):
+            mdp, optimal = self._solved
+            loss = memoryless_loss(mdp, classes, optimal=optimal, budget=self.budget)
+        return {"lower": loss.lower, "upper": loss.upper, "exact": loss.exact}
+
+    @cached_property
+    def _solved(self) -> tuple[Any, Any]:
+        from pharos.solvers import value_iteration
+
+        mdp = self.space.mdp(gamma=self.gamma)
+        return mdp, value_iteration(mdp, 1e-7)
+
+
+def _entry(space: "StateSpace", name: str, options: dict[str, Any], price: _Price, *, strict: bool) -> dict[str, Any]:
     """What is said of one observation.
 
     Args:
         strict: whether an observation that the environment does not have is an error; else it is said in the entry.
     """
-    from pharos.observations import aliasing, observe
+    import numpy as np
+
+    from pharos.observations import counted, observation_classes, observe
 
     entry: dict[str, Any] = {"observation": name, "options": options}
     env: Any = space.environment
@@ -83,7 +139,8 @@ def _entry(space: "StateSpace", name: str, options: dict[str, Any], *, strict: b
             raise
         return entry | {"unavailable": str(error)}
     with progress_bar("observing", space.num_states, name) as progress:
-        counts = aliasing(space, seen, progress=progress)
+        classes = observation_classes(space, seen, progress=progress)
+    counts = counted(classes, np.asarray(space.terminal))
     return entry | {
         "shape": list(seen.space.shape or ()),
         "dtype": str(seen.space.dtype),
@@ -91,10 +148,11 @@ def _entry(space: "StateSpace", name: str, options: dict[str, Any], *, strict: b
         "num_sharing": counts.num_sharing,
         "share": counts.share,
         "num_confused": counts.num_confused,
+        "loss": price.of(classes, counts.num_confused),
     }
 
 
-def _print(title: str, space: "StateSpace", entries: list[dict[str, Any]]) -> None:
+def _print(title: str, space: "StateSpace", entries: list[dict[str, Any]], gamma: float) -> None:
     from rich.markup import escape
     from rich.table import Table
 
@@ -102,7 +160,7 @@ def _print(title: str, space: "StateSpace", entries: list[dict[str, Any]]) -> No
     table.add_column("observation", style="cyan", no_wrap=True)
     for heading in ("shape", "type"):
         table.add_column(heading)
-    for heading in ("different", "states that share one", "share", "where one acts"):
+    for heading in ("different", "states that share one", "share", "where one acts", "loses"):
         table.add_column(heading, justify="right")
     for entry in entries:
         words = " ".join((entry["observation"], *(f"{name}={value}" for name, value in entry["options"].items())))
@@ -111,7 +169,8 @@ def _print(title: str, space: "StateSpace", entries: list[dict[str, Any]]) -> No
         shape = " x ".join(map(str, entry["shape"])) or "1"
         counts = (f"{entry[key]:,}" for key in ("num_observations", "num_sharing"))
         share = f"{100 * entry['share']:.1f} %"
-        table.add_row(escape(words), shape, entry["dtype"], *counts, share, f"{entry['num_confused']:,}")
+        confused = f"{entry['num_confused']:,}"
+        table.add_row(escape(words), shape, entry["dtype"], *counts, share, confused, _loss_text(entry["loss"]))
     to = console()
     to.print(f"[bold]{escape(title)}[/bold]", soft_wrap=True)
     terminal = int(space.terminal.sum())
@@ -120,4 +179,18 @@ def _print(title: str, space: "StateSpace", entries: list[dict[str, Any]]) -> No
     for entry in entries:
         if "unavailable" in entry:
             to.print(escape(f"{entry['observation']}: {entry['unavailable']}"), style="dim", soft_wrap=True)
-    to.print("states that share one: terminal states count like others; where one acts: neither is", style="dim")
+    for note in (
+        "states that share one: terminal states count like others; where one acts: those that share one with another "
+        "state, neither of them terminal",
+        f"loses: optimal value at the start less that of the best deterministic policy without memory, discount "
+        f"{gamma:g}",
+    ):
+        to.print(note, style="dim", soft_wrap=True)
+
+
+def _loss_text(loss: dict[str, Any] | None) -> str:
+    """Exact to six digits, or an interval."""
+    if loss is None:
+        return "not bounded"
+    lower, upper = (f"{loss[end]:.6g}" if loss[end] >= 1e-6 else "0" for end in ("lower", "upper"))
+    return upper if loss["exact"] else f"{lower} to {upper}"

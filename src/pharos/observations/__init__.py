@@ -14,7 +14,8 @@ from pharos.observations.vector import Index, OneHot, Vector
 
 if TYPE_CHECKING:
     from pharos.observations.complex_image import ComplexImage
-    from pharos.observations.look_alikes import Aliasing, aliasing, observation_classes
+    from pharos.observations.look_alikes import Aliasing, aliasing, counted, observation_classes
+    from pharos.observations.memoryless import MemorylessLoss, memoryless_loss
     from pharos.observations.own import OwnObservation, imported, observation_of, own_observation
     from pharos.observations.rendered import RENDERERS, render, renderers
     from pharos.observations.simple_image import SimpleImage
@@ -22,11 +23,14 @@ if TYPE_CHECKING:
 _FILES = {
     "Aliasing": "look_alikes",
     "ComplexImage": "complex_image",
+    "MemorylessLoss": "memoryless",
     "OwnObservation": "own",
     "RENDERERS": "rendered",
     "SimpleImage": "simple_image",
     "aliasing": "look_alikes",
+    "counted": "look_alikes",
     "imported": "own",
+    "memoryless_loss": "memoryless",
     "observation_classes": "look_alikes",
     "observation_of": "own",
     "own_observation": "own",
@@ -41,6 +45,7 @@ __all__ = [
     "ComplexImage",
     "FunctionObservation",
     "Index",
+    "MemorylessLoss",
     "Observation",
     "ObservationInContext",
     "OneHot",
@@ -48,8 +53,10 @@ __all__ = [
     "SimpleImage",
     "Vector",
     "aliasing",
+    "counted",
     "imported",
     "in_blocks",
+    "memoryless_loss",
     "names",
     "observation_classes",
     "observation_of",

@@ -1,0 +1,177 @@
+"""What an agent without memory loses by an observation that several states share.
+
+A deterministic memoryless policy chooses an action for each observation. The best one is looked for by branch and
+bound: some observations get an action, all other states choose freely, and the optimal value of this relaxed MDP is an
+upper bound. Policies that choose alike wherever states look alike are lower bounds. Finding the best one is NP-hard
+(Littman 1994), so the search may end with an interval.
+"""
+
+import heapq
+import itertools
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from pharos.mdp import TabularMDP
+from pharos.solvers import Solution, evaluate_policy, value_iteration
+
+TOLERANCE = 1e-7
+# Improvements of one policy, and steps of its occupancy
+MOST_IMPROVEMENTS, MOST_STEPS = 20, 400
+# States times actions of relaxed problems: larger ones get one bound from above, the optimum
+MOST_ENTRIES = 2_000_000
+
+
+@dataclass(frozen=True)
+class MemorylessLoss:
+    """How much less than the optimum the best deterministic memoryless policy on an observation is worth at the start.
+
+    Attributes:
+        lower, upper: bounds of the loss, proven; in units of return.
+        exact: whether they differ by rounding and tolerance alone.
+        policies: how many policies, and relaxed problems, were solved.
+    """
+
+    lower: float
+    upper: float
+    exact: bool
+    policies: int = 0
+
+
+def memoryless_loss(
+    mdp: TabularMDP, classes: np.ndarray, *, optimal: Solution | None = None, budget: float = 10.0
+) -> MemorylessLoss:
+    """Bound V*(start) - max over policies on observations of V(start).
+
+    Args:
+        mdp: without sticky actions; discounted or with a horizon, as `value_iteration` takes it.
+        classes: (S,) the number of the observation of each state, as `observation_classes` gives it.
+        optimal: the solution of `mdp`, where there is one.
+        budget: seconds after which the bounds so far are returned.
+    Cost: up to `budget`, and one solution of the MDP and one policy beyond it.
+    Source: Littman (1994), "Memoryless policies: theoretical limitations and practical results".
+    """
+    optimal = optimal or value_iteration(mdp, TOLERANCE)
+    search = _Search(mdp, np.asarray(classes), time.monotonic() + budget)
+    lower, upper = search.bounds(optimal)
+    best, error = float(optimal.value_at_start), optimal.error_bound
+    least = max(0.0, best - error - upper)
+    most = max(least, best + error - lower)
+    return MemorylessLoss(least, most, most - least <= 10 * (TOLERANCE + error), search.solved)
+
+
+class _Search:
+    """Branch and bound over the observations that states share.
+
+    Attributes:
+        solved: how many problems and policies were solved.
+    """
+
+    def __init__(self, mdp: TabularMDP, classes: np.ndarray, deadline: float):
+        self.mdp, self.deadline, self.solved = mdp, deadline, 0
+        self.live = ~np.asarray(mdp.terminal)
+        self.classes = classes
+        self.count = int(classes.max()) + 1
+        self.is_shared = np.bincount(classes[self.live], minlength=self.count) > 1
+        self.is_small = mdp.num_states * mdp.num_actions <= MOST_ENTRIES
+
+    def bounds(self, optimal: Solution) -> tuple[float, float]:
+        """(lower, upper) bound of the value of the best policy at the start."""
+        free = np.full(self.count, -1)
+        lower, conflict = self.rounded(optimal, free)
+        upper = optimal.value_at_start + optimal.error_bound
+        order = itertools.count()
+        heap = [(-upper, next(order), free, conflict)]
+        while heap:
+            bound, _, fixed, conflict = heapq.heappop(heap)
+            upper = -bound
+            if upper <= lower + TOLERANCE:
+                return lower, max(lower, upper)
+            if conflict < 0 or not self.is_small or time.monotonic() > self.deadline:
+                return lower, upper
+            for action in range(self.mdp.num_actions):
+                child = fixed.copy()
+                child[conflict] = action
+                solution = value_iteration(self.relaxed(child), TOLERANCE)
+                self.solved += 1
+                above = min(upper, solution.value_at_start + solution.error_bound)
+                if above > lower + TOLERANCE:
+                    found, next_conflict = self.rounded(solution, child)
+                    lower = max(lower, found)
+                    heapq.heappush(heap, (-above, next(order), child, next_conflict))
+        return lower, lower + TOLERANCE
+
+    def relaxed(self, fixed: np.ndarray) -> TabularMDP:
+        """The MDP in which all actions do the same where the observation has a fixed one."""
+        mdp, actions = self.mdp, np.arange(self.mdp.num_actions)
+        chosen = np.where(self.live, fixed[self.classes], -1)
+        executed = np.where(chosen[:, None] < 0, actions, chosen[:, None])
+        rows = np.arange(mdp.num_states)[:, None]
+        setting: dict[str, Any] = {"gamma": mdp.gamma, "initial": mdp.initial, "horizon": mdp.horizon}
+        table, rewards = mdp.dynamics.deterministic_table(), mdp.rewards[rows, executed]
+        if table is not None:
+            return TabularMDP.from_arrays(table[rows, executed], rewards, terminal=mdp.terminal, **setting)
+        taken = (rows * mdp.num_actions + executed).ravel()
+        return TabularMDP.from_matrices(mdp.dynamics.matrix()[taken][:, : mdp.num_states], rewards, **setting)
+
+    def rounded(self, solution: Solution, fixed: np.ndarray) -> tuple[float, int]:
+        """(value at the start of a memoryless policy near the solution; the observation to branch on, -1: none).
+
+        The policy takes in each observation the action with the largest value over its states, weighted by how much an
+        optimal one is there; it is then improved by its own values and visits.
+        """
+        policy = np.asarray(solution.q).argmax(axis=1)
+        visits = self.visits(policy)
+        weights = visits + 1e-12 * self.live
+        actions = self.best(solution.q, weights, fixed)
+        lost = self.lost(solution.q, weights, actions, fixed)
+        conflict = int(lost.argmax()) if lost.max() > 0 else -1
+        value, seen = -np.inf, set()
+        for _ in range(MOST_IMPROVEMENTS):
+            evaluated = evaluate_policy(self.mdp, actions[self.classes], TOLERANCE)
+            self.solved += 1
+            value = max(value, evaluated.value_at_start - evaluated.error_bound)
+            seen.add(actions.tobytes())
+            if time.monotonic() > self.deadline:
+                break
+            weights = self.visits(actions[self.classes]) + 1e-3 * weights
+            actions = self.best(evaluated.q, weights, np.full(self.count, -1))
+            if actions.tobytes() in seen:
+                break
+        return value, conflict
+
+    def best(self, q: np.ndarray, weights: np.ndarray, fixed: np.ndarray) -> np.ndarray:
+        """(C,): of each observation the action with the largest weighted value; a fixed one as it is."""
+        actions = self.sums(np.asarray(q), weights).argmax(axis=1)
+        return np.where(fixed < 0, actions, fixed)
+
+    def lost(self, q: np.ndarray, weights: np.ndarray, actions: np.ndarray, fixed: np.ndarray) -> np.ndarray:
+        """(C,): the weighted value that each observation loses by its one action; 0 where it has a fixed one."""
+        q = np.asarray(q)
+        gaps = q.max(axis=1) - q[np.arange(len(q)), actions[self.classes]]
+        lost = np.bincount(self.classes, np.where(self.live, weights * gaps, 0.0), minlength=self.count)
+        return np.where((fixed < 0) & self.is_shared & (lost > 0), lost, 0.0)
+
+    def sums(self, q: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """(C, A): the sum over the states of each observation of weight times value."""
+        weights = np.where(self.live, weights, 0.0)
+        columns = (np.bincount(self.classes, weights * q[:, a], minlength=self.count) for a in range(q.shape[1]))
+        return np.stack(list(columns), axis=1)
+
+    def visits(self, policy: np.ndarray) -> np.ndarray:
+        """(S,): how often a policy is in each state, discounted; its first steps."""
+        mdp = self.mdp
+        mass = np.zeros(mdp.num_states)
+        mass[mdp.start_states] = mdp.start_probabilities
+        visits, rows = np.zeros(mdp.num_states), np.arange(mdp.num_states)
+        for _ in range(min(MOST_STEPS, mdp.horizon or MOST_STEPS)):
+            mass[~self.live] = 0.0
+            visits += mass
+            if mass.sum() < 1e-9 or time.monotonic() > self.deadline:
+                break
+            executed = np.zeros((mdp.num_states, mdp.num_actions))
+            executed[rows, policy] = mass
+            mass = mdp.gamma * mdp.dynamics.pushed(executed)[:, 0]
+        return visits
