@@ -13,13 +13,15 @@ import numpy as np
 
 import pharos
 from pharos import drawing
+from pharos.environments import start_distribution
 from pharos.observations import observe, render
+from pharos.wording import many
 
 DOCS = Path(__file__).parents[1] / "docs"
 FOLDER = DOCS / "gallery"
 INSTANCES = {
     "simple_grid": (("simple_grid/6x6-decoy", 0), ("simple_grid/8x8-plain", 5)),
-    "frozen_lake": (("frozen_lake/4x4", 2), ("frozen_lake/8x8", 6)),
+    "frozen_lake": (("frozen_lake/4x4", 2), ("frozen_lake/8x8", 6), ("frozen_lake/4x4 slippery", 9)),
     "freeway": (("freeway/16x7-speed1", 12), ("freeway/20x11-speed1", 12)),
     "breakout": (("breakout/12x8x1", 60), ("breakout/16x8x3", 60)),
     "sliding_tiles": (("sliding_tiles/3x3", 5), ("sliding_tiles/2x5", 20)),
@@ -28,11 +30,14 @@ INSTANCES = {
     "mini_grid": (("mini_grid/key-corridor-s4r3", 7), ("mini_grid/lava-crossing-s9n2", 3)),
     "mini_grid_empty": (("mini_grid_empty/8x8", 4),),
     "mini_grid_rooms": (("mini_grid_rooms/9x4", 12),),
+    "cliff_walking": (("cliff_walking/4x12", 5), ("cliff_walking/4x12-slippery", 9)),
+    "taxi": (("taxi/5x5", 6), ("taxi/5x5-rainy", 6)),
+    "blackjack": (("blackjack/sutton-barto", 1),),
     "game_2048": (("game_2048/2x3", 40), ("game_2048/3x3-to-64", 25)),
 }
-PLAYED = {
+PLAYED = {  # names of instances
     "simple_grid": "simple_grid/6x6-decoy",
-    "frozen_lake": "frozen_lake/8x8",
+    "frozen_lake": "frozen_lake/8x8, frozen_lake/4x4 slippery",
     "freeway": "freeway/16x7-speed1",
     "breakout": "breakout/12x8x3",
     "mini_grid": "mini_grid/unlock-pickup",
@@ -41,17 +46,39 @@ PLAYED = {
     "sliding_tiles": "sliding_tiles/3x3-hardest",
     "pocket_cube": "pocket_cube/quarter",
     "sokoban": "sokoban/storehouse",
+    "cliff_walking": "cliff_walking/4x12-slippery",
+    "taxi": "taxi/5x5-rainy",
+    "blackjack": "blackjack/sutton-barto",
     "game_2048": "game_2048/3x3-to-64",
 }
-FRAMES_PER_SECOND = {"sliding_tiles": 4, "pocket_cube": 3, "sokoban": 6, "game_2048": 3}  # others: 12
+SEVERAL = ("taxi", "blackjack")  # games, from starts that are drawn: one is soon over
+FRAMES_PER_SECOND = {
+    "sliding_tiles": 4,
+    "pocket_cube": 3,
+    "sokoban": 6,
+    "game_2048": 3,
+    "taxi": 4,
+    "blackjack": 2,
+}  # others: 12
 FRAMES = 90
 NUMBERS = 8  # of a vector
 GAMMA = 0.99
 
 
+def made(name):
+    """An environment by the name of an instance, and of a parameter that is to be true."""
+    instance, *switched_on = name.split()
+    return pharos.make(instance, **dict.fromkeys(switched_on, True))
+
+
+def file_of(name, suffix):
+    """Where the picture of an instance is."""
+    return FOLDER / f"{name.replace('/', '-').replace(' ', '-')}{suffix}"
+
+
 def optimal(name):
     """(environment, policy): of the discounted problem, so that it does not loiter."""
-    env = pharos.make(name)
+    env = made(name)
     space = pharos.build(env)
     policy = pharos.value_iteration(space.mdp(gamma=GAMMA)).policy
     return env, lambda state: int(policy[space.index(state)])
@@ -132,18 +159,28 @@ def section(cls):
     for name, steps in INSTANCES[cls]:
         env, policy = optimal(name)
         state = drawing.episode(env, policy, env.initial_states()[0][0], steps=steps)[-1][0]
-        file = FOLDER / f"{name.replace('/', '-')}.png"
+        file = file_of(name, ".png")
         drawing.save_png(file, shown(env, state))
         space = pharos.build(env)
-        lines += [f"`{name}`, {space.num_states:,} states, after {steps} steps of the optimal policy:", ""]
+        lines += [f"`{name}`, {space.num_states:,} states, after {many(steps, 'step')} of the optimal policy:", ""]
         lines += [f"![{name}](gallery/{file.name})", "", numbers(env, space, state), ""]
-    name = PLAYED[cls]
-    env, policy = (unturned if cls == "game_2048" else optimal)(name)
-    played = drawing.episode(env, policy, env.initial_states()[0][0], steps=FRAMES)
-    pictures = [render(env, state, "complex_image", size="natural") for state, _, _ in played]
-    file = FOLDER / f"{name.replace('/', '-')}.gif"
-    drawing.save_gif(file, pictures, frames_per_second=FRAMES_PER_SECOND.get(cls, 12), at_least=160)
-    return "\n".join([*lines, f"The optimal policy of `{name}`:", "", f"![{name}](gallery/{file.name})", ""])
+    for name in PLAYED[cls].split(", "):
+        env, policy = (unturned if cls == "game_2048" else optimal)(name)
+        pictures = [render(env, state, "complex_image", size="natural") for state in played(env, policy, cls)]
+        file = file_of(name, ".gif")
+        drawing.save_gif(file, pictures, frames_per_second=FRAMES_PER_SECOND.get(cls, 12), at_least=160)
+        lines += [f"The optimal policy of `{name}`:", "", f"![{name}](gallery/{file.name})", ""]
+    return "\n".join(lines)
+
+
+def played(env, policy, cls):
+    """The states of an episode of at most FRAMES steps, or of several games where they are short."""
+    starts, probabilities = start_distribution(env)
+    if cls not in SEVERAL:
+        return [state for state, _, _ in drawing.episode(env, policy, starts[0], steps=FRAMES)]
+    chosen = np.random.default_rng(0).choice(len(starts), 8, p=probabilities)
+    games = [drawing.episode(env, policy, starts[k], steps=FRAMES, seed=seed) for seed, k in enumerate(chosen)]
+    return [state for game in games for state, _, _ in game][:FRAMES]
 
 
 def main(chosen) -> None:
