@@ -87,6 +87,31 @@ def gymnasium(
     _tell(words, mdp, out, json)
 
 
+@app.command("prism")
+def prism(
+    file: Annotated[Path, typer.Argument(help="A model: .prism, .nm, .pm, .jani or .drn; built by Storm.")],
+    out: Annotated[Path, typer.Option("--out", help="Folder for the MDP.")],
+    constants: Annotated[str, typer.Option("--constants", help="Undefined ones, such as N=3,K=2.")] = "",
+    reward: Annotated[
+        str | None, typer.Option("--reward", help="Reward structure; the only one when not given, without --target.")
+    ] = None,
+    target: Annotated[
+        str | None, typer.Option("--target", help="Label that ends the episode; pays 1 where there is no --reward.")
+    ] = None,
+    gamma: Annotated[float, typer.Option("--gamma", min=0, max=1, help="Discount of the MDP.")] = 1.0,
+    horizon: Annotated[
+        int | None, typer.Option("--horizon", min=1, help="Steps of an episode; without end when not given.")
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Import a model in PRISM's language, in JANI or in Storm's DRN."""
+    from pharos import importers
+
+    mdp = importers.storm(file, constants=constants, reward=reward, target=target, gamma=gamma, horizon=horizon)
+    importers.save(mdp, out, source=f"Storm: {file.name} {constants}".rstrip())
+    _tell(file.name, mdp, out, json)
+
+
 def _tell(name: str, mdp: "TabularMDP", out: Path, json: bool) -> None:
     if json:
         print_json(

@@ -1,4 +1,4 @@
-"""MDPs from elsewhere: BRIDGE's files, Gymnasium's `P` tables, matrices, MiniGrid; and folders that keep them.
+"""MDPs from elsewhere, and folders that keep them: files of BRIDGE, tables of Gymnasium, matrices, MiniGrid, Storm.
 
 Nothing here unpickles: files hold plain arrays and JSON, or are refused.
 """
@@ -7,6 +7,7 @@ from pharos.importers.bridge import bridge, bridge_screens, has_screens
 from pharos.importers.folder import environment, is_folder, load, save
 from pharos.importers.gymnasium import gymnasium, matrices
 from pharos.importers.minigrid import minigrid, minigrid_grids, minigrid_recording
+from pharos.importers.storm import storm
 
 __all__ = [
     "bridge",
@@ -21,4 +22,5 @@ __all__ = [
     "minigrid_grids",
     "minigrid_recording",
     "save",
+    "storm",
 ]
