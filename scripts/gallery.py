@@ -34,6 +34,13 @@ INSTANCES = {
     "taxi": (("taxi/5x5", 6), ("taxi/5x5-rainy", 6)),
     "blackjack": (("blackjack/sutton-barto", 1),),
     "game_2048": (("game_2048/2x3", 40), ("game_2048/3x3-to-64", 25)),
+    "corner_grid": (("corner_grid/8x8", 3),),
+    "river_swim": (("river_swim/strehl-littman", 2),),
+    "deep_sea": (("deep_sea/10x10", 4),),
+    "endless_sea": (("endless_sea/10x10", 5),),
+    "catch": (("catch/10x5", 4),),
+    "memory_chain": (("memory_chain/bits-4", 1),),
+    "umbrella_chain": (("umbrella_chain/length-10", 3),),
 }
 PLAYED = {  # names of instances
     "simple_grid": "simple_grid/6x6-decoy",
@@ -50,16 +57,19 @@ PLAYED = {  # names of instances
     "taxi": "taxi/5x5-rainy",
     "blackjack": "blackjack/sutton-barto",
     "game_2048": "game_2048/3x3-to-64",
+    "corner_grid": "corner_grid/8x8-random",
+    "river_swim": "river_swim/strehl-littman",
+    "deep_sea": "deep_sea/10x10-stochastic",
+    "endless_sea": "endless_sea/20x20-random",
+    "catch": "catch/10x5",
+    "memory_chain": "memory_chain/bits-4",
+    "umbrella_chain": "umbrella_chain/length-10",
 }
-SEVERAL = ("taxi", "blackjack")  # games, from starts that are drawn: one is soon over
-FRAMES_PER_SECOND = {
-    "sliding_tiles": 4,
-    "pocket_cube": 3,
-    "sokoban": 6,
-    "game_2048": 3,
-    "taxi": 4,
-    "blackjack": 2,
-}  # others: 12
+SEVERAL = ("taxi", "blackjack", "catch", "memory_chain", "umbrella_chain")  # games, from drawn starts: one is soon over
+FRAMES_PER_SECOND = {  # others: 12
+    **{"sliding_tiles": 4, "pocket_cube": 3, "sokoban": 6, "game_2048": 3, "taxi": 4, "blackjack": 2},
+    **{"river_swim": 4, "catch": 6, "memory_chain": 2, "umbrella_chain": 6},
+}
 FRAMES = 90
 NUMBERS = 8  # of a vector
 GAMMA = 0.99
@@ -102,8 +112,8 @@ def unturned(name):
 
 
 def enlarged(picture, height):
-    """A small picture enlarged by a whole factor to about `height` pixels."""
-    factor = max(1, round(height / len(picture)))
+    """A small picture enlarged by a whole factor to about `height` pixels, but not beyond a width of 800."""
+    factor = max(1, min(round(height / len(picture)), 800 // picture.shape[1]))
     return picture.repeat(factor, axis=0).repeat(factor, axis=1)
 
 
