@@ -21,7 +21,7 @@ class MemoryChain(Environment):
     Ends     after memory_length + 1 steps.
     Limit    the same.
     Ours     bsuite shows the bits at the start alone and the question at the end alone, so that its agents need a
-             memory. Here the whole state is seen, and is Markov; that observations may hide variables is to come.
+             memory. Here the whole state is seen, and is Markov; `hide=` of an observation hides variables always.
     Source   bsuite memory_chain (memory_len: one bit; memory_size: several).
 
     Attributes:
