@@ -102,6 +102,7 @@ def test_what_was_recorded_is_observed_and_drawn(folders):
     assert (stretched == shown[3] * (255 // shown.max(axis=(0, 1, 2)))).all()
     assert (drawing.human(env, (1,))[::200, ::200][:2] == shown[1]).all()
     assert drawing.text_drawing(env, (3,)) == "3"
+    assert (drawing.human(env, (4,)) == 0).all()
     assert pharos.observe(env, "one_hot")(np.array([[3]])).tolist() == [[0, 0, 0, 1, 0]]
 
 
@@ -179,6 +180,8 @@ def test_what_was_learnt_on_a_folder_is_evaluated_on_it(folders, tmp_path):
     words = ("train", folders["matrices"], "--steps", 200, "--interval", 200, "--out", tmp_path / "run", "--json")
     learnt = json.loads(run(*words).stdout)
     assert learnt["config"]["environment"] == "imported"
+    listed = json.loads(run("observations", folders["matrices"], "--json").stdout)["observations"]
+    assert listed[-1]["observation"] == "recorded" and listed[-1]["num_observations"] == 4
     answer = json.loads(run("evaluate", folders["matrices"], "--policy", tmp_path / "run", "--json").stdout)
     mdp = in_every_form()["matrices"]
     assert answer["optimal_value_at_start"] == pytest.approx(pharos.value_iteration(mdp).value_at_start, abs=2e-6)

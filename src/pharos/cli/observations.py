@@ -75,6 +75,8 @@ def observations(
         raise ParameterError(f"{target}: pharos does not know the class of this environment; name it as module:Class")
     if not observation and not space.environment.has_motion:
         asked = tuple((name, options) for name, options in asked if "motion" not in options)
+    if not observation and space.environment.recorded is not None:
+        asked += (("recorded", {}),)
     price = _Price(space, discount(gamma, None), budget)
     entries = [_entry(space, name, options, price, strict=bool(observation)) for name, options in asked]
     if json:

@@ -33,7 +33,10 @@ def train(
         str, typer.Option("--agent", help="q_learning, dqn, ppo, a2c, or module:Class for Stable-Baselines3.")
     ] = "q_learning",
     observation: Annotated[
-        str, typer.Option("--observation", help="vector, simple_image, complex_image, one_hot, index, or your own.")
+        str,
+        typer.Option(
+            "--observation", help="vector, simple_image, complex_image, one_hot, index, recorded, or your own."
+        ),
     ] = "vector",
     option: Annotated[
         list[str] | None,

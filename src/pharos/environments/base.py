@@ -180,6 +180,11 @@ class Environment:
     def draw_motion(self, state, planes) -> None:
         """Write 1, 2, ... into planes (M, rows, columns) uint8: what `draw` does not tell of the state."""
 
+    @property
+    def recorded(self) -> np.ndarray | None:
+        """(states, ...) what an import recorded of each state, for the observation "recorded"; here None: nothing."""
+        return None
+
     # Derived --------------------------------------------------------------------------------------------------------
 
     @property

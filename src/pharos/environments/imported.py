@@ -149,7 +149,7 @@ class ImportedWorld(Environment):
         return self._with_end(np.asarray(self._arrays["rewards"], np.float64), 0.0)
 
     @cached_property
-    def recorded(self) -> np.ndarray | None:
+    def recorded(self) -> np.ndarray | None:  # type: ignore[override]
         """(S, ...) what the source shows of each state, zeros for the end; None where the import recorded nothing."""
         if mdp_files.OBSERVATIONS not in self.manifest["arrays"]:
             return None

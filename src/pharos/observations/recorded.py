@@ -22,7 +22,7 @@ class Recorded(Observation):
     def __init__(self, env: Environment, *, stretch: bool = False):
         from gymnasium.spaces import Box
 
-        shown: np.ndarray | None = getattr(env, "recorded", None)
+        shown = env.recorded
         if shown is None:
             raise ParameterError(
                 f"{env}: has no recorded observations; 'recorded' is for imported MDPs whose import recorded what the "
