@@ -10,6 +10,7 @@ from typer.testing import CliRunner
 
 import pharos
 from pharos.cli import app
+from pharos.errors import ParameterError
 from pharos.observations import aliasing, memoryless_loss, observation_classes, observe
 
 
@@ -71,14 +72,14 @@ def test_an_observation_of_ones_own_is_counted_too(breakout):
     assert "--option goes with --observation" in result.stderr
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(12))
 def test_the_loss_is_that_of_the_best_of_all_policies(seed):
     rng = np.random.default_rng(seed)
     P, R = rng.dirichlet(np.full(6, 0.4), (6, 2)), rng.normal(size=(6, 2))
     classes = np.array([0, 0, 0, 1, 1, 2])[rng.permutation(6)]
     if seed % 2:
         table = rng.integers(6, size=(6, 2))
-        mdp = pharos.TabularMDP.from_arrays(table, R, gamma=0.9)
+        mdp = pharos.random_actions(pharos.TabularMDP.from_arrays(table, R, gamma=0.9), 0.5)
     else:
         mdp = pharos.TabularMDP.from_matrices(P, R, gamma=0.9)
     every = (
@@ -102,3 +103,5 @@ def test_two_rooms_that_look_alike_cost_half_of_the_prizes():
     assert loss.exact
     assert loss.lower <= 0.5 * 0.5 * 2 <= loss.upper
     assert memoryless_loss(mdp, np.arange(3)).upper <= 1e-6
+    with pytest.raises(ParameterError, match="under sticky actions a policy without memory does not know the state"):
+        memoryless_loss(pharos.sticky_actions(mdp, 0.25), np.array([0, 1, 1]))

@@ -11,10 +11,12 @@ from pharos.cli.common import (
     MaxStates,
     Memory,
     Parameters,
+    Random,
     TargetArgument,
     Workers,
     build_options,
     console,
+    describe_chance,
     discount,
     parse_parameters,
     parse_target,
@@ -57,6 +59,7 @@ def observations(
         typer.Option("--option", metavar="NAME=VALUE", help="Option of the observations that were named."),
     ] = None,
     gamma: Gamma = None,
+    random: Random = 0.0,
     budget: Annotated[
         float, typer.Option("--budget", min=0, help="Seconds to bound what one observation costs; 0: do not.")
     ] = 10.0,
@@ -77,7 +80,7 @@ def observations(
         asked = tuple((name, options) for name, options in asked if "motion" not in options)
     if not observation and space.environment.recorded is not None:
         asked += (("recorded", {}),)
-    price = _Price(space, discount(gamma, None), budget)
+    price = _Price(space, discount(gamma, None), random, budget)
     entries = [_entry(space, name, options, price, strict=bool(observation)) for name, options in asked]
     if json:
         answer = {"environment": space.environment.name, "parameters": space.environment.parameters}
@@ -88,18 +91,19 @@ def observations(
                 "num_states": space.num_states,
                 "num_terminal_states": terminal,
                 "gamma": price.gamma,
+                "random": random,
                 "observations": entries,
             }
         )
         return
-    _print(" ".join((target, *(parameters or ()))), space, entries, price.gamma)
+    _print(" ".join((target, *(parameters or ()))), space, entries, price)
 
 
 class _Price:
     """What observations cost an agent without memory; the space is solved once, when it is first asked."""
 
-    def __init__(self, space: "StateSpace", gamma: float, budget: float):
-        self.space, self.gamma, self.budget = space, gamma, budget
+    def __init__(self, space: "StateSpace", gamma: float, random: float, budget: float):
+        self.space, self.gamma, self.random, self.budget = space, gamma, random, budget
 
     def of(self, classes: "np.ndarray", num_confused: int) -> dict[str, Any] | None:
         """Bounds of the loss; None where they were not wanted, or the space is too large."""
@@ -116,9 +120,10 @@ class _Price:
 
     @cached_property
     def _solved(self) -> tuple[Any, Any]:
+        from pharos.mdp import random_actions
         from pharos.solvers import value_iteration
 
-        mdp = self.space.mdp(gamma=self.gamma)
+        mdp = random_actions(self.space.mdp(gamma=self.gamma), self.random)
         return mdp, value_iteration(mdp, 1e-7)
 
 
@@ -154,7 +159,7 @@ def _entry(space: "StateSpace", name: str, options: dict[str, Any], price: _Pric
     }
 
 
-def _print(title: str, space: "StateSpace", entries: list[dict[str, Any]], gamma: float) -> None:
+def _print(title: str, space: "StateSpace", entries: list[dict[str, Any]], price: _Price) -> None:
     from rich.markup import escape
     from rich.table import Table
 
@@ -185,7 +190,7 @@ def _print(title: str, space: "StateSpace", entries: list[dict[str, Any]], gamma
         "states that share one: terminal states count like others; where one acts: those that share one with another "
         "state, neither of them terminal",
         f"loses: optimal value at the start less that of the best deterministic policy without memory, discount "
-        f"{gamma:g}",
+        f"{price.gamma:g}, chance: {describe_chance(0.0, price.random)}",
     ):
         to.print(note, style="dim", soft_wrap=True)
 

@@ -65,7 +65,7 @@ class ComplexImage(Observation):
         picture = _scaled(ground, height, width)
         layers = self._drawing.layers
         sprite, place, color, keep = _sprite_tables(layers, scenery, np.diff(top), np.diff(left))
-        hidden = hidden_names(hide, f"layer that complex_image of {env.name} can hide", layers)
+        hidden = hidden_names(hide, f"complex_image of {env.name}", layers)
         sprite[[name in hidden for name in layers]] = -1
         if grey:
             picture, color = (values @ np.array(LUMINANCE)[:, None] for values in (picture, color))

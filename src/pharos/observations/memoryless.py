@@ -10,10 +10,12 @@ import heapq
 import itertools
 import time
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
+from pharos.errors import ParameterError
 from pharos.mdp import TabularMDP
 from pharos.solvers import Solution, evaluate_policy, value_iteration
 
@@ -46,13 +48,19 @@ def memoryless_loss(
     """Bound V*(start) - max over policies on observations of V(start).
 
     Args:
-        mdp: without sticky actions; discounted or with a horizon, as `value_iteration` takes it.
+        mdp: discounted or with a horizon, as `value_iteration` takes it; random actions, but no sticky ones.
         classes: (S,) the number of the observation of each state, as `observation_classes` gives it.
         optimal: the solution of `mdp`, where there is one.
         budget: seconds after which the bounds so far are returned.
+    Raises:
+        ParameterError: actions are sticky.
     Cost: up to `budget`, and one solution of the MDP and one policy beyond it.
     Source: Littman (1994), "Memoryless policies: theoretical limitations and practical results".
     """
+    if mdp.is_sticky:
+        raise ParameterError(
+            f"{mdp}: under sticky actions a policy without memory does not know the state; leave them out"
+        )
     optimal = optimal or value_iteration(mdp, TOLERANCE)
     search = _Search(mdp, np.asarray(classes), time.monotonic() + budget)
     lower, upper = search.bounds(optimal)
@@ -110,11 +118,26 @@ class _Search:
         executed = np.where(chosen[:, None] < 0, actions, chosen[:, None])
         rows = np.arange(mdp.num_states)[:, None]
         setting: dict[str, Any] = {"gamma": mdp.gamma, "initial": mdp.initial, "horizon": mdp.horizon}
-        table, rewards = mdp.dynamics.deterministic_table(), mdp.rewards[rows, executed]
-        if table is not None:
-            return TabularMDP.from_arrays(table[rows, executed], rewards, terminal=mdp.terminal, **setting)
+        table = mdp.dynamics.deterministic_table()
+        if table is not None and not mdp.is_random:
+            chosen_rewards = mdp.rewards[rows, executed]
+            return TabularMDP.from_arrays(table[rows, executed], chosen_rewards, terminal=mdp.terminal, **setting)
+        matrix, rewards = self.chosen
         taken = (rows * mdp.num_actions + executed).ravel()
-        return TabularMDP.from_matrices(mdp.dynamics.matrix()[taken][:, : mdp.num_states], rewards, **setting)
+        return TabularMDP.from_matrices(matrix[taken], rewards[rows, executed], **setting)
+
+    @cached_property
+    def chosen(self) -> tuple[Any, np.ndarray]:
+        """What choosing an action does, random actions included: (S A, S) probabilities, (S, A) rewards."""
+        from scipy import sparse
+
+        mdp, actions = self.mdp, self.mdp.num_actions
+        matrix, rewards = mdp.dynamics.matrix()[:, : mdp.num_states], mdp.rewards
+        if not mdp.is_random:
+            return matrix, rewards
+        executed = mdp.chance.weights(np.eye(actions), None)
+        mixed = sparse.kron(sparse.identity(mdp.num_states), sparse.csr_matrix(executed), format="csr") @ matrix
+        return sparse.csr_matrix(mixed), rewards @ executed.T
 
     def rounded(self, solution: Solution, fixed: np.ndarray) -> tuple[float, int]:
         """(value at the start of a memoryless policy near the solution; the observation to branch on, -1: none).

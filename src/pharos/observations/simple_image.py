@@ -66,7 +66,7 @@ class SimpleImage(Observation):
         self.space = Box(0, 255, (planes, rows * scale, columns * scale), np.uint8)
         self._one = (1, planes, rows * scale, columns * scale)
         self.shades = _shades(layers, self._covering)
-        hidden = hidden_names(hide, f"layer that simple_image of {env.name} can hide", layers)
+        hidden = hidden_names(hide, f"simple_image of {env.name}", layers)
         self.shades[[name in hidden for name in layers]] = 0
         self.is_flat = scale == 1 and not grey and not self._drawing.motion
 

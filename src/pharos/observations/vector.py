@@ -46,7 +46,7 @@ class Vector(Observation):
         self.names = components.names
         self.low = components.low
         self.scale = np.where(components.size > 1, 1 / np.maximum(components.size - 1, 1), 0.0)
-        whose = f"variable that the vector of {env.name} can hide"
+        whose = f"vector of {env.name}"
         for name in hidden_names(hide, whose, components.variables, components.names):
             self.scale[components.variables.get(name) or components.names.index(name)] = 0.0
         self.space = Box(0.0, 1.0, (len(components),), np.float32)
