@@ -139,6 +139,35 @@ def test_folders_that_changed_are_another_environment_or_none(folders, tmp_path)
         importers.save(mdp, folder, actions=("one",))
 
 
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"num_states": "4"},
+        {"num_actions": 0},
+        {"horizon": 0.5},
+        {"time_limit": -1},
+        {"actions": ["one"]},
+        {"actions": 7},
+    ],
+)
+def test_manifests_that_say_what_no_mdp_has_are_refused_in_one_line(change, tmp_path):
+    folder = importers.save(in_every_form()["matrices"], tmp_path / "kept")
+    path = folder / "manifest.json"
+    manifest = {key: value for key, value in json.loads(path.read_text()).items() if key != "digest"}
+    path.write_text(json.dumps(manifest))
+    assert pharos.make(str(folder)).num_actions == 2
+    path.write_text(json.dumps(manifest | change))
+    for words in (("render",), ("train", "--steps", 10), ("count",)):
+        done = run(words[0], folder, *words[1:])
+        assert done.exit_code in (1, 2) or (words[0] == "count" and {"time_limit", "actions"} & set(change))
+        assert len(done.stderr.strip().splitlines()) == (done.exit_code != 0)  # none where it is a traceback
+
+
+def test_an_imported_world_without_a_folder_is_refused():
+    with pytest.raises(ParameterError, match="imported: folder is ''"):
+        pharos.make("imported")
+
+
 def test_observations_raise_the_version_and_nothing_else_does(folders, tmp_path):
     plain = importers.save(in_every_form()["matrices"], tmp_path / "plain", actions=("stay", "go"))
     versions = [

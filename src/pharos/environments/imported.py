@@ -51,6 +51,8 @@ class ImportedWorld(Environment):
     layers = {"digit": Layer(tuple("0123456789"), (226, 228, 232), sprite=DIGITS)}
 
     def validate(self) -> None:
+        if not isinstance(self.folder, str) or not self.folder:
+            raise ParameterError(f"imported: folder is {self.folder!r}; expected one that `pharos import` wrote")
         store(self, "folder", str(Path(self.folder).expanduser().absolute()))
         digest = str(self.manifest.get(storage.DIGEST) or storage.digest_of_json(self.manifest))
         if self.digest not in ("", digest):
@@ -59,9 +61,15 @@ class ImportedWorld(Environment):
                 f"bring the folder of then back, or start anew"
             )
         store(self, "digest", digest)
-        for entry, least in (("num_states", 1), ("num_actions", 1)):
-            if not isinstance(self.manifest.get(entry), int) or self.manifest[entry] < least:
-                raise FileFormatError(f"{self.folder}: {entry} is {self.manifest.get(entry)!r}; {mdp_files.AGAIN}")
+        for entry, is_optional in (("num_states", 0), ("num_actions", 0), ("horizon", 1), ("time_limit", 1)):
+            value = self.manifest.get(entry)
+            if not (is_optional and value is None) and (type(value) is not int or value < 1):
+                raise FileFormatError(f"{self.folder}: {entry} is {value!r}; expected an integer; {mdp_files.AGAIN}")
+        names = self.manifest.get("actions")
+        if names is not None and not (
+            isinstance(names, list) and len(names) == self.manifest["num_actions"] and all(map(is_name, names))
+        ):
+            raise FileFormatError(f"{self.folder}: actions are {names!r}; expected their names; {mdp_files.AGAIN}")
 
     @cached_property
     def manifest(self) -> Mapping[str, Any]:
@@ -76,7 +84,7 @@ class ImportedWorld(Environment):
     @property
     def max_episode_steps(self) -> int:  # type: ignore[override]
         """The horizon of the MDP; else the time limit of its source; else 1,000."""
-        return int(self.manifest["horizon"] or self.manifest.get("time_limit") or TIME_LIMIT)
+        return int(self.manifest.get("horizon") or self.manifest.get("time_limit") or TIME_LIMIT)
 
     @property
     def outcomes(self) -> int:  # type: ignore[override]
@@ -177,6 +185,11 @@ class ImportedWorld(Environment):
         except (ValueError, IndexError, TypeError, OverflowError) as error:
             raise FileFormatError(f"{self.folder}: the imported MDP is damaged: {error}; {mdp_files.AGAIN}") from None
         return table
+
+
+def is_name(value: object) -> bool:
+    """Whether it can be the name of an action."""
+    return isinstance(value, str) and value != ""
 
 
 def outcomes_of(
