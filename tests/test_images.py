@@ -28,6 +28,7 @@ OPTIONS = [
     ("simple_image", {}),
     ("simple_image", {"scale": 5}),
     ("simple_image", {"grey": True}),
+    ("simple_image", {"motion": True}),
     ("complex_image", {}),
     ("complex_image", {"size": "natural"}),
     ("complex_image", {"size": (61, 97), "channels_first": True}),

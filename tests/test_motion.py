@@ -110,6 +110,8 @@ def test_a_class_without_motion_has_the_same_image_with_it():
     states = reached(env)
     np.testing.assert_array_equal(interpreted(env, motion=True)(states), interpreted(env)(states))
     assert observe(env, "simple_image", motion=True).is_flat
+    with pytest.raises(ParameterError, match="motion is 'maybe'; expected True or False"):
+        observe(env, "simple_image", motion="maybe")
 
 
 @pytest.mark.parametrize("name", ["simple_image", "complex_image"])

@@ -25,12 +25,14 @@ class Drawing:
         motion: whether the planes of `draw_motion` follow those of `draw`; not where the class defines none.
         layers: those of all planes.
     Raises:
-        ParameterError: the environment declares no grid, no layers or no draw().
+        ParameterError: the environment declares no grid, no layers or no draw(), or motion is no truth.
     """
 
     def __init__(self, env: Environment, kernel: str, interpreted: Callable[..., None], block: int, motion: bool):
+        if not isinstance(motion, bool):
+            raise ParameterError(f"{env}: motion is {motion!r}; expected True or False")
         self.env, self._block = env, block
-        self.motion = bool(motion) and env.has_motion
+        self.motion = motion and env.has_motion
         self.layers: dict[str, Layer] = {**env.layers, **(env.motion_layers if self.motion else {})}
         try:
             self.rows, self.columns = env.grid()
