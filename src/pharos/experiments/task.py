@@ -1,9 +1,12 @@
 """A task: an environment with chance, an observation, and the setting in which values and returns are measured."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from typing import Any
+
+import numpy as np
 
 from pharos.environments import Environment, make
 from pharos.errors import ParameterError
@@ -13,6 +16,8 @@ from pharos.mdp import TabularMDP
 from pharos.policies import Sight
 from pharos.solvers import Solution, uniform_value, value_iteration, worst_value
 from pharos.state_space import StateSpace, build
+
+TAIL = 1e-9  # part of a discounted return that is not looked at
 
 
 @dataclass(frozen=True)
@@ -186,10 +191,12 @@ class Task:
 
     @cached_property
     def _solved_return_range(self) -> tuple[float, float]:
+        plain = self._episodes(self._mdp_without_chance)
+        if not plain.dynamics.is_deterministic:
+            return _range_of_returns(plain)
         if not self.chance and len(self.mdp.start_states) == 1:
             reference = self.reference
             return reference.worst - reference.error_bound, reference.optimal + reference.error_bound
-        plain = self._episodes(self._mdp_without_chance)
         low, high = worst_value(plain), value_iteration(plain)
         starts = plain.start_states
         return float(low.v[starts].min() - low.error_bound), float(high.v[starts].max() + high.error_bound)
@@ -197,3 +204,26 @@ class Task:
     def _episodes(self, mdp: TabularMDP) -> TabularMDP:
         """The states that an episode can meet: of a Freeway of a million, some thousand."""
         return mdp if self.horizon_steps is None else mdp.within(self.horizon_steps)
+
+
+def _range_of_returns(mdp: TabularMDP) -> tuple[float, float]:
+    """The lowest and the highest return of an episode, whichever outcomes are drawn; each pays what its action pays on
+    average, as episodes on a table do.
+    """
+    largest = max(abs(mdp.reward_table.lowest), abs(mdp.reward_table.highest))
+    steps, rest = mdp.horizon, 0.0
+    if steps is None:  # what is left out of a discounted return is less than rest
+        steps = max(1, math.ceil(math.log(TAIL) / math.log(mdp.gamma))) if mdp.gamma > 0 else 1
+        rest = largest * mdp.gamma**steps / (1 - mdp.gamma)
+    rest += 1e-12 * largest * steps  # rounding
+    ends, rewards, terminal = [], mdp.rewards, np.asarray(mdp.terminal)
+    for extreme, best in ((mdp.dynamics.smallest, np.min), (mdp.dynamics.largest, np.max)):
+        x = np.zeros(mdp.num_states + 1)
+        for _ in range(steps):
+            before = x.copy()
+            x[:-1] = best(rewards + mdp.gamma * extreme(x), axis=1)
+            x[:-1][terminal] = 0.0
+            if (x == before).all():
+                break
+        ends.append(float(best(x[mdp.start_states])))
+    return ends[0] - rest, ends[1] + rest
