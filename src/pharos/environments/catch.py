@@ -22,7 +22,8 @@ class Catch(Environment):
     Source   bsuite catch; Mnih, Heess, Graves and Kavukcuoglu (2014), "Recurrent Models of Visual Attention".
 
     Attributes:
-        rows: at least 2. columns: at least 1.
+        rows: of the court; at least 2.
+        columns: of the court; at least 1.
     """
 
     rows: int = parameter(10, low=2, high=1000)

@@ -25,7 +25,8 @@ class MemoryChain(Environment):
     Source   bsuite memory_chain (memory_len: one bit; memory_size: several).
 
     Attributes:
-        memory_length: at least 1. num_bits: from 1 to 12.
+        memory_length: steps until the query; at least 1.
+        num_bits: bits to remember; from 1 to 12.
     """
 
     memory_length: int = parameter(10, low=1, high=100_000)
