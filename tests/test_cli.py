@@ -3,7 +3,6 @@
 import io
 import json
 import os
-import random
 import subprocess
 import sys
 
@@ -465,6 +464,6 @@ def test_a_build_with_chance_says_how_many_outcomes_there_are(pharos, tmp_path):
 def test_a_game_that_is_played_draws_the_outcomes_of_chance_in_the_rules(monkeypatch):
     game = Game(make("cliff_walking/4x12-slippery"), (3, 0))
     for u, state in ((0.2, (3, 0)), (0.5, (2, 0)), (0.9, (2, 1))):  # up: slips to the left, goes up, slips to the right
-        monkeypatch.setattr(random, "random", lambda u=u: u)
+        monkeypatch.setattr(game.rng, "random", lambda u=u: u)
         game.press("w")
         assert game.state == state

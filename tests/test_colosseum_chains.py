@@ -23,6 +23,8 @@ from naive_colosseum import (
 from pharos import TabularMDP, hardness
 from pharos.hardness.colosseum import colosseum_diameter
 
+pytestmark = pytest.mark.long  # with each class compiled
+
 # family, size, p_lazy, p_rand, start states -> printed
 EPISODIC = {
     ("DeepSea", 5, 0.0, 0.0, 1): 5.0,

@@ -191,7 +191,7 @@ def test_count_says_states_transitions_and_depth_and_keeps_nothing(folders, monk
     assert "2 states (0 terminal), 2 actions, 4 transitions, depth 1" in run("count", file).stdout
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_count_of_an_environment_uses_the_cache_or_leaves_nothing_there(monkeypatch, tmp_path):
     kept = json.loads(run("build", "simple_grid", "--json").stdout)
     counted = json.loads(run("count", "simple_grid", "--json").stdout)
@@ -204,7 +204,7 @@ def test_count_of_an_environment_uses_the_cache_or_leaves_nothing_there(monkeypa
     assert run("count", "simple_grid", "--max-states", 3).exit_code == 1
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_what_was_learnt_on_a_folder_is_evaluated_on_it(folders, tmp_path):
     words = ("train", folders["matrices"], "--steps", 200, "--interval", 200, "--out", tmp_path / "run", "--json")
     learnt = json.loads(run(*words).stdout)

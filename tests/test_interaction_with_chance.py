@@ -16,6 +16,8 @@ from chance_worlds import ChanceWorld
 from pharos.interaction import GymEnv, make_sb3_vec, make_vec
 from pharos.rules import InterpretedStepping
 
+pytestmark = pytest.mark.long  # with each class compiled
+
 WORLDS = {
     "blackjack": pharos.make("blackjack"),
     "taxi": pharos.make("taxi", size=3, rainy=True, fickle=True),

@@ -10,6 +10,8 @@ from pharos.environments.built_in import BUILT_IN
 from pharos.errors import ParameterError, RuleError
 from pharos.observations import observe
 
+pytestmark = pytest.mark.long  # with each class compiled
+
 # Name of an instance -> parameters: small ones
 SMALL = {
     "simple_grid/4x4-decoy": {},
