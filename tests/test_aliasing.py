@@ -13,6 +13,8 @@ from pharos.cli import app
 from pharos.errors import ParameterError
 from pharos.observations import aliasing, memoryless_loss, observation_classes, observe
 
+pytestmark = pytest.mark.long  # with each class compiled
+
 
 @pytest.fixture(scope="module")
 def breakout(tmp_path_factory):

@@ -80,7 +80,7 @@ def test_a_build_that_stops_again_and_again_ends_in_the_same_files(case, tmp_pat
     assert files_of(build(world, tmp_path / "space").folder) == expected
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_beyond_32_bit_indices_only_the_width_of_the_successors_changes(case, tmp_path, small_blocks, monkeypatch):
     world, expected = case
     narrow = json.loads(expected["manifest.json"])
@@ -98,7 +98,7 @@ def test_beyond_32_bit_indices_only_the_width_of_the_successors_changes(case, tm
     assert narrow["num_transitions"] == json.loads(files["manifest.json"])["num_transitions"]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_build_that_dies_at_any_step_ends_in_the_same_files(case, tmp_path, monkeypatch):
     world, expected = case
     monkeypatch.setattr(search, "CHUNK", 1024)
@@ -114,7 +114,7 @@ def test_a_build_that_dies_at_any_step_ends_in_the_same_files(case, tmp_path, mo
     assert 20 < call < 398
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_an_interrupt_at_any_line_loses_nothing(case, tmp_path, monkeypatch):
     world, expected = case
@@ -134,7 +134,7 @@ KINDS = ("building-successors.bin", "building-codes.bin", "building-palette.bin"
 FINAL = ("successors.bin", "codes.bin", "palette.bin", "offsets.bin", "manifest.json.tmp", "fsync", "rename")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("call", (1, 3, 8))
 @pytest.mark.parametrize("kind", (*KINDS, *FINAL))
 def test_a_full_disk_loses_nothing(kind, call, case, tmp_path, small_blocks, monkeypatch):
@@ -317,7 +317,7 @@ def survive(folder, which, mutations) -> None:
     print(right, wrong)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("which", FOLDERS)
 def test_mutants_never_end_the_process(which, tmp_path):
     code = f"import sys, pathlib; sys.path.insert(0, {str(Path(__file__).parent)!r}); import test_chance_files as t\n"

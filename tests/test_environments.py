@@ -34,7 +34,9 @@ SMALL = (  # beside them, spaces of at most 120 states
 ALL = pharos.list_environments()
 # Each class is compiled: the paper's four and one with chance by `make test`, the others by `make test-long`.
 COMPILED = [
-    pytest.param(name, marks=() if name.split("/")[0] in (*GRIDS, "freeway", "breakout", "taxi") else pytest.mark.long)
+    pytest.param(
+        name, marks=() if name.split("/")[0] in (*GRIDS, "freeway", "breakout", "cliff_walking") else pytest.mark.long
+    )
     for name in ALL
 ]
 

@@ -11,6 +11,8 @@ from pharos import TabularMDP, hardness
 from pharos.kernels import symmetry
 from without_end import without_end
 
+pytestmark = pytest.mark.long  # with each class compiled
+
 
 @st.composite
 def covers(draw):
