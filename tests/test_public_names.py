@@ -25,6 +25,7 @@ HEAVY = ("numba", "scipy", "pandas", "matplotlib", "torch", "rich", "typer", "st
 ORDER = (
     *(
         "errors",
+        "lazy",
         "paths",
         "wording",
         "storage",

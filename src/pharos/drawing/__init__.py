@@ -3,8 +3,9 @@
 A file is loaded when something in it is first used.
 """
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from pharos import lazy
 
 if TYPE_CHECKING:
     from pharos.drawing.pictures import INK, NIGHT, episode, human, image, save_gif, save_png
@@ -68,10 +69,4 @@ __all__ = [
     "tile",
 ]
 
-
-def __getattr__(name: str) -> Any:
-    if name not in _FILES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(importlib.import_module(f"{__name__}.{_FILES[name]}"), name)
-    globals()[name] = value
-    return value
+__getattr__ = lazy.attributes(__name__, _FILES)

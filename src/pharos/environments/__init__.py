@@ -3,9 +3,9 @@
 `import pharos` needs the names of the built-in classes alone; a file is loaded when something in it is first used.
 """
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from pharos import lazy
 from pharos.environments.built_in import BUILT_IN, BuiltIn, on_registration
 
 if TYPE_CHECKING:
@@ -151,10 +151,4 @@ __all__ = [
     "start_distribution",
 ]
 
-
-def __getattr__(name: str) -> Any:
-    if name not in _FILES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(importlib.import_module(f"{__name__}.{_FILES[name]}"), name)
-    globals()[name] = value
-    return value
+__getattr__ = lazy.attributes(__name__, _FILES)

@@ -3,8 +3,9 @@
 `import pharos` needs `registration` alone, so that everything else is loaded when it is first used.
 """
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from pharos import lazy
 
 if TYPE_CHECKING:
     from pharos.interaction.gym_env import GymEnv
@@ -39,8 +40,4 @@ __all__ = [
     "split_options",
 ]
 
-
-def __getattr__(name: str) -> Any:
-    if name not in _FILES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(f"{__name__}.{_FILES[name]}"), name)
+__getattr__ = lazy.attributes(__name__, _FILES)

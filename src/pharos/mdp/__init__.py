@@ -3,8 +3,9 @@
 A file is loaded when something in it is first used: to step an environment needs `Chance` and no table.
 """
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from pharos import lazy
 
 if TYPE_CHECKING:
     from pharos.mdp.arguments import takes_mdp
@@ -71,10 +72,4 @@ __all__ = [
     "takes_mdp",
 ]
 
-
-def __getattr__(name: str) -> Any:
-    if name not in _FILES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(importlib.import_module(f"{__name__}.{_FILES[name]}"), name)
-    globals()[name] = value
-    return value
+__getattr__ = lazy.attributes(__name__, _FILES)

@@ -4,9 +4,9 @@
 states. Images are loaded when they are first asked for.
 """
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from pharos import lazy
 from pharos.observations.blocks import in_blocks
 from pharos.observations.context import NO_ACTION, ObservationInContext
 from pharos.observations.observation import FunctionObservation, Observation, names, observe, register, title
@@ -68,10 +68,4 @@ __all__ = [
     "title",
 ]
 
-
-def __getattr__(name: str) -> Any:
-    if name not in _FILES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(importlib.import_module(f"{__name__}.{_FILES[name]}"), name)
-    globals()[name] = value
-    return value
+__getattr__ = lazy.attributes(__name__, _FILES)

@@ -3,8 +3,9 @@
 Only what loads no Numba is imported at once; the rest is when it is asked for.
 """
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from pharos import lazy
 from pharos.rules.fingerprint import fingerprint_of_rules
 from pharos.rules.layout import Layout, layout_of, pack, unpack
 
@@ -44,12 +45,4 @@ __all__ = [
     "unpack",
 ]
 
-
-def __getattr__(name: str) -> Any:
-    if name not in _LAZY:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from importlib import import_module
-
-    value = getattr(import_module(f"pharos.rules.{_LAZY[name]}"), name)
-    globals()[name] = value
-    return value
+__getattr__ = lazy.attributes(__name__, _LAZY)
