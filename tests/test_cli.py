@@ -3,6 +3,7 @@
 import io
 import json
 import os
+import re
 import subprocess
 import sys
 
@@ -467,3 +468,15 @@ def test_a_game_that_is_played_draws_the_outcomes_of_chance_in_the_rules(monkeyp
         monkeypatch.setattr(game.rng, "random", lambda u=u: u)
         game.press("w")
         assert game.state == state
+
+
+@pytest.mark.parametrize("verb", ["solve", "hardness"])
+def test_a_world_with_chance_is_not_said_to_have_none(pharos, verb):
+    words = [verb, "frozen_lake/4x4", *(["--measures", "minimal_gap"] if verb == "hardness" else [])]
+    plain, own, both = (
+        " ".join(pharos(*words, *more).stdout.split())
+        for more in ([], ["slippery=true"], ["slippery=true", "--random", 0.1])
+    )
+    assert re.search("chance:? none", plain)
+    assert re.search("chance:? of the world", own)
+    assert re.search("chance:? of the world, random actions 0.1", both)

@@ -332,9 +332,14 @@ def print_facts(title: str, facts: Sequence[tuple[str, object]]) -> None:
     to.print(table)
 
 
-def describe_chance(sticky: float, random: float) -> str:
-    """Chance in words."""
-    parts = [f"sticky actions {sticky:g}"] * bool(sticky) + [f"random actions {random:g}"] * bool(random)
+def describe_chance(sticky: float, random: float, of_the_world: bool = False) -> str:
+    """Chance in words.
+
+    Args:
+        of_the_world: whether executing an action may have several outcomes itself.
+    """
+    parts = ["of the world"] * of_the_world
+    parts += [f"sticky actions {sticky:g}"] * bool(sticky) + [f"random actions {random:g}"] * bool(random)
     return ", ".join(parts) or "none"
 
 

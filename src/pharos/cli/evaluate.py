@@ -104,7 +104,7 @@ def evaluate(
             ("optimal, uniform, worst", f"{best:.8g}, {uniform:.8g}, {worst:.8g}"),
             ("error at most", f"{max(each.error_bound for each in values.values()):.2g}"),
             ("discount", describe_discount(mdp.gamma, mdp.horizon)),
-            ("chance", describe_chance(sticky, random)),
+            ("chance", describe_chance(sticky, random, not mdp.dynamics.is_deterministic)),
         ],
     )
 

@@ -101,7 +101,8 @@ def hardness(
     elif latex:
         print(report.to_latex())
     else:
-        _print(" ".join((target, *(parameters or ()))), report, describe_chance(sticky, random), definitions)
+        chance = describe_chance(sticky, random, not mdp.dynamics.is_deterministic)
+        _print(" ".join((target, *(parameters or ()))), report, chance, definitions)
 
 
 def _print(title: str, report: Any, chance: str, definitions: bool) -> None:

@@ -190,7 +190,7 @@ def _print(title: str, space: "StateSpace", entries: list[dict[str, Any]], price
         "states that share one: terminal states count like others; where one acts: those that share one with another "
         "state, neither of them terminal",
         f"loses: optimal value at the start less that of the best deterministic policy without memory, discount "
-        f"{price.gamma:g}, chance: {describe_chance(0.0, price.random)}",
+        f"{price.gamma:g}, chance: {describe_chance(0.0, price.random, space.has_chance)}",
     ):
         to.print(note, style="dim", soft_wrap=True)
 

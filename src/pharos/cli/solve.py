@@ -86,7 +86,7 @@ def solve(
         ("uniform policy at the start", f"{uniform.value_at_start:.8g}"),
         ("error at most", f"{max(solution.error_bound, uniform.error_bound):.2g}"),
         ("discount", describe_discount(solution.gamma, solution.horizon)),
-        ("chance", describe_chance(sticky, random)),
+        ("chance", describe_chance(sticky, random, not mdp.dynamics.is_deterministic)),
         ("states", f"{mdp.num_states:,} x {many(mdp.num_actions, 'action')}"),
         ("sweeps", f"{solution.sweeps} in {solution.seconds:.2f} s"),
     ]

@@ -111,7 +111,7 @@ def train(
             {**result.result, "config": result.config, "seconds": result.seconds, "folder": out, "plot": picture}
         )
         return
-    facts = _facts(result, steps, describe_chance(sticky, random))
+    facts = _facts(result, steps, describe_chance(sticky, random, env.has_chance))
     if out is not None:
         facts += [("results", out), *([("plot", picture)] if picture else [])]
     print_facts(f"{agent} on {' '.join((target, *(parameters or ())))}, {result.config['observation']}", facts)
