@@ -165,18 +165,20 @@ class Taxi(Environment):
         return walls
 
     def probability(self, state, action, outcome):
-        slip, destination = outcome % 3 if self.rainy else 0, outcome // 3 if self.rainy else outcome
-        way = action
+        slip, destination = parts_of(self, outcome)
         chance = 1.0
+        way = action
         if self.rainy and action < PICK_UP and not is_stopped(self, state, action):
             way = turned(action, slip)
             chance = self.rainy_probability if slip == 0 else (1 - self.rainy_probability) / 2
         elif slip > 0:
             return 0.0
-        changes = len(self.landmark_rows) > 1 and state[UNDECIDED] == 1 and state[PASSENGER] == len(self.landmark_rows)
-        if changes and way < PICK_UP and not is_stopped(self, state, way):
-            others = len(self.landmark_rows) - 1
-            return chance * (1 - self.fickle_probability if destination == 0 else self.fickle_probability / others)
+        places = len(self.landmark_rows)
+        is_deciding = state[UNDECIDED] == 1 and state[PASSENGER] == places
+        if is_deciding and way < PICK_UP and not is_stopped(self, state, way):
+            return chance * (
+                1 - self.fickle_probability if destination == 0 else self.fickle_probability / (places - 1)
+            )
         return chance if destination == 0 else 0.0
 
     def transition(self, state, action, outcome, out):
@@ -191,7 +193,7 @@ class Taxi(Environment):
                     if is_at(self, state, place):
                         out[PASSENGER] = place
             return
-        slip, destination = outcome % 3 if self.rainy else 0, outcome // 3 if self.rainy else outcome
+        slip, destination = parts_of(self, outcome)
         if is_stopped(self, state, action):
             return
         way = turned(action, slip)
@@ -234,6 +236,13 @@ class Taxi(Environment):
     def draw_motion(self, state, planes):
         if state[PASSENGER] == len(self.landmark_rows):  # else the passenger may stand where the taxi is
             planes[0, state[ROW], 2 * state[COLUMN]] = 1
+
+
+def parts_of(self, outcome):
+    """Which way the rain turns a move (see `turned`), and how many destinations further the passenger wants to go."""
+    if self.rainy:
+        return outcome % 3, outcome // 3
+    return 0, outcome
 
 
 def is_at(self, state, place):
