@@ -25,6 +25,7 @@ def test_q_learning_learns_and_its_regret_is_exact():
     assert result["normalized_regret"] < 0.5 and result["final_regret"] < 0.1 * abs(result["value_optimal"])
 
 
+@pytest.mark.slow
 def test_policies_over_observations_are_worth_what_their_tables_are(task):
     policy = np.random.default_rng(0).dirichlet(np.ones(4), task.space.num_states)
     vectors = pharos.observe(task.env, "vector")(task.space.states())

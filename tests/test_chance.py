@@ -53,6 +53,7 @@ def assert_agrees(space: pharos.StateSpace, env) -> None:
     np.testing.assert_allclose(mdp.rewards, R, rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.slow
 @settings(max_examples=25, deadline=None)
 @given(env=chance_worlds())
 def test_build_agrees_with_a_plain_enumeration_on_random_worlds(env, tmp_path_factory):
@@ -84,12 +85,14 @@ def test_files_do_not_depend_on_threads_or_blocks(tmp_path, undisturbed, small_b
     assert files_of(folder) == undisturbed
 
 
+@pytest.mark.slow
 def test_files_do_not_depend_on_where_the_table_is(tmp_path, undisturbed, small_blocks, monkeypatch):
     monkeypatch.setattr(table.MemoryTable, "fits", lambda *_: False)
     folder = build(WORLD, tmp_path / "space", workers=2, checkpoint_seconds=0.0).folder
     assert files_of(folder) == undisturbed
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("traced", (True, False))
 def test_files_do_not_depend_on_the_engine(traced, tmp_path, undisturbed, monkeypatch):
     monkeypatch.setattr(rules, "compiled_or_none", lambda *_: None)
@@ -245,6 +248,7 @@ def test_ages_are_those_of_the_rule(tmp_path, monkeypatch):
         build(pharos.make("frozen_lake/4x4"), tmp_path / "lake").ages  # noqa: B018
 
 
+@pytest.mark.slow
 def test_the_mdp_of_a_class_with_an_age_is_solved_in_one_pass(tmp_path):
     space = build(Dice(), tmp_path / "space")
     mdp = space.mdp(gamma=0.9)

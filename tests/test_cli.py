@@ -454,6 +454,7 @@ def test_help_and_list_load_nothing_heavy(words):
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.slow
 def test_a_build_with_chance_says_how_many_outcomes_there_are(pharos, tmp_path):
     done = pharos("build", "frozen_lake", "slippery=true", "--out", str(tmp_path / "space"))
     assert done.exit_code == 0, done.stderr
@@ -470,6 +471,7 @@ def test_a_game_that_is_played_draws_the_outcomes_of_chance_in_the_rules(monkeyp
         assert game.state == state
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("verb", ["solve", "hardness"])
 def test_a_world_with_chance_is_not_said_to_have_none(pharos, verb):
     words = [verb, "frozen_lake/4x4", *(["--measures", "minimal_gap"] if verb == "hardness" else [])]

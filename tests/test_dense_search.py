@@ -2,6 +2,7 @@
 eccentricities."""
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -25,6 +26,7 @@ def graphs(draw):
     return Graph.of(mdp, restart), distances(mdp, restart=restart)
 
 
+@pytest.mark.slow
 @given(graphs())
 @settings(max_examples=60, deadline=None)
 def test_the_largest_distance_to_each_source_is_found(drawn):
@@ -54,6 +56,7 @@ def test_bounds_that_follow_along_edges_hold_and_are_the_least_of_all_paths(draw
         np.testing.assert_array_equal(found, np.where(np.isfinite(expected), expected, unknown).astype(graph.dtype))
 
 
+@pytest.mark.slow
 @given(graphs(), st.integers(1, 20))
 @settings(max_examples=50, deadline=None)
 def test_nodes_that_are_spread_out_are_no_successors_of_those_before(drawn, limit):
@@ -70,6 +73,7 @@ def test_nodes_that_are_spread_out_are_no_successors_of_those_before(drawn, limi
     assert counted[: len(graph.ends)][~graph.ends].tolist() == np.array(num_successors)[~graph.ends].tolist()
 
 
+@pytest.mark.slow
 def test_the_diameter_of_a_small_tray_is_the_largest_of_all_distances():
     space = pharos.build(pharos.make("sliding_tiles/2x3"), progress=False)
     mdp = space.mdp(gamma=0.9)

@@ -75,6 +75,7 @@ def test_each_form_of_a_table_is_the_same_environment(folders):
             assert reached[0] == pytest.approx(reached[1], abs=1e-12)
 
 
+@pytest.mark.slow
 def test_built_spaces_have_the_values_of_the_table(folders):
     mdp = in_every_form()["matrices"]
     space = pharos.build(pharos.make(str(folders["matrices"])), progress=False)

@@ -57,6 +57,7 @@ def test_impossible_outcomes_are_left_out_wherever_they_stand():
     assert one.successors_of(np.array([1])).tolist() == [0]
 
 
+@pytest.mark.slow
 def test_a_table_of_single_outcomes_is_deterministic():
     one = TabularMDP.from_outcomes([[[1, 0]], [[-1, 0]]], [[[1.0, 0.0]], [[1.0, 0.0]]], [[1.0], [2.0]], gamma=0.5)
     assert one.is_deterministic
@@ -108,6 +109,7 @@ def test_an_outcome_table_takes_a_palette_or_probabilities():
         OutcomeTable(np.zeros((1, 1, 1), np.int32), 1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("ragged", "palette", "width"), LAYOUTS.values(), ids=LAYOUTS)
 def test_next_states_are_drawn_as_often_as_they_are_probable(ragged, palette, width):
     rows = [[(1, 0.5), (0, 0.25), (-1, 0.25)], [(1, 1.0)], [(0, 1.0)], [(1, 0.5), (1, 0.5)]]

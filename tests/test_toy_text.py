@@ -86,6 +86,7 @@ def summed(row):
     return dict(sums)
 
 
+@pytest.mark.slow
 def test_cliff_walking_takes_thirteen_steps_along_the_edge():
     """Sutton and Barto (2018), example 6.6: the optimal path is worth -13 without discount."""
     space = pharos.build("cliff_walking", progress=False)
@@ -104,11 +105,13 @@ def test_taxi_has_gymnasiums_table(rain):
     assert {theirs.encode(*state[:4]) for state in states} == set(np.flatnonzero(theirs.initial_state_distrib))
 
 
+@pytest.mark.slow
 def test_404_of_500_states_of_the_taxi_can_be_reached():
     space = pharos.build("taxi", progress=False)
     assert (space.num_states, space.num_terminal_states) == (404, 4)
 
 
+@pytest.mark.slow
 def test_fickle_passengers_are_those_of_gymnasium():
     """30 thousand of Gymnasium's games in the rain: after the first move with the passenger, the destinations."""
     theirs = gymnasium.make("Taxi-v4", is_rainy=True, fickle_passenger=True, fickle_probability=0.4).unwrapped
