@@ -46,6 +46,7 @@ TESTED_BY = {  # path in src/pharos: weight of its faults (kernels compile again
     "mdp/selection.py": (1.0, "test_dynamics test_solvers test_policies"),
     "mdp/rewards.py": (1.0, "test_mdp test_solvers"),
     "mdp/tabular.py": (1.0, "test_mdp test_natural_arguments test_dynamics"),
+    "mdp/tabular_arrays.py": (1.0, "test_mdp test_natural_arguments test_dynamics"),
     "solvers/fixed_point.py": (1.0, "test_error_bounds test_solvers"),
     "solvers/linear_systems.py": (1.0, "test_error_bounds test_solvers"),
     "solvers/policy_iteration.py": (1.0, "test_error_bounds test_solvers"),
@@ -64,6 +65,8 @@ TESTED_BY = {  # path in src/pharos: weight of its faults (kernels compile again
     "kernels/gaps.py": (0.5, "test_gaps"),
     "kernels/ties.py": (0.5, "test_gaps"),
     "kernels/graph.py": (0.2, "test_diameter test_dynamics"),
+    "kernels/many_searches.py": (0.2, "test_diameter"),
+    "kernels/clocks.py": (0.2, "test_diameter"),
     "kernels/hitting.py": (0.3, "test_stochastic_diameter"),
     "kernels/paths.py": (0.5, "test_dynamics test_chain_measures"),
 }

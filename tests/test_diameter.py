@@ -11,7 +11,7 @@ from naive_hardness import distances
 from pharos import TabularMDP, hardness, random_actions
 from pharos.errors import ParameterError
 from pharos.hardness.sum_sweep import Graph
-from pharos.kernels import graph
+from pharos.kernels import clocks
 
 
 @st.composite
@@ -182,7 +182,7 @@ def test_a_clock_with_layers_of_many_words_is_followed():
 
 def test_following_a_clock_may_read_each_entry_of_the_table_200_times(monkeypatch):
     limits = []
-    monkeypatch.setattr(graph, "last_gap", lambda *arguments: limits.append(arguments[-1]) or (-3, 0))
+    monkeypatch.setattr(clocks, "last_gap", lambda *arguments: limits.append(arguments[-1]) or (-3, 0))
     mdp = clocked(30, 9, np.zeros((30, 9), bool))
     hardness.diameter(mdp)
     assert limits == [200 * mdp.next_states.size + 10**8]

@@ -92,7 +92,6 @@ def start_eccentricity(
 
 
 @takes_mdp
-@takes_mdp
 def start_eccentricity_interval(
     mdp: TabularMDP, *, restart: bool = True, tolerance: float = 1e-6, budget: Budget | float | None = None
 ) -> Interval:

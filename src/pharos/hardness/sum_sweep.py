@@ -10,13 +10,15 @@ import numpy as np
 
 from pharos.hardness.interval import Interval, Spending
 from pharos.hardness.orbits import orbits
-from pharos.kernels import dense_search, graph
+from pharos.kernels import clocks, dense_search, graph, many_searches
 from pharos.mdp import TabularMDP
 from pharos.wording import many
 
 # Untyped, as starred arguments of compiled functions are not checked.
 kernels: Any = graph
+clock: Any = clocks
 dense: Any = dense_search
+searches: Any = many_searches
 # Nodes of a layer beyond which layers are not narrow: a set of them no longer fits into a core's cache.
 _WIDE = 1024
 # Widths of searches from many nodes, in words of 64 sources: eight words are a cache line.
@@ -242,11 +244,11 @@ class SumSweep:
         bits = [np.zeros((graph.num_nodes, words), np.uint64) for _ in range(3)]
         scratch = (graph.queue, np.empty_like(graph.queue))
         if outward:
-            _, reads = kernels.search_forward_from_many(
+            _, reads = searches.search_forward_from_many(
                 graph.next_states, graph.ends, graph.start, sources, *bits, *scratch, largest
             )
         else:
-            _, reads = kernels.search_backward_from_many(
+            _, reads = searches.search_backward_from_many(
                 *graph.backward, graph.start, sources, *bits, *scratch, largest
             )
         upper[nodes] = lower[nodes] = largest
@@ -320,7 +322,7 @@ class SumSweep:
         graph = self.graph
         if graph.num_nodes < 64:
             return ""
-        cycle = int(kernels.period(graph.next_states, graph.ends, graph.start, self.away, graph.has_end))
+        cycle = int(clock.period(graph.next_states, graph.ends, graph.start, self.away, graph.has_end))
         if cycle < 8:
             return ""
         layer = self.away % cycle
@@ -334,7 +336,7 @@ class SumSweep:
         position[order] = np.arange(graph.num_nodes) - np.repeat(layer_first[:-1], widths)
         scratch = [np.empty((widest, -(-widest // 64)), np.uint64) for _ in range(2)]
         max_reads = 200 * graph.num_nodes * graph.next_states.shape[1] + 10**8
-        gap, _ = kernels.last_gap(
+        gap, _ = clock.last_gap(
             graph.next_states, graph.ends, graph.start, order, layer_first, position, *scratch, max_reads
         )
         if gap == -2:
@@ -356,7 +358,7 @@ def _infinite_diameter(graph: Graph, spending: Spending, conventions: dict[str, 
         sources = np.arange(done, min(done + 64 * words, size), dtype=graph.dtype)
         bits[0][:] = 0
         largest = np.empty(len(sources), np.int64)
-        pairs, _ = kernels.search_forward_from_many(
+        pairs, _ = searches.search_forward_from_many(
             graph.next_states, graph.ends, graph.start, sources, *bits, *scratch, largest
         )
         reached += int(pairs)

@@ -5,6 +5,7 @@ The package announces its files; each is loaded where it is used, and loads Numb
 
 __all__ = [
     "bellman",
+    "clocks",
     "dense_search",
     "disk_table",
     "elimination",
@@ -14,6 +15,7 @@ __all__ = [
     "hitting",
     "horizon",
     "learning",
+    "many_searches",
     "observation_kernels",
     "occupancy",
     "outcomes",

@@ -44,12 +44,8 @@ def dense_search_backward(next_states, ends, start, sources, seen, front, coming
             is_end = v == num_states or ends[v]
             heard = False
             for a in range(1 if is_end else num_actions):
-                u = start if is_end else next_states[v, a]
-                if u < 0:
-                    if is_end:
-                        continue
-                    u = num_states
-                if active[u]:
+                u = _successor(next_states, start, v, a, is_end)
+                if u >= 0 and active[u]:
                     reads += 1
                     if heard:
                         for w in range(WORDS):
@@ -124,11 +120,9 @@ def lower_along_edges(next_states, ends, start, in_upper, out_upper):
     for u in range(len(in_upper)):
         is_end = u == num_states or ends[u]
         for a in range(1 if is_end else num_actions):
-            v = start if is_end else next_states[u, a]
+            v = _successor(next_states, start, u, a, is_end)
             if v < 0:
-                if is_end:
-                    continue
-                v = num_states
+                continue
             if in_upper[v] - 1 > in_upper[u]:
                 in_upper[v] = in_upper[u] + 1
                 lowered = True
@@ -136,3 +130,12 @@ def lower_along_edges(next_states, ends, start, in_upper, out_upper):
                 out_upper[u] = out_upper[v] + 1
                 lowered = True
     return lowered
+
+
+@njit(cache=True, nogil=True)
+def _successor(next_states, start, v, a, is_end):
+    """The node that v leads to by a; -1 where that is an end which leads nowhere."""
+    if is_end:
+        return start
+    u = np.int64(next_states[v, a])
+    return u if u >= 0 else len(next_states)

@@ -1,6 +1,5 @@
 """TabularMDP: next states, rewards, discount, start distribution, and chance that stays implicit."""
 
-import math
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +13,15 @@ from pharos.mdp.outcome_arrays import checked_outcomes, compact_outcomes
 from pharos.mdp.outcome_table import OutcomeTable
 from pharos.mdp.rewards import Rewards
 from pharos.mdp.table import Table
+from pharos.mdp.tabular_arrays import (
+    check_gamma,
+    check_horizon,
+    checked_next_states,
+    mean_rewards,
+    rewards_of_shape,
+    start_of,
+    terminal_states,
+)
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
@@ -54,8 +62,8 @@ class TabularMDP:
     age: np.ndarray | None = None
 
     def __post_init__(self) -> None:
-        _check_gamma(self.gamma)
-        _check_horizon(self.horizon)
+        check_gamma(self.gamma)
+        check_horizon(self.horizon)
 
     # Making one -----------------------------------------------------------------------------------------------------
 
@@ -83,27 +91,13 @@ class TabularMDP:
             ParameterError: a shape, an index, a reward, gamma or the start distribution is wrong; the first such entry
                 is named.
         """
-        table = np.asarray(next_states)
-        if table.ndim != 2 or table.size == 0 or table.dtype.kind not in "iu":
-            raise ParameterError(
-                f"next_states has shape {table.shape} and type {table.dtype}; expected integers of shape "
-                "(states, actions)"
-            )
-        outside = (table < -1) | (table >= len(table))
-        if outside.any():
-            s, a = map(int, np.argwhere(outside)[0])
-            raise ParameterError(
-                f"next_states[{s}, {a}] is {table[s, a]}; expected a state from 0 to {len(table) - 1}, or -1 "
-                "for the end"
-            )
-        reward_table = _rewards_of_shape(rewards, table.shape)
-        dtype = np.int32 if len(table) < 2**31 else np.int64
-        table = np.ascontiguousarray(table, dtype)
+        table = checked_next_states(next_states)
+        reward_table = rewards_of_shape(rewards, table.shape)
         silent = (reward_table.array == 0).all(axis=1)
-        own = np.arange(len(table), dtype=dtype)[:, None]
+        own = np.arange(len(table), dtype=table.dtype)[:, None]
         stays = ((table == own) | (table == -1)).all(axis=1)
-        mask = _terminal(terminal, (table == -1).all(axis=1) & silent, stays & silent)
-        states, probabilities = _start(initial, len(table))
+        mask = terminal_states(terminal, (table == -1).all(axis=1) & silent, stays & silent)
+        states, probabilities = start_of(initial, len(table))
         return TabularMDP(Table(table), reward_table, mask, gamma, horizon, states, probabilities)
 
     @staticmethod
@@ -131,7 +125,7 @@ class TabularMDP:
         table, chances = checked_outcomes(successors, probabilities)
         paid = np.asarray(rewards, np.float64)
         if paid.shape == table.shape:
-            paid = _mean_rewards(paid, chances)
+            paid = mean_rewards(paid, chances)
         elif paid.shape != table.shape[:2]:
             raise ParameterError(
                 f"rewards have shape {paid.shape}; expected {table.shape[:2]}, one for each state and action, or "
@@ -158,11 +152,11 @@ class TabularMDP:
     ) -> "TabularMDP":
         """As `from_outcomes`, on a table of outcomes that is there, with expected rewards (S, A)."""
         num_states = dynamics.num_states
-        reward_table = _rewards_of_shape(rewards, (num_states, dynamics.num_actions))
+        reward_table = rewards_of_shape(rewards, (num_states, dynamics.num_actions))
         silent = (reward_table.array == 0).all(axis=1)
         ends, stays = dynamics.ends_and_stays()
-        mask = _terminal(terminal, ends & silent, stays & silent)
-        states, probabilities = _start(initial, num_states)
+        mask = terminal_states(terminal, ends & silent, stays & silent)
+        states, probabilities = start_of(initial, num_states)
         return TabularMDP(dynamics, reward_table, mask, gamma, horizon, states, probabilities)
 
     @staticmethod
@@ -182,10 +176,10 @@ class TabularMDP:
         matrix, num_actions = transitions_of(P)
         dynamics = Matrices(matrix, num_actions)
         shape = (dynamics.num_states, num_actions)
-        reward_table = _rewards_of_shape(expected_rewards(P, R, *shape), shape)
+        reward_table = rewards_of_shape(expected_rewards(P, R, *shape), shape)
         ended = np.asarray(matrix.sum(axis=1)).reshape(shape) <= 1e-12
         terminal = ended.all(axis=1) & (reward_table.array == 0).all(axis=1)
-        states, probabilities = _start(initial, dynamics.num_states)
+        states, probabilities = start_of(initial, dynamics.num_states)
         return TabularMDP(dynamics, reward_table, terminal, gamma, horizon, states, probabilities)
 
     @staticmethod
@@ -332,7 +326,7 @@ class TabularMDP:
 
     def with_rewards(self, rewards: Any) -> "TabularMDP":
         """The same MDP with other rewards, (S, A); those of terminal states must be 0."""
-        table = _rewards_of_shape(rewards, self.reward_table.shape)
+        table = rewards_of_shape(rewards, self.reward_table.shape)
         paid = self.terminal[:, None] & (table.array != 0)
         if paid.any():
             s, a = map(int, np.argwhere(paid)[0])
@@ -341,7 +335,7 @@ class TabularMDP:
 
     def with_initial(self, initial: Any) -> "TabularMDP":
         """The same MDP with another start: a state, a sequence of states, or (S,) probabilities."""
-        states, probabilities = _start(initial, self.num_states)
+        states, probabilities = start_of(initial, self.num_states)
         return replace(self, start_states=states, start_probabilities=probabilities)
 
     def with_age(self, age: Any) -> "TabularMDP":
@@ -409,70 +403,3 @@ class TabularMDP:
         states, actions = ("s" * (number != 1) for number in (self.num_states, self.num_actions))
         size = f"{self.num_states} state{states}, {self.num_actions} action{actions}"
         return f"TabularMDP({kind}{size}, gamma={self.gamma}{horizon}{chance})"
-
-
-def _check_gamma(gamma: Any) -> None:
-    if not (isinstance(gamma, int | float | np.floating) and math.isfinite(gamma) and 0 <= gamma <= 1):
-        raise ParameterError(f"gamma is {gamma!r}; expected a number in [0, 1]")
-
-
-def _check_horizon(horizon: Any) -> None:
-    if horizon is not None and not (isinstance(horizon, int | np.integer) and horizon >= 1):
-        raise ParameterError(f"horizon is {horizon!r}; expected a whole number of steps, at least 1, or None")
-
-
-def _rewards_of_shape(rewards: Any, shape: tuple[int, ...]) -> Rewards:
-    array = np.asarray(rewards, np.float64)
-    if array.shape != shape:
-        raise ParameterError(f"rewards have shape {array.shape}; expected {shape}, one for each state and action")
-    return Rewards.from_array(array)
-
-
-def _mean_rewards(rewards: np.ndarray, probabilities: np.ndarray) -> np.ndarray:
-    """(S, A), from the rewards of outcomes (S, A, K); those of impossible ones may be anything."""
-    possible = probabilities > 0
-    wrong = possible & ~np.isfinite(rewards)
-    if wrong.any():
-        s, a, k = map(int, np.argwhere(wrong)[0])
-        raise ParameterError(
-            f"the reward of state {s}, action {a}, outcome {k} is {rewards[s, a, k]}; expected a finite number"
-        )
-    return (probabilities * np.where(possible, rewards, 0.0)).sum(axis=2)
-
-
-def _terminal(terminal: Any, default: np.ndarray, allowed: np.ndarray) -> np.ndarray:
-    """(S,) bool, the terminal states: those given, which must be among the allowed ones, or the default."""
-    if terminal is None:
-        return default
-    mask = np.asarray(terminal, np.bool_)
-    if mask.shape != allowed.shape or (mask & ~allowed).any():
-        raise ParameterError(
-            f"terminal has shape {mask.shape}; expected {allowed.shape}, true only where a state leads to itself (or "
-            "to -1) with reward 0 by every action"
-        )
-    return mask
-
-
-def _start(initial: Any, num_states: int) -> tuple[np.ndarray, np.ndarray]:
-    """Start states and their probabilities."""
-    start = np.asarray(initial)
-    if start.dtype.kind in "iu" and start.ndim == 0:
-        states, probabilities = start.reshape(1), np.ones(1)
-    elif start.dtype.kind in "iu" and start.ndim == 1 and len(start):
-        states, counts = np.unique(start, return_counts=True)
-        probabilities = counts / counts.sum()
-    elif start.dtype.kind == "f" and start.shape == (num_states,):
-        if not (np.isfinite(start).all() and (start >= 0).all() and abs(start.sum() - 1) < 1e-9):
-            raise ParameterError(f"initial sums to {start.sum()}; expected {num_states} probabilities that sum to 1")
-        states = np.flatnonzero(start)
-        probabilities = start[states]
-    else:
-        raise ParameterError(
-            f"initial has shape {start.shape} and type {start.dtype}; expected a state, several states, or "
-            f"({num_states},) probabilities"
-        )
-    if (states < 0).any() or (states >= num_states).any():
-        raise ParameterError(
-            f"initial names state {states[(states < 0) | (states >= num_states)][0]}; expected 0 to {num_states - 1}"
-        )
-    return states.astype(np.int64), np.asarray(probabilities, np.float64)
