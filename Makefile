@@ -4,8 +4,9 @@ BIN := .venv/bin
 
 .PHONY: quickstart test test-fast test-long lint clean
 
-.venv/.ok: pyproject.toml constraints.txt
+.venv/.ok: pyproject.toml setup.py constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
+	$(BIN)/python -m pip uninstall -q -y pharos 2>/dev/null  # the name of this distribution before it was pharos-rl
 	$(BIN)/python -m pip install -q -e ".[dev]" -c constraints.txt
 	@touch $@
 

@@ -25,6 +25,7 @@ HEAVY = ("numba", "scipy", "pandas", "matplotlib", "torch", "rich", "typer", "st
 ORDER = (
     *(
         "errors",
+        "installation",
         "lazy",
         "paths",
         "wording",

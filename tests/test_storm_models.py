@@ -24,7 +24,7 @@ def run(*words):
 
 @pytest.mark.skipif(models is not None, reason="stormpy is installed")
 def test_without_storm_the_extra_is_named(tmp_path):
-    with pytest.raises(MissingExtra, match=r"pip install 'pharos\[storm\]'"):
+    with pytest.raises(MissingExtra, match=r"pip install 'pharos-rl\[storm\]'"):
         importers.storm(tmp_path / "model.nm")
     done = run("import", "prism", tmp_path / "model.nm", "--out", tmp_path / "out")
     assert done.exit_code == 1 and len(done.stderr.strip().splitlines()) == 1

@@ -104,6 +104,6 @@ def test_on_ray_every_run_is_one_task_and_lost_ones_have_failed(tmp_path, undist
 
 def test_without_ray_the_message_names_the_extra(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
-    with pytest.raises(MissingExtra, match=r"pip install 'pharos\[ray\]'"):
+    with pytest.raises(MissingExtra, match=r"pip install 'pharos-rl\[ray\]'"):
         study.run_on_ray(SPECIFICATION, tmp_path)
     assert not os.listdir(tmp_path)

@@ -12,9 +12,14 @@ once, so that its registry knows the environments.
 """
 
 import importlib
+import warnings as _warnings
 from typing import Any
 
+from pharos.installation import conflict as _conflict
 from pharos.interaction import registration as _registration  # noqa: F401  (Gymnasium's registry)
+
+if _conflict() is not None:
+    _warnings.warn(str(_conflict()), stacklevel=2)
 
 __version__ = "0.1.0"
 

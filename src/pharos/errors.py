@@ -109,4 +109,10 @@ class MissingExtra(PharosError, ImportError):
     """An optional dependency is missing; the message names the extra that brings it."""
 
     def __init__(self, purpose: str, package: str, extra: str):
-        super().__init__(f"{purpose} needs {package}; install it with: pip install 'pharos[{extra}]'")
+        hint = f"pip install 'pharos-rl[{extra}]'"
+        if extra == "agents":
+            hint += (
+                " (on Linux that brings PyTorch for CUDA, several GB; for the small one, of CPUs alone, first: "
+                "pip install torch --index-url https://download.pytorch.org/whl/cpu)"
+            )
+        super().__init__(f"{purpose} needs {package}; install it with: {hint}")

@@ -1,7 +1,7 @@
 """Hyperparameters for every agent, class of environments and observation, in RL Zoo's convention.
 
-hyperparameters.yaml has those of each agent; a class of environments declares what suits it better
-(`Environment.hyperparameters`). A table of one's own holds both.
+defaults.py has those of each agent; a class of environments declares what suits it better
+(`Environment.hyperparameters`). A table of one's own, in YAML, holds both.
 """
 
 from collections.abc import Mapping
@@ -9,10 +9,9 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from pharos.agents.defaults import DEFAULTS
 from pharos.environments import class_called
 from pharos.errors import MissingExtra, ParameterError
-
-TABLE = Path(__file__).with_name("hyperparameters.yaml")
 
 
 def hyperparameters(
@@ -25,13 +24,18 @@ def hyperparameters(
         table: a YAML that says all of it (agent, then "default" or the class, then "default" or the observation), such
             as one that `pharos tune` wrote; None for what pharos and the class declare.
     Raises:
-        ParameterError: the table has another form. MissingExtra: PyYAML is not installed.
+        ParameterError: the table has another form. MissingExtra: a table is given, and PyYAML is not installed.
     """
-    entries = _read(table or TABLE).get(agent, {})
-    declaring = None if table else class_called(environment)
-    by_observation = declaring.hyperparameters.get(agent, {}) if declaring else entries.get(environment, {})
+    by_observation: Mapping[str, Any]
+    if table is None:
+        declaring = class_called(environment)
+        default = DEFAULTS.get(agent)
+        by_observation = declaring.hyperparameters.get(agent, {}) if declaring else {}
+    else:
+        entries = _read(table).get(agent, {})
+        default, by_observation = entries.get("default"), entries.get(environment, {})
     result: dict[str, Any] = {}
-    for part in (entries.get("default"), by_observation.get("default"), by_observation.get(observation), given):
+    for part in (default, by_observation.get("default"), by_observation.get(observation), given):
         result.update(part or {})
     return result
 

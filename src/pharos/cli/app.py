@@ -30,6 +30,7 @@ from pharos.cli import (
 )
 from pharos.cli.common import complain
 from pharos.errors import DivergenceError, ParameterError, PharosError
+from pharos.installation import conflict
 
 EXIT_FAILED, EXIT_USAGE, EXIT_INTERRUPTED = 1, 2, 130
 
@@ -133,4 +134,7 @@ app.add_typer(cache.app, name="cache")
 def main() -> None:
     """Entry point of the `pharos` command."""
     warnings.showwarning = lambda message, *_, **__: complain(f"warning: {message}")
+    if not hasattr(sys.modules["pharos"], "make") and (wrong := conflict()):  # the __init__.py is the other project's
+        complain(wrong)
+        sys.exit(EXIT_FAILED)
     app()

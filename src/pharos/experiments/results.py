@@ -1,24 +1,30 @@
 """The result of a run on disk: run.json and curve.parquet, each written whole or not at all, with digests.
 
+Where pyarrow is not installed the curve is text: curve.csv, with the same columns, values to the last bit and digest.
 Nothing is pickled.
 """
 
+import csv
+import importlib.util
+import io
 import os
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pharos import storage
-from pharos.errors import FileFormatError, MissingExtra, ResultCorrupted
+from pharos.errors import FileFormatError, ResultCorrupted
 from pharos.experiments.config import run_id
 
 if TYPE_CHECKING:
+    import numpy as np
     import pandas as pd
     import pyarrow as pa
 
 FORMAT = 1
 RECORD, CURVE, POLICY, AGENT = "run.json", "curve.parquet", "policy.npy", "agent"
+TEXT_CURVE = "curve.csv"
 AGAIN = "delete the folder and execute the run again"
 _ID = re.compile(r"[0-9a-f]{16}")
 COLUMNS = {
@@ -35,6 +41,8 @@ COLUMNS = {
     "error_bound": "float64",
 }
 """Columns of curve.parquet, a row for each evaluation. docs/agents.md defines them."""
+_TYPES: dict[str, Callable[[Any], Any]] = {"int64": int, "float64": float, "bool": bool}
+_TRUTHS = {"True": True, "False": False}
 
 
 def identifier(config: Mapping[str, Any]) -> str:
@@ -69,22 +77,32 @@ def write_record(folder: Path, record: Mapping[str, Any]) -> None:
     storage.replace_json(folder / RECORD, storage.sealed(record))
 
 
-def require_pyarrow() -> None:
-    """Raise MissingExtra where curves cannot be written, before a run begins."""
-    try:
-        import pyarrow  # noqa: F401
-    except ImportError as error:
-        raise MissingExtra("writing results", "pyarrow", "study") from error
-
-
 def write_curve(folder: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Replace curve.parquet in one step, with checksums of its pages; the same rows give the same bytes."""
-    require_pyarrow()
-    import pyarrow as pa
+    """Replace curve.parquet in one step, with checksums of its pages; the same rows give the same bytes.
 
-    schema = pa.schema([(name, pa.type_for_alias(dtype)) for name, dtype in COLUMNS.items()])
-    columns = [pa.array([row[name] for row in rows], schema.field(name).type) for name in COLUMNS]
-    write_table(folder / CURVE, pa.Table.from_arrays(columns, schema=schema))
+    Without pyarrow it is curve.csv, whose numbers are the shortest decimals that mean the same float64.
+    """
+    if _has_pyarrow():
+        import pyarrow as pa
+
+        schema = pa.schema([(name, pa.type_for_alias(dtype)) for name, dtype in COLUMNS.items()])
+        columns = [pa.array([row[name] for row in rows], schema.field(name).type) for name in COLUMNS]
+        write_table(folder / CURVE, pa.Table.from_arrays(columns, schema=schema))
+        (folder / TEXT_CURVE).unlink(missing_ok=True)
+        return
+    lines = io.StringIO(newline="")
+    writer = csv.writer(lines, lineterminator="\n")
+    writer.writerow(COLUMNS)
+    writer.writerows([repr(_TYPES[dtype](row[name])) for name, dtype in COLUMNS.items()] for row in rows)
+    storage.replace_file(folder / TEXT_CURVE, lines.getvalue())
+    (folder / CURVE).unlink(missing_ok=True)
+
+
+def _has_pyarrow() -> bool:
+    try:
+        return importlib.util.find_spec("pyarrow") is not None
+    except ValueError:  # its place in sys.modules is taken
+        return False
 
 
 def read_record(folder: str | os.PathLike) -> dict[str, Any]:
@@ -131,16 +149,63 @@ def read_curve_table(folder: str | os.PathLike, columns: Iterable[str] = tuple(C
         FileFormatError: there are none, or columns are missing. ResultCorrupted: the file was cut short or changed
         after it was written, or is that of another run.
     """
-    path = Path(folder) / CURVE
-    table = read_table(path)
+    path = _curve_file(Path(folder))
+    if path.name == TEXT_CURVE:
+        import pyarrow as pa
+
+        table = pa.table(_read_text(path))
+    else:
+        table = read_table(path)
     missing = [name for name in columns if name not in table.column_names]
     if missing:
         raise FileFormatError(f"{path}: lacks the columns {', '.join(missing)}")
-    if (path.parent / RECORD).exists():
-        expected = _expected_checksums(path.parent).get(CURVE)
-        if expected is not None and digest_of_curve(table) != expected:
-            raise ResultCorrupted(f"{path}: does not match its checksum in {RECORD}; {AGAIN}")
+    _check_digest(path, _columns_of(table))
     return table
+
+
+def read_rows(folder: str | os.PathLike) -> list[dict[str, Any]]:
+    """Return the evaluations of a run, a dictionary each, as `read_curve_table`; of curve.csv without pyarrow too."""
+    path = _curve_file(Path(folder))
+    if path.name == CURVE:
+        return read_curve_table(folder).to_pylist()
+    columns = _read_text(path)
+    _check_digest(path, columns)
+    values = (column.tolist() for column in columns.values())
+    return [dict(zip(columns, row, strict=True)) for row in zip(*values, strict=True)]
+
+
+def _curve_file(folder: Path) -> Path:
+    """The file that has the curve: curve.csv where only that is there."""
+    text = folder / TEXT_CURVE
+    return text if text.exists() and not (folder / CURVE).exists() else folder / CURVE
+
+
+def _read_text(path: Path) -> dict[str, "np.ndarray"]:
+    """Name -> values, of a curve.csv.
+
+    Raises:
+        ResultCorrupted: it was cut short or changed.
+    """
+    import numpy as np
+
+    read: dict[str, Callable[[str], Any]] = {"int64": int, "float64": float, "bool": _TRUTHS.__getitem__}
+    try:
+        with open(path, encoding="utf-8", newline="") as file:
+            head, *rows = csv.reader(file, strict=True)
+        return {
+            name: np.array([read[COLUMNS[name]](text) for text in column], COLUMNS[name])
+            for name, column in zip(head, zip(*rows, strict=True) if rows else [()] * len(head), strict=True)
+        }
+    except (OSError, ValueError, KeyError, csv.Error) as error:
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise ResultCorrupted(f"{path}: cannot be read, it was cut short or changed: {reason}; {AGAIN}") from None
+
+
+def _check_digest(path: Path, columns: Mapping[str, "np.ndarray"]) -> None:
+    if (path.parent / RECORD).exists():
+        expected = _expected_checksums(path.parent).get(path.name)
+        if expected is not None and _digest_of_columns(columns) != expected:
+            raise ResultCorrupted(f"{path}: does not match its checksum in {RECORD}; {AGAIN}")
 
 
 def check_agent(folder: Path) -> None:
@@ -150,7 +215,7 @@ def check_agent(folder: Path) -> None:
         ResultCorrupted: one is missing or was changed after it was written.
     """
     for name, expected in _expected_checksums(folder).items():
-        if name == CURVE:
+        if name in (CURVE, TEXT_CURVE):
             continue
         try:
             digest = storage.digest_of_file(folder / name)
@@ -192,13 +257,20 @@ def digest_of_curve(table: "pa.Table") -> str:
     For each column, by name: its name, type and number of rows, and its values as little-endian int64, float64 (NaN
     where there is none) or bytes of truth; of other types as JSON.
     """
+    return _digest_of_columns(_columns_of(table))
+
+
+def _columns_of(table: "pa.Table") -> dict[str, "np.ndarray"]:
+    return {name: table.column(name).to_numpy() for name in table.column_names}
+
+
+def _digest_of_columns(columns: Mapping[str, "np.ndarray"]) -> str:
     import numpy as np
     import xxhash
 
     digest = xxhash.xxh3_128()
-    for name in sorted(table.column_names):
-        values = table.column(name).to_numpy()
-        kind = values.dtype.kind
+    for name, values in sorted(columns.items()):
+        rows, kind = len(values), values.dtype.kind
         if kind == "f":
             values = np.where(np.isnan(values), np.nan, values).astype("<f8")
         elif kind in "iu":
@@ -206,16 +278,19 @@ def digest_of_curve(table: "pa.Table") -> str:
         elif kind == "b":
             values = values.astype("|u1")
         else:
-            text = storage.json_text(table.column(name).to_pylist())
+            text = storage.json_text(values.tolist())
             kind, values = "O", np.frombuffer(text.encode(), "|u1")
-        digest.update(f"{name}:{kind}:{table.num_rows}:".encode())
+        digest.update(f"{name}:{kind}:{rows}:".encode())
         digest.update(np.ascontiguousarray(values).data)
     return digest.hexdigest()
 
 
 def _checksums(folder: Path) -> dict[str, str]:
     """Checksums of the files of a finished run, by their names within its folder."""
-    checksums = {CURVE: digest_of_curve(read_table(folder / CURVE))} if (folder / CURVE).exists() else {}
+    checksums = {}
+    if (curve := _curve_file(folder)).exists():
+        columns = _read_text(curve) if curve.name == TEXT_CURVE else _columns_of(read_table(curve))
+        checksums[curve.name] = _digest_of_columns(columns)
     for path in (folder / POLICY, *sorted((folder / AGENT).rglob("*"))):
         if path.is_file():
             storage.sync(path)

@@ -1,7 +1,7 @@
 """Training an agent on a task, with the exact regret of its policy at chosen steps; what is done stays done.
 
     FOLDER/run.json         configuration, versions, status, result
-    FOLDER/curve.parquet    a row for each evaluation
+    FOLDER/curve.parquet    a row for each evaluation (curve.csv where pyarrow is not installed)
     FOLDER/checkpoint/      while it runs: what the next attempt goes on from; arrays, JSON and tensors, never code
 
 A run that is killed goes on from its last checkpoint when it is started again: at most the last interval between
@@ -87,7 +87,7 @@ def train(
         sticky, random: chance.
         gamma, horizon: setting of values and returns, see `Task`; the agent's own discount is a hyperparameter.
         evaluation_interval: steps between evaluations; None: a hundredth of `steps`.
-        hyperparameters: go before those of agents/hyperparameters.yaml; or a YAML file of the same form, such as one
+        hyperparameters: go before those of agents/defaults.py; or a YAML file of the same form, such as one
             that `tune` wrote.
         out: folder of the run; None: nothing is written. A finished run there is returned, an unfinished one resumed.
         tensorboard: write TensorBoard's logs into `out`/tensorboard (algorithms of Stable-Baselines3).
@@ -248,7 +248,6 @@ def _run(
         )
     began = time.perf_counter()
     if folder is not None:
-        _results.require_pyarrow()
         done = _finished(folder, config)
         if done is not None:
             return done
@@ -345,7 +344,7 @@ def _finished(folder: Path, config: RunConfig) -> TrainingResult | None:
             )
     if record.get("status") != "finished":
         return None
-    rows = _results.read_curve(folder).to_dict("records")
+    rows = _results.read_rows(folder)
     return TrainingResult(record["config"], record["result"], rows, None, folder, record["seconds"])
 
 

@@ -1,6 +1,6 @@
 """Tuning: hyperparameters for an agent on a class of environments, searched by Optuna's TPE sampler.
 
-    FOLDER/hyperparameters.yaml   the best ones, in the form of agents/hyperparameters.yaml
+    FOLDER/hyperparameters.yaml   the best ones, in the form that docs/agents.md describes
     FOLDER/tuning.json            what was searched, and every trial: hyperparameters, score, status, seconds
     FOLDER/journal.log            Optuna's own record, from which an interrupted search goes on
 

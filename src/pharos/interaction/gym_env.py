@@ -35,7 +35,7 @@ class GymEnv(SimulatedEnv, gymnasium.Env):
     Args:
         environment: a name that `pharos.make` knows, or an Environment.
         render_mode: None; "ansi", text; "rgb_array", the picture for people, (H, W, 3) uint8; or "human", a window with
-            that picture, drawn anew at each step, 15 a second at most (needs `pip install 'pharos[play]'`).
+            that picture, drawn anew at each step, 15 a second at most (needs `pip install 'pharos-rl[play]'`).
         options: see `Interaction`, and the parameters of the environment, such as `height=12`.
     Raises:
         ParameterError: an option or parameter is wrong. MissingExtra: render_mode is "human" and pygame is not

@@ -1,0 +1,100 @@
+"""What is published: one version, metadata, links that work on the index, and the other project of that name."""
+
+import importlib.util
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+import yaml
+
+import pharos
+from pharos import errors, installation
+
+ROOT = Path(__file__).parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+README = (ROOT / "README.md").read_text()
+
+
+def test_every_file_that_says_the_version_says_the_same():
+    assert "version" in PROJECT["dynamic"]
+    assert yaml.safe_load((ROOT / "CITATION.cff").read_text())["version"] == pharos.__version__
+    assert f'version = "{pharos.__version__}"' in (ROOT / "conda/meta.yaml").read_text()
+
+
+def test_the_conda_recipe_has_the_dependencies_of_the_core():
+    recipe = (ROOT / "conda/meta.yaml").read_text()
+    for requirement in PROJECT["dependencies"]:
+        name, bound = re.fullmatch(r"(\w+)(.*)", requirement).groups()
+        assert re.search(rf"- (python-)?{name} {re.escape(bound)}$", recipe, re.MULTILINE), requirement
+    assert f"python {PROJECT['requires-python']}" in recipe
+
+
+def test_extras_name_this_distribution():
+    own = [r for extra in PROJECT["optional-dependencies"].values() for r in extra if r.startswith("pharos")]
+    assert own and all(requirement.startswith("pharos-rl[") for requirement in own)
+
+
+def test_hints_name_the_extra_and_which_torch():
+    assert "pip install 'pharos-rl[study]'" in str(errors.MissingExtra("plotting", "matplotlib", "study"))
+    hint = str(errors.MissingExtra("the agent 'dqn'", "stable-baselines3", "agents"))
+    assert "CUDA" in hint and "pip install torch --index-url https://download.pytorch.org/whl/cpu" in hint
+    assert "\n" not in hint and "download.pytorch.org/whl/cpu" in README
+
+
+def test_the_index_shows_links_that_lead_somewhere():
+    spec = importlib.util.spec_from_file_location("description", ROOT / "setup.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    text = module.absolute(README, "https://host/project")
+    targets = re.findall(r"\]\(([^)\s]+)\)", text) + re.findall(r'src="([^"]+)"', text)
+    assert len(targets) > 20 and all(target.startswith(("https://", "#")) for target in targets)
+    assert "https://host/project/raw/main/docs/images/breakout.gif" in targets
+    assert "https://host/project/blob/main/docs/cli.md" in targets
+
+
+@pytest.mark.parametrize("folder", [".github/workflows", ".github/ISSUE_TEMPLATE"])
+def test_workflows_and_templates_are_yaml(folder):
+    files = sorted((ROOT / folder).glob("*.yml"))
+    assert files and all(isinstance(yaml.safe_load(file.read_text()), dict) for file in files)
+
+
+def test_the_source_distribution_leaves_nothing_out():
+    tracked = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True)
+    if tracked.returncode:
+        pytest.skip("not a checkout")
+    manifest = (ROOT / "MANIFEST.in").read_text().split()
+    always = {"MANIFEST.in", "README.md", "LICENSE", "pyproject.toml", "setup.py", "src"}
+    top = {line.split("/")[0] for line in tracked.stdout.splitlines()}
+    assert not top - set(manifest) - always
+
+
+def test_the_other_project_in_the_same_folder_is_told(tmp_path, monkeypatch):
+    assert installation.conflict() is None
+    (tmp_path / "__version__.py").write_text('__version__ = "0.2.0"\n')
+    wrong = installation.conflict(tmp_path)
+    assert "pip uninstall pharos pharos-rl; pip install pharos-rl" in wrong and "\n" not in wrong
+
+    monkeypatch.setattr(installation, "conflict", lambda folder=None: wrong)  # this one came last
+    spec = importlib.util.spec_from_file_location("came_last", pharos.__file__)
+    with pytest.warns(UserWarning, match="another project"):
+        spec.loader.exec_module(importlib.util.module_from_spec(spec))
+
+
+def test_the_command_tells_where_the_other_project_came_last(tmp_path):
+    code = """
+import importlib, sys, types
+from pathlib import Path
+sys.modules["pharos"] = other = types.ModuleType("pharos")
+other.__path__ = [FOLDER]
+from pharos import installation
+from pharos.cli import main
+importlib.import_module("pharos.cli.app").conflict = lambda: installation.conflict(Path(OTHER))
+main()
+""".replace("FOLDER", repr(str(Path(pharos.__file__).parent))).replace("OTHER", repr(str(tmp_path)))
+    (tmp_path / "__version__.py").touch()
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 1 and "another project" in done.stderr and done.stderr.count("\n") == 1, done.stderr
+    assert not done.stdout
