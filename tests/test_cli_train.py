@@ -39,3 +39,22 @@ def test_wrong_words_are_usage_errors(tmp_path):
     assert run("simple_grid", "--agent", "dqm").exit_code == 2
     assert run("simple_grid", "--set", "learning_rate").exit_code == 2
     assert run("simple_grid", "--steps", 0).exit_code == 2
+
+
+def test_many_seeds_leave_a_folder_each_and_one_table(tmp_path):
+    words = ("simple_grid/4x4-plain", "--steps", 2000, "--interval", 1000, "--out", tmp_path)
+    done = run(*words, "--seeds", "0:2,7", "--engine", "batched")
+    assert done.exit_code == 0, done.output
+    assert "q_learning on simple_grid/4x4-plain, 3 seeds" in done.stdout and "final regret" in done.stdout
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["seed-0", "seed-1", "seed-7"]
+    answer = json.loads(run(*words, "--seeds", "0,7", "--json").stdout)
+    assert [each["seed"] for each in answer["runs"]] == [0, 7] and answer["failed"] == {}
+    low, middle, high = answer["quartiles"]["final_regret"]
+    assert low <= middle <= high
+
+
+def test_wrong_seeds_and_engines_are_usage_errors():
+    for words in (("--seeds", "0:0"), ("--seeds", "1,1"), ("--seeds", "a"), ("--seeds", "0:2", "--seed", 3)):
+        assert run("simple_grid", *words).exit_code == 2
+    refused = run("simple_grid", "--agent", "a2c", "--engine", "batched")
+    assert refused.exit_code == 2 and "sb3" in refused.output

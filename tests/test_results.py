@@ -16,7 +16,7 @@ from pharos.errors import FileFormatError, ResultCorrupted
 from pharos.experiments import load_agent, read_curve, read_record, run_id, train
 from pharos.experiments import results as _results
 
-_train = importlib.import_module("pharos.experiments.train")
+run_folder = importlib.import_module("pharos.experiments.run_folder")
 
 ROW = {name: 1 if dtype == "int64" else True if dtype == "bool" else 0.5 for name, dtype in _results.COLUMNS.items()}
 values = st.recursive(
@@ -86,7 +86,7 @@ def test_a_run_that_fails_says_why_and_can_be_started_again(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize(("agent", "file"), [("q_learning", "q_learning.npz"), ("dqn", "parameters.pt")])
 def test_a_damaged_checkpoint_is_said_to_be_one(agent, file, tmp_path, monkeypatch):
-    monkeypatch.setattr(_train, "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr(run_folder, "CHECKPOINT_SECONDS", 0.0)
     options = {"steps": 400, "evaluation_interval": 100, "out": tmp_path / "run"}
     with pytest.raises(Stopped):
         train(agent, "simple_grid/4x4-plain", progress=stop, **options)

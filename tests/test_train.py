@@ -26,14 +26,14 @@ from pharos.experiments.learners import Deep
 from pharos.experiments.results import COLUMNS
 from pharos.experiments.task import Task
 
-_train = importlib.import_module("pharos.experiments.train")
+run_folder = importlib.import_module("pharos.experiments.run_folder")
 
 SMALL = {"learning_starts": 50, "buffer_size": 1000, "target_update_interval": 50}
 
 
 @pytest.fixture(autouse=True)
 def always_checkpoint(monkeypatch):
-    monkeypatch.setattr(_train, "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr(run_folder, "CHECKPOINT_SECONDS", 0.0)
 
 
 def short(agent, out=None, steps=400, seed=1, progress=None, **options):
@@ -176,7 +176,7 @@ def test_a_checkpoint_is_on_the_disk_before_the_older_one_goes(tmp_path, monkeyp
 
     monkeypatch.setattr(os, "fsync", syncing)
     monkeypatch.setattr(os, "replace", replacing)
-    checkpoint = _train._Checkpoint(tmp_path / "checkpoint", "id")
+    checkpoint = run_folder.Checkpoint(tmp_path / "checkpoint", "id")
     for _ in range(2):
         synced.clear()
         checkpoint.save(Learner(), [], 0.0)

@@ -42,6 +42,7 @@ _HOMES = {
     "GymEnv": "pharos.interaction",
     "make_vec": "pharos.interaction",
     "train": "pharos.experiments",
+    "train_many": "pharos.experiments",
     "PharosError": "pharos.errors",
 }
 # Modules that stand in another folder than their public name says.

@@ -2,12 +2,13 @@
 
 from pharos.agents.deep import algorithm, check_hyperparameters, make_model
 from pharos.agents.hyperparameters import hyperparameters
-from pharos.agents.kinds import AGENTS, TABULAR_OBSERVATION, AgentKind, agent_kind, agent_source, is_known
+from pharos.agents.kinds import AGENTS, BATCHED, TABULAR_OBSERVATION, AgentKind, agent_kind, agent_source, is_known
 from pharos.agents.q_learning import DEFAULTS as Q_LEARNING_DEFAULTS
 from pharos.agents.q_learning import QLearning
 
 __all__ = [
     "AGENTS",
+    "BATCHED",
     "Q_LEARNING_DEFAULTS",
     "TABULAR_OBSERVATION",
     "AgentKind",
@@ -15,6 +16,7 @@ __all__ = [
     "agent_kind",
     "agent_source",
     "algorithm",
+    "batched",
     "check_hyperparameters",
     "hyperparameters",
     "is_known",

@@ -41,6 +41,10 @@ AGENTS = {
 """The agents that have a name. Any other algorithm for Stable-Baselines3 is named by its class, `module:Class`."""
 
 
+BATCHED = ("dqn", "ppo")
+"""The networks that the batched engine trains, many runs as one program."""
+
+
 def agent_kind(name: str) -> AgentKind:
     """What the agent called `name` is; a class of an algorithm for Stable-Baselines3 is a network."""
     return AGENTS.get(name) or AgentKind(name, name.rpartition(":")[2])

@@ -249,6 +249,25 @@ def parse_environment(text: str, words: Iterable[str] | None = None) -> "Environ
     return parse_target(text, words).found_environment()
 
 
+def parse_seeds(text: str) -> list[int]:
+    """`0:64`, `0,1,5` or both, as a list; the end of a range does not belong to it.
+
+    Raises:
+        ParameterError: it is none of these, or has a seed twice.
+    """
+    seeds: list[int] = []
+    for word in text.split(","):
+        first, colon, last = word.partition(":")
+        try:
+            seeds += range(int(first), int(last)) if colon else [int(first)]
+        except ValueError:
+            seeds = []
+            break
+    if not seeds or len(set(seeds)) < len(seeds) or min(seeds) < 0:
+        raise ParameterError(f"--seeds {text!r}; expected whole numbers, each once, such as 0:64 or 0,1,5")
+    return seeds
+
+
 # Answers --------------------------------------------------------------------------------------------------------------
 
 

@@ -1,7 +1,9 @@
 """pharos train: an agent learns, and its policy's exact regret is measured as it does."""
 
 import math
-from collections.abc import Callable
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,16 +15,20 @@ from pharos.cli.common import (
     Random,
     Sticky,
     TargetArgument,
+    complain,
     describe_chance,
     parse_environment,
     parse_parameters,
+    parse_seeds,
     print_facts,
     print_json,
     progress_bar,
 )
+from pharos.errors import ParameterError
 from pharos.wording import many
 
 if TYPE_CHECKING:
+    from pharos.environments import Environment
     from pharos.experiments import TrainingResult
 
 
@@ -44,6 +50,14 @@ def train(
     ] = None,
     steps: Annotated[int, typer.Option("--steps", min=1, help="Steps to learn from.")] = 50_000,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Decides everything random.")] = 0,
+    seeds: Annotated[
+        str | None,
+        typer.Option("--seeds", metavar="A:B|S,...", help="A run for each, such as 0:64; --out has a folder for each."),
+    ] = None,
+    engine: Annotated[
+        str, typer.Option("--engine", help="sb3 (Stable-Baselines3), or batched: many seeds as one program.")
+    ] = "sb3",
+    device: Annotated[str, typer.Option("--device", help="Of the batched engine: cpu or cuda.")] = "cpu",
     out: Annotated[
         Path | None, typer.Option("--out", help="Folder for results; an unfinished run there is resumed.")
     ] = None,
@@ -87,24 +101,27 @@ def train(
         seen = agent_kind(agent).observation(observation)
         given = hyperparameters_of(agent, env.name, seen, given, table=table)
 
+    setting: dict[str, Any] = {
+        "steps": steps,
+        "observation": observation,
+        "observation_options": parse_parameters(option),
+        "sticky": sticky,
+        "random": random,
+        "gamma": gamma if gamma is not None else 0.99 if endless else 1.0,
+        "horizon": None if endless else horizon or "default",
+        "evaluation_interval": interval,
+        "hyperparameters": given,
+        "engine": engine,
+        "out": out,
+    }
+    if seeds is not None:
+        if seed or tensorboard:
+            raise ParameterError("--seeds goes with neither --seed nor --tensorboard; expected one of them")
+        title = f"{agent} on {' '.join((target, *(parameters or ())))}"
+        _train_many(title, agent, env, {**setting, "seeds": parse_seeds(seeds), "device": device}, json)
+        return
     with progress_bar("training", steps, "loading, building, compiling, first evaluation") as show:
-        result = learn(
-            agent,
-            env,
-            steps=steps,
-            observation=observation,
-            observation_options=parse_parameters(option),
-            sticky=sticky,
-            random=random,
-            gamma=gamma if gamma is not None else 0.99 if endless else 1.0,
-            horizon=None if endless else horizon or "default",
-            seed=seed,
-            evaluation_interval=interval,
-            hyperparameters=given,
-            out=out,
-            tensorboard=tensorboard,
-            progress=_telling(show),
-        )
+        result = learn(agent, env, seed=seed, tensorboard=tensorboard, progress=_telling(show), **setting)
     picture = _plot(out)
     if json:
         print_json(
@@ -115,6 +132,83 @@ def train(
     if out is not None:
         facts += [("results", out), *([("plot", picture)] if picture else [])]
     print_facts(f"{agent} on {' '.join((target, *(parameters or ())))}, {result.config['observation']}", facts)
+
+
+def _train_many(title: str, agent: str, env: "Environment", setting: dict[str, Any], json: bool) -> None:
+    """A run for each seed; what they have in common is told, and what went wrong."""
+    from pharos.experiments import FailedRun, train_many
+
+    seeds, steps, began = setting["seeds"], setting["steps"], time.perf_counter()
+    with progress_bar("training", len(seeds) * steps, "loading, building, compiling, first evaluation") as show:
+        ends = train_many(agent, env, progress=_telling_of_many(show), **setting)
+    seconds = time.perf_counter() - began
+    failed = {seed: end.error for seed, end in zip(seeds, ends, strict=True) if isinstance(end, FailedRun)}
+    results = {seed: end for seed, end in zip(seeds, ends, strict=True) if not isinstance(end, FailedRun)}
+    spread = {
+        name: _quartiles([run.result[name] for run in results.values()])
+        for name in ("final_value", "final_regret", "normalized_regret", "mean_return")
+    }
+    if json:
+        runs = [{"seed": seed, **run.result, "folder": run.folder} for seed, run in results.items()]
+        answer = {"runs": runs, "failed": failed, "quartiles": spread, "seconds": seconds, "folder": setting["out"]}
+        print_json(answer)
+    else:
+        print_facts(f"{title}, {many(len(seeds), 'seed')}", _facts_of_many(results, spread, steps, seconds, setting))
+    for error, count in Counter(failed.values()).most_common():
+        complain(f"{count} x {error}")
+    if failed:
+        raise typer.Exit(1)
+
+
+def _quartiles(values: list[float | None]) -> list[float] | None:
+    """Lower quartile, median, upper quartile; None where there is no number."""
+    import numpy as np
+
+    known = [value for value in values if value is not None and math.isfinite(value)]
+    return [float(value) for value in np.quantile(known, (0.25, 0.5, 0.75))] if known else None
+
+
+def _facts_of_many(
+    results: Mapping[int, "TrainingResult"],
+    spread: Mapping[str, list[float] | None],
+    steps: int,
+    seconds: float,
+    setting: Mapping[str, Any],
+) -> list[tuple[str, object]]:
+    facts: list[tuple[str, object]] = []
+    for name, found in spread.items():
+        low, middle, high = found or (math.nan,) * 3
+        facts.append((name.replace("_", " "), f"median {middle:.4g}, quartiles {low:.4g} to {high:.4g}"))
+    if results:
+        some = next(iter(results.values())).result
+        best = sum(run.result["final_regret"] < 1e-6 for run in results.values())
+        facts += [
+            ("optimal at the end", f"{best} of {many(len(results), 'run')}"),
+            ("values", f"optimal {some['value_optimal']:.6g}, uniform {some['value_uniform']:.6g}"),
+        ]
+    pace = len(results) * steps / seconds
+    facts.append(("seconds", f"{seconds:.1f} ({pace:,.0f} agent-steps/s, evaluation and finished runs included)"))
+    if setting["out"] is not None:
+        facts.append(("results", f"{setting['out']}/seed-{setting['seeds'][0]} and so on"))
+    return facts
+
+
+def _telling_of_many(show: Callable[[int, str], None] | None) -> Callable[[Any], None] | None:
+    """What `train_many` calls after each evaluation: the mean regret of the policies, and the pace."""
+    if show is None:
+        return None
+    began: list[tuple[float, int]] = []
+
+    def tell(now: Any) -> None:
+        if not began:
+            began.append((time.perf_counter(), now.done))
+        passed, before = time.perf_counter() - began[0][0], began[0][1]
+        pace = f", {(now.done - before) / passed:,.0f} agent-steps/s" if passed else ""
+        regrets = [row["expected_regret"] for row in now.rows.values()]
+        said = f"mean regret {sum(regrets) / len(regrets):.4g}" if regrets else "finished before"
+        show(now.done, f"{said}{pace}{f', {now.failed} failed' if now.failed else ''}")
+
+    return tell
 
 
 def _facts(run: "TrainingResult", steps: int, chance: str) -> list[tuple[str, object]]:

@@ -11,6 +11,7 @@ from pharos.cli.common import (
     Random,
     Sticky,
     parse_environment,
+    parse_seeds,
     parse_value,
     print_facts,
     print_json,
@@ -67,7 +68,7 @@ def tune(
             steps=steps,
             trials=trials,
             observation=observation,
-            seeds=_seeds(seeds),
+            seeds=parse_seeds(seeds),
             sticky=sticky,
             random=random,
             chances=_chances(chance),
@@ -102,13 +103,6 @@ def tune(
     if out is not None:
         facts += [("use it", f"pharos train ... --hyperparameters {out / 'hyperparameters.yaml'}")]
     print_facts(f"{agent} on {result.environment}, {result.observation}", facts)
-
-
-def _seeds(text: str) -> list[int]:
-    try:
-        return [int(word) for word in text.split(",")]
-    except ValueError:
-        raise ParameterError(f"--seeds {text!r}; expected whole numbers, such as 1000,1001") from None
 
 
 def _chances(words: list[str] | None) -> list[dict[str, float]] | None:

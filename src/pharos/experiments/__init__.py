@@ -1,9 +1,11 @@
 """Experiments: an agent trained on a task, its policies evaluated exactly, and the result written down."""
 
+from pharos.experiments.batch import FailedRun, Members, Progress, train_configs
 from pharos.experiments.bootstrap import bootstrap_interval
-from pharos.experiments.config import ChanceSetting, Horizon, RunConfig, run_id
+from pharos.experiments.config import ENGINES, ChanceSetting, Horizon, RunConfig, run_id
 from pharos.experiments.evaluation import Evaluation, evaluate_agent
 from pharos.experiments.loading import load_agent
+from pharos.experiments.many import train_many
 from pharos.experiments.regret import ReferenceValues, RegretCurve, cumulative_expected_regret, regret
 from pharos.experiments.results import (
     check_agent,
@@ -15,16 +17,21 @@ from pharos.experiments.results import (
     write_record,
     write_table,
 )
+from pharos.experiments.run_folder import TrainingResult
 from pharos.experiments.search_space import SPACES
 from pharos.experiments.task import Task, TaskValues
-from pharos.experiments.train import TrainingResult, train, train_config
+from pharos.experiments.train import train, train_config
 from pharos.experiments.tuning import TuningResult, tune
 
 __all__ = [
+    "ENGINES",
     "SPACES",
     "ChanceSetting",
     "Evaluation",
+    "FailedRun",
     "Horizon",
+    "Members",
+    "Progress",
     "ReferenceValues",
     "RegretCurve",
     "RunConfig",
@@ -46,6 +53,8 @@ __all__ = [
     "run_id",
     "train",
     "train_config",
+    "train_configs",
+    "train_many",
     "tune",
     "write_record",
     "write_table",

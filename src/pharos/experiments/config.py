@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any
 
-from pharos.agents import agent_kind, agent_source, is_known
+from pharos.agents import BATCHED, agent_kind, agent_source, is_known
 from pharos.environments import Environment, as_tuples, class_of, make, source_of
 from pharos.errors import FileFormatError, ParameterError, UnknownName, UntrustedCode
 from pharos.observations import OwnObservation, observation_of
@@ -19,6 +19,9 @@ from pharos.sources import Source, is_reference, resolve
 if TYPE_CHECKING:
     from pharos.experiments.task import Task, TaskValues
     from pharos.mdp import TabularMDP
+
+ENGINES = ("sb3", "batched")
+"""What trains networks: Stable-Baselines3, one run in a process; or many runs as one program."""
 
 
 @dataclass(frozen=True)
@@ -124,6 +127,8 @@ class RunConfig:
         gamma: discount of values and returns; the agent's own discount is a hyperparameter.
         horizon: number of steps of an episode in values and returns; None: discounted values without a horizon.
         evaluation_interval: steps between evaluations of the policy.
+        engine: what trains networks, one of ENGINES. Tables are the same with each, so theirs is always "sb3"; `id` and
+            `to_dict` have it only where it is another.
         sources: where a class, observation or agent of the user's own comes from, under "environment", "observation"
             and "agent". Their names belong to the `id`; files and checksums do not.
     """
@@ -140,9 +145,19 @@ class RunConfig:
     gamma: float = 1.0
     horizon: int | None
     evaluation_interval: int
+    engine: str = "sb3"
     sources: Mapping[str, Source] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        if self.engine not in ENGINES:
+            raise UnknownName("engine", self.engine, ENGINES)
+        if self.is_tabular:
+            object.__setattr__(self, "engine", "sb3")
+        elif self.engine == "batched" and self.agent not in BATCHED:
+            raise ParameterError(
+                f"agent {self.agent!r}: the batched engine has {', '.join(BATCHED)} and q_learning; "
+                f"the engine sb3 has {self.agent!r}"
+            )
         for name in ("steps", "evaluation_interval"):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int) or value < 1:
@@ -157,6 +172,7 @@ class RunConfig:
         seed: int = 0,
         evaluation_interval: int | None = None,
         hyperparameters: Mapping[str, Any] | None = None,
+        engine: str = "sb3",
     ) -> "RunConfig":
         """The configuration of a run on a task; it is evaluated every hundredth of `steps` unless told otherwise.
 
@@ -184,6 +200,7 @@ class RunConfig:
             gamma=task.gamma,
             horizon=task.horizon_steps,
             evaluation_interval=evaluation_interval or (max(1, steps // 100) if isinstance(steps, int) else 1),
+            engine=engine,
             sources={part: source for part, source in sources.items() if source is not None},
         )
 
@@ -195,7 +212,7 @@ class RunConfig:
             FileFormatError: an entry is missing, unknown or of another type.
         """
         known = [each.name for each in fields(RunConfig)]
-        missing = [name for name in known if name not in entry and name != "sources"]
+        missing = [name for name in known if name not in entry and name not in ("sources", "engine")]
         unknown = [name for name in entry if name not in known]
         if missing or unknown:
             wrong = f"lacks {', '.join(missing)}" if missing else f"has the unknown entry {unknown[0]!r}"
@@ -222,6 +239,8 @@ class RunConfig:
             "horizon": self.horizon,
             "evaluation_interval": self.evaluation_interval,
         }
+        if self.engine != "sb3":
+            entry["engine"] = self.engine
         if self.sources:
             entry["sources"] = {part: source.to_dict() for part, source in self.sources.items()}
         return entry

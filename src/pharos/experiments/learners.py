@@ -125,7 +125,11 @@ class Deep:
 
         model = self.model
         with _said_to_be_damaged(folder):
-            model.set_parameters(torch.load(folder / "parameters.pt", weights_only=True), device="cpu")
+            parameters = torch.load(folder / "parameters.pt", weights_only=True)
+            if set(parameters) == {"policy"}:  # of the batched engine: what was learnt, without an optimiser
+                model.policy.load_state_dict(parameters["policy"])
+            else:
+                model.set_parameters(parameters, device="cpu")
             stored = json.loads((folder / "model.json").read_text())
             for name, value in stored["counters"].items():
                 if name in _COUNTERS:
@@ -140,6 +144,23 @@ class Deep:
     def publish(self, folder: Path) -> None:
         """The network, in the folder agent."""
         self.save(folder / "agent")
+
+
+def publish_network(folder: Path, parameters: dict[str, np.ndarray], counters: dict[str, int], returns: float) -> None:
+    """Write a network of the batched engine into the folder of its run, as `Deep` reads it.
+
+    Args:
+        parameters: by their names in the policy of Stable-Baselines3.
+        counters: num_timesteps and episodes.
+        returns: the sum over episodes.
+    """
+    import torch
+
+    place = folder / results.AGENT
+    place.mkdir(parents=True, exist_ok=True)
+    policy = {name: torch.from_numpy(np.ascontiguousarray(values)) for name, values in parameters.items()}
+    torch.save({"policy": policy}, place / "parameters.pt")
+    (place / "model.json").write_text(json.dumps({"counters": counters, "returns": returns}))
 
 
 @contextlib.contextmanager

@@ -9,13 +9,10 @@ evaluations is lost (or the last ten seconds, where intervals are shorter). With
 same curve file.
 """
 
-import json
-import math
 import os
 import shutil
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -24,36 +21,14 @@ from pharos.agents import hyperparameters as hyperparameters_of
 from pharos.environments import Environment, make
 from pharos.errors import ParameterError
 from pharos.experiments import results as _results
-from pharos.experiments.config import RunConfig, run_id
-from pharos.experiments.evaluation import evaluate_agent
+from pharos.experiments.config import RunConfig
+from pharos.experiments.curve import Curve
 from pharos.experiments.learners import Learner, make_learner
+from pharos.experiments.run_folder import Checkpoint, Record, TrainingResult, finished_result
 from pharos.experiments.task import Task, TaskValues
 from pharos.observations import own_observation
-from pharos.storage import sync
 
 Progress = Callable[[int, int, Mapping[str, Any]], None]
-CHECKPOINT_SECONDS = 10.0
-
-
-@dataclass(frozen=True)
-class TrainingResult:
-    """What a run gave.
-
-    Attributes:
-        config: of the run.
-        result: summary: values of the optimal, uniform, worst and final policy, regrets, episodes.
-        curve: a row for each evaluation, a dictionary with the columns of curve.parquet.
-        agent: the trained agent: a `QLearning` or a model of Stable-Baselines3; None where the run was finished before.
-        folder: of the run, or None.
-        seconds: time that it took.
-    """
-
-    config: dict[str, Any]
-    result: dict[str, Any]
-    curve: list[dict[str, Any]]
-    agent: Any
-    folder: Path | None
-    seconds: float
 
 
 def train(
@@ -70,6 +45,7 @@ def train(
     seed: int = 0,
     evaluation_interval: int | None = None,
     hyperparameters: Mapping[str, Any] | str | os.PathLike | None = None,
+    engine: str = "sb3",
     out: str | os.PathLike | None = None,
     tensorboard: bool = False,
     progress: Progress | None = None,
@@ -89,6 +65,8 @@ def train(
         evaluation_interval: steps between evaluations; None: a hundredth of `steps`.
         hyperparameters: go before those of agents/defaults.py; or a YAML file of the same form, such as one
             that `tune` wrote.
+        engine: what trains networks: "sb3", Stable-Baselines3; or "batched", pharos' own DQN and PPO, which trains many
+            runs at once (`train_many`).
         out: folder of the run; None: nothing is written. A finished run there is returned, an unfinished one resumed.
         tensorboard: write TensorBoard's logs into `out`/tensorboard (algorithms of Stable-Baselines3).
         progress: called after each evaluation with steps done, steps in all, and the row of the curve.
@@ -97,13 +75,14 @@ def train(
             suggested.
         MissingExtra: Stable-Baselines3 is not installed.
     """
-    seen = agent_kind(agent).observation(observation)
-    task = Task(
-        make(environment, **parameters) if isinstance(environment, str) else environment,
+    task = task_for(
+        agent,
+        environment,
+        parameters,
+        observation=observation,
+        observation_options=observation_options,
         sticky=sticky,
         random=random,
-        observation=own_observation(seen) or seen,
-        observation_options=dict(observation_options or {}),
         gamma=gamma,
         horizon=horizon,
     )
@@ -114,10 +93,21 @@ def train(
         seed=seed,
         evaluation_interval=evaluation_interval,
         hyperparameters=hyperparameters,
+        engine=engine,
         out=out,
         tensorboard=tensorboard,
         progress=progress,
     )
+
+
+def task_for(
+    agent: str, environment: Environment | str, parameters: Mapping[str, Any], *, observation: str, **setting: Any
+) -> Task:
+    """The task of an agent that asks for an observation, which tables do not get; `setting` as `train` takes it."""
+    seen = agent_kind(agent).observation(observation)
+    options = dict(setting.pop("observation_options") or {})
+    made = make(environment, **parameters) if isinstance(environment, str) else environment
+    return Task(made, observation=own_observation(seen) or seen, observation_options=options, **setting)
 
 
 def train_on(
@@ -128,23 +118,31 @@ def train_on(
     seed: int = 0,
     evaluation_interval: int | None = None,
     hyperparameters: Mapping[str, Any] | str | os.PathLike | None = None,
+    engine: str = "sb3",
     out: str | os.PathLike | None = None,
     tensorboard: bool = False,
     progress: Progress | None = None,
 ) -> TrainingResult:
     """As `train`, on a task, which is built and solved once for all runs on it."""
-    if hyperparameters is not None and not isinstance(hyperparameters, Mapping):
-        table = Path(hyperparameters)
-        hyperparameters = hyperparameters_of(agent, task.env.name, str(task.observation), table=table)
     config = RunConfig.of_task(
         task,
         agent,
         steps=steps,
         seed=seed,
         evaluation_interval=evaluation_interval,
-        hyperparameters=hyperparameters,
+        hyperparameters=given_hyperparameters(agent, task, hyperparameters),
+        engine=engine,
     )
-    return _run(config, task, None if out is None else Path(out), tensorboard, progress)
+    return train_task(config, task, None if out is None else Path(out), tensorboard, progress)
+
+
+def given_hyperparameters(
+    agent: str, task: Task, given: Mapping[str, Any] | str | os.PathLike | None
+) -> Mapping[str, Any] | None:
+    """Those of a mapping, or of a YAML file for this agent and task."""
+    if given is None or isinstance(given, Mapping):
+        return given
+    return hyperparameters_of(agent, task.env.name, str(task.observation), table=Path(given))
 
 
 def train_config(
@@ -169,86 +167,31 @@ def train_config(
     if not isinstance(config, RunConfig):
         config = RunConfig.from_dict(config)
     task, algorithm = config.task(values, trust=trust, strict=strict), config.algorithm(trust=trust, strict=strict)
-    return _run(config, task, Path(folder), False, progress, algorithm)
+    return train_task(config, task, Path(folder), False, progress, algorithm)
 
 
 # One run --------------------------------------------------------------------------------------------------------------
 
 
-@dataclass
-class _Curve:
-    """The rows so far, and the regret of the episodes between evaluations."""
-
-    task: Task
-    rows: list[dict[str, Any]] = field(default_factory=list)
-
-    def add(self, step: int, episodes: int, returns: float, agent: Any) -> dict[str, Any]:
-        """Evaluate the policy after `step` steps and `episodes` finished episodes, whose returns sum to `returns`."""
-        found = evaluate_agent(agent, self.task)
-        best, uniform = self.task.reference.optimal, self.task.reference.uniform
-        last = self.rows[-1] if self.rows else None
-        finished = episodes - (last["episodes"] if last else 0)
-        gained = returns - (last["returns"] if last else 0.0)
-        mean = gained / finished if finished else math.nan
-        regret = best - found.value
-        spread = best - uniform
-        row = {
-            "step": step,
-            "episodes": episodes,
-            "value": found.value,
-            "expected_regret": regret,
-            "cumulative_expected_regret": (
-                last["cumulative_expected_regret"] + finished * last["expected_regret"] if last else 0.0
-            ),
-            "normalized_regret": regret / spread if spread > 1e-12 else math.nan,
-            "mean_return": mean,
-            "realised_regret": best - mean,
-            "cumulative_realised_regret": episodes * best - returns,
-            "exact": found.exact,
-            "error_bound": found.error_bound,
-            "returns": returns,
-        }
-        self.rows.append(row)
-        return row
-
-    def result(self) -> dict[str, Any]:
-        """The summary of a finished run."""
-        task, last = self.task, self.rows[-1]
-        best, uniform = task.reference.optimal, task.reference.uniform
-        scale = last["episodes"] * (best - uniform)
-        return {
-            "value_optimal": best,
-            "value_uniform": uniform,
-            "value_worst": task.reference.worst,
-            "final_value": last["value"],
-            "final_regret": last["expected_regret"],
-            "cumulative_regret": last["cumulative_expected_regret"],
-            "normalized_regret": last["cumulative_expected_regret"] / scale if scale > 1e-12 else math.nan,
-            "cumulative_realised_regret": last["cumulative_realised_regret"],
-            "normalized_realised_regret": last["cumulative_realised_regret"] / scale if scale > 1e-12 else math.nan,
-            "mean_return": last["returns"] / last["episodes"] if last["episodes"] else math.nan,
-            "episodes": last["episodes"],
-            "exact": all(row["exact"] for row in self.rows),
-            "conventions": task.conventions,
-        }
-
-
-def _run(
+def train_task(
     config: RunConfig,
     task: Task,
     folder: Path | None,
-    tensorboard: bool,
-    progress: Progress | None,
+    tensorboard: bool = False,
+    progress: Progress | None = None,
     algorithm: str | type | None = None,
 ) -> TrainingResult:
+    """As `train_config`, on a task that is made already; with `algorithm` as `RunConfig.algorithm` gives it."""
     if tensorboard and (folder is None or config.is_tabular):
         raise ParameterError(
             f"TensorBoard's logs were asked for, with {config.agent} and {'a' if folder else 'no'} folder for results; "
             f"expected an algorithm of Stable-Baselines3 and a folder (out)"
         )
+    if config.engine == "batched":
+        return _as_a_batch(config, task, folder, tensorboard, progress)
     began = time.perf_counter()
     if folder is not None:
-        done = _finished(folder, config)
+        done = finished_result(folder, config)
         if done is not None:
             return done
     chosen = hyperparameters_of(config.agent, config.environment, config.observation, config.hyperparameters)
@@ -256,12 +199,12 @@ def _run(
         folder.mkdir(parents=True, exist_ok=True)
     logs = folder / "tensorboard" if folder is not None and tensorboard else None
     learner = make_learner(config, algorithm or config.algorithm(), task, chosen, logs)
-    curve, checkpoint = _Curve(task), None
+    curve, checkpoint = Curve(task), None
     if folder is not None:
-        checkpoint = _Checkpoint(folder / "checkpoint", config.id)
+        checkpoint = Checkpoint(folder / "checkpoint", config.id)
         curve.rows, spent = checkpoint.restore(learner) or ([], 0.0)
         began -= spent
-    record = _Record(folder, config, chosen)
+    record = Record(folder, config, chosen)
     record.write("running")
     _learn(learner, curve, config, progress, checkpoint, record, began)
     seconds = time.perf_counter() - began
@@ -276,13 +219,35 @@ def _run(
     return TrainingResult(config.to_dict(), result, rows, learner.agent, folder, seconds)
 
 
+def _as_a_batch(
+    config: RunConfig, task: Task, folder: Path | None, tensorboard: bool, progress: Progress | None
+) -> TrainingResult:
+    """A single run of the batched engine: a batch of one."""
+    from pharos.experiments.batch import FailedRun, Members, train_configs
+
+    if tensorboard:
+        raise ParameterError("TensorBoard's logs are those of Stable-Baselines3; expected the engine sb3, or none")
+    members = Members()
+    members.adopt(config, task)
+
+    def tell(now: Any) -> None:
+        if progress is not None and 0 in now.rows:
+            progress(now.rows[0]["step"], config.steps, now.rows[0])
+
+    folders, checkpoints = (None, None) if folder is None else ([folder], folder / "checkpoints")
+    (end,) = train_configs([config], folders, checkpoints=checkpoints, progress=tell, members=members)
+    if isinstance(end, FailedRun):
+        raise end.exception
+    return end
+
+
 def _learn(
     learner: Learner,
-    curve: _Curve,
+    curve: Curve,
     config: RunConfig,
     progress: Progress | None,
-    checkpoint: "_Checkpoint | None",
-    record: "_Record",
+    checkpoint: Checkpoint | None,
+    record: Record,
     began: float,
 ) -> None:
     """Learn from the last row of the curve on, with an evaluation at each point; `began`: when the run did."""
@@ -306,83 +271,3 @@ def _learn(
     except Exception as error:
         record.write("failed", error=f"{type(error).__name__}: {' '.join(str(error).split())}")
         raise
-
-
-class _Record:
-    """The file run.json, where there is a folder for results."""
-
-    def __init__(self, folder: Path | None, config: RunConfig, hyperparameters: Mapping[str, Any]):
-        self.folder, self.hyperparameters = folder, hyperparameters
-        versions = _results.versions()
-        self.run = {"format": _results.FORMAT, "id": config.id, "config": config.to_dict(), "versions": versions}
-
-    def write(self, status: str, **entries: Any) -> None:
-        """Replace it: the run is "running", "failed" or "finished"."""
-        if self.folder is None:
-            return
-        record = {**self.run, "status": status, "hyperparameters": self.hyperparameters, **entries}
-        _results.write_record(self.folder, record)
-
-
-def _finished(folder: Path, config: RunConfig) -> TrainingResult | None:
-    """The result that lies there; None where there is none; ParameterError where it is that of another run."""
-    if not (folder / "run.json").exists():
-        return None
-    record = _results.read_record(folder)
-    stored = record["config"]
-    if run_id(stored) != config.id:
-        entry = json.loads(json.dumps(config.to_dict()))
-        different = [name for name in {**entry, **stored} if stored.get(name) != entry.get(name)]
-        raise ParameterError(
-            f"{folder}: holds a run with another {', '.join(different) or 'configuration'}; "
-            f"choose another folder, or delete it"
-        )
-    for part, source in config.sources.items():
-        if stored["sources"][part].get("checksum") != source.checksum:
-            raise ParameterError(
-                f"{folder}: holds a run from before {source.file} was changed; choose another folder, or delete it"
-            )
-    if record.get("status") != "finished":
-        return None
-    rows = _results.read_rows(folder)
-    return TrainingResult(record["config"], record["result"], rows, None, folder, record["seconds"])
-
-
-class _Checkpoint:
-    """A folder that holds the last checkpoint, replaced in one step."""
-
-    def __init__(self, folder: Path, id: str):
-        self.folder, self.id = folder, id
-        self._saved = -math.inf
-
-    def save(self, learner: Learner, rows: list[dict[str, Any]], seconds: float) -> None:
-        """Write one, unless the last is not ten seconds old."""
-        if time.monotonic() - self._saved < CHECKPOINT_SECONDS:
-            return
-        partial = self.folder.with_name(f"{self.folder.name}.partial")
-        shutil.rmtree(partial, ignore_errors=True)
-        partial.mkdir(parents=True)
-        learner.save(partial)
-        (partial / "curve.json").write_text(json.dumps({"id": self.id, "rows": rows, "seconds": seconds}))
-        for path in (*partial.rglob("*"), partial):  # the older one goes only when this one is on the disk
-            sync(path)
-        old = self.folder.with_name(f"{self.folder.name}.old")
-        if self.folder.exists():
-            shutil.rmtree(old, ignore_errors=True)
-            os.replace(self.folder, old)
-        os.replace(partial, self.folder)
-        sync(self.folder.parent)
-        shutil.rmtree(old, ignore_errors=True)
-        self._saved = time.monotonic()
-
-    def restore(self, learner: Learner) -> tuple[list[dict[str, Any]], float] | None:
-        """(rows of the curve, seconds spent) of the last checkpoint, from which the learner goes on; or None."""
-        for folder in (self.folder, self.folder.with_name(f"{self.folder.name}.old")):
-            try:
-                kept = json.loads((folder / "curve.json").read_text())
-            except (FileNotFoundError, ValueError):
-                continue
-            if kept.get("id") == self.id:
-                learner.load(folder)
-                return kept["rows"], kept["seconds"]
-        return None

@@ -1,0 +1,89 @@
+"""The same agent on the same task with many seeds: a folder for each, trained at once where the engine can."""
+
+import os
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from pharos.environments import Environment
+from pharos.errors import ParameterError
+from pharos.experiments.batch import FailedRun, Members, Tell, train_configs
+from pharos.experiments.config import RunConfig
+from pharos.experiments.run_folder import TrainingResult
+from pharos.experiments.train import given_hyperparameters, task_for
+
+
+def train_many(
+    agent: str,
+    environment: Environment | str,
+    *,
+    seeds: Iterable[int],
+    steps: int,
+    observation: str = "vector",
+    observation_options: Mapping[str, Any] | None = None,
+    sticky: float = 0.0,
+    random: float = 0.0,
+    gamma: float = 1.0,
+    horizon: int | str | None = "default",
+    evaluation_interval: int | None = None,
+    hyperparameters: Mapping[str, Any] | str | os.PathLike | None = None,
+    engine: str = "batched",
+    device: str = "cpu",
+    out: str | os.PathLike | None = None,
+    progress: Tell | None = None,
+    **parameters: Any,
+) -> list[TrainingResult | FailedRun]:
+    """Train an agent once for each seed, and measure the exact regret of its policies as they learn.
+
+    Args:
+        seeds: of the runs, each another.
+        engine: "batched", all runs as one program (dqn, ppo, and q_learning one after the other); or "sb3", one after
+            the other.
+        device: of the batched engine: "cpu" or "cuda".
+        out: a folder, in which each run has its own, seed-0 and so on; None: nothing is written. Finished runs there
+            are returned, and what was killed goes on from its last checkpoint.
+        progress: called after each evaluation.
+        others: as for `train`.
+    Returns:
+        The result of each run in the order of the seeds; a run that failed says why, and does not stop the others.
+    Raises:
+        ParameterError: no seed, or one twice; or as `train`.
+    """
+    numbers = [int(seed) for seed in seeds]
+    if not numbers or len(set(numbers)) != len(numbers):
+        raise ParameterError(f"seeds are {numbers}; expected at least one, each once")
+    task = task_for(
+        agent,
+        environment,
+        parameters,
+        observation=observation,
+        observation_options=observation_options,
+        sticky=sticky,
+        random=random,
+        gamma=gamma,
+        horizon=horizon,
+    )
+    given = given_hyperparameters(agent, task, hyperparameters)
+    configs = [
+        RunConfig.of_task(
+            task,
+            agent,
+            steps=steps,
+            seed=seed,
+            evaluation_interval=evaluation_interval,
+            hyperparameters=given,
+            engine=engine,
+        )
+        for seed in numbers
+    ]
+    folder = None if out is None else Path(out)
+    members = Members()
+    members.adopt(configs[0], task)
+    return train_configs(
+        configs,
+        None if folder is None else [folder / f"seed-{seed}" for seed in numbers],
+        checkpoints=None if folder is None else folder / "checkpoints",
+        progress=progress,
+        members=members,
+        device=device,
+    )

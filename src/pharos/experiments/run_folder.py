@@ -1,0 +1,133 @@
+"""The folder of a run while it is trained: its record, its checkpoints, and the result where it is finished."""
+
+import json
+import math
+import os
+import shutil
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+from pharos.errors import ParameterError
+from pharos.experiments import results as _results
+from pharos.experiments.config import RunConfig, run_id
+from pharos.storage import sync
+
+CHECKPOINT_SECONDS = 10.0
+# Writing checkpoints takes at most this share of the time
+SHARE_OF_TIME = 0.05
+
+
+class Stored(Protocol):
+    """What a checkpoint keeps."""
+
+    def save(self, folder: Path) -> None:
+        """Write what `load` needs."""
+
+    def load(self, folder: Path) -> None:
+        """Go on from what `save` wrote."""
+
+
+@dataclass(frozen=True)
+class TrainingResult:
+    """What a run gave.
+
+    Attributes:
+        config: of the run.
+        result: summary: values of the optimal, uniform, worst and final policy, regrets, episodes.
+        curve: a row for each evaluation, a dictionary with the columns of curve.parquet.
+        agent: the trained agent: a `QLearning` or a model of Stable-Baselines3; None where the run was finished before.
+        folder: of the run, or None.
+        seconds: time that it took.
+    """
+
+    config: dict[str, Any]
+    result: dict[str, Any]
+    curve: list[dict[str, Any]]
+    agent: Any
+    folder: Path | None
+    seconds: float
+
+
+class Record:
+    """The file run.json, where there is a folder for results."""
+
+    def __init__(self, folder: Path | None, config: RunConfig, hyperparameters: Mapping[str, Any]):
+        self.folder, self.hyperparameters = folder, hyperparameters
+        versions = _results.versions()
+        self.run = {"format": _results.FORMAT, "id": config.id, "config": config.to_dict(), "versions": versions}
+
+    def write(self, status: str, **entries: Any) -> None:
+        """Replace it: the run is "running", "failed" or "finished"."""
+        if self.folder is None:
+            return
+        record = {**self.run, "status": status, "hyperparameters": self.hyperparameters, **entries}
+        _results.write_record(self.folder, record)
+
+
+def finished_result(folder: Path, config: RunConfig) -> TrainingResult | None:
+    """The result that lies there; None where there is none; ParameterError where it is that of another run."""
+    if not (folder / "run.json").exists():
+        return None
+    record = _results.read_record(folder)
+    stored = record["config"]
+    if run_id(stored) != config.id:
+        entry = json.loads(json.dumps(config.to_dict()))
+        different = [name for name in {**entry, **stored} if stored.get(name) != entry.get(name)]
+        raise ParameterError(
+            f"{folder}: holds a run with another {', '.join(different) or 'configuration'}; "
+            f"choose another folder, or delete it"
+        )
+    for part, source in config.sources.items():
+        if stored["sources"][part].get("checksum") != source.checksum:
+            raise ParameterError(
+                f"{folder}: holds a run from before {source.file} was changed; choose another folder, or delete it"
+            )
+    if record.get("status") != "finished":
+        return None
+    rows = _results.read_rows(folder)
+    return TrainingResult(record["config"], record["result"], rows, None, folder, record["seconds"])
+
+
+class Checkpoint:
+    """A folder that holds the last checkpoint, replaced in one step."""
+
+    def __init__(self, folder: Path, id: str):
+        self.folder, self.id = folder, id
+        self._next = -math.inf
+
+    def save(self, learner: Stored, rows: list[Any], seconds: float) -> None:
+        """Write one, unless the last is not ten seconds old, or writing would take more than SHARE_OF_TIME."""
+        began = time.monotonic()
+        if began < self._next:
+            return
+        partial = self.folder.with_name(f"{self.folder.name}.partial")
+        shutil.rmtree(partial, ignore_errors=True)
+        partial.mkdir(parents=True)
+        learner.save(partial)
+        (partial / "curve.json").write_text(json.dumps({"id": self.id, "rows": rows, "seconds": seconds}))
+        for path in (*partial.rglob("*"), partial):  # the older one goes only when this one is on the disk
+            sync(path)
+        old = self.folder.with_name(f"{self.folder.name}.old")
+        if self.folder.exists():
+            shutil.rmtree(old, ignore_errors=True)
+            os.replace(self.folder, old)
+        os.replace(partial, self.folder)
+        sync(self.folder.parent)
+        shutil.rmtree(old, ignore_errors=True)
+        now = time.monotonic()
+        self._next = now + max(CHECKPOINT_SECONDS, (now - began) / SHARE_OF_TIME if CHECKPOINT_SECONDS else 0.0)
+
+    def restore(self, learner: Stored) -> tuple[list[Any], float] | None:
+        """(rows of the curve, seconds spent) of the last checkpoint, from which the learner goes on; or None."""
+        for folder in (self.folder, self.folder.with_name(f"{self.folder.name}.old")):
+            try:
+                kept = json.loads((folder / "curve.json").read_text())
+            except (FileNotFoundError, ValueError):
+                continue
+            if kept.get("id") == self.id:
+                learner.load(folder)
+                return kept["rows"], kept["seconds"]
+        return None

@@ -1,0 +1,199 @@
+"""Many runs at once: each leaves what it leaves alone, whoever else is there, however often it is killed."""
+
+import importlib
+import json
+import sys
+
+import numpy as np
+import pytest
+
+import fake_engine
+import pharos
+from pharos.errors import ParameterError, PharosError, UnknownName
+from pharos.experiments import FailedRun, RunConfig, Task, read_curve, read_record, train_configs, train_many
+from pharos.experiments.results import COLUMNS
+
+run_folder = importlib.import_module("pharos.experiments.run_folder")
+
+
+@pytest.fixture
+def engine(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pharos.agents.batched", fake_engine)
+    monkeypatch.setattr(run_folder, "CHECKPOINT_SECONDS", 0.0)
+    fake_engine.made.clear()
+    return fake_engine
+
+
+class Killed(BaseException):
+    pass
+
+
+def kill_at(done):
+    def progress(now):
+        if now.done >= done:
+            raise Killed
+
+    return progress
+
+
+def many(out=None, seeds=(0, 1, 2), agent="dqn", **options):
+    options = {"steps": 40, "evaluation_interval": 10, "observation": "vector", **options}
+    return train_many(agent, "simple_grid/4x4-plain", seeds=seeds, out=out, **options)
+
+
+def config(seed=0, environment="simple_grid/4x4-plain", engine="batched", agent="dqn", observation="vector", **given):
+    task = Task.of(environment, observation=observation)
+    return RunConfig.of_task(
+        task, agent, steps=40, seed=seed, evaluation_interval=10, hyperparameters=given, engine=engine
+    )
+
+
+def bytes_of(folder):
+    return [(folder / name).read_bytes() for name in ("curve.parquet", "agent/parameters.pt", "agent/model.json")]
+
+
+def test_each_run_leaves_what_a_run_leaves(engine, tmp_path):
+    results = many(tmp_path, sticky=0.25)
+    assert engine.made == [3]
+    for seed, result in enumerate(results):
+        folder = tmp_path / f"seed-{seed}"
+        record, curve = read_record(folder), read_curve(folder)
+        assert record["status"] == "finished" and record["config"]["engine"] == "batched"
+        assert record["config"]["seed"] == seed and record["result"] == result.result
+        assert record["batch"]["runs"] == 3 and record["seconds"] == pytest.approx(record["batch"]["seconds"] / 3)
+        assert list(curve.columns) == list(COLUMNS) and curve["step"].tolist() == [0, 10, 20, 30, 40]
+        assert set(record["checksums"]) == {"curve.parquet", "agent/model.json", "agent/parameters.pt"}
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["seed-0", "seed-1", "seed-2"]
+
+
+def test_what_is_finished_is_not_trained_again(engine, tmp_path):
+    first = many(tmp_path, seeds=(0, 1))
+    again = many(tmp_path, seeds=(0, 1, 2))
+    assert engine.made == [2, 1]
+    assert [each.result for each in again[:2]] == [each.result for each in first]
+    assert all(each.agent is None for each in again[:2])
+
+
+def test_a_run_does_not_depend_on_who_else_is_there(engine, tmp_path):
+    many(tmp_path / "together", seeds=(0, 1, 2, 3))
+    many(tmp_path / "alone", seeds=(2,))
+    assert bytes_of(tmp_path / "together" / "seed-2") == bytes_of(tmp_path / "alone" / "seed-2")
+
+
+@pytest.mark.parametrize("asked_again", [(0, 1, 2), (2, 1), (0, 1, 2, 3)])
+def test_a_killed_batch_goes_on_to_the_bytes_of_an_undisturbed_one(asked_again, engine, tmp_path):
+    many(tmp_path / "whole", seeds=(0, 1, 2, 3))
+    with pytest.raises(Killed):
+        many(tmp_path / "killed", progress=kill_at(3 * 20))
+    assert read_record(tmp_path / "killed" / "seed-1")["status"] == "running"
+    done = []
+    many(tmp_path / "killed", seeds=asked_again, progress=lambda now: done.extend(now.rows.items()))
+    resumed = [row["step"] for place, row in done if asked_again[place] < 3]
+    assert sorted(set(resumed)) == [30, 40]
+    for seed in asked_again:
+        whole, killed = (tmp_path / name / f"seed-{seed}" for name in ("whole", "killed"))
+        assert bytes_of(whole) == bytes_of(killed)
+    assert not (tmp_path / "killed" / "checkpoints").exists()
+
+
+def test_a_run_with_what_the_engine_lacks_is_named_and_the_others_go_on(engine, tmp_path):
+    runs = [config(0), config(1, optimize_memory_usage=True), config(2, learning_rate=-1.0)]
+    folders = [tmp_path / str(i) for i in range(3)]
+    good, lacking, wrong = train_configs(runs, folders)
+    assert good.result["episodes"] == 4
+    assert isinstance(lacking, FailedRun) and isinstance(wrong, FailedRun)
+    assert lacking.error == (
+        "the batched engine: it has no hyperparameter 'optimize_memory_usage'; the engine sb3 has it"
+    )
+    assert "learning_rate is -1.0" in wrong.error
+    assert [read_record(folder)["status"] for folder in folders] == ["finished", "failed", "failed"]
+
+
+def test_a_run_that_ends_the_program_is_found_and_the_others_finish(engine, tmp_path):
+    runs = [config(seed, learning_rate=fake_engine.BROKEN if seed == 2 else 0.001) for seed in range(5)]
+    with pytest.warns(UserWarning, match="this run is broken: 5 runs at once; goes on with 2 runs at once"):
+        results = train_configs(runs, [tmp_path / str(i) for i in range(5)])
+    assert [isinstance(each, FailedRun) for each in results] == [False, False, True, False, False]
+    assert results[2].error == "RuntimeError: this run is broken"
+    assert read_record(tmp_path / "2")["status"] == "failed"
+    alone = train_configs([runs[4]])
+    assert str(alone[0].curve) == str(results[4].curve)
+
+
+def test_a_batch_that_memory_has_no_room_for_is_halved_with_one_line(engine, monkeypatch):
+    monkeypatch.setattr(fake_engine, "MOST", 3)
+    with pytest.warns(UserWarning) as said:
+        results = many(seeds=range(5))
+    assert [str(each.message) for each in said] == ["out of memory: 5 runs at once; goes on with 2 runs at once"]
+    assert engine.made == [5, 2, 3]
+    assert [each.config["seed"] for each in results] == list(range(5))
+
+
+def test_runs_that_cannot_share_a_batch_are_grouped(engine):
+    runs = [
+        *(config(seed, batch_size=size) for size in (32, 64) for seed in (0, 1)),
+        config(0, "frozen_lake/4x4", batch_size=64),
+        config(0, observation="simple_image", batch_size=64),
+    ]
+    results = train_configs(runs)
+    assert sorted(engine.made) == [1, 2, 3]
+    assert [each.config["environment"] for each in results] == [run.environment for run in runs]
+
+
+def test_a_lane_changes_no_result(engine):
+    whole, parts = train_configs([config(i) for i in range(5)]), train_configs([config(i) for i in range(5)], lane=2)
+    assert engine.made == [5, 2, 2, 1]
+    assert str([each.curve for each in whole]) == str([each.curve for each in parts])
+
+
+def test_one_run_is_a_batch_of_one(engine, tmp_path):
+    steps = []
+    result = pharos.train(
+        "dqn",
+        "simple_grid/4x4-plain",
+        steps=40,
+        evaluation_interval=10,
+        engine="batched",
+        out=tmp_path,
+        progress=lambda done, *_: steps.append(done),
+    )
+    assert steps == [10, 20, 30, 40]
+    assert str(result.curve) == str(many(seeds=(0,))[0].curve)
+    with pytest.raises(PharosError, match="optimize_memory_usage"):
+        pharos.train(
+            "dqn", "simple_grid/4x4-plain", steps=40, engine="batched", hyperparameters={"optimize_memory_usage": True}
+        )
+
+
+def test_tables_of_many_seeds_are_those_of_single_runs(tmp_path):
+    results = many(tmp_path, agent="q_learning", steps=4000, evaluation_interval=1000)
+    assert [each.config["seed"] for each in results] == [0, 1, 2]
+    alone = pharos.train(
+        "q_learning", "simple_grid/4x4-plain", steps=4000, evaluation_interval=1000, seed=1, out=tmp_path / "alone"
+    )
+    assert np.array_equal(results[1].agent.q, alone.agent.q) and np.array_equal(
+        results[1].agent.visits, alone.agent.visits
+    )
+    for name in ("curve.parquet", "policy.npy"):
+        assert (tmp_path / "alone" / name).read_bytes() == (tmp_path / "seed-1" / name).read_bytes()
+    assert read_record(tmp_path / "alone")["id"] == read_record(tmp_path / "seed-1")["id"]
+
+
+def test_the_engine_belongs_to_the_id_only_where_it_is_another():
+    usual = config(engine="sb3")
+    assert "engine" not in usual.to_dict()
+    assert usual.id == RunConfig.from_dict(usual.to_dict()).id
+    batched = RunConfig.from_dict(json.loads(json.dumps(config().to_dict())))
+    assert batched == config() and batched.id != usual.id
+    assert config(agent="q_learning", observation="index") == config(
+        agent="q_learning", observation="index", engine="sb3"
+    )
+
+
+def test_an_engine_that_lacks_the_agent_is_refused_with_the_one_that_has_it():
+    with pytest.raises(ParameterError, match="agent 'a2c': the batched engine has dqn, ppo and q_learning;"):
+        config(agent="a2c")
+    with pytest.raises(UnknownName, match="unknown engine 'batch'; did you mean 'batched'"):
+        config(engine="batch")
+    with pytest.raises(ParameterError, match="expected at least one, each once"):
+        many(seeds=(1, 1))
