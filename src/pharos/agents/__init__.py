@@ -1,5 +1,8 @@
-"""Agents: tabular Q-learning, and algorithms of Stable-Baselines3. `pharos.experiments.train` trains them on a task."""
+"""Agents: tabular Q-learning, and algorithms of Stable-Baselines3, one by one or batched. `pharos.experiments.train`
+trains them on a task.
+"""
 
+from pharos.agents import batched
 from pharos.agents.deep import algorithm, check_hyperparameters, make_model
 from pharos.agents.hyperparameters import hyperparameters
 from pharos.agents.kinds import AGENTS, BATCHED, TABULAR_OBSERVATION, AgentKind, agent_kind, agent_source, is_known

@@ -4,6 +4,8 @@ The package announces its files; each is loaded where it is used, and loads Numb
 """
 
 __all__ = [
+    "batched_learning",
+    "batched_worlds",
     "bellman",
     "clocks",
     "dense_search",
@@ -23,6 +25,7 @@ __all__ = [
     "palettes",
     "partition",
     "paths",
+    "philox",
     "stepping",
     "symmetry",
     "tails",

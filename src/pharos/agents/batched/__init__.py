@@ -1,0 +1,25 @@
+"""The batched engine: many independent runs of DQN or PPO as one program on torch. docs/agents.md describes it.
+
+torch is loaded when a batch is made.
+"""
+
+from typing import TYPE_CHECKING
+
+from pharos import lazy
+
+if TYPE_CHECKING:
+    from pharos.agents.batched.batch import Batch, make_batch
+    from pharos.agents.batched.runs import BatchRun, ObservationSource, group_key, supports
+
+_FILES = {
+    "Batch": "batch",
+    "BatchRun": "runs",
+    "ObservationSource": "runs",
+    "group_key": "runs",
+    "make_batch": "batch",
+    "supports": "runs",
+}
+
+__all__ = ["Batch", "BatchRun", "ObservationSource", "group_key", "make_batch", "supports"]
+
+__getattr__ = lazy.attributes(__name__, _FILES)

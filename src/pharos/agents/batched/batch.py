@@ -1,0 +1,97 @@
+"""A batch: any number of runs, packed into lanes of fixed width."""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import torch
+
+from pharos.agents.batched.dqn import DQNLane
+from pharos.agents.batched.lane import Lane, RunPolicy
+from pharos.agents.batched.runs import BatchRun, group_key
+from pharos.errors import ParameterError
+
+WIDTH_OF_VECTORS, WIDTH_OF_IMAGES = 32, 8
+LANES: dict[str, type[Lane]] = {"dqn": DQNLane}
+
+
+class Batch:
+    """N independent runs as one program.
+
+    Attributes:
+        runs: as given.
+        steps: of each run so far.
+        episodes: (N,) int64, finished ones; returns: (N,) float64, the sums of their returns.
+    """
+
+    def __init__(self, agent: str, runs: Sequence[BatchRun]):
+        if not runs:
+            raise ParameterError("a batch has no runs; expected at least one")
+        keys = {group_key(agent, run) for run in runs}
+        if len(keys) > 1:
+            raise ParameterError(f"{len(runs)} runs are of {len(keys)} groups; expected one batch a group (group_key)")
+        self.runs = list(runs)
+        self.width = WIDTH_OF_IMAGES if runs[0].observe.is_image else WIDTH_OF_VECTORS
+        self.lanes = [
+            LANES[agent](self.runs[first : first + self.width], self.width) for first in range(0, len(runs), self.width)
+        ]
+
+    @property
+    def steps(self) -> int:
+        """Steps of each run so far; those of a rollout that goes beyond the last one are not counted."""
+        return min(self.lanes[-1].steps, self.lanes[-1].total)
+
+    @property
+    def episodes(self) -> np.ndarray:
+        """(N,) int64, finished episodes."""
+        return np.concatenate([lane.worlds.episodes[: lane.number] for lane in self.lanes])
+
+    @property
+    def returns(self) -> np.ndarray:
+        """(N,) float64, the sums of the returns of finished episodes."""
+        return np.concatenate([lane.worlds.returns[: lane.number] for lane in self.lanes])
+
+    def learn(self, points: Sequence[int], at_point: Callable[[int], None]) -> None:
+        """Go on from `steps`, and call `at_point` at each of the points.
+
+        As in Stable-Baselines3's callbacks that is before the update that is due then; at the last step of the
+        training it is after it.
+        """
+        for point in points:
+            for lane in self.lanes:
+                lane.advance(int(point))
+            at_point(point)
+
+    def policy(self, i: int) -> RunPolicy:
+        """The policy of run i, as it is when it is asked: greedy for DQN, probabilities for PPO."""
+        return RunPolicy(self.lanes[i // self.width], i % self.width)
+
+    def parameters(self, i: int) -> dict[str, np.ndarray]:
+        """The network of run i, under the names of Stable-Baselines3's `policy.state_dict()`."""
+        return self.lanes[i // self.width].stored(i % self.width)
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Everything that `restore` needs to go on, bit for bit; the arrays are copies."""
+        return {
+            f"{k}/{name}": array.copy() for k, lane in enumerate(self.lanes) for name, array in lane.arrays().items()
+        }
+
+    def restore(self, state: dict[str, np.ndarray]) -> None:
+        """Go on from what `state` gave, in a batch of the same runs."""
+        for k, lane in enumerate(self.lanes):
+            prefix = f"{k}/"
+            lane.restore({name[len(prefix) :]: array for name, array in state.items() if name.startswith(prefix)})
+
+
+def make_batch(agent: str, runs: Sequence[BatchRun], *, device: str = "cpu", threads: int | None = None) -> Batch:
+    """A batch of runs of one group.
+
+    Args:
+        device: where it runs.
+        threads: of torch; None for one, as studies use processes.
+    Raises:
+        ParameterError: the engine lacks a hyperparameter, or the runs are of several groups.
+    """
+    if device != "cpu":
+        raise ParameterError(f"device is {device!r}; expected 'cpu'")
+    torch.set_num_threads(threads or 1)
+    return Batch(agent, runs)

@@ -1,0 +1,203 @@
+"""What a run is before it exists: its MDP, what it sees of the states, its hyperparameters; and which share a batch."""
+
+from collections.abc import Hashable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pharos.errors import ParameterError
+from pharos.mdp import TabularMDP
+
+if TYPE_CHECKING:
+    from pharos.observations import ObservationInContext
+    from pharos.state_space import StateSpace
+
+# What Stable-Baselines3 takes where nothing is given. The first part may differ among the runs of a batch.
+OF_A_RUN: dict[str, dict[str, Any]] = {
+    "dqn": {
+        "learning_rate": 1e-4,
+        "learning_starts": 100,
+        "tau": 1.0,
+        "gamma": 0.99,
+        "target_update_interval": 10_000,
+        "exploration_fraction": 0.1,
+        "exploration_initial_eps": 1.0,
+        "exploration_final_eps": 0.05,
+        "max_grad_norm": 10.0,
+    },
+    "ppo": {
+        "learning_rate": 3e-4,
+        "gamma": 0.99,
+        "gae_lambda": 0.95,
+        "clip_range": 0.2,
+        "ent_coef": 0.0,
+        "vf_coef": 0.5,
+        "max_grad_norm": 0.5,
+    },
+}
+OF_A_BATCH: dict[str, dict[str, Any]] = {
+    "dqn": {
+        "n_envs": 1,
+        "buffer_size": 1_000_000,
+        "batch_size": 32,
+        "train_freq": 4,
+        "gradient_steps": 1,
+        "n_steps": 1,
+        "net_arch": [128],
+        "double": False,
+    },
+    "ppo": {
+        "n_envs": 1,
+        "n_steps": 2048,
+        "batch_size": 64,
+        "n_epochs": 10,
+        "normalize_advantage": True,
+        "target_kl": None,
+        "net_arch": [128],
+    },
+}
+# Names that change nothing here, or that may have this one value only.
+WITHOUT_EFFECT = ("n_timesteps", "verbose", "stats_window_size")
+ONLY: dict[str, Any] = {
+    "policy": "MlpPolicy",
+    "optimize_memory_usage": False,
+    "replay_buffer_class": None,
+    "replay_buffer_kwargs": None,
+    "rollout_buffer_class": None,
+    "rollout_buffer_kwargs": None,
+    "use_sde": False,
+    "sde_sample_freq": -1,
+    "clip_range_vf": None,
+}
+BLOCK = 4096  # states that are observed at once
+
+
+class ObservationSource:
+    """What the states of a space look like, by their numbers.
+
+    Attributes:
+        shape, dtype: of one observation.
+        is_image: whether Stable-Baselines3 takes it for an image: (C, H, W) or (H, W, C) uint8 from 0 to 255.
+        num_states: S.
+    Raises:
+        ParameterError: the observation is more than a function of the state.
+    """
+
+    def __init__(self, space: "StateSpace", observe: "ObservationInContext"):
+        if not observe.is_plain:
+            raise ParameterError(
+                "the batched engine sees functions of the state; expected neither previous_action nor remaining_time"
+            )
+        self.space, self.observe, self.num_states = space, observe.observation, space.num_states
+        seen = observe.space
+        self.shape, self.dtype = tuple(seen.shape or ()), np.dtype(seen.dtype)  # type: ignore[arg-type]
+        if not self.shape:
+            raise ParameterError("the batched engine has no network for the number of the state; expected 'vector'")
+        self.is_image = False
+        if len(self.shape) == 3 and self.dtype == np.uint8:
+            low, high = np.asarray(getattr(seen, "low", 1)), np.asarray(getattr(seen, "high", 1))
+            self.is_image = bool((low == 0).all() and (high == 255).all())
+
+    @staticmethod
+    def of(space: "StateSpace", observe: "ObservationInContext") -> "ObservationSource":
+        """The observations of a state space."""
+        return ObservationSource(space, observe)
+
+    @property
+    def bytes(self) -> int:
+        """Of the observations of all states."""
+        return self.num_states * int(np.prod(self.shape)) * self.dtype.itemsize
+
+    def at(self, indices: np.ndarray) -> np.ndarray:
+        """(N, ...): the observations of states (N,)."""
+        return self.observe(self.space.states(indices))
+
+    def table(self) -> np.ndarray:
+        """(S, ...): the observations of all states."""
+        table = np.empty((self.num_states, *self.shape), self.dtype)
+        for first in range(0, self.num_states, BLOCK):
+            rows = np.arange(first, min(first + BLOCK, self.num_states))
+            table[rows] = self.at(rows)
+        return table
+
+
+@dataclass(frozen=True, eq=False)
+class BatchRun:
+    """One run, before it exists.
+
+    Attributes:
+        mdp: with its chance; runs of one task share the same.
+        observe: what the agent sees of the states; runs of one task share the same.
+        time_limit: steps of an episode.
+        hyperparameters: under the names of Stable-Baselines3.
+        steps: of the whole training, for the schedules.
+        seed: for the record.
+        key: 64 bits that name the run; all its random numbers follow from them.
+        gamma: of the returns that are counted, not the agent's own discount.
+        outcome_rewards: (N,) what each possible outcome pays, as `rewards_of_outcomes` gives it; None: expected rewards
+            are paid.
+    """
+
+    mdp: TabularMDP
+    observe: Any
+    time_limit: int
+    hyperparameters: Mapping[str, Any]
+    steps: int
+    seed: int
+    key: int
+    gamma: float = 1.0
+    outcome_rewards: np.ndarray | None = None
+
+
+def supports(agent: str, hyperparameters: Mapping[str, Any]) -> str | None:
+    """None where the engine has the agent and its hyperparameters; else the first that it lacks, and why."""
+    if agent not in OF_A_RUN:
+        return f"agent {agent!r}: the batched engine has {' and '.join(OF_A_RUN)}"
+    for name, value in hyperparameters.items():
+        if name == "policy_kwargs":
+            others = sorted(set(value or {}) - {"net_arch"})
+            if others:
+                return f"policy_kwargs: {others[0]}"
+        elif name in ONLY:
+            if value != ONLY[name]:
+                return f"{name}: {value!r}; the batched engine has {ONLY[name]!r} alone"
+        elif name not in OF_A_RUN[agent] and name not in OF_A_BATCH[agent] and name not in WITHOUT_EFFECT:
+            return f"{name}: the batched engine does not have it"
+        elif name == "train_freq" and not _is_in_steps(value):
+            return f"train_freq: {value!r}; the batched engine counts steps"
+        elif name in OF_A_RUN[agent] and (isinstance(value, bool) or not isinstance(value, int | float)):
+            return f"{name}: {value!r}; the batched engine takes a number"
+    if agent == "dqn" and isinstance(_net_arch(hyperparameters), Mapping):
+        return "net_arch: a list of sizes for DQN"
+    return None
+
+
+def resolved(agent: str, hyperparameters: Mapping[str, Any]) -> dict[str, Any]:
+    """All hyperparameters of an agent; ParameterError where the engine lacks one."""
+    lacking = supports(agent, hyperparameters)
+    if lacking is not None:
+        raise ParameterError(f"{lacking}; try the engine 'stable_baselines3'")
+    known = {**OF_A_RUN[agent], **OF_A_BATCH[agent]}
+    result = {**known, **{name: value for name, value in hyperparameters.items() if name in known}}
+    result["net_arch"] = _net_arch(hyperparameters)
+    if agent == "dqn" and not isinstance(result["train_freq"], int):
+        result["train_freq"] = int(result["train_freq"][0])
+    return result
+
+
+def group_key(agent: str, run: BatchRun) -> Hashable:
+    """Runs with equal keys can share a batch."""
+    options = resolved(agent, run.hyperparameters)
+    shared = tuple((name, repr(options[name])) for name in OF_A_BATCH[agent])
+    observation = (tuple(run.observe.shape), str(run.observe.dtype), run.observe.is_image)
+    return agent, run.steps, run.mdp.num_actions, observation, shared
+
+
+def _net_arch(hyperparameters: Mapping[str, Any]) -> Any:
+    given = hyperparameters.get("net_arch", OF_A_BATCH["dqn"]["net_arch"])
+    return (hyperparameters.get("policy_kwargs") or {}).get("net_arch", given)
+
+
+def _is_in_steps(value: Any) -> bool:
+    return isinstance(value, int) or (len(value) == 2 and value[1] == "step")

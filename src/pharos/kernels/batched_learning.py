@@ -1,0 +1,103 @@
+"""What W runs learn from at once: minibatches of a replay memory, losses with their gradients, Adam with clipping.
+
+Sources: Mnih et al. (2015); van Hasselt et al. (2016), double; Kingma and Ba (2015). Each function does for every run
+what Stable-Baselines3 does for one; docs/agents.md says where the arithmetic differs.
+"""
+
+import numpy as np
+from numba import float32, njit
+
+from pharos.kernels.batched_worlds import DONE, SAMPLE, TIMEOUT
+from pharos.kernels.philox import below, philox
+
+
+@njit(cache=True, nogil=True)
+def sample(keys, step, draw, place, filled, gammas, num_steps, memory, batch):
+    """Draw a minibatch of each run from its replay memory, uniformly, with returns of `num_steps` steps.
+
+    place: the row that is written next; filled: the number of rows that are; gammas (W,).
+    memory: (state, next state (W, R, E), action (W, R, E), reward (W, R, E) float32, flags (W, R, E)).
+    batch: (state, next state (W, B), action (W, B), reward (W, B) float32, discount (W, B) float32), written here:
+    discount is what the value of the next state is multiplied by: gamma^n, 0 where the episode ended there. A return
+    stops at the end of an episode, at a time limit, and at the newest transition.
+    """
+    state, following, action, reward, flags = memory
+    states, nexts, actions, rewards, discounts = batch
+    size, copies = state.shape[1], state.shape[2]
+    last = (place - 1) % size
+    for i in range(states.shape[0]):
+        for b in range(states.shape[1]):
+            w = philox(b, draw, step, SAMPLE, keys[i])
+            row, e = below(w[0], filled), below(w[1], copies)
+            states[i, b], actions[i, b] = state[i, row, e], action[i, row, e]
+            total, factor, at = 0.0, 1.0, row
+            for n in range(num_steps):
+                at = (row + n) % size
+                total += factor * reward[i, at, e]
+                factor *= gammas[i]
+                if flags[i, at, e] & DONE or at == last:
+                    break
+            nexts[i, b], rewards[i, b] = following[i, at, e], float32(total)
+            ended = flags[i, at, e] & DONE and not flags[i, at, e] & TIMEOUT
+            discounts[i, b] = float32(0.0) if ended else float32(factor)
+
+
+@njit(cache=True, nogil=True)
+def huber(q, q_next, q_choice, actions, rewards, discounts, dq, loss):
+    """The smooth L1 loss of DQN, (W,), and its gradient dq (W, B, A).
+
+    q: (W, B, A) of the states; q_next: of the next states, by the target network; q_choice: what the next action is
+    the best of: q_next itself, or by the online network (double).
+    """
+    num_rows, num_actions = q.shape[1], q.shape[2]
+    share = float32(1.0) / float32(num_rows)
+    for i in range(q.shape[0]):
+        total = 0.0
+        for b in range(num_rows):
+            best = 0
+            for a in range(num_actions):
+                dq[i, b, a] = 0.0
+                if q_choice[i, b, a] > q_choice[i, b, best]:
+                    best = a
+            target = rewards[i, b] + discounts[i, b] * q_next[i, b, best]
+            difference = q[i, b, actions[i, b]] - target
+            size = abs(difference)
+            total += 0.5 * size * size if size < 1.0 else size - 0.5
+            dq[i, b, actions[i, b]] = share * min(max(difference, float32(-1.0)), float32(1.0))
+        loss[i] = total / num_rows
+
+
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
+def _squares(x):
+    total = float32(0.0)
+    for j in range(len(x)):
+        total += x[j] * x[j]
+    return total
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _adam(parameters, gradient, mean, square, scale, step, root, eps):
+    first, second = float32(0.1), float32(0.001)
+    keep = float32(0.999)
+    for j in range(len(parameters)):
+        g = scale * gradient[j]
+        m = mean[j] + first * (g - mean[j])
+        v = keep * square[j] + second * g * g
+        mean[j], square[j] = m, v
+        parameters[j] -= step * m / (np.sqrt(v) / root + eps)
+
+
+@njit(cache=True, nogil=True)
+def adam(parameters, gradients, means, squares, counts, is_active, rates, max_norms, eps):
+    """A step of Adam (betas 0.9 and 0.999) for the runs that are active, by gradients clipped to a norm.
+
+    parameters, gradients, means, squares: (W, P) float32; counts (W,): steps so far; rates, max_norms (W,).
+    """
+    for i in range(len(parameters)):
+        if is_active[i]:
+            counts[i] += 1
+            norm = np.sqrt(np.float64(_squares(gradients[i])))
+            scale = float32(min(1.0, max_norms[i] / (norm + 1e-6)))
+            step = rates[i] / (1.0 - 0.9 ** counts[i])
+            root = np.sqrt(1.0 - 0.999 ** counts[i])
+            _adam(parameters[i], gradients[i], means[i], squares[i], scale, float32(step), float32(root), float32(eps))

@@ -1,0 +1,134 @@
+"""Many runs' episodes at once: W runs with E copies of their environment each, on the tables of their MDPs.
+
+Every draw is named by its counter (philox.py): the run is the key, and a step of a copy has one block of four words:
+a random action; what is executed; which outcome; where the next episode starts. Whether a run explores in a step is a
+block of its own, as one draw holds for all copies of a run.
+"""
+
+import numpy as np
+from numba import njit, types
+from numba.extending import overload
+
+from pharos.kernels.bellman import reward_at
+from pharos.kernels.outcomes import outcome, outcomes_of, size_of
+from pharos.kernels.philox import below, philox, unit
+from pharos.kernels.stepping import executed_by_number
+
+STEP, EXPLORE, SAMPLE, SHUFFLE, WEIGHTS, ACT = range(6)  # streams of random numbers
+DONE, TIMEOUT = 1, 2  # bits of a transition's flags
+
+
+@njit(cache=True, nogil=True)
+def exploring(keys, step, epsilon, is_warming, out):
+    """out[i] = whether run i acts at random in a step: while it warms up, and with probability epsilon[i]."""
+    for i in range(len(keys)):
+        out[i] = is_warming[i] or unit(philox(0, 0, step, EXPLORE, keys[i])[0]) < epsilon[i]
+
+
+@njit(cache=True, nogil=True)
+def choose(keys, step, explores, q, actions):
+    """actions (W, E): random ones where a run explores, else the first of the best of q (W, E, A)."""
+    for i in range(actions.shape[0]):
+        for e in range(actions.shape[1]):
+            if explores[i]:
+                actions[i, e] = below(philox(0, e, step, STEP, keys[i])[0], q.shape[2])
+            else:
+                best = 0
+                for a in range(1, q.shape[2]):
+                    if q[i, e, a] > q[i, e, best]:
+                        best = a
+                actions[i, e] = best
+
+
+def drawn_outcome(transitions, s, a, u):
+    """(next state, number of the outcome) of (s, a) that u in (0, 1) falls on."""
+
+
+@overload(drawn_outcome)
+def _drawn_outcome(transitions, s, a, u):
+    if isinstance(transitions, types.Array):
+        return lambda transitions, s, a, u: (np.int64(transitions[s, a]), 0)
+
+    def drawn(transitions, s, a, u):
+        k, passed = 0, 0.0
+        for j in outcomes_of(transitions, s, a):
+            p = outcome(transitions, s, a, j)[1]
+            if p > 0.0 and passed <= u:
+                k = j
+                passed += p
+        return np.int64(outcome(transitions, s, a, k)[0]), k
+
+    return drawn
+
+
+def paid(rewards, s, a, k):
+    """The reward of outcome k of (s, a): of the outcome itself, or expected where only that is known."""
+
+
+@overload(paid)
+def _paid(rewards, s, a, k):
+    if len(rewards) == 2:  # (table, palette) of expected rewards
+        return lambda rewards, s, a, k: reward_at(rewards[0], rewards[1], s, a)
+    return lambda rewards, s, a, k: outcome(rewards, s, a, k)[0]
+
+
+@njit(cache=True, nogil=True)
+def start(keys, members, starts, cumulative, state):
+    """state (W, E) of the first episodes of the runs `members`."""
+    for i in members:
+        for e in range(state.shape[1]):
+            state[i, e] = _start_of(starts, cumulative, philox(1, e, 0, STEP, keys[i])[3])
+
+
+@njit(forceinline=True)
+def _start_of(starts, cumulative, word):
+    k = 0
+    if len(cumulative) > 1:
+        u = unit(word)
+        while k < len(cumulative) - 1 and u >= cumulative[k]:
+            k += 1
+    return starts[k]
+
+
+@njit(cache=True, nogil=True)
+def advance(
+    transitions, rewards, terminal, starts, cumulative, members, setting, actions, episodes, transition, counts
+):
+    """One step of every copy of the runs `members`, which share an MDP; what has ended starts anew.
+
+    transitions: see kernels/outcomes.py; rewards: see `paid`; terminal (S,); starts, cumulative: start states and
+    their cumulated probabilities.
+    setting: (keys (W,) uint64, step, chances (W, 4), limits (W,), gammas (W,)), as in `stepping.Setting`.
+    episodes: (state, previous, elapsed (W, E) int64, return, discount (W, E) float64) of the running episodes, and
+    (number, sum of returns (W,)) of the finished ones, which this step adds to where `counts` is true.
+    transition: (next state (W, E) int64, reward (W, E) float64, flags (W, E) uint8) of this step, written here. A
+    transition that ends an episode without a next state has the state itself there.
+    """
+    keys, step, chances, limits, gammas = setting
+    state, previous, elapsed, running, discount, finished, returns = episodes
+    following, reward, flags = transition
+    num_actions = size_of(transitions)[1]
+    for i in members:
+        chance = (chances[i, 0], chances[i, 1], chances[i, 2], chances[i, 3])
+        for e in range(state.shape[1]):
+            w = philox(0, e, step, STEP, keys[i])
+            s, action = state[i, e], actions[i, e]
+            if chance[0] < 1.0 or chance[3] < 1.0:
+                action = executed_by_number(action, previous[i, e], chance, num_actions, unit(w[1]))
+            t, k = drawn_outcome(transitions, s, action, unit(w[2]))
+            reward[i, e] = paid(rewards, s, action, k)
+            ended = t < 0 or terminal[t]
+            elapsed[i, e] += 1
+            timeout = not ended and elapsed[i, e] >= limits[i]
+            following[i, e] = s if t < 0 else t
+            flags[i, e] = (DONE if ended or timeout else 0) | (TIMEOUT if timeout else 0)
+            running[i, e] += discount[i, e] * reward[i, e]
+            discount[i, e] *= gammas[i]
+            state[i, e], previous[i, e] = following[i, e], action
+            if ended or timeout:
+                if counts:
+                    finished[i] += 1
+                    returns[i] += running[i, e]
+                running[i, e], discount[i, e] = 0.0, 1.0
+                state[i, e] = _start_of(starts, cumulative, w[3])
+                previous[i, e], elapsed[i, e] = -1, 0

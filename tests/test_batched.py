@@ -1,0 +1,95 @@
+"""The batched engine by itself: its random numbers, that runs do not feel each other, and that it can be resumed."""
+
+import numpy as np
+import pytest
+
+from pharos.agents.batched import BatchRun, ObservationSource, group_key, make_batch, supports
+from pharos.environments import make
+from pharos.errors import ParameterError
+from pharos.experiments.task import Task
+from pharos.kernels.philox import philox
+
+DQN = {"learning_rate": 0.01, "buffer_size": 60, "learning_starts": 20, "batch_size": 8, "train_freq": 4, "n_envs": 2,
+       "target_update_interval": 10, "net_arch": [12], "n_steps": 2}  # fmt: skip
+
+
+def runs_of(task, hyperparameters, number=3, steps=120):
+    source = ObservationSource.of(task.space, task.sight.observe)
+    return [
+        BatchRun(task.mdp, source, task.time_limit, hyperparameters, steps, i, 2**40 + 977 * i) for i in range(number)
+    ]
+
+
+@pytest.fixture(scope="module")
+def grid():
+    return Task.of(make("simple_grid"), sticky=0.2, random=0.1)
+
+
+def outcome(batch, i):
+    """All that a run leaves behind, as bytes."""
+    parts = [value.tobytes() for value in batch.parameters(i).values()]
+    return b"".join([*parts, batch.episodes[i].tobytes(), batch.returns[i].tobytes()])
+
+
+def learned(agent, runs, points=(60, 120)):
+    batch = make_batch(agent, runs)
+    batch.learn(points, lambda point: None)
+    return batch
+
+
+@pytest.mark.parametrize(
+    ("counter", "key", "words"),
+    [
+        ((0, 0, 0, 0), (0, 0), (0x6627E8D5, 0xE169C58D, 0xBC57AC4C, 0x9B00DBD8)),
+        ((0xFFFFFFFF,) * 4, (0xFFFFFFFF,) * 2, (0x408F276D, 0x41C83B0E, 0xA20BC7C6, 0x6D5451FD)),
+        (
+            (0x243F6A88, 0x85A308D3, 0x13198A2E, 0x03707344),
+            (0xA4093822, 0x299F31D0),
+            (0xD16CFE09, 0x94FDCCEB, 0x5001E420, 0x24126EA1),
+        ),
+    ],
+)
+def test_philox_gives_the_known_answers_of_random123(counter, key, words):
+    from numba import njit
+
+    answer = njit(lambda c, k: philox(c[0], c[1], c[2], c[3], k))(
+        tuple(map(np.uint64, counter)), np.uint64(key[0] | key[1] << 32)
+    )
+    assert tuple(map(int, answer)) == words
+
+
+def test_a_run_is_the_same_alone_among_others_and_in_another_order(grid):
+    runs = runs_of(grid, DQN, 40)
+    together, backwards, alone = learned("dqn", runs), learned("dqn", runs[::-1]), learned("dqn", runs[5:6])
+    assert outcome(together, 5) == outcome(alone, 0)
+    assert all(outcome(together, i) == outcome(backwards, 39 - i) for i in range(40))
+    assert len({outcome(together, i) for i in range(40)}) == 40
+
+
+def test_a_restored_batch_goes_on_bit_for_bit(grid):
+    runs = runs_of(grid, DQN)
+    kept = {}
+    batch = make_batch("dqn", runs)
+    batch.learn([50, 120], lambda point: kept.setdefault(point, batch.state()))
+    resumed = make_batch("dqn", runs)
+    resumed.restore(kept[50])
+    assert resumed.steps == 50
+    resumed.learn([120], lambda point: None)
+    assert all((resumed.state()[name] == array).all() for name, array in batch.state().items())
+
+
+def test_what_the_engine_lacks_is_named(grid):
+    assert supports("dqn", DQN) is None
+    assert supports("a2c", {}).startswith("agent 'a2c'")
+    assert supports("dqn", {"train_freq": (1, "episode")}).startswith("train_freq")
+    assert supports("ppo", {"use_sde": True}).startswith("use_sde")
+    assert supports("dqn", {"policy_kwargs": {"activation_fn": None}}) == "policy_kwargs: activation_fn"
+    with pytest.raises(ParameterError, match=r"learning_rate: .* takes a number"):
+        make_batch("dqn", runs_of(grid, {**DQN, "learning_rate": "lin_0.1"}))
+
+
+def test_runs_of_other_shapes_are_of_another_group(grid):
+    one, other, alike = (runs_of(grid, {**DQN, **more}, 1)[0] for more in ({}, {"batch_size": 4}, {"gamma": 0.5}))
+    assert group_key("dqn", one) == group_key("dqn", alike) != group_key("dqn", other)
+    with pytest.raises(ParameterError, match="2 groups"):
+        make_batch("dqn", [one, other])
