@@ -135,25 +135,53 @@ def before(part: str, other: str) -> bool:
 @functools.cache
 def imports() -> list[tuple[str, str, bool]]:
     """(file, what it imports of pharos, whether its package announces that); those for type checkers included."""
-    found = []
-    for file in sorted(SOURCE.rglob("*.py")):
-        path = file.relative_to(SOURCE).as_posix()
-        for node in ast.walk(ast.parse(file.read_text())):
-            if isinstance(node, ast.Import):
-                names = [(alias.name, alias.name.count(".") < 2) for alias in node.names]
-            elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module == "pharos":
-                names = [(f"pharos.{alias.name}", True) for alias in node.names]
-            elif isinstance(node, ast.ImportFrom) and node.level == 0:
-                parts = (node.module or "").split(".")  # a package may announce modules, as kernels does
-                wanted = [".".join([*parts[1:], alias.name]).split(".")[1:] for alias in node.names]
-                names = [
-                    (f"{node.module}.{alias.name}", name[0] in announced(parts[1]) if len(parts) > 1 and name else True)
-                    for alias, name in zip(node.names, wanted, strict=True)
-                ]
-            else:
-                continue
-            found += [(path, name, public) for name, public in names if name.split(".")[0] == "pharos" and "." in name]
+    files = {file.relative_to(SOURCE).as_posix(): file.read_text() for file in sorted(SOURCE.rglob("*.py"))}
+    found = [(path, *each) for path, text in files.items() for each in imports_of(path, text)]
     return [(path, name, public) for path, name, public in found if name.split(".")[1] in ORDER]
+
+
+def imports_of(path: str, text: str) -> list[tuple[str, bool]]:
+    """(what the text of a file imports of pharos, whether its package announces that), however it is written: at the
+    top or in a function, relatively, as an attribute of pharos, or by a name for `import_module`."""
+    found = []
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.Import):
+            found += [(alias.name, alias.name.count(".") < 2) for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            above = ["pharos", *path.split("/")][: -node.level] if node.level else []
+            module = ".".join([*above, *filter(None, [node.module])])
+            parts = module.split(".")[1:]  # a package may announce modules, as kernels does
+            found += [(f"{module}.{alias.name}", is_announced([*parts, alias.name])) for alias in node.names]
+        elif isinstance(node, ast.Attribute) and ast.unparse(node.value) == "pharos":
+            found.append((f"pharos.{node.attr}", True))
+        elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith("import_module"):
+            name = node.args[0].value if isinstance(node.args[0], ast.Constant) else ""
+            found.append((name, is_announced(name.split(".")[1:])))
+    return [(name, public) for name, public in found if name.startswith("pharos.")]
+
+
+def is_announced(parts: list[str]) -> bool:
+    """Whether a name below pharos, such as mdp.TabularMDP, is a package, or what a package announces."""
+    return len(parts) < 2 or parts[1] in announced(parts[0])
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ("import pharos.mdp", ("pharos.mdp", True)),
+        ("from pharos import mdp", ("pharos.mdp", True)),
+        ("from pharos.mdp import TabularMDP", ("pharos.mdp.TabularMDP", True)),
+        ("from pharos.mdp.tabular import TabularMDP", ("pharos.mdp.tabular.TabularMDP", False)),
+        ("def f():\n    import pharos.mdp.tabular", ("pharos.mdp.tabular", False)),
+        ("from ..mdp import TabularMDP", ("pharos.mdp.TabularMDP", True)),
+        ("from ..mdp.tabular import TabularMDP", ("pharos.mdp.tabular.TabularMDP", False)),
+        ("from .. import mdp", ("pharos.mdp", True)),
+        ("import pharos\npharos.study.run()", ("pharos.study", True)),
+        ("importlib.import_module('pharos.mdp.tabular')", ("pharos.mdp.tabular", False)),
+    ],
+)
+def test_an_import_is_seen_however_it_is_written(line, expected):
+    assert imports_of("solvers/values.py", line) == [expected]
 
 
 @functools.cache
