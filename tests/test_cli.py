@@ -392,6 +392,25 @@ def test_bad_usage_is_one_line_and_exit_code_2(failure, words, said):
     assert said in line
 
 
+@pytest.mark.parametrize(
+    ("words", "code", "said"),
+    [
+        (
+            ["build", "simple_grid", "height=4000000000", "width=4000000000"],
+            1,
+            "a number is too large: array is too big",
+        ),
+        (["build", "freeway", f"num_cars={10**30}"], 1, "a number is too large"),
+        (["build", "simple_grid", f"penalties=0,1:-{10**400}"], 2, "expected ((row, column), value)"),
+        (["train", "frozen_lake/4x4", "--agent", "q_learning", "--steps", 10**24], 2, "of 64 bits"),
+    ],
+)
+def test_numbers_beyond_all_machines_are_one_line(failure, words, code, said):
+    found, line = failure(*words)
+    assert found == code
+    assert said in line
+
+
 def test_what_fails_is_one_line_and_exit_code_1(failure, tmp_path):
     code, line = failure("build", "simple_grid", "--max-states", 3, "--out", tmp_path / "small")
     assert code == 1

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 import pharos
 from naive_horizon import analysis
 from pharos import hardness
-from pharos.errors import ParameterError, UndefinedMeasure
+from pharos.errors import ParameterError, PrecisionError, UndefinedMeasure
 from pharos.hardness.effective_horizon import _compiled, _vectorized
 from pharos.hardness.large_horizon import LargeHorizon
 from pharos.hardness.steps import TIE, Steps
@@ -229,3 +229,10 @@ def test_actions_that_rounding_or_less_than_the_tie_tolerance_tells_apart_are_bo
     assert 0.1 + 0.2 > 0.3
     assert _vectorized(Steps(mdp, 2))["k_min"] == expected
     assert _compiled(LargeHorizon(mdp, 2, TIE))["k_min"] == expected
+
+
+@pytest.mark.parametrize("function", [hardness.effective_horizon, hardness.gorp_bound])
+def test_returns_whose_squares_are_no_floats_are_refused(function):
+    mdp = TabularMDP.from_arrays([[0, 1], [1, 1]], [[1e308, 0.0], [0.0, 0.0]], gamma=1.0)
+    with pytest.raises(PrecisionError, match=r"returns of 50 steps may pass 1e\+150"):
+        function(mdp, horizon=50)

@@ -33,6 +33,8 @@ from pharos.errors import DivergenceError, ParameterError, PharosError
 from pharos.installation import conflict
 
 EXIT_FAILED, EXIT_USAGE, EXIT_INTERRUPTED = 1, 2, 130
+# What NumPy says of an array that no machine can hold, by a ValueError
+NO_ARRAY = ("array is too big", "Maximum allowed dimension exceeded")
 
 
 class _Group(TyperGroup):
@@ -72,6 +74,9 @@ def _exit_code(error: Exception) -> int | None:
         return EXIT_FAILED
     if isinstance(error, MemoryError):
         complain(f"out of memory: {error or 'an array did not fit'}; choose a smaller instance, or set --memory")
+        return EXIT_FAILED
+    if isinstance(error, OverflowError) or str(error).startswith(NO_ARRAY):
+        complain(f"a number is too large: {error}; choose a smaller instance")
         return EXIT_FAILED
     if type(error).__name__ == "Abort":
         return EXIT_INTERRUPTED

@@ -209,7 +209,12 @@ VALUED_CELLS = Kind("row,column:value; ...", _valued_cells)
 
 def is_real(value: object) -> bool:
     """Whether `value` is a finite real number (and not a bool)."""
-    return isinstance(value, numbers.Real) and not isinstance(value, bool) and math.isfinite(value)
+    if not isinstance(value, numbers.Real) or isinstance(value, bool):
+        return False
+    try:
+        return math.isfinite(value)
+    except OverflowError:  # an integer beyond 1.8e308
+        return False
 
 
 def _integer(env: Any, name: str, value: Any, low: int | None, high: int | None) -> int:

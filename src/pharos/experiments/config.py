@@ -160,8 +160,8 @@ class RunConfig:
             )
         for name in ("steps", "evaluation_interval"):
             value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-                raise ParameterError(f"{name} is {value!r}; expected a whole number of at least 1")
+            if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value < 2**63:
+                raise ParameterError(f"{name} is {value!r}; expected a whole number of at least 1, and of 64 bits")
 
     @staticmethod
     def of_task(

@@ -13,7 +13,7 @@ import numpy as np
 from pharos.hardness.gorp import gorp_bound
 from pharos.hardness.large_horizon import LargeHorizon, applies
 from pharos.hardness.look_ahead import LookAhead
-from pharos.hardness.steps import TIE, Steps, steps_of
+from pharos.hardness.steps import TIE, Steps, check_returns, steps_of
 from pharos.mdp import TabularMDP, takes_mdp
 
 COMPILED = 2**26  # bytes of the table of all steps from which on it is not written out
@@ -73,13 +73,14 @@ def effective_horizon(mdp: TabularMDP, *, horizon: int | None = None, tight: int
         tight: the largest k for which the tight bound of `gorp_bound` is computed as well; 0: none.
     Raises:
         UndefinedMeasure: there is no horizon, or the table of all steps does not fit into memory: 8 GiB under chance,
-            else 60 % of that of the machine.
+            else 60 % of that of the machine. PrecisionError: returns may pass 1e150.
     Cost: a pass over T x nodes x A for every k that is tried, of those that can be met within T steps. Memory 40 bytes
         for each of them under chance; 17 bytes for each of T x S without.
     Source: Laidlaw, Russell and Dragan (2023), "Bridging RL theory and practice with the effective horizon", theorem
         5.4 and appendix C; sticky actions: Laidlaw et al. (2024).
     """
     steps = steps_of("effective_horizon", mdp, horizon)
+    check_returns("effective_horizon", mdp, steps)
     mdp = mdp.within(steps)
     compiled = applies(mdp) and 40 * steps * mdp.num_states * mdp.num_actions > COMPILED
     parts = _compiled(LargeHorizon(mdp, steps, TIE)) if compiled else _vectorized(Steps(mdp, steps))

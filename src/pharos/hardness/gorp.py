@@ -17,7 +17,7 @@ import numpy as np
 from pharos.errors import ParameterError, UndefinedMeasure
 from pharos.hardness.gorp_tails import Tails, knapsack, sequences_of
 from pharos.hardness.return_distribution import central_moments
-from pharos.hardness.steps import TIE, Steps, steps_of
+from pharos.hardness.steps import TIE, Steps, check_returns, steps_of
 from pharos.mdp import TabularMDP, takes_mdp
 from pharos.wording import many
 
@@ -87,13 +87,14 @@ def gorp_bound(
     Raises:
         UndefinedMeasure: the MDP has chance or several outcomes: GORP's sequences of actions then lead nowhere in
             particular.
-        ParameterError: an option is wrong.
+        ParameterError: an option is wrong. PrecisionError: returns may pass 1e150.
     Cost: for each of about 15 values of m a pass over the nodes that optimal play can meet, A^2k 100 tails for each.
         KeyCorridor (168 states, T = 100, k = 1) takes 20 s; only `exact` and `bennett` 4 s.
     Source: Laidlaw, Russell and Dragan (2023), "Bridging RL theory and practice with the effective horizon", appendix
         C.
     """
     steps, names = steps_of("gorp_bound", mdp, horizon), tuple(methods)
+    check_returns("gorp_bound", mdp, steps)
     if isinstance(max_k, bool) or not isinstance(max_k, int | np.integer) or max_k < 1:
         raise ParameterError(f"max_k is {max_k!r}; expected a whole number, at least 1")
     for name in names:

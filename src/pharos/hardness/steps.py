@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy import sparse
 
-from pharos.errors import ParameterError, UndefinedMeasure
+from pharos.errors import ParameterError, PrecisionError, UndefinedMeasure
 from pharos.hardness.choices import choices_of
 from pharos.mdp import TabularMDP
 
@@ -17,6 +17,8 @@ from pharos.mdp import TabularMDP
 TIE = 1e-4
 # Bytes that the tables of all steps may take.
 MEMORY = 8 * 2**30
+# Of returns whose squares 64-bit floats hold.
+LARGEST = 1e150
 
 
 def steps_of(name: str, mdp: TabularMDP, horizon: int | None) -> int:
@@ -27,6 +29,15 @@ def steps_of(name: str, mdp: TabularMDP, horizon: int | None) -> int:
     if isinstance(steps, bool) or not isinstance(steps, int | np.integer) or steps < 1:
         raise ParameterError(f"horizon is {steps!r}; expected a whole number of steps, at least 1")
     return int(steps)
+
+
+def check_returns(name: str, mdp: TabularMDP, steps: int) -> None:
+    """PrecisionError where returns of so many steps may have squares that 64-bit floats do not hold."""
+    if not steps * max(abs(mdp.reward_table.lowest), abs(mdp.reward_table.highest)) <= LARGEST:
+        raise PrecisionError(
+            f"{name}: returns of {steps} steps may pass {LARGEST:g}, and 64-bit floats do not hold their squares; "
+            f"use smaller rewards"
+        )
 
 
 class Steps:
