@@ -41,7 +41,7 @@ def train(
     observation: Annotated[
         str,
         typer.Option(
-            "--observation", help="vector, simple_image, complex_image, one_hot, index, recorded, or your own."
+            "--observation", help="vector, simple_image, complex_image, one_hot, index, hash, recorded, or your own."
         ),
     ] = "vector",
     option: Annotated[

@@ -29,6 +29,7 @@ __all__ = [
     "stepping",
     "symmetry",
     "tails",
+    "tangent",
     "ties",
     "travel",
 ]

@@ -14,28 +14,39 @@ from pharos.observations.vector import Index, OneHot, Vector
 
 if TYPE_CHECKING:
     from pharos.observations.complex_image import ComplexImage
+    from pharos.observations.empirical import empirical_ntk
+    from pharos.observations.hash import Hash
     from pharos.observations.look_alikes import Aliasing, aliasing, counted, observation_classes
     from pharos.observations.memoryless import MemorylessLoss, memoryless_loss
+    from pharos.observations.networks import Network, default_network
     from pharos.observations.own import OwnObservation, imported, observation_of, own_observation
     from pharos.observations.rendered import RENDERERS, render, renderers
     from pharos.observations.simple_image import SimpleImage
+    from pharos.observations.tangent_kernels import network_inputs, ntk, tangent_kernel
 
 _FILES = {
     "Aliasing": "look_alikes",
     "ComplexImage": "complex_image",
+    "Hash": "hash",
     "MemorylessLoss": "memoryless",
+    "Network": "networks",
     "OwnObservation": "own",
     "RENDERERS": "rendered",
     "SimpleImage": "simple_image",
     "aliasing": "look_alikes",
     "counted": "look_alikes",
+    "default_network": "networks",
+    "empirical_ntk": "empirical",
     "imported": "own",
     "memoryless_loss": "memoryless",
+    "network_inputs": "tangent_kernels",
+    "ntk": "tangent_kernels",
     "observation_classes": "look_alikes",
     "observation_of": "own",
     "own_observation": "own",
     "render": "rendered",
     "renderers": "rendered",
+    "tangent_kernel": "tangent_kernels",
 }
 
 __all__ = [
@@ -44,8 +55,10 @@ __all__ = [
     "Aliasing",
     "ComplexImage",
     "FunctionObservation",
+    "Hash",
     "Index",
     "MemorylessLoss",
+    "Network",
     "Observation",
     "ObservationInContext",
     "OneHot",
@@ -54,10 +67,14 @@ __all__ = [
     "Vector",
     "aliasing",
     "counted",
+    "default_network",
+    "empirical_ntk",
     "imported",
     "in_blocks",
     "memoryless_loss",
     "names",
+    "network_inputs",
+    "ntk",
     "observation_classes",
     "observation_of",
     "observe",
@@ -65,6 +82,7 @@ __all__ = [
     "register",
     "render",
     "renderers",
+    "tangent_kernel",
     "title",
 ]
 

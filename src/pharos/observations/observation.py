@@ -102,6 +102,7 @@ _BUILT_IN = {
     "complex_image": "complex_image:ComplexImage",
     "one_hot": "vector:OneHot",
     "index": "vector:Index",
+    "hash": "hash:Hash",
     "recorded": "recorded:Recorded",
 }
 _registered: dict[str, tuple[Function, Any]] = {}

@@ -1,0 +1,53 @@
+"""Tangent kernels of any network of PyTorch, as a mean over random networks: where no closed form is known."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from pharos.errors import MissingExtra, ParameterError
+
+
+def empirical_ntk(make: Callable[[], Any], x: np.ndarray, *, networks: int = 100, seed: int = 0) -> np.ndarray:
+    """Return the mean over random networks of the inner products of gradients of the first output.
+
+    Args:
+        make: () -> a torch.nn.Module from inputs (N, ...) to outputs (N, A), with parameters drawn anew.
+        x: (N, ...) inputs, see `network_inputs`.
+        networks: how many; the standard error falls with the square root.
+        seed: of PyTorch's random numbers, which are left as they were.
+    Returns:
+        (N, N) float32, symmetric.
+    Raises:
+        MissingExtra: PyTorch is not installed. ParameterError: no network, or none was asked for.
+    Cost: `networks` times N gradients, which lie in memory one network at a time.
+    Source: Jacot, Gabriel and Hongler (2018).
+    """
+    try:
+        import torch
+    except ImportError as error:
+        raise MissingExtra("an empirical kernel", "torch", "agents") from error
+    if networks < 1:
+        raise ParameterError(f"networks is {networks!r}; expected at least 1")
+    inputs = torch.as_tensor(np.asarray(x, np.float32))
+    total = np.zeros((len(x), len(x)))
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        for _ in range(networks):
+            network = make()
+            if not isinstance(network, torch.nn.Module):
+                raise ParameterError(f"make returned {network!r}; expected a torch.nn.Module")
+            rows = _gradients(torch, network, inputs)
+            total += (rows @ rows.T).double().numpy()
+    return (total / networks).astype(np.float32)
+
+
+def _gradients(torch: Any, network: Any, inputs: Any) -> Any:
+    """(N, P): of the first output by all parameters."""
+    parameters = {name: value.detach() for name, value in network.named_parameters()}
+
+    def output(values: Any, one: Any) -> Any:
+        return torch.func.functional_call(network, values, (one[None],))[0, 0]
+
+    gradients = torch.func.vmap(torch.func.grad(output), in_dims=(None, 0))(parameters, inputs)
+    return torch.cat([each.flatten(1) for each in gradients.values()], dim=1)

@@ -1,0 +1,178 @@
+"""Tangent kernels of agents' networks: their closed form against gradients of random networks."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+import pharos
+from pharos.errors import ParameterError, UnknownName
+from pharos.observations import Network, default_network, empirical_ntk, network_inputs, ntk, observe, tangent_kernel
+
+RNG = np.random.default_rng(0)
+VECTORS = RNG.random((6, 5), np.float32)
+IMAGES = (RNG.random((6, 3, 5, 6)) < 0.3).astype(np.float32)
+LARGE = (RNG.random((3, 1, 36, 40)) < 0.2).astype(np.float32)
+
+
+def agents_network(space, net_arch, policy):
+    """What `make_model` builds for one output: the features of pharos, then what Stable-Baselines3 adds."""
+    from stable_baselines3.common.policies import ActorCriticPolicy
+    from stable_baselines3.common.torch_layers import create_mlp
+    from torch import nn
+
+    from pharos.agents.deep import extractor
+
+    if policy == "pytorch":
+        features = extractor(space)(space)
+        return nn.Sequential(features, *create_mlp(features.features_dim, 1, net_arch))
+    made = ActorCriticPolicy(
+        space,
+        spaces.Discrete(2),
+        lambda _: 1e-3,
+        net_arch=net_arch,
+        features_extractor_class=extractor(space),
+        activation_fn=nn.Tanh if policy == "tanh" else nn.ReLU,
+    )
+    return nn.Sequential(made.features_extractor, made.mlp_extractor.value_net, made.value_net)
+
+
+BOX, IMAGE, FRAME = (
+    spaces.Box(0.0, 1.0, (5,), np.float32),
+    spaces.Box(0, 255, IMAGES.shape[1:], np.uint8),
+    spaces.Box(0, 255, LARGE.shape[1:], np.uint8),
+)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "space", "x", "net_arch", "policy", "networks"),
+    [
+        ("mlp128", BOX, VECTORS, [], "pytorch", 400),
+        ("mlp128x2", BOX, VECTORS, [128], "pytorch", 400),
+        ("mlp128-64-32", BOX, VECTORS, [64, 32], "pytorch", 600),
+        ("cnn16", IMAGE, IMAGES, [128], "pytorch", 400),
+        ("nature", FRAME, LARGE, [128], "pytorch", 60),
+        ("mlp128x2", BOX, VECTORS, [128], "sb3", 400),
+        ("mlp128x2+tanh", BOX, VECTORS, [128], "tanh", 400),
+        ("cnn16+tanh", IMAGE, IMAGES, [128], "tanh", 300),
+    ],
+)
+def test_the_closed_form_is_the_mean_over_random_networks(name, space, x, net_arch, policy, networks):
+    found = tangent_kernel(Network.of(name, "pytorch" if policy == "pytorch" else "sb3"), x)
+    expected = empirical_ntk(lambda: agents_network(space, net_arch, policy), x, networks=networks)
+    error = np.abs(found / expected - 1)
+    # 16 orthogonal filters differ so much from one network to the next that single entries take thousands of networks
+    assert (error.mean() if name == "cnn16+tanh" else error.max()) <= 0.02
+
+
+def test_one_pair_is_what_the_recursion_says():
+    """Two hidden layers of 64, as the formulas read, in plain Python."""
+    x, y = VECTORS[:2].astype(float)
+
+    def arc(xy, xx, yy):
+        scale = np.sqrt(xx * yy)
+        angle = np.pi - np.arccos(xy / scale)
+        return scale * (np.sin(angle) - angle * np.cos(angle)) / (2 * np.pi), angle / (2 * np.pi)
+
+    def entry(x, y):
+        q = [(a @ b + 1) / 15 for a, b in ((x, y), (x, x), (y, y))]
+        kernel = x @ y + 1
+        for _ in range(2):
+            value, slope = arc(*q)
+            kernel = 64 * value + 1 + slope / 3 * kernel
+            q = [value / 3 + 1 / 192, q[1] / 6 + 1 / 192, q[2] / 6 + 1 / 192]
+        return kernel
+
+    found = tangent_kernel(Network.of("mlp64x2"), VECTORS)
+    assert found[0, 1] == pytest.approx(entry(x, y), rel=1e-6)
+
+
+@pytest.mark.parametrize("name", ["mlp128x2", "mlp64+tanh", "cnn16", "cnn4-32"])
+def test_blocks_give_the_same_kernel_as_one_by_one(name, monkeypatch):
+    network, x = Network.of(name), IMAGES
+    whole = tangent_kernel(network, x)
+    assert (whole == whole.T).all()
+    np.testing.assert_allclose(tangent_kernel(network, x[:2], x[2:]), whole[:2, 2:], rtol=1e-6)
+    monkeypatch.setattr("pharos.observations.tangent_kernels.BLOCK", 4)
+    np.testing.assert_allclose(tangent_kernel(network, x), whole, rtol=1e-6)
+    assert np.linalg.eigvalsh(whole.astype(float)).min() > 0
+
+
+def test_rotated_vectors_have_the_same_kernel():
+    rotation = np.linalg.qr(RNG.normal(size=(5, 5)))[0]
+    network = Network.of("mlp128x2")
+    turned = tangent_kernel(network, VECTORS @ rotation.astype(np.float32))
+    np.testing.assert_allclose(turned, tangent_kernel(network, VECTORS), rtol=1e-5)
+
+
+def test_a_convolution_at_one_position_is_a_dense_layer():
+    """A picture of one pixel has one position: a dense layer of what lies around it, which is padding."""
+    pixels = RNG.random((4, 3, 1, 1)).astype(np.float32)
+    centre = np.zeros((4, 27), np.float32)
+    centre[:, 4::9] = pixels[:, :, 0, 0]
+    found = tangent_kernel(Network.of("cnn16-128"), pixels)
+    np.testing.assert_allclose(found, tangent_kernel(Network.of("mlp16-128"), centre), rtol=1e-5)
+
+
+@pytest.fixture(scope="module")
+def grid():
+    return pharos.build(pharos.make("simple_grid", height=3, width=4), progress=False)
+
+
+def test_an_environment_has_the_kernel_of_its_agents_network(grid):
+    for observation, network in (("vector", "mlp128x2"), ("simple_image", "cnn16"), ("index", "mlp128x2")):
+        seen = observe(grid.environment, observation, state_space=grid)
+        assert default_network(seen.space) == network
+        kernel = ntk(grid, observation)
+        assert kernel.shape == (grid.num_states,) * 2
+        assert kernel.dtype == np.float32
+        inputs = network_inputs(seen, grid.states())
+        np.testing.assert_array_equal(kernel, tangent_kernel(Network.of(network), inputs))
+    part = ntk(grid.environment, "simple_image", "cnn16", states=grid.states()[:3], others=grid.states())
+    np.testing.assert_allclose(part, ntk(grid, "simple_image")[:3], rtol=1e-6)
+    assert network_inputs(observe(grid.environment, "simple_image"), grid.states()).max() == 1.0
+
+
+def test_inputs_are_those_of_stable_baselines(grid):
+    import torch
+    from stable_baselines3.common.preprocessing import preprocess_obs
+
+    frames = [observe(grid.environment, name) for name in ("vector", "one_hot", "simple_image", "complex_image")]
+    for seen in (*frames, observe(grid.environment, "index", state_space=grid)):
+        space, values = seen.space, np.asarray(seen(grid.states()))
+        if seen.name == "complex_image":  # what VecTransposeImage does
+            values = values.transpose(0, 3, 1, 2)
+            space = spaces.Box(0, 255, values.shape[1:], np.uint8)
+        expected = preprocess_obs(torch.as_tensor(values), space).numpy()
+        np.testing.assert_array_equal(network_inputs(seen, grid.states()), expected)
+
+
+def test_what_has_no_kernel_says_so_in_a_line(grid, monkeypatch):
+    for name, words in (
+        ("resnet18", "no closed form"),
+        ("mlp", "no closed form"),
+        ("mlp0", "no closed form"),
+        ("cnn0", "no filters"),
+        ("cnn16", "has convolutions"),
+    ):
+        with pytest.raises(ParameterError, match=words) as error:
+            ntk(grid, "vector", name)
+        assert "\n" not in str(error.value)
+    with pytest.raises(ParameterError, match="larger images than 6 x 8"):
+        ntk(grid, "simple_image", "nature")
+    with pytest.raises(ParameterError, match="expected one of pytorch, sb3"):
+        ntk(grid, "vector", initialisation="he")
+    with pytest.raises(UnknownName, match="vector"):
+        ntk(grid, "vectr")
+    monkeypatch.setattr("pharos.state_space.available_memory", lambda: 800)
+    with pytest.raises(ParameterError, match="10 states fit into memory"):
+        ntk(grid, "vector")
+
+
+def test_kernels_need_no_torch():
+    code = "import sys; from pharos.observations import ntk; ntk('simple_grid', 'vector', 'mlp8'); "
+    code += "assert 'torch' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True)
