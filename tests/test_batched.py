@@ -12,6 +12,9 @@ from pharos.kernels.philox import philox
 DQN = {"learning_rate": 0.01, "buffer_size": 60, "learning_starts": 20, "batch_size": 8, "train_freq": 4, "n_envs": 2,
        "target_update_interval": 10, "net_arch": [12], "n_steps": 2}  # fmt: skip
 
+PPO = {"n_envs": 2, "n_steps": 8, "batch_size": 12, "n_epochs": 2, "net_arch": [7], "target_kl": 0.01}
+AGENTS = {"dqn": DQN, "ppo": PPO}
+
 
 def runs_of(task, hyperparameters, number=3, steps=120):
     source = ObservationSource.of(task.space, task.sight.observe)
@@ -58,20 +61,22 @@ def test_philox_gives_the_known_answers_of_random123(counter, key, words):
     assert tuple(map(int, answer)) == words
 
 
-def test_a_run_is_the_same_alone_among_others_and_in_another_order(grid):
-    runs = runs_of(grid, DQN, 40)
-    together, backwards, alone = learned("dqn", runs), learned("dqn", runs[::-1]), learned("dqn", runs[5:6])
+@pytest.mark.parametrize("agent", AGENTS)
+def test_a_run_is_the_same_alone_among_others_and_in_another_order(grid, agent):
+    runs = runs_of(grid, AGENTS[agent], 40)
+    together, backwards, alone = learned(agent, runs), learned(agent, runs[::-1]), learned(agent, runs[5:6])
     assert outcome(together, 5) == outcome(alone, 0)
     assert all(outcome(together, i) == outcome(backwards, 39 - i) for i in range(40))
     assert len({outcome(together, i) for i in range(40)}) == 40
 
 
-def test_a_restored_batch_goes_on_bit_for_bit(grid):
-    runs = runs_of(grid, DQN)
+@pytest.mark.parametrize("agent", AGENTS)
+def test_a_restored_batch_goes_on_bit_for_bit(grid, agent):
+    runs = runs_of(grid, AGENTS[agent])
     kept = {}
-    batch = make_batch("dqn", runs)
+    batch = make_batch(agent, runs)
     batch.learn([50, 120], lambda point: kept.setdefault(point, batch.state()))
-    resumed = make_batch("dqn", runs)
+    resumed = make_batch(agent, runs)
     resumed.restore(kept[50])
     assert resumed.steps == 50
     resumed.learn([120], lambda point: None)

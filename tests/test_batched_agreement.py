@@ -3,13 +3,15 @@
 import numpy as np
 import pytest
 import torch
-from stable_baselines3.common.type_aliases import ReplayBufferSamples
+from stable_baselines3.common.type_aliases import ReplayBufferSamples, RolloutBufferSamples
 
 from pharos.agents import make_model
 from pharos.agents.batched import BatchRun, ObservationSource, make_batch
 from pharos.environments import make
 from pharos.experiments.task import Task
 from pharos.interaction import make_sb3_vec
+from pharos.kernels import batched_rollouts as rollouts
+from pharos.policies import DeepPolicy
 
 DQN = {"learning_rate": 0.001, "buffer_size": 200, "learning_starts": 40, "batch_size": 16, "train_freq": 4,
        "target_update_interval": 20, "net_arch": [24], "max_grad_norm": 0.05}  # fmt: skip
@@ -28,8 +30,8 @@ def model_of(agent, task, hyperparameters):
 
 def load(model, parameters):
     state = model.policy.state_dict()
-    assert set(parameters) <= set(state)
-    model.policy.load_state_dict({**state, **{name: torch.from_numpy(value) for name, value in parameters.items()}})
+    assert set(parameters) == set(state)
+    model.policy.load_state_dict({name: torch.from_numpy(value) for name, value in parameters.items()})
 
 
 def assert_same_parameters(model, parameters):
@@ -41,13 +43,18 @@ def assert_same_parameters(model, parameters):
 
 def clipped(lane, i, max_norm):
     """The gradients of a run as Adam gets them, by name."""
-    from pharos.agents.batched.networks import as_stored
-
     scale = min(1.0, max_norm / (float(lane.gradients[i].norm()) + 1e-6))
-    return {name: as_stored(name, view[i].numpy() * scale) for name, view in lane.gradient_views.items()}
+    return {name: value * scale for name, value in lane.as_stored(lane.gradient_views, i).items()}
 
 
-@pytest.fixture(scope="module", params=["vector"])
+def losses_of(model):
+    """The losses that the model records, as they come."""
+    losses = []
+    model.logger.record = lambda name, value, **_: losses.append(value) if name == "train/loss" else None
+    return losses
+
+
+@pytest.fixture(scope="module", params=["vector", "simple_image"])
 def task(request):
     return Task.of(make("frozen_lake/4x4"), observation=request.param)
 
@@ -62,9 +69,7 @@ def test_updates_of_dqn_are_those_of_stable_baselines3(task, max_grad_norm):
         getattr(lane, name)[:] = 0
     model = model_of("dqn", task, hyperparameters)
     load(model, batch.parameters(i))
-    optimizer = model.policy.optimizer
-    losses = []
-    model.logger.record = lambda name, value, **_: losses.append(value) if name == "train/loss" else None
+    losses = losses_of(model)
     source = batch.runs[i].observe
 
     def minibatch(size, env=None):
@@ -83,4 +88,63 @@ def test_updates_of_dqn_are_those_of_stable_baselines3(task, max_grad_norm):
         for name, parameter in model.policy.q_net.named_parameters():
             assert np.abs(parameter.grad.numpy() - gradients[f"q_net.{name}"]).max() <= 1e-6
         assert_same_parameters(model, batch.parameters(i))
-    assert optimizer.param_groups[0]["eps"] == 1e-8
+
+
+PPO = {"n_envs": 3, "n_steps": 8, "batch_size": 12, "n_epochs": 2, "learning_rate": 0.001, "ent_coef": 0.02,
+       "clip_range": 0.05, "net_arch": {"pi": [24], "vf": [16, 8]}}  # fmt: skip
+
+
+def shared_extractor(name):
+    """A parameter of PPO under the first of its names."""
+    return name.removeprefix("pi_").removeprefix("vf_")
+
+
+@pytest.mark.parametrize("max_grad_norm", (0.05, 10.0))
+def test_updates_of_ppo_are_those_of_stable_baselines3(task, max_grad_norm):
+    hyperparameters = {**PPO, "max_grad_norm": max_grad_norm}
+    batch = batch_of("ppo", task, hyperparameters)
+    lane, i = batch.lanes[0], 1
+    batch.learn([24], lambda point: None)  # a rollout, whose update waits
+    model = model_of("ppo", task, hyperparameters)
+    load(model, batch.parameters(i))
+    losses, buffer = losses_of(model), model.rollout_buffer
+    lane.add_values_of_cut_episodes()
+    rollouts.advantages(
+        lane.rewards, lane.kept_values, lane.begins, lane.values_of(lane.worlds.state), lane.begin > 0,
+        lane.own["gamma"], lane.own["gae_lambda"], lane.advantages,
+    )  # fmt: skip
+    returns = lane.advantages + lane.kept_values
+    parts = [lane.states, lane.actions_taken, lane.log_probabilities, lane.advantages, returns]
+    sources = [part.reshape(lane.width, -1) for part in parts]
+    rng = np.random.default_rng(0)
+    minibatches = [rng.permutation(24)[:12] for _ in range(6)]
+
+    def samples(size):
+        for rows in minibatches:
+            states, actions, old, advantages, wanted = (part[i, rows] for part in sources)
+            seen = batch.runs[i].observe.at(states)
+            arrays = (seen, actions[:, None].astype(np.float32), old, old, advantages, wanted)
+            yield RolloutBufferSamples(*map(torch.from_numpy, arrays))
+
+    buffer.get = samples
+    buffer.values, buffer.returns = np.zeros(24), np.zeros(24)  # for the record of the explained variance
+    model.n_epochs = 1
+    model.train()
+    for rows in minibatches:
+        lane.learn_minibatch(tuple(part[:, rows].copy() for part in sources), ~lane.is_idle)
+    assert abs(losses[-1] - lane.losses[i]) <= 1e-6
+    gradients = clipped(lane, i, max_grad_norm)
+    for name, parameter in model.policy.named_parameters():
+        assert np.abs(parameter.grad.numpy() - gradients[shared_extractor(name)]).max() <= 1e-6
+    assert_same_parameters(model, batch.parameters(i))
+
+
+@pytest.mark.parametrize("agent", ("dqn", "ppo"))
+def test_the_policy_is_that_of_the_model(task, agent):
+    hyperparameters = {"dqn": DQN, "ppo": PPO}[agent]
+    batch = batch_of(agent, task, hyperparameters)
+    model = model_of(agent, task, hyperparameters)
+    load(model, batch.parameters(0))
+    seen = batch.runs[0].observe.at(np.arange(task.space.num_states))
+    difference = batch.policy(0).action_probabilities(seen) - DeepPolicy(model).action_probabilities(seen)
+    assert np.abs(difference).max() <= 1e-6

@@ -5,6 +5,7 @@ The package announces its files; each is loaded where it is used, and loads Numb
 
 __all__ = [
     "batched_learning",
+    "batched_rollouts",
     "batched_worlds",
     "bellman",
     "clocks",

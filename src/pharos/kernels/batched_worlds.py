@@ -132,3 +132,24 @@ def advance(
                 running[i, e], discount[i, e] = 0.0, 1.0
                 state[i, e] = _start_of(starts, cumulative, w[3])
                 previous[i, e], elapsed[i, e] = -1, 0
+
+
+@njit(cache=True, nogil=True)
+def act(keys, step, scores, actions, log_probabilities):
+    """Draw actions (W, E) from the softmax of scores (W, E, A), and the logarithms of their probabilities, float32."""
+    num_actions = scores.shape[2]
+    for i in range(actions.shape[0]):
+        for e in range(actions.shape[1]):
+            best = scores[i, e].max()
+            total = 0.0
+            for a in range(num_actions):
+                total += np.exp(np.float64(scores[i, e, a] - best))
+            u = unit(philox(0, e, step, STEP, keys[i])[0]) * total
+            passed, chosen = 0.0, num_actions - 1
+            for a in range(num_actions):
+                passed += np.exp(np.float64(scores[i, e, a] - best))
+                if u < passed:
+                    chosen = a
+                    break
+            actions[i, e] = chosen
+            log_probabilities[i, e] = np.float64(scores[i, e, chosen] - best) - np.log(total)

@@ -7,11 +7,12 @@ import torch
 
 from pharos.agents.batched.dqn import DQNLane
 from pharos.agents.batched.lane import Lane, RunPolicy
+from pharos.agents.batched.ppo import PPOLane
 from pharos.agents.batched.runs import BatchRun, group_key
 from pharos.errors import ParameterError
 
 WIDTH_OF_VECTORS, WIDTH_OF_IMAGES = 32, 8
-LANES: dict[str, type[Lane]] = {"dqn": DQNLane}
+LANES: dict[str, type[Lane]] = {"dqn": DQNLane, "ppo": PPOLane}
 
 
 class Batch:

@@ -1,14 +1,16 @@
 """A lane: a fixed number of runs that advance together. What DQN and PPO have in common."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import torch
 
-from pharos.agents.batched import networks
+from pharos.agents.batched.layers import Shape, Values, room
+from pharos.agents.batched.networks import names_of
+from pharos.agents.batched.observed import Seen
 from pharos.agents.batched.runs import BatchRun, resolved
-from pharos.agents.batched.worlds import Seen, Worlds, as_networks_see
+from pharos.agents.batched.worlds import Worlds
 from pharos.kernels import batched_learning as learning
 from pharos.kernels import batched_worlds as kernels
 from pharos.kernels import philox
@@ -22,54 +24,52 @@ class Lane:
     The width is part of the program: with it the same run has the same bits whoever else is there.
 
     Attributes:
-        steps: of each run so far.
-        total: of the training.
+        number: of runs that are not idle.
+        shared: hyperparameters of all of them; own: name -> (W,) those that are numbers.
+        steps: of each run so far; calls: of all copies together; collected: calls of the rollout that goes on.
+        total: steps of the whole training.
+        is_due: whether an update waits.
     """
 
     agent: str
+    network: Any
 
     def __init__(self, runs: Sequence[BatchRun], width: int):
         self.number, self.width = len(runs), width
         self.runs = [*runs, *[runs[0]] * (width - len(runs))]
         every = [resolved(self.agent, run.hyperparameters) for run in self.runs]
         self.shared = every[0]
-        self.own = {
-            name: np.array([options[name] for options in every])
-            for name in every[0]
-            if isinstance(every[0][name], int | float)
-        }
+        numbers = [name for name, value in every[0].items() if isinstance(value, int | float)]
+        self.own = {name: np.array([options[name] for options in every], np.float64) for name in numbers}
         self.total, self.copies = runs[0].steps, int(self.shared["n_envs"])
         self.num_actions = runs[0].mdp.num_actions
         self.keys = np.array([run.key for run in self.runs], np.uint64)
         self.is_idle = np.arange(width) >= len(runs)
         self.worlds = Worlds(self.runs, self.keys, self.copies)
-        self.shape, moves = as_networks_see(runs[0])
-        self.seen = Seen(self.runs, self.shape, moves=moves)
-        self._rooms: dict[Any, torch.Tensor] = {}
-        self.network = self._network()
-        self.parameters = torch.from_numpy(self._first_parameters())
+        self.actions = np.zeros((width, self.copies), np.int64)
+        self.seen = Seen(self.runs)
+        self._rooms: dict[int, torch.Tensor] = {}
+        self.parameters = torch.from_numpy(self.network_of_lane().initial(self._draws))
         self.gradients = torch.zeros_like(self.parameters)
         self.means, self.squares = torch.zeros_like(self.parameters), torch.zeros_like(self.parameters)
         self.updates = np.zeros(width, np.int64)
-        self.values = self.network.parameters.views(self.parameters)
-        self.gradient_views = self.network.parameters.views(self.gradients)
+        self.losses = np.zeros(width)
+        self.values: Values = self.network.parameters.views(self.parameters)
+        self.gradient_views: Values = self.network.parameters.views(self.gradients)
         self.steps = self.calls = self.collected = 0
-        self.is_due = False  # whether an update waits
+        self.is_due = False
 
     # What an agent says of itself -----------------------------------------------------------------------------------
 
-    def _network(self) -> Any:
+    def network_of_lane(self) -> Any:
+        """Make `network`."""
         raise NotImplementedError
 
-    def _first_parameters(self) -> np.ndarray:
-        """(W, P) float32."""
-        raise NotImplementedError
-
-    def _step(self) -> None:
+    def step(self) -> None:
         """One step of each copy; sets `is_due` at the end of a rollout."""
         raise NotImplementedError
 
-    def _update(self) -> None:
+    def update(self) -> None:
         """Learn from what was collected."""
         raise NotImplementedError
 
@@ -77,12 +77,8 @@ class Lane:
         """What the agent has to remember besides `arrays`."""
         raise NotImplementedError
 
-    def probabilities(self, scores: torch.Tensor) -> np.ndarray:
-        """(M, A) float64: the policy, from what `_scores` says."""
-        raise NotImplementedError
-
-    def _scores(self, x: torch.Tensor) -> torch.Tensor:
-        """(W, B, A) of observations (W, B, size)."""
+    def probabilities(self, scores: np.ndarray) -> np.ndarray:
+        """(M, A) float64: the policy, from scores (M, A)."""
         raise NotImplementedError
 
     # Learning -------------------------------------------------------------------------------------------------------
@@ -92,37 +88,37 @@ class Lane:
         is_last = point >= self.total
         while self.steps < point or (is_last and self.collected):
             self._learn_what_is_due()
-            self._step()
+            self.step()
         if is_last:
             self._learn_what_is_due()
 
     def _learn_what_is_due(self) -> None:
         if self.is_due:
-            self._update()
+            self.update()
             self.is_due = False
 
     def observed(self, states: np.ndarray) -> torch.Tensor:
         """(W, B, size) float32 observations of states (W, B); they stay until the next call with as many."""
-        key = ("observed", states.shape[1])
-        if key not in self._rooms:
-            self._rooms[key] = networks.room(self.width, states.shape[1], int(np.prod(self.shape)))
-        return self.seen.at(states, self._rooms[key])
+        if states.shape[1] not in self._rooms:
+            self._rooms[states.shape[1]] = room(self.width, states.shape[1], self.seen.size)
+        return self.seen.at(states, self._rooms[states.shape[1]])
 
-    def _adam(self, is_active: np.ndarray, eps: float) -> None:
+    def move(self) -> None:
+        """Execute `actions`; episodes that end after the last step of the training do not count."""
+        self.worlds.step(self.calls, self.actions, counts=self.steps + self.copies <= self.total)
+
+    def adam(self, is_active: np.ndarray) -> None:
+        """A step down the clipped gradients, for the runs that are active."""
         learning.adam(
             self.parameters.numpy(), self.gradients.numpy(), self.means.numpy(), self.squares.numpy(), self.updates,
-            is_active, self.own["learning_rate"].astype(np.float64), self.own["max_grad_norm"].astype(np.float64), eps,
+            is_active, self.own["learning_rate"], self.own["max_grad_norm"], self.network.eps,
         )  # fmt: skip
 
-    def _draws(self) -> Callable[[int], np.ndarray]:
-        """number -> (W, number) uniform in (0, 1), for the first parameters."""
-
-        def draws(number: int) -> np.ndarray:
-            found = np.empty((self.width, -(-number // 4), 4), np.uint32)
-            philox.words(self.keys, kernels.WEIGHTS, 0, found)
-            return (found.reshape(self.width, -1)[:, :number] + 0.5) * 2.0**-32
-
-        return draws
+    def _draws(self, number: int) -> np.ndarray:
+        """(W, number) uniform in (0, 1), for the first parameters."""
+        found = np.empty((self.width, -(-number // 4), 4), np.uint32)
+        philox.words(self.keys, kernels.WEIGHTS, 0, found)
+        return (found.reshape(self.width, -1)[:, :number] + 0.5) * 2.0**-32
 
     # What is kept ---------------------------------------------------------------------------------------------------
 
@@ -134,14 +130,20 @@ class Lane:
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """Go on from what `arrays` gave."""
-        for name, array in self.arrays().items():
-            array[...] = arrays[name]
         self.steps, self.calls, self.collected, is_due = map(int, arrays["counters"])
         self.is_due = bool(is_due)
+        for name, array in self.arrays().items():
+            array[...] = arrays[name]
 
     def stored(self, i: int) -> dict[str, np.ndarray]:
         """The parameters of run i under Stable-Baselines3's names."""
-        return {name: networks.as_stored(name, view[i].numpy()) for name, view in self.values.items()}
+        return self.as_stored(self.values, i)
+
+    def as_stored(self, views: Values, i: int) -> dict[str, np.ndarray]:
+        """name -> one run's part of some views of parameters or gradients, in Stable-Baselines3's shapes."""
+        shapes: list[Shape] = self.network.parameters.shapes
+        found = {each.name: np.array(each.stored(views[each.name][i].numpy()), order="C") for each in shapes}
+        return {name: value for known, value in found.items() for name in names_of(known)}
 
 
 class RunPolicy:
@@ -152,18 +154,12 @@ class RunPolicy:
 
     def action_probabilities(self, observations: np.ndarray) -> np.ndarray:
         """(M, A) float64 for observations (M, ...) as the environment gives them."""
-        lane, number = self.lane, len(observations)
-        seen = torch.from_numpy(np.ascontiguousarray(observations))
-        if lane.seen.moves:
-            seen = seen.movedim(-1, 1)
-        x = seen.reshape(number, -1).float()
-        if lane.seen.is_image:
-            x.div_(255.0)
+        lane = self.lane
         values = {name: view[self.i : self.i + 1] for name, view in lane.values.items()}
-        block = torch.zeros((1, ASKED, x.shape[1]))  # of one size, as layers keep room for each size
+        block = torch.zeros((1, ASKED, lane.seen.size))  # of one size, as layers keep room for each size
         answers = []
-        for first in range(0, number, ASKED):
-            rows = x[first : first + ASKED]
+        for first in range(0, len(observations), ASKED):
+            rows = lane.seen.encoded(observations[first : first + ASKED])
             block[0, : len(rows)] = rows
-            answers.append(lane.probabilities(lane.network.scores(values, block)[0, : len(rows)]))
+            answers.append(lane.probabilities(lane.network.scores(values, block)[0, : len(rows)].numpy()))
         return np.concatenate(answers)

@@ -1,136 +1,58 @@
-"""W networks of one shape as one: parameters with a leading axis of runs, forward and backward written out.
-
-The networks are those of agents/networks.py with the heads that Stable-Baselines3 puts on them. Parameters of all runs
-lie in one (W, P) array, the gradients in another, so that clipping and Adam are one pass over each. Weights of linear
-layers are kept (in, out), the transpose of Stable-Baselines3's, which multiplies faster.
-"""
+"""The networks of agents/networks.py with the heads that Stable-Baselines3 puts on them, for W runs at once."""
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import torch
 from torch import Tensor
 
+from pharos.agents.batched.layers import (
+    NONE,
+    RELU,
+    TANH,
+    Convolution,
+    Layer,
+    Linear,
+    Parameters,
+    PatchConvolution,
+    Stack,
+    Values,
+)
+
 FEATURES = 128
-ALIGNED = 16  # floats: each parameter of each run begins at a multiple of 64 bytes
-RELU, TANH, NONE = "relu", "tanh", "none"
+FILTERS = 16
+NATURE = 36  # pixels from which the three convolutions of Mnih et al. (2015) take the place of one, as in networks.py
+
+Draws = Callable[[int], np.ndarray]
+"""number of draws -> (W, number) uniform in (0, 1)."""
 
 
-@dataclass(frozen=True)
-class Shape:
-    """One parameter: its name in Stable-Baselines3, its shape here, and where it lies in a row of parameters."""
-
-    name: str
-    shape: tuple[int, ...]
-    offset: int
-
-    @property
-    def size(self) -> int:
-        return math.prod(self.shape)
+def is_small(shape: tuple[int, ...], is_image: bool) -> bool:
+    """Whether an observation is an image of the small convolution, which sees the neighbours of each pixel."""
+    return is_image and min(shape[1:]) < NATURE
 
 
-class Parameters:
-    """(W, P) float32 parameters and gradients of W runs, and the views that layers use."""
-
-    def __init__(self) -> None:
-        self.shapes: list[Shape] = []
-        self.length = 0
-
-    def add(self, name: str, *shape: int) -> Shape:
-        """Room for one more parameter."""
-        added = Shape(name, shape, self.length)
-        self.shapes.append(added)
-        self.length += -(-added.size // ALIGNED) * ALIGNED
-        return added
-
-    def views(self, rows: Tensor) -> dict[str, Tensor]:
-        """name -> (W, ...) view of (W, P)."""
-        return {
-            each.name: rows[:, each.offset : each.offset + each.size].view(len(rows), *each.shape)
-            for each in self.shapes
-        }
+def extractor(parameters: Parameters, name: str, shape: tuple[int, ...], is_image: bool) -> list[Layer]:
+    """The layers from an observation to 128 features: SmallMLP, or SmallCNN with one or three convolutions."""
+    if not is_image:
+        return [Linear(parameters, f"{name}.layers.1", math.prod(shape), FEATURES, RELU)]
+    if is_small(shape, is_image):
+        small = PatchConvolution(parameters, f"{name}.layers.0.0", shape, FILTERS)
+        return [small, Linear(parameters, f"{name}.layers.1", small.outputs, FEATURES, RELU, pixels=small.pixels)]
+    convolutions: list[Layer] = []
+    for i, (filters, kernel, stride) in enumerate(((32, 8, 4), (64, 4, 2), (64, 3, 1))):
+        scale = 1 / 255 if i == 0 else 1.0
+        made = Convolution(parameters, f"{name}.layers.0.{2 * i}", shape, filters, kernel, stride, scale)
+        convolutions.append(made)
+        shape = made.shape_out
+    return [*convolutions, Linear(parameters, f"{name}.layers.1", math.prod(shape), FEATURES, RELU)]
 
 
-def room(width: int, *shape: int, device: Any = None) -> Tensor:
-    """(W, ...) float32 whose runs begin at multiples of 64 bytes, so that a run's place changes nothing."""
-    size = math.prod(shape)
-    rows = torch.zeros((width, -(-size // ALIGNED) * ALIGNED), device=device)
-    return rows[:, :size].view(width, *shape)
-
-
-class Linear:
-    """y = activation(x w + b) for (W, B, in) -> (W, B, out)."""
-
-    def __init__(self, parameters: Parameters, name: str, inputs: int, outputs: int, activation: str):
-        self.name, self.inputs, self.outputs, self.activation = name, inputs, outputs, activation
-        parameters.add(f"{name}.weight", inputs, outputs)
-        parameters.add(f"{name}.bias", 1, outputs)
-        self._rooms: dict[tuple[int, int], tuple[Tensor, Tensor]] = {}
-
-    def forward(self, values: dict[str, Tensor], x: Tensor) -> Tensor:
-        """The outputs; they stay until the next call with as many rows."""
-        y, _ = self._room(x)
-        torch.baddbmm(values[f"{self.name}.bias"], x, values[f"{self.name}.weight"], out=y)
-        if self.activation == RELU:
-            y.clamp_(min=0.0)
-        elif self.activation == TANH:
-            _whole(y).tanh_()
-        return y
-
-    def backward(
-        self, values: dict[str, Tensor], gradients: dict[str, Tensor], x: Tensor, dy: Tensor, *, onward: bool
-    ) -> Tensor | None:
-        """Write the gradients of the parameters; return that of x where it goes `onward`. Changes dy."""
-        y, dx = self._room(x)
-        if self.activation == RELU:
-            dy = torch.ops.aten.threshold_backward(dy, y, 0)
-        elif self.activation == TANH:
-            dy = torch.ops.aten.tanh_backward(dy, y)
-        torch.sum(dy, 1, keepdim=True, out=gradients[f"{self.name}.bias"])
-        torch.bmm(x.transpose(1, 2), dy, out=gradients[f"{self.name}.weight"])
-        return torch.bmm(dy, values[f"{self.name}.weight"].transpose(1, 2), out=dx) if onward else None
-
-    def _room(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        key = (x.shape[0], x.shape[1])
-        if key not in self._rooms:
-            made = (room(*key, self.outputs, device=x.device), room(*key, self.inputs, device=x.device))
-            self._rooms[key] = made
-        return self._rooms[key]
-
-
-def _whole(y: Tensor) -> Tensor:
-    """All the memory of a `room`, in which each run has a multiple of 64 bytes: no run is at a loop's ragged end."""
-    return y.as_strided((y.shape[0], y.stride(0)), (y.stride(0), 1))
-
-
-class Stack:
-    """Layers one after another."""
-
-    def __init__(self, layers: Sequence[Any]):
-        self.layers = list(layers)
-        self._inputs: list[Tensor] = []
-
-    def forward(self, values: dict[str, Tensor], x: Tensor) -> Tensor:
-        """The outputs of the last layer."""
-        self._inputs = []
-        for layer in self.layers:
-            self._inputs.append(x)
-            x = layer.forward(values, x)
-        return x
-
-    def backward(
-        self, values: dict[str, Tensor], gradients: dict[str, Tensor], dy: Tensor, *, onward: bool = False
-    ) -> Tensor | None:
-        """The gradients of all parameters, after `forward`; that of the input where it goes `onward`."""
-        for i in range(len(self.layers) - 1, -1, -1):
-            dx = self.layers[i].backward(values, gradients, self._inputs[i], dy, onward=onward or i > 0)
-            if dx is None:
-                return None
-            dy = dx
-        return dy
+def hidden(parameters: Parameters, name: str, sizes: Sequence[int], activation: str) -> list[Layer]:
+    """Hidden layers as Stable-Baselines3 numbers them: name.0, name.2, ..."""
+    inputs = [FEATURES, *sizes]
+    return [Linear(parameters, f"{name}.{2 * i}", inputs[i], outputs, activation) for i, outputs in enumerate(sizes)]
 
 
 def sizes_of(net_arch: Any, head: str = "pi") -> list[int]:
@@ -138,69 +60,100 @@ def sizes_of(net_arch: Any, head: str = "pi") -> list[int]:
     return list(net_arch.get(head, ())) if isinstance(net_arch, dict) else list(net_arch)
 
 
-def hidden(parameters: Parameters, name: str, inputs: int, sizes: Sequence[int], activation: str) -> list[Linear]:
-    """Hidden layers as Stable-Baselines3 numbers them: name.0, name.2, ..."""
-    layers = []
-    for i, outputs in enumerate(sizes):
-        layers.append(Linear(parameters, f"{name}.{2 * i}", inputs, outputs, activation))
-        inputs = outputs
-    return layers
-
-
-def vector_extractor(parameters: Parameters, name: str, shape: tuple[int, ...]) -> list[Any]:
-    """The layers of SmallMLP."""
-    return [Linear(parameters, f"{name}.layers.1", math.prod(shape), FEATURES, RELU)]
-
-
-def initial_uniform(parameters: Parameters, draws: Callable[[int], np.ndarray]) -> np.ndarray:
-    """(W, P): weights and biases uniform in +- 1 / sqrt(fan in), as torch begins.
-
-    Args:
-        draws: number of draws -> (W, number) uniform in (0, 1).
-    """
-    uniform = draws(parameters.length)
-    fan_in = 1
-    for each in parameters.shapes:  # a bias follows its weights
-        if each.name.endswith("weight"):
-            fan_in = math.prod(each.shape[1:]) if len(each.shape) == 4 else each.shape[0]
-        part = slice(each.offset, each.offset + each.size)
-        uniform[:, part] = (2.0 * uniform[:, part] - 1.0) / math.sqrt(fan_in)
-    return uniform.astype(np.float32)
-
-
-def as_stored(name: str, value: np.ndarray) -> np.ndarray:
-    """A parameter of one run in the shape that Stable-Baselines3 gives it."""
-    if name.endswith("bias"):
-        return value.reshape(-1).copy()
-    return value.T.copy() if value.ndim == 2 else value.copy()
+def names_of(name: str) -> list[str]:
+    """All the names that a parameter has in Stable-Baselines3: parts of a network that are shared have several."""
+    extractors = [name]
+    if name.startswith("features_extractor."):
+        extractors += [f"{whose}_{name}" for whose in ("pi", "vf")]
+    return [*extractors, *(each.replace(".layers.0.", ".convolutions.") for each in extractors if ".layers.0." in each)]
 
 
 class QNetworks:
-    """The Q-networks of W runs: an extractor of features, hidden layers, a value for each action."""
+    """A value for each action: `net_arch` hidden layers after the features. torch's own initialisation."""
 
-    def __init__(self, shape: tuple[int, ...], is_image: bool, net_arch: Sequence[int], num_actions: int):
+    eps = 1e-8  # of Adam
+
+    def __init__(self, shape: tuple[int, ...], is_image: bool, net_arch: Any, num_actions: int):
         self.parameters = parameters = Parameters()
-        extractor = "q_net.features_extractor"
-        layers: list[Any] = _extractor(parameters, extractor, shape, is_image)
-        layers += hidden(parameters, "q_net.q_net", FEATURES, net_arch, RELU)
-        last = net_arch[-1] if net_arch else FEATURES
-        layers.append(Linear(parameters, f"q_net.q_net.{2 * len(net_arch)}", last, num_actions, NONE))
-        self.stack = Stack(layers)
+        sizes = sizes_of(net_arch)
+        layers = extractor(parameters, "q_net.features_extractor", shape, is_image)
+        layers += hidden(parameters, "q_net.q_net", sizes, RELU)
+        last = Linear(parameters, f"q_net.q_net.{2 * len(sizes)}", [FEATURES, *sizes][-1], num_actions, NONE)
+        self.stack = Stack([*layers, last])
 
-    def forward(self, values: dict[str, Tensor], x: Tensor) -> Tensor:
-        """(W, B, A) values of observations (W, B, ...)."""
+    def scores(self, values: Values, x: Tensor) -> Tensor:
+        """(W, B, A) values of actions in observations (W, B, size)."""
         return self.stack.forward(values, x)
 
-    scores = forward
-
-    def backward(self, values: dict[str, Tensor], gradients: dict[str, Tensor], dq: Tensor) -> None:
-        """The gradients after `forward`."""
+    def backward(self, values: Values, gradients: Values, dq: Tensor) -> None:
+        """The gradients, after `scores`."""
         self.stack.backward(values, gradients, dq)
 
+    def initial(self, draws: Draws) -> np.ndarray:
+        """(W, P): weights and biases uniform in +- 1 / sqrt(fan in)."""
+        rows = draws(self.parameters.length)
+        for each in self.parameters.shapes:
+            part = slice(each.offset, each.offset + each.size)
+            rows[:, part] = (2.0 * rows[:, part] - 1.0) / math.sqrt(each.fan_in)
+        return rows.astype(np.float32)
 
-def _extractor(parameters: Parameters, name: str, shape: tuple[int, ...], is_image: bool) -> list[Any]:
-    if is_image:
-        from pharos.agents.batched.convolutions import image_extractor
 
-        return image_extractor(parameters, name, shape)
-    return vector_extractor(parameters, name, shape)
+class ActorCritics:
+    """Scores of actions and a value, from shared features. Orthogonal initialisation."""
+
+    eps = 1e-5
+
+    def __init__(self, shape: tuple[int, ...], is_image: bool, net_arch: Any, num_actions: int):
+        self.parameters = parameters = Parameters()
+        self.trunk = Stack(extractor(parameters, "features_extractor", shape, is_image))
+        actor, critic = sizes_of(net_arch, "pi"), sizes_of(net_arch, "vf")
+        actor_layers = hidden(parameters, "mlp_extractor.policy_net", actor, TANH)
+        critic_layers = hidden(parameters, "mlp_extractor.value_net", critic, TANH)
+        actor_layers.append(Linear(parameters, "action_net", [FEATURES, *actor][-1], num_actions, NONE))
+        critic_layers.append(Linear(parameters, "value_net", [FEATURES, *critic][-1], 1, NONE))
+        self.actor, self.critic = Stack(actor_layers), Stack(critic_layers)
+
+    def both(self, values: Values, x: Tensor) -> tuple[Tensor, Tensor]:
+        """(W, B, A) scores, whose softmax is the policy, and (W, B, 1) values."""
+        features = self.trunk.forward(values, x)
+        return self.actor.forward(values, features), self.critic.forward(values, features)
+
+    def scores(self, values: Values, x: Tensor) -> Tensor:
+        """(W, B, A)."""
+        return self.actor.forward(values, self.trunk.forward(values, x))
+
+    def values(self, values: Values, x: Tensor) -> Tensor:
+        """(W, B, 1)."""
+        return self.critic.forward(values, self.trunk.forward(values, x))
+
+    def backward(self, values: Values, gradients: Values, dscores: Tensor, dvalues: Tensor) -> None:
+        """The gradients, after `both`."""
+        features = self.actor.backward(values, gradients, dscores, onward=True)
+        features.add_(self.critic.backward(values, gradients, dvalues, onward=True))
+        self.trunk.backward(values, gradients, features)
+
+    def initial(self, draws: Draws) -> np.ndarray:
+        """(W, P): orthogonal weights times sqrt(2), 0.01 for the actions and 1 for the value; biases 0.
+
+        Source: Saxe et al. (2014), as torch draws it: the Q of a normal matrix, its columns signed by R's diagonal.
+        """
+        uniform = draws(2 * self.parameters.length)
+        normal = np.sqrt(-2.0 * np.log(uniform[:, ::2])) * np.cos(2.0 * np.pi * uniform[:, 1::2])  # Box and Muller
+        rows = np.zeros((len(normal), self.parameters.length), np.float32)
+        gains = {"action_net.weight": 0.01, "value_net.weight": 1.0}
+        for each in self.parameters.shapes:
+            if each.name.endswith("weight"):
+                part = slice(each.offset, each.offset + each.size)
+                shape = each.stored(np.empty(each.shape)).shape
+                for row, drawn in zip(rows, normal[:, part], strict=True):
+                    weights = orthogonal(drawn.reshape(shape[0], -1)) * gains.get(each.name, math.sqrt(2.0))
+                    row[part] = each.kept(weights.reshape(shape)).ravel()
+        return rows
+
+
+def orthogonal(drawn: np.ndarray) -> np.ndarray:
+    """Orthonormal rows, or columns where there are more rows, from a matrix of normal numbers."""
+    turned = len(drawn) < drawn.shape[1]
+    q, r = np.linalg.qr(drawn.T if turned else drawn)
+    q = q * np.sign(np.diag(r))
+    return q.T if turned else q

@@ -4,13 +4,10 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import torch
 
-from pharos.agents.batched.runs import BLOCK, BatchRun
+from pharos.agents.batched.runs import BatchRun
 from pharos.errors import ParameterError
 from pharos.kernels import batched_worlds as kernels
-
-LARGEST_TABLES = 1 << 30  # bytes of observations that are kept
 
 
 class World:
@@ -79,61 +76,3 @@ class Worlds:
         """All that changes."""
         names = ("state", "previous", "elapsed", "running", "discount", "episodes", "returns")
         return {name: getattr(self, name) for name in names}
-
-
-class Seen:
-    """The observations of the states of W runs, as tensors: gathered from one table, or drawn for those who ask.
-
-    Args:
-        shape: of one observation as the network takes it; images have their channels first.
-        moves: whether images are (H, W, C) and have to be turned.
-    """
-
-    def __init__(self, runs: Sequence[BatchRun], shape: tuple[int, ...], *, moves: bool):
-        self.shape, self.moves, self.is_image = shape, moves, runs[0].observe.is_image
-        sources = list({id(run.observe): run.observe for run in runs}.values())
-        self.sources, place = sources, {id(source): i for i, source in enumerate(sources)}
-        self.which = np.array([place[id(run.observe)] for run in runs])
-        first = np.cumsum([0, *(source.num_states for source in sources)])
-        self.first = torch.from_numpy(first[self.which])[:, None]
-        self.table: torch.Tensor | None = None
-        kind = torch.uint8 if self.is_image else torch.float32
-        size = int(np.prod(shape))
-        if first[-1] * size * kind.itemsize <= LARGEST_TABLES:
-            table = torch.empty((int(first[-1]), size), dtype=kind)
-            for source, begin in zip(sources, first, strict=False):
-                for row in range(0, source.num_states, BLOCK):
-                    rows = np.arange(row, min(row + BLOCK, source.num_states))
-                    table[begin + row : begin + row + len(rows)] = self._drawn(source, rows)
-            self.table = table
-
-    def at(self, states: np.ndarray, out: torch.Tensor) -> torch.Tensor:
-        """Write the observations of states (W, B) into out (W, B, size) float32, images from 0 to 1."""
-        if self.table is not None:
-            rows = (torch.from_numpy(states) + self.first).view(-1)
-            seen = self.table.index_select(0, rows).view(out.shape)
-            torch.div(seen, 255.0, out=out) if self.is_image else out.copy_(seen)
-            return out
-        for i, source in enumerate(self.sources):
-            members = np.flatnonzero(self.which == i)
-            drawn = self._drawn(source, states[members].ravel()).view(len(members), states.shape[1], -1)
-            out[torch.from_numpy(members)] = drawn.float().div_(255.0) if self.is_image else drawn.float()
-        return out
-
-    def _drawn(self, source: Any, rows: np.ndarray) -> torch.Tensor:
-        """(N, size) observations of one source."""
-        seen = source.at(rows)
-        if self.moves:
-            seen = np.ascontiguousarray(np.moveaxis(seen, -1, 1))
-        return torch.from_numpy(seen.reshape(len(rows), -1))
-
-
-def as_networks_see(run: BatchRun) -> tuple[tuple[int, ...], bool]:
-    """(shape of an observation as the network takes it, whether it is turned): images have their channels first.
-
-    Stable-Baselines3 takes the smallest side of an image for its channels, and turns it unless that comes first.
-    """
-    shape = tuple(run.observe.shape)
-    if not run.observe.is_image or int(np.argmin(shape)) == 0:
-        return shape, False
-    return (shape[2], *shape[:2]), True

@@ -1,0 +1,134 @@
+"""PPO of W runs at once (Schulman et al., 2017), as Stable-Baselines3 has it."""
+
+from typing import Any
+
+import numpy as np
+import torch
+
+from pharos.agents.batched.lane import Lane
+from pharos.agents.batched.networks import ActorCritics
+from pharos.kernels import batched_rollouts as rollouts
+from pharos.kernels import batched_worlds as kernels
+
+
+class PPOLane(Lane):
+    """W runs of PPO.
+
+    Attributes:
+        states, next_states, actions_taken (W, T, E) int64, log_probabilities, kept_values, rewards, begins, advantages
+            (W, T, E) float32: the rollout that goes on; begins is 1 where a step is the first of its episode.
+        timeouts: (W, T, E) bool, whether a step was cut off by the time limit.
+        begin: (W, E) float32, whether the next step is the first of its episode.
+    """
+
+    agent = "ppo"
+
+    def __init__(self, runs: Any, width: int):
+        super().__init__(runs, width)
+        shape = (width, int(self.shared["n_steps"]), self.copies)
+        self.states, self.next_states, self.actions_taken = (np.zeros(shape, np.int64) for _ in range(3))
+        self.log_probabilities, self.kept_values, self.rewards, self.begins, self.advantages = (
+            np.zeros(shape, np.float32) for _ in range(5)
+        )
+        self.timeouts = np.zeros(shape, np.bool_)
+        self.begin = np.ones((width, self.copies), np.float32)
+        self._log_p = np.zeros((width, self.copies), np.float32)
+        self._order = np.zeros((width, shape[1] * shape[2]), np.int64)
+        self.divergences = np.zeros(width)
+
+    def network_of_lane(self) -> ActorCritics:
+        """As `Lane` says."""
+        seen = self.seen
+        self.network = ActorCritics(seen.shape, seen.is_image, self.shared["net_arch"], self.num_actions)
+        return self.network
+
+    def probabilities(self, scores: np.ndarray) -> np.ndarray:
+        """The softmax of the scores."""
+        weights = np.exp(scores.astype(np.float64) - scores.max(axis=1, keepdims=True))
+        return weights / weights.sum(axis=1, keepdims=True)
+
+    def step(self) -> None:
+        """As `Lane` says."""
+        worlds, t = self.worlds, self.collected
+        scores, values = self.network.both(self.values, self.observed(worlds.state))
+        kernels.act(self.keys, self.calls, scores.numpy(), self.actions, self._log_p)
+        self.states[:, t] = worlds.state
+        self.move()
+        self.next_states[:, t], self.actions_taken[:, t] = worlds.next_state, self.actions
+        self.log_probabilities[:, t], self.kept_values[:, t] = self._log_p, values[..., 0].numpy()
+        self.rewards[:, t], self.begins[:, t] = worlds.reward, self.begin
+        self.timeouts[:, t] = worlds.flags & kernels.TIMEOUT
+        self.begin[:] = worlds.flags & kernels.DONE
+        self.steps += self.copies
+        self.calls += 1
+        self.collected = (t + 1) % self.states.shape[1]
+        self.is_due = self.collected == 0
+
+    def update(self) -> None:
+        """As `Lane` says."""
+        self.add_values_of_cut_episodes()
+        last = self.values_of(self.worlds.state)
+        rollouts.advantages(
+            self.rewards, self.kept_values, self.begins, last, self.begin > 0, self.own["gamma"],
+            self.own["gae_lambda"], self.advantages,
+        )  # fmt: skip
+        returns = self.advantages + self.kept_values
+        parts = (self.states, self.actions_taken, self.log_probabilities, self.advantages, returns)
+        sources = tuple(part.reshape(self.width, -1) for part in parts)
+        number, size = self._order.shape[1], int(self.shared["batch_size"])
+        is_active = ~self.is_idle
+        for epoch in range(int(self.shared["n_epochs"])):
+            rollouts.shuffle(self.keys, self.calls, epoch, self._order)
+            for first in range(0, number, size):
+                shape = (self.width, min(size, number - first))
+                minibatch = tuple(np.empty(shape, part.dtype) for part in sources)
+                rollouts.gather(self._order, first, sources, minibatch)
+                is_active &= self.learn_minibatch(minibatch, is_active)
+                if not is_active.any():
+                    return
+
+    def add_values_of_cut_episodes(self) -> None:
+        """rewards += gamma V(s') where the time limit cut an episode off, a block of E steps of each run at a time."""
+        runs, places = np.nonzero(self.timeouts.reshape(self.width, -1))
+        if not len(runs):
+            return
+        rank = np.arange(len(runs)) - np.searchsorted(runs, runs)  # of each among those of its run
+        rewards, following = (part.reshape(self.width, -1) for part in (self.rewards, self.next_states))
+        for block in range(int(rank.max()) // self.copies + 1):
+            now = rank // self.copies == block
+            i, place, column = runs[now], places[now], rank[now] % self.copies
+            states = self.worlds.state.copy()
+            states[i, column] = following[i, place]
+            value = self.own["gamma"][i] * self.values_of(states)[i, column].astype(np.float64)
+            rewards[i, place] = (rewards[i, place] + value).astype(np.float32)
+
+    def values_of(self, states: np.ndarray) -> np.ndarray:
+        """(W, E) float32 values of states (W, E)."""
+        return self.network.values(self.values, self.observed(states))[..., 0].numpy().copy()
+
+    def learn_minibatch(self, minibatch: tuple[np.ndarray, ...], is_active: np.ndarray) -> np.ndarray:
+        """One step of gradient descent for the active runs, unless the policy has moved too far; (W,) those that did.
+
+        Args:
+            minibatch: (states, actions, logarithms of probabilities, advantages, returns), (W, B) each.
+        """
+        states, actions, old, advantages, returns = minibatch
+        if self.shared["normalize_advantage"] and states.shape[1] > 1:
+            rollouts.normalize(advantages)
+        scores, values = self.network.both(self.values, self.observed(states))
+        dscores, dvalues = torch.empty(scores.shape), torch.empty(values.shape)
+        rollouts.clipped_loss(
+            scores.numpy(), values.numpy(), (actions, old, advantages, returns), self.own["clip_range"],
+            self.own["ent_coef"], self.own["vf_coef"], dscores.numpy(), dvalues.numpy(), self.losses, self.divergences,
+        )  # fmt: skip
+        target = self.shared["target_kl"]
+        if target is not None:
+            is_active = is_active & ~(self.divergences > 1.5 * float(target))
+        self.network.backward(self.values, self.gradient_views, dscores, dvalues)
+        self.adam(is_active)
+        return is_active
+
+    def own_arrays(self) -> dict[str, np.ndarray]:
+        """As `Lane` says."""
+        names = ("states", "next_states", "actions_taken", "log_probabilities", "kept_values", "rewards", "begins")
+        return {f"rollout_{name}": getattr(self, name) for name in (*names, "timeouts")} | {"begin": self.begin}
