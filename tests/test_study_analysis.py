@@ -207,6 +207,15 @@ def test_measures_that_are_unknown_are_left_out_and_named(cells):
     assert "2 of 16 cells have no positive diameter: left out" in found.notes
 
 
+def test_classes_that_a_model_has_not_seen_need_a_model():
+    rows = [("a", 1.0, 2.0), ("a", 2.0, 1.0), ("b", 1.5, 3.0), ("b", 2.5, 2.0)]
+    cells = pd.DataFrame(rows, columns=["environment", "cumulative_regret", "diameter"])
+    cells = cells.assign(agent="ppo", observation="vector", instance=list("wxyz"), chance="plain")
+    found = study.models(cells, agent="ppo", regret="cumulative_regret", measures=["diameter"])
+    assert (found.fits, found.leave_one_class_out) == ([], None)
+    assert "the class model of a has 2 rows; needs at least 4 for its 1 predictor: run more" in " ".join(found.notes)
+
+
 def test_the_models_without_rows_are_a_note():
     empty = pd.DataFrame({"agent": ["ppo"], "observation": ["vector"], "cumulative_regret": [1.0]})
     assert study.models(empty).notes[-1] == "no cell of dqn has all measures: there are no models"

@@ -239,12 +239,15 @@ def test_a_study_without_dqn_says_nothing_false_and_has_no_empty_section(tmp_pat
         "Each instance",
         "How it was made",
     ]
-    assert "the paper prints" not in text and "Findings" not in text
+    assert "the paper prints" not in text and "Findings" not in text and "The paper's figure" not in text
     assert "Cumulative regret of PPO" in text and "costs PPO more regret" in text
     names = {file.stem for file in report.figures}
     assert {"representations_ppo", "single_model_cumulative", "regret_by_task_frozen_lake"} <= names
     assert any(file.name == "coefficients_cumulative_regret.csv" for file in report.tables)
     assert not any("findings" in file.name or "paper" in file.name for file in report.tables)
+    latex = next(file for file in report.tables if file.name == "returns_frozen_lake.tex").read_text()
+    assert r"\multicolumn{2}{c}{PPO} & tabular Q-learning \\" in latex
+    assert "simple image & vector & index" in latex and "DQN" not in latex and "--" not in latex
 
 
 @pytest.mark.slow

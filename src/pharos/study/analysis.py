@@ -32,7 +32,8 @@ class Models:
         fits: those that there are enough rows for.
         notes: one line for whatever was left out, and why.
         representation_r_squared, class_r_squared: of the fits together; None without them.
-        leave_one_class_out: R2 for classes that the model has not seen; None where there are fewer than two.
+        leave_one_class_out: R2 for classes that the model has not seen; None where there are fewer than two,
+            or no single model.
         class_alone: R2 of the single model without the measures: class and representation alone; None without a model.
         agent: whose regret it is.
     """
@@ -84,13 +85,14 @@ def models(
         notes.append(f"no cell of {agent} has all measures: there are no models")
         return Models(regret, [], notes, None, None, None, agent=agent)
     fits = _fits(rows, used, notes)
+    outside, is_fitted = None, any(part.model == "single" for part in fits)
     try:
-        outside = leave_one_class_out_r_squared(rows, measures=used)
+        if is_fitted:
+            outside = leave_one_class_out_r_squared(rows, measures=used)
     except ParameterError as error:
-        outside = None
         notes.append(str(error))
     together = (_together(fits, "representation"), _together(fits, "class"))
-    alone = _class_alone(rows) if any(part.model == "single" for part in fits) else None
+    alone = _class_alone(rows) if is_fitted else None
     return Models(regret, fits, notes, *together, outside, alone, agent)
 
 

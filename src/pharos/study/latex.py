@@ -1,4 +1,4 @@
-"""The tables of a study in LaTeX, in the paper's layout (packages booktabs, multirow), by pandas' Styler."""
+"""The tables of a study in LaTeX, those of the paper in its layout (packages booktabs, multirow), by pandas' Styler."""
 
 import re
 from collections.abc import Sequence
@@ -6,7 +6,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pharos.agents import TABULAR_OBSERVATION
 from pharos.study.analysis import IMAGE, VECTOR, Models
+from pharos.study.figures import agent_name, title
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -30,7 +32,11 @@ def tables_of(cells: "pd.DataFrame", measured: "pd.DataFrame", models: Sequence[
 
 
 def returns_table(cells: "pd.DataFrame", environment: str) -> str:
-    """The table of one class as in appendix C: PPO and DQN, IMAGE and MINIMAL (the vector), three lines an instance."""
+    """The returns of one class, a line for each kind of chance.
+
+    As in appendix C where PPO and DQN see images and vectors: IMAGE and MINIMAL (the vector). Else a column for each
+    agent and observation that there is.
+    """
     import pandas as pd
 
     part = cells[cells["environment"] == environment]
@@ -40,10 +46,14 @@ def returns_table(cells: "pd.DataFrame", environment: str) -> str:
         name = rf"{{\small {escape(row['instance'])}}}"
         entries = rows.setdefault((name, escape(kind)), {})
         entries[row["agent"], row["observation"]] = _entry(row["return"], row["return_deviation"])
-    columns = pd.MultiIndex.from_tuples([(TITLES[agent], TITLES[seen]) for agent, seen in COLUMNS])
+    seen = sorted({(row.agent, row.observation) for row in part.itertuples()}, key=lambda key: (key[0] != "ppo", *key))
+    titles = [(escape(agent_name(agent)), escape(title(name))) for agent, name in seen]
+    if {key for key in seen if key[1] != TABULAR_OBSERVATION} == set(COLUMNS):
+        seen, titles = list(COLUMNS), [(TITLES[agent], TITLES[name]) for agent, name in COLUMNS]
+    columns = pd.MultiIndex.from_tuples(titles)
     index = pd.MultiIndex.from_tuples(list(rows), names=["instance", "randomization"])
-    data = [[entries.get(column, "--") for column in COLUMNS] for entries in rows.values()]
-    return _latex(pd.DataFrame(data, index, columns), "llcccc", multirow_align="c", clines="skip-last;data")
+    data = [[entries.get(column, "--") for column in seen] for entries in rows.values()]
+    return _latex(pd.DataFrame(data, index, columns), "ll" + "c" * len(seen), multirow_align="c", clines="skip-last;data")
 
 
 def hardness_table(measured: "pd.DataFrame") -> str:

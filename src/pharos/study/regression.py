@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pharos.errors import ParameterError
+from pharos.wording import many
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -88,9 +89,8 @@ def fit(rows: "pd.DataFrame", model: str, subset: str, predictors: Sequence[str]
     needed = len(terms) + 3
     if len(rows) < needed:
         raise ParameterError(
-            f"the {model} model of {subset} has {len(rows)} rows; needs at least {needed} for its {len(terms)} "
-            f"predictors: "
-            f"run more instances or fewer predictors"
+            f"the {model} model of {subset} has {many(len(rows), 'row')}; needs at least {needed} for its "
+            f"{many(len(terms), 'predictor')}: run more instances or fewer predictors"
         )
     formula = "regret ~ " + (" + ".join(terms) if terms else "1")
     result = smf.ols(formula, rows).fit()

@@ -137,8 +137,7 @@ def _regret(results: Results, figures: Figures) -> Section:
             figures,
             "regret",
             "Cumulative regret by steps (lower is better), the mean over instances and kinds of chance with the 95 % "
-            "bootstrap "
-            "interval over seeds. The paper's figure 2.",
+            "bootstrap interval over seeds." + (" The paper's figure 2." if results.comparison is not None else ""),
         ),
         table=table(
             shown[columns],
@@ -225,11 +224,11 @@ def _hardness(results: Results) -> Section:
 
 
 def _returns(results: Results) -> Section:
-    """Returns of each class; those of the paper's agents in LaTeX below."""
+    """Returns of each class, and in LaTeX below."""
     parts = []
     for environment in dict.fromkeys(results.cells["environment"]):
         part = results.cells[results.cells["environment"] == environment]
-        latex = returns_table(results.cells, environment) if set(part["agent"]) & {"dqn", "ppo"} else ""
+        latex = returns_table(results.cells, environment)
         parts.append({"title": title(environment), "table": table(_wide_returns(part)), "latex": latex})
     return Section.of("Returns", "returns", parts=parts)
 
