@@ -18,6 +18,7 @@ from pharos.errors import FileFormatError, ParameterError
 from pharos.experiments import Task, read_curve, train
 from pharos.plots.plane import _label
 from pharos.plots.regret import _label as run_label
+from pharos.plots.regret import _labels as run_labels
 from pharos.plots.style import thousands
 
 
@@ -269,6 +270,8 @@ def config_of(**other):
         "environment": "frozen_lake",
         "parameters": pharos.make("frozen_lake").parameters,
         "chance": {"sticky": 0.0, "random": 0.0},
+        "gamma": 1.0,
+        "horizon": 100,
         "steps": 20000,
         "hyperparameters": {"gamma": 0.9, "batch_size": 32},
     }
@@ -290,6 +293,21 @@ def test_legends_have_no_empty_fields_and_say_units():
         "dqn, vector, frozen_lake/8x8, sticky=0.25, 20k steps, gamma=0.9",
         "dqn, vector, frozen_lake size=6 seed=3, no chance, 20k steps, gamma=0.9",
         "dqn, vector, frozen_lake/4x4, no chance, 20k steps, gamma=0.99",
+    ]
+
+
+def test_no_two_groups_of_runs_have_one_label():
+    configs = [
+        config_of(),
+        config_of(gamma=0.9, horizon=None),
+        config_of(evaluation_interval=5),
+        config_of(agent="ppo"),
+    ]
+    assert run_labels(configs) == [
+        "dqn, vector, discount 1, 100 steps an episode",
+        "dqn, vector, discount 0.9, no horizon",
+        "dqn, vector, discount 1, 100 steps an episode (3)",
+        "ppo, vector",
     ]
 
 

@@ -80,7 +80,19 @@ def _groups(folders: Sequence[str | os.PathLike]) -> dict[str, list[tuple[dict[s
         key = json.dumps({**record["config"], "seed": None}, sort_keys=True)
         groups.setdefault(key, []).append((record, read_curve(folder)))
     configs = [runs[0][0]["config"] for runs in groups.values()]
-    return {_label(config, configs): runs for config, runs in zip(configs, groups.values(), strict=True)}
+    return dict(zip(_labels(configs), groups.values(), strict=True))
+
+
+def _labels(configs: list[dict[str, Any]]) -> list[str]:
+    """The label of each group of runs; where two are alike, with discount and horizon, or a number."""
+    alike = [_label(config, configs) for config in configs]
+    labels: list[str] = []
+    for config, label in zip(configs, alike, strict=True):
+        if alike.count(label) > 1:
+            episode = f"{config['horizon']} steps an episode" if config["horizon"] else "no horizon"
+            label += f", discount {config['gamma']:g}, {episode}"
+        labels.append(f"{label} ({len(labels) + 1})" if label in labels else label)
+    return labels
 
 
 def _label(config: dict[str, Any], configs: list[dict[str, Any]]) -> str:

@@ -53,7 +53,9 @@ def returns_table(cells: "pd.DataFrame", environment: str) -> str:
     columns = pd.MultiIndex.from_tuples(titles)
     index = pd.MultiIndex.from_tuples(list(rows), names=["instance", "randomization"])
     data = [[entries.get(column, "--") for column in seen] for entries in rows.values()]
-    return _latex(pd.DataFrame(data, index, columns), "ll" + "c" * len(seen), multirow_align="c", clines="skip-last;data")
+    return _latex(
+        pd.DataFrame(data, index, columns), "ll" + "c" * len(seen), multirow_align="c", clines="skip-last;data"
+    )
 
 
 def hardness_table(measured: "pd.DataFrame") -> str:
