@@ -65,13 +65,18 @@ class DQNLane(Lane):
 
     def _follow_schedules(self) -> None:
         """After each step: copy to the targets where it is time, and move the exploration rates."""
-        for i in np.flatnonzero(self.calls % self._target_calls == 0):
-            tau = float(self.own["tau"][i])
-            self.target[i].mul_(1.0 - tau).add_(self.parameters[i], alpha=tau)
+        copied = np.flatnonzero(self.calls % self._target_calls == 0)
+        if len(copied):
+            self.copy_to_targets(copied)
         passed = 1.0 - (1.0 - self.steps / self.total)
         first, last, share = (self.own[f"exploration_{name}"] for name in ("initial_eps", "final_eps", "fraction"))
         slope = (last - first) / np.maximum(share, 1e-300)
         self.epsilon[:] = np.where(passed > share, last, first + passed * slope)
+
+    def copy_to_targets(self, runs: np.ndarray) -> None:
+        """Move the target networks of some runs towards the online ones, all the way where tau is 1."""
+        rows, tau = torch.from_numpy(runs), torch.from_numpy(self.own["tau"][runs]).float()[:, None]
+        self.target[rows] = self.target[rows].mul_(1.0 - tau) + self.parameters[rows] * tau
 
     def update(self) -> None:
         """As `Lane` says."""
