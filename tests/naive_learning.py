@@ -1,5 +1,7 @@
 """Q-learning in plain Python, drawing the same random numbers as the compiled loop: its slow twin."""
 
+import math
+
 import numpy as np
 
 import naive_mdp
@@ -37,8 +39,21 @@ def drawn(mdp, s, x, rng):
     return outcomes[-1][0]
 
 
-def q_learning(mdp, word, steps, total_steps, options, limit):
+def normal(rng):
+    """A standard normal number (Box and Muller 1958)."""
+    return math.sqrt(-2 * math.log(1 - rng.random())) * math.cos(2 * math.pi * rng.random())
+
+
+def paid(earned, delay, ended):
+    """What the last step pays, given what the steps of an episode earned, that one included."""
+    if ended:
+        return sum(earned[-1 - delay :])
+    return earned[-1 - delay] if len(earned) > delay else 0.0
+
+
+def q_learning(mdp, word, steps, total_steps, options, limit, noise=0.0, delay=0, noise_word=0):
     """(Q, sum of returns, episodes) after `steps` steps."""
+    noises = SplitMix64(noise_word)
     rng, chance = SplitMix64(word), mdp.chance
     num_actions, sees = mdp.num_actions, options["sees_previous_action"]
     rewards, cumulative = mdp.rewards, np.cumsum(mdp.start_probabilities)
@@ -52,7 +67,7 @@ def q_learning(mdp, word, steps, total_steps, options, limit):
     for step in range(steps):
         if state is None:
             state = int(mdp.start_states[np.searchsorted(cumulative, rng.random(), side="right")])
-            previous, age, gained, discount = num_actions, 0, 0.0, 1.0
+            previous, age, gained, discount, earned = num_actions, 0, 0.0, 1.0, []
         key = (state, previous) if sees else state
         exploration = options["exploration_fraction"] * total_steps
         share = min(1.0, step / exploration) if exploration > 0 else 1.0
@@ -79,7 +94,9 @@ def q_learning(mdp, word, steps, total_steps, options, limit):
         reward, after = rewards[state, executed], drawn(mdp, state, executed, rng)
         ended = after < 0 or bool(mdp.terminal[after])
         following = (after, executed) if sees else after
-        target = reward + (0.0 if ended else options["gamma"] * max(value(following, a) for a in range(num_actions)))
+        earned.append(reward)
+        pay = paid(earned, delay, ended or age + 1 >= limit) + (noise * normal(noises) if noise else 0.0)
+        target = pay + (0.0 if ended else options["gamma"] * max(value(following, a) for a in range(num_actions)))
         visits[key, action] = visits.get((key, action), 0) + 1
         w = options["visits_exponent"]
         alpha = max(options["learning_rate"], visits[key, action] ** -w) if w else options["learning_rate"]

@@ -1,10 +1,11 @@
 """MDPs written out in full, and solved by linear algebra: the slow twin of pharos.mdp and pharos.solvers."""
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 
-from pharos.mdp import OutcomeTable
+from pharos.mdp import Lazy, OutcomeTable
 
 
 def augmented(mdp):
@@ -40,6 +41,10 @@ def augmented(mdp):
 
 def outcomes(mdp, s, x):
     """[(next state or -1, probability)] of executing x in s."""
+    if isinstance(mdp.dynamics, Lazy):
+        p = mdp.dynamics.laziness
+        moves = outcomes(replace(mdp, dynamics=mdp.dynamics.tables), s, x)
+        return [(s, p), *((t, (1 - p) * probability) for t, probability in moves)]
     if isinstance(mdp.dynamics, OutcomeTable):
         return listed(mdp.dynamics, s, x)
     if mdp.transitions is None:

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 import naive_mdp
-from pharos.mdp import OutcomeTable, TabularMDP, random_actions, sticky_actions
+from pharos.mdp import OutcomeTable, TabularMDP, lazy_actions, random_actions, sticky_actions
 
 probabilities = st.sampled_from([0.0, 0.1, 0.25, 0.5, 1.0])
 gammas = st.sampled_from([0.0, 0.5, 0.9, 0.99])
@@ -152,6 +152,16 @@ def small_mdps(draw, **options):
     """Any of the above, with any chance."""
     of_outcomes = outcome_mdps(FEW)
     return _with_chance(draw, draw(st.one_of(deterministic_mdps(**options), general_mdps(), of_outcomes)))
+
+
+@st.composite
+def lazy_mdps(draw):
+    """An MDP in which actions have no effect now and then, which pays what it wants, with any chance of choosing."""
+    mdp = draw(st.one_of(deterministic_mdps(), general_mdps(), outcome_mdps(FEW)))
+    staying = draw(hnp.arrays(np.float64, mdp.rewards.shape, elements=rewards_of_games))
+    staying[np.asarray(mdp.terminal)] = 0.0
+    mdp = lazy_actions(mdp, draw(st.sampled_from([0.1, 1 / 3, 0.9])), staying=draw(st.sampled_from([None, staying])))
+    return _with_chance(draw, mdp)
 
 
 def _with_chance(draw, mdp):

@@ -26,6 +26,7 @@ from strategies import (
     as_outcome_tables,
     deterministic_mdps,
     general_mdps,
+    lazy_mdps,
     outcome_mdps,
     probabilities,
     small_mdps,
@@ -115,7 +116,7 @@ def same(answers):
 
 @pytest.mark.slow
 @often
-@given(st.one_of(small_mdps(), outcome_mdps()), st.integers(0, 2**32))
+@given(st.one_of(small_mdps(), outcome_mdps(), lazy_mdps()), st.integers(0, 2**32))
 def test_every_representation_gives_the_same_answers(mdp, seed):
     rng = np.random.default_rng(seed)
     size, num_actions = mdp.num_states, mdp.num_actions
@@ -148,7 +149,7 @@ def test_every_representation_gives_the_same_answers(mdp, seed):
 
 @pytest.mark.slow
 @often
-@given(st.one_of(small_mdps(), with_chance(outcome_mdps())), st.integers(0, 2**32))
+@given(st.one_of(small_mdps(), with_chance(outcome_mdps()), lazy_mdps()), st.integers(0, 2**32))
 def test_compiled_backups_and_moves_are_those_of_the_formulas(mdp, seed):
     rng = np.random.default_rng(seed)
     looks_back = mdp.is_sticky and seed % 2 == 0
@@ -185,7 +186,7 @@ def test_compiled_backups_and_moves_are_those_of_the_formulas(mdp, seed):
 
 @pytest.mark.slow
 @often
-@given(small_mdps())
+@given(st.one_of(small_mdps(), lazy_mdps()))
 def test_solvers_take_any_representation(mdp):
     from dataclasses import replace
 
@@ -228,7 +229,7 @@ def test_sampled_next_states_are_possible_ones_and_about_as_frequent(mdp, seed):
 
 @pytest.mark.slow
 @often
-@given(small_mdps())
+@given(st.one_of(small_mdps(), lazy_mdps()))
 def test_pairs_that_can_be_met_are_those_of_the_explicit_matrices(mdp):
     P, _, start = naive_mdp.augmented(mdp)
     ended = np.append(np.repeat(np.asarray(mdp.terminal), mdp.num_actions + 1), True)

@@ -24,8 +24,12 @@ from strategies import FEW, deterministic_mdps, outcome_mdps, probabilities
     st.sampled_from([0.0, 0.5, 1.0]),
     st.sampled_from(["linear", "exponential"]),
     st.integers(1, 5),
+    st.sampled_from([0.0, 0.5]),
+    st.integers(0, 3),
 )
-def test_the_compiled_loop_does_what_its_twin_does(mdp, sticky, random, seed, sees, exponent, schedule, limit):
+def test_the_compiled_loop_does_what_its_twin_does(
+    mdp, sticky, random, seed, sees, exponent, schedule, limit, noise, delay
+):
     mdp = random_actions(sticky_actions(mdp, sticky), random)
     options = {
         "visits_exponent": exponent,
@@ -33,10 +37,11 @@ def test_the_compiled_loop_does_what_its_twin_does(mdp, sticky, random, seed, se
         "exploration_schedule": schedule,
         "initial_q": 0.5,
     }
-    agent = QLearning(mdp, total_steps=80, seed=seed, time_limit=limit, **options)
-    word = agent.word[0]
+    payment = {"reward_noise": noise, "reward_delay": delay}
+    agent = QLearning(mdp, total_steps=80, seed=seed, time_limit=limit, **payment, **options)
+    word, noise_word = agent.word[0], agent.noise_word[0]
     agent.learn(30).learn(50)
-    table, total, episodes = q_learning(mdp, word, 80, 80, agent.options, limit)
+    table, total, episodes = q_learning(mdp, word, 80, 80, agent.options, limit, noise, delay, noise_word)
     expected = np.full_like(agent.q, 0.5)
     for (key, action), value in table.items():
         expected[key[0] * (mdp.num_actions + 1) + key[1] if sees else key, action] = value

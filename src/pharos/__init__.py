@@ -1,8 +1,8 @@
 """pharos: principled reinforcement-learning benchmarking.
 
 In the order of the data flow: an Environment (`make`) is enumerated into a StateSpace (`build`, `load`), which is a
-TabularMDP with its rewards (`StateSpace.mdp`), to which chance can be added (`sticky_actions`, `random_actions`), which
-is solved (`value_iteration`, `evaluate_policy`) and measured (`hardness`).
+TabularMDP with its rewards (`StateSpace.mdp`), to which chance can be added (`sticky_actions`, `random_actions`,
+`lazy_actions`), which is solved (`value_iteration`, `evaluate_policy`) and measured (`hardness`).
 
 Interaction goes another way from the same Environment:
 `gymnasium.make("pharos/Breakout-v0", observation="simple_image")`.
@@ -35,6 +35,7 @@ _HOMES = {
     "TabularMDP": "pharos.mdp",
     "sticky_actions": "pharos.mdp",
     "random_actions": "pharos.mdp",
+    "lazy_actions": "pharos.mdp",
     "Solution": "pharos.solvers",
     "value_iteration": "pharos.solvers",
     "evaluate_policy": "pharos.policies",

@@ -35,6 +35,8 @@ class QLearning:
         mdp: the MDP, with chance; its horizon is the time limit of episodes.
         total_steps: over which exploration is scheduled.
         seed: of all random numbers; the same seed gives the same table, whatever the pieces that `learn` is called in.
+        reward_noise, reward_delay: how r is paid, as `pharos.interaction.Interaction` has it; returns are of what is
+            earned.
         learning_rate: alpha, in (0, 1]; with visits_exponent w > 0, alpha = max(learning_rate, n^-w) at the n-th update
             of a pair.
         gamma: discount of the agent.
@@ -48,7 +50,15 @@ class QLearning:
     """
 
     def __init__(
-        self, mdp: TabularMDP, *, total_steps: int, seed: int = 0, time_limit: int | None = None, **options: Any
+        self,
+        mdp: TabularMDP,
+        *,
+        total_steps: int,
+        seed: int = 0,
+        time_limit: int | None = None,
+        reward_noise: float = 0.0,
+        reward_delay: int = 0,
+        **options: Any,
     ):
         table = mdp.dynamics.deterministic_table()
         self._transitions = mdp.dynamics.for_kernels if table is None else table
@@ -72,6 +82,8 @@ class QLearning:
         self.place = np.array([-1, 0, 0, 0, 0], np.int64)
         self.sums = np.array([0.0, 1.0, 0.0])
         self.word = np.array([np.random.SeedSequence(self.seed).generate_state(1, np.uint64)[0]], np.uint64)
+        self.reward_noise, self.pending = float(reward_noise), np.zeros(int(reward_delay))
+        self.noise_word = np.random.SeedSequence(self.seed, spawn_key=(1,)).generate_state(1, np.uint64)
 
     @property
     def steps(self) -> int:
@@ -120,6 +132,9 @@ class QLearning:
             self.place,
             self.sums,
             self.word,
+            self.reward_noise,
+            self.pending,
+            self.noise_word,
             int(steps),
         )
         return self
@@ -139,7 +154,10 @@ class QLearning:
 
     def state(self) -> dict[str, np.ndarray]:
         """Everything that `restore` needs to go on, as plain arrays."""
-        return {"q": self.q, "visits": self.visits, "place": self.place, "sums": self.sums, "word": self.word}
+        arrays = {"q": self.q, "visits": self.visits, "place": self.place, "sums": self.sums, "word": self.word}
+        if len(self.pending):
+            arrays["pending"] = self.pending
+        return arrays | ({"noise_word": self.noise_word} if self.reward_noise else {})
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
         """Go on from what `state` returned."""

@@ -53,6 +53,7 @@ Sticky = Annotated[
 Random = Annotated[
     float, typer.Option("--random", min=0, max=1, help="Probability that a uniformly random action is executed.")
 ]
+Lazy = Annotated[float, typer.Option("--lazy", min=0, max=1, help="Probability that the action has no effect.")]
 Trust = Annotated[
     bool, typer.Option("--trust", help="Execute code that received files name: classes, observations and agents.")
 ]
@@ -145,12 +146,13 @@ class Target:
         horizon: int | None = None,
         sticky: float = 0.0,
         random: float = 0.0,
+        lazy: float = 0.0,
         **building: Any,
     ) -> "TabularMDP":
         """The tabular MDP, with chance; `gamma` None is 0.99, or 1 with a horizon. `building` as for `space`."""
         from pharos.experiments import ChanceSetting
 
-        chance = ChanceSetting(sticky, random)
+        chance = ChanceSetting(sticky, random, lazy)
         if self.is_imported:
             mdp = self._imported(horizon)
             return chance.of(mdp if gamma is None else mdp.with_gamma(gamma))
@@ -351,14 +353,19 @@ def print_facts(title: str, facts: Sequence[tuple[str, object]]) -> None:
     to.print(table)
 
 
-def describe_chance(sticky: float, random: float, of_the_world: bool = False) -> str:
+def describe_chance(
+    sticky: float, random: float, of_the_world: bool = False, lazy: float = 0.0, noise: float = 0.0, delay: int = 0
+) -> str:
     """Chance in words.
 
     Args:
         of_the_world: whether executing an action may have several outcomes itself.
+        noise, delay: of the rewards that are paid.
     """
     parts = ["of the world"] * of_the_world
     parts += [f"sticky actions {sticky:g}"] * bool(sticky) + [f"random actions {random:g}"] * bool(random)
+    parts += [f"lazy actions {lazy:g}"] * bool(lazy) + [f"reward noise {noise:g}"] * bool(noise)
+    parts += [f"rewards {delay} steps late"] * bool(delay)
     return ", ".join(parts) or "none"
 
 

@@ -9,6 +9,7 @@ from pharos.cli.common import (
     Gamma,
     Horizon,
     Json,
+    Lazy,
     MaxStates,
     Memory,
     Parameters,
@@ -52,6 +53,7 @@ def evaluate(
     horizon: Horizon = None,
     sticky: Sticky = 0.0,
     random: Random = 0.0,
+    lazy: Lazy = 0.0,
     tolerance: Tolerance = 1e-6,
     memory: Memory = None,
     workers: Workers = None,
@@ -67,7 +69,7 @@ def evaluate(
         table = goal.mdp()
         gamma, horizon = table.gamma if gamma is None else gamma, table.horizon if horizon is None else horizon
         goal = Target(target, environment=goal.found_environment())
-    mdp = goal.mdp(gamma=gamma, horizon=horizon, sticky=sticky, random=random, **building)
+    mdp = goal.mdp(gamma=gamma, horizon=horizon, sticky=sticky, random=random, lazy=lazy, **building)
     with progress_line("evaluating"):
         values = _values(mdp, policy, given, tolerance)
     best, uniform, worst = (values[name].value_at_start for name in POLICIES)
@@ -89,6 +91,7 @@ def evaluate(
         "horizon": mdp.horizon,
         "sticky": sticky,
         "random": random,
+        "lazy": lazy,
     }
     if json:
         print_json(answer)
@@ -104,7 +107,7 @@ def evaluate(
             ("optimal, uniform, worst", f"{best:.8g}, {uniform:.8g}, {worst:.8g}"),
             ("error at most", f"{max(each.error_bound for each in values.values()):.2g}"),
             ("discount", describe_discount(mdp.gamma, mdp.horizon)),
-            ("chance", describe_chance(sticky, random, not mdp.dynamics.is_deterministic)),
+            ("chance", describe_chance(sticky, random, mdp.dynamics.has_chance, lazy)),
         ],
     )
 

@@ -7,6 +7,7 @@ import typer
 
 from pharos.cli.common import (
     Json,
+    Lazy,
     MaxStates,
     Memory,
     Parameters,
@@ -51,6 +52,7 @@ def hardness(
     ] = None,
     sticky: Sticky = 0.0,
     random: Random = 0.0,
+    lazy: Lazy = 0.0,
     tolerance: Annotated[
         float, typer.Option("--tolerance", help="Largest error of the optimal values, in units of return.")
     ] = 1e-9,
@@ -81,6 +83,7 @@ def hardness(
         horizon=horizon if gamma == 1 or own else None,
         sticky=sticky,
         random=random,
+        lazy=lazy,
         **building,
     )
     from pharos.hardness import report as measure
@@ -101,7 +104,7 @@ def hardness(
     elif latex:
         print(report.to_latex())
     else:
-        chance = describe_chance(sticky, random, not mdp.dynamics.is_deterministic)
+        chance = describe_chance(sticky, random, mdp.dynamics.has_chance, lazy)
         _print(" ".join((target, *(parameters or ()))), report, chance, definitions)
 
 

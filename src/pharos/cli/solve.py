@@ -9,6 +9,7 @@ from pharos.cli.common import (
     Gamma,
     Horizon,
     Json,
+    Lazy,
     MaxStates,
     Memory,
     Parameters,
@@ -35,6 +36,7 @@ def solve(
     horizon: Horizon = None,
     sticky: Sticky = 0.0,
     random: Random = 0.0,
+    lazy: Lazy = 0.0,
     tolerance: Annotated[
         float, typer.Option("--tolerance", help="Largest error of a value, in units of return.")
     ] = 1e-6,
@@ -50,7 +52,8 @@ def solve(
     if out is not None:
         check_format(out, (".npz", ".npy"))
     building = build_options(memory, workers, max_states)
-    mdp = parse_target(target, parameters).mdp(gamma=gamma, horizon=horizon, sticky=sticky, random=random, **building)
+    chance = {"sticky": sticky, "random": random, "lazy": lazy}
+    mdp = parse_target(target, parameters).mdp(gamma=gamma, horizon=horizon, **chance, **building)
     from pharos.solvers import uniform_value, value_iteration
 
     with progress_line("solving") as report:
@@ -71,6 +74,7 @@ def solve(
         "horizon": solution.horizon,
         "sticky": sticky,
         "random": random,
+        "lazy": lazy,
         "tolerance": tolerance,
         "uniform_error_bound": uniform.error_bound,
         "uniform_seconds": uniform.seconds,
@@ -86,7 +90,7 @@ def solve(
         ("uniform policy at the start", f"{uniform.value_at_start:.8g}"),
         ("error at most", f"{max(solution.error_bound, uniform.error_bound):.2g}"),
         ("discount", describe_discount(solution.gamma, solution.horizon)),
-        ("chance", describe_chance(sticky, random, not mdp.dynamics.is_deterministic)),
+        ("chance", describe_chance(sticky, random, mdp.dynamics.has_chance, lazy)),
         ("states", f"{mdp.num_states:,} x {many(mdp.num_actions, 'action')}"),
         ("sweeps", f"{solution.sweeps} in {solution.seconds:.2f} s"),
     ]

@@ -11,6 +11,7 @@ import typer
 
 from pharos.cli.common import (
     Json,
+    Lazy,
     Parameters,
     Random,
     Sticky,
@@ -76,6 +77,13 @@ def train(
     ] = None,
     sticky: Sticky = 0.0,
     random: Random = 0.0,
+    lazy: Lazy = 0.0,
+    reward_noise: Annotated[
+        float, typer.Option("--reward-noise", min=0, help="Standard deviation of noise in what is paid; 0 on average.")
+    ] = 0.0,
+    reward_delay: Annotated[
+        int, typer.Option("--reward-delay", min=0, help="Steps by which rewards are paid late, the last at the end.")
+    ] = 0,
     gamma: Annotated[
         float | None,
         typer.Option("--gamma", min=0, max=1, help="Discount of values and returns; 1 when not given, with a horizon."),
@@ -107,6 +115,9 @@ def train(
         "observation_options": parse_parameters(option),
         "sticky": sticky,
         "random": random,
+        "lazy": lazy,
+        "reward_noise": reward_noise,
+        "reward_delay": reward_delay,
         "gamma": gamma if gamma is not None else 0.99 if endless else 1.0,
         "horizon": None if endless else horizon or "default",
         "evaluation_interval": interval,
@@ -128,7 +139,7 @@ def train(
             {**result.result, "config": result.config, "seconds": result.seconds, "folder": out, "plot": picture}
         )
         return
-    facts = _facts(result, steps, describe_chance(sticky, random, env.has_chance))
+    facts = _facts(result, steps, describe_chance(sticky, random, env.has_chance, lazy, reward_noise, reward_delay))
     if out is not None:
         facts += [("results", out), *([("plot", picture)] if picture else [])]
     print_facts(f"{agent} on {' '.join((target, *(parameters or ())))}, {result.config['observation']}", facts)

@@ -159,6 +159,11 @@ class Members:
         lacking = supports(config.agent, chosen)
         if lacking is not None:
             raise ParameterError(f"the batched engine: {lacking}; the engine sb3 has it")
+        if config.chance.lazy or config.chance.pays_otherwise:
+            raise ParameterError(
+                f"the batched engine: {config.chance}: it has no lazy actions, and pays what is earned at once and "
+                f"without noise; the engine sb3 has them"
+            )
         task = self.task(config)
         run = BatchRun(
             mdp=task.mdp,

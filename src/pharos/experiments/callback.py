@@ -4,6 +4,7 @@ Algorithms that learn from whole rollouts, such as PPO, take the steps of their 
 episodes that end after the last point are not counted.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -16,10 +17,19 @@ class AtPoints(BaseCallback):
     Args:
         gamma: discount of returns.
         finished: episodes and sum of returns before.
+        earned: gives what the last step earned, (N,), of which returns are; agents may be paid otherwise.
     """
 
-    def __init__(self, points: list[int], at_point: Any, gamma: float, finished: tuple[int, float]):
+    def __init__(
+        self,
+        points: list[int],
+        at_point: Any,
+        gamma: float,
+        finished: tuple[int, float],
+        earned: Callable[[], np.ndarray],
+    ):
         super().__init__()
+        self._earned = earned
         self.points, self.at_point, self.gamma, self.last = list(points), at_point, gamma, points[-1]
         self.episodes, self.returns = finished
         self._owner: Any = None
@@ -36,7 +46,7 @@ class AtPoints(BaseCallback):
         if self.num_timesteps > self.last:
             return True
         dones = self.locals["dones"]
-        self._running += self._discount * self.locals["rewards"]
+        self._running += self._discount * self._earned()
         self._discount *= self.gamma
         for i in np.flatnonzero(dones):
             self.episodes += 1

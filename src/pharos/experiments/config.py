@@ -6,6 +6,7 @@ settings that a run shares with values and measures of hardness: `ChanceSetting`
 """
 
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any
@@ -26,31 +27,64 @@ ENGINES = ("sb3", "batched")
 
 @dataclass(frozen=True)
 class ChanceSetting:
-    """Chance that is added to a deterministic environment; `pharos.mdp.Chance` is what it does to an MDP.
+    """What is added to an environment: chance of acting, which changes the MDP, and how rewards are paid, which does
+    not: values and regret are those of the rewards as they are earned.
 
     Attributes:
         sticky: probability that the previous action is executed again.
         random: probability that a uniformly random action is executed. Where both are given, random ones come first.
+        lazy: probability that the executed action has no effect.
+        reward_noise: standard deviation of the noise that is added to what is paid.
+        reward_delay: steps by which rewards are paid late.
     """
 
     sticky: float = 0.0
     random: float = 0.0
+    lazy: float = 0.0
+    reward_noise: float = 0.0
+    reward_delay: int = 0
+
+    def __post_init__(self) -> None:
+        noise, delay = self.reward_noise, self.reward_delay
+        if isinstance(noise, bool) or not isinstance(noise, int | float) or not 0 <= noise < math.inf:
+            raise ParameterError(f"reward_noise is {noise!r}; expected a standard deviation of at least 0")
+        if isinstance(delay, bool) or not isinstance(delay, int) or delay < 0:
+            raise ParameterError(f"reward_delay is {delay!r}; expected a whole number of steps of at least 0")
 
     @staticmethod
     def from_dict(entry: Mapping[str, float]) -> "ChanceSetting":
         """Read `{"sticky": .., "random": ..}`; what is left out is 0.
 
         Raises:
-            UnknownName: another kind of chance.
+            UnknownName: another kind of chance. ParameterError: noise or delay is out of range.
         """
+        known = [each.name for each in fields(ChanceSetting)]
         for name in entry:
-            if name not in ("sticky", "random"):
-                raise UnknownName("kind of chance", name, ("sticky", "random"))
-        return ChanceSetting(entry.get("sticky", 0.0), entry.get("random", 0.0))
+            if name not in known:
+                raise UnknownName("kind of chance", name, known)
+        delay = entry.get("reward_delay", 0)
+        whole = int(delay) if isinstance(delay, float) and delay.is_integer() else delay  # as `--chance` reads it
+        return ChanceSetting(**{**entry, "reward_delay": whole})  # type: ignore[arg-type]
 
     def to_dict(self) -> dict[str, float]:
-        """`{"sticky": .., "random": ..}`."""
-        return {"sticky": self.sticky, "random": self.random}
+        """`{"sticky": .., "random": ..}`, and the others where they are not 0."""
+        values = vars(self)
+        return {name: value for name, value in values.items() if value or name in ("sticky", "random")}
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """All of them, as a `Task` and environments take them."""
+        return dict(vars(self))
+
+    @property
+    def pays_otherwise(self) -> bool:
+        """Whether rewards are paid late or with noise."""
+        return bool(self.reward_noise or self.reward_delay)
+
+    @property
+    def changes_mdp(self) -> bool:
+        """Whether there is chance of acting."""
+        return bool(self.sticky or self.random or self.lazy)
 
     def of(self, mdp: "TabularMDP") -> "TabularMDP":
         """The MDP with this chance added.
@@ -58,17 +92,19 @@ class ChanceSetting:
         Raises:
             ParameterError: a probability is not between 0 and 1.
         """
-        from pharos.mdp import random_actions, sticky_actions
+        from pharos.mdp import lazy_actions, random_actions, sticky_actions
 
+        if self.lazy:
+            mdp = lazy_actions(mdp, self.lazy)
         if self.sticky:
             mdp = sticky_actions(mdp, self.sticky)
         return random_actions(mdp, self.random) if self.random else mdp
 
     def __bool__(self) -> bool:
-        return bool(self.sticky or self.random)
+        return any(vars(self).values())
 
     def __str__(self) -> str:
-        """`plain`, `sticky 0.25`, `random 0.1`, or both."""
+        """`plain`, `sticky 0.25`, `random 0.1`, or several of them."""
         parts = [f"{name} {value:g}" for name, value in self.to_dict().items() if value]
         return ", ".join(parts) or "plain"
 
@@ -117,7 +153,7 @@ class RunConfig:
     Attributes:
         environment: name of the class of environments.
         parameters: all parameters of the environment, JSON-able.
-        chance: added to the environment.
+        chance: added to the environment: of acting, and in how rewards are paid.
         observation: name of what the agent sees; "index" for tabular agents.
         observation_options: options of the observation.
         agent: "q_learning", "dqn", "ppo", "a2c", or "module:Class" of an algorithm for Stable-Baselines3.
@@ -287,8 +323,7 @@ class RunConfig:
             self._check_trust("observation", trust)
         return Task(
             self.make_environment(trust=trust, strict=strict),
-            sticky=self.chance.sticky,
-            random=self.chance.random,
+            **self.chance.options,
             observation=observation,
             observation_options=dict(self.observation_options),
             gamma=self.gamma,

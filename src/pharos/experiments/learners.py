@@ -55,7 +55,15 @@ class Tabular:
     """Q-learning."""
 
     def __init__(self, task: Task, hyperparameters: dict[str, Any], steps: int, seed: int):
-        self.agent = QLearning(task.mdp, total_steps=steps, seed=seed, time_limit=task.time_limit, **hyperparameters)
+        self.agent = QLearning(
+            task.mdp,
+            total_steps=steps,
+            seed=seed,
+            time_limit=task.time_limit,
+            reward_noise=task.reward_noise,
+            reward_delay=task.reward_delay,
+            **hyperparameters,
+        )
 
     def learn(self, points: list[int], at_point: AtPoint) -> None:
         """As `Learner` says."""
@@ -92,6 +100,7 @@ class Deep:
         check_hyperparameters(agent, hyperparameters)
         self.task, self.steps = task, steps
         env = vector_environment(task, int(hyperparameters.get("n_envs", 1)), seed)
+        self.env = env
         self.model = make_model(agent, env, hyperparameters, seed=seed, tensorboard=tensorboard)
         self.agent = DeepPolicy(self.model)
         self.finished = (0, 0.0)  # episodes, and the sum of their returns
@@ -100,7 +109,7 @@ class Deep:
         """As `Learner` says."""
         from pharos.experiments.callback import AtPoints
 
-        callback = AtPoints(points, at_point, self.task.gamma, self.finished)
+        callback = AtPoints(points, at_point, self.task.gamma, self.finished, lambda: self.env.earned)
         callback.counted_by(self)
         self.model.learn(self.steps - self.model.num_timesteps, callback=callback, reset_num_timesteps=False)
         callback.at_the_end()

@@ -53,7 +53,10 @@ class Task:
 
     Attributes:
         env: the environment.
-        sticky, random: chance, as in `pharos.sticky_actions` and `pharos.random_actions`; both: random ones come first.
+        sticky, random, lazy: chance, as in `pharos.sticky_actions`, `pharos.random_actions` and `pharos.lazy_actions`;
+            random ones come first, then sticky ones.
+        reward_noise, reward_delay: how agents are paid, as `pharos.interaction.Interaction` has it; values and regret
+            are those of the rewards without noise and delay.
         observation, observation_options: what the agent sees, as `pharos.observe` takes it.
         previous_action: whether the agent also sees the previously executed action.
         gamma: discount of values and returns.
@@ -65,6 +68,9 @@ class Task:
     env: Environment
     sticky: float = 0.0
     random: float = 0.0
+    lazy: float = 0.0
+    reward_noise: float = 0.0
+    reward_delay: int = 0
     observation: Any = "vector"
     observation_options: Mapping[str, Any] = field(default_factory=dict)
     previous_action: bool = False
@@ -82,6 +88,7 @@ class Task:
             )
         if not isinstance(self.env, Environment):
             raise ParameterError(f"env is {self.env!r}; expected an Environment, or its name")
+        _ = self.chance  # which refuses what is out of range
         object.__setattr__(self, "horizon", Horizon.of(self.horizon).steps(self.env))
         if self.horizon is None and self.gamma >= 1:
             raise ParameterError(
@@ -100,7 +107,7 @@ class Task:
     @property
     def chance(self) -> ChanceSetting:
         """The chance that is added to the environment."""
-        return ChanceSetting(self.sticky, self.random)
+        return ChanceSetting(self.sticky, self.random, self.lazy, self.reward_noise, self.reward_delay)
 
     @property
     def horizon_steps(self) -> int | None:
@@ -123,8 +130,7 @@ class Task:
         options: dict[str, Any] = {
             "observation": self.observation,
             "observation_options": dict(self.observation_options) or None,
-            "sticky": self.sticky,
-            "random": self.random,
+            **self.chance.options,
             "previous_action": self.previous_action,
             "time_limit": self.time_limit,
         }
@@ -194,7 +200,7 @@ class Task:
         plain = self._episodes(self._mdp_without_chance)
         if not plain.dynamics.is_deterministic:
             return _range_of_returns(plain)
-        if not self.chance and len(self.mdp.start_states) == 1:
+        if not self.chance.changes_mdp and len(self.mdp.start_states) == 1:
             reference = self.reference
             return reference.worst - reference.error_bound, reference.optimal + reference.error_bound
         low, high = worst_value(plain), value_iteration(plain)

@@ -40,6 +40,9 @@ def train(
     observation_options: Mapping[str, Any] | None = None,
     sticky: float = 0.0,
     random: float = 0.0,
+    lazy: float = 0.0,
+    reward_noise: float = 0.0,
+    reward_delay: int = 0,
     gamma: float = 1.0,
     horizon: int | str | None = "default",
     seed: int = 0,
@@ -60,7 +63,8 @@ def train(
         steps: number of environment steps to learn from.
         observation, observation_options: what the agent sees, also "module:name" or "file.py:name"; tabular agents see
             the index of the state.
-        sticky, random: chance.
+        sticky, random, lazy: chance of acting, see `Task`.
+        reward_noise, reward_delay: how the agent is paid; values, returns and regret are of what it earns.
         gamma, horizon: setting of values and returns, see `Task`; the agent's own discount is a hyperparameter.
         evaluation_interval: steps between evaluations; None: a hundredth of `steps`.
         hyperparameters: go before those of agents/defaults.py; or a YAML file of the same form, such as one
@@ -83,6 +87,9 @@ def train(
         observation_options=observation_options,
         sticky=sticky,
         random=random,
+        lazy=lazy,
+        reward_noise=reward_noise,
+        reward_delay=reward_delay,
         gamma=gamma,
         horizon=horizon,
     )

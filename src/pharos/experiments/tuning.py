@@ -85,8 +85,8 @@ def tune(
         environments: instances, named or made; all of one class.
         steps, observation, sticky, random: of every run, as for `train`.
         trials: number of trials, those that `out` holds already included.
-        chances: several kinds of chance, such as [{}, {"random": 0.1}, {"sticky": 0.25}], each for every instance; in
-            place of `sticky` and `random`.
+        chances: several kinds of chance, such as [{}, {"random": 0.1}, {"reward_delay": 3}], each for every instance;
+            in place of `sticky` and `random`.
         seeds: of the runs of a trial; keep them apart from the seeds of the experiment that follows.
         space: what is searched, in the form of `SPACES`; None: what that says of the agent.
         search_seed: of the search.
@@ -176,9 +176,7 @@ class _Search:
     def tasks(self) -> list[Task]:
         """Every instance under every kind of chance."""
         return [
-            Task(each, sticky=kind.sticky, random=kind.random, observation=self._observed)
-            for each in self.instances
-            for kind in self.kinds
+            Task(each, **kind.options, observation=self._observed) for each in self.instances for kind in self.kinds
         ]
 
     @cached_property

@@ -239,7 +239,8 @@ def optimal_solution(mdp: TabularMDP, solution: Solution | None) -> Solution:
         return value_iteration(mdp, 1e-9)
     shape = (mdp.num_states, mdp.num_actions)
     given = (solution.mdp.num_states, solution.mdp.num_actions)
-    if solution.kind != "optimal" or given != shape or solution.mdp.chance != mdp.chance:
+    chance, other = ((each.chance, each.laziness) for each in (mdp, solution.mdp))
+    if solution.kind != "optimal" or given != shape or chance != other:
         raise ParameterError(
             f"solution is of kind {solution.kind!r} for {solution.mdp}; expected the optimal one of {mdp}"
         )

@@ -152,7 +152,12 @@ def conventions_of(mdp: TabularMDP, restart: bool) -> dict[str, Any]:
     return {
         "restart": restart,
         "start_states": len(mdp.start_states),
-        "chance": {"chosen": mdp.chance.chosen, "previous": mdp.chance.previous, "uniform": mdp.chance.uniform},
+        "chance": {
+            "chosen": mdp.chance.chosen,
+            "previous": mdp.chance.previous,
+            "uniform": mdp.chance.uniform,
+            **({"lazy": mdp.laziness} if mdp.laziness else {}),
+        },
     }
 
 

@@ -213,6 +213,7 @@ def _conventions(problem: Problem) -> dict[str, Any]:
             "previous": chance.previous,
             "uniform": chance.uniform,
             "first_chosen": chance.first_chosen,
+            **({"lazy": mdp.laziness} if mdp.laziness else {}),
         },
         "restart": problem.restart,
         "tolerance": problem.tolerance,

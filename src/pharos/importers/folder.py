@@ -40,13 +40,12 @@ def save(
         observed: what they are: "image", (S, H, W, 3) uint8; "grid", (S, columns, rows, C) uint8 codes of things;
             "vector", (S, N) numbers; None: "image" where they are (S, H, W, 3), else "vector".
     Raises:
-        ParameterError: the folder holds something else, or the MDP has sticky or random actions (add them after
+        ParameterError: the folder holds something else, or the MDP has sticky, random or lazy actions (add them after
             loading); or names, limit or observations do not fit it.
     """
     told = _told(mdp, actions, time_limit, observations, observed)
     folder = Path(folder)
-    if mdp.is_sticky or mdp.is_random:
-        raise ParameterError("an MDP is kept without sticky or random actions; add them when it is loaded")
+    _check_without_chance(mdp)
     if folder.is_dir() and any(folder.iterdir()) and not is_folder(folder):
         raise ParameterError(f"{folder}: is not empty and holds no imported MDP; choose another folder")
     folder.mkdir(parents=True, exist_ok=True)
@@ -105,13 +104,15 @@ def environment(mdp: TabularMDP | str | os.PathLike) -> Environment:
     """Return the environment whose rules are the table of an imported MDP: to train on, to step and to draw.
 
     Args:
-        mdp: a folder that `save` wrote; or an MDP without sticky or random actions, which is kept in the user's cache
-            where it has no such folder. Its discount is left to the task.
+        mdp: a folder that `save` wrote; or an MDP without sticky, random or lazy actions, which is kept in the user's
+            cache where it has no such folder. Its discount is left to the task.
     Raises:
-        FileFormatError: the folder holds none, or was changed. ParameterError: the MDP has sticky or random actions.
+        FileFormatError: the folder holds none, or was changed. ParameterError: the MDP has sticky, random or lazy
+            actions.
     """
     if not isinstance(mdp, TabularMDP):
         return make("imported", folder=os.fspath(mdp))
+    _check_without_chance(mdp)
     if mdp.folder is not None and is_folder(mdp.folder):
         return make("imported", folder=os.fspath(mdp.folder))
     place = paths.cache_directory() / "imported"
@@ -119,6 +120,13 @@ def environment(mdp: TabularMDP | str | os.PathLike) -> Environment:
     said = [mdp.num_states, mdp.num_actions, mdp.gamma, mdp.horizon, str(mdp.chance), sorted(parts.items())]
     folder = place / storage.digest_of_json(said)
     return make("imported", folder=os.fspath(folder if is_folder(folder) else save(mdp, folder)))
+
+
+def _check_without_chance(mdp: TabularMDP) -> None:
+    if mdp.is_sticky or mdp.is_random or mdp.laziness:
+        raise ParameterError(
+            "an MDP is kept without sticky or random actions, and without lazy ones; add them when it is loaded"
+        )
 
 
 def _arrays_of(mdp: TabularMDP) -> dict[str, np.ndarray]:

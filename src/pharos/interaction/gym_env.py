@@ -13,6 +13,7 @@ import numpy as np
 
 from pharos.environments import Environment
 from pharos.errors import ParameterError
+from pharos.interaction.payment import Payment
 from pharos.interaction.simulator import SimulatedEnv, Simulator, Stream, split_options
 from pharos.observations import NO_ACTION, Index
 
@@ -20,17 +21,21 @@ if TYPE_CHECKING:
     from pharos.drawing import Window
 
 
+_ONE = np.ones(1, np.bool_)
+
+
 class GymEnv(SimulatedEnv, gymnasium.Env):
     """An environment of pharos as a Gymnasium environment.
 
     Actions are 0 .. A-1, named by `action_names`. `info` has "state" (D,) int64, "executed_action" (-1 after reset),
     and "index" where a state space was given. `reset(options={"state": ...})` starts in any state. Sticky and random
-    actions draw one number from `np_random` a step.
+    actions draw one number from `np_random` a step, then lazy ones another.
 
     Where the rules have chance, an outcome of the executed action is drawn and its reward paid; `info["prob"]` is the
     probability of that outcome, 1.0 after reset, as in Gymnasium's toy text. All numbers, for the start, for sticky and
-    random actions and, after these, for the outcome, then come from the stream that environment 0 of a `VectorEnv` has
-    with the same seed: one seed, the same episodes in both. Without a seed, `np_random` seeds that stream.
+    random actions, for lazy ones and, after these, for the outcome, then come from the stream that environment 0 of a
+    `VectorEnv` has with the same seed: one seed, the same episodes in both. Without a seed, `np_random` seeds that
+    stream. Where rewards are paid late or with noise, `info["earned_reward"]` is what the rules pay for the step.
 
     Args:
         environment: a name that `pharos.make` knows, or an Environment.
@@ -76,11 +81,12 @@ class GymEnv(SimulatedEnv, gymnasium.Env):
         self._start_observations = observation(simulator.start_states) if few else None
         if self._step_and_draw is not None:
             self._shades, self._blank = observation.shades, np.zeros(observation.space.shape, np.uint8)
-        self._has_chance, self._stays = simulator.has_chance, simulator.chance[0]
+        self._has_chance, self._stays, self._lazy = simulator.has_chance, simulator.chance[0], simulator.lazy
         self._has_outcomes, self._num_outcomes = simulator.has_outcomes, int(simulator.env.outcomes)
         self._outcome_one = simulator.rules.outcome_one
         self._stream: Stream | None = None  # of random numbers, where the rules have chance
         self._is_index = simulator.context.is_plain and isinstance(observation, Index)
+        self._payment = Payment(interaction, 1) if simulator.pays_otherwise else None
         space = simulator.state_space
         self._successors = None if space is None or self._has_outcomes else space.successors
 
@@ -103,6 +109,9 @@ class GymEnv(SimulatedEnv, gymnasium.Env):
         """Start an episode; `options={"state": ...}` says where (D integers)."""
         super().reset(seed=seed)
         simulator = self.simulator
+        if self._payment is not None:
+            self._payment.seed([seed])
+            self._payment.restart(_ONE)
         if self._has_outcomes and (seed is not None or self._stream is None):
             self._stream = Stream(int(self.np_random.integers(1 << 63)) if seed is None else seed)
         if options is not None and options.get("state") is not None:
@@ -133,9 +142,11 @@ class GymEnv(SimulatedEnv, gymnasium.Env):
         if self._has_chance and (u := (self._stream or self.np_random).random()) >= self._stays:
             chosen = self.simulator.executed(chosen, self._previous, u)
         branch, likely = chosen, 1.0
-        if self._stream is not None:
+        if self._lazy and (self._stream or self.np_random).random() < self._lazy:
+            branch, likely = -1 - chosen, self._lazy
+        elif self._stream is not None:
             outcome, likely = self._outcome_one(self._parameters, state, chosen, self._stream.random())
-            branch = chosen * self._num_outcomes + outcome
+            branch, likely = chosen * self._num_outcomes + outcome, likely * (1.0 - self._lazy)
         following = self._spare
         observation: Any = self._blank.copy()
         if self._step_and_draw is not None:
@@ -155,7 +166,9 @@ class GymEnv(SimulatedEnv, gymnasium.Env):
         self._elapsed += 1
         info: dict[str, Any] = {"state": following.copy(), "executed_action": chosen}
         if self._successors is not None:
-            info["index"] = self._index = int(self._successors[self._index, chosen])
+            if branch >= 0:
+                self._index = int(self._successors[self._index, chosen])
+            info["index"] = self._index
         if self._has_outcomes:
             info["prob"] = likely
             if self.simulator.state_space is not None:
@@ -164,7 +177,12 @@ class GymEnv(SimulatedEnv, gymnasium.Env):
             observation = self._observation()
         if self._window is not None:
             self.render()
-        return observation, reward, self._terminated, self._elapsed >= self._limit, info
+        is_truncated = self._elapsed >= self._limit
+        if self._payment is not None:
+            info["earned_reward"] = reward
+            ended = np.array([self._terminated or is_truncated])
+            reward = float(self._payment.pay(np.array([reward]), _ONE, ended)[0])
+        return observation, reward, self._terminated, is_truncated, info
 
     def _step_after_the_end(self) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         state = self._started()
@@ -197,6 +215,8 @@ class GymEnv(SimulatedEnv, gymnasium.Env):
             info["index"] = self._index
         if self._has_outcomes:
             info["prob"] = 1.0
+        if self._payment is not None:
+            info["earned_reward"] = 0.0
         return info
 
     def _index_of(self, state: np.ndarray) -> int:

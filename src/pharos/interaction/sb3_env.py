@@ -20,6 +20,10 @@ class SB3VecEnv(VecEnv):
     `infos` are empty but at the end of an episode: "terminal_observation", "TimeLimit.truncated", "episode" with the
     undiscounted return r, length l and seconds t (as a Monitor writes them), and the last "state" (D,) or "index".
     Discrete observations such as "index" come as (N,) int64.
+
+    Attributes:
+        earned: (N,) float32, what the rules paid for the last step; where rewards are paid late or with noise, that is
+            not what `step` returned.
     """
 
     def __init__(self, env: VectorEnv):
@@ -29,6 +33,7 @@ class SB3VecEnv(VecEnv):
         self.render_mode = None
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
         self._actions: Any = None
+        self.earned = np.zeros(env.num_envs, np.float32)
         self._returns = np.zeros(env.num_envs)
         self._lengths = np.zeros(env.num_envs, np.int64)
         self._began = time.perf_counter()
@@ -49,6 +54,7 @@ class SB3VecEnv(VecEnv):
     def step_wait(self) -> tuple[Any, np.ndarray, np.ndarray, list[dict]]:
         observations, rewards, terminated, truncated, info = self.env.step(self._actions)
         done = terminated | truncated
+        self.earned = info.get("earned_reward", rewards).astype(np.float32)
         self._returns += rewards
         self._lengths += 1
         infos: list[dict] = [{} for _ in range(self.num_envs)]

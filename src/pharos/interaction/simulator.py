@@ -1,5 +1,6 @@
 """An environment made ready for interaction: the options that single and vector environments share."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -32,6 +33,12 @@ class Interaction:
         sticky: probability that the previously executed action is executed again.
         random: probability that the action is replaced by one uniform over all; with both, the choice is replaced first
             and then may stick: the chance of `random_actions(sticky_actions(mdp, sticky), random)`.
+        lazy: probability that the executed action has no effect: the state stays what it is, and the rules' reward of
+            that is paid, as `lazy_actions` has it.
+        reward_noise: standard deviation of normal noise that is added to what is paid at each step. It has mean 0, so
+            values and optimal policies stay what they are.
+        reward_delay: steps by which rewards are paid late; at the end of an episode everything is paid that is due, see
+            `Payment`.
         initial_previous_action: what sticks on the first step. None: nothing, the chosen action is executed (as in
             Gymnasium's StickyAction); the Arcade Learning Environment starts with its action "noop".
         previous_action: whether the agent sees the previously executed action.
@@ -45,6 +52,9 @@ class Interaction:
     observation_options: Mapping[str, Any] | None = None
     sticky: float = 0.0
     random: float = 0.0
+    lazy: float = 0.0
+    reward_noise: float = 0.0
+    reward_delay: int = 0
     initial_previous_action: int | None = None
     previous_action: bool = False
     remaining_time: bool = False
@@ -59,6 +69,8 @@ class Simulator:
         env, state_space, context, limit: as the options say; `context` maps states to what the agent gets.
         chance: (chosen, previous, uniform), weights of the executed action; they sum to 1.
         first_chosen: the weight of the chosen action where there is no previous one; the rest is uniform.
+        lazy: the probability that the executed action has no effect.
+        pays_otherwise: whether rewards are paid late or with noise.
         has_chance: whether another than the chosen action may be executed.
         has_outcomes: whether the rules have chance, so that an outcome is drawn after the action.
         start_states (K, D), start_cumulative (K,): start states and the cumulative sum of their probabilities.
@@ -80,7 +92,9 @@ class Simulator:
         )
         chance = _chance(options)
         self.chance, self.first_chosen = chance.triple, float(chance.first_chosen)
-        self._weights = (*self.chance, self.first_chosen)
+        self.lazy = float(options.lazy)
+        self._weights = (*self.chance, self.first_chosen, self.lazy)
+        self.pays_otherwise = _pays_otherwise(options)
         self.has_chance = self.chance != (1.0, 0.0, 0.0)
         self.has_outcomes = self.env.has_chance
         self.first_previous = _first_previous(options.initial_previous_action, self.env)
@@ -149,9 +163,11 @@ class Stream:
         return stepping.next_number(self.words)
 
 
-def stream_of(seed: int | None) -> np.ndarray:
-    """(1,) uint64, the stream of random numbers of an environment that is seeded with `seed`."""
-    return np.random.SeedSequence(seed).generate_state(1, np.uint64)
+def stream_of(seed: int | None, *purpose: int) -> np.ndarray:
+    """(1,) uint64, the stream of random numbers of an environment that is seeded with `seed`; another one for each
+    purpose: none for steps, 1 for the noise of rewards.
+    """
+    return np.random.SeedSequence(seed, spawn_key=purpose).generate_state(1, np.uint64)
 
 
 class SimulatedEnv:
@@ -239,10 +255,21 @@ def _indexed(env: Environment) -> "StateSpace":
 
 
 def _chance(options: Interaction) -> Chance:
-    for name, p in (("sticky", options.sticky), ("random", options.random)):
+    for name, p in (("sticky", options.sticky), ("random", options.random), ("lazy", options.lazy)):
         if isinstance(p, bool) or not isinstance(p, int | float) or not 0 <= p <= 1:
             raise ParameterError(f"{name} is {p!r}; expected a probability in [0, 1]")
+    if options.lazy == 1:
+        raise ParameterError("lazy is 1, so nothing ever happens; expected a probability in [0, 1)")
     return Chance.of(options.sticky, options.random)
+
+
+def _pays_otherwise(options: Interaction) -> bool:
+    noise, delay = options.reward_noise, options.reward_delay
+    if isinstance(noise, bool) or not isinstance(noise, int | float) or not 0 <= noise < math.inf:
+        raise ParameterError(f"reward_noise is {noise!r}; expected a standard deviation of at least 0")
+    if isinstance(delay, bool) or not isinstance(delay, int | np.integer) or delay < 0:
+        raise ParameterError(f"reward_delay is {delay!r}; expected a number of steps of at least 0")
+    return bool(noise or delay)
 
 
 def _time_limit(limit: int | str | None, env: Environment) -> int | None:

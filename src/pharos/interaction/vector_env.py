@@ -3,7 +3,8 @@
 `make_vec("breakout", 1024, observation="vector", sticky=0.25)`, or
 `gymnasium.make_vec("pharos/Breakout-v0", num_envs=1024)`. Chance is drawn inside the loop, from one stream of random
 numbers for each environment: the start where there are several, then for each step what is executed under sticky or
-random actions, then the outcome where the rules have chance. Where there is but one possibility nothing is drawn.
+random actions, whether it has an effect under lazy ones, then the outcome where the rules have chance. Where there is
+but one possibility nothing is drawn.
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,6 +17,7 @@ from gymnasium.vector.utils import batch_space
 
 from pharos.environments import Environment
 from pharos.errors import ParameterError
+from pharos.interaction.payment import Payment
 from pharos.interaction.simulator import SimulatedEnv, Simulator, split_options, stream_of
 from pharos.interaction.walks import RulesWalk, TableWalk
 from pharos.kernels.stepping import DISABLED, SAME_STEP, Batch, first_outside
@@ -29,7 +31,8 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
 
     With `space` the built state space is walked as a table, and the rules are not run: `info` has "index" (N,) in place
     of "state" (N, D). It always has "executed_action" (N,), -1 after a reset; and where the rules have chance "prob"
-    (N,), the probability of the outcome that was drawn, 1 after a reset. Arrays are fresh at every step.
+    (N,), the probability of the outcome that was drawn, 1 after a reset; and where rewards are paid late or with noise
+    "earned_reward" (N,), what the rules pay for the step. Arrays are fresh at every step.
 
     Args:
         environment: a name that `pharos.make` knows, or an Environment.
@@ -81,6 +84,7 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
         self._previous = np.full(n, NO_ACTION, np.int64)
         self._elapsed = np.zeros(n, np.int64)
         self._ended = np.zeros(n, np.bool_)
+        self._payment = Payment(interaction, n) if simulator.pays_otherwise else None
         self._num_drawn = n if simulator.has_outcomes else 0  # outcomes that are drawn in a step
         walk = RulesWalk if simulator.state_space is None else TableWalk
         self._walk: Any = walk(simulator, n, self._mode)
@@ -117,6 +121,8 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
         self._previous[mask] = self.simulator.first_previous
         self._elapsed[mask] = 0
         self._ended[mask] = False
+        if self._payment is not None:
+            self._payment.restart(mask)
         executed = np.full(self.num_envs, NO_ACTION, np.int64)
         info = self._info(executed, np.ones(self._num_drawn))
         return self._walk.observations(self._previous, self._elapsed), info
@@ -142,10 +148,12 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
             )
         )  # fmt: skip
         info = self._info(executed, likely)
-        if self._mode == SAME_STEP:
-            done = terminated | truncated
-            if done.any():
-                self._add_final(info, done)
+        done = terminated | truncated
+        if self._payment is not None:
+            rewards = self._payment.pay(rewards, executed != NO_ACTION, done)
+            info["earned_reward"] = self._payment.earned
+        if self._mode == SAME_STEP and done.any():
+            self._add_final(info, done)
         return self._walk.observations(self._previous, self._elapsed), rewards, terminated, truncated, info
 
     def _info(self, executed: np.ndarray, likely: np.ndarray) -> dict[str, Any]:
@@ -159,6 +167,8 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
         }
         if len(likely):
             info["prob"], info["_prob"] = likely, everywhere
+        if self._payment is not None:
+            info["earned_reward"], info["_earned_reward"] = np.zeros(self.num_envs), everywhere
         return info
 
     def _add_final(self, info: dict[str, Any], done: np.ndarray) -> None:
@@ -197,6 +207,8 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
             raise ParameterError(f"seed has {len(seeds)} entries; expected one integer, or {n}")
         if self._rng is None:
             self._rng = np.random.SeedSequence().generate_state(n, np.uint64)
+        if self._payment is not None:
+            self._payment.seed(seeds)
         for i, one in enumerate(seeds):
             if one is not None:
                 self._rng[i] = stream_of(one)[0]

@@ -10,7 +10,7 @@ import numpy as np
 from pharos.errors import ParameterError
 from pharos.interaction.simulator import Simulator
 from pharos.kernels import stepping
-from pharos.mdp import rewards_of_outcomes
+from pharos.mdp import rewards_of_outcomes, rewards_of_staying
 from pharos.observations import Index, in_blocks
 
 if TYPE_CHECKING:
@@ -103,6 +103,7 @@ class TableWalk:
         self.final = np.zeros(num_envs, np.int64)
         self.final_elapsed = np.zeros(num_envs, np.int64)
         self._transitions, self._rewards = _tables(self.space)
+        self._staying = rewards_of_staying(self.space).array if simulator.lazy else np.empty((0, 0))
         self._starts = self.space.indices(simulator.start_states)
         self._setting = tuple(simulator.setting(mode, np.zeros((2, 0), np.int64), np.zeros(0), self._starts))
         context: Any = simulator.context
@@ -136,7 +137,7 @@ class TableWalk:
         terminal, setting, arrays = self.space.terminal, self._setting, tuple(batch)
 
         def run(first: int, last: int) -> None:
-            walk_table(self._transitions, self._rewards, terminal, setting, arrays, first, last)
+            walk_table(self._transitions, self._rewards, self._staying, terminal, setting, arrays, first, last)
 
         in_blocks(run, len(self.current), BLOCK)
 

@@ -10,6 +10,7 @@ from numba.extending import overload
 
 from pharos.kernels.bellman import reward_at
 from pharos.kernels.outcomes import drawn, size_of
+from pharos.kernels.stepping import normal_number
 
 
 @njit(forceinline=True)
@@ -55,6 +56,9 @@ def q_learning(
     place,
     sums,
     word,
+    noise,
+    pending,
+    noise_word,
     steps,
 ):
     """`steps` steps of Watkins' Q-learning; everything that changes is in the arrays, so that it goes on from them.
@@ -67,6 +71,8 @@ def q_learning(
         exponential?).
     place: int64 (state or -1, previous action, steps in the episode, steps in all, episodes); sums: float64 (return of
     this episode, its discount, sum of finished returns); word: uint64 (1,).
+    noise: standard deviation of the noise of what is paid; pending: float64 (steps by which it is late,) what is due;
+    noise_word: uint64 (1,). Returns are of what is earned.
     """
     num_states, num_actions = size_of(transitions)
     chosen_weight, previous_weight, _, first_chosen = chance
@@ -113,9 +119,19 @@ def q_learning(
             value = q[after, 0]
             for a in range(1, num_actions):
                 value = max(value, q[after, a])
+        paid = reward
+        if len(pending) > 0:
+            slot = place[2] % len(pending)
+            paid, pending[slot] = pending[slot], reward
+            if ended or place[2] + 1 >= limit:
+                for k in range(len(pending)):
+                    paid += pending[k]
+                    pending[k] = 0.0
+        if noise > 0.0:
+            paid += noise * normal_number(noise_word, 0)
         visits[row, action] += 1
         alpha = rate if exponent == 0.0 else max(rate, visits[row, action] ** -exponent)
-        q[row, action] += alpha * (reward + gamma * value - q[row, action])
+        q[row, action] += alpha * (paid + gamma * value - q[row, action])
         sums[0] += sums[1] * reward
         sums[1] *= measure_gamma
         place[0] = t

@@ -1,13 +1,15 @@
 """What executing an action may lead to, for loops that do not ask how it is stored.
 
-Kernels take `transitions`, one of two things:
+Kernels take `transitions`, one of three things:
 
 - a table (S, A) of next states, -1 where the episode ends;
 - several outcomes, as a tuple (successors (N,), offsets, codes, weights, (S, A), each). The outcomes of (s, a), row =
   s A + a, are successors[row K : (row + 1) K], or successors[offsets[row] : offsets[row + 1]] where there are offsets.
   Their probabilities are weights[codes[row]], or, without codes, weights at the same places as the successors. Without
   offsets the last ones of a row may have probability 0: they repeat its first successor. each: K, or, so that the
-  compiler knows it and unrolls loops (twice as fast), a tuple of K zeros (`each_of`).
+  compiler knows it and unrolls loops (twice as fast), a tuple of K zeros (`each_of`);
+- a pair (`transitions` of the first two kinds, p): with probability p a state stays what it is, else they hold. Staying
+  is the last outcome of each row.
 
 `outcomes_of` and `outcome` give them one by one, `expectation` adds up values. Loops over tables cost nothing more.
 """
@@ -25,12 +27,19 @@ def each_of(num_outcomes):
     return (0,) * num_outcomes if num_outcomes <= UNROLLED else num_outcomes
 
 
+def _is_lazy(transitions):
+    """Whether the type is that of a pair."""
+    return isinstance(transitions, types.BaseTuple) and len(transitions) == 2
+
+
 def size_of(transitions):
     """(S, A)."""
 
 
 @overload(size_of)
 def _size_of(transitions):
+    if _is_lazy(transitions):
+        return lambda transitions: size_of(transitions[0])
     if isinstance(transitions, types.Array):
         return lambda transitions: transitions.shape
     return lambda transitions: transitions[4]
@@ -42,6 +51,8 @@ def outcomes_of(transitions, s, a):
 
 @overload(outcomes_of)
 def _outcomes_of(transitions, s, a):
+    if _is_lazy(transitions):
+        return lambda transitions, s, a: range(len(outcomes_of(transitions[0], s, a)) + 1)
     if isinstance(transitions, types.Array):
         return lambda transitions, s, a: range(1)
     if isinstance(transitions[5], types.BaseTuple):
@@ -62,6 +73,15 @@ def outcome(transitions, s, a, k):
 
 @overload(outcome)
 def _outcome(transitions, s, a, k):
+    if _is_lazy(transitions):
+
+        def moves_or_stays(transitions, s, a, k):
+            if np.int64(k) == len(outcomes_of(transitions[0], s, a)):
+                return np.int64(s), transitions[1]
+            t, p = outcome(transitions[0], s, a, k)
+            return np.int64(t), (1.0 - transitions[1]) * p
+
+        return moves_or_stays
     if isinstance(transitions, types.Array):
         return lambda transitions, s, a, k: (transitions[s, a], 1.0)
     if isinstance(transitions[2], types.NoneType):
@@ -107,6 +127,12 @@ def expectation(transitions, v, s, a):
 
 @overload(expectation)
 def _expectation(transitions, v, s, a):
+    if _is_lazy(transitions):
+
+        def moves_or_stays(transitions, v, s, a):
+            return (1.0 - transitions[1]) * expectation(transitions[0], v, s, a) + transitions[1] * v[s]
+
+        return moves_or_stays
     if isinstance(transitions, types.Array):
         return lambda transitions, v, s, a: v[transitions[s, a]]
 
@@ -126,6 +152,12 @@ def expectation_of_pair(transitions, v, s, a):
 
 @overload(expectation_of_pair)
 def _expectation_of_pair(transitions, v, s, a):
+    if _is_lazy(transitions):
+
+        def moves_or_stays(transitions, v, s, a):
+            return (1.0 - transitions[1]) * expectation_of_pair(transitions[0], v, s, a) + transitions[1] * v[s, a]
+
+        return moves_or_stays
     if isinstance(transitions, types.Array):
         return lambda transitions, v, s, a: v[transitions[s, a], a]
 

@@ -2,6 +2,7 @@
 
 from typing import Any, NamedTuple
 
+import numpy as np
 from numba import float64, njit, types, uint64
 from numba.extending import overload
 
@@ -16,8 +17,8 @@ class Setting(NamedTuple):
     Attributes:
         ranges: (2, D) int64, lowest and highest value of each component; (2, 0) on a table.
         scale: (D,) float64, of the vectors that `step_many` writes.
-        chance: (chosen, previous, uniform, first_chosen), weights of the executed action; the last is that of the
-            chosen one where there is no previous action.
+        chance: (chosen, previous, uniform, first_chosen, lazy), weights of the executed action, of which the fourth is
+            that of the chosen one where there is no previous action; and the probability that it has no effect.
         limit: steps after which an episode is truncated.
         mode: NEXT_STEP, SAME_STEP or DISABLED.
         first_previous: the previous action on the first step of an episode, -1 for none.
@@ -27,7 +28,7 @@ class Setting(NamedTuple):
 
     ranges: Any
     scale: Any
-    chance: tuple[float, float, float, float]
+    chance: tuple[float, float, float, float, float]
     limit: int
     mode: int
     first_previous: int
@@ -83,6 +84,21 @@ def next_number(rng):
 
 
 @njit(forceinline=True)
+def normal_number(rng, i):
+    """A standard normal number of stream i, of two uniform ones (Box and Muller 1958)."""
+    radius = np.sqrt(-2.0 * np.log(1.0 - uniform_number(rng, i)))
+    return radius * np.cos(2.0 * np.pi * uniform_number(rng, i))
+
+
+@njit(cache=True, nogil=True)
+def add_noise(rng, deviation, mask, out):
+    """out[i] += deviation times a standard normal number of stream i, for every i in `mask`."""
+    for i in range(len(out)):
+        if mask[i]:
+            out[i] += deviation * normal_number(rng, i)
+
+
+@njit(forceinline=True)
 def executed_by_number(chosen, previous, chance, num_actions, u):
     """The executed action, by one uniform number u in [0, 1): chosen, then previous, then uniform.
 
@@ -105,6 +121,12 @@ def executed_action(chosen, previous, chance, num_actions, rng, i):
     if chance[0] >= 1.0:
         return chosen
     return executed_by_number(chosen, previous, chance, num_actions, uniform_number(rng, i))
+
+
+@njit(forceinline=True)
+def has_no_effect(chance, rng, i):
+    """Whether the executed action of stream i changes nothing; nothing is drawn where each has an effect."""
+    return chance[4] > 0.0 and uniform_number(rng, i) < chance[4]
 
 
 @njit(forceinline=True)
@@ -160,12 +182,13 @@ def _outcome_on_table(transitions, rewards, s, a, rng, i):
 
 
 @njit(cache=True, nogil=True)
-def walk_table(transitions, table_rewards, is_terminal, setting, batch, first, last):
+def walk_table(transitions, table_rewards, staying, is_terminal, setting, batch, first, last):
     """One step of environments first .. last - 1 on a tabulated state space; as `step_many`, with indices for
     states.
 
     transitions: see kernels/outcomes.py; table_rewards: what they pay, (S, A), or with chance as `transitions`, with
-    rewards in the place of the successors.
+    rewards in the place of the successors; staying: (S, A), what an action without effect pays; (0, 0) where all have
+    one.
     """
     _, _, chance, limit, mode, first_previous, starts, cumulative = setting
     rng, actions, index, previous, elapsed, ended, rewards, terminated, truncated, executed, final = batch[:11]
@@ -180,7 +203,11 @@ def walk_table(transitions, table_rewards, is_terminal, setting, batch, first, l
             previous[i], elapsed[i], ended[i] = first_previous, 0, False
             continue
         action = executed_action(actions[i], previous[i], chance, num_actions, rng, i)
-        index[i], rewards[i], p = outcome_on_table(transitions, table_rewards, index[i], action, rng, i)
+        if has_no_effect(chance, rng, i):
+            rewards[i], p = staying[index[i], action], chance[4]
+        else:
+            index[i], rewards[i], p = outcome_on_table(transitions, table_rewards, index[i], action, rng, i)
+            p *= 1.0 - chance[4]
         if len(likely) > 0:
             likely[i] = p
         previous[i] = executed[i] = action

@@ -10,13 +10,14 @@ from pharos import lazy
 if TYPE_CHECKING:
     from pharos.mdp.arguments import takes_mdp
     from pharos.mdp.bisimulation import Minimization, minimize
-    from pharos.mdp.chance import Chance, random_actions, sticky_actions
+    from pharos.mdp.chance import Chance, lazy_actions, random_actions, sticky_actions
     from pharos.mdp.dynamics import BellmanEquation, Dynamics, Outcomes, Play
+    from pharos.mdp.lazy import Lazy
     from pharos.mdp.matrices import Matrices
     from pharos.mdp.outcome_table import OutcomeTable
     from pharos.mdp.rewards import Rewards
     from pharos.mdp.selection import BEST, WORST, Extreme, PolicyTable, Selection, chosen_mass
-    from pharos.mdp.space_rewards import rewards_of_outcomes, rewards_of_space
+    from pharos.mdp.space_rewards import rewards_of_outcomes, rewards_of_space, rewards_of_staying
     from pharos.mdp.table import Table
     from pharos.mdp.tabular import TabularMDP
 
@@ -27,6 +28,7 @@ _FILES = {
     "Chance": "chance",
     "Dynamics": "dynamics",
     "Extreme": "selection",
+    "Lazy": "lazy",
     "Matrices": "matrices",
     "Minimization": "bisimulation",
     "OutcomeTable": "outcome_table",
@@ -38,10 +40,12 @@ _FILES = {
     "Table": "table",
     "TabularMDP": "tabular",
     "chosen_mass": "selection",
+    "lazy_actions": "chance",
     "minimize": "bisimulation",
     "random_actions": "chance",
     "rewards_of_outcomes": "space_rewards",
     "rewards_of_space": "space_rewards",
+    "rewards_of_staying": "space_rewards",
     "sticky_actions": "chance",
     "takes_mdp": "arguments",
 }
@@ -53,6 +57,7 @@ __all__ = [
     "Chance",
     "Dynamics",
     "Extreme",
+    "Lazy",
     "Matrices",
     "Minimization",
     "OutcomeTable",
@@ -64,10 +69,12 @@ __all__ = [
     "Table",
     "TabularMDP",
     "chosen_mass",
+    "lazy_actions",
     "minimize",
     "random_actions",
     "rewards_of_outcomes",
     "rewards_of_space",
+    "rewards_of_staying",
     "sticky_actions",
     "takes_mdp",
 ]

@@ -154,4 +154,12 @@ def _merged(mdp: TabularMDP, classes: np.ndarray, representatives: np.ndarray) -
         terminal=np.asarray(mdp.terminal)[representatives],
         folder=None,
         age=None,
+        staying=None if mdp.staying is None else _lost,
     ).with_initial(start)
+
+
+def _lost() -> Rewards:
+    raise ParameterError(
+        "lazy_actions: the states of this MDP stand for several, which staying may pay differently; "
+        "add lazy actions before you minimize, or say what staying= pays"
+    )

@@ -1,7 +1,8 @@
-"""Chance that derives from a deterministic transition function: sticky and random actions. An MDP in, an MDP out.
+"""Chance that is added to a world: sticky, random and lazy actions. An MDP in, an MDP out.
 
-Nothing is copied: an MDP carries three weights, and `Chance` says what they do to values (`choice`), to distributions
-(`executed`), to the weights of each action (`weights`) and to single steps (`draw`).
+Nothing is copied. Which action is executed: an MDP carries three weights, and `Chance` says what they do to values
+(`choice`), to distributions (`executed`), to the weights of each action (`weights`) and to single steps (`draw`).
+Whether the executed action has an effect: its dynamics carry one probability more, see lazy.py.
 """
 
 import math
@@ -202,6 +203,33 @@ def sticky_actions(mdp: "TabularMDP", p: float) -> "TabularMDP":
     Source: Machado et al. (2018), section 5; the pharos paper, appendix A.
     """
     return replace(mdp, chance=mdp.chance.with_sticky(p))
+
+
+@takes_mdp
+def lazy_actions(mdp: "TabularMDP", p: float, *, staying: Any = None) -> "TabularMDP":
+    """The MDP in which, with probability p, the executed action has no effect: the state stays what it is.
+
+        q(s, a) = (1 - p) [r(s, a) + gamma E V(next)] + p [r(s, a, s) + gamma V(s)]
+
+    Its chance comes after that of sticky and random actions, in whatever order they are added: first it is drawn which
+    action is executed, then whether it has an effect. An action without effect is the previous one of the next step.
+    Colosseum's `p_lazy`; its `p_rand` is `random_actions`.
+
+    Args:
+        p: in [0, 1).
+        staying: (S, A) what staying pays. None: what the rules pay for going from s to s by a, where the MDP is of a
+            state space; else r(s, a), as the rewards of a table belong to state and action alone.
+    Returns:
+        An MDP without ages: a state can be met twice.
+    Raises:
+        ParameterError: p is not in [0, 1), or `staying` has another shape.
+    Cost: an array of rewards. One more term in each expectation.
+    Source: Conserva and Rauber (2022), "Hardness in Markov decision processes: theory and practice", appendix.
+    """
+    _check_probability("lazy_actions", p)
+    if p == 1:
+        raise ParameterError("lazy_actions: probability is 1, so nothing ever happens; expected a number in [0, 1)")
+    return mdp.lazy(float(p), staying) if p else mdp
 
 
 def _check_probability(name: str, p: float) -> None:

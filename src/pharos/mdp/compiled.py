@@ -25,6 +25,11 @@ class CompiledDynamics(Dynamics):
         """The same for the loops in which solvers spend their time: what the compiler knows more of."""
         return self.for_kernels
 
+    def lazy(self, p: float) -> Dynamics:
+        from pharos.mdp.lazy import Lazy  # which derives from this class
+
+        return Lazy(self, p)
+
     def backup(self, equation: BellmanEquation, x: np.ndarray, out: np.ndarray) -> None:
         rewards, gamma, chance, select = equation
         if not isinstance(select, Extreme):

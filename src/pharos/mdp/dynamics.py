@@ -90,6 +90,7 @@ class Dynamics(ABC):
         mass: the largest sum of the probabilities of a row, at least 1.
         is_deterministic: whether executing an action has one outcome, everywhere.
         has_ends: whether some execution ends the episode without a next state.
+        laziness: probability that nothing happens, as far as `lazy` has added it.
     """
 
     num_states: int
@@ -98,6 +99,7 @@ class Dynamics(ABC):
     mass: float
     is_deterministic: bool
     has_ends: bool
+    laziness: float = 0.0
 
     # What each representation says of itself ------------------------------------------------------------------------
 
@@ -133,9 +135,20 @@ class Dynamics(ABC):
     def arrays(self) -> dict[str, np.ndarray]:
         """What it is made of, by name, as files keep it."""
 
+    def lazy(self, p: float) -> "Dynamics":
+        """The same, but with probability p the state stays what it is, whatever is executed; 0 < p < 1."""
+        from pharos.mdp.matrices import Matrices  # which derives from this class
+
+        return Matrices(self.matrix()[:, : self.num_states], self.num_actions).lazy(p)
+
     def deterministic_table(self) -> np.ndarray | None:
         """(S, A) next states, -1 for the end, where each execution has one outcome; else None."""
         return None
+
+    @property
+    def has_chance(self) -> bool:
+        """Whether an action that has an effect may have several outcomes."""
+        return not self.is_deterministic
 
     @property
     def for_kernels(self) -> Any:

@@ -59,6 +59,15 @@ class Matrices(Dynamics):
         names = ("transitions_data", "transitions_indices", "transitions_indptr")
         return dict(zip(names, (matrix.data, matrix.indices, matrix.indptr), strict=True))
 
+    def lazy(self, p: float) -> "Matrices":
+        from scipy import sparse
+
+        rows = np.arange(self.transitions.shape[0])
+        stays = sparse.csr_matrix((np.full(len(rows), p), (rows, rows // self.num_actions)), self.transitions.shape)
+        result = Matrices(((1.0 - p) * self.transitions + stays).tocsr(), self.num_actions)
+        result.laziness = 1.0 - (1.0 - self.laziness) * (1.0 - p)
+        return result
+
     def deterministic_table(self) -> np.ndarray | None:
         if self._table is None and self.is_deterministic:
             table = np.full(self.num_states * self.num_actions, -1, np.int64)

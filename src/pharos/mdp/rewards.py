@@ -55,6 +55,19 @@ class Rewards:
         """(N, A) float64, the rewards of some states."""
         return self.palette[self.table[states]] if len(self.palette) else self.table[states]
 
+    def of(self, states: np.ndarray) -> "Rewards":
+        """The rewards of some states alone."""
+        return Rewards(np.asarray(self.table[states]), self.palette)
+
+    def mixed(self, other: "Rewards", p: float) -> "Rewards":
+        """(1 - p) these + p others, of as many states and actions; where both are equal, that."""
+        collector = RewardsCollector(self.shape)
+        for start in range(0, len(self.table), _BLOCK):
+            block = slice(start, start + _BLOCK)
+            own = self.rows(block)
+            collector.add(start, own + p * (other.rows(block) - own))
+        return collector.finish()
+
     @property
     def lowest(self) -> float:
         """The smallest reward."""

@@ -28,8 +28,7 @@ def rewards_of_space(space: "StateSpace", rewards: Any = None, *, workers: int |
         ParameterError: the array has the wrong shape, or holds NaN or infinity.
         RuleError: the reward function gave NaN or infinity for a transition, which the message names.
     """
-    from pharos.mdp.rewards import Rewards, RewardsCollector
-    from pharos.rules import refused_reward
+    from pharos.mdp.rewards import Rewards
 
     shape = (space.num_states, space.num_actions)
     if rewards is not None and not callable(rewards):
@@ -45,8 +44,45 @@ def rewards_of_space(space: "StateSpace", rewards: Any = None, *, workers: int |
             f"the rewards; import the module that registers it, or pass rewards as an (S, A) array"
         )
     env = space.environment if rewards is None else _with_reward(space.environment, rewards)
-    collector = RewardsCollector(shape)
-    for start, block in _blocks(space, env, workers):
+    return _collected(space, env, _blocks(space, env, workers))
+
+
+def rewards_of_staying(space: "StateSpace", reward: Callable | None = None) -> "Rewards":
+    """What the rules pay for going from a state to itself, whether an action leads there or not; 0 in terminal states.
+
+    Args:
+        reward: a function reward(self, state, action, next_state) in place of the environment's.
+    Raises:
+        RuleError: NaN or infinity.
+    """
+    from pharos.rules import rules_of
+
+    assert space.environment is not None
+    env = space.environment if reward is None else _with_reward(space.environment, reward)
+    rules, num_actions = rules_of(env).rewards, space.num_actions
+
+    def blocks() -> Iterator[tuple[int, np.ndarray]]:
+        for start in range(0, space.num_states, _ROWS):
+            stop = min(start + _ROWS, space.num_states)
+            states, terminal, count = space.packed_states[start:stop], space.terminal[start:stop], stop - start
+            own = np.repeat(np.arange(count), num_actions)
+            if space.has_chance:
+                outcomes = np.arange(len(own)), own, np.ones(len(own))
+                yield start, rules.expected_block(states, outcomes, terminal, 0, count)
+            else:
+                table = own.reshape(count, num_actions).astype(space.successors.dtype)
+                yield start, rules.block(states, table, terminal, 0, count)
+
+    return _collected(space, env, blocks())
+
+
+def _collected(space: "StateSpace", env: Environment, blocks: Iterator[tuple[int, np.ndarray]]) -> "Rewards":
+    """Blocks (first state, rewards) as one; RuleError where one is not finite."""
+    from pharos.mdp.rewards import RewardsCollector
+    from pharos.rules import refused_reward
+
+    collector = RewardsCollector((space.num_states, space.num_actions))
+    for start, block in blocks:
         if not np.isfinite(block).all():
             s, a = map(int, np.argwhere(~np.isfinite(block))[0])
             raise refused_reward(env, space.state(start + s), a, f"is {block[s, a]}; expected a finite number")

@@ -1,6 +1,8 @@
 """TabularMDP: next states, rewards, discount, start distribution, and chance that stays implicit."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -33,8 +35,8 @@ if TYPE_CHECKING:
 class TabularMDP:
     """A Markov decision process of S states and A actions.
 
-    Made by `StateSpace.mdp`, `from_arrays`, `from_outcomes` or `from_matrices`; `sticky_actions` and `random_actions`
-    add chance.
+    Made by `StateSpace.mdp`, `from_arrays`, `from_outcomes` or `from_matrices`; `sticky_actions`, `random_actions` and
+    `lazy_actions` add chance.
 
     Attributes:
         dynamics: what executing an action does; solvers and measures ask it, whatever it is stored as.
@@ -60,6 +62,7 @@ class TabularMDP:
     chance: Chance = field(default_factory=Chance)
     folder: Any = None
     age: np.ndarray | None = None
+    staying: Callable[[], Rewards] | None = None
 
     def __post_init__(self) -> None:
         check_gamma(self.gamma)
@@ -183,10 +186,12 @@ class TabularMDP:
         return TabularMDP(dynamics, reward_table, terminal, gamma, horizon, states, probabilities)
 
     @staticmethod
-    def from_space(space: "StateSpace", rewards: Rewards, gamma: float = 0.99) -> "TabularMDP":
+    def from_space(
+        space: "StateSpace", rewards: Rewards, gamma: float = 0.99, staying: Callable[[], Rewards] | None = None
+    ) -> "TabularMDP":
         """The MDP on the states of a state space, with their ages where the class declares one.
 
-        `StateSpace.mdp` computes the rewards.
+        `StateSpace.mdp` computes the rewards, and says how to compute those of staying.
 
         Raises:
             ParameterError: a transition leads to a state that is not older.
@@ -200,6 +205,7 @@ class TabularMDP:
             space.start_states,
             space.start_probabilities,
             folder=space.folder,
+            staying=staying,
         )
         has_age = space.environment is not None and space.environment.has_age
         return mdp.with_age(space.ages) if has_age else mdp
@@ -257,6 +263,11 @@ class TabularMDP:
     def is_random(self) -> bool:
         """Whether a uniform action is executed now and then."""
         return self.chance.is_random
+
+    @property
+    def laziness(self) -> float:
+        """The probability that the executed action has no effect, see `lazy_actions`."""
+        return self.dynamics.laziness
 
     @property
     def width(self) -> int:
@@ -331,7 +342,18 @@ class TabularMDP:
         if paid.any():
             s, a = map(int, np.argwhere(paid)[0])
             raise ParameterError(f"rewards[{s}, {a}] is {table.array[s, a]}, but state {s} is terminal; expected 0")
-        return replace(self, reward_table=table)
+        return replace(self, reward_table=table, staying=None)
+
+    def lazy(self, p: float, staying: Any = None) -> "TabularMDP":
+        """The same MDP in which, with probability p, nothing happens; see `lazy_actions`."""
+        if staying is not None:
+            stays = self.with_rewards(staying).reward_table
+        else:
+            stays = self.reward_table if self.staying is None else self.staying()
+        mixed = self.reward_table if stays is self.reward_table else self.reward_table.mixed(stays, p)
+        return replace(
+            self, dynamics=self.dynamics.lazy(p), reward_table=mixed, staying=partial(_as_is, stays), age=None
+        )
 
     def with_initial(self, initial: Any) -> "TabularMDP":
         """The same MDP with another start: a state, a sequence of states, or (S,) probabilities."""
@@ -389,7 +411,8 @@ class TabularMDP:
         return replace(
             self,
             dynamics=self.dynamics.restricted_to(states),
-            reward_table=replace(self.reward_table, table=np.asarray(self.reward_table.table[states])),
+            reward_table=self.reward_table.of(states),
+            staying=None if self.staying is None else partial(_some, self.staying, states),
             terminal=np.asarray(self.terminal[states]),
             start_states=number[self.start_states],
             folder=None,
@@ -399,7 +422,16 @@ class TabularMDP:
     def __repr__(self) -> str:
         kind = "" if self.dynamics.is_deterministic else "general, "
         chance = "" if self.chance == Chance() else f", {self.chance}"
+        chance += f", lazy={self.laziness:g}" if self.laziness else ""
         horizon = "" if self.horizon is None else f", horizon={self.horizon}"
         states, actions = ("s" * (number != 1) for number in (self.num_states, self.num_actions))
         size = f"{self.num_states} state{states}, {self.num_actions} action{actions}"
         return f"TabularMDP({kind}{size}, gamma={self.gamma}{horizon}{chance})"
+
+
+def _as_is(rewards: Rewards) -> Rewards:
+    return rewards
+
+
+def _some(rewards: Callable[[], Rewards], states: np.ndarray) -> Rewards:
+    return rewards().of(states)

@@ -5,7 +5,7 @@ what the rules see as `self`; A actions of at most K outcomes. `ranges` (2, D) i
 component.
 
 One environment takes a branch a K + k, outcome k of action a, which `outcome_one` draws before; many draw it
-themselves. Without chance K is 1, so a branch is an action.
+themselves. Without chance K is 1, so a branch is an action. Branch -1 - a is action a without effect.
 """
 
 from typing import Any, NamedTuple
@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import int64
 
-from pharos.kernels.stepping import SAME_STEP, drawn_start, executed_action, uniform_number
+from pharos.kernels.stepping import SAME_STEP, drawn_start, executed_action, has_no_effect, uniform_number
 
 
 class InteractionKernels(NamedTuple):
@@ -77,6 +77,8 @@ def advance_function(compiler: Any, rules: Any, K: int) -> Any:
         """
         for i in range(len(state)):
             following[i] = state[i]
+        if branch < 0:
+            return float(reward(self, state, -1 - branch, following)), int64(0)
         move(self, state, branch, following)
         for i in range(len(state)):
             if following[i] < ranges[0, i] or following[i] > ranges[1, i]:
@@ -214,8 +216,13 @@ def step_many_kernel(compiler: Any, Parameters: Any, advance: Any, drawn_outcome
             if not restart:
                 action = executed_action(actions[i], previous[i], chance, A, rng, i)
                 branch = action
-                if K > 1:  # nothing is drawn where an action has one outcome
-                    outcome, likely[i] = drawn_outcome(self, states[i], action, uniform_number(rng, i))
+                if has_no_effect(chance, rng, i):
+                    branch = -1 - action
+                    if K > 1:
+                        likely[i] = chance[4]
+                elif K > 1:  # nothing is drawn where an action has one outcome
+                    outcome, p = drawn_outcome(self, states[i], action, uniform_number(rng, i))
+                    likely[i] = p * (1.0 - chance[4])
                     branch = action * K + outcome
                 value, code = advance(self, ranges, states[i], branch, following)
                 if code > 1:

@@ -139,7 +139,9 @@ class Stepping(Protocol):
         """(outcome, its probability) of an action, by a number in [0, 1)."""
 
     def step_one(self, *arguments: Any) -> Any:
-        """(reward, code) of one step, by an action, or by the branch a K + k for outcome k of K of action a."""
+        """(reward, code) of one step, by an action, or by the branch a K + k for outcome k of K of action a;
+        -1 - a: by action a without effect.
+        """
 
     def step_many(self, *arguments: Any) -> Any:
         """One step of many environments; -1, or which component of which left its range."""

@@ -42,15 +42,18 @@ class InterpretedStepping:
 
     def step_one(self, parameters, ranges, scale, state, branch, following, vector) -> tuple[float, int]:
         before = tuple(state.tolist())
-        action, outcome = divmod(branch, self.env.outcomes)
-        after = self.env.next_state(before, action, outcome)
+        if branch < 0:
+            action, after = -1 - branch, before
+        else:
+            action, outcome = divmod(branch, self.env.outcomes)
+            after = self.env.next_state(before, action, outcome)
         for i, value in enumerate(after):
             if not ranges[0, i] <= value <= ranges[1, i]:
                 return 0.0, 2 + i
         following[:] = after
         if len(vector):
             vector[:] = (following - ranges[0]) * scale
-        return float(self.env.reward(before, action, after)), int(bool(self.env.is_terminal(after)))
+        return float(self.env.reward(before, action, after)), int(branch >= 0 and bool(self.env.is_terminal(after)))
 
     def is_terminal_one(self, parameters, state) -> bool:
         return bool(self.env.is_terminal(tuple(state.tolist())))
@@ -66,16 +69,20 @@ class InterpretedStepping:
             if not restart:
                 action = self._executed(int(actions[i]), int(previous[i]), chance, rng, i)
                 before = tuple(states[i].tolist())
-                outcome = 0
-                if self.env.has_chance:
-                    outcome, likely[i] = self._drawn_outcome(before, action, _uniform_number(rng, i))
-                after = self.env.next_state(before, action, outcome)
+                outcome, after = 0, before
+                if stays := chance[4] > 0 and _uniform_number(rng, i) < chance[4]:
+                    likely[i : i + 1] = chance[4]
+                elif self.env.has_chance:
+                    outcome, p = self._drawn_outcome(before, action, _uniform_number(rng, i))
+                    likely[i] = p * (1.0 - chance[4])
+                if not stays:
+                    after = self.env.next_state(before, action, outcome)
                 executed[i] = action
                 for c, value in enumerate(after):
                     if not ranges[0, c] <= value <= ranges[1, c]:
                         return i * len(after) + c
                 rewards[i] = self.env.reward(before, action, after)
-                terminated[i] = self.env.is_terminal(after)
+                terminated[i] = not stays and self.env.is_terminal(after)
                 previous[i] = action
                 elapsed[i] += 1
                 truncated[i] = elapsed[i] >= limit

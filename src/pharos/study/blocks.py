@@ -117,15 +117,19 @@ class EnvironmentEntry(_Part):
 
 
 class ChanceEntry(_Part):
-    """Probabilities that the previous action, or a uniformly random one, is executed instead of the chosen one."""
+    """Probabilities that the previous action, or a uniformly random one, is executed instead of the chosen one, and
+    that it has no effect; noise and delay of what is paid."""
 
     sticky: float = Field(default=0.0, ge=0, le=1)
     random: float = Field(default=0.0, ge=0, le=1)
+    lazy: float = Field(default=0.0, ge=0, lt=1)
+    reward_noise: float = Field(default=0.0, ge=0, allow_inf_nan=False)
+    reward_delay: int = Field(default=0, ge=0)
 
     @property
     def setting(self) -> ChanceSetting:
         """The same for a run."""
-        return ChanceSetting(self.sticky, self.random)
+        return ChanceSetting(**self.model_dump())
 
 
 class ObservationEntry(_Part):

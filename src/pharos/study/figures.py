@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 # Okabe and Ito's colours, which people tell apart whatever their sight; those of classes stand in their `look`
 MORE_COLORS = ("#CC79A7", "#E69F00", "#F0E442", "#999999")
 OBSERVATION_COLORS = {TABULAR_OBSERVATION: "#009E73", VECTOR: "#0072B2", IMAGE: "#D55E00"}
-CHANCE_MARKERS = {"plain": "o", "random": "^", "sticky": "s"}
+CHANCE_MARKERS = {"plain": "o", "random": "^", "sticky": "s", "lazy": "v", "reward_noise": "P", "reward_delay": "X"}
 LINES = {"q_learning": "-", "dqn": "-", "ppo": "--"}
 NAMES = {"q_learning": "tabular Q-learning", "dqn": "DQN", "ppo": "PPO"}
 OBSERVATIONS = {TABULAR_OBSERVATION: "", VECTOR: "vector", IMAGE: "image"}
