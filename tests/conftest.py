@@ -5,8 +5,14 @@ Threads that wait give the processor back: `make test` runs as many processes as
 take from them.
 """
 
+import fcntl
 import os
+import sysconfig
+import tempfile
+import zlib
+from pathlib import Path
 
+import pytest
 from hypothesis import settings
 
 # before NumPy and Numba are imported
@@ -16,3 +22,18 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 settings.register_profile("fixed", derandomize=True)
 settings.register_profile("explore", derandomize=False)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "fixed"))
+
+
+@pytest.fixture(scope="session")
+def quantecon():
+    """The package quantecon, imported by one process at a time.
+
+    Its import compiles two ufuncs into Numba's cache beside it. Two processes that do so at once leave files that do
+    not fit together, and every import after that ends the process ("LLVM ERROR: Symbol not found: __gufunc__").
+    """
+    installed = sysconfig.get_path("purelib").encode()
+    with (Path(tempfile.gettempdir()) / f"quantecon-{os.getuid()}-{zlib.crc32(installed):08x}.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        import quantecon
+
+        return quantecon

@@ -228,9 +228,8 @@ def test_slippery_frozen_lake_has_every_entry_of_gymnasium(size):
 
 
 @pytest.mark.parametrize(("size", "expected"), [(4, 0.8235294117647058), (8, 1.0)])
-def test_slippery_frozen_lake_is_solved_as_quantecon_solves_it(size, expected, tmp_path):
+def test_slippery_frozen_lake_is_solved_as_quantecon_solves_it(size, expected, tmp_path, quantecon):
     """From Gymnasium's P, by QuantEcon's policy iteration; without discount the 4x4 lake is worth 14/17."""
-    quantecon = pytest.importorskip("quantecon")
     table, rewards, _ = gymnasium_law(size, slippery=True)
     space = pharos.build(pharos.make("frozen_lake", size=size, slippery=True), tmp_path / "space", progress=False)
     mdp = space.mdp(gamma=0.99)

@@ -199,15 +199,13 @@ def test_a_finer_tolerance_moves_values_by_less_than_the_bounds(mdp):
 
 
 @pytest.mark.slow
-def test_an_established_solver_finds_the_same_values():
-    from quantecon.markov import DiscreteDP
-
+def test_an_established_solver_finds_the_same_values(quantecon):
     rng = np.random.default_rng(0)
     next_states = rng.integers(0, 500, size=(500, 3))
     rewards = rng.normal(size=(500, 3))
     dense = np.zeros((500, 3, 500))
     np.put_along_axis(dense, next_states[:, :, None], 1.0, axis=2)
-    theirs = DiscreteDP(rewards, dense, 0.95).solve(method="policy_iteration").v
+    theirs = quantecon.markov.DiscreteDP(rewards, dense, 0.95).solve(method="policy_iteration").v
     ours = value_iteration(TabularMDP.from_arrays(next_states, rewards, gamma=0.95))
     assert np.abs(theirs - ours.v).max() <= ours.error_bound + TWIN
 
