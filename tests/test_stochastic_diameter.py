@@ -293,3 +293,72 @@ def test_intervals_hold_the_hitting_times_of_exact_fractions(rows):
             assert interval.upper == math.inf or value <= Fraction(interval.upper)
             assert not interval.exact or interval.upper - interval.lower <= 2e-6 * interval.upper
             assert value > 1e13 or interval.exact
+
+
+def many_starts(size, starts, slips):
+    """A walk with chance over half of the states, by leaps into the other half; starts in any of the first `starts`."""
+    state, half = np.arange(size), size // 2
+    ways = [np.stack([(state + step) % size, state], axis=1) for step in (1, half)]
+    successors = np.where((state >= half)[:, None, None], state[:, None, None], np.stack(ways, axis=1))
+    chances = np.broadcast_to([1 - slips, slips], successors.shape).copy()
+    initial = np.where(state < starts, 1.0 / starts, 0.0)
+    return TabularMDP.from_outcomes(successors, chances, np.zeros((size, 2)), terminal=state >= half, initial=initial)
+
+
+def test_states_in_which_episodes_end_are_one_unknown_of_linear_systems():
+    choices = choices_of(many_starts(40, 10, 0.2), True)
+    targets = HittingTimes(choices)
+    for target in (3, 25):
+        j, count, _ = targets.open(target)
+        targets.bounds(j, count)
+        inner, factors = targets._factored(count)
+        assert inner.size == 39 and len(factors.first) == 20 + (target == 25)
+
+
+@pytest.mark.parametrize("starts", [1, 2, 10])
+def test_episodes_that_end_in_many_states_and_start_in_many_are_those_of_the_matrices(starts):
+    mdp = many_starts(30, starts, 0.2)
+    expected, _ = naive_hitting.diameter(mdp, True)
+    assert hardness.diameter(mdp).upper == pytest.approx(expected, rel=1e-6)
+    expected = naive_hitting.start_eccentricity(mdp, True)
+    assert hardness.start_eccentricity(mdp) == pytest.approx(expected, rel=1e-6)
+
+
+def slippery_torus(size, slips):
+    """Steps in four directions, each of which may go to either side instead: (S, A, K) outcomes."""
+    row, column = np.divmod(np.arange(size * size), size)
+    ahead = [(row + down) % size * size + (column + right) % size for down, right in ((-1, 0), (0, 1), (1, 0), (0, -1))]
+    around = np.stack(ahead, axis=1)
+    successors = np.stack([np.roll(around, turn, axis=1) for turn in (0, 1, -1)], axis=2)
+    chances = np.broadcast_to([1 - 2 * slips, slips, slips], successors.shape).copy()
+    return TabularMDP.from_outcomes(successors, chances, np.zeros(successors.shape[:2]))
+
+
+def test_one_hub_bounds_a_world_with_slips_and_settles_how_far_the_start_is_from_all():
+    mdp = slippery_torus(12, 0.1)
+    little = hardness.diameter(mdp, budget=hardness.Budget(searches=1))
+    assert little.upper < 3 * little.lower  # ways back are by the most probable outcome, not by a slip
+    found = hardness.start_eccentricity_interval(mdp)
+    assert found.exact and found.searches <= 30  # of 144
+    assert found.upper == pytest.approx(little.lower, rel=1e-6)  # every state is like every other
+    cut = hardness.start_eccentricity_interval(mdp, budget=hardness.Budget(searches=2))
+    assert not cut.exact and cut.lower <= found.lower and found.upper <= cut.upper < 3 * cut.lower
+
+
+def test_hitting_times_of_random_graphs_take_sweeps_where_factors_would_fill_in(monkeypatch):
+    rng = np.random.default_rng(0)
+    successors, chances = rng.integers(0, 3000, (3000, 2, 3)), rng.dirichlet(np.ones(3), (3000, 2))
+    targets = HittingTimes(choices_of(TabularMDP.from_outcomes(successors, chances, np.zeros((3000, 2))), True))
+    monkeypatch.setattr(HittingTimes, "_factored", None)
+    j, count, _ = targets.open(7)
+    bounds = targets.solve(j, count, 1e-6, 0.0, Spending(hardness.Budget(), None))
+    assert bounds.meets(1e-6)
+
+
+@pytest.mark.slow
+def test_hardness_of_blackjack_takes_seconds():
+    mdp = pharos.build("blackjack").mdp()
+    found = hardness.diameter(mdp, budget=30)
+    assert found.exact and found.upper == pytest.approx(38114.81866, rel=1e-6)
+    found = hardness.start_eccentricity_interval(mdp, budget=30)
+    assert found.exact and found.upper == pytest.approx(38112.81866, rel=1e-6)

@@ -27,6 +27,8 @@ class Choices:
         previous: (N,) the previously executed action, A for none; -1 where it does not matter.
         starts: [(node, probability)] of the first step.
         num_actions: A.
+        alike: (N,) bool, nodes that all lead to the same nodes with the same probabilities, whatever is chosen: those
+            in which episodes end, where a restart leads to one of several start states.
     """
 
     matrix: Any
@@ -35,6 +37,7 @@ class Choices:
     starts: list[tuple[int, float]]
     num_actions: int
     num_targets: int
+    alike: np.ndarray
 
     @cached_property
     def reversed(self) -> tuple[np.ndarray, np.ndarray]:
@@ -124,7 +127,8 @@ def choices_of(mdp: TabularMDP, restart: bool) -> Choices:
     matrix = matrix + _restarts(owner, live, starts, num_actions, nodes, restart)
     matrix = sparse.csr_matrix(matrix)
     matrix.sum_duplicates()
-    choices = Choices(matrix, owner, previous, starts, num_actions, size)
+    alike = ~live[owner] if restart and len(starts) > 1 else np.zeros(nodes, np.bool_)
+    choices = Choices(matrix, owner, previous, starts, num_actions, size, alike)
     return reachable(choices) if mdp.is_sticky else choices
 
 
@@ -185,5 +189,11 @@ def reachable(choices: Choices) -> Choices:
     matrix = sparse.csr_matrix(choices.matrix[rows][:, nodes])
     starts = [(int(place[node]), p) for node, p in choices.starts]
     return Choices(
-        matrix, choices.underlying[nodes], choices.previous[nodes], starts, choices.num_actions, choices.num_targets
+        matrix,
+        choices.underlying[nodes],
+        choices.previous[nodes],
+        starts,
+        choices.num_actions,
+        choices.num_targets,
+        choices.alike[nodes],
     )

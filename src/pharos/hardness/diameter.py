@@ -12,7 +12,8 @@ import numpy as np
 
 from pharos.errors import ParameterError, UndefinedMeasure
 from pharos.hardness.interval import Budget, Interval, Progress, Spending, conventions_of
-from pharos.hardness.stochastic_diameter import stochastic_diameter, stochastic_start_eccentricity
+from pharos.hardness.stochastic_diameter import stochastic_diameter
+from pharos.hardness.stochastic_eccentricity import stochastic_start_eccentricity
 from pharos.hardness.sum_sweep import Graph, SumSweep
 from pharos.mdp import TabularMDP, takes_mdp
 from pharos.wording import many

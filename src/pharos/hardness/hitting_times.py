@@ -39,6 +39,13 @@ from pharos.kernels import hitting
 
 # Sweeps before a policy is evaluated by a linear solve: as many as cost about as much as one.
 SWEEPS = 40
+# Nodes at the same distance from the target up to which they are tried: so many are about the size of a full matrix in
+# the factors. A grid of a million nodes has a thousand, a random graph of ten thousand five thousand.
+WIDEST = 8_000
+# Sweeps that a linear solve takes as long as: FILL_IN times the cube of that number of nodes, by the outcomes.
+FILL_IN = 1 / 30
+# They end closer than the tolerance asks for, nearly as close as a linear solve does.
+CLOSER = 1e-3
 # Nodes up to which linear solves are tried: beyond, their fill-in takes more memory than the MDP.
 SOLVABLE = 60_000
 # Stands for infinity in the hitting times of nodes that do not surely reach the target: products with it stay finite.
@@ -99,7 +106,7 @@ class HittingTimes:
         matrix = choices.matrix
         self.choices = choices
         self.support = (matrix.indptr.astype(np.int64), matrix.indices.astype(np.int64), choices.num_actions)
-        self.arrays = _without_common(matrix, choices.num_actions)
+        self.arrays = (*_without_common(matrix, choices.num_actions), choices.alike)
         first, previous = choices.reversed
         self.back = (first.astype(np.int64), previous.astype(np.int64))
         self.members = np.argsort(choices.underlying, kind="stable")
@@ -172,9 +179,9 @@ class HittingTimes:
     def solve(self, j: np.ndarray, count: int, tolerance: float, enough: float, spending: Spending) -> Bounds:
         """Bounds within `tolerance` of each other, or an upper bound of at most `enough`, or what budget and floats
         allow."""
-        bounds, failures, stalls, apart = self.sweep(j, count, SWEEPS, enough, spending), 0, 0, math.inf
+        bounds, failures, stalls, apart = self._converged(j, count, tolerance, enough, spending), 0, 0, math.inf
         while not bounds.meets(tolerance) and bounds.upper > enough and not spending.is_over:
-            if count > SOLVABLE:
+            if count > SOLVABLE or self._width(count) > WIDEST:
                 if bounds.limited:
                     return bounds
                 bounds = self.sweep(j, count, 8 * SWEEPS, enough, spending)
@@ -198,20 +205,49 @@ class HittingTimes:
                 apart = bounds.apart
                 if RESIDUAL_UNITS * hitting.UNIT * bounds.largest > tolerance or stalls >= STALLS:
                     return self._refined(j, count, tolerance, bounds, spending)
-            bounds = self.sweep(j, count, SWEEPS, enough, spending)
+            bounds = self._converged(j, count, tolerance, enough, spending)
         return bounds
 
-    def _factored(self, count: int) -> tuple[np.ndarray, Any] | None:
+    def _converged(self, j: np.ndarray, count: int, tolerance: float, enough: float, spending: Spending) -> Bounds:
+        """Sweeps; more than `SWEEPS` where at their rate the bounds meet sooner than a linear solve takes."""
+        bounds = self.sweep(j, count, SWEEPS // 2, enough, spending)
+        as_long = FILL_IN * self._width(count) ** 3 / max(self.support[1].size, 1)
+        left = max(1, int(as_long / (SWEEPS // 2)) - 1)
+        unbounded = left // 4  # of these: while nothing is proven, no rate is known
+        while not (bounds.upper <= enough or bounds.limited or spending.is_over):
+            apart, bounds = bounds.apart, self.sweep(j, count, SWEEPS // 2, enough, spending)
+            left, goal = left - 1, CLOSER * tolerance
+            if math.isinf(bounds.apart) and unbounded > 0:
+                unbounded -= 1
+                continue
+            if bounds.apart <= goal or bounds.apart >= apart:
+                break
+            if math.isfinite(apart) and left * math.log(apart / bounds.apart) < math.log(bounds.apart / goal):
+                break
+        return bounds
+
+    def _width(self, count: int) -> int:
+        """Most nodes at the same distance from the target."""
+        return int(np.bincount(self.distance[self.order[:count]]).max(initial=0))
+
+    def _factored(self, count: int) -> "tuple[np.ndarray, _Factors] | None":
         """(inner nodes, factors of 1 - P of the greedy policy); None where no policy is proper. Rows are made to sum to
         1."""
         nodes = self.order[:count]
         inner = nodes[~self.goal[nodes]]
-        rows = sparse.csr_matrix(self.choices.matrix[inner * self.choices.num_actions + self.policy[inner]])
-        itself = np.repeat(inner, np.diff(rows.indptr)) == rows.indices
-        rows.data = np.where(itself, 0.0, rows.data)
-        leaving = np.asarray(rows.sum(axis=1)).ravel()
+        alike = self.choices.alike[inner]
+        first, unknown = _numbered_once(alike)
+        place = np.full(len(self.goal), first.size)  # what leads elsewhere is left out of the equations
+        place[inner] = unknown
+        solved = inner[first]
+        rows = sparse.csr_matrix(self.choices.matrix[solved * self.choices.num_actions + self.policy[solved]])
+        row, column = np.repeat(np.arange(first.size), np.diff(rows.indptr)), place[rows.indices]
+        data = np.where(row == column, 0.0, rows.data)
+        leaving = np.bincount(row, data, first.size)
+        inside = column < first.size
+        matrix = sparse.coo_matrix((data[inside], (row[inside], column[inside])), shape=(first.size, first.size))
         try:
-            return inner, splu(sparse.csc_matrix(sparse.diags(leaving) - rows[:, inner]))
+            return inner, _Factors(splu(sparse.csc_matrix(sparse.diags(leaving) - matrix)), first, unknown)
         except RuntimeError:  # singular
             return None
 
@@ -294,6 +330,34 @@ class HittingTimes:
         residual, error = np.zeros_like(high), np.zeros_like(high)
         arrays = (high, low, self.policy, residual, error)
         return residual, error, hitting.residuals_of_pairs(*self.arrays, self.goal, self.order, count, *arrays)
+
+
+@dataclass(frozen=True)
+class _Factors:
+    """Factors of a linear system in which nodes that are alike are one unknown.
+
+    first: (unknowns,) the first node of each. unknown: (inner nodes,) which one a node is.
+    """
+
+    factors: Any
+    first: np.ndarray
+    unknown: np.ndarray
+
+    def solve(self, right: np.ndarray) -> np.ndarray:
+        """(inner nodes,) the solution, given the right side."""
+        solution: np.ndarray = self.factors.solve(right[self.first])[self.unknown]
+        return solution
+
+
+def _numbered_once(alike: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(first member of each group, (N,) its group): nodes that are alike are one group, every other one a group."""
+    opens = ~alike
+    if alike.any():
+        opens[alike.argmax()] = True
+    group = np.cumsum(opens) - 1
+    if alike.any():
+        group[alike] = group[alike.argmax()]
+    return np.flatnonzero(opens), group
 
 
 def _certified(above: float, below: float, largest: float) -> Bounds:

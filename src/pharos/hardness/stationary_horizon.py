@@ -251,7 +251,8 @@ def _states_and_the_end(mdp: TabularMDP) -> tuple[Choices, np.ndarray]:
     terminal = np.flatnonzero(mdp.terminal)
     table[terminal] = terminal[:, None]
     starts = [(int(s), float(p)) for s, p in zip(mdp.start_states, mdp.start_probabilities, strict=True) if p > 0]
-    return Choices(None, np.arange(size + 1), np.full(size + 1, -1), starts, mdp.num_actions, size + 1), table
+    none = np.zeros(size + 1, np.bool_)
+    return Choices(None, np.arange(size + 1), np.full(size + 1, -1), starts, mdp.num_actions, size + 1, none), table
 
 
 def _solved(solver: Callable[..., Solution], mdp: TabularMDP, tolerance: float) -> Solution:

@@ -17,10 +17,9 @@ from typing import Any
 import numpy as np
 
 from pharos.hardness.choices import Choices, choices_of
-from pharos.hardness.hitting_times import SWEEPS, HittingTimes
+from pharos.hardness.hitting_times import HittingTimes
 from pharos.hardness.interval import Interval, Spending, conventions_of
 from pharos.hardness.travel import TravelBounds
-from pharos.kernels.hitting import UNIT
 from pharos.mdp import TabularMDP
 from pharos.workers import usable_workers
 
@@ -115,7 +114,7 @@ class _Diameter:
         return int(np.count_nonzero(self.upper > -math.inf))
 
     def _upper(self) -> float:
-        return max(self.settled_upper, self.lower, float(self.upper.max()))
+        return float(max(self.settled_upper, self.lower, self.upper.max()))
 
     def _promising(self) -> Iterator[list[int]]:
         """Batches of open targets, the farthest from some node first; they grow, as one makes a guess for the next."""
@@ -237,57 +236,3 @@ def _by_promise(targets: HittingTimes, wanted: np.ndarray, spending: Spending) -
         promise[target] = targets.distance[targets.order[count - 1]] if count else 0
     order = np.argsort(-promise, kind="stable")
     return order[wanted[order]]
-
-
-def stochastic_start_eccentricity(mdp: TabularMDP, restart: bool, tolerance: float, spending: Spending) -> Interval:
-    """The largest least expected number of steps from the start: exact up to `tolerance`, or the interval proven."""
-    choices = choices_of(mdp, restart)
-    targets = HittingTimes(choices)
-    nodes = np.array([node for node, _ in choices.starts])
-    weights = np.array([weight for _, weight in choices.starts])
-    rounding = 1 + (len(nodes) + 8) * UNIT
-    lower = upper = 0.0
-    limited = solved = 0
-    infinite = False
-    for target in range(choices.num_targets):
-        if spending.is_over:
-            break
-        solved += 1
-        if not targets.nodes_of(target).size:
-            infinite = True
-            break
-        j, count, lost = targets.open(target)
-        if lost is not None and lost[nodes].any():
-            infinite = True
-            break
-        bounds = targets.sweep(j, count, SWEEPS, 0.0, spending)
-        spending.searches += 1
-        if float(weights @ j[nodes]) * bounds.high * rounding <= upper:
-            continue
-        bounds = targets.solve(j, count, tolerance, 0.0, spending)
-        mean = float(weights @ j[nodes])
-        lower = max(lower, mean * bounds.low / rounding)
-        upper = max(upper, mean * bounds.high * rounding)
-        limited += bounds.limited and not bounds.meets(tolerance)
-    note = ""
-    if infinite:
-        lower = upper = math.inf
-    elif solved < choices.num_targets:
-        note = f"budget spent: {solved} of {choices.num_targets} targets are solved"
-        upper = max(upper, choices.crude_upper * CRUDE)
-    exact = infinite or (not note and math.isfinite(upper) and upper - lower <= 2 * tolerance * upper)
-    if not (exact or note):
-        note = f"hitting times are so large that 64-bit floats prove no closer bounds of {limited} targets"
-        note = note if limited else "budget spent before the bounds of the last targets met"
-    return Interval(
-        lower,
-        min(upper, max(lower, choices.crude_upper * CRUDE)) if not infinite else upper,
-        exact,
-        finite_part=0.0 if infinite else lower,
-        tolerance=tolerance,
-        searches=spending.searches,
-        method="a stochastic shortest path problem for each target, bounds from residuals",
-        conventions=conventions_of(mdp, restart),
-        note=note,
-        seconds=spending.seconds,
-    )

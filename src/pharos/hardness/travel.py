@@ -109,9 +109,10 @@ class TravelBounds:
         new = value.copy()
         edges = np.linspace(0, len(value), self._threads + 1).astype(np.int64)
         with ThreadPoolExecutor(self._threads) as pool:
-            for _ in range(PASSES):
+            for passes in range(PASSES):
+                arrays = (own, times, value, new, passes < 2)  # twice, as two arrays take turns
                 parts = [
-                    pool.submit(travel.attempt, low, high, *self._fixed, *self._ways, own, times, value, new)
+                    pool.submit(travel.attempt, low, high, *self._fixed, *self._ways, *arrays)
                     for low, high in itertools.pairwise(edges)
                 ]
                 short = max(part.result() for part in parts)

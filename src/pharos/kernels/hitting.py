@@ -1,7 +1,9 @@
 """Least expected hitting times on explicit choices: nodes, A actions each, row n A + a of a sparse matrix (first, node,
 weight).
 
-hardness/hitting_times.py says what is computed and why the bounds hold. `goal` (N,) bool marks the nodes of the target.
+hardness/hitting_times.py says what is computed and why the bounds hold. `goal` (N,) bool marks the nodes of the target,
+`alike` (N,) bool nodes that all have the same rows, such as those in which episodes end: what holds for the first of
+them is not worked out again for the others.
 """
 
 import numpy as np
@@ -36,7 +38,7 @@ def backward_order(first, previous, goal, order, distance):
 
 
 @njit(cache=True, nogil=True)
-def sweep_in_place(rows, common, goal, order, count, j):
+def sweep_in_place(rows, common, alike, goal, order, count, j):
     """j(n) = 1 + min_a sum p j, in place in the order given; the largest change. j is 0 at the goal.
 
     What all actions of a node have in common is in its row of `common`, the rest in `rows` of each action.
@@ -44,10 +46,14 @@ def sweep_in_place(rows, common, goal, order, count, j):
     first, node, weight = rows
     always, always_node, always_weight = common
     num_actions = (len(first) - 1) // len(goal)
-    change = 0.0
+    change, of_alike = 0.0, -1.0
     for i in range(count):
         n = order[i]
         if goal[n]:
+            continue
+        if alike[n] and of_alike >= 0:
+            change = max(change, abs(of_alike - j[n]))
+            j[n] = of_alike
             continue
         best = np.inf
         for row in range(n * num_actions, (n + 1) * num_actions):
@@ -60,11 +66,13 @@ def sweep_in_place(rows, common, goal, order, count, j):
             best += always_weight[k] * j[always_node[k]]
         change = max(change, abs(best - j[n]))
         j[n] = best
+        if alike[n]:
+            of_alike = best
     return change
 
 
 @njit(cache=True, nogil=True)
-def residuals(rows, common, goal, order, count, j, policy):
+def residuals(rows, common, alike, goal, order, count, j, policy):
     """(bound of T j - j, bound of j - T j, largest j) over nodes that are not the goal; policy[n] = the action that
     attains T j.
 
@@ -75,12 +83,17 @@ def residuals(rows, common, goal, order, count, j, policy):
     first, node, weight = rows
     always, always_node, always_weight = common
     num_actions = (len(first) - 1) // len(goal)
-    above, below, largest = 0.0, 0.0, 0.0
+    above, below, largest, first_alike = 0.0, 0.0, 0.0, -1
     for i in range(count):
         n = order[i]
         if goal[n]:
             continue
         here = j[n]
+        if alike[n]:
+            if first_alike >= 0 and here == j[first_alike]:
+                policy[n] = policy[first_alike]
+                continue
+            first_alike = n
         shared, size = 0.0, 1.0
         for k in range(always[n], always[n + 1]):
             step = always_weight[k] * (j[always_node[k]] - here)
@@ -108,7 +121,7 @@ def residuals(rows, common, goal, order, count, j, policy):
 
 
 @njit(cache=True, nogil=True)
-def residuals_of_pairs(rows, common, goal, order, count, high, low, policy, residual, error):
+def residuals_of_pairs(rows, common, alike, goal, order, count, high, low, policy, residual, error):
     """As `residuals`, for j = high + low: two floats a node, so that j may be 1e16 times its differences.
 
     residual, error (N,): T j - j, and by how much it may be off. The error of a difference of two such numbers is a
@@ -117,11 +130,16 @@ def residuals_of_pairs(rows, common, goal, order, count, high, low, policy, resi
     first, node, weight = rows
     always, always_node, always_weight = common
     num_actions = (len(first) - 1) // len(goal)
-    above, below = 0.0, 0.0
+    above, below, first_alike = 0.0, 0.0, -1
     for i in range(count):
         n = order[i]
         if goal[n]:
             continue
+        if alike[n]:
+            if first_alike >= 0 and high[n] == high[first_alike] and low[n] == low[first_alike]:
+                policy[n], residual[n], error[n] = policy[first_alike], residual[first_alike], error[first_alike]
+                continue
+            first_alike = n
         shared, size, scale = 0.0, 1.0, 0.0
         for k in range(always[n], always[n + 1]):
             m = always_node[k]

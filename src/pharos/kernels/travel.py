@@ -14,6 +14,8 @@ from numba import njit
 NONE = 255
 # More than the rounding error of a sum of probabilities.
 ROUNDING = 1e-12
+# The distance from 1 to the next float.
+EPSILON = 2.0**-52
 
 
 @njit(cache=True, nogil=True)
@@ -43,9 +45,10 @@ def outcomes_into(node, num_nodes):
 
 
 @njit(cache=True, nogil=True)
-def _search_back(y, node, owner, into, ball, seen, queue, via):
-    """Nodes by their distance to y: queue[:result]; seen[n] = distance + 1, via[n] = the outcome taken first. Ends with
-    `ball` nodes."""
+def _search_back(y, outcomes, owner, into, ball, seen, queue, via):
+    """Nodes by their distance to y: queue[:result]; seen[n] = distance + 1, via[n] = the outcome aimed at first, the
+    most probable one of those that lead to the same node. Ends with `ball` nodes."""
+    _, _, node, prob = outcomes
     into_first, into_outcome = into
     seen[y] = 1
     queue[0] = y
@@ -60,6 +63,8 @@ def _search_back(y, node, owner, into, ball, seen, queue, via):
                 via[x] = into_outcome[k]
                 queue[tail] = x
                 tail += 1
+            elif seen[x] == seen[n] + 1 and node[via[x]] == n and prob[into_outcome[k]] > prob[via[x]]:
+                via[x] = into_outcome[k]
     return tail
 
 
@@ -73,7 +78,7 @@ def steps_back(low, high, outcomes, owner, into, square, steps, ball, seen, queu
     first, _, node, _ = outcomes
     into_first, into_outcome = into
     for y in range(low, high):
-        found = _search_back(y, node, owner, into, ball, seen, queue, via)
+        found = _search_back(y, outcomes, owner, into, ball, seen, queue, via)
         for k in range(into_first[y], into_first[y + 1]):
             i = into_outcome[k]
             x = owner[i]
@@ -91,7 +96,7 @@ def ways_back(low, high, outcomes, owner, into, square, steps, start, way, ball,
     first, _, node, _ = outcomes
     into_first, into_outcome = into
     for y in range(low, high):
-        found = _search_back(y, node, owner, into, ball, seen, queue, via)
+        found = _search_back(y, outcomes, owner, into, ball, seen, queue, via)
         for k in range(into_first[y], into_first[y + 1]):
             i = into_outcome[k]
             x = owner[i]
@@ -147,15 +152,28 @@ def keep_near(outcomes, owner, weights, num_previous, square, steps, limit, leng
 
 
 @njit(cache=True, nogil=True)
-def attempt(begin, end, outcomes, owner, weights, num_previous, square, steps, start, way, own, times, value, new):
+def attempt(
+    begin, end, outcomes, owner, weights, num_previous, square, steps, start, way, own, times, value, new, once
+):
     """new[i] = own + sum over what happens instead: along the way back, the sum of values; else times[there].
 
-    The largest over the previously executed action. Returns the largest increase.
+    The largest over the previously executed action. Returns the largest increase. `once`: also for outcomes without any
+    way back, which depend on no values: they are worked out in one pass and stay as they are.
     """
     first, action, node, prob = outcomes
-    increase = 0.0
+    increase, mean = 0.0, 0.0
     for i in range(begin, end):
         low, high = first[owner[i]], first[owner[i] + 1]
+        if square[i] < 0 and not once:
+            continue
+        if square[i] < 0 and action[i] < 0:  # whatever is chosen: of all outcomes only this one does not lead elsewhere
+            if i in (low, begin):
+                mean = 0.0
+                for j in range(low, high):
+                    mean += prob[j] * times[node[j]]
+            new[i] = own + max(mean - prob[i] * times[node[i]], 0.0) + (high - low + 2) * EPSILON * mean
+            increase = max(increase, new[i] - value[i])
+            continue
         if node[i] == owner[i]:
             continue
         worst = 0.0
