@@ -10,7 +10,17 @@ import pytest
 import fake_engine
 import pharos
 from pharos.errors import ParameterError, PharosError, UnknownName
-from pharos.experiments import FailedRun, RunConfig, Task, read_curve, read_record, train_configs, train_many
+from pharos.experiments import (
+    FailedRun,
+    RunConfig,
+    Task,
+    evaluate_agent,
+    load_agent,
+    read_curve,
+    read_record,
+    train_configs,
+    train_many,
+)
 from pharos.experiments.results import COLUMNS
 
 run_folder = importlib.import_module("pharos.experiments.run_folder")
@@ -197,3 +207,18 @@ def test_an_engine_that_lacks_the_agent_is_refused_with_the_one_that_has_it():
         config(engine="batch")
     with pytest.raises(ParameterError, match="expected at least one, each once"):
         many(seeds=(1, 1))
+
+
+@pytest.mark.slow
+def test_what_the_engine_itself_has_learnt_is_read_and_resumed(tmp_path, monkeypatch):
+    monkeypatch.setattr(run_folder, "CHECKPOINT_SECONDS", 0.0)
+    small = {"learning_starts": 50, "buffer_size": 500, "target_update_interval": 50}
+    options = {"steps": 400, "evaluation_interval": 100, "hyperparameters": small, "random": 0.1}
+    many(tmp_path / "whole", seeds=(0, 1, 2), **options)
+    with pytest.raises(Killed):
+        many(tmp_path / "killed", seeds=(0, 1), progress=kill_at(2 * 200), **options)
+    ends = many(tmp_path / "killed", seeds=(0, 1), **options)
+    for seed, end in enumerate(ends):
+        assert bytes_of(tmp_path / "killed" / f"seed-{seed}") == bytes_of(tmp_path / "whole" / f"seed-{seed}")
+        task, agent = load_agent(tmp_path / "killed" / f"seed-{seed}")
+        assert evaluate_agent(agent, task).value == pytest.approx(end.result["final_value"], abs=1e-9)

@@ -8,53 +8,27 @@ goes on from its last checkpoint to the bytes that it gives undisturbed. What is
 that fails is said to have failed, and the others go on.
 """
 
+import contextlib
 import json
 import shutil
 import time
 import warnings
 from collections import defaultdict
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from pharos.agents import check_hyperparameters
-from pharos.agents import hyperparameters as hyperparameters_of
-from pharos.errors import FileFormatError, ParameterError, PharosError
+from pharos.errors import FileFormatError, FolderLocked, ParameterError, PharosError
 from pharos.experiments import results as _results
 from pharos.experiments.config import RunConfig
-from pharos.experiments.curve import Curve
 from pharos.experiments.learners import publish_network
+from pharos.experiments.members import FailedRun, Member, Members, in_one_line
 from pharos.experiments.run_folder import Checkpoint, Record, TrainingResult, finished_result
-from pharos.experiments.task import Task, TaskValues
-from pharos.storage import digest_of_json
+from pharos.storage import digest_of_json, lock, replace_json
 from pharos.wording import many
-
-WORLD = ("environment", "parameters", "gamma", "sources")
-TASK = ("environment", "parameters", "chance", "observation", "observation_options", "gamma", "horizon", "sources")
-SIGHT = ("environment", "parameters", "observation", "observation_options", "sources")
-
-
-@dataclass(frozen=True)
-class FailedRun:
-    """A run that has no result, and why."""
-
-    config: dict[str, Any]
-    folder: Path | None
-    exception: Exception
-
-    @property
-    def error(self) -> str:
-        """The reason in one line."""
-        return in_one_line(self.exception)
-
-
-def in_one_line(error: BaseException) -> str:
-    """An error as pharos says it, or with its type."""
-    text = " ".join(str(error).split())
-    return text if isinstance(error, PharosError) else f"{type(error).__name__}: {text}"
 
 
 @dataclass(frozen=True)
@@ -77,121 +51,8 @@ class Progress:
 Tell = Callable[[Progress], None]
 
 
-@dataclass(eq=False)
-class Member:
-    """A run that waits for its batch, or is in it.
-
-    Attributes:
-        place: among the configurations; None for a run of a checkpoint that nobody asks for.
-    """
-
-    place: int | None
-    config: RunConfig
-    folder: Path | None
-    task: Task
-    hyperparameters: dict[str, Any]
-    run: Any
-    key: Hashable
-    error: Exception | None = None
-    curve: Curve = field(init=False)
-
-    def __post_init__(self) -> None:
-        self.curve = Curve(self.task)
-
-    @property
-    def record(self) -> Record:
-        """Its run.json."""
-        return Record(self.folder, self.config, self.hyperparameters)
-
-    def fail(self, error: Exception) -> None:
-        """It has failed; the reason is kept in run.json."""
-        self.error = error
-        self.record.write("failed", error=in_one_line(error))
-
-
 class Stopped(Exception):
     """What the caller's own function raised, which is not an error of a run."""
-
-
-class Members:
-    """Makes members of batches; what several runs share is made once: spaces, rewards, solved values, observations.
-
-    Args:
-        values: config -> values at the start of its task, where they are known.
-        trust, strict: as for `RunConfig.task`.
-    """
-
-    def __init__(
-        self,
-        values: Callable[[RunConfig], TaskValues | None] | None = None,
-        *,
-        trust: bool = False,
-        strict: bool = False,
-    ):
-        self.values, self.trust, self.strict = values, trust, strict
-        self.made: dict[str, Any] = {}
-
-    def task(self, config: RunConfig) -> Task:
-        """The task of a run, the same object for all that have it; spaces and rewards are those of other tasks."""
-        return self._once("task", config, TASK, lambda: self._task(config))
-
-    def adopt(self, config: RunConfig, task: Task) -> None:
-        """Take a task that is made already for that of a run."""
-        self._once("task", config, TASK, lambda: task)
-
-    def _task(self, config: RunConfig) -> Task:
-        known = self.values(config) if self.values is not None else None
-        task = config.task(known, trust=self.trust, strict=self.strict)
-        space, plain = self._once("world", config, WORLD, lambda: (task.space, task.space.mdp(gamma=task.gamma)))
-        vars(task).update(space=space, mdp=task.chance.of(plain.with_horizon(task.horizon_steps)))
-        return task
-
-    def member(self, place: int | None, config: RunConfig, folder: Path | None) -> Member:
-        """A run, ready to be grouped.
-
-        Raises:
-            ParameterError: a hyperparameter is wrong, or the engine lacks it.
-        """
-        from pharos.agents.batched import BatchRun, ObservationSource, group_key, supports
-
-        chosen = hyperparameters_of(config.agent, config.environment, config.observation, config.hyperparameters)
-        check_hyperparameters(config.agent, chosen)
-        lacking = supports(config.agent, chosen)
-        if lacking is not None:
-            raise ParameterError(f"the batched engine: {lacking}; the engine sb3 has it")
-        if config.chance.lazy or config.chance.pays_otherwise:
-            raise ParameterError(
-                f"the batched engine: {config.chance}: it has no lazy actions, and pays what is earned at once and "
-                f"without noise; the engine sb3 has them"
-            )
-        task = self.task(config)
-        run = BatchRun(
-            mdp=task.mdp,
-            observe=self._once("sight", config, SIGHT, lambda: ObservationSource.of(task.space, task.sight.observe)),
-            time_limit=task.time_limit,
-            hyperparameters=chosen,
-            steps=config.steps,
-            seed=config.seed,
-            key=int(config.id, 16),
-            gamma=config.gamma,
-            outcome_rewards=self._once("rewards", config, WORLD, lambda: _drawn_rewards(task)),
-        )
-        key = (config.agent, config.steps, config.evaluation_interval, group_key(config.agent, run))
-        return Member(place, config, folder, task, chosen, run, key)
-
-    def _once(self, what: str, config: RunConfig, names: Sequence[str], make: Callable[[], Any]) -> Any:
-        entry = config.to_dict()
-        key = json.dumps([what, *(entry.get(name) for name in names)], sort_keys=True)
-        if key not in self.made:
-            self.made[key] = make()
-        return self.made[key]
-
-
-def _drawn_rewards(task: Task) -> Any:
-    """What each outcome pays where the rules have chance; None where rewards belong to pairs."""
-    from pharos.mdp import rewards_of_outcomes
-
-    return rewards_of_outcomes(task.space) if task.space.has_chance else None
 
 
 def train_configs(
@@ -372,6 +233,8 @@ class _Batch:
         self.config, self.places = group[0].config, [member.place for member in group]
         self.batch: Any = None
         self.spent = 0.0
+        self.held = contextlib.ExitStack()
+        self.keeps = False  # whether this process holds the folder of checkpoints
 
     @property
     def _place(self) -> Path | None:
@@ -386,6 +249,7 @@ class _Batch:
         try:
             self._train()
         except Stopped as stop:
+            self.held.close()
             raise stop.args[0] from None
         except Exception as error:
             self.batch = None
@@ -413,10 +277,10 @@ class _Batch:
         began = time.perf_counter()
         self.batch = make_batch(self.config.agent, [member.run for member in self.group], device=self.work.device)
         checkpoint = None
-        if self._place is not None:
-            self._place.mkdir(parents=True, exist_ok=True)
-            entry = {"configs": [member.config.to_dict() for member in self.group]}
-            (self._place / "batch.json").write_text(json.dumps(entry), encoding="utf-8")
+        if self._place is not None and self._claim(self._place):
+            members = [member.config for member in self.group]
+            entry = {"ids": [each.id for each in members], "configs": [each.to_dict() for each in members]}
+            replace_json(self._place / "batch.json", entry)
             checkpoint = Checkpoint(self._place / "checkpoint", self._place.name)
             rows, self.spent = checkpoint.restore(self) or ([], 0.0)
             for member, curve in zip(self.group, rows, strict=False):
@@ -429,6 +293,14 @@ class _Batch:
             member.record.write("running")
         self._learn(checkpoint, began)
         self._publish(time.perf_counter() - began)
+
+    def _claim(self, place: Path) -> bool:
+        """Hold the folder of checkpoints; False where another process does, which trains the same runs."""
+        place.mkdir(parents=True, exist_ok=True)
+        with contextlib.suppress(FolderLocked):
+            self.held.enter_context(lock(place, FolderLocked, "training"))
+            self.keeps = True
+        return self.keeps
 
     def _learn(self, checkpoint: Checkpoint | None, began: float) -> None:
         """Learn from the last row of the curves on, with evaluations at each point."""
@@ -522,8 +394,10 @@ class _Batch:
         self.work.done += member.config.steps
 
     def _remove_checkpoint(self) -> None:
-        if self._place is not None:
+        if self._place is not None and self.keeps:
             shutil.rmtree(self._place, ignore_errors=True)
+        self.held.close()
+        self.keeps = False
 
 
 _GIVEN = ("place", "config", "folder", "task", "hyperparameters", "run", "key")

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 from pharos.agents import TABULAR_OBSERVATION, agent_kind, agent_source, hyperparameters
 from pharos.environments import as_tuples, imported, source_of
 from pharos.errors import MissingExtra, ParameterError, UnknownName
-from pharos.experiments import ChanceSetting, Horizon, RunConfig
+from pharos.experiments import ENGINES, ChanceSetting, Horizon, RunConfig
 from pharos.observations import OwnObservation, own_observation
 from pharos.sources import is_reference
 from pharos.study.regression import MEASURES
@@ -39,10 +39,12 @@ class Run:
     Attributes:
         configuration: what determines its result.
         instance: name of the environment as the specification gives it, such as "frozen_lake/4x4".
+        engine: "batched" where it is trained together with others; a table, too, whose configuration does not say so.
     """
 
     configuration: RunConfig
     instance: str
+    engine: str = "sb3"
 
     @cached_property
     def config(self) -> Mapping[str, Any]:
@@ -60,9 +62,10 @@ class Run:
         return str(self.configuration.chance)
 
     @property
-    def kind(self) -> tuple[str, str, str]:
-        """Class of environment, agent and observation: runs of a kind take about as long for each step."""
-        return (self.configuration.environment, self.configuration.agent, self.configuration.observation)
+    def kind(self) -> tuple[str, str, str, str]:
+        """Class of environment, agent, observation, engine: runs of a kind take about as long for each step."""
+        config = self.configuration
+        return (config.environment, config.agent, config.observation, config.engine)
 
 
 def _entry(value: Any) -> Any:
@@ -187,6 +190,13 @@ class Hardness(_Part):
         return [name for name in taken if name in self.measures] or list(self.measures)
 
 
+def _engines(value: Any) -> Any:
+    for engine in value.values() if isinstance(value, dict) else [value]:
+        if engine not in ENGINES:
+            raise UnknownName("engine", engine, ENGINES)
+    return value
+
+
 def _horizon(value: Any) -> Any:
     return Horizon.of(value).value
 
@@ -194,6 +204,7 @@ def _horizon(value: Any) -> Any:
 Seeds = Annotated[list[Annotated[int, Field(ge=0)]], BeforeValidator(_seeds), Field(min_length=1)]
 Steps = Annotated[int, Field(ge=1)]
 Gamma = Annotated[float, Field(ge=0, le=1)]
+EngineEntry = Annotated[str | dict[str, str], BeforeValidator(_engines)]
 HorizonEntry = Annotated[Any, BeforeValidator(_horizon)]
 
 
@@ -212,6 +223,7 @@ class Block(_Part):
     gamma: Gamma | None = None
     horizon: HorizonEntry | None = None
     hyperparameters: dict[str, str | dict[str, Any]] = {}
+    engine: EngineEntry | None = None
 
 
 class Specification(_Part):
@@ -227,6 +239,7 @@ class Specification(_Part):
     gamma: Gamma = 1.0
     horizon: HorizonEntry = "limit"
     hyperparameters: dict[str, dict[str, Any]] = {}
+    engine: EngineEntry = "sb3"
     hardness: Hardness = Field(default_factory=Hardness)
 
     @cached_property
@@ -246,6 +259,7 @@ class Specification(_Part):
         for environment in block.environments:
             for chance in block.chance:
                 for agent in block.agents:
+                    engine = self.engine_of(block, agent)
                     agent_from = agent_source(agent, self.folder, check=False)
                     observations: Sequence[ObservationEntry] = block.observations
                     if agent_kind(agent).is_tabular:
@@ -274,10 +288,17 @@ class Specification(_Part):
                                     gamma=gamma,
                                     horizon=Horizon.of(horizon).steps(environment.instance),
                                     evaluation_interval=max(1, steps // evaluations),
+                                    engine=engine,
                                     sources={part: source for part, source in sources.items() if source is not None},
                                 ),
                                 environment.label,
+                                engine,
                             )
+
+    def engine_of(self, block: Block, agent: str) -> str:
+        """What trains an agent of a block: "sb3" or "batched"."""
+        said = self.engine if block.engine is None else block.engine
+        return said if isinstance(said, str) else said.get(agent, "sb3")
 
     def _hyperparameters(self, block: Block, agent: str, environment: str, observation: str) -> dict[str, Any]:
         """All of them, those of the library's table included: when that changes, these are other runs."""

@@ -5,8 +5,6 @@ may be killed at any moment, several runners may share a folder, and the same co
 """
 
 import contextlib
-import json
-import multiprocessing
 import os
 import shutil
 import socket
@@ -18,11 +16,13 @@ from multiprocessing import connection
 from pathlib import Path
 from typing import Any
 
-from pharos.errors import FileFormatError, ParameterError, PharosError, StateSpaceLocked
+from pharos.errors import FileFormatError, ParameterError, PharosError
 from pharos.storage import replace_json
+from pharos.study import batches as _batches
 from pharos.study import values as _values
 from pharos.study import worker as _worker
 from pharos.study.blocks import Run, Specification
+from pharos.study.preparing import prepare_instance, prepare_instances
 from pharos.study.processes import end_processes, one_thread, processors, worker_context
 from pharos.study.specification import Source
 from pharos.study.status import Status, claim, duration, opened, status
@@ -50,12 +50,6 @@ def train(config: Mapping[str, Any], folder: Path) -> None:
     train_config(config, folder, values=known, trust=True, strict=True)
 
 
-def prepare_instance(config: Mapping[str, Any]) -> None:
-    """Build the state space of a run into the cache, and keep the values of its task at the start."""
-    _values.task_of(config).space.num_states  # noqa: B018
-    _values.solve(config)
-
-
 def shard_of(runs: Sequence[Run], shard: str | tuple[int, int] | None) -> tuple[Run, ...]:
     """The i-th of n parts of the runs, `i/n` with i from 1 to n; every n-th run, so that parts last about as long."""
     if shard is None:
@@ -81,6 +75,7 @@ def run(
     progress: Callable[[Status], None] | None = None,
     runner: _worker.Runner = train,
     prepare: Callable[[Mapping[str, Any]], Any] | None = None,
+    batch_runner: _batches.BatchRunner | None = None,
 ) -> Status:
     """Execute the runs of a study that are not over, on this machine.
 
@@ -92,12 +87,14 @@ def run(
         resume: let runs that were killed go on from their last checkpoint, for long runs on machines that come and go.
             A deep agent then ends elsewhere than without the interruption; else killed runs start anew, and results
             never depend on it.
-        timeout: seconds after which a run is ended, and failed.
+        timeout: seconds after which a run is ended, and failed; a batch gets as many for each of its runs.
         workers: processes; None for as many as there are processors.
         progress: called with a Status every now and then.
         runner: `runner(config, folder)`, a function of a module, which writes run.json and curve.parquet.
         prepare: called with one config of each instance, in a process of its own, before the runs; None: builds state
             spaces for the usual runner, and does nothing for another.
+        batch_runner: `runner(configs, folders, folder for checkpoints)` of runs that the study says are batched; None:
+            the usual one for the usual runner, else each of them alone.
     Returns:
         The Status at the end. Failed runs do not stop the others.
     Raises:
@@ -116,6 +113,7 @@ def run(
         workers=workers or processors(),
         progress=progress,
         runner=runner,
+        batch_runner=_batches.train_batch if batch_runner is None and runner is train else batch_runner,
         status_file=name,
     )
     execution = Execution(study, place, runs, options)
@@ -136,6 +134,7 @@ class Options:
     workers: int
     progress: Callable[[Status], None] | None = None
     runner: _worker.Runner = train
+    batch_runner: _batches.BatchRunner | None = None
     status_file: str = "status.json"
 
 
@@ -151,7 +150,8 @@ class Execution:
         self.damaged: dict[str, str] = {}
         self.repeated: set[str] = set()
         self.pending: deque[tuple[float, Run]] = deque()
-        self.running: dict[int, tuple[Any, Run, float]] = {}
+        self.running: dict[int, tuple[Any, tuple[Run, ...], float]] = {}
+        self.batches = _batches.Batches(folder)
         self.kills: dict[str, int] = defaultdict(int)
         self.lost_servers = 0
         self.seconds_per_step: dict[tuple, tuple[float, int]] = {}
@@ -162,41 +162,7 @@ class Execution:
     def prepare(self, prepare: Callable[[Mapping[str, Any]], Any]) -> None:
         """Call `prepare` with one config of each instance that has runs to come; a failure is left to the runs to
         tell."""
-        instances: dict[str, Run] = {}
-        for _, run in self.pending:
-            config = run.config
-            key = json.dumps([config[name] for name in ("environment", "parameters", "chance", "gamma", "horizon")])
-            instances.setdefault(key, run)
-        todo = list(instances.values())
-        while todo:
-            del todo[: self._prepare(prepare, todo, len(instances))]
-
-    def _prepare(self, prepare: Callable[[Mapping[str, Any]], Any], todo: Sequence[Run], total: int) -> int:
-        """Prepare instances in a process of their own; how many are done, the one at which it died included."""
-        context = multiprocessing.get_context("spawn")
-        receiver, sender = context.Pipe(duplex=False)
-        process = context.Process(target=_prepare_all, args=(prepare, [run.config for run in todo], sender))
-        process.start()
-        sender.close()
-        done, waits_for = 0, ""
-        try:
-            while done < len(todo):
-                run = todo[done]
-                number = total - len(todo) + done + 1
-                self.report(f"preparing {run.instance}, {run.chance} ({number} of {total}){waits_for}")
-                if receiver.poll(STATUS_SECONDS):
-                    message = receiver.recv()
-                    waits_for = f"; {message}" if message else ""
-                    done += not message
-        except EOFError:
-            done += 1
-        except BaseException:
-            end_processes([process])
-            raise
-        finally:
-            receiver.close()
-        process.join()
-        return done
+        prepare_instances(prepare, [run for _, run in self.pending], self.report)
 
     def run(self) -> Status:
         context = worker_context(self.options.runner is train)
@@ -236,13 +202,16 @@ class Execution:
                 continue
             if self.note(run, run.id in self.repeated):
                 continue
+            unit = (run,) if self.options.batch_runner is None else self.batches.unit(run, self.pending)
             try:
-                process = self._worker(context, run)
+                process = self._worker(context, unit)
             except (EOFError, ConnectionError) as error:
                 self._server_lost(error)
-                self.pending.appendleft((due, run))
+                self.pending.extendleft((due, each) for each in reversed(unit))
                 return
-            self.running[process.sentinel] = (process, run, time.monotonic())
+            self.running[process.sentinel] = (process, unit, time.monotonic())
+            if not self.pending:
+                return
 
     def _server_lost(self, error: Exception) -> None:
         """The process that forks workers is gone: wait a little, and the next start begins another."""
@@ -255,10 +224,17 @@ class Execution:
             ) from error
         time.sleep(BUSY_SECONDS)
 
-    def _worker(self, context: Any, run: Run) -> Any:
-        where = (run.id, self.folder.absolute(), run.id in self.repeated, self.options.resume)
-        arguments = (self.options.runner, dict(run.config), *where, dict(os.environ))
-        process = context.Process(target=_worker.main, args=arguments, name=run.id)
+    def _worker(self, context: Any, unit: tuple[Run, ...]) -> Any:
+        run, folder = unit[0], self.folder.absolute()
+        target: Callable[..., None] = _worker.main
+        arguments: tuple[Any, ...]
+        if self.options.batch_runner is not None and run.engine == "batched":
+            target = _batches.main
+            arguments = _batches.arguments(self.options.batch_runner, unit, folder, self.repeated)
+        else:
+            where = (run.id, folder, run.id in self.repeated, self.options.resume)
+            arguments = (self.options.runner, dict(run.config), *where, dict(os.environ))
+        process = context.Process(target=target, args=arguments, name=run.id)
         with one_thread():
             process.start()
         return process
@@ -269,29 +245,50 @@ class Execution:
             time.sleep(BUSY_SECONDS)
             return
         for sentinel in connection.wait(list(self.running), waiting):
-            process, run, _ = self.running.pop(sentinel)  # type: ignore[arg-type]
+            process, unit, _ = self.running.pop(sentinel)  # type: ignore[arg-type]
             process.join()
             code = process.exitcode
             process.close()
-            if code == _worker.EXIT_BUSY:
-                self.pending.append((time.monotonic() + BUSY_SECONDS, run))
-            elif code == SERVER_LOST and not self.note(run) and self.lost_servers < LOST_SERVERS:
-                self.lost_servers += 1  # the worker may well live: the next attempt waits for it
-                self.pending.append((time.monotonic() + BUSY_SECONDS, run))
-            elif not self.note(run, code != 0 and run.id in self.repeated):
-                self._killed(run, code)
+            self._ended(unit, code)
         if self.options.timeout is not None:
-            for process, run, started in self.running.values():
-                if time.monotonic() - started > self.options.timeout:
-                    self.kills[run.id] = ATTEMPTS
+            for process, unit, started in self.running.values():
+                if time.monotonic() - started > self.options.timeout * len(unit):
+                    self.kills.update({run.id: ATTEMPTS for run in unit})
                     process.kill()
 
-    def _killed(self, run: Run, code: int) -> None:
-        """A worker ended without a result: again, up to ATTEMPTS times, then the run has failed."""
-        self.kills[run.id] += 1
-        if self.kills[run.id] < ATTEMPTS:
-            self.pending.append((0.0, run))
+    def _ended(self, unit: tuple[Run, ...], code: int) -> None:
+        """A process is over: what it has not left behind is done again."""
+        if code == _worker.EXIT_BUSY:
+            left = list(unit)
+        else:
+            left = [run for run in unit if not self.note(run)]
+            if code == SERVER_LOST and left and self.lost_servers < LOST_SERVERS:
+                self.lost_servers += 1  # the worker may well live: the next attempt waits for it
+            elif code == 0 and unit[0].engine == "batched":
+                pass  # another process is at them
+            else:
+                self._killed([run for run in unit if not self.note(run, code != 0 and run.id in self.repeated)], code)
+                return
+        self.pending.extend((time.monotonic() + BUSY_SECONDS, run) for run in left)
+
+    def _killed(self, unit: Sequence[Run], code: int) -> None:
+        """Without results: again, up to ATTEMPTS times; then a batch is halved, and a run has failed."""
+        for run in unit:
+            self.kills[run.id] += 1
+        if all(self.kills[run.id] < ATTEMPTS for run in unit):
+            self.batches.look()
+            self.pending.extend((0.0, run) for run in unit)
             return
+        if len(unit) > 1 and all(self.kills[run.id] <= ATTEMPTS for run in unit):
+            self.batches.halve(unit)
+            self.kills.update({run.id: 0 for run in unit})
+            self.pending.extend((0.0, run) for run in unit)
+            return
+        for run in unit:
+            self._give_up(run, code)
+
+    def _give_up(self, run: Run, code: int) -> None:
+        """A run has failed: its process was killed too often, or took too long."""
         if self.kills[run.id] > ATTEMPTS:
             error = f"took longer than {self.options.timeout:g} s"
         else:
@@ -332,8 +329,8 @@ class Execution:
         pace = {kind: seconds / steps for kind, (seconds, steps) in self.seconds_per_step.items()}
         usual = sum(pace.values()) / len(pace)
         seconds = sum(run.config["steps"] * pace.get(run.kind, usual) for _, run in self.pending)
-        for _, run, started in self.running.values():
-            needed = run.config["steps"] * pace.get(run.kind, usual)
+        for _, unit, started in self.running.values():
+            needed = sum(run.config["steps"] * pace.get(run.kind, usual) for run in unit)
             seconds += max(0.0, needed - (time.monotonic() - started))
         return seconds / self.options.workers
 
@@ -344,7 +341,7 @@ class Execution:
             total=len(self.runs),
             finished=len(self.finished),
             failed=len(self.errors),
-            running=len(self.running),
+            running=sum(len(unit) for _, unit, _ in self.running.values()),
             errors=dict(self.errors),
             elapsed=time.monotonic() - self.began,
             remaining=self._remaining(),
@@ -360,36 +357,11 @@ class Execution:
         return now
 
 
-def _prepare_all(
-    prepare: Callable[[Mapping[str, Any]], Any], configs: Iterable[Mapping[str, Any]], sender: Any
-) -> None:
-    """Prepare instances one after the other; send "" after each, and why where it waits."""
-    _worker.end_cleanly()
-    _worker.end_with_parent()
-    for config in configs:
-        with contextlib.suppress(Exception):  # the runs of this instance will fail with the same error, and say so
-            _unless_locked(prepare, config, sender.send)
-        sender.send("")
-
-
-def _unless_locked(
-    prepare: Callable[[Mapping[str, Any]], Any], config: Mapping[str, Any], tell: Callable[[str], None]
-) -> None:
-    """Prepare an instance; where another process is building it, wait for that one."""
-    while True:
-        try:
-            prepare(config)
-            return
-        except StateSpaceLocked as error:
-            tell(str(error))
-            time.sleep(STATUS_SECONDS)
-
-
 def _clear(folder: Path, runs: Iterable[Run]) -> None:
     """Remove what only running needs, once every run is over."""
     for run in runs:
         for name in (f"partial/{run.id}", f"partial/{run.id}.failed", f"locks/{run.id}"):
             shutil.rmtree(folder / name, ignore_errors=True)
-    for name in ("partial", "locks"):
+    for name in ("partial", "locks", _batches.BATCHES):
         with contextlib.suppress(OSError):
             (folder / name).rmdir()

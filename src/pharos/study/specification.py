@@ -11,6 +11,7 @@
         observations: [vector, {name: simple_image, options: {size: 84}}]
         agents: [dqn, ppo, q_learning]
         hyperparameters: {dqn: patient, ppo: {n_steps: 256}}
+        engine: {dqn: batched}         # or a word for all agents; of the study where a block does not say
 
 A block is the product of its lists. Tabular agents see the index of the state whatever the block's observations are.
 Environments, observations and agents of one's own are named as module:Name or file.py:Name, and looked for in
@@ -25,7 +26,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from pharos.agents import AGENTS, agent_source, is_known
+from pharos.agents import AGENTS, BATCHED, agent_source, is_known
 from pharos.errors import MissingExtra, ParameterError, UnknownName, UntrustedCode
 from pharos.sources import is_reference
 
@@ -231,11 +232,21 @@ def _wrong(found: Specification) -> Iterator[tuple[Loc, str]]:
         gamma = found.gamma if block.gamma is None else block.gamma
         if (block.horizon or found.horizon) == "none" and gamma == 1:
             yield ("blocks", i), "gamma is 1 and horizon is none, so values may be infinite; expected a gamma below 1"
+        said = found.engine if block.engine is None else block.engine
+        for agent in said if isinstance(said, dict) else ():
+            if agent not in AGENTS and not is_reference(agent):
+                where: Loc = ("engine",) if block.engine is None else ("blocks", i, "engine")
+                yield where, str(UnknownName("agent", agent, AGENTS))
         for j, agent in enumerate(block.agents):
             try:
                 if agent not in AGENTS and not is_reference(agent):
                     raise UnknownName("agent", agent, AGENTS)
                 agent_source(agent, found.folder, check=False)
+                if found.engine_of(block, agent) == "batched" and agent not in (*BATCHED, "q_learning"):
+                    raise ParameterError(
+                        f"agent {agent!r}: the batched engine has {', '.join(BATCHED)} and q_learning, the engine sb3 "
+                        f"has {agent!r}; write engine: {{{BATCHED[0]}: batched}} for some agents only"
+                    )
             except ParameterError as error:
                 yield ("blocks", i, "agents", j), str(error)
         for agent, given in block.hyperparameters.items():

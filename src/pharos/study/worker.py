@@ -105,15 +105,15 @@ def _attempt(runner: Runner, config: Mapping[str, Any], id: str, folder: Path, a
     if done == FINISHED or (done == FAILED and not again):
         return done
     partial = folder / "partial" / id
-    if not _is_complete(partial):
+    if not is_complete(partial):
         if partial.exists() and not resume:
             shutil.rmtree(partial)
         partial.mkdir(parents=True, exist_ok=True)
         began = time.perf_counter()
-        with _log(partial / "log.txt"):
+        with log(partial / "log.txt"):
             try:
                 runner(config, partial)
-                if not _is_complete(partial):
+                if not is_complete(partial):
                     raise RuntimeError("the runner returned without a finished run.json and a curve.parquet")
             except Exception as error:
                 traceback.print_exc()
@@ -160,7 +160,8 @@ def _remove(path: Path) -> None:
         path.unlink(missing_ok=True)
 
 
-def _is_complete(partial: Path) -> bool:
+def is_complete(partial: Path) -> bool:
+    """Whether the folder of a run has a finished result."""
     try:
         record = read_record(partial)
     except FileFormatError:  # cut short
@@ -169,7 +170,7 @@ def _is_complete(partial: Path) -> bool:
 
 
 @contextlib.contextmanager
-def _log(path: Path):
+def log(path: Path):
     """What this process prints goes to a file."""
     sys.stdout.flush()
     sys.stderr.flush()
@@ -203,7 +204,15 @@ def main(
     resume: bool,
     environment: Mapping[str, str],
 ) -> None:
-    """The body of a worker process: ends with the process that started it, leaves interrupts to it, uses one thread.
+    """The body of a worker process; see `begin` for `environment`."""
+    begin(environment)
+    if attempt(runner, config, id, folder, again=again, resume=resume) == BUSY:
+        sys.exit(EXIT_BUSY)
+
+
+def begin(environment: Mapping[str, str]) -> None:
+    """What a worker process begins with: it ends with the one that started it, leaves interrupts to it, uses one
+    thread.
 
     `environment` holds the variables of that process now, which may not be those of when workers began to be forked.
     """
@@ -215,8 +224,6 @@ def main(
     end_cleanly()
     end_with_parent()
     use_one_thread()
-    if attempt(runner, config, id, folder, again=again, resume=resume) == BUSY:
-        sys.exit(EXIT_BUSY)
 
 
 def end_cleanly() -> None:

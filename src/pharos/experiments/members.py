@@ -1,0 +1,153 @@
+"""Runs that are to be trained together: each with its task, what it sees, and its hyperparameters, checked."""
+
+import json
+from collections.abc import Callable, Hashable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from pharos.agents import check_hyperparameters
+from pharos.agents import hyperparameters as hyperparameters_of
+from pharos.errors import ParameterError, PharosError
+from pharos.experiments.config import RunConfig
+from pharos.experiments.curve import Curve
+from pharos.experiments.run_folder import Record
+from pharos.experiments.task import Task, TaskValues
+
+# What of a configuration decides about rewards and states, about the task, about what is seen
+WORLD = ("environment", "parameters", "gamma", "sources")
+TASK = ("environment", "parameters", "chance", "observation", "observation_options", "gamma", "horizon", "sources")
+SIGHT = ("environment", "parameters", "observation", "observation_options", "sources")
+
+
+@dataclass(frozen=True)
+class FailedRun:
+    """A run that has no result, and why."""
+
+    config: dict[str, Any]
+    folder: Path | None
+    exception: Exception
+
+    @property
+    def error(self) -> str:
+        """The reason in one line."""
+        return in_one_line(self.exception)
+
+
+def in_one_line(error: BaseException) -> str:
+    """An error as pharos says it, or with its type."""
+    text = " ".join(str(error).split())
+    return text if isinstance(error, PharosError) else f"{type(error).__name__}: {text}"
+
+
+@dataclass(eq=False)
+class Member:
+    """A run that waits for its batch, or is in it.
+
+    Attributes:
+        place: among the configurations; None for a run of a checkpoint that nobody asks for.
+    """
+
+    place: int | None
+    config: RunConfig
+    folder: Path | None
+    task: Task
+    hyperparameters: dict[str, Any]
+    run: Any
+    key: Hashable
+    error: Exception | None = None
+    curve: Curve = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.curve = Curve(self.task)
+
+    @property
+    def record(self) -> Record:
+        """Its run.json."""
+        return Record(self.folder, self.config, self.hyperparameters)
+
+    def fail(self, error: Exception) -> None:
+        """It has failed; the reason is kept in run.json."""
+        self.error = error
+        self.record.write("failed", error=in_one_line(error))
+
+
+class Members:
+    """Makes members of batches; what several runs share is made once: spaces, rewards, solved values, observations.
+
+    Args:
+        values: config -> values at the start of its task, where they are known.
+        trust, strict: as for `RunConfig.task`.
+    """
+
+    def __init__(
+        self,
+        values: Callable[[RunConfig], TaskValues | None] | None = None,
+        *,
+        trust: bool = False,
+        strict: bool = False,
+    ):
+        self.values, self.trust, self.strict = values, trust, strict
+        self.made: dict[str, Any] = {}
+
+    def task(self, config: RunConfig) -> Task:
+        """The task of a run, the same object for all that have it; spaces and rewards are those of other tasks."""
+        return self._once("task", config, TASK, lambda: self._task(config))
+
+    def adopt(self, config: RunConfig, task: Task) -> None:
+        """Take a task that is made already for that of a run."""
+        self._once("task", config, TASK, lambda: task)
+
+    def _task(self, config: RunConfig) -> Task:
+        known = self.values(config) if self.values is not None else None
+        task = config.task(known, trust=self.trust, strict=self.strict)
+        space, plain = self._once("world", config, WORLD, lambda: (task.space, task.space.mdp(gamma=task.gamma)))
+        vars(task).update(space=space, mdp=task.chance.of(plain.with_horizon(task.horizon_steps)))
+        return task
+
+    def member(self, place: int | None, config: RunConfig, folder: Path | None) -> Member:
+        """A run, ready to be grouped.
+
+        Raises:
+            ParameterError: a hyperparameter is wrong, or the engine lacks it.
+        """
+        from pharos.agents.batched import BatchRun, ObservationSource, group_key, supports
+
+        chosen = hyperparameters_of(config.agent, config.environment, config.observation, config.hyperparameters)
+        check_hyperparameters(config.agent, chosen)
+        lacking = supports(config.agent, chosen)
+        if lacking is not None:
+            raise ParameterError(f"the batched engine: {lacking}; the engine sb3 has it")
+        if config.chance.lazy or config.chance.pays_otherwise:
+            raise ParameterError(
+                f"the batched engine: {config.chance}: it has no lazy actions, and pays what is earned at once and "
+                f"without noise; the engine sb3 has them"
+            )
+        task = self.task(config)
+        run = BatchRun(
+            mdp=task.mdp,
+            observe=self._once("sight", config, SIGHT, lambda: ObservationSource.of(task.space, task.sight.observe)),
+            time_limit=task.time_limit,
+            hyperparameters=chosen,
+            steps=config.steps,
+            seed=config.seed,
+            key=int(config.id, 16),
+            gamma=config.gamma,
+            outcome_rewards=self._once("rewards", config, WORLD, lambda: _drawn_rewards(task)),
+        )
+        key = (config.agent, config.steps, config.evaluation_interval, group_key(config.agent, run))
+        return Member(place, config, folder, task, chosen, run, key)
+
+    def _once(self, what: str, config: RunConfig, names: Sequence[str], make: Callable[[], Any]) -> Any:
+        entry = config.to_dict()
+        key = json.dumps([what, *(entry.get(name) for name in names)], sort_keys=True)
+        if key not in self.made:
+            self.made[key] = make()
+        return self.made[key]
+
+
+def _drawn_rewards(task: Task) -> Any:
+    """What each outcome pays where the rules have chance; None where rewards belong to pairs."""
+    from pharos.mdp import rewards_of_outcomes
+
+    return rewards_of_outcomes(task.space) if task.space.has_chance else None

@@ -1,0 +1,229 @@
+"""Runs of a study that are trained as one program: which fit together, and the process that trains them.
+
+A run belongs to a batch where the study says `engine: batched`. Batches are formed when a worker is free, from the
+runs that are missing then; a run does not depend on its batch, so neither do results. While a batch is trained, its
+checkpoints are in DIR/batches; a batch that was killed goes on from there with the runs that it had.
+"""
+
+import contextlib
+import json
+import os
+import shutil
+import time
+import traceback
+from collections import deque
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+from pharos import storage
+from pharos.errors import FolderLocked
+from pharos.study import values as _values
+from pharos.study import worker as _worker
+from pharos.study.blocks import Run
+
+BATCHES = "batches"
+# Runs of one program: what the engine takes at once on the processor; tables are learnt one after the other
+VECTORS, IMAGES, TABLES = 32, 8, 16
+
+BatchRunner = Callable[[Sequence[Mapping[str, Any]], Sequence[Path], Path], Sequence[str | None]]
+"""runner(configs, folders, folder for checkpoints) -> for each run None, or why it failed."""
+
+
+def train_batch(configs: Sequence[Mapping[str, Any]], folders: Sequence[Path], checkpoints: Path) -> list[str | None]:
+    """The usual one: `pharos.experiments.train_configs`, with the values that the study has solved already."""
+    from pharos.experiments import FailedRun, Members, RunConfig, TaskValues, train_configs
+
+    def values(config: RunConfig) -> TaskValues | None:
+        known = _values.stored_values(config.to_dict())
+        return None if known is None else TaskValues.from_dict(known)
+
+    members = Members(values, trust=True, strict=True)
+    ends = train_configs(configs, folders, checkpoints=checkpoints, members=members)
+    return [end.error if isinstance(end, FailedRun) else None for end in ends]
+
+
+class Batches:
+    """Which of the missing runs are trained together.
+
+    Args:
+        folder: of the study.
+    """
+
+    def __init__(self, folder: Path):
+        self.folder = folder / BATCHES
+        self.most: dict[str, int] = {}  # of runs whose batch was too large for memory: how many may be together
+        self.shapes: dict[str, Hashable] = {}
+        self.stored: dict[str, frozenset[str]] = {}
+        self.look()
+
+    def look(self) -> None:
+        """Which batches have checkpoints: their runs stay together."""
+        self.stored = {id: ids for ids in self._stored_ids() for id in ids}
+
+    def _stored_ids(self) -> list[frozenset[str]]:
+        found = []
+        for file in self.folder.glob("*/batch.json"):
+            with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
+                found.append(frozenset(json.loads(file.read_text(encoding="utf-8"))["ids"]))
+        return found
+
+    def unit(self, run: Run, pending: "deque[tuple[float, Run]]") -> tuple[Run, ...]:
+        """The runs that are trained with this one; they are taken from `pending`."""
+        if run.engine != "batched":
+            return (run,)
+        now, key, width = time.monotonic(), self.key(run), self.width(run)
+        others = self.stored.get(run.id)
+        chosen = [run]
+        for entry in list(pending):
+            due, other = entry
+            if others is not None:
+                fits = other.id in others
+            else:
+                fits = len(chosen) < width and due <= now and other.id not in self.stored
+                fits = fits and other.engine == "batched" and self.width(other) >= width and self.key(other) == key
+            if fits:
+                pending.remove(entry)
+                chosen.append(other)
+        return tuple(chosen)
+
+    def width(self, run: Run) -> int:
+        """How many runs may be in a batch of this one."""
+        is_image = not run.configuration.is_tabular and len(self._shape(run)[0]) == 3
+        usual = IMAGES if is_image else TABLES if run.configuration.is_tabular else VECTORS
+        return min(usual, self.most.get(run.id, usual))
+
+    def key(self, run: Run) -> Hashable:
+        """Runs with equal keys fit together; one whose key cannot be told is alone."""
+        from pharos.agents.batched import group_key
+
+        config = run.configuration
+        if config.is_tabular:
+            return (config.agent, config.environment)
+        try:
+            (shape, dtype, is_image), actions = self._shape(run), run_actions(run)
+            seen = SimpleNamespace(shape=shape, dtype=dtype, is_image=is_image)
+            stand_in: Any = SimpleNamespace(
+                observe=seen,
+                mdp=SimpleNamespace(num_actions=actions),
+                hyperparameters=config.hyperparameters,
+                steps=config.steps,
+            )
+            return (config.agent, config.steps, config.evaluation_interval, group_key(config.agent, stand_in))
+        except Exception:  # what is wrong with it, the run will say
+            return run.id
+
+    def _shape(self, run: Run) -> Any:
+        """(shape, type, whether it is an image) of what the agent sees, told without the states."""
+        config = run.configuration
+        entry = run.config
+        names = ("environment", "parameters", "observation", "observation_options")
+        key = json.dumps([entry[name] for name in names], sort_keys=True)
+        if key not in self.shapes:
+            from pharos.observations import observe
+
+            try:
+                task = config.task(trust=True)
+                space = observe(task.env, task.observation, **dict(task.observation_options)).space
+                shape = tuple(space.shape or ())
+                self.shapes[key] = (shape, str(space.dtype), len(shape) == 3 and str(space.dtype) == "uint8")
+            except Exception:
+                self.shapes[key] = ((), key, False)
+        return self.shapes[key]
+
+    def halve(self, unit: Sequence[Run]) -> None:
+        """The process of this batch was killed too often: its runs go on in halves, from the beginning."""
+        for run in unit:
+            self.most[run.id] = max(1, len(unit) // 2)
+        self.forget(unit)
+
+    def forget(self, unit: Sequence[Run]) -> None:
+        """Remove the checkpoints in which these runs are."""
+        ids = {run.id for run in unit}
+        for file in self.folder.glob("*/batch.json"):
+            with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
+                if ids & set(json.loads(file.read_text(encoding="utf-8"))["ids"]):
+                    shutil.rmtree(file.parent, ignore_errors=True)
+        self.stored = {id: others for id, others in self.stored.items() if not others & ids}
+
+
+def run_actions(run: Run) -> int:
+    """How many actions the environment of a run has."""
+    return int(run.configuration.make_environment(trust=True).num_actions)
+
+
+# As a process --------------------------------------------------------------------------------------------------------
+
+
+def main(
+    runner: BatchRunner,
+    configs: Sequence[Mapping[str, Any]],
+    ids: Sequence[str],
+    folder: Path,
+    again: Sequence[str],
+    environment: Mapping[str, str],
+) -> None:
+    """The body of a worker process that trains a batch; see `worker.main`."""
+    _worker.begin(environment)
+    attempt(runner, configs, ids, folder, again)
+
+
+def attempt(
+    runner: BatchRunner, configs: Sequence[Mapping[str, Any]], ids: Sequence[str], folder: Path, again: Sequence[str]
+) -> None:
+    """Execute those of the runs that are not over, and that no other process is at; each leaves its folder.
+
+    Args:
+        again: runs that are repeated where they have failed.
+    """
+    with contextlib.ExitStack() as held:
+        todo = []
+        for config, id in zip(configs, ids, strict=True):
+            holder = folder / "locks" / id
+            holder.mkdir(parents=True, exist_ok=True)
+            try:
+                held.enter_context(storage.lock(holder, FolderLocked, "training"))
+            except FolderLocked:
+                continue
+            done = _worker.read_status(folder, id)
+            if done != _worker.FINISHED and (done != _worker.FAILED or id in again):
+                todo.append((config, id))
+        waiting = []
+        for config, id in todo:
+            if _worker.is_complete(folder / "partial" / id):
+                _worker.publish(folder / "partial" / id, folder, id)
+            else:
+                waiting.append((config, id))
+        if waiting:
+            _train(runner, waiting, folder)
+
+
+def _train(runner: BatchRunner, waiting: Sequence[tuple[Mapping[str, Any], str]], folder: Path) -> None:
+    """Train, and put every run into its place, finished or failed."""
+    places = [folder / "partial" / id for _, id in waiting]
+    for place in places:
+        place.mkdir(parents=True, exist_ok=True)
+    began = time.perf_counter()
+    log = folder / "partial" / f"{waiting[0][1]}.log"
+    with _worker.log(log):
+        try:
+            errors = list(runner([config for config, _ in waiting], places, folder / BATCHES))
+        except Exception as error:
+            traceback.print_exc()
+            errors = [_worker.describe(error)] * len(waiting)
+    seconds = (time.perf_counter() - began) / len(waiting)
+    for (config, id), place, said in zip(waiting, places, errors, strict=True):
+        shutil.copyfile(log, place / "log.txt")
+        if not _worker.is_complete(place):
+            _worker.write_failure(place, config, id, said or "the runner returned without a finished run", seconds)
+        _worker.publish(place, folder, id)
+    log.unlink(missing_ok=True)
+
+
+def arguments(
+    runner: BatchRunner, unit: Sequence[Run], folder: Path, repeated: set[str]
+) -> tuple[BatchRunner, list[dict[str, Any]], list[str], Path, list[str], dict[str, str]]:
+    """What `main` takes for these runs."""
+    again = [run.id for run in unit if run.id in repeated]
+    return runner, [dict(run.config) for run in unit], [run.id for run in unit], folder, again, dict(os.environ)
