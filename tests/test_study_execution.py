@@ -15,6 +15,7 @@ import fake_training
 from pharos import study
 from pharos.errors import ParameterError, PharosError
 from pharos.study import execution as _execution
+from pharos.study import preparing
 from pharos.study import worker as _worker
 from pharos.study.execution import shard_of
 
@@ -374,7 +375,7 @@ def test_where_locks_are_not_supported_runs_and_instances_are_no_longer_taken_fo
     run = specification().runs[0]
     assert _worker.attempt(fake_training.train, run.config, run.id, tmp_path) == "finished"
     sent = []
-    _execution._unless_locked(lambda config: sent.append(config), run.config, sent.append)
+    preparing.unless_locked(lambda config: sent.append(config), run.config, sent.append)
     assert sent == [run.config]
 
 

@@ -74,11 +74,11 @@ def _prepare_all(
     _worker.end_with_parent()
     for config in configs:
         with contextlib.suppress(Exception):  # the runs of this instance will fail with the same error, and say so
-            _unless_locked(prepare, config, sender.send)
+            unless_locked(prepare, config, sender.send)
         sender.send("")
 
 
-def _unless_locked(
+def unless_locked(
     prepare: Callable[[Mapping[str, Any]], Any], config: Mapping[str, Any], tell: Callable[[str], None]
 ) -> None:
     """Prepare an instance; where another process is building it, wait for that one."""
