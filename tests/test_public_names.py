@@ -30,6 +30,7 @@ ORDER = (
         "paths",
         "wording",
         "storage",
+        "compiling",
         "mdp_files",
         "sources",
         "workers",

@@ -28,6 +28,7 @@ _HOMES = {
     "Layer": "pharos.environments",
     "make": "pharos.environments",
     "list_environments": "pharos.environments",
+    "register": "pharos.environments",
     "check_environment": "pharos.state_space.conformance",
     "build": "pharos.state_space",
     "load": "pharos.state_space",

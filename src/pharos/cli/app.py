@@ -24,6 +24,7 @@ from pharos.cli import (
     study,
     train,
     tune,
+    warm,
 )
 from pharos.cli import (
     list as list_,
@@ -129,6 +130,7 @@ app.command("render")(render.render)
 app.command("play")(play.play)
 app.command("train")(train.train)
 app.command("tune")(tune.tune)
+app.command("warm")(warm.warm)
 app.add_typer(plot.app, name="plot")
 app.add_typer(study.app, name="study")
 app.command("export")(export.export)

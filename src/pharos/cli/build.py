@@ -1,6 +1,5 @@
 """pharos build: enumerate a state space."""
 
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -14,6 +13,7 @@ from pharos.cli.common import (
     TargetArgument,
     Workers,
     bytes_of,
+    compiling_fact,
     describe,
     parse_environment,
     parse_size,
@@ -22,6 +22,7 @@ from pharos.cli.common import (
     print_json,
     size_text,
 )
+from pharos.compiling import Stopwatch
 
 if TYPE_CHECKING:
     from pharos.state_space import StateSpace
@@ -43,9 +44,9 @@ def build(
     env = parse_environment(environment, parameters)
     limit = parse_size(memory)
     found = _is_there(out or cached_folder(env))
-    began = time.perf_counter()
+    watch = Stopwatch()
     space = state_space.build(env, out, memory=limit, workers=workers, max_states=max_states)
-    seconds = time.perf_counter() - began
+    seconds = watch.seconds
     rate, peak, bytes_on_disk = space.num_states / seconds, peak_memory_bytes(), bytes_of(space.folder)
     answer = {
         "environment": env.name,
@@ -56,6 +57,7 @@ def build(
         "num_terminal_states": space.num_terminal_states,
         "depth": space.depth,
         "seconds": seconds,
+        "compiling_seconds": watch.compiling,
         "states_per_second": rate,
         "peak_memory_bytes": peak,
         "bytes_on_disk": bytes_on_disk,
@@ -73,6 +75,7 @@ def build(
             *_outcomes(space),
             ("depth", f"{space.depth:,}"),
             ("seconds", f"{seconds:.2f} (it was there already)" if found else f"{seconds:.2f} ({rate:,.0f} states/s)"),
+            *compiling_fact(),
             ("peak memory", size_text(peak)),
             ("on disk", size_text(bytes_on_disk)),
             ("folder", space.folder),

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from pharos import compiling
 from pharos.environments import as_tuples
 from pharos.errors import ParameterError
 
@@ -25,13 +26,44 @@ if TYPE_CHECKING:
     from pharos.mdp import TabularMDP
     from pharos.state_space import StateSpace
 
+
+def complete_target(incomplete: str) -> list[str]:
+    """What a shell proposes for TARGET: classes, and once there is a slash or one class is left, named instances."""
+    from pharos.environments import BUILT_IN
+
+    names = [entry.name for entry in BUILT_IN if entry.name.startswith(incomplete)]
+    if "/" in incomplete or len(names) == 1:
+        names += [f"{entry.name}/{instance}" for entry in BUILT_IN for instance in entry.instance_names]
+    return [name for name in names if name.startswith(incomplete)]
+
+
+def complete_parameter(context: typer.Context, incomplete: str) -> list[str]:
+    """What a shell proposes after TARGET: its parameters."""
+    from pharos.environments import class_called
+
+    target = context.params.get("target") or context.params.get("environment") or ""
+    cls = class_called(str(target).partition("/")[0])
+    names = [field.name for field in dataclasses.fields(cls)] if cls is not None else []  # type: ignore[arg-type]
+    return [f"{name}=" for name in names if name.startswith(incomplete)]
+
+
 Json = Annotated[bool, typer.Option("--json", help="One JSON object on standard output, nothing else.")]
 TargetArgument = Annotated[
-    str, typer.Argument(metavar="TARGET", help="Environment, module:Class, built folder or imported file.")
+    str,
+    typer.Argument(
+        metavar="TARGET",
+        help="Environment, module:Class, built folder or imported file.",
+        autocompletion=complete_target,
+    ),
 ]
 Parameters = Annotated[
     list[str] | None,
-    typer.Argument(metavar="[NAME=VALUE]...", help="Parameters of the environment.", show_default=False),
+    typer.Argument(
+        metavar="[NAME=VALUE]...",
+        help="Parameters of the environment.",
+        show_default=False,
+        autocompletion=complete_parameter,
+    ),
 ]
 Tolerance = Annotated[float, typer.Option("--tolerance", help="Largest error of a value, in units of return.")]
 Memory = Annotated[
@@ -60,6 +92,8 @@ Trust = Annotated[
 MaxStates = Annotated[
     int | None, typer.Option("--max-states", min=1, help="Stop with an error beyond this many states.")
 ]
+
+NOTABLE_SECONDS = 0.2  # of compiling, beside those of work
 
 # Parameters -----------------------------------------------------------------------------------------------------------
 
@@ -391,6 +425,12 @@ def describe(environment: "Environment") -> str:
 
 def _written(value: Any) -> str:
     return json.dumps(value, separators=(",", ":")) if isinstance(value, tuple | list) else str(value)
+
+
+def compiling_fact() -> list[tuple[str, str]]:
+    """What this command has spent on compiling, a fact or none: where little was compiled there is nothing to tell."""
+    seconds = compiling.seconds()
+    return [("compiling", f"{seconds:.1f} s, kept for the next time")] if seconds >= NOTABLE_SECONDS else []
 
 
 def peak_memory_bytes() -> int:

@@ -2,7 +2,6 @@
 
 import shutil
 import tempfile
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,10 +13,12 @@ from pharos.cli.common import (
     Target,
     TargetArgument,
     Workers,
+    compiling_fact,
     parse_size,
     parse_target,
     print_json,
 )
+from pharos.compiling import Stopwatch
 from pharos.errors import ParameterError, StateSpaceTooLarge
 from pharos.wording import many
 
@@ -35,7 +36,7 @@ def count(
     json: Json = False,
 ) -> None:
     """Count the states that can be reached, their transitions and the depth, and keep nothing."""
-    began = time.perf_counter()
+    watch = Stopwatch()
     goal = parse_target(target, parameters)
     if goal.is_imported:
         counted = counts_of_table(_table_of(goal))
@@ -43,7 +44,12 @@ def count(
             raise StateSpaceTooLarge(f"{target}: has {counted['num_states']:,} states; expected at most {max_states:,}")
     else:
         counted = _counts_of_space(goal, memory=parse_size(memory), workers=workers, max_states=max_states)
-    answer: dict[str, Any] = {"target": target, **counted, "seconds": time.perf_counter() - began}
+    answer: dict[str, Any] = {
+        "target": target,
+        **counted,
+        "seconds": watch.seconds,
+        "compiling_seconds": watch.compiling,
+    }
     if json:
         print_json(answer)
         return
@@ -53,6 +59,7 @@ def count(
         f"{' '.join((target, *(parameters or ())))}: {many(answer['num_states'], 'state')} "
         f"({answer['num_terminal_states']:,} terminal{extra}), {many(answer['num_actions'], 'action')}, "
         f"{many(answer['num_transitions'], 'transition')}, depth {answer['depth']:,}, {answer['seconds']:.2f} s"
+        + "".join(f", compiling {how_long}" for _, how_long in compiling_fact())
     )
 
 

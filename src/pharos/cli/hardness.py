@@ -5,6 +5,7 @@ from typing import Annotated, Any
 
 import typer
 
+from pharos import compiling
 from pharos.cli.common import (
     Json,
     Lazy,
@@ -16,6 +17,7 @@ from pharos.cli.common import (
     TargetArgument,
     Workers,
     build_options,
+    compiling_fact,
     console,
     describe_chance,
     parse_target,
@@ -100,7 +102,7 @@ def hardness(
             progress=lambda what, line: tell(f"{what}  {line}"),
         )
     if json:
-        print_json(report.to_dict())
+        print_json({**report.to_dict(), "compiling_seconds": compiling.seconds()})
     elif latex:
         print(report.to_latex())
     else:
@@ -142,5 +144,7 @@ def _print(title: str, report: Any, chance: str, definitions: bool) -> None:
     error = conventions.get("error_bound")
     if error is not None and math.isfinite(error):
         to.print(f"values are within {error:.2g} of the optimal ones (proven)", style="dim", soft_wrap=True)
+    for _, how_long in compiling_fact():
+        to.print(f"compiling: {how_long}", style="dim", soft_wrap=True)
     for note in notes:
         to.print(escape(note), style="dim", soft_wrap=True)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pharos.cli.common import Json, console, print_json
+from pharos.cli.common import Json, complete_target, console, print_json
 from pharos.environments import class_called, classes, declared_parameters, imported, named_instances
 from pharos.errors import UnknownName
 
@@ -19,7 +19,10 @@ def list_(
     name: Annotated[
         str | None,
         typer.Argument(
-            metavar="[ENVIRONMENT]", help="One class, or file.py:Class: its rules and parameters.", show_default=False
+            metavar="[ENVIRONMENT]",
+            help="One class, or file.py:Class: its rules and parameters.",
+            show_default=False,
+            autocompletion=complete_target,
         ),
     ] = None,
     json: Json = False,

@@ -5,6 +5,7 @@ from typing import Annotated, Any
 
 import typer
 
+from pharos import compiling
 from pharos.cli.common import (
     Gamma,
     Horizon,
@@ -19,6 +20,7 @@ from pharos.cli.common import (
     Workers,
     build_options,
     check_format,
+    compiling_fact,
     describe_chance,
     describe_discount,
     parse_target,
@@ -70,6 +72,7 @@ def solve(
         "error_bound": solution.error_bound,
         "sweeps": solution.sweeps,
         "seconds": solution.seconds,
+        "compiling_seconds": compiling.seconds(),
         "gamma": solution.gamma,
         "horizon": solution.horizon,
         "sticky": sticky,
@@ -93,6 +96,7 @@ def solve(
         ("chance", describe_chance(sticky, random, mdp.dynamics.has_chance, lazy)),
         ("states", f"{mdp.num_states:,} x {many(mdp.num_actions, 'action')}"),
         ("sweeps", f"{solution.sweeps} in {solution.seconds:.2f} s"),
+        *compiling_fact(),
     ]
     if out is not None:
         facts.append(("written", out))

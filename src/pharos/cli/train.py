@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from pharos import compiling
 from pharos.cli.common import (
     Json,
     Lazy,
@@ -16,6 +17,7 @@ from pharos.cli.common import (
     Random,
     Sticky,
     TargetArgument,
+    compiling_fact,
     complain,
     describe_chance,
     parse_environment,
@@ -136,7 +138,14 @@ def train(
     picture = _plot(out)
     if json:
         print_json(
-            {**result.result, "config": result.config, "seconds": result.seconds, "folder": out, "plot": picture}
+            {
+                **result.result,
+                "config": result.config,
+                "seconds": result.seconds,
+                "compiling_seconds": compiling.seconds(),
+                "folder": out,
+                "plot": picture,
+            }
         )
         return
     facts = _facts(result, steps, describe_chance(sticky, random, env.has_chance, lazy, reward_noise, reward_delay))
@@ -236,6 +245,7 @@ def _facts(run: "TrainingResult", steps: int, chance: str) -> list[tuple[str, ob
         ("values", "exact" if result["exact"] else "some are estimates, see exact in curve.parquet"),
         ("chance", chance),
         ("seconds", f"{run.seconds:.1f} ({steps / run.seconds:,.0f} steps/s, evaluation included)"),
+        *compiling_fact(),
     ]
 
 

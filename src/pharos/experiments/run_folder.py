@@ -40,7 +40,7 @@ class TrainingResult:
         curve: a row for each evaluation, a dictionary with the columns of curve.parquet.
         agent: the trained agent: a `QLearning` or a model of Stable-Baselines3; None where the run was finished before.
         folder: of the run, or None.
-        seconds: time that it took.
+        seconds: time that it took, without that of compiling.
     """
 
     config: dict[str, Any]

@@ -16,6 +16,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from pharos import compiling
 from pharos.agents import agent_kind
 from pharos.agents import hyperparameters as hyperparameters_of
 from pharos.environments import Environment, make
@@ -196,7 +197,7 @@ def train_task(
         )
     if config.engine == "batched":
         return _as_a_batch(config, task, folder, tensorboard, progress)
-    began = time.perf_counter()
+    began, compiled = time.perf_counter(), compiling.seconds()
     if folder is not None:
         done = finished_result(folder, config)
         if done is not None:
@@ -214,12 +215,13 @@ def train_task(
     record = Record(folder, config, chosen)
     record.write("running")
     _learn(learner, curve, config, progress, checkpoint, record, began)
-    seconds = time.perf_counter() - began
+    compiled = compiling.seconds() - compiled
+    seconds = time.perf_counter() - began - compiled
     result = curve.result()
     if folder is not None:
         learner.publish(folder)
         _results.write_curve(folder, curve.rows)
-        record.write("finished", seconds=seconds, result=result)
+        record.write("finished", seconds=seconds, compiling_seconds=compiled, result=result)
         for leftover in folder.glob("checkpoint*"):  # of kills in the middle of replacing one, too
             shutil.rmtree(leftover, ignore_errors=True)
     rows = [{name: row[name] for name in _results.COLUMNS} for row in curve.rows]

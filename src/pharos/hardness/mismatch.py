@@ -1,11 +1,11 @@
 """How much rarer an exploring policy is where the optimal policy goes: the distribution mismatch coefficient."""
 
 import math
-import time
 from typing import Any
 
 import numpy as np
 
+from pharos.compiling import Stopwatch
 from pharos.errors import UndefinedMeasure
 from pharos.hardness.gaps import optimal_solution
 from pharos.hardness.interval import Interval
@@ -40,7 +40,7 @@ def distribution_mismatch(
     Source: Kakade and Langford (2002); Agarwal, Kakade, Lee and Mahajan (2021), "On the theory of policy gradient
         methods", section 4.2.
     """
-    began = time.perf_counter()
+    watch = Stopwatch()
     if mdp.horizon is not None or mdp.gamma == 1.0:
         raise UndefinedMeasure(
             "distribution_mismatch is defined for discounted MDPs without a horizon: give gamma < 1 and no horizon"
@@ -66,5 +66,5 @@ def distribution_mismatch(
         method="occupancy measures",
         conventions={"gamma": mdp.gamma, "policy": "uniform" if policy is None else "given"},
         note="" if math.isfinite(upper) else "the policy hardly ever reaches a state of the optimal policy",
-        seconds=time.perf_counter() - began,
+        seconds=watch.seconds,
     )

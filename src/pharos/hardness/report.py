@@ -1,13 +1,13 @@
 """All measures of an MDP in one table, with definitions and sources; kept beside the state space."""
 
 import math
-import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
+from pharos.compiling import Stopwatch
 from pharos.errors import ParameterError, PrecisionError, UndefinedMeasure
 from pharos.hardness.interval import Budget, Certificate, Certified, certificate_of
 from pharos.hardness.registry import Measure, Problem, chosen
@@ -135,7 +135,7 @@ def report(
         UnknownName: no such measure. ParameterError: an option is out of range.
     Cost: see each measure.
     """
-    began = time.perf_counter()
+    watch = Stopwatch()
     horizon = mdp.horizon if horizon is None else horizon
     if horizon is not None and (isinstance(horizon, bool) or not isinstance(horizon, int | np.integer) or horizon < 1):
         raise ParameterError(f"horizon is {horizon!r}; expected a whole number of steps, at least 1, or None")
@@ -146,7 +146,7 @@ def report(
     results = {measure.name: _measured(measure, problem, file) for measure in wanted}
     if "solution" in vars(problem):
         conventions["error_bound"] = problem.solution.error_bound
-    return Report(results, conventions, time.perf_counter() - began)
+    return Report(results, conventions, watch.seconds)
 
 
 def _measured(measure: Measure, problem: Problem, file: ResultsFile | None) -> Result:
@@ -154,13 +154,13 @@ def _measured(measure: Measure, problem: Problem, file: ResultsFile | None) -> R
     entry = None if file is None else file.get(measure, problem.budget)
     if entry is not None:
         return replace(empty, **entry, kept=True)
-    began = time.perf_counter()
+    watch = Stopwatch()
     problem.report(measure.name, "")
     try:
         outcome = measure.function(problem)
     except (UndefinedMeasure, PrecisionError) as error:
-        return replace(empty, undefined=str(error), seconds=time.perf_counter() - began)
-    certificate, seconds = certificate_of(outcome), time.perf_counter() - began
+        return replace(empty, undefined=str(error), seconds=watch.seconds)
+    certificate, seconds = certificate_of(outcome), watch.seconds
     result = replace(empty, value=_plain(outcome), text=_text(outcome), certificate=certificate, seconds=seconds)
     if file is not None:
         file.put(measure, result.value, result.text, certificate, seconds, problem.budget)

@@ -3,6 +3,8 @@
 The package announces its files; each is loaded where it is used, and loads Numba.
 """
 
+from pharos import compiling
+
 __all__ = [
     "batched_learning",
     "batched_rollouts",
@@ -34,3 +36,5 @@ __all__ = [
     "ties",
     "travel",
 ]
+
+compiling.listen()

@@ -1,10 +1,10 @@
 """Values of a given policy: on its functional graph where everything is deterministic, else by iteration."""
 
-import time
 from typing import Any
 
 import numpy as np
 
+from pharos.compiling import Stopwatch
 from pharos.errors import DivergenceError
 from pharos.mdp import PolicyTable, TabularMDP, takes_mdp
 from pharos.solvers.fixed_point import chain_bound
@@ -45,10 +45,10 @@ def evaluate_policy(
     horizon = checked_horizon(mdp, horizon)
     if hasattr(policy, "policy_table"):
         policy = policy.policy_table()
-    began = time.perf_counter()
+    watch = Stopwatch()
     select = PolicyTable.of(mdp, policy)
     if select.actions is not None and mdp.is_deterministic and horizon is None:
-        return _on_its_graph(mdp, select, began)
+        return _on_its_graph(mdp, select, watch)
     return solution_of(mdp, select, tolerance, horizon)
 
 
@@ -58,7 +58,7 @@ def uniform_policy(mdp: TabularMDP) -> np.ndarray:
     return np.full((mdp.num_states, mdp.num_actions), 1 / mdp.num_actions)
 
 
-def _on_its_graph(mdp: TabularMDP, select: PolicyTable, began: float) -> Solution:
+def _on_its_graph(mdp: TabularMDP, select: PolicyTable, watch: Stopwatch) -> Solution:
     assert select.actions is not None
     successor, reward = chain(mdp, select.actions)
     x = np.zeros((mdp.num_states + 1, 1))
@@ -70,4 +70,4 @@ def _on_its_graph(mdp: TabularMDP, select: PolicyTable, began: float) -> Solutio
             f"give a horizon, or gamma < 1"
         )
     bound = chain_bound(mdp, select, x, successor, reward)
-    return Solution(mdp, bound, 1, time.perf_counter() - began, None, select, x, x)
+    return Solution(mdp, bound, 1, watch.seconds, None, select, x, x)

@@ -19,7 +19,7 @@ class Solution:
     Attributes:
         mdp: what was solved.
         error_bound: every entry of `v` and `q` is within this of the true value (proven; in units of return).
-        sweeps, seconds: what it took.
+        sweeps, seconds: what it took; compiling is not among the seconds.
         horizon: of the values: those of the first step, with all steps to go; or None.
         select: what is chosen: the best action, the worst one, or what a policy says.
         x: (S + 1, W) float64, values of (state, previously executed action), W = A under sticky actions, else 1; row S,

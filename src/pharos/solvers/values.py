@@ -1,10 +1,10 @@
 """Optimal values, worst values and values of uniform play."""
 
-import time
 from collections.abc import Callable
 
 import numpy as np
 
+from pharos.compiling import Stopwatch
 from pharos.errors import ParameterError
 from pharos.mdp import BEST, WORST, Selection, TabularMDP, random_actions, takes_mdp
 from pharos.solvers.fixed_point import backward_induction, fixed_point
@@ -68,7 +68,7 @@ def solution_of(
     """The values of what is chosen: a fixed point, or those of backward induction where there is a horizon."""
     check_tolerance(tolerance)
     horizon = checked_horizon(mdp, horizon)
-    began = time.perf_counter()
+    watch = Stopwatch()
     steps = None
     if horizon is None:
         values = fixed_point(mdp, select, tolerance, progress)
@@ -77,8 +77,7 @@ def solution_of(
         values, following, steps = backward_induction(mdp, select, horizon, keep_all)
     if steps is not None:
         steps = steps[:, :-1] if mdp.is_sticky else steps[:, :-1, 0]
-    seconds = time.perf_counter() - began
-    return Solution(mdp, values.bound, values.sweeps, seconds, horizon, select, values.x, following, steps)
+    return Solution(mdp, values.bound, values.sweeps, watch.seconds, horizon, select, values.x, following, steps)
 
 
 def check_tolerance(tolerance: float) -> None:

@@ -1,0 +1,94 @@
+"""pharos warm: compile beforehand what the other commands would compile as they go."""
+
+import tempfile
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from pharos.cli.common import (
+    Json,
+    Random,
+    Sticky,
+    complete_target,
+    parse_target,
+    print_facts,
+    print_json,
+    progress_line,
+)
+from pharos.compiling import Stopwatch
+from pharos.errors import StateSpaceTooLarge
+from pharos.wording import many
+
+if TYPE_CHECKING:
+    from pharos.environments import Environment
+
+# Small instances of the classes of the paper: all instances of a class share what is compiled.
+USUAL: tuple[tuple[str, dict[str, int]], ...] = (
+    ("simple_grid/4x4-plain", {}),
+    ("frozen_lake/4x4", {}),
+    ("freeway", {"num_cars": 2, "lane_length": 3}),
+    ("breakout", {"height": 8, "columns": 5}),
+)
+STEPS = 50
+LARGEST = 5_000_000
+
+
+def warm(
+    targets: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[ENVIRONMENT]...",
+            autocompletion=complete_target,
+            help="Environments or named instances; small ones of the paper's four classes when not given.",
+            show_default=False,
+        ),
+    ] = None,
+    sticky: Sticky = 0.0,
+    random: Random = 0.0,
+    json: Json = False,
+) -> None:
+    """Compile what building, solving, measuring, playing and Q-learning need, and keep it for later processes."""
+    environments = [parse_target(name).found_environment() for name in targets or ()]
+    if not targets:
+        from pharos.environments import make
+
+        environments = [make(name, **parameters) for name, parameters in USUAL]
+    seconds: dict[str, float] = {}
+    watch = Stopwatch()
+    with progress_line("compiling") as tell:
+        for env in environments:
+            tell(str(env))
+            before = watch.compiling
+            _use(env, sticky, random)
+            seconds[str(env)] = watch.compiling - before
+    if json:
+        print_json({"environments": seconds, "seconds": watch.seconds, "compiling_seconds": watch.compiling})
+        return
+    facts: list[tuple[str, object]] = [(name, f"{spent:.1f} s") for name, spent in seconds.items()]
+    print_facts(f"compiled for {many(len(facts), 'environment')}, and kept", facts)
+
+
+def _use(env: "Environment", sticky: float, random: float) -> None:
+    """Do a little of everything with an environment; a space beyond LARGEST states is stepped through alone."""
+    from pharos import hardness, solvers, state_space
+    from pharos.experiments import ChanceSetting, train
+    from pharos.interaction import GymEnv, VectorEnv
+
+    chance: dict[str, Any] = {"sticky": sticky, "random": random}
+    for observation in ("vector", "simple_image"):
+        one = GymEnv(env, observation=observation, **chance)
+        one.reset(seed=0)
+        one.step(0)
+        two = VectorEnv(env, 2, observation=observation, **chance)
+        two.reset(seed=0)
+        two.step([0, 0])
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            space = state_space.build(env, f"{folder}/space", max_states=LARGEST, progress=False)
+        except StateSpaceTooLarge:
+            return
+        mdp = ChanceSetting(sticky, random).of(space.mdp(gamma=0.99))
+        solvers.value_iteration(mdp)
+        solvers.uniform_value(mdp)
+        hardness.report(mdp, budget=10.0, keep=False)
+    train("q_learning", env, steps=STEPS, gamma=0.99, horizon=None, evaluation_interval=STEPS, **chance)
