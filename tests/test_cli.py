@@ -431,6 +431,16 @@ def test_an_interrupted_command_says_so_and_exits_with_130(failure, monkeypatch)
     assert "interrupted" in line
 
 
+def test_a_file_that_ends_too_early_is_no_interruption(failure, monkeypatch):
+    def cut_short(*_, **__):
+        raise EOFError("Ran out of input")
+
+    monkeypatch.setattr("pharos.state_space.build", cut_short)
+    code, line = failure("build", "simple_grid")
+    assert code == 1
+    assert "a file ended too early (Ran out of input); if it is compiled code, delete " in line
+
+
 def test_a_full_or_forbidden_disk_is_one_line(failure, monkeypatch):
     def forbidden(*_, **__):
         raise PermissionError(13, "Permission denied", "/somewhere")

@@ -3,6 +3,7 @@
 import os
 import sys
 import warnings
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -56,6 +57,13 @@ class _Group(TyperGroup):
         if code == EXIT_INTERRUPTED:
             complain("interrupted; finished work is kept, and the same command goes on from there")
         sys.exit(code if isinstance(code, int) else 0)
+
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except EOFError as error:  # which would be taken for the keyboard's, and said to be an interruption
+            kernels = Path(__file__).parents[1] / "kernels" / "__pycache__"
+            raise PharosError(f"a file ended too early ({error}); if it is compiled code, delete {kernels}") from error
 
 
 def _exit_code(error: Exception) -> int | None:
