@@ -94,8 +94,7 @@ class Measure:
         name: key of the result.
         function: Problem -> a number, or an object with `to_dict()`; UndefinedMeasure where it does not exist. What is
             proven of it the result says itself, by attributes `exact`, `lower`, `upper`, `note`; a plain number says
-            nothing, and the
-            report says so: "float64". `Certified` is a number that has them.
+            nothing, and the report says so: "float64". `Certified` is a number that has them.
         definition: formula, in a line.
         source: who defined it.
         complexity: "visitation", "estimation", "planning" or "other".

@@ -5,11 +5,10 @@
 2. Deterministic dynamics, with or without sticky actions. Let x be the computed values, and let every action that is
 not among the best computed ones be surely worse (its gap exceeds the error). Call two pairs (state, previous action)
 alike where x is the same to the last bit. If all pairs that are alike, and each of the best actions there, pay the same
-and lead to pairs that are
-alike, then what the best actions collect is the same sequence of rewards for ever, so their values are the same number:
-any choice among them solves the same equations, one for each class of pairs. Under sticky actions the action that is
-repeated must lead on alike as well. A map from values to rewards and next values (`kernels.ties`) finds out in one
-pass.
+and lead to pairs that are alike, then what the best actions collect is the same sequence of rewards for ever, so their
+values are the same number: any choice among them solves the same equations, one for each class of pairs. Under sticky
+actions the action that is repeated must lead on alike as well. A map from values to rewards and next values
+(`kernels.ties`) finds out in one pass.
 """
 
 from collections.abc import Iterator

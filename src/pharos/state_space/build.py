@@ -45,9 +45,8 @@ def build(
 
         Cost only (the files are the same, byte for byte):
         memory: bytes that states and table may take; None for as much as there is. Beyond them the table is on disk, in
-        a file
-            without a name in `folder` of 23 to 46 bytes a state (11 to 23 more for each further word), which is gone in
-            the end.
+            a file without a name in `folder` of 23 to 46 bytes a state (11 to 23 more for each further word), which is
+            gone in the end.
         workers: threads, or processes where rules are interpreted; None for all processors.
         progress: None for a bar on a terminal; False for silence; or a function that gets a BuildProgress now and then.
         checkpoint_seconds: at most this much work is lost when the process is killed.

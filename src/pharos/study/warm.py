@@ -1,8 +1,7 @@
 """Loaded once by the process from which the workers of a study are forked: a run then starts in milliseconds.
 
 Everything a run imports, and a few steps of training, which makes PyTorch and Stable-Baselines3 load what they load
-late.
-One thread only, by the variables with which it is started: a process with threads must not be forked.
+late. One thread only, by the variables with which it is started: a process with threads must not be forked.
 """
 
 import contextlib

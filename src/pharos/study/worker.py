@@ -5,8 +5,7 @@
     DIR/locks/ID/     held by the process that runs it
 
 A process that is killed leaves a folder in `partial`, which the next attempt throws away, unless its result is
-complete, or
-unless it is to be resumed: then the runner finds there what it wrote before.
+complete, or unless it is to be resumed: then the runner finds there what it wrote before.
 """
 
 import contextlib
@@ -88,8 +87,7 @@ def attempt(
     """Execute one run unless it is finished already; FINISHED, FAILED or BUSY (another process is at it).
 
     A run that raises is FAILED: its error stands in run.json and its log; `again` repeats such runs. With `resume` the
-        runner
-    gets what an attempt that was killed left behind, else an empty folder.
+    runner gets what an attempt that was killed left behind, else an empty folder.
     """
     holder = folder / "locks" / id
     holder.mkdir(parents=True, exist_ok=True)
