@@ -123,8 +123,8 @@ def _known_class(source: Source, cls: Any) -> type[Environment]:
         )
     if not isinstance(cls, type) or not issubclass(cls, Environment):
         raise ParameterError(
-            f"{source.name!r}: found {cls!r}; "
-            f"expected 'module:Class' or 'file.py:Class' of a subclass of pharos.Environment"
+            f"{source.name!r}: found {cls!r}; expected 'module:Class' or 'file.py:Class' of a subclass of "
+            "pharos.Environment"
         )
     return cls if _is_built_in(cls) else register(cls)
 

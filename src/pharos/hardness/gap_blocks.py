@@ -124,8 +124,7 @@ def _all_steps(mdp: TabularMDP, solution: Solution) -> np.ndarray:
         if needed > _MEMORY:
             raise ParameterError(
                 f"gaps of {solution.horizon} steps of {mdp.num_states} states need {needed / 2**30:.1f} GiB; expected "
-                f"at most "
-                f"{_MEMORY / 2**30:.0f}: leave out the horizon, or make it or the space smaller"
+                f"at most {_MEMORY / 2**30:.0f}: leave out the horizon, or make it or the space smaller"
             )
         solution = value_iteration(mdp, horizon=solution.horizon, keep_all=True)
     assert solution.all_steps is not None

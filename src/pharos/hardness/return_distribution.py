@@ -116,8 +116,7 @@ def _backward(mdp: TabularMDP, policy: Any, steps: int) -> Iterator[tuple[np.nda
         if 8 * states * num_actions * len(following) * 3 > MEMORY:
             raise UndefinedMeasure(
                 f"return_distribution: {len(following)} returns are possible in {steps - t} steps from {states} "
-                "states, more than "
-                f"{MEMORY / 2**30:.0f} GiB hold; a smaller horizon or instance would define it"
+                f"states, more than {MEMORY / 2**30:.0f} GiB hold; a smaller horizon or instance would define it"
             )
         executed = np.zeros((states, num_actions, len(following)))
         after = mdp.dynamics.expected(values)

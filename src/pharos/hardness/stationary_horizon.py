@@ -86,9 +86,8 @@ def stationary_effective_horizon(
     tie = max(1e-9, 1.25 * floor) if tie_tolerance is None else float(tie_tolerance)
     if not tie > floor:
         raise PrecisionError(
-            f"tie_tolerance is {tie_tolerance!r}; expected more than twice the error of the values, "
-            f"{floor:.3g}: raise it, or "
-            f"solve with a smaller tolerance"
+            f"tie_tolerance is {tie_tolerance!r}; expected more than twice the error of the values, {floor:.3g}: raise "
+            "it, or solve with a smaller tolerance"
         )
     slack = max(1e-12, 2 * floor)
     optimal = nodes.best >= nodes.best.max(axis=1, keepdims=True) - tie

@@ -55,9 +55,8 @@ class Steps:
         needed = 40 * steps * size * mdp.num_actions
         if needed > MEMORY:
             raise UndefinedMeasure(
-                f"effective_horizon: {steps} steps of the {size} nodes that they can meet need "
-                f"{needed / 2**30:.1f} GiB, "
-                f"more than {MEMORY / 2**30:.0f}; a smaller horizon or instance would define it"
+                f"effective_horizon: {steps} steps of the {size} nodes that they can meet need {needed / 2**30:.1f} "
+                f"GiB, more than {MEMORY / 2**30:.0f}; a smaller horizon or instance would define it"
             )
         choices = choices_of(mdp, restart=False)
         self.matrix, self.num_actions, self.steps = choices.matrix, mdp.num_actions, steps

@@ -184,8 +184,8 @@ def observe(
         made, known = FunctionObservation(env, *observation), []
     elif not isinstance(observation, str):
         raise ParameterError(
-            f"observation is {observation!r}; "
-            f"expected one of {', '.join(names())}, or a pair (function, Gymnasium space)"
+            f"observation is {observation!r}; expected one of {', '.join(names())}, or a pair (function, Gymnasium "
+            "space)"
         )
     elif observation in _registered:
         made, known = FunctionObservation(env, *_registered[observation], name=observation), []

@@ -176,9 +176,8 @@ def _in_one_pass(backup: Backup, tolerance: float, progress: Callable[[int, floa
     order = mdp.order()
     if order is None:
         raise DivergenceError(
-            f"{mdp}: gamma is 1, there is no horizon, and some states can be visited again and again, so the "
-            "value may be "
-            f"infinite; give a horizon (the environment's time limit, say), or gamma < 1"
+            f"{mdp}: gamma is 1, there is no horizon, and some states can be visited again and again, so the value may "
+            "be infinite; give a horizon (the environment's time limit, say), or gamma < 1"
         )
     x, backups = backup.zeros(), order.longest + 1
     with np.errstate(over="ignore", invalid="ignore"):
@@ -195,9 +194,8 @@ def _in_one_pass(backup: Backup, tolerance: float, progress: Callable[[int, floa
 def _imprecise(mdp: TabularMDP, bound: float, tolerance: float) -> PrecisionError:
     if not math.isfinite(bound):
         return PrecisionError(
-            f"{mdp}: 64-bit floats give no bound at gamma = {mdp.gamma!r}: values pass 1.8e308, or "
-            "probabilities sum to "
-            f"1 / gamma or more; lower gamma or the rewards"
+            f"{mdp}: 64-bit floats give no bound at gamma = {mdp.gamma!r}: values pass 1.8e308, or probabilities sum "
+            "to 1 / gamma or more; lower gamma or the rewards"
         )
     return PrecisionError(
         f"{mdp}: 64-bit floats reach a bound of {bound:.2g} at gamma = {mdp.gamma!r}; asked for {tolerance:.2g}: "

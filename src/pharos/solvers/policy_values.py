@@ -65,9 +65,8 @@ def _on_its_graph(mdp: TabularMDP, select: PolicyTable, watch: Stopwatch) -> Sol
     x[:-1, 0], infinite = chain_values(mdp.gamma, successor, reward)
     if infinite >= 0:
         raise DivergenceError(
-            f"{mdp}: gamma is 1, there is no horizon, and the policy goes round in a cycle through state "
-            f"{infinite} that pays; "
-            f"give a horizon, or gamma < 1"
+            f"{mdp}: gamma is 1, there is no horizon, and the policy goes round in a cycle through state {infinite} "
+            "that pays; give a horizon, or gamma < 1"
         )
     bound = chain_bound(mdp, select, x, successor, reward)
     return Solution(mdp, bound, 1, watch.seconds, None, select, x, x)

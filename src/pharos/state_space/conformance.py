@@ -253,9 +253,8 @@ def _check_compiled_drawings(check: InterpretedCheck, states: list[State], notes
         if (drawn != check.drawings[state]).any():
             layer, row, column = (int(i) for i in np.argwhere(drawn != check.drawings[state])[0])
             raise RuleError(
-                f"{check.where('draw', state)} writes {drawn[layer, row, column]} "
-                f"at [{layer}, {row}, {column}] compiled, "
-                f"{check.drawings[state][layer, row, column]} interpreted; expected the same"
+                f"{check.where('draw', state)} writes {drawn[layer, row, column]} at [{layer}, {row}, {column}] "
+                f"compiled, {check.drawings[state][layer, row, column]} interpreted; expected the same"
             )
 
 

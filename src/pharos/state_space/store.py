@@ -334,7 +334,6 @@ def _environment_of(folder: Path, manifest: dict[str, Any]) -> Environment | Non
         if identity.get(key) != manifest.get(key):
             raise StateSpaceMismatch(
                 f"{folder}: {key} of {env.name} is {manifest.get(key)} in the folder and {identity.get(key)} in this "
-                f"pharos; "
-                f"build again"
+                "pharos; build again"
             )
     return env

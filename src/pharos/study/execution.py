@@ -219,8 +219,7 @@ class Execution:
         if self.lost_servers > LOST_SERVERS:
             raise PharosError(
                 f"the process that starts runs died {many(self.lost_servers, 'time')} in a row "
-                f"({_worker.describe(error)}); "
-                f"was there memory enough?"
+                f"({_worker.describe(error)}); was there memory enough?"
             ) from error
         time.sleep(BUSY_SECONDS)
 

@@ -32,11 +32,9 @@ def _models_of(models: Models, results: Results, figures: Figures) -> dict[str, 
     fits = pd.DataFrame([_line(fit) for fit in models.fits])
     caption = (
         "Ordinary least squares, section 4.3 of the paper: equations 7 (single), 8 (representation) and 9 (class). R² "
-        "outside is "
-        "for each task by the model fitted on the others; the condition number is that of the standardised "
-        "predictors, above 30 the "
-        "coefficients cannot be told apart; influence is the largest Cook's distance. Significant: p < 0.05, a task "
-        "counted once."
+        "outside is for each task by the model fitted on the others; the condition number is that of the standardised "
+        "predictors, above 30 the coefficients cannot be told apart; influence is the largest Cook's distance. "
+        "Significant: p < 0.05, a task counted once."
     )
     values = {
         "class and representation alone, without measures": models.class_alone,

@@ -52,11 +52,10 @@ def _summary(results: Results) -> Section:
     failed = f", {now.failed} failed" if now.failed else ""
     lines = [
         f"{now.finished:,} of {many(now.total, 'run')} {'is' if now.total == 1 else 'are'} finished{failed}: "
-        f"{many(runs['instance'].nunique(), 'instance')} of "
-        f"{many(runs['environment'].nunique(), 'class', 'classes')}, {many(runs['chance'].nunique(), 'kind')} of "
-        f"chance, "
-        f"{many(runs['agent'].nunique(), 'agent')}, {many(runs['seed'].nunique(), 'seed')}; "
-        f"{int(runs['steps'].sum()):,} steps, which took one processor {duration(runs['seconds'].sum())}."
+        f"{many(runs['instance'].nunique(), 'instance')} of {many(runs['environment'].nunique(), 'class', 'classes')}, "
+        f"{many(runs['chance'].nunique(), 'kind')} of chance, {many(runs['agent'].nunique(), 'agent')}, "
+        f"{many(runs['seed'].nunique(), 'seed')}; {int(runs['steps'].sum()):,} steps, which took one processor "
+        f"{duration(runs['seconds'].sum())}."
     ]
     if (estimated := _estimated(runs)) is not None:
         lines.append(estimated)
@@ -65,9 +64,8 @@ def _summary(results: Results) -> Section:
         printed = "; the paper prints 0.09" if results.comparison is not None else ""
         lines.append(
             f"One linear model of {agent_name(results.models[0].agent)}'s cumulative regret over all classes and "
-            f"representations "
-            f"explains R² = {main.r_squared:.2f} of it ({main.cross_validated_r_squared:.2f} for tasks it has not "
-            f"seen){printed}."
+            f"representations explains R² = {main.r_squared:.2f} of it ({main.cross_validated_r_squared:.2f} for tasks "
+            f"it has not seen){printed}."
         )
     if results.comparison is not None:
         returns = results.comparison.returns
@@ -90,10 +88,9 @@ def _estimated(runs: "pd.DataFrame") -> str | None:
     of = ", ".join(f"{agent_name(agent)} on {title(name)} ({count})" for (name, agent), count in groups.items())
     return (
         f"The regret of {many(len(estimates), 'run')} of {len(runs):,} is estimated by playing, because the policy "
-        f"reaches too "
-        f"many states for an exact value: {of}. Their normalised regret may be off by up to ± "
-        f"{estimates['half_width'].max():.4f} "
-        f"if all errors of a run add up; tables mark them by ≈. All other regret is exact."
+        f"reaches too many states for an exact value: {of}. Their normalised regret may be off by up to ± "
+        f"{estimates['half_width'].max():.4f} if all errors of a run add up; tables mark them by ≈. All other regret "
+        "is exact."
     )
 
 
@@ -111,8 +108,7 @@ def _findings(results: Results) -> Section | None:
         table=table(
             decided,
             "What the paper says in words, and the same from these runs. Undecided: not significant at 0.05; no "
-            "correction for the "
-            "number of tests. Every test counts a task once. How each is tested: docs/study.md.",
+            "correction for the number of tests. Every test counts a task once. How each is tested: docs/study.md.",
         ),
     )
 
@@ -142,9 +138,8 @@ def _regret(results: Results, figures: Figures) -> Section:
         table=table(
             shown[columns],
             "Interquartile mean of the normalised regret (0: optimal from the first episode on; 1: as bad as acting "
-            "at random) and "
-            "its 95 % stratified bootstrap interval. With few seeds such intervals are too narrow. ≈: some values are "
-            "estimated.",
+            "at random) and its 95 % stratified bootstrap interval. With few seeds such intervals are too narrow. ≈: "
+            "some values are estimated.",
         ),
     )
 
@@ -159,14 +154,12 @@ def _representations(results: Results, figures: Figures, left_out: list[str]) ->
         harder = (wide[seen] > wide[VECTOR]).groupby(level="environment").agg(["sum", "size"])
         lines = [
             f"{title(str(name))}: the {title(seen) if seen != IMAGE else 'image'} costs {agent_name(agent)} more "
-            f"regret in "
-            f"{row['sum']} of {row['size']} tasks"
+            f"regret in {row['sum']} of {row['size']} tasks"
             for name, row in harder.iterrows()
         ]
         caption = (
             f"Normalised regret of {agent_name(agent)} that sees a vector against that of {agent_name(agent)} that "
-            f"sees an image, "
-            f"a point for each instance and kind of chance. Below the dotted line the image is harder."
+            "sees an image, a point for each instance and kind of chance. Below the dotted line the image is harder."
         )
         if results.comparison is not None and agent == "dqn":
             caption += " The paper's figure 3."
@@ -194,10 +187,8 @@ def _aliasing(results: Results) -> Section | None:
         "States that share an observation",
         "aliasing",
         text="These observations do not tell every state: an agent that remembers nothing cannot act differently in "
-        "states that look "
-        "alike, and learns from targets that mix them. Regret is measured against the optimal policy of the states. "
-        "So where "
-        "vectors and images are compared, a part of the difference may be this.",
+        "states that look alike, and learns from targets that mix them. Regret is measured against the optimal policy "
+        "of the states. So where vectors and images are compared, a part of the difference may be this.",
         table=table(
             shown,
             "Reachable states, different observations among them, and the share of states that look like another.",
@@ -216,8 +207,7 @@ def _hardness(results: Results) -> Section:
         table=table(
             results.hardness,
             "The tabular measures of each instance under each kind of chance, as they enter the models; notes say "
-            "where one is of the "
-            "instance without chance, or stands for a proven interval.",
+            "where one is of the instance without chance, or stands for a proven interval.",
         ),
         complete=complete,
     )
@@ -262,13 +252,11 @@ def _beside(results: Results) -> Section | None:
     if len(fits) == len(returns) == 0:
         return None
     text = (
-        f"Returns: {len(returns)} of {len(results.comparison.returns)} printed values have one of ours; the "
-        f"difference is "
-        f"{returns['difference'].mean():+.2f} in the mean, and {returns['difference'].abs().median():.2f} in the "
-        f"middle case. The "
-        f"paper trains 50 thousand steps on grids and lakes, else 600 thousand; it prints no rewards, discounts, "
-        f"probabilities of "
-        f"chance, or what of a run its returns are means of: differences are to be expected."
+        f"Returns: {len(returns)} of {len(results.comparison.returns)} printed values have one of ours; the difference "
+        f"is {returns['difference'].mean():+.2f} in the mean, and {returns['difference'].abs().median():.2f} in the "
+        "middle case. The paper trains 50 thousand steps on grids and lakes, else 600 thousand; it prints no rewards, "
+        "discounts, probabilities of chance, or what of a run its returns are means of: differences are to be "
+        "expected."
     )
     caption = "R² and correlation: printed, ours, and the difference, for both kinds of regret."
     return Section.of(
@@ -314,9 +302,8 @@ def _each_instance(results: Results, figures: Figures) -> Section:
     parts = []
     for environment in dict.fromkeys(results.runs["environment"]):
         caption = (
-            f"Cumulative regret on each instance of {title(environment)} under each kind of chance: the mean, its 95 "
-            f"% bootstrap "
-            f"interval, and thin a line for each seed."
+            f"Cumulative regret on each instance of {title(environment)} under each kind of chance: the mean, its 95 % "
+            "bootstrap interval, and thin a line for each seed."
         )
         drawn = image(figures, f"regret_by_task_{slug(environment)}", caption)
         parts.append({"title": f"{title(environment)}, each kind of chance and each seed", "figure": drawn})
