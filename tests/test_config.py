@@ -118,7 +118,7 @@ def test_a_horizon_is_a_number_the_limit_of_the_environment_or_none():
     lake = pharos.make("frozen_lake/4x4")
     settings = (7, "limit", "default", "none", None, Horizon(3))
     assert [Horizon.of(setting).steps(lake) for setting in settings] == [7, 100, 100, None, None, 3]
-    for wrong in (0, -1, True, 1.5, "never"):
+    for wrong in (0, -1, True, 1.5, "never", 2**31):
         with pytest.raises(ParameterError, match="expected a number of steps, limit"):
             Horizon.of(wrong)
 

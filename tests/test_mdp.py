@@ -125,6 +125,7 @@ def test_a_row_of_minus_one_that_pays_is_no_terminal_state():
         ({"initial": 2}, "initial names state 2"),
         ({"initial": [0.5, 0.6]}, "sum to 1"),
         ({"horizon": 0}, "horizon"),
+        ({"horizon": 2**31}, "horizon"),
         ({"terminal": [True, False]}, "terminal"),
     ],
 )

@@ -143,7 +143,7 @@ def test_a_spoilt_file_of_kept_results_is_replaced(text):
 
 
 def test_a_horizon_must_be_a_number_of_steps():
-    for horizon in (0, -1, 2.5, True):
+    for horizon in (0, -1, 2.5, True, 2**31):
         with pytest.raises(ParameterError, match="whole number of steps"):
             hardness.report(corridor(), horizon=horizon)
 

@@ -133,10 +133,11 @@ class Horizon:
             return Horizon("limit")
         if setting is None or setting == "none":
             return Horizon("none")
-        if isinstance(setting, int) and not isinstance(setting, bool) and setting >= 1:
+        if isinstance(setting, int) and not isinstance(setting, bool) and 1 <= setting < 2**31:
             return Horizon(setting)
         raise ParameterError(
             f"horizon: found {setting!r}; expected a number of steps, limit (the environment's), or none"
+            + (" (a number below 2^31)" if isinstance(setting, int) and setting >= 2**31 else "")
         )
 
     def steps(self, env: Environment) -> int | None:

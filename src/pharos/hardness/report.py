@@ -137,8 +137,11 @@ def report(
     """
     watch = Stopwatch()
     horizon = mdp.horizon if horizon is None else horizon
-    if horizon is not None and (isinstance(horizon, bool) or not isinstance(horizon, int | np.integer) or horizon < 1):
-        raise ParameterError(f"horizon is {horizon!r}; expected a whole number of steps, at least 1, or None")
+    is_number = isinstance(horizon, int | np.integer) and not isinstance(horizon, bool)
+    if horizon is not None and not (is_number and 1 <= horizon < 2**31):
+        raise ParameterError(
+            f"horizon is {horizon!r}; expected a whole number of steps, at least 1 and below 2^31, or None"
+        )
     wanted = chosen(measures)
     problem = Problem(mdp, horizon, tolerance, restart, Budget.of(budget), progress)
     conventions = _conventions(problem)

@@ -37,8 +37,10 @@ def check_gamma(gamma: Any) -> None:
 
 def check_horizon(horizon: Any) -> None:
     """ParameterError unless it is a number of steps, or None."""
-    if horizon is not None and not (isinstance(horizon, int | np.integer) and horizon >= 1):
-        raise ParameterError(f"horizon is {horizon!r}; expected a whole number of steps, at least 1, or None")
+    if horizon is not None and not (isinstance(horizon, int | np.integer) and 1 <= horizon < 2**31):
+        raise ParameterError(
+            f"horizon is {horizon!r}; expected a whole number of steps, at least 1 and below 2^31, or None"
+        )
 
 
 def rewards_of_shape(rewards: Any, shape: tuple[int, ...]) -> Rewards:
