@@ -1,6 +1,7 @@
 """Bisimulation: the coarsest partition by brute force, values that are kept, published minimal MDPs."""
 
 import itertools
+import time
 from pathlib import Path
 
 import numpy as np
@@ -173,3 +174,22 @@ def test_observations_must_be_one_a_state():
     mdp = pharos.build(pharos.make("frozen_lake/4x4")).mdp()
     with pytest.raises(ParameterError, match="one for each state"):
         minimize(mdp, np.zeros(3))
+
+
+def long_river(length):
+    """Two actions, which may both stay where they are: ends are told from each other after as many steps as there are
+    states."""
+    s = np.arange(length)
+    ways = [np.stack([np.clip(s + step, 0, length - 1), s], axis=1) for step in (1, -1)]
+    successors = np.stack(ways, axis=1)
+    rewards = np.zeros((length, 2))
+    rewards[-1] = 1.0
+    return TabularMDP.from_outcomes(successors, np.broadcast_to([0.8, 0.2], successors.shape).copy(), rewards)
+
+
+def test_a_river_of_twenty_thousand_states_takes_as_many_rounds_and_no_longer_than_a_second():
+    minimize(long_river(3))  # compiles
+    started = time.process_time()
+    found = minimize(long_river(20_000))
+    assert found.num_classes == 20_000 and found.rounds == 19_999
+    assert time.process_time() - started < 1

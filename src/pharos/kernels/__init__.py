@@ -29,6 +29,7 @@ __all__ = [
     "partition",
     "paths",
     "philox",
+    "refinement",
     "stepping",
     "symmetry",
     "tails",

