@@ -1,7 +1,7 @@
 """pharos hardness: all measures of one instance in a table, with exactness and sources."""
 
 import math
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -20,11 +20,18 @@ from pharos.cli.common import (
     compiling_fact,
     console,
     describe_chance,
+    parse_parameters,
     parse_target,
     print_json,
     progress_line,
 )
+from pharos.errors import ParameterError
 from pharos.wording import many
+
+if TYPE_CHECKING:
+    from pharos.cli.common import Target
+    from pharos.hardness import Representation
+    from pharos.mdp import TabularMDP
 
 # What the column "exact" says of each kind of certificate.
 PROVEN = {"exact": "yes", "interval": "interval", "float64": "float64"}
@@ -64,6 +71,29 @@ def hardness(
     budget: Annotated[
         float, typer.Option("--budget", min=0, help="Seconds a measure may take before it gives a proven interval.")
     ] = 300.0,
+    observation: Annotated[
+        str | None,
+        typer.Option(
+            "--observation", help="What the agent sees, as of train: adds measures of what its network makes of it."
+        ),
+    ] = None,
+    option: Annotated[
+        list[str] | None,
+        typer.Option("--option", metavar="NAME=VALUE", help="Option of the observation, such as hide=row."),
+    ] = None,
+    network: Annotated[
+        str | None,
+        typer.Option("--network", help="mlp128, mlp128x2, cnn16, nature; that of the agents when not given."),
+    ] = None,
+    initialisation: Annotated[
+        str, typer.Option("--initialisation", help="Of the network: pytorch (as DQN has), or sb3 (as PPO and A2C).")
+    ] = "pytorch",
+    landmarks: Annotated[
+        int | None,
+        typer.Option(
+            "--landmarks", min=0, help="Approximate the kernel by so many; 0: never; beyond 4,096 when not given."
+        ),
+    ] = None,
     definitions: Annotated[bool, typer.Option("--definitions", help="Show definitions and sources.")] = False,
     latex: Annotated[bool, typer.Option("--latex", help="Print a LaTeX table.")] = False,
     fresh: Annotated[bool, typer.Option("--fresh", help="Compute anew what is kept beside the state space.")] = False,
@@ -78,6 +108,8 @@ def hardness(
         from pharos.hardness import chosen
 
         chosen(measures)  # an unknown name is told before anything is built
+    if observation is None and (option or network or landmarks is not None):
+        raise ParameterError("--option, --network and --landmarks go with --observation NAME")
     goal = parse_target(target, parameters)
     own = goal.is_imported  # an imported MDP has a discount and a horizon of its own
     mdp = goal.mdp(
@@ -88,6 +120,11 @@ def hardness(
         lazy=lazy,
         **building,
     )
+    seen = None
+    if observation is not None:
+        words = parse_parameters(option)
+        named = {"network": network, "initialisation": initialisation, "landmarks": landmarks}
+        mdp, seen = _represented(goal, mdp, observation, building, {**words, **named})
     from pharos.hardness import report as measure
 
     with progress_line("measuring") as tell:
@@ -100,6 +137,7 @@ def hardness(
             budget=budget,
             keep=not fresh,
             progress=lambda what, line: tell(f"{what}  {line}"),
+            representation=seen,
         )
     if json:
         print_json({**report.to_dict(), "compiling_seconds": compiling.seconds()})
@@ -108,6 +146,21 @@ def hardness(
     else:
         chance = describe_chance(sticky, random, mdp.dynamics.has_chance, lazy)
         _print(" ".join((target, *(parameters or ()))), report, chance, definitions)
+
+
+def _represented(
+    goal: "Target", mdp: "TabularMDP", observation: str, building: dict[str, Any], options: dict[str, Any]
+) -> "tuple[TabularMDP, Representation]":
+    """The MDP with its states numbered as in the state space, and what is seen of them."""
+    from pharos.observations import representation
+
+    space = goal.space(**building)
+    if goal.is_imported:  # its table has an order of its own
+        from dataclasses import replace
+
+        mdp = replace(space.mdp(gamma=mdp.gamma).with_horizon(mdp.horizon), chance=mdp.chance)
+    with progress_line("observing"):
+        return mdp, representation(space, observation, **options)
 
 
 def _print(title: str, report: Any, chance: str, definitions: bool) -> None:

@@ -11,14 +11,24 @@ from pharos.hardness.colosseum import colosseum_diameter
 from pharos.hardness.covering import Covering, covering
 from pharos.hardness.diameter import diameter, start_eccentricity, start_eccentricity_interval
 from pharos.hardness.effective_horizon import EffectiveHorizon, effective_horizon
+from pharos.hardness.exploration_time import ExplorationTime, exploration_time
 from pharos.hardness.gaps import Gaps, gaps, minimal_gap, sum_of_reciprocal_gaps
 from pharos.hardness.gorp import GorpBound, GorpRuns, gorp_bound, run_gorp
 from pharos.hardness.interval import Budget, Certificate, Certified, Interval, Progress
+from pharos.hardness.kernel_regret import KernelRegret, kernel_regret
+from pharos.hardness.kernel_spectrum import (
+    Spectral,
+    aliasing_floor,
+    kernel_learning_time,
+    kernel_sample_complexity,
+)
+from pharos.hardness.mean_field import LearningCurve, Schedule
 from pharos.hardness.mismatch import distribution_mismatch
 from pharos.hardness.mixing_time import MixingTime, mixing_time
 from pharos.hardness.occupancy import Occupancy, occupancy
 from pharos.hardness.registry import Measure, Problem, chosen, measures, register
 from pharos.hardness.report import Report, Result, report
+from pharos.hardness.representation import Representation
 from pharos.hardness.return_distribution import ReturnDistribution, return_distribution
 from pharos.hardness.stationary_horizon import StationaryHorizon, stationary_effective_horizon
 from pharos.hardness.value_norm import environmental_value_norm
@@ -30,20 +40,27 @@ __all__ = [
     "Certified",
     "Covering",
     "EffectiveHorizon",
+    "ExplorationTime",
     "Gaps",
     "GorpBound",
     "GorpRuns",
     "Interval",
+    "KernelRegret",
+    "LearningCurve",
     "Measure",
     "MixingTime",
     "Occupancy",
     "Problem",
     "Progress",
     "Report",
+    "Representation",
     "Result",
     "ReturnDistribution",
+    "Schedule",
+    "Spectral",
     "StationaryHorizon",
     "action_gap_regularity",
+    "aliasing_floor",
     "chosen",
     "colosseum_diameter",
     "covering",
@@ -51,8 +68,12 @@ __all__ = [
     "distribution_mismatch",
     "effective_horizon",
     "environmental_value_norm",
+    "exploration_time",
     "gaps",
     "gorp_bound",
+    "kernel_learning_time",
+    "kernel_regret",
+    "kernel_sample_complexity",
     "measures",
     "minimal_gap",
     "mixing_time",

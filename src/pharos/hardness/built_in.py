@@ -8,8 +8,11 @@ from pharos.hardness.action_gap import action_gap_regularity
 from pharos.hardness.covering import covering
 from pharos.hardness.diameter import diameter, start_eccentricity_interval
 from pharos.hardness.effective_horizon import effective_horizon
+from pharos.hardness.exploration_time import exploration_time
 from pharos.hardness.gorp import gorp_bound
 from pharos.hardness.interval import Certified
+from pharos.hardness.kernel_regret import kernel_regret
+from pharos.hardness.kernel_spectrum import aliasing_floor, kernel_learning_time, kernel_sample_complexity
 from pharos.hardness.mismatch import distribution_mismatch
 from pharos.hardness.mixing_time import mixing_time
 from pharos.hardness.registry import Problem, register
@@ -162,5 +165,74 @@ register(
     complexity="planning",
     version=1,
     depends="all",
+    on_request=True,
+)
+register(
+    "exploration_time",
+    lambda problem: exploration_time(problem.mdp, horizon=problem.episode("exploration_time")),
+    definition="expected steps after which uniform play, in episodes of T steps, meets a reward above half the largest",
+    source="pharos",
+    complexity="visitation",
+    version=1,
+    depends="episodes",
+    on_request=True,
+)
+
+
+def _of_representation(function: Any) -> Any:
+    """A measure of what the agent sees, as a report takes it."""
+
+    def measure(problem: Problem) -> Any:
+        seen = problem.seen(function.__name__)
+        return function(problem.mdp, seen, schedule=problem.schedule, horizon=problem.horizon)
+
+    return measure
+
+
+register(
+    "kernel_regret",
+    lambda problem: kernel_regret(
+        problem.mdp,
+        problem.seen("kernel_regret"),
+        schedule=problem.schedule,
+        solution=problem.solution,
+        horizon=problem.horizon,
+    ),
+    definition="mean over learning of (V* - V of the greedy policy) / (V* - V of uniform play) of expected Q-learning "
+    "in the tangent kernel of the agent's network; as played; and both of tabular Q-learning",
+    source="pharos; after Sirignano and Spiliopoulos (2019)",
+    complexity="representation",
+    version=1,
+    depends="representation",
+    on_request=True,
+)
+register(
+    "kernel_learning_time",
+    _of_representation(kernel_learning_time),
+    definition="time after which gradient flow in the kernel (trace 1) has learnt 90 % of the energy of A* = Q* - V*",
+    source="pharos; Jacot, Gabriel and Hongler (2018)",
+    complexity="representation",
+    version=1,
+    depends="representation",
+    on_request=True,
+)
+register(
+    "kernel_sample_complexity",
+    _of_representation(kernel_sample_complexity),
+    definition="samples from which kernel regression explains 90 % of the variance of Q*",
+    source="Simon, Dickens, Karkada and DeWeese (2023)",
+    complexity="representation",
+    version=1,
+    depends="representation",
+    on_request=True,
+)
+register(
+    "aliasing_floor",
+    _of_representation(aliasing_floor),
+    definition="E Var(Q* | observation) / Var Q*: what no function of the observation explains",
+    source="pharos",
+    complexity="representation",
+    version=1,
+    depends="representation",
     on_request=True,
 )

@@ -140,7 +140,7 @@ class Certificate:
 def certificate_of(outcome: Any) -> Certificate:
     """What a measure's result says of itself: by `exact`, `lower`, `upper` and `note`, where it has them."""
     if not hasattr(outcome, "exact"):
-        return Certificate("float64")
+        return Certificate("float64", note=getattr(outcome, "note", ""))
     kind = "exact" if outcome.exact else "interval"
     lower, upper = getattr(outcome, "lower", None), getattr(outcome, "upper", None)
     note = getattr(outcome, "note", "")

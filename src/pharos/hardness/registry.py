@@ -9,6 +9,8 @@ from typing import Any
 from pharos.errors import ParameterError, PrecisionError, UndefinedMeasure, UnknownName
 from pharos.hardness.gaps import Gaps, resolved_gaps
 from pharos.hardness.interval import Budget, Progress
+from pharos.hardness.mean_field import Schedule
+from pharos.hardness.representation import Representation
 from pharos.mdp import TabularMDP
 from pharos.solvers import Solution, value_iteration
 
@@ -24,6 +26,8 @@ class Problem:
         restart: convention of the diameter: terminal states lead back to the start.
         budget: what each measure may spend before it returns a proven interval.
         progress: called with the name of the running measure and a line on how far it is.
+        representation: what the agent's network makes of the states, for measures that need one; or None.
+        schedule: of the idealised learner.
     """
 
     mdp: TabularMDP
@@ -32,6 +36,8 @@ class Problem:
     restart: bool = True
     budget: Budget = field(default_factory=Budget)
     progress: Callable[[str, str], None] | None = None
+    representation: Representation | None = None
+    schedule: Schedule = field(default_factory=Schedule)
 
     @cached_property
     def solution(self) -> Solution:
@@ -61,6 +67,12 @@ class Problem:
         if self.horizon is None:
             raise UndefinedMeasure(f"{measure} is defined for episodes of T steps: give a horizon")
         return self.horizon
+
+    def seen(self, measure: str) -> Representation:
+        """The representation; UndefinedMeasure where there is none."""
+        if self.representation is None:
+            raise UndefinedMeasure(f"{measure} is of what an agent sees: give an observation and a network")
+        return self.representation
 
     def report(self, what: str, line: str) -> None:
         """Report progress."""
@@ -97,11 +109,12 @@ class Measure:
             nothing, and the report says so: "float64". `Certified` is a number that has them.
         definition: formula, in a line.
         source: who defined it.
-        complexity: "visitation", "estimation", "planning" or "other".
+        complexity: "visitation", "estimation", "planning", "representation" or "other".
         version: goes up when the function's results change, so that kept ones are not used; None: never keep results.
         depends: on what results depend, beside the transitions, chance and start: "structure" (nothing else), "values"
-            (rewards, gamma), "episodes" (rewards, horizon), "all".
-        on_request: only part of a report where it is named, or where all are asked for.
+            (rewards, gamma), "episodes" (rewards, horizon), "all" (these), "representation" (what the agent sees, too).
+        on_request: only part of a report where it is named, or where all are asked for; if it depends on the
+            representation, also where one is given.
     """
 
     name: str
@@ -165,14 +178,18 @@ def measures() -> dict[str, Measure]:
     return dict(_MEASURES)
 
 
-def chosen(names: Any) -> list[Measure]:
+def chosen(names: Any, is_seen: bool = False) -> list[Measure]:
     """The measures of these names; None: all but those on request; "all": these as well.
+
+    Args:
+        is_seen: whether there is a representation; without names, measures of it are among them then.
 
     Raises:
         UnknownName: there is no such measure; the nearest is suggested.
     """
     if names is None:
-        return [measure for measure in _MEASURES.values() if not measure.on_request]
+        wanted = _MEASURES.values()
+        return [each for each in wanted if not each.on_request or (is_seen and each.depends == "representation")]
     if names == "all":
         return list(_MEASURES.values())
     if isinstance(names, str):

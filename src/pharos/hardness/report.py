@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -10,7 +10,9 @@ import numpy as np
 from pharos.compiling import Stopwatch
 from pharos.errors import ParameterError, PrecisionError, UndefinedMeasure
 from pharos.hardness.interval import Budget, Certificate, Certified, certificate_of
+from pharos.hardness.mean_field import Schedule
 from pharos.hardness.registry import Measure, Problem, chosen
+from pharos.hardness.representation import Representation
 from pharos.hardness.results_file import ResultsFile
 from pharos.mdp import TabularMDP, takes_mdp
 
@@ -114,6 +116,8 @@ def report(
     budget: Budget | float | None = None,
     keep: bool = True,
     progress: Callable[[str, str], None] | None = None,
+    representation: Representation | None = None,
+    schedule: Schedule | None = None,
 ) -> Report:
     """Measure how hard an MDP is.
 
@@ -129,6 +133,9 @@ def report(
         keep: use results kept beside the state space, and keep new ones there. Nothing is kept where there is no
             folder.
         progress: called with the name of the running measure and a line on how far it is.
+        representation: what the agent's network makes of the states, `pharos.observations.representation`; with one,
+            measures of it are part of the report.
+        schedule: of the idealised learner that these have.
     Returns:
         A Report. A measure that does not exist for this MDP says why; the others are there.
     Raises:
@@ -142,8 +149,9 @@ def report(
         raise ParameterError(
             f"horizon is {horizon!r}; expected a whole number of steps, at least 1 and below 2^31, or None"
         )
-    wanted = chosen(measures)
-    problem = Problem(mdp, horizon, tolerance, restart, Budget.of(budget), progress)
+    wanted = chosen(measures, representation is not None)
+    schedule = schedule or Schedule()
+    problem = Problem(mdp, horizon, tolerance, restart, Budget.of(budget), progress, representation, schedule)
     conventions = _conventions(problem)
     file = ResultsFile(mdp, conventions) if keep else None
     results = {measure.name: _measured(measure, problem, file) for measure in wanted}
@@ -207,7 +215,12 @@ def _escape(text: str) -> str:
 def _conventions(problem: Problem) -> dict[str, Any]:
     mdp, chance = problem.mdp, problem.mdp.chance
     starts = [[int(s), float(p)] for s, p in zip(mdp.start_states[:100], mdp.start_probabilities, strict=False)]
+    seen = problem.representation
+    represented = (
+        {} if seen is None else {"representation": dict(seen.conventions), "schedule": asdict(problem.schedule)}
+    )
     return {
+        **represented,
         "gamma": float(mdp.gamma),
         "horizon": None if problem.horizon is None else int(problem.horizon),
         "horizon_of_values": mdp.horizon,

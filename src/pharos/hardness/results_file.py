@@ -20,7 +20,8 @@ from pharos.mdp import TabularMDP
 FILE = "hardness.json"
 FORMAT = 2
 
-# Conventions that the results of a measure depend on, by its `depends`; else all.
+# Conventions that the results of a measure depend on, by its `depends`; else all, but for these where it is "all".
+_OF_REPRESENTATIONS = ("representation", "schedule")
 _DEPENDS = {
     "structure": ("chance", "restart"),
     "values": ("chance", "gamma", "horizon_of_values", "tolerance"),
@@ -86,7 +87,10 @@ class ResultsFile:
             storage.replace_json(self.path, {"format": FORMAT, "results": results}, durable=False)
 
     def _key(self, measure: Measure) -> str:
-        keys = _DEPENDS.get(measure.depends, tuple(sorted(self.conventions)))
+        everything = tuple(sorted(self.conventions))
+        if measure.depends != "representation":
+            everything = tuple(key for key in everything if key not in _OF_REPRESENTATIONS)
+        keys = _DEPENDS.get(measure.depends, everything)
         conventions = json.dumps({key: self.conventions[key] for key in keys}, sort_keys=True)
         return f"{measure.name}/{measure.version}/{self._digest(conventions, measure.depends != 'structure')}"
 

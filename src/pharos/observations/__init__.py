@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from pharos.observations.networks import Network, default_network
     from pharos.observations.own import OwnObservation, imported, observation_of, own_observation
     from pharos.observations.rendered import RENDERERS, render, renderers
+    from pharos.observations.represented import representation
     from pharos.observations.simple_image import SimpleImage
     from pharos.observations.tangent_kernels import network_inputs, ntk, tangent_kernel
 
@@ -46,6 +47,7 @@ _FILES = {
     "own_observation": "own",
     "render": "rendered",
     "renderers": "rendered",
+    "representation": "represented",
     "tangent_kernel": "tangent_kernels",
 }
 
@@ -82,6 +84,7 @@ __all__ = [
     "register",
     "render",
     "renderers",
+    "representation",
     "tangent_kernel",
     "title",
 ]

@@ -1,0 +1,118 @@
+"""Products with a kernel: the kernel itself, the identity, or landmarks and a diagonal (Nyström)."""
+
+import math
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Any, Protocol
+
+import numpy as np
+
+MOST_LANCZOS = 60
+
+Kernel = Callable[[np.ndarray, np.ndarray], np.ndarray]
+
+
+class KernelOperator(Protocol):
+    """A positive semidefinite kernel K of C observations; z is (C, A) float32."""
+
+    def __call__(self, z: np.ndarray) -> np.ndarray:
+        """K z."""
+
+
+class Identity:
+    """No likeness between observations: a table."""
+
+    def __call__(self, z: np.ndarray) -> np.ndarray:
+        return z
+
+
+class Exact:
+    """The kernel itself, 4 C^2 bytes."""
+
+    def __init__(self, kernel: Kernel, states: np.ndarray):
+        self.matrix = np.ascontiguousarray(kernel(states, states), np.float32)
+
+    def __call__(self, z: np.ndarray) -> np.ndarray:
+        return self.matrix @ z
+
+
+class Landmarks:
+    """K ~ F F' + a diagonal, F = K(., L) K(L, L)^-1/2: exact between landmarks L and others, and on the diagonal.
+
+    The diagonal keeps what an observation learns for itself alone (Snelson and Ghahramani, 2006, for regression).
+    Source: Williams and Seeger (2001).
+    """
+
+    def __init__(self, kernel: Kernel, states: np.ndarray, landmarks: np.ndarray, block: int = 4096):
+        values, vectors = np.linalg.eigh(kernel(landmarks, landmarks).astype(np.float64))
+        kept = values > 1e-6 * values[-1]
+        root = (vectors[:, kept] / np.sqrt(values[kept])).astype(np.float32)
+        self.features = np.empty((len(states), int(kept.sum())), np.float32)
+        self.diagonal = np.empty((len(states), 1), np.float32)
+        for start in range(0, len(states), block):
+            rows = states[start : start + block]
+            part = kernel(rows, landmarks) @ root
+            self.features[start : start + block] = part
+            own = np.concatenate([np.diag(kernel(each, each)) for each in np.array_split(rows, len(rows) // 64 + 1)])
+            self.diagonal[start : start + block, 0] = np.maximum(own - np.einsum("nm,nm->n", part, part), 0.0)
+
+    def __call__(self, z: np.ndarray) -> np.ndarray:
+        return self.features @ (self.features.T @ z) + self.diagonal * z
+
+
+def largest_eigenvalue(apply: KernelOperator, weights: np.ndarray, vector: np.ndarray) -> float:
+    """The largest eigenvalue of K diag(weights), weights (C, 1), to 0.1 %, by Lanczos' method from `vector` (C, 1).
+
+    Returns it with the residual added, so that it is not too small; `vector` becomes the eigenvector found.
+    """
+    if isinstance(apply, Identity):
+        return float(weights.max())
+    root = np.sqrt(weights)
+    basis = [vector / np.linalg.norm(vector)]
+    diagonal: list[float] = []
+    beside: list[float] = []
+    while True:
+        after = root * apply(root * basis[-1])
+        diagonal.append(float((basis[-1] * after).sum()))
+        rows = np.concatenate(basis, axis=1)
+        after = after - rows @ (rows.T @ after)
+        after = after - rows @ (rows.T @ after)  # twice is enough (Parlett, 1998)
+        length = float(np.linalg.norm(after))
+        small = np.diag(diagonal) + np.diag(beside, 1) + np.diag(beside, -1)
+        values, vectors = np.linalg.eigh(small)
+        residual = length * abs(float(vectors[-1, -1]))
+        if residual <= 1e-3 * values[-1] or len(basis) == min(MOST_LANCZOS, len(vector)):
+            vector[:] = rows @ vectors[:, -1:].astype(np.float32)
+            return max(float(values[-1]), 0.0) + residual
+        basis.append(after / np.float32(length))
+        beside.append(length)
+
+
+def descended(apply: KernelOperator, weights: np.ndarray, error: np.ndarray, rate: float, steps: int) -> np.ndarray:
+    """What gradient descent adds to Q in `steps` steps Q += rate K (weights (target - Q)), where target - Q is `error`.
+
+    It is K times rate weights times the sum of the errors on the way, a polynomial of degree steps - 1 in
+    rate K diag(weights), whose eigenvalues lie in [0, 1]: a Chebyshev series of about 4 sqrt(steps) terms has it to
+    float32's accuracy. weights, error: (C, A) float32.
+    """
+    series = _sum_of_powers(steps)
+    past, now = error, error - 2 * rate * apply(weights * error)
+    total = series[0] * past
+    if len(series) > 1:
+        total = total + series[1] * now
+    for coefficient in series[2:]:
+        past, now = now, 2 * now - 4 * rate * apply(weights * now) - past
+        total += coefficient * now
+    return rate * apply(weights * total)
+
+
+@lru_cache(maxsize=16)
+def _sum_of_powers(steps: int) -> np.ndarray:
+    """Chebyshev coefficients in u = 1 - 2 x of the sum of (1 - x)^t, t < steps, on [0, 1]; float32."""
+    degree = min(steps - 1, math.ceil(3.5 * math.sqrt(steps)))
+
+    def total(u: Any) -> Any:
+        x = (1 - u) / 2
+        return np.where(x > 1e-9, -np.expm1(steps * np.log1p(-np.minimum(x, 1 - 1e-16))) / np.maximum(x, 1e-9), steps)
+
+    return np.polynomial.chebyshev.chebinterpolate(total, degree).astype(np.float32)

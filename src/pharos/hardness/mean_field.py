@@ -1,0 +1,231 @@
+"""Q-learning of a network in expectation: the learner behind `kernel_regret`."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from pharos.errors import ParameterError, UndefinedMeasure
+from pharos.hardness.kernel_operator import KernelOperator, descended, largest_eigenvalue
+from pharos.hardness.occupancy import Walk
+from pharos.hardness.representation import Grouped
+from pharos.mdp import TabularMDP
+from pharos.solvers import Solution, evaluate_policy, uniform_value, value_iteration
+
+TIES = 1e-6  # of the largest value of a state: actions that close are chosen alike
+MARGIN = 1.05  # of the largest eigenvalue, which is known to 0.1 %
+ACCURACY = 1e-5  # of values, as a share of what is between optimal and uniform play
+WORST_GREEDY, WORST_PLAYED = 1.5, 3.0  # a policy's regret counts no more than this
+
+
+@dataclass(frozen=True, kw_only=True)
+class Schedule:
+    """How the idealised learner learns.
+
+    Attributes:
+        steps: of the environment.
+        period: steps between copies of the target network; a phase.
+        gradient_steps: in a phase.
+        learning_starts: steps before the first gradient step.
+        exploration_initial_eps, exploration_final_eps, exploration_fraction: epsilon falls linearly from one to the
+            other over this share of the steps; before `learning_starts` it is 1.
+        gamma: the learner's own discount; that of values is the MDP's.
+    """
+
+    steps: int = 30_000
+    period: int = 250
+    gradient_steps: int = 62
+    learning_starts: int = 1000
+    exploration_initial_eps: float = 1.0
+    exploration_final_eps: float = 0.05
+    exploration_fraction: float = 0.3
+    gamma: float = 0.95
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "period", "gradient_steps"):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
+                raise ParameterError(f"schedule: {name} is {value!r}; expected a whole number, at least 1")
+        if not self.learning_starts >= 0:
+            raise ParameterError(f"schedule: learning_starts is {self.learning_starts!r}; expected at least 0")
+        for name in ("exploration_initial_eps", "exploration_final_eps", "exploration_fraction", "gamma"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ParameterError(f"schedule: {name} is {getattr(self, name)!r}; expected a number in [0, 1]")
+
+    def epsilon(self, step: int) -> float:
+        """The share of uniform actions at a step."""
+        first, last = self.exploration_initial_eps, self.exploration_final_eps
+        if step < self.learning_starts:
+            return 1.0
+        share = min(step / (self.exploration_fraction * self.steps), 1.0) if self.exploration_fraction else 1.0
+        return first + (last - first) * share
+
+
+@dataclass(frozen=True, eq=False)
+class LearningCurve:
+    """What the idealised learner does in each of its J phases; regrets are normalised: 0 optimal, 1 uniform play.
+
+    Attributes:
+        steps: (J,) at the beginning of a phase.
+        greedy: (J,) regret of the greedy policy.
+        played: (J,) regret of what is played, exploration included.
+        episodes: (J,) expected episodes in a phase.
+    """
+
+    steps: np.ndarray
+    greedy: np.ndarray
+    played: np.ndarray
+    episodes: np.ndarray
+
+    @property
+    def mean_greedy(self) -> float:
+        """Mean over phases; a policy counts at most WORST_GREEDY."""
+        return float(np.minimum(self.greedy, WORST_GREEDY).mean())
+
+    @property
+    def mean_played(self) -> float:
+        """Mean over episodes; a policy counts at most WORST_PLAYED."""
+        return float(np.average(np.minimum(self.played, WORST_PLAYED), weights=self.episodes))
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able."""
+        return {name: np.round(values, 6).tolist() for name, values in vars(self).items()}
+
+
+class Learner:
+    """An MDP, and what learners on it have in common.
+
+    Attributes:
+        mdp: as given, without states that its horizon keeps out of reach.
+        numbers: (S,) of its states in the MDP as it was given.
+        states: (N,) those that an episode can meet and that are not terminal.
+    Raises:
+        UndefinedMeasure: uniform play is optimal, so that regret has no scale.
+    """
+
+    def __init__(self, mdp: TabularMDP, schedule: Schedule, episode: int, solution: Solution | None = None):
+        solution = solution or value_iteration(mdp)
+        uniform = uniform_value(mdp)
+        self.optimal, self.spread = solution.value_at_start, solution.value_at_start - uniform.value_at_start
+        if not self.spread > max(1e-12, 2 * (solution.error_bound + uniform.error_bound)):
+            raise UndefinedMeasure("kernel_regret: uniform play is optimal, so that there is no regret to speak of")
+        self.schedule, self.episode = schedule, episode
+        self.mdp, self.numbers = mdp, np.arange(mdp.num_states)
+        met = mdp.states_within(episode)
+        met[mdp.start_states] = True
+        if mdp.horizon is not None and mdp.horizon == episode and not met.all():
+            self.mdp, self.numbers = mdp.within(episode), np.flatnonzero(met)
+            met = np.ones(len(self.numbers), np.bool_)
+        self.states = np.flatnonzero(met & ~np.asarray(self.mdp.terminal))
+
+    def curve(self, seen: Grouped, apply: KernelOperator) -> LearningCurve:
+        """Learn from observations, of which `seen` says which states have them, with a kernel over them."""
+        schedule, actions = self.schedule, self.mdp.num_actions
+        values = np.zeros((len(seen), actions))
+        memory = _Memory(self.mdp, self.states)
+        vector = np.full((len(seen), 1), len(seen) ** -0.5, np.float32)
+        rows = []
+        for step in range(0, schedule.steps, schedule.period):
+            period, epsilon = min(schedule.period, schedule.steps - step), schedule.epsilon(step)
+            greedy = _greedy(values)[seen.groups]
+            policy = (1 - epsilon) * greedy + epsilon / actions
+            played, length = memory.play(self._everywhere(policy), policy, self.episode, period)
+            if not self._is_return:
+                played = self._value(policy)
+            rows.append((step, self._regret(self._value(greedy)), self._regret(played), period / length))
+            if step < schedule.learning_starts:
+                continue
+            q = values[seen.groups]
+            target, visits = memory.targets(q.max(axis=1), schedule.gamma)
+            weights = seen.sums(visits / visits.sum())
+            total = seen.sums(visits / visits.sum() * target)
+            error = np.divide(total, weights, out=values.copy(), where=weights > 0) - values
+            values += self._learnt(apply, weights.astype(np.float32), error.astype(np.float32), vector)
+        return LearningCurve(*(np.array(column) for column in zip(*rows, strict=True)))
+
+    def _learnt(self, apply: KernelOperator, weights: np.ndarray, error: np.ndarray, vector: np.ndarray) -> np.ndarray:
+        """(C, A): what the gradient steps of a phase add. vector (C, 1): the last phase's eigenvector, replaced."""
+        largest = largest_eigenvalue(apply, weights.max(axis=1, keepdims=True), vector)
+        before = float((weights * error**2).sum())
+        while largest > 0 and before > 0:
+            added = descended(apply, weights, error, 1 / (MARGIN * largest), self.schedule.gradient_steps)
+            after = float((weights * (error - added) ** 2).sum())
+            if after <= 1.001 * before:  # no step of a stable size makes it larger
+                return added
+            largest *= 1.1
+        return np.zeros_like(error)
+
+    @property
+    def _is_return(self) -> bool:
+        """Whether a value is the expected return of an episode, so that walks tell it."""
+        return self.mdp.gamma == 1.0 and self.mdp.horizon == self.episode
+
+    def _regret(self, value: float) -> float:
+        return (self.optimal - value) / self.spread
+
+    def _value(self, policy: np.ndarray) -> float:
+        if policy.max(axis=1).min() == 1.0:
+            actions = np.zeros(self.mdp.num_states, np.int64)
+            actions[self.states] = policy.argmax(axis=1)
+            return evaluate_policy(self.mdp, actions, ACCURACY * self.spread).value_at_start
+        return evaluate_policy(self.mdp, self._everywhere(policy), ACCURACY * self.spread).value_at_start
+
+    def _everywhere(self, policy: np.ndarray) -> np.ndarray:
+        """(S, A), uniform where nobody acts."""
+        table = np.full((self.mdp.num_states, self.mdp.num_actions), 1 / self.mdp.num_actions)
+        table[self.states] = policy
+        return table
+
+
+class _Memory:
+    """Expected visits so far, by state, previously executed action and chosen action: the replay buffer."""
+
+    def __init__(self, mdp: TabularMDP, states: np.ndarray):
+        self.mdp, self.states = mdp, states
+        shape = (len(states), mdp.num_actions)
+        self.first = np.zeros(shape)  # the first steps of episodes
+        self.later = np.zeros((shape[0], mdp.width, shape[1]))
+        self.rewards = np.asarray(mdp.reward_table.rows(states), np.float64)
+
+    def play(self, table: np.ndarray, policy: np.ndarray, episode: int, period: int) -> tuple[float, float]:
+        """Add the visits of `period` steps. Returns (expected return, expected steps) of an episode."""
+        walk = Walk(self.mdp, table, episode)
+        shape = (self.mdp.num_states, self.mdp.width)
+        first, later = np.zeros(shape[0]), np.zeros(shape)
+        for nodes, alive in walk.distributions():
+            if alive <= 1e-12:
+                break
+            if nodes.first:
+                first += nodes.mass[:, 0]
+            else:
+                later += nodes.mass
+        first[~walk.live] = later[~walk.live] = 0.0
+        executed = walk.executed(first, later)
+        length = float(executed.sum())
+        scale = period / length
+        if self.mdp.is_sticky:
+            self.first += scale * first[self.states, None] * policy
+        else:
+            later[:, 0] += first
+        self.later += scale * later[self.states][:, :, None] * policy[:, None]
+        return float((executed[self.states] * self.rewards).sum()), length
+
+    def targets(self, v: np.ndarray, gamma: float) -> tuple[np.ndarray, np.ndarray]:
+        """((N, A), (N, A)): the mean target of each choice, by the values v (N,) of states; and its visits."""
+        chance, x = self.mdp.chance, np.zeros(self.mdp.num_states + 1)
+        x[self.states] = v
+        q = self.rewards + gamma * self.mdp.dynamics.expected(x, self.states)
+        later = self.later.sum(axis=1)
+        if not self.mdp.is_sticky:
+            return chance.chosen_values(q), later
+        mean, visits = q.mean(axis=1, keepdims=True), self.first + later
+        chosen = chance.first_chosen * self.first + chance.chosen * later
+        uniform = chance.first_uniform * self.first + chance.uniform * later
+        total = chosen * q + uniform * mean + chance.previous * np.einsum("sba,sb->sa", self.later, q)
+        return np.divide(total, visits, out=q.copy(), where=visits > 0), visits
+
+
+def _greedy(values: np.ndarray) -> np.ndarray:
+    """(C, A) probabilities: the best action, or all that are as good up to rounding alike."""
+    best = values >= (values.max(axis=1) - TIES * np.abs(values).max(axis=1))[:, None]
+    return best / best.sum(axis=1, keepdims=True)

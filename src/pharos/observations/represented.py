@@ -1,0 +1,83 @@
+"""An observation and a network as measures of hardness take them."""
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pharos.errors import ParameterError
+from pharos.hardness import Representation
+from pharos.observations.look_alikes import observation_classes
+from pharos.observations.networks import Network, default_network
+from pharos.observations.observation import observe
+from pharos.observations.tangent_kernels import check_memory, network_inputs, tangent_kernel
+
+if TYPE_CHECKING:
+    from pharos.state_space import StateSpace
+
+SAMPLE = 4096  # states whose observations the digest is of
+
+
+def representation(
+    space: "StateSpace",
+    observation: Any = "vector",
+    network: Network | str | None = None,
+    *,
+    initialisation: str = "pytorch",
+    landmarks: int | None = None,
+    **options: Any,
+) -> Representation:
+    """Return what a network makes of the states of a state space, for `pharos.hardness.report` and its measures.
+
+        hardness.report(space.mdp(), representation=observations.representation(space, "vector", "mlp128x2"))
+
+    Args:
+        observation, options: as for `observe`.
+        network, initialisation: as for `ntk`.
+        landmarks: of the approximation of the kernel; None: where there are more than 4,096 different observations; 0:
+            never.
+    Raises:
+        ParameterError: the environment's class is not known, the network has no closed form or does not fit the
+            observation, the observation has no space that networks take, or landmarks is no number of them.
+    Cost: one observation of each state now; the kernel when a measure asks for it.
+    """
+    if space.environment is None:
+        raise ParameterError(f"{space}: the class of its environment is not known, so nothing is seen of its states")
+    if landmarks is not None and (isinstance(landmarks, bool) or not isinstance(landmarks, int) or landmarks < 0):
+        raise ParameterError(f"landmarks is {landmarks!r}; expected a whole number, 0 for none, or None")
+    seen = observe(space.environment, observation, state_space=space, **options)
+    net = Network.of(default_network(seen.space) if network is None else network, initialisation)
+    first = network_inputs(seen, space.states(slice(0, 1)))
+    tangent_kernel(net, first)  # what does not fit is said before all states are looked at
+
+    def inputs(states: np.ndarray) -> np.ndarray:
+        return network_inputs(seen, space.states(states))
+
+    def kernel(rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+        check_memory(len(rows), len(columns), str(space.environment))
+        same = rows is columns
+        return tangent_kernel(net, inputs(rows), None if same else inputs(columns))
+
+    return Representation(
+        kernel=kernel,
+        classes=observation_classes(space, seen),
+        time_limit=int(space.environment.max_episode_steps),
+        landmarks=landmarks,
+        conventions={
+            "observation": seen.name,
+            "options": {
+                name: value if isinstance(value, str | int | float) else str(value) for name, value in options.items()
+            },
+            "network": net.name,
+            "initialisation": net.initialisation,
+            "landmarks": landmarks,
+            "digest": _digest(inputs, space.num_states),
+        },
+    )
+
+
+def _digest(inputs: Any, num_states: int) -> str:
+    """Of what the network sees of up to SAMPLE states all over the space."""
+    import xxhash
+
+    states = np.unique(np.linspace(0, num_states - 1, min(SAMPLE, num_states)).astype(np.int64))
+    return xxhash.xxh3_128_hexdigest(np.ascontiguousarray(inputs(states)).data)

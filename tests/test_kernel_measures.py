@@ -1,0 +1,363 @@
+"""Measures of what a network makes of an MDP's states: against tables, closed forms, and learners written plainly."""
+
+import json
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import pharos
+from pharos import hardness
+from pharos.cli import app
+from pharos.errors import ParameterError, UndefinedMeasure
+from pharos.hardness import Representation, Schedule, kernel_regret
+from pharos.mdp import TabularMDP
+from pharos.observations import Network, representation, tangent_kernel
+
+SHORT = Schedule(steps=3000, learning_starts=500)
+RNG = np.random.default_rng(1)
+
+
+def chain(length=4, **options):
+    """Action 1 goes on, action 0 back to the start; the last step pays 1 and ends."""
+    table = np.stack([np.zeros(length, int), np.arange(1, length + 1)], axis=1)
+    table[-1, 1] = -1
+    rewards = np.zeros((length, 2))
+    rewards[-1, 1] = 1.0
+    return TabularMDP.from_arrays(table, rewards, **{"gamma": 1.0, "horizon": 12, **options})
+
+
+def random_mdp(states=7, seed=0):
+    """Two outcomes an action, two start states, an end, rewards that differ."""
+    rng = np.random.default_rng(seed)
+    successors = rng.integers(0, states, (states, 3, 2))
+    probabilities = rng.dirichlet([1, 1], (states, 3))
+    rewards = rng.random((states, 3))
+    successors[-1], probabilities[-1], rewards[-1] = states - 1, [1.0, 0.0], 0.0
+    return TabularMDP.from_outcomes(
+        successors,
+        probabilities,
+        rewards,
+        gamma=1.0,
+        horizon=9,
+        initial=[0, 1],
+        terminal=np.arange(states) == states - 1,
+    )
+
+
+def kernel_of(states, seed=0):
+    features = np.random.default_rng(seed).random((states, 3)).astype(np.float32)
+    return tangent_kernel(Network.of("mlp16"), features)
+
+
+def plain_regret(mdp, kernel, schedule, sticky):
+    """The definition, step by step, on pairs (state, previous action; A: none): (greedy, played)."""
+    S, A, T = mdp.num_states, mdp.num_actions, mdp.horizon
+    P = np.asarray(mdp.dynamics.matrix().todense())[:, :S].reshape(S, A, S)
+    r, live = mdp.rewards, ~np.asarray(mdp.terminal)
+    chance = mdp.chance
+    start = np.zeros((S, A + 1))
+    np.add.at(start[:, A], mdp.start_states, mdp.start_probabilities)
+
+    def executed(b, pi):  # (A chosen, A executed) probabilities
+        first = b == A
+        joint = np.diag(pi) * (chance.first_chosen if first else chance.chosen)
+        joint = joint + pi[:, None] * (chance.first_uniform if first else chance.uniform) / A
+        if not first:
+            joint[:, b] += pi * chance.previous
+        return joint
+
+    def walk(policy):
+        mass, visits, value = start.copy(), np.zeros((S, A + 1, A)), 0.0
+        for _ in range(T):
+            after = np.zeros((S, A + 1))
+            for s in np.flatnonzero(live):
+                for b in range(A + 1):
+                    if mass[s, b] > 0:
+                        visits[s, b] += mass[s, b] * policy[s]
+                        for x, p in enumerate(mass[s, b] * executed(b, policy[s]).sum(axis=0)):
+                            value += p * r[s, x]
+                            after[:, x] += p * P[s, x]
+            mass = after
+        return visits, value
+
+    def value_of(policy):
+        return walk(policy)[1]
+
+    optimal = pharos.value_iteration(mdp).value_at_start
+    uniform = value_of(np.full((S, A), 1 / A))
+    q, memory, greedy_regrets, played_regrets, episodes = np.zeros((S, A)), np.zeros((S, A + 1, A)), [], [], []
+    for step in range(0, schedule.steps, schedule.period):
+        scale = np.abs(q).max(axis=1, keepdims=True)
+        greedy = (q >= q.max(axis=1, keepdims=True) - 1e-6 * scale).astype(float)
+        greedy /= greedy.sum(axis=1, keepdims=True)
+        epsilon = schedule.epsilon(step)
+        played = epsilon / A + (1 - epsilon) * greedy
+        visits, value = walk(played)
+        greedy_regrets.append((optimal - value_of(greedy)) / (optimal - uniform))
+        played_regrets.append((optimal - value) / (optimal - uniform))
+        episodes.append(schedule.period / visits.sum())
+        memory += visits * episodes[-1]
+        if step < schedule.learning_starts:
+            continue
+        base = r + schedule.gamma * P @ np.where(live, q.max(axis=1), 0)
+        targets = np.zeros((S, A + 1, A))
+        for b in range(A + 1):
+            joint = executed(b, np.ones(A))
+            targets[:, b] = base @ joint.T
+        d = memory.sum(axis=1)
+        y = np.divide((memory * targets).sum(axis=1), d, out=q.copy(), where=d > 0)
+        d = d / d.sum()
+        eta = 1 / (1.05 * np.abs(np.linalg.eigvals(kernel * d.max(axis=1))).max())
+        for _ in range(schedule.gradient_steps):
+            q = q + eta * kernel @ (d * (y - q))
+    return np.minimum(greedy_regrets, 1.5).mean(), np.average(np.minimum(played_regrets, 3), weights=episodes)
+
+
+@pytest.mark.parametrize("sticky", [0.0, 0.3])
+@pytest.mark.parametrize("random", [0.0, 0.2])
+def test_the_measure_is_what_its_definition_says(sticky, random):
+    """With outcomes in the rules, two start states, sticky and random actions."""
+    mdp = pharos.random_actions(pharos.sticky_actions(random_mdp(), sticky), random)
+    schedule = Schedule(steps=2000, period=200, gradient_steps=20, learning_starts=400, gamma=0.9)
+    for kernel in (kernel_of(7), np.eye(7)):
+        found = kernel_regret(mdp, Representation.of_matrix(kernel), schedule=schedule)
+        expected = plain_regret(mdp, np.asarray(kernel, float), schedule, sticky)
+        assert (found.value, found.curve.mean_played) == pytest.approx(expected, abs=1e-3)
+    assert (found.tabular.mean_greedy, found.tabular.mean_played) == pytest.approx(expected, abs=1e-3)
+
+
+def test_the_identity_is_expected_tabular_q_learning():
+    """A phase of a table in closed form: what is left of an error is (1 - d / max d / 1.05)^g of it."""
+    schedule = Schedule(steps=500, period=250, gradient_steps=7, learning_starts=0, exploration_final_eps=1.0)
+    mdp = chain(2, horizon=5)
+    found = kernel_regret(mdp, Representation.of_matrix(np.eye(2)), schedule=schedule)
+    # uniform play: only (1, 1) pays; after one phase it has a value and all others none, so state 0 is still a tie
+    assert found.curve.greedy[0] == pytest.approx(1.0)
+    values = np.array([[0.0, 0.0], [0.0, 1.0]])
+    policy = np.where(values == values.max(axis=1, keepdims=True), 1.0, 0.0)
+    policy /= policy.sum(axis=1, keepdims=True)
+    lost = 1.0 - pharos.evaluate_policy(mdp, policy).value_at_start
+    assert found.curve.greedy[1] == pytest.approx(lost / (1 - pharos.solvers.uniform_value(mdp).value_at_start))
+
+
+def test_an_identity_kernel_of_any_scale_is_the_table():
+    found = kernel_regret(chain(6), Representation.of_matrix(37 * np.eye(6)), schedule=SHORT)
+    np.testing.assert_allclose(found.curve.greedy, found.tabular.greedy, atol=1e-4)
+    np.testing.assert_allclose(found.curve.played, found.tabular.played, atol=1e-4)
+
+
+def test_the_order_of_states_does_not_matter():
+    mdp, kernel, order = random_mdp(), kernel_of(7), np.array([3, 0, 6, 1, 5, 2, 4])
+    place = np.argsort(order)
+    P = np.asarray(mdp.dynamics.matrix().todense())[:, :7].reshape(7, 3, 7)[order][:, :, order]
+    turned = TabularMDP.from_matrices(
+        P * ~(order == 6)[:, None, None], mdp.rewards[order], gamma=1.0, horizon=9, initial=place[[0, 1]].tolist()
+    )
+    plain = hardness.report(mdp, MEASURES, representation=Representation.of_matrix(kernel), schedule=SHORT)
+    other = hardness.report(
+        turned, MEASURES, representation=Representation.of_matrix(kernel[np.ix_(order, order)]), schedule=SHORT
+    )
+    for name in MEASURES:
+        assert number(other[name].value) == pytest.approx(number(plain[name].value), abs=2e-3, rel=1e-4), name
+
+
+MEASURES = ["kernel_regret", "kernel_learning_time", "kernel_sample_complexity", "aliasing_floor"]
+
+
+def number(value):
+    return value["value"] if isinstance(value, dict) else value
+
+
+def test_a_random_code_tends_to_an_isotropic_kernel():
+    words = RNG.integers(0, 2, (30, 20_000)).astype(np.float32)
+    kernel = tangent_kernel(Network.of("mlp64"), words)
+    outside = kernel[~np.eye(30, dtype=bool)]
+    assert outside.std() / kernel.diagonal().mean() < 0.01
+    assert kernel.diagonal().std() / kernel.diagonal().mean() < 0.01
+
+
+def test_states_that_look_alike_are_one_observation():
+    """A kernel of rank one for two states is as good as one observation for both."""
+    mdp = chain(5)
+    kernel, classes = kernel_of(5), np.array([0, 1, 2, 1, 3])
+    alike = kernel[np.ix_([0, 1, 2, 1, 4], [0, 1, 2, 1, 4])]
+    merged = kernel_regret(mdp, Representation.of_matrix(alike, classes), schedule=SHORT)
+    apart = kernel_regret(mdp, Representation.of_matrix(alike), schedule=SHORT)
+    assert merged.observations == 4
+    np.testing.assert_allclose(merged.curve.greedy, apart.curve.greedy, atol=1e-3)
+    seen = Representation.of_matrix(alike, classes)
+    floor = hardness.aliasing_floor(mdp, seen)
+    assert 0 < floor < 1
+    assert hardness.aliasing_floor(mdp, Representation.of_matrix(kernel)) == 0.0
+    everything = Representation.of_matrix(np.ones((5, 5)), np.zeros(5, int))
+    assert hardness.aliasing_floor(mdp, everything) == pytest.approx(1.0)
+
+
+def test_landmarks_are_exact_where_there_are_enough_of_them_and_say_so_where_not():
+    mdp, kernel = chain(12, horizon=40), kernel_of(12)
+    exact = kernel_regret(mdp, Representation.of_matrix(kernel), schedule=SHORT)
+    all_but_one = kernel_regret(mdp, Representation.of_matrix(kernel, landmarks=11), schedule=SHORT)
+    assert exact.landmarks is None
+    assert exact.note == ""
+    assert all_but_one.landmarks == 11
+    assert "no bound" in all_but_one.note
+    assert all_but_one.value == pytest.approx(exact.value, abs=0.05)
+    identity = kernel_regret(mdp, Representation.of_matrix(np.eye(12), landmarks=4), schedule=SHORT)
+    np.testing.assert_allclose(identity.curve.greedy, identity.tabular.greedy, atol=1e-3)
+
+
+def test_a_wide_network_trained_on_expectations_follows_the_kernel():
+    """Full gradients of a network of 2,048 units, all actions' weights at once, against its own closed form."""
+    torch = pytest.importorskip("torch")
+    torch.manual_seed(0)
+    x = np.random.default_rng(3).random((6, 3)).astype(np.float32)
+    kernel = tangent_kernel(Network.of("mlp2048"), x)
+    d = np.random.default_rng(4).dirichlet(np.ones(6))
+    y = np.random.default_rng(5).random(6)
+    eta, steps = 1 / (1.05 * np.abs(np.linalg.eigvals(kernel * d)).max()), 62
+    expected = np.zeros(6)
+    for _ in range(steps):
+        expected = expected + eta * kernel @ (d * (y - expected))
+    inputs, found = torch.as_tensor(x), []
+    for _ in range(4):
+        net = torch.nn.Sequential(torch.nn.Linear(3, 2048), torch.nn.ReLU(), torch.nn.Linear(2048, 1))
+        with torch.no_grad():
+            before = net(inputs)[:, 0]
+        optimizer = torch.optim.SGD(net.parameters(), lr=float(eta))
+        for _ in range(steps):
+            error = torch.as_tensor(y, dtype=torch.float32) - (net(inputs)[:, 0] - before)
+            loss = (torch.as_tensor(d, dtype=torch.float32) * error**2).sum() / 2
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+        with torch.no_grad():
+            found.append((net(inputs)[:, 0] - before).numpy())
+    assert np.abs(np.mean(found, axis=0) - expected).max() < 0.05 * np.abs(expected).max()
+
+
+def test_learning_time_of_one_eigenvalue_is_a_logarithm():
+    """Isotropic kernels learn all at the rate weight / sum: with equal weights ln(10) N / 2."""
+    table = np.array([[1, -1], [0, -1]])
+    mdp = TabularMDP.from_arrays(table, [[0.0, 1.0], [0.0, 1.0]], gamma=1.0, horizon=6, initial=[0.5, 0.5])
+    found = hardness.kernel_learning_time(mdp, Representation.of_matrix(5 * np.eye(2)))
+    assert found.value == pytest.approx(np.log(10) * 2 / 2, rel=1e-6)
+    assert found.note == ""
+
+
+def test_sample_complexity_is_that_of_regression_by_simulation():
+    """Kernel regression of a fixed function on random samples: the predicted number leaves about a tenth."""
+    from pharos.hardness import kernel_spectrum
+
+    rng = np.random.default_rng(0)
+    features = rng.normal(size=(400, 60)) * np.arange(1, 61) ** -1.0
+    kernel, y = features @ features.T, features[:, :20] @ rng.normal(size=20)
+    y = y - y.mean()
+    centred = kernel - kernel.mean(0) - kernel.mean(1)[:, None] + kernel.mean()
+    weights = np.full(400, 1 / 400)
+    eigenvalues, energy = kernel_spectrum._spectrum(centred, y[:, None], weights)
+    n = round(kernel_spectrum._samples(eigenvalues, energy))
+    left = []
+    for _ in range(200):
+        rows = rng.integers(0, 400, n)
+        ridge = kernel_spectrum.RIDGE * np.trace(centred) / 400 * np.eye(n)
+        fit = centred[:, rows] @ np.linalg.lstsq(centred[np.ix_(rows, rows)] + ridge, y[rows], rcond=None)[0]
+        left.append(((fit - y) ** 2).mean() / (y**2).mean())
+    assert 0.07 < np.mean(left) < 0.14
+
+
+@pytest.mark.parametrize(("sticky", "random"), [(0.0, 0.0), (0.25, 0.0), (0.0, 0.2), (0.25, 0.2)])
+def test_exploration_time_is_that_of_a_linear_system(sticky, random):
+    """Expected steps to the first reward of a chain, episodes after episodes, from explicit nodes (t, s, previous)."""
+    mdp = pharos.random_actions(pharos.sticky_actions(chain(3, horizon=5), sticky), random)
+    T, A, chance = 5, 2, mdp.chance
+    table, rewards = np.asarray(mdp.next_states), mdp.rewards
+    number = {(0, 0, A): 0}
+    nodes, rows = [(0, 0, A)], []
+    for t, s, b in nodes:
+        weights = chance.weights(np.full((1, A), 0.5), np.array([b]))[0]
+        row = {}
+        for a, p in enumerate(weights):
+            if rewards[s, a] > 0.5 or p == 0:
+                continue
+            ended = table[s, a] < 0 or t + 1 == T
+            after = (0, 0, A) if ended else (t + 1, int(table[s, a]), a if mdp.is_sticky else A - 1)
+            if after not in number:
+                number[after] = len(nodes)
+                nodes.append(after)
+            row[after] = row.get(after, 0) + p
+        rows.append(row)
+    matrix = np.eye(len(nodes))
+    for i, row in enumerate(rows):
+        for after, p in row.items():
+            matrix[i, number[after]] -= p
+    expected = np.linalg.solve(matrix, np.ones(len(nodes)))[0]
+    found = hardness.exploration_time(mdp)
+    assert found.steps == pytest.approx(expected, rel=1e-9)
+    assert found.episodes == pytest.approx(1 / found.probability)
+
+
+def test_what_does_not_exist_says_so():
+    endless = chain(horizon=None, gamma=0.9)
+    seen = Representation.of_matrix(np.eye(4))
+    for name in ("kernel_regret", "kernel_learning_time", "aliasing_floor"):
+        with pytest.raises(UndefinedMeasure, match=f"{name} is defined for episodes"):
+            getattr(hardness, name)(endless, seen)
+    with pytest.raises(UndefinedMeasure, match="episodes"):
+        hardness.exploration_time(endless)
+    with pytest.raises(UndefinedMeasure, match="no reward is positive"):
+        hardness.exploration_time(chain().with_rewards(np.zeros((4, 2))))
+    with pytest.raises(UndefinedMeasure, match="uniform play is optimal"):
+        kernel_regret(chain().with_rewards(np.zeros((4, 2))), seen)
+    with pytest.raises(ParameterError, match="of 4 states; expected 5"):
+        kernel_regret(chain(5), seen)
+    with pytest.raises(ParameterError, match="not symmetric"):
+        Representation.of_matrix([[1.0, 2.0], [0.0, 1.0]])
+    with pytest.raises(ParameterError, match="period is 0"):
+        Schedule(period=0)
+    missing = hardness.report(chain(), MEASURES)
+    assert all("give an observation and a network" in missing[name].undefined for name in MEASURES)
+
+
+@pytest.fixture(scope="module")
+def grid(tmp_path_factory):
+    env = pharos.make("simple_grid", height=3, width=4)
+    return pharos.build(env, tmp_path_factory.mktemp("space") / "grid", progress=False)
+
+
+def test_a_report_has_them_where_there_is_a_representation_and_keeps_them(grid):
+    mdp, seen = grid.mdp(), representation(grid, "vector", "mlp16")
+    chosen = [*MEASURES, "minimal_gap"]
+    first = hardness.report(mdp, chosen, representation=seen, schedule=SHORT)
+    again = hardness.report(mdp, chosen, representation=representation(grid, "vector", "mlp16"), schedule=SHORT)
+    assert all(again[name].kept for name in chosen)
+    assert again["kernel_regret"].value == json.loads(json.dumps(first["kernel_regret"].value))
+    other = hardness.report(mdp, chosen, representation=representation(grid, "one_hot", "mlp16"), schedule=SHORT)
+    assert [name for name in chosen if other[name].kept] == ["minimal_gap"]
+    assert {"kernel_regret", "aliasing_floor"} <= {measure.name for measure in hardness.chosen(None, True)}
+    assert "kernel_regret" not in {measure.name for measure in hardness.chosen(None)}
+    assert (
+        hardness.report(mdp, "minimal_gap").to_dict()["conventions"].keys().isdisjoint({"representation", "schedule"})
+    )
+
+
+@pytest.mark.slow
+def test_the_command_line_has_them(grid):
+    target = ["hardness", "simple_grid", "height=3", "width=4", "--measures", ",".join(MEASURES)]
+    done = CliRunner().invoke(app, [*target, "--observation", "simple_image", "--network", "cnn16", "--json"])
+    answer = json.loads(done.stdout)
+    assert 0 < answer["measures"]["kernel_regret"]["value"] < 1
+    assert answer["conventions"]["representation"]["network"] == "cnn16"
+    assert answer["measures"]["aliasing_floor"] == 0
+    done = CliRunner().invoke(app, [*target, "--observation", "vector", "--network", "mlp128", "--landmarks", "4"])
+    assert "no bound" in " ".join(done.stdout.split())
+    for words, line in (
+        (["--network", "mlp128"], "go with --observation NAME"),
+        (["--observation", "vector", "--network", "lstm"], "no closed form"),
+        (["--observation", "vector", "--network", "cnn16"], "has convolutions"),
+        (["--observation", "vectors"], "did you mean 'vector'?"),
+    ):
+        done = CliRunner().invoke(app, [*target, *words])
+        assert done.exit_code == 2
+        assert line in done.stderr
+        assert len(done.stderr.strip().splitlines()) == 1
