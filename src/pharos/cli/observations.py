@@ -105,11 +105,11 @@ class _Price:
     def __init__(self, space: "StateSpace", gamma: float, random: float, budget: float):
         self.space, self.gamma, self.random, self.budget = space, gamma, random, budget
 
-    def of(self, classes: "np.ndarray", num_confused: int) -> dict[str, Any] | None:
-        """Bounds of the loss; None where they were not wanted, or the space is too large."""
+    def of(self, classes: "np.ndarray | None", num_confused: int) -> dict[str, Any] | None:
+        """Bounds of the loss; None where they were not wanted, the space is too large, or there are several frames."""
         if num_confused == 0:
             return {"lower": 0.0, "upper": 0.0, "exact": True}
-        if self.budget <= 0 or self.gamma >= 1 or self.space.num_states > MOST_SOLVED:
+        if classes is None or self.budget <= 0 or self.gamma >= 1 or self.space.num_states > MOST_SOLVED:
             return None
         from pharos.observations import memoryless_loss
 
@@ -135,7 +135,7 @@ def _entry(space: "StateSpace", name: str, options: dict[str, Any], price: _Pric
     """
     import numpy as np
 
-    from pharos.observations import counted, observation_classes, observe
+    from pharos.observations import counted, history_aliasing, observation_classes, observe
 
     entry: dict[str, Any] = {"observation": name, "options": options}
     env: Any = space.environment
@@ -146,8 +146,11 @@ def _entry(space: "StateSpace", name: str, options: dict[str, Any], price: _Pric
             raise
         return entry | {"unavailable": str(error)}
     with progress_bar("observing", space.num_states, name) as progress:
-        classes = observation_classes(space, seen, progress=progress)
-    counts = counted(classes, np.asarray(space.terminal))
+        if seen.frames > 1:
+            classes, counts = None, history_aliasing(space, seen, progress=progress)
+        else:
+            classes = observation_classes(space, seen, progress=progress)
+            counts = counted(classes, np.asarray(space.terminal))
     return entry | {
         "shape": list(seen.space.shape or ()),
         "dtype": str(seen.space.dtype),
@@ -186,7 +189,12 @@ def _print(title: str, space: "StateSpace", entries: list[dict[str, Any]], price
     for entry in entries:
         if "unavailable" in entry:
             to.print(escape(f"{entry['observation']}: {entry['unavailable']}"), style="dim", soft_wrap=True)
+    frames = (
+        "frames: different are stacks of frames; a state shares one where some history that ends in it looks as one "
+    )
+    frames += "that ends in another state"
     for note in (
+        *([frames] if any(entry["options"].get("frames", 1) != 1 for entry in entries) else []),
         "states that share one: terminal states count like others; where one acts: those that share one with another "
         "state, neither of them terminal",
         f"loses: optimal value at the start less that of the best deterministic policy without memory, discount "

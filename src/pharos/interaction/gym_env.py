@@ -14,6 +14,7 @@ import numpy as np
 from pharos.environments import Environment
 from pharos.errors import ParameterError
 from pharos.interaction.payment import Payment
+from pharos.interaction.seeing import Seeing
 from pharos.interaction.simulator import SimulatedEnv, Simulator, Stream, split_options
 from pharos.observations import NO_ACTION, Index
 
@@ -86,6 +87,8 @@ class GymEnv(SimulatedEnv, gymnasium.Env):
         self._outcome_one = simulator.rules.outcome_one
         self._stream: Stream | None = None  # of random numbers, where the rules have chance
         self._is_index = simulator.context.is_plain and isinstance(observation, Index)
+        self._seeing = Seeing(simulator, 1) if simulator.context.has_more else None
+        self._last: Any = None  # the observation, where it is more than a function of the state
         self._payment = Payment(interaction, 1) if simulator.pays_otherwise else None
         space = simulator.state_space
         self._successors = None if space is None or self._has_outcomes else space.successors
@@ -112,6 +115,8 @@ class GymEnv(SimulatedEnv, gymnasium.Env):
         if self._payment is not None:
             self._payment.seed([seed])
             self._payment.restart(_ONE)
+        if self._seeing is not None:
+            self._seeing.seed([seed])
         if self._has_outcomes and (seed is not None or self._stream is None):
             self._stream = Stream(int(self.np_random.integers(1 << 63)) if seed is None else seed)
         if options is not None and options.get("state") is not None:
@@ -129,7 +134,9 @@ class GymEnv(SimulatedEnv, gymnasium.Env):
             self._index = self._index_of(self._state)
         if self._window is not None:
             self.render()
-        return self._observation() if observation is None else observation, self._info(self._state)
+        if observation is None or self._seeing is not None:
+            observation = self._observation(begins=True)
+        return observation, self._info(self._state)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Choose an action. After a terminal state nothing changes and nothing is paid."""
@@ -188,7 +195,8 @@ class GymEnv(SimulatedEnv, gymnasium.Env):
         state = self._started()
         self._elapsed += 1
         info = self._info(state)
-        return self._observation(), 0.0, True, self._elapsed >= self._limit, info
+        observation = self._observation() if self._last is None else self._last
+        return observation, 0.0, True, self._elapsed >= self._limit, info
 
     def render(self) -> Any:
         """The current state in the render mode: text, a picture, or None where there is a window."""
@@ -228,9 +236,15 @@ class GymEnv(SimulatedEnv, gymnasium.Env):
             raise gymnasium.error.ResetNeeded(f"{self.environment}: call reset() before step() or render()")
         return self._state
 
-    def _observation(self) -> Any:
+    def _observation(self, *, begins: bool = False) -> Any:
         if self._is_index:
             return np.int64(self._index)
+        if self._seeing is not None:
+            states, context = self._started()[None], (np.array([self._previous]), np.array([self._elapsed]))
+            self._seeing.follow(states, _ONE, np.array([begins]))
+            batch = self._seeing.now(states, *context)
+            self._last = {k: v[0] for k, v in batch.items()} if isinstance(batch, dict) else batch[0]
+            return self._last
         return self.simulator.context.one(self._started(), self._previous, self._elapsed)
 
 

@@ -165,7 +165,7 @@ class Stream:
 
 def stream_of(seed: int | None, *purpose: int) -> np.ndarray:
     """(1,) uint64, the stream of random numbers of an environment that is seeded with `seed`; another one for each
-    purpose: none for steps, 1 for the noise of rewards.
+    purpose: none for steps, 1 for the noise of rewards, 2 for coins of observations.
     """
     return np.random.SeedSequence(seed, spawn_key=purpose).generate_state(1, np.uint64)
 

@@ -18,6 +18,7 @@ from gymnasium.vector.utils import batch_space
 from pharos.environments import Environment
 from pharos.errors import ParameterError
 from pharos.interaction.payment import Payment
+from pharos.interaction.seeing import Seeing
 from pharos.interaction.simulator import SimulatedEnv, Simulator, split_options, stream_of
 from pharos.interaction.walks import RulesWalk, TableWalk
 from pharos.kernels.stepping import DISABLED, SAME_STEP, Batch, first_outside
@@ -84,6 +85,7 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
         self._previous = np.full(n, NO_ACTION, np.int64)
         self._elapsed = np.zeros(n, np.int64)
         self._ended = np.zeros(n, np.bool_)
+        self._seeing = Seeing(simulator, n) if simulator.context.has_more else None
         self._payment = Payment(interaction, n) if simulator.pays_otherwise else None
         self._num_drawn = n if simulator.has_outcomes else 0  # outcomes that are drawn in a step
         walk = RulesWalk if simulator.state_space is None else TableWalk
@@ -125,7 +127,7 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
             self._payment.restart(mask)
         executed = np.full(self.num_envs, NO_ACTION, np.int64)
         info = self._info(executed, np.ones(self._num_drawn))
-        return self._walk.observations(self._previous, self._elapsed), info
+        return self._observations(mask, mask), info
 
     def step(self, actions: Any) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Choose an action (N,) for every environment."""
@@ -154,7 +156,16 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
             info["earned_reward"] = self._payment.earned
         if self._mode == SAME_STEP and done.any():
             self._add_final(info, done)
-        return self._walk.observations(self._previous, self._elapsed), rewards, terminated, truncated, info
+        begins = done if self._mode == SAME_STEP else executed == NO_ACTION
+        return self._observations(np.ones_like(done), begins), rewards, terminated, truncated, info
+
+    def _observations(self, moves: np.ndarray, begins: np.ndarray) -> Any:
+        """Of the current states; `moves` and `begins` (N,) bool: where there was a step, or an episode begins."""
+        if self._seeing is None:
+            return self._walk.observations(self._previous, self._elapsed)
+        states = self.states
+        self._seeing.follow(states, moves, begins)
+        return self._seeing.now(states, self._previous, self._elapsed)
 
     def _info(self, executed: np.ndarray, likely: np.ndarray) -> dict[str, Any]:
         everywhere = np.ones(self.num_envs, np.bool_)
@@ -174,7 +185,11 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
     def _add_final(self, info: dict[str, Any], done: np.ndarray) -> None:
         """The last observations and infos, as Gymnasium's own vector environments give them."""
         rows, executed = np.flatnonzero(done), info["executed_action"]
-        last = self._walk.final_observations(rows, executed[rows], self._walk.final_elapsed[rows])
+        context = executed[rows], self._walk.final_elapsed[rows]
+        if self._seeing is None:
+            last = self._walk.final_observations(rows, *context)
+        else:
+            last = self._seeing.final(rows, self._walk.final_states(rows), *context)
         final = np.full(self.num_envs, None, object)
         for row, observation in zip(rows, _rows_of(last, len(rows)), strict=True):
             final[row] = observation
@@ -207,8 +222,9 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
             raise ParameterError(f"seed has {len(seeds)} entries; expected one integer, or {n}")
         if self._rng is None:
             self._rng = np.random.SeedSequence().generate_state(n, np.uint64)
-        if self._payment is not None:
-            self._payment.seed(seeds)
+        for streams in (self._payment, self._seeing):
+            if streams is not None:
+                streams.seed(seeds)
         for i, one in enumerate(seeds):
             if one is not None:
                 self._rng[i] = stream_of(one)[0]

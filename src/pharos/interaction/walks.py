@@ -86,6 +86,9 @@ class RulesWalk:
             return self._vector
         return self.simulator.context(self.current, previous, elapsed)
 
+    def final_states(self, rows: np.ndarray) -> np.ndarray:
+        return self.final[rows]
+
     def final_observations(self, rows: np.ndarray, previous: np.ndarray, elapsed: np.ndarray) -> Any:
         return self.simulator.context(self.final[rows], previous, elapsed)
 
@@ -143,6 +146,9 @@ class TableWalk:
 
     def observations(self, previous: np.ndarray, elapsed: np.ndarray) -> Any:
         return self._observed(self.current, previous, elapsed)
+
+    def final_states(self, rows: np.ndarray) -> np.ndarray:
+        return self.space.states(self.final[rows])
 
     def final_observations(self, rows: np.ndarray, previous: np.ndarray, elapsed: np.ndarray) -> Any:
         return self._observed(self.final[rows], previous, elapsed)

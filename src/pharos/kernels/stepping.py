@@ -98,6 +98,14 @@ def add_noise(rng, deviation, mask, out):
             out[i] += deviation * normal_number(rng, i)
 
 
+@njit(cache=True, nogil=True)
+def throw(rng, out):
+    """out[i, j] = 0 or 1, a fair coin of stream i for each j."""
+    for i in range(len(out)):
+        for j in range(out.shape[1]):
+            out[i, j] = 1.0 if uniform_number(rng, i) < 0.5 else 0.0
+
+
 @njit(forceinline=True)
 def executed_by_number(chosen, previous, chance, num_actions, u):
     """The executed action, by one uniform number u in [0, 1): chosen, then previous, then uniform.

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from pharos.observations.complex_image import ComplexImage
     from pharos.observations.empirical import empirical_ntk
     from pharos.observations.hash import Hash
-    from pharos.observations.look_alikes import Aliasing, aliasing, counted, observation_classes
+    from pharos.observations.look_alikes import Aliasing, aliasing, counted, history_aliasing, observation_classes
     from pharos.observations.memoryless import MemorylessLoss, memoryless_loss
     from pharos.observations.networks import Network, default_network
     from pharos.observations.own import OwnObservation, imported, observation_of, own_observation
@@ -38,6 +38,7 @@ _FILES = {
     "counted": "look_alikes",
     "default_network": "networks",
     "empirical_ntk": "empirical",
+    "history_aliasing": "look_alikes",
     "imported": "own",
     "memoryless_loss": "memoryless",
     "network_inputs": "tangent_kernels",
@@ -71,6 +72,7 @@ __all__ = [
     "counted",
     "default_network",
     "empirical_ntk",
+    "history_aliasing",
     "imported",
     "in_blocks",
     "memoryless_loss",

@@ -10,14 +10,14 @@ from pharos.drawing import color_of, glyph_of, ground_of, scenery_of, shape_of, 
 from pharos.environments import Environment, Layer, Scenery
 from pharos.errors import ParameterError
 from pharos.observations.drawn import Drawing, num_values
+from pharos.observations.frames import Frames
 from pharos.observations.hiding import hidden_names
-from pharos.observations.observation import Observation
 
 LARGEST = 1024  # pixels on a side
 LUMINANCE = (0.299, 0.587, 0.114)  # ITU-R BT.601, as in Pillow and OpenCV
 
 
-class ComplexImage(Observation):
+class ComplexImage(Frames):
     """A colour picture (height, width, 3) uint8 of all layers, with sprites.
 
     The picture is composed at the size asked for: ground and sprites are scaled once, by averaging areas, to whole
@@ -29,6 +29,7 @@ class ComplexImage(Observation):
         grey: one channel of luminance instead of three of colour.
         channels_first: (C, height, width).
         motion: the M motion layers are laid over the others, as in simple images.
+        frames: k, the last k pictures of the episode, the oldest first, along the channels. See `Frames`.
         hide: names of layers that the agent does not see.
     Raises:
         ParameterError: the environment cannot be drawn, or the size is too small for a pixel a cell.
@@ -42,6 +43,7 @@ class ComplexImage(Observation):
         grey: bool = False,
         channels_first: bool = False,
         motion: bool = False,
+        frames: int = 1,
         hide: str | Sequence[str] = (),
     ):
         from gymnasium.spaces import Box
@@ -73,8 +75,9 @@ class ComplexImage(Observation):
         channels = picture.shape[2]
         shape = (channels, height, width) if channels_first else (height, width, channels)
         self.space = Box(0, 255, shape, np.uint8)
+        self._stack(frames, 0 if channels_first else 2)
 
-    def __call__(self, states: np.ndarray) -> np.ndarray:
+    def frame(self, states: np.ndarray) -> np.ndarray:
         out = np.empty((len(states), *self._tables[0].shape), np.uint8)
         self._drawing(states, out, *self._tables)
         return np.ascontiguousarray(out.transpose(0, 3, 1, 2)) if self._channels_first else out

@@ -17,12 +17,16 @@ class ObservationInContext:
     Without either, the observation itself. A `vector` is extended: one entry for each action (1 for the previous one,
     all 0 on the first step), then the remaining time. Any other observation becomes a Dict of "observation",
     "previous_action" (Discrete(A + 1), A on the first step) and "remaining_time" (Box (1,)).
-    The remaining time is (limit - elapsed) / limit, in [0, 1].
+    The remaining time is (limit - elapsed) / limit, in [0, 1]. Frames and coins, which some observations want
+    besides, are brought along by who knows them; without, a state is seen as at the start of an episode, and coins are
+    0.
 
     Attributes:
         observation: the function of the state.
         space: Gymnasium space of what the agent gets.
         names: of the entries of a vector; None for others.
+        has_more: whether frames or coins are wanted.
+        is_plain: whether that, the previous action and the remaining time are not.
     Raises:
         ParameterError: the remaining time is wanted where there is no time limit.
     """
@@ -35,14 +39,16 @@ class ObservationInContext:
         env = observation.env
         self.observation = observation
         self.names = observation.names
-        self.is_plain = not previous_action and not remaining_time
+        self.has_more = observation.frames > 1 or observation.irrelevant > 0
+        self.is_plain = not previous_action and not remaining_time and not self.has_more
         self.is_vector = isinstance(observation, Vector)
         self._previous_action = previous_action
         self._remaining_time = remaining_time
         self._limit = limit
         self._num_actions = env.num_actions
         self.space: Space = observation.space
-        if self.is_plain:
+        self._is_alone = not previous_action and not remaining_time
+        if self._is_alone:
             return
         if self.is_vector:
             self.names = (
@@ -59,8 +65,21 @@ class ObservationInContext:
             parts["remaining_time"] = Box(0.0, 1.0, (1,), np.float32)
         self.space = Dict(parts)
 
-    def __call__(self, states: np.ndarray, previous: np.ndarray, elapsed: np.ndarray) -> Any:
-        """States (N, D), previous actions (N,), elapsed steps (N,) -> a batch of observations (a dict of batches)."""
+    def __call__(
+        self,
+        states: np.ndarray,
+        previous: np.ndarray,
+        elapsed: np.ndarray,
+        *,
+        seen: np.ndarray | None = None,
+        coins: np.ndarray | None = None,
+    ) -> Any:
+        """States (N, D), previous actions (N,), elapsed steps (N,) -> a batch of observations (a dict of batches).
+
+        Args:
+            seen: stacked frames, in place of what the observation is as a function of the states.
+            coins: (N, irrelevant), entries that mean nothing.
+        """
         if self.is_plain:
             return self.observation(states)
         if self.is_vector:
@@ -69,9 +88,15 @@ class ObservationInContext:
             observation: Any = self.observation
             out = np.zeros((len(states), *self.space.shape), np.float32)  # type: ignore[misc]
             normalize(states, observation.low, observation.scale, out)
-            self._write_context(out, states.shape[1], previous, elapsed)
+            column = states.shape[1]
+            if coins is not None:
+                out[:, column : column + coins.shape[1]] = coins
+            self._write_context(out, column + self.observation.irrelevant, previous, elapsed)
             return out
-        batch: dict[str, Any] = {"observation": self.observation(states)}
+        seen = self.observation(states) if seen is None else seen
+        if self._is_alone:
+            return seen
+        batch: dict[str, Any] = {"observation": seen}
         if self._previous_action:
             batch["previous_action"] = np.where(previous == NO_ACTION, self._num_actions, previous).astype(np.int64)
         if self._remaining_time:
@@ -83,7 +108,7 @@ class ObservationInContext:
         if self.is_plain:
             return self.observation.one(state)
         batch = self(state[None], np.array([previous]), np.array([elapsed]))
-        return batch[0] if self.is_vector else {name: values[0] for name, values in batch.items()}
+        return batch[0] if self.is_vector or self._is_alone else {name: values[0] for name, values in batch.items()}
 
     def _write_context(self, out: np.ndarray, column: int, previous: np.ndarray, elapsed: np.ndarray) -> None:
         if self._previous_action:

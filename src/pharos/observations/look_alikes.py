@@ -2,16 +2,18 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pharos.errors import ParameterError
 from pharos.observations.observation import Observation
 
 if TYPE_CHECKING:
     from pharos.state_space import StateSpace
 
 BLOCK = 4096
+MOST_HISTORIES = 1_000_000
 
 Progress = Callable[[int, str], None]
 """Called with how many states are done, and a text."""
@@ -43,8 +45,12 @@ class Aliasing:
 def aliasing(space: "StateSpace", observation: Observation, *, progress: Progress | None = None) -> Aliasing:
     """Count the states of a state space that an observation does not tell apart.
 
+    Of an observation of k frames the states that some histories do not tell apart, see `history_aliasing`.
+
     Cost: as for `observation_classes`.
     """
+    if observation.frames > 1:
+        return history_aliasing(space, observation, progress=progress)
     return counted(observation_classes(space, observation, progress=progress), np.asarray(space.terminal))
 
 
@@ -58,22 +64,96 @@ def observation_classes(
 
     Returns:
         (S,) int64, the number of the observation of each state, from 0.
+    Raises:
+        ParameterError: the observation has several frames, so it is no function of the state.
     Cost: one observation and about 40 bytes for each state; sorting S digests.
     """
+    if observation.frames > 1:
+        raise ParameterError(
+            f"{observation.name} with {observation.frames} frames is no function of the state; "
+            f"history_aliasing counts what it tells"
+        )
+
+    def seen(block: slice) -> np.ndarray:
+        return observation(space.states(block))
+
+    return _numbered(seen, space.num_states, observation.name, progress)
+
+
+def history_aliasing(
+    space: "StateSpace",
+    observation: Any,
+    *,
+    most: int = MOST_HISTORIES,
+    progress: Progress | None = None,
+) -> Aliasing:
+    """Count the states that an observation of k frames does not tell apart, over all histories that play can have.
+
+    A history is what the last k states of an episode can be; at its start the first state stands k times. A state
+    shares an observation where some history that ends in it gives the same frames as one that ends in another state.
+    `num_observations` are the different stacks of frames.
+
+    Raises:
+        ParameterError: there are more than `most` histories.
+    Cost: k frames for each history, of which there are up to S (A K)^(k - 1).
+    """
+    histories = _histories(space, observation.frames, most)
+
+    def seen(block: slice) -> np.ndarray:
+        part = histories[block]
+        states = space.states(part.ravel())
+        return observation.of_histories(states.reshape(*part.shape, -1))
+
+    classes = _numbered(seen, len(histories), observation.name, progress)
+    ends, terminal = histories[:, -1], np.asarray(space.terminal)
+
+    def sharing(among: np.ndarray) -> int:
+        pairs = np.unique(np.stack([classes[among], ends[among]], axis=1), axis=0)
+        several = np.bincount(pairs[:, 0], minlength=1) > 1
+        return len(np.unique(pairs[several[pairs[:, 0]], 1]))
+
+    everything = np.ones(len(ends), np.bool_)
+    return Aliasing(space.num_states, int(classes.max()) + 1, sharing(everything), sharing(~terminal[ends]))
+
+
+def _histories(space: "StateSpace", length: int, most: int) -> np.ndarray:
+    """(H, length) int64, all histories that play can have."""
+    found = np.unique(np.repeat(space.start_states[:, None], length, axis=1), axis=0).astype(np.int64)
+    met, frontier, terminal = set(map(tuple, found.tolist())), found, np.asarray(space.terminal)
+    while len(frontier):
+        going = frontier[~terminal[frontier[:, -1]]]
+        rows = np.repeat(np.arange(len(going)), space.num_actions)
+        actions = np.tile(np.arange(space.num_actions), len(going))
+        outcomes = space.dynamics.outcomes(going[rows, -1], actions)
+        inside = outcomes.states < space.num_states
+        before = going[rows[outcomes.which[inside]], 1:]
+        after = np.unique(np.concatenate([before, outcomes.states[inside][:, None]], axis=1), axis=0)
+        frontier = np.array([each for each in after.tolist() if tuple(each) not in met], np.int64).reshape(-1, length)
+        met.update(map(tuple, frontier.tolist()))
+        if len(met) > most:
+            raise ParameterError(
+                f"{space} has more than {most:,} histories of {length} states; expected fewer, so that they can be "
+                f"counted: look at a smaller instance, or at fewer frames"
+            )
+    return np.array(sorted(met), np.int64)
+
+
+def _numbered(seen: Callable[[slice], np.ndarray], count: int, name: str, progress: Progress | None) -> np.ndarray:
+    """(count,) int64, the numbers of different observations, which `seen` gives for blocks of rows."""
     import xxhash
 
-    digests = np.empty(space.num_states, "V16")
-    for start in range(0, space.num_states, BLOCK):
+    digests = np.empty(count, "V16")
+    for start in range(0, count, BLOCK):
         if progress is not None:
-            progress(start, observation.name)
-        observations = observation(space.states(slice(start, start + BLOCK)))
+            progress(start, name)
+        observations = seen(slice(start, min(start + BLOCK, count)))
         rows = np.ascontiguousarray(observations).reshape(len(observations), -1).view(np.uint8)
         digests[start : start + len(rows)] = [xxhash.xxh3_128_digest(row.data) for row in rows]
     halves = digests.view(np.uint64).reshape(-1, 2)
     order = np.lexsort((halves[:, 1], halves[:, 0]))
-    is_new = np.zeros(space.num_states, np.int64)
+    is_new = np.zeros(count, np.int64)
     is_new[1:] = (halves[order[1:]] != halves[order[:-1]]).any(axis=1)
-    classes = np.empty(space.num_states, np.int64)
+    classes = np.empty(count, np.int64)
     classes[order] = np.cumsum(is_new)
     return classes
 

@@ -22,11 +22,16 @@ Function = Callable[[Environment, np.ndarray], np.ndarray]
 class Observation:
     """A function of the state for one environment; called with a batch of states it gives a batch of observations.
 
+    Two options tell an agent something else besides: `frames`, pictures of the states before (frames.py), and
+    `irrelevant`, coins that are thrown anew at each step (context.py). Who steps an environment brings them along.
+
     Attributes:
         name: such as "vector".
         env: the environment.
         space: Gymnasium space of one observation.
         names: of the entries of a one-dimensional observation; None for others.
+        frames: k, where the last k states are seen; else 1.
+        irrelevant: how many entries of noise follow a vector.
         is_flat: whether a compiled step may draw it: a pixel is a cell, and each layer has a plane of its own.
     """
 
@@ -35,6 +40,8 @@ class Observation:
     space: "gymnasium.Space"
     names: tuple[str, ...] | None = None
     is_flat: bool = False
+    frames: int = 1
+    irrelevant: int = 0
 
     def __call__(self, states: np.ndarray) -> np.ndarray:
         """(N, D) int64 states -> (N, *space.shape) of space.dtype, a fresh array."""
@@ -108,7 +115,7 @@ _BUILT_IN = {
 _registered: dict[str, tuple[Function, Any]] = {}
 
 # Options that change what an agent is told, not how
-TELLING = ("motion", "hide")
+TELLING = ("motion", "hide", "frames", "irrelevant")
 
 
 def names() -> list[str]:

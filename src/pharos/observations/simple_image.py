@@ -7,13 +7,13 @@ import numpy as np
 from pharos.environments import Environment, Layer
 from pharos.errors import ParameterError
 from pharos.observations.drawn import Drawing, num_values
+from pharos.observations.frames import Frames
 from pharos.observations.hiding import hidden_names
-from pharos.observations.observation import Observation
 
 DARKEST = 128  # of the shades of things on a plane of their own
 
 
-class SimpleImage(Observation):
+class SimpleImage(Frames):
     """One plane for each layer of the environment, channel first: (L, rows k, columns k) uint8, 0 where nothing is.
 
     A layer with one kind of thing shows it as 255; one with several (such as cars of several colours) in even shades
@@ -23,6 +23,7 @@ class SimpleImage(Observation):
     Args:
         motion: planes for the M motion layers follow, such as the cell that a ball comes from: with them no two states
             of the classes of pharos look alike. Where a class declares none, `draw` shows all that there is.
+        frames: k, the last k pictures of the episode, the oldest first: (k L, rows, columns). See `Frames`.
         hide: names of layers that the agent does not see: their planes stay, and are always 0.
         grey: one plane (1, rows k, columns k) for all things, each in a shade of its own, later layers over earlier
             ones.
@@ -39,6 +40,7 @@ class SimpleImage(Observation):
         env: Environment,
         *,
         motion: bool = False,
+        frames: int = 1,
         hide: str | Sequence[str] = (),
         grey: bool = False,
         scale: int | None = None,
@@ -51,7 +53,8 @@ class SimpleImage(Observation):
         layers = self._drawing.layers
         self._covering = bool(grey)
         rows, columns = self._drawing.rows, self._drawing.columns
-        planes = 1 if grey else len(layers)
+        each = 1 if grey else len(layers)
+        planes = each * max(frames, 1) if isinstance(frames, int) else each
         if scale is None:
             scale = -(-planes // min(rows, columns))
         if isinstance(scale, bool) or not isinstance(scale, int) or scale < 1:
@@ -63,19 +66,22 @@ class SimpleImage(Observation):
                 f"would be taken for an image of {min(rows, columns) * scale} channels; "
                 f"use scale={-(-planes // min(rows, columns))} or grey=True"
             )
-        self.space = Box(0, 255, (planes, rows * scale, columns * scale), np.uint8)
-        self._one = (1, planes, rows * scale, columns * scale)
+        self._one = (1, each, rows * scale, columns * scale)
+        self.space = Box(0, 255, self._one[1:], np.uint8)
+        self._stack(frames, 0)
         self.shades = _shades(layers, self._covering)
         hidden = hidden_names(hide, f"simple_image of {env.name}", layers)
         self.shades[[name in hidden for name in layers]] = 0
-        self.is_flat = scale == 1 and not grey and not self._drawing.motion
+        self.is_flat = scale == 1 and not grey and not self._drawing.motion and frames == 1
 
-    def __call__(self, states: np.ndarray) -> np.ndarray:
-        out = np.zeros((len(states), *self.space.shape), np.uint8)  # type: ignore[misc]
+    def frame(self, states: np.ndarray) -> np.ndarray:
+        out = np.zeros((len(states), *self._one[1:]), np.uint8)
         self._drawing(states, out, self.shades, self._covering)
         return out
 
     def one(self, state: np.ndarray) -> np.ndarray:
+        if self.frames > 1:
+            return self(state[None])[0]
         out = np.zeros(self._one, np.uint8)
         self._drawing.one(state, out, self.shades, self._covering)
         return out[0]

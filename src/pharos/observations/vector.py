@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
 MOST_EXACT = 1 << 24  # integers up to here are told apart in float32
 MOST_ONE_HOT = 1 << 20
+MOST_IRRELEVANT = 10
 
 
 class Vector(Observation):
@@ -25,13 +26,16 @@ class Vector(Observation):
     Args:
         hide: variables that the agent does not see, such as "ball_goes_right" or "bricks", or single components of
             them, such as "bricks[0,3]": their entries stay, and are always 0.
+        irrelevant: how many entries follow that mean nothing: fair coins, 0 or 1, thrown anew at every step, whatever
+            the state is. As a function of the state they are 0; environments throw them. At most MOST_IRRELEVANT.
     Attributes:
         low, scale: (D,), the observation is (state - low) * scale.
     Raises:
-        ParameterError: a component has more values than float32 tells apart.
+        ParameterError: a component has more values than float32 tells apart; or too many irrelevant entries.
+    Source: irrelevant features: Rajan et al. (2023), MDP Playground, whose irrelevant part is a chain of its own.
     """
 
-    def __init__(self, env: Environment, *, hide: str | Sequence[str] = ()):
+    def __init__(self, env: Environment, *, hide: str | Sequence[str] = (), irrelevant: int = 0):
         from gymnasium.spaces import Box
 
         components = env.components
@@ -49,12 +53,19 @@ class Vector(Observation):
         whose = f"vector of {env.name}"
         for name in hidden_names(hide, whose, components.variables, components.names):
             self.scale[components.variables.get(name) or components.names.index(name)] = 0.0
-        self.space = Box(0.0, 1.0, (len(components),), np.float32)
+        if isinstance(irrelevant, bool) or not isinstance(irrelevant, int) or not 0 <= irrelevant <= MOST_IRRELEVANT:
+            raise ParameterError(
+                f"{whose}: irrelevant is {irrelevant!r}; expected 0 to {MOST_IRRELEVANT} entries, so that a policy can "
+                f"be asked about all their values in a state"
+            )
+        self.irrelevant = irrelevant
+        self.names = (*components.names, *(f"irrelevant[{i}]" for i in range(irrelevant)))
+        self.space = Box(0.0, 1.0, (len(self.names),), np.float32)
 
     def __call__(self, states: np.ndarray) -> np.ndarray:
         from pharos.kernels.observation_kernels import normalize
 
-        out = np.empty(states.shape, np.float32)
+        out = np.zeros((len(states), len(self.names or ())), np.float32)
         normalize(states, self.low, self.scale, out)
         return out
 

@@ -48,6 +48,11 @@ class Sight:
             observation, previous_action=self.previous_action, remaining_time=False, limit=self.time_limit
         )
 
+    @property
+    def frames(self) -> int:
+        """How many states are seen at once, the last ones of the episode."""
+        return self.observe.observation.frames
+
 
 class Answers:
     """What a policy answered so far, by row: a state s, or s (A + 1) + b where the previous action b matters (A: none).
@@ -104,7 +109,15 @@ class Answers:
 
     def start_rows(self) -> np.ndarray:
         """The rows of the start states."""
-        return self.mdp.start_states * self.width + (self.num_actions if self.by_pairs else 0)
+        return self.first_rows(self.mdp.start_states)
+
+    def first_rows(self, states: np.ndarray) -> np.ndarray:
+        """(N,) the rows of states in which episodes start."""
+        return states * self.width + (self.num_actions if self.by_pairs else 0)
+
+    def next_rows(self, rows: np.ndarray, executed: np.ndarray, following: np.ndarray) -> np.ndarray:
+        """(N,) where executing actions in rows leads that come to the states `following`."""
+        return self._arrivals(following, executed)
 
     def reach(self, max_rows: int | None = None, steps: int | None = None) -> bool:
         """Ask the policy in all rows that it reaches within `steps`, level by level; False beyond `max_rows` rows."""
@@ -136,7 +149,7 @@ class Answers:
         if not mdp.is_sticky:  # a row is a state of the new MDP
             states, starts = self.rows // self.width, self.index(self.start_rows())
             return self._mdp_on(
-                states, starts, lambda *arrived: self.index(self._arrivals(*arrived))
+                states, starts, lambda following, executed, _: self.index(self._arrivals(following, executed))
             ), self.probabilities
         states = np.unique(self.rows // self.width)
         place = np.full(mdp.num_states, -1, np.int64)
@@ -144,16 +157,17 @@ class Answers:
         policy = np.zeros((states.size, self.width, mdp.num_actions))
         policy[:, :, 0] = 1.0  # of pairs that are not reached
         policy[place[self.rows // self.width], self.rows % self.width] = self.probabilities
-        return self._mdp_on(states, place[mdp.start_states], lambda next_states, _: place[next_states]), policy
+        return self._mdp_on(states, place[mdp.start_states], lambda following, *_: place[following]), policy
 
     def _mdp_on(
-        self, states: np.ndarray, starts: np.ndarray, number: Callable[[np.ndarray, np.ndarray], np.ndarray]
+        self, states: np.ndarray, starts: np.ndarray, number: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
     ) -> TabularMDP:
         """The MDP in which state i behaves as `states[i]`.
 
         Args:
             starts: numbers of the start states.
-            number: (next states, executed actions) -> numbers in the new MDP, -1 for the end.
+            number: (next states, executed actions, numbers of the states before) -> numbers in the new MDP, -1 for the
+                end.
         """
         mdp, count, num_actions = self.mdp, len(states), self.mdp.num_actions
         initial = np.zeros(count)
@@ -164,7 +178,8 @@ class Answers:
         outcomes = mdp.dynamics.outcomes(np.repeat(states, num_actions), actions)
         inside = outcomes.states < mdp.num_states
         following = np.full(len(inside), -1, np.int64)
-        following[inside] = number(outcomes.states[inside], actions[outcomes.which[inside]])
+        which = outcomes.which[inside]
+        following[inside] = number(outcomes.states[inside], actions[which], which // num_actions)
         if mdp.dynamics.is_deterministic:
             reached = TabularMDP.from_arrays(following.reshape(count, num_actions), rewards, **setting)
         else:
@@ -196,8 +211,15 @@ class PolicyAnswers(Answers):
     def _ask(self, rows: np.ndarray) -> np.ndarray:
         states, previous = np.divmod(rows, self.width)
         previous = np.where(previous == self.num_actions, -1, previous) if self.by_pairs else np.full(len(rows), -1)
-        observations = self.sight.observe(self.sight.space.states(states), previous, np.zeros(len(rows), np.int64))
-        return self.answer(observations, len(rows))
+        context = self.sight.space.states(states), previous, np.zeros(len(rows), np.int64)
+        irrelevant = self.sight.observe.observation.irrelevant
+        if not irrelevant:
+            return self.answer(self.sight.observe(*context), len(rows))
+        total = np.zeros((len(rows), self.num_actions))  # coins are fair and thrown anew at each step
+        for coins in np.ndindex(*(2,) * irrelevant):
+            thrown = np.tile(np.array(coins, np.float32), (len(rows), 1))
+            total += self.answer(self.sight.observe(*context, coins=thrown), len(rows))
+        return total / 2**irrelevant
 
     def answer(self, observations: Any, count: int = 1) -> np.ndarray:
         """(N, A) probabilities for a batch of `count` observations; ParameterError for any other answer."""

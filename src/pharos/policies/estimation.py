@@ -22,17 +22,19 @@ def estimate(
     mdp, chance = answers.mdp, answers.mdp.chance
     steps = mdp.horizon or math.ceil(math.log(1e-9) / math.log(mdp.gamma)) if mdp.gamma > 0 else 1
     states = rng.choice(mdp.start_states, episodes, p=mdp.start_probabilities)
-    previous = np.full(episodes, mdp.num_actions)
+    previous, rows = np.full(episodes, mdp.num_actions), answers.first_rows(states)
     returns, alive = np.zeros(episodes), np.arange(episodes)
     for step in range(steps):
         s, b = states[alive], previous[alive]
-        probabilities = answers.of(s * answers.width + (b if answers.by_pairs else 0))
+        probabilities = answers.of(rows[alive])
         chosen = (probabilities.cumsum(axis=1) < rng.random((alive.size, 1))).sum(axis=1).clip(max=mdp.num_actions - 1)
         executed = chance.draw(chosen, b, mdp.num_actions, rng)
         returns[alive] += mdp.gamma**step * mdp.reward_table.rows(s)[np.arange(alive.size), executed]
         following = mdp.dynamics.sample(s, executed, rng)
         states[alive], previous[alive] = following, executed
-        alive = alive[(following >= 0) & ~np.asarray(mdp.terminal)[following]]
+        goes_on = (following >= 0) & ~np.asarray(mdp.terminal)[following]
+        before, alive = rows[alive][goes_on], alive[goes_on]
+        rows[alive] = answers.next_rows(before, executed[goes_on], following[goes_on])
         if not alive.size:
             break
     return float(returns.mean()), _half_width(returns, *return_range)

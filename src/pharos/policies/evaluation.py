@@ -16,6 +16,7 @@ from pharos.errors import DivergenceError, ParameterError
 from pharos.mdp import PolicyTable, TabularMDP, takes_mdp
 from pharos.policies.asking import Answers, PolicyAnswers, Sight, TableAnswers
 from pharos.policies.estimation import estimate
+from pharos.policies.histories import answers_of
 from pharos.policies.policy import Model, Policy, PolicyLike, TabularAgent
 from pharos.solvers import Solution
 from pharos.state_space import load
@@ -72,7 +73,7 @@ def evaluate_seeing(
             return Evaluation(solution.value_at_start, True, solution.error_bound, mdp.num_states)
         answers = TableAnswers(table, mdp)
     else:
-        answers = PolicyAnswers(policy, mdp, sight(), deterministic=deterministic)
+        answers = answers_of(policy, mdp, sight(), deterministic=deterministic)
     steps, error = _steps_that_matter(mdp)
     if answers.reach(max_states, steps):
         solution = solvers.evaluate_policy(*answers.reached_mdp())
@@ -178,6 +179,10 @@ def evaluate_observing(
             f"give the policy as a table"
         )
     sight = Sight(space, space.environment, observation, dict(observation_options or {}), previous_action, mdp.horizon)
+    if sight.frames > 1:
+        raise ParameterError(
+            "the policy sees several frames, so its values belong to no state; use experiments.evaluate_agent"
+        )
     answers = PolicyAnswers(policy, mdp, sight, deterministic=deterministic)
     answers.reach()
     sub, chosen = answers.reached_mdp()
