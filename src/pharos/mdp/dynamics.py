@@ -271,10 +271,12 @@ class Dynamics(ABC):
     def order(self, live: np.ndarray) -> Order | None:
         """An order of states in which each live one (S,) bool stands before those it leads to; None: there is none."""
         transitions = self._edges(live)
-        if paths.is_increasing(transitions, live, None)[0] < 0:
-            return Order(None, int(paths.longest_path(transitions, live, None)))
-        states, longest = paths.topological_order(transitions, live)
-        return Order(states, int(longest)) if longest >= 0 else None
+        states = None
+        if paths.is_increasing(transitions, live, None)[0] >= 0:
+            states = paths.topological_order(transitions, live)
+            if len(states) < self.num_states:
+                return None
+        return Order(states, int(paths.longest_path(transitions, live, states)))
 
     def check_age(self, live: np.ndarray, age: np.ndarray) -> None:
         """ParameterError unless each transition of a live state (S,) bool leads to one of larger age (S,)."""

@@ -380,7 +380,7 @@ class TabularMDP:
     def order(self) -> Order | None:
         """An order of the states in which each stands before those it may lead to; None: some can be visited again.
 
-        Cost: from ages at most a sort; else O(S A) and 24 bytes a state.
+        Cost: from ages at most a sort; else O(S A) and 16 bytes a state.
         """
         if self.age is None:
             return self.dynamics.order(~np.asarray(self.terminal))
