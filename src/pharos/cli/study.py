@@ -139,10 +139,16 @@ def run(
                 timeout=timeout,
                 workers=workers,
                 progress=progress,
+                foretold=_say,
             )
     _answer(end, json)
     if end.failed:
         raise typer.Exit(EXIT_FAILED)
+
+
+def _say(forecast: Any) -> None:
+    """How long it will take, on standard error."""
+    console(stderr=True).print(str(forecast), soft_wrap=True)
 
 
 def _print_jobs(jobs: list[str], json: bool) -> None:

@@ -6,6 +6,7 @@ from pharos.experiments.config import ENGINES, ChanceSetting, Horizon, RunConfig
 from pharos.experiments.evaluation import Evaluation, evaluate_agent
 from pharos.experiments.loading import load_agent
 from pharos.experiments.many import train_many
+from pharos.experiments.pace import steps_in_seconds
 from pharos.experiments.regret import ReferenceValues, RegretCurve, cumulative_expected_regret, regret
 from pharos.experiments.results import (
     check_agent,
@@ -51,6 +52,7 @@ __all__ = [
     "read_table",
     "regret",
     "run_id",
+    "steps_in_seconds",
     "train",
     "train_config",
     "train_configs",

@@ -16,6 +16,7 @@ from pharos.study.blocks import Run, Specification
 from pharos.study.clusters import run_on_ray, submit
 from pharos.study.execution import Status, opened, run, status
 from pharos.study.findings import findings
+from pharos.study.forecast import Forecast
 from pharos.study.paper import paper_regressions, paper_returns
 from pharos.study.regression import Fit, aggregate_r_squared, fit, fit_models, leave_one_class_out_r_squared
 from pharos.study.report import StudyReport, report
@@ -27,6 +28,7 @@ __all__ = [
     "Comparison",
     "Estimate",
     "Fit",
+    "Forecast",
     "Models",
     "Run",
     "Specification",

@@ -22,6 +22,7 @@ from pharos.study import batches as _batches
 from pharos.study import values as _values
 from pharos.study import worker as _worker
 from pharos.study.blocks import Run, Specification
+from pharos.study.forecast import Forecast, forecast
 from pharos.study.preparing import prepare_instance, prepare_instances
 from pharos.study.processes import end_processes, one_thread, processors, worker_context
 from pharos.study.specification import Source
@@ -76,6 +77,7 @@ def run(
     runner: _worker.Runner = train,
     prepare: Callable[[Mapping[str, Any]], Any] | None = None,
     batch_runner: _batches.BatchRunner | None = None,
+    foretold: Callable[[Forecast], None] | None = None,
 ) -> Status:
     """Execute the runs of a study that are not over, on this machine.
 
@@ -95,6 +97,8 @@ def run(
             spaces for the usual runner, and does nothing for another.
         batch_runner: `runner(configs, folders, folder for checkpoints)` of runs that the study says are batched; None:
             the usual one for the usual runner, else each of them alone.
+        foretold: called before the first run with how long all of them will take; paces that nothing tells are
+            measured where the whole takes long. None: nothing is foretold.
     Returns:
         The Status at the end. Failed runs do not stop the others.
     Raises:
@@ -117,6 +121,8 @@ def run(
         status_file=name,
     )
     execution = Execution(study, place, runs, options)
+    if foretold is not None and execution.pending:
+        foretold(execution.forecast(measure=runner is train))
     if prepare is None and runner is train:
         prepare = prepare_instance
     if prepare is not None:
@@ -158,6 +164,11 @@ class Execution:
         for run in runs:
             if not self.note(run, options.retry_failed):
                 self.pending.append((0.0, run))
+
+    def forecast(self, *, measure: bool) -> Forecast:
+        """How long the runs that are missing will take."""
+        runs = [run for _, run in self.pending]
+        return forecast(runs, self.options.workers, self.seconds_per_step, measure=measure, tell=self.report)
 
     def prepare(self, prepare: Callable[[Mapping[str, Any]], Any]) -> None:
         """Call `prepare` with one config of each instance that has runs to come; a failure is left to the runs to
