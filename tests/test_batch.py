@@ -9,6 +9,7 @@ import pytest
 
 import fake_engine
 import pharos
+from pharos.agents import hyperparameters
 from pharos.errors import ParameterError, PharosError, UnknownName
 from pharos.experiments import (
     FailedRun,
@@ -20,6 +21,7 @@ from pharos.experiments import (
     read_record,
     train_configs,
     train_many,
+    tune,
 )
 from pharos.experiments.results import COLUMNS
 
@@ -222,3 +224,29 @@ def test_what_the_engine_itself_has_learnt_is_read_and_resumed(tmp_path, monkeyp
         assert bytes_of(tmp_path / "killed" / f"seed-{seed}") == bytes_of(tmp_path / "whole" / f"seed-{seed}")
         task, agent = load_agent(tmp_path / "killed" / f"seed-{seed}")
         assert evaluate_agent(agent, task).value == pytest.approx(end.result["final_value"], abs=1e-9)
+
+
+def test_a_trial_of_a_search_is_one_batch(engine, tmp_path):
+    instances, chances = ["simple_grid/4x4-plain", "simple_grid/4x4-decoy"], [{}, {"random": 0.1}]
+    options = {"steps": 40, "seeds": [5, 6], "chances": chances, "engine": "batched"}
+    found = tune("dqn", instances, trials=2, out=tmp_path / "found", **options)
+    assert engine.made == [8, 8]
+    assert json.loads((tmp_path / "found" / "tuning.json").read_text())["config"]["engine"] == "batched"
+    runs = [
+        RunConfig.of_task(
+            Task.of(instance, random=chance.get("random", 0.0)),
+            "dqn",
+            steps=40,
+            seed=seed,
+            evaluation_interval=2,
+            hyperparameters={**hyperparameters("dqn", "simple_grid", "vector"), **found.trials[0]["hyperparameters"]},
+            engine="batched",
+        )
+        for seed in (5, 6)
+        for instance in instances
+        for chance in chances
+    ]
+    rows = [row["normalized_regret"] for end in train_configs(runs) for row in end.curve[1:]]
+    assert found.first_score == pytest.approx(sum(rows) / len(rows))
+    with pytest.raises(PharosError, match="the batched engine: it has no hyperparameter"):
+        tune("dqn", instances, trials=1, space={"optimize_memory_usage": ("one of", True)}, **options)

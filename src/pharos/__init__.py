@@ -43,6 +43,7 @@ _HOMES = {
     "observe": "pharos.observations",
     "GymEnv": "pharos.interaction",
     "make_vec": "pharos.interaction",
+    "to_gymnax": "pharos.interaction",
     "train": "pharos.experiments",
     "train_many": "pharos.experiments",
     "PharosError": "pharos.errors",

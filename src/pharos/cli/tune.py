@@ -30,7 +30,7 @@ def tune(
     steps: Annotated[int, typer.Option("--steps", min=1, help="Steps of every run.")] = 50_000,
     trials: Annotated[int, typer.Option("--trials", min=1, help="Trials in all, earlier ones in --out included.")] = 50,
     seeds: Annotated[
-        str, typer.Option("--seeds", metavar="S,...", help="Of the runs of a trial; not those of your experiment.")
+        str, typer.Option("--seeds", metavar="A:B|S,...", help="Of the runs of a trial; not those of your experiment.")
     ] = "1000,1001",
     search: Annotated[
         list[str] | None,
@@ -42,6 +42,9 @@ def tune(
         ),
     ] = None,
     search_seed: Annotated[int, typer.Option("--search-seed", min=0, help="Of the search.")] = 0,
+    engine: Annotated[
+        str, typer.Option("--engine", help="sb3; or batched: all runs of a trial that fit together as one program.")
+    ] = "sb3",
     out: Annotated[
         Path | None, typer.Option("--out", help="Folder for the YAML and the record; a search there goes on.")
     ] = None,
@@ -74,6 +77,7 @@ def tune(
             chances=_chances(chance),
             space=_space(search),
             search_seed=search_seed,
+            engine=engine,
             out=out,
             progress=_telling(show),
         )

@@ -6,7 +6,8 @@
 
 A trial trains on every instance with every seed. Its score is the mean over these runs of the mean normalised regret of
 their evaluations after the first: 0 is optimal from the first evaluation on, 1 as bad as acting at random. A trial
-whose mean so far is worse than the median of earlier trials at the same point is given up. The first trial is what the
+whose mean so far is worse than the median of earlier trials at the same point is given up. With the batched engine all
+runs of a trial that fit together are one program. The first trial is what the
 table says now, so that the best is never worse than that on the instances and seeds of the search.
 
 Source: Bergstra et al. (2011), Algorithms for hyper-parameter optimization; Akiba et al. (2019), Optuna.
@@ -27,8 +28,10 @@ from pharos.agents import hyperparameters as hyperparameters_of
 from pharos.environments import Environment, make
 from pharos.errors import MissingExtra, ParameterError
 from pharos.experiments import results as _results
-from pharos.experiments.config import ChanceSetting
+from pharos.experiments.batch import Progress, train_configs
+from pharos.experiments.config import ChanceSetting, RunConfig
 from pharos.experiments.journal import JournalLock, mend_journal
+from pharos.experiments.members import FailedRun, Members
 from pharos.experiments.search_space import allows, checked_space, default_value, suggested_value
 from pharos.experiments.task import Task
 from pharos.experiments.train import train_on
@@ -75,6 +78,7 @@ def tune(
     chances: Sequence[Mapping[str, float]] | None = None,
     space: Mapping[str, Sequence[Any]] | None = None,
     search_seed: int = 0,
+    engine: str = "sb3",
     out: str | os.PathLike | None = None,
     progress: Callable[[int, int, float], None] | None = None,
 ) -> TuningResult:
@@ -90,6 +94,7 @@ def tune(
         seeds: of the runs of a trial; keep them apart from the seeds of the experiment that follows.
         space: what is searched, in the form of `SPACES`; None: what that says of the agent.
         search_seed: of the search.
+        engine: "sb3": the runs of a trial one after the other; "batched": at once.
         out: folder; a search there goes on. None: nothing is written.
         progress: called after each trial with trials done, trials in all, and the best score so far.
     Raises:
@@ -117,6 +122,7 @@ def tune(
         seeds=seeds,
         steps=steps,
         search_seed=search_seed,
+        engine=engine,
     )
     folder = None if out is None else Path(out)
     if folder is not None:
@@ -161,6 +167,7 @@ class _Search:
     seeds: Sequence[int]
     steps: int
     search_seed: int
+    engine: str
 
     @cached_property
     def observation_name(self) -> str:
@@ -198,6 +205,8 @@ class _Search:
             "space": {name: list(choices) for name, choices in self.space.items()},
             "search_seed": self.search_seed,
         }
+        if self.engine != "sb3":
+            config["engine"] = self.engine
         return json.loads(json.dumps(config))
 
     def check_tasks(self) -> None:
@@ -211,6 +220,8 @@ class _Search:
     def score(self, trial: Any, pruned: type[Exception]) -> float:
         """The mean normalised regret of evaluations after the first, over all runs; `pruned` is raised on the way."""
         chosen = {key: suggested_value(trial, key, choices) for key, choices in self.space.items()}
+        if self.engine == "batched":
+            return self._score_of_a_batch(trial, pruned, chosen)
         regrets: list[float] = []
 
         def progress(_done: int, _steps: int, row: Mapping[str, Any]) -> None:
@@ -230,6 +241,39 @@ class _Search:
                     hyperparameters={**self.table, **chosen},
                     progress=progress,
                 )
+        return sum(regrets) / len(regrets)
+
+    @cached_property
+    def _members(self) -> Members:
+        return Members()
+
+    def _score_of_a_batch(self, trial: Any, pruned: type[Exception], chosen: Mapping[str, Any]) -> float:
+        """As `score`, of all runs at once: the mean so far is that of all of them at the same step."""
+        configs = []
+        for seed in self.seeds:
+            for task in self.tasks:
+                config = RunConfig.of_task(
+                    task,
+                    self.agent,
+                    steps=self.steps,
+                    seed=seed,
+                    evaluation_interval=max(1, self.steps // EVALUATIONS),
+                    hyperparameters={**self.table, **chosen},
+                    engine=self.engine,
+                )
+                self._members.adopt(config, task)
+                configs.append(config)
+        regrets: list[float] = []
+
+        def progress(now: Progress) -> None:
+            regrets.extend(row["normalized_regret"] for row in now.rows.values())
+            trial.report(sum(regrets) / len(regrets), len(regrets))
+            if trial.should_prune():
+                raise pruned
+
+        for end in train_configs(configs, progress=progress, members=self._members):
+            if isinstance(end, FailedRun):
+                raise end.exception
         return sum(regrets) / len(regrets)
 
 

@@ -9,6 +9,7 @@ from pharos import lazy
 
 if TYPE_CHECKING:
     from pharos.interaction.gym_env import GymEnv
+    from pharos.interaction.jax_export import to_gymnax
     from pharos.interaction.registration import ids_of, register_class
     from pharos.interaction.sb3_env import SB3VecEnv, make_sb3_vec
     from pharos.interaction.simulator import Interaction, Simulator, split_options
@@ -25,6 +26,7 @@ _FILES = {
     "make_vec": "vector_env",
     "register_class": "registration",
     "split_options": "simulator",
+    "to_gymnax": "jax_export",
 }
 
 __all__ = [
@@ -38,6 +40,7 @@ __all__ = [
     "make_vec",
     "register_class",
     "split_options",
+    "to_gymnax",
 ]
 
 __getattr__ = lazy.attributes(__name__, _FILES)

@@ -1,0 +1,194 @@
+"""A tabular MDP as an environment of gymnax, for agents in JAX: jit, vmap and scan go through it. Needs the extra jax.
+
+The tables are parameters of the environment, arrays on the device, so that one compiled program steps any MDP of the
+same shape, and `vmap` over parameters trains on several at once.
+"""
+
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from gymnax.environments import environment, spaces
+
+from pharos.mdp import TabularMDP
+
+
+@struct.dataclass
+class EnvState(environment.EnvState):
+    """Where an episode is.
+
+    Attributes:
+        time: steps so far.
+        index: number of the state; S is the end.
+        previous: the action that was executed last; A before the first step.
+    """
+
+    time: Any
+    index: Any
+    previous: Any
+
+
+@struct.dataclass
+class EnvParams(environment.EnvParams):
+    """The tables of an MDP with S states, A actions and at most K outcomes of an action.
+
+    Attributes:
+        max_steps_in_episode: time limit.
+        successors: (S + 1, A, K) int32; the last row is the end.
+        cumulative: (S + 1, A, K) float32, cumulated probabilities of the outcomes.
+        rewards: (S + 1, A) float32, what executing an action pays on average.
+        ends: (S + 1,) bool, whether an episode is over there.
+        starts, start_cumulative: (N,) int32, (N,) float32: start states and their cumulated probabilities.
+        observations: (S + 1, ...) what is seen of each state.
+        chance: (4,) float32: probabilities that the chosen, the previous, a uniform action is executed; and that the
+            chosen one is on the first step.
+    """
+
+    max_steps_in_episode: Any
+    successors: Any
+    cumulative: Any
+    rewards: Any
+    ends: Any
+    starts: Any
+    start_cumulative: Any
+    observations: Any
+    chance: Any
+
+
+class GymnaxEnv(environment.Environment):
+    """A tabular MDP; `default_params` holds its tables.
+
+    Args:
+        mdp: with its chance.
+        observations: (S, ...) what is seen of each state.
+        low, high: of the observations.
+        time_limit: steps of an episode.
+        name: of the environment.
+    """
+
+    def __init__(self, mdp: TabularMDP, observations: np.ndarray, low: Any, high: Any, time_limit: int, name: str):
+        super().__init__()
+        self._name, self._num_actions, self._num_states = name, mdp.num_actions, mdp.num_states
+        self._space = spaces.Box(low, high, observations.shape[1:], observations.dtype)
+        nothing = np.zeros_like(observations[:1])
+        cumulative = np.cumsum(mdp.start_probabilities)
+        successors, probabilities = _outcomes(mdp)
+        ends = np.append(np.asarray(mdp.terminal, np.bool_), True)
+        rewards = np.vstack([np.where(ends[:-1, None], 0.0, mdp.rewards), np.zeros((1, mdp.num_actions))])
+        self._params = EnvParams(
+            max_steps_in_episode=time_limit,
+            successors=jnp.asarray(successors, jnp.int32),
+            cumulative=jnp.asarray(probabilities, jnp.float32),
+            rewards=jnp.asarray(rewards, jnp.float32),
+            ends=jnp.asarray(ends),
+            starts=jnp.asarray(mdp.start_states, jnp.int32),
+            start_cumulative=jnp.asarray(cumulative, jnp.float32),
+            observations=jnp.asarray(np.concatenate([observations, nothing])),
+            chance=jnp.asarray([*mdp.chance.triple, mdp.chance.first_chosen], jnp.float32),
+        )
+
+    @property
+    def default_params(self) -> EnvParams:
+        """The tables of the MDP."""
+        return self._params
+
+    @property
+    def name(self) -> str:
+        """As pharos writes the environment."""
+        return self._name
+
+    @property
+    def num_actions(self) -> int:
+        """A."""
+        return self._num_actions
+
+    def step_env(self, key: Any, state: Any, action: Any, params: Any) -> tuple[Any, ...]:
+        """One step: (observation, state, reward, whether a terminal state was reached, info)."""
+        key_which, key_uniform, key_outcome = jax.random.split(key, 3)
+        chosen, previous, _, first_chosen = params.chance
+        u = jax.random.uniform(key_which)
+        uniform = jax.random.randint(key_uniform, (), 0, self._num_actions)
+        later = jnp.where(u < chosen, action, jnp.where(u < chosen + previous, state.previous, uniform))
+        first = jnp.where(u < first_chosen, action, uniform)
+        executed = jnp.where(state.previous == self._num_actions, first, later).astype(jnp.int32)
+        outcome = _drawn(params.cumulative[state.index, executed], jax.random.uniform(key_outcome))
+        following = params.successors[state.index, executed, outcome]
+        reward = params.rewards[state.index, executed]
+        after = EnvState(time=state.time + 1, index=following, previous=executed)
+        is_over = params.ends[following]
+        info = {"discount": jnp.where(is_over, 0.0, 1.0), "executed": executed}
+        return self.get_obs(after, params), after, reward, is_over, info
+
+    def reset_env(self, key: Any, params: Any) -> tuple[Any, EnvState]:
+        """A start state: (observation, state)."""
+        index = params.starts[_drawn(params.start_cumulative, jax.random.uniform(key))]
+        state = EnvState(
+            time=jnp.zeros((), jnp.int32), index=index, previous=jnp.full((), self._num_actions, jnp.int32)
+        )
+        return self.get_obs(state, params), state
+
+    def get_obs(self, state: Any, params: Any = None, key: Any = None) -> Any:
+        """What is seen of a state."""
+        return (self._params if params is None else params).observations[state.index]
+
+    def is_terminated(self, state: Any, params: Any) -> Any:
+        """Whether a terminal state was reached."""
+        return params.ends[state.index]
+
+    def action_space(self, params: Any = None) -> Any:
+        """Discrete(A)."""
+        return spaces.Discrete(self._num_actions)
+
+    def observation_space(self, params: Any = None) -> Any:
+        """A Box."""
+        return self._space
+
+    def state_space(self, params: Any = None) -> Any:
+        """A Dict of the components of `EnvState`."""
+        limit = (self._params if params is None else params).max_steps_in_episode
+        return spaces.Dict(
+            {
+                "time": spaces.Discrete(limit + 1),
+                "index": spaces.Discrete(self._num_states + 1),
+                "previous": spaces.Discrete(self._num_actions + 1),
+            }
+        )
+
+
+class JoinedEnds(GymnaxEnv):
+    """The same for agents of gymnax before 1.0, such as rejax 0.1: `step` joins terminated and truncated to `done`."""
+
+    @partial(jax.jit, static_argnames=("self",))
+    def step(self, key: Any, state: Any, action: Any, params: Any = None) -> tuple[Any, ...]:
+        """(observation, state, reward, done, info)."""
+        seen, after, reward, terminated, truncated, info = super().step(key, state, action, params)
+        return seen, after, reward, jnp.logical_or(terminated, truncated), info
+
+
+def _drawn(cumulative: Any, u: Any) -> Any:
+    """The first entry whose cumulated probability exceeds u; entries that cannot be drawn come after all others."""
+    return jnp.minimum(jnp.sum(u >= cumulative), len(cumulative) - 1)
+
+
+def _outcomes(mdp: TabularMDP) -> tuple[np.ndarray, np.ndarray]:
+    """(S + 1, A, K) next states, S for the end, and cumulated probabilities; 1 from the last possible outcome on."""
+    num_states, num_actions = mdp.num_states, mdp.num_actions
+    states = np.repeat(np.arange(num_states), num_actions)
+    found = mdp.dynamics.outcomes(states, np.tile(np.arange(num_actions), num_states))
+    which = np.asarray(found.which)
+    order = np.argsort(which, kind="stable")
+    which = which[order]
+    place = np.arange(len(which)) - np.searchsorted(which, which)
+    pairs, width = num_states * num_actions, int(place.max(initial=0)) + 1
+    successors, cumulative = np.full((pairs, width), num_states), np.zeros((pairs, width))
+    successors[which, place] = np.asarray(found.states)[order]
+    cumulative[which, place] = np.asarray(found.probabilities)[order]
+    counts = np.bincount(which, minlength=pairs)
+    cumulative = np.cumsum(cumulative, axis=1)
+    cumulative[np.arange(width) >= counts[:, None] - 1] = 1.0
+    end = np.full((1, num_actions, width), num_states), np.ones((1, num_actions, width))
+    shape = (num_states, num_actions, width)
+    return np.concatenate([successors.reshape(shape), end[0]]), np.concatenate([cumulative.reshape(shape), end[1]])
