@@ -53,7 +53,7 @@ def walks(jax, env, number, steps, seed=0):
         return jax.lax.scan(step, state, jax.random.split(key_steps, steps))[1]
 
     keys = jax.random.split(jax.random.PRNGKey(seed), number)
-    return [np.asarray(each) for each in jax.jit(jax.vmap(walk))(keys)]
+    return [np.swapaxes(np.asarray(each), 0, 1) for each in jax.jit(jax.vmap(walk))(keys)]
 
 
 def test_the_interface_is_that_of_gymnax(jax, space):

@@ -32,7 +32,7 @@ class EnvState(environment.EnvState):
 
 
 @struct.dataclass
-class EnvParams(environment.EnvParams):
+class EnvParams:
     """The tables of an MDP with S states, A actions and at most K outcomes of an action.
 
     Attributes:
