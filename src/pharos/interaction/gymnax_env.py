@@ -78,7 +78,8 @@ class GymnaxEnv(environment.Environment):
         successors, probabilities = _outcomes(mdp)
         ends = np.append(np.asarray(mdp.terminal, np.bool_), True)
         rewards = np.vstack([np.where(ends[:-1, None], 0.0, mdp.rewards), np.zeros((1, mdp.num_actions))])
-        self._params = EnvParams(
+        made: Any = EnvParams  # whose fields flax declares
+        self._params = made(
             max_steps_in_episode=time_limit,
             successors=jnp.asarray(successors, jnp.int32),
             cumulative=jnp.asarray(probabilities, jnp.float32),
