@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from pharos.errors import ParameterError
+from pharos.errors import ParameterError, UnknownName
 from pharos.mdp import TabularMDP
 
 DEFAULTS: dict[str, Any] = {
@@ -69,8 +69,6 @@ class QLearning:
             )
         unknown = set(options) - set(DEFAULTS)
         if unknown:
-            from pharos.errors import UnknownName
-
             raise UnknownName("hyperparameter of q_learning", sorted(unknown)[0], DEFAULTS)
         self.mdp, self.options, self.seed = mdp, {**DEFAULTS, **options}, int(seed)
         self.total_steps = int(total_steps)

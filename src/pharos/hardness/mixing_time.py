@@ -9,6 +9,7 @@ from scipy import sparse
 from scipy.sparse import csgraph
 
 from pharos.errors import ParameterError, UndefinedMeasure
+from pharos.hardness.choices import choices_of, reachable
 from pharos.mdp import PolicyTable, TabularMDP, takes_mdp
 
 MOST_NODES = 4096
@@ -69,8 +70,6 @@ def mixing_time(
     Cost: 2 log2(t_mix) products of N x N matrices.
     Source: Kearns and Singh (2002); Levin, Peres and Wilmer (2009), "Markov chains and mixing times", section 4.5.
     """
-    from pharos.hardness.choices import choices_of, reachable
-
     if isinstance(epsilon, bool) or not isinstance(epsilon, int | float | np.floating) or not 0 < epsilon < 0.5:
         raise ParameterError(f"epsilon is {epsilon!r}; expected a number between 0 and 1/2")
     if mdp.num_states > 100 * MOST_NODES:  # too many to be written out, even if few can be reached

@@ -13,6 +13,7 @@ import numpy as np
 
 from pharos.errors import ParameterError, PrecisionError, UndefinedMeasure
 from pharos.hardness.choices import Choices, choices_of, reachable
+from pharos.hardness.gaps import optimal_solution
 from pharos.hardness.look_ahead import LookAhead
 from pharos.hardness.steps import expected_rewards, single_outcomes
 from pharos.mdp import TabularMDP, takes_mdp
@@ -173,8 +174,6 @@ class _Nodes:
     """
 
     def __init__(self, mdp: TabularMDP, solution: Solution | None, tolerance: float, tell: Callable[[str], None]):
-        from pharos.hardness.gaps import optimal_solution
-
         self.gamma, self.num_actions = mdp.gamma, mdp.num_actions
         self.table: np.ndarray | None
         if mdp.is_deterministic:

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from pharos.agents import TABULAR_OBSERVATION, agent_kind, agent_source, hyperparameters
-from pharos.environments import as_tuples, imported, source_of
+from pharos.environments import as_tuples, imported, make, source_of
 from pharos.errors import MissingExtra, ParameterError, UnknownName
 from pharos.experiments import ENGINES, ChanceSetting, Horizon, RunConfig
-from pharos.observations import OwnObservation, own_observation
+from pharos.observations import OwnObservation, names, own_observation
 from pharos.sources import is_reference
 from pharos.study.regression import MEASURES
 
@@ -106,8 +106,6 @@ class EnvironmentEntry(_Part):
 
     @cached_property
     def instance(self) -> Any:
-        from pharos.environments import make
-
         name = imported(self.name, self._folder).name if is_reference(self.name) else self.name
         return make(name, **{name: as_tuples(value) for name, value in self.parameters.items()})
 
@@ -148,8 +146,6 @@ class ObservationEntry(_Part):
     @field_validator("name")
     @classmethod
     def _known(cls, name: str, info: ValidationInfo) -> str:
-        from pharos.observations import names
-
         if is_reference(name):
             own_observation(name, (info.context or {}).get("folder"))
         elif name not in names():

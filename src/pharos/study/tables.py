@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pharos import experiments
+from pharos.environments import classes, make
 from pharos.errors import FileFormatError, ParameterError, UnknownName
 from pharos.experiments import ChanceSetting
 from pharos.observations import title
@@ -303,7 +304,6 @@ def _measure(
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """What is kept with the measures added (value, lower, upper, exact; or why there is none); the same with those that
     failed."""
-    from pharos.environments import make
     from pharos.hardness import report
 
     environment = make(config["environment"], **config["parameters"])
@@ -326,7 +326,6 @@ def build_mdp(
     environment: str, parameters: Mapping[str, Any], chance: Mapping[str, float], gamma: float
 ) -> "TabularMDP":
     """The tabular MDP that a run is about; its state space is built, or taken from the cache."""
-    from pharos.environments import make
     from pharos.state_space import build
 
     mdp = build(make(environment, **parameters), progress=False).mdp(gamma=gamma)
@@ -362,8 +361,6 @@ def _number(value: Any, exact: bool) -> dict[str, Any]:
 @cache
 def _paper_instances() -> dict[tuple[str, str], tuple[str, int]]:
     """(class, parameters as JSON) -> (class, number of its block in the paper's table)."""
-    from pharos.environments import classes, make
-
     return {
         (environment, _key(make(f"{environment}/{name}").parameters)): (environment, number)
         for environment, cls in classes().items()

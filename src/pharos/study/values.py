@@ -9,7 +9,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pharos.environments import start_distribution
 from pharos.errors import FileFormatError
+from pharos.experiments import RunConfig, TaskValues
+from pharos.paths import cache_directory
 from pharos.storage import is_intact, read_json, replace_json, sealed
 
 if TYPE_CHECKING:
@@ -18,8 +21,6 @@ if TYPE_CHECKING:
 
 def task_of(config: Mapping[str, Any]) -> "Task":
     """The task of a run of a study that was read already, so that code which it names is trusted."""
-    from pharos.experiments import RunConfig
-
     return RunConfig.from_dict(config).task(trust=True, strict=True)
 
 
@@ -27,8 +28,6 @@ def solve(config: Mapping[str, Any]) -> dict[str, Any]:
     """The values at the start of a task, as `TaskValues.to_dict` writes them; solved now unless they are stored."""
     values = stored_values(config)
     if values is None:
-        from pharos.experiments import TaskValues
-
         task = task_of(config)
         values = TaskValues(task.reference, task.return_range).to_dict()
         file = _file(config)
@@ -51,15 +50,12 @@ def stored_values(config: Mapping[str, Any]) -> dict[str, Any] | None:
 def _file(config: Mapping[str, Any]) -> Path:
     import xxhash
 
-    from pharos.paths import cache_directory
-
     name = xxhash.xxh3_64_hexdigest(json.dumps(_key(config), sort_keys=True).encode())
     return cache_directory() / "values" / f"{name}.json"
 
 
 def _key(config: Mapping[str, Any]) -> dict[str, Any]:
     """What the values depend on: parameters, rules by their code, start states, chance and setting."""
-    from pharos.environments import start_distribution
     from pharos.rules import fingerprint_of_rules
 
     env = task_of(config).env

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pharos.errors import MissingExtra
+
 if TYPE_CHECKING:
     import jinja2
     import pandas as pd
@@ -56,8 +58,6 @@ def _templates() -> "jinja2.Environment":
     try:
         import jinja2
     except ImportError as error:
-        from pharos.errors import MissingExtra
-
         raise MissingExtra("the report of a study", "jinja2", "study") from error
     return jinja2.Environment(
         loader=jinja2.PackageLoader("pharos.study.report"),

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pharos.environments import start_distribution
+from pharos.errors import PharosError
 from pharos.study.analysis import IMAGE, VECTOR
 from pharos.study.figures import agent_name, label, pairs_of, representations_figure, slug, title
 from pharos.study.latex import returns_table
@@ -279,8 +281,6 @@ def _pictures(study: Specification) -> dict[str, bytes]:
     from PIL import Image
 
     from pharos.drawing import human
-    from pharos.environments import start_distribution
-    from pharos.errors import PharosError
 
     pictures: dict[str, bytes] = {}
     for run in study.runs:
