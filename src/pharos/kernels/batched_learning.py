@@ -76,15 +76,14 @@ def _squares(x):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _adam(parameters, gradient, mean, square, scale, step, root, eps):
-    first, second = float32(0.1), float32(0.001)
-    keep = float32(0.999)
+def _adam(parameters, gradient, mean, square, scale, step, eps):
+    first, second, keep = float32(0.1), float32(0.001), float32(0.999)
     for j in range(len(parameters)):
         g = scale * gradient[j]
         m = mean[j] + first * (g - mean[j])
         v = keep * square[j] + second * g * g
         mean[j], square[j] = m, v
-        parameters[j] -= step * m / (np.sqrt(v) / root + eps)
+        parameters[j] -= step * m / (np.sqrt(v) + eps)
 
 
 @njit(cache=True, nogil=True)
@@ -98,6 +97,6 @@ def adam(parameters, gradients, means, squares, counts, is_active, rates, max_no
             counts[i] += 1
             norm = np.sqrt(np.float64(_squares(gradients[i])))
             scale = float32(min(1.0, max_norms[i] / (norm + 1e-6)))
-            step = rates[i] / (1.0 - 0.9 ** counts[i])
-            root = np.sqrt(1.0 - 0.999 ** counts[i])
-            _adam(parameters[i], gradients[i], means[i], squares[i], scale, float32(step), float32(root), float32(eps))
+            root = np.sqrt(1.0 - 0.999 ** counts[i])  # what divides the root of the squares multiplies the rest
+            step = float32(rates[i] / (1.0 - 0.9 ** counts[i]) * root)
+            _adam(parameters[i], gradients[i], means[i], squares[i], scale, step, float32(eps * root))

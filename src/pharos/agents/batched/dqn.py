@@ -8,6 +8,7 @@ import torch
 from pharos.agents.batched.lane import Lane
 from pharos.agents.batched.networks import QNetworks
 from pharos.agents.batched.replay import Replay
+from pharos.agents.batched.runs import remembers_targets
 from pharos.kernels import batched_learning as learning
 from pharos.kernels import batched_worlds as kernels
 
@@ -30,6 +31,8 @@ class DQNLane(Lane):
         self.epsilon = np.zeros(width)
         self._explores = np.zeros(width, np.bool_)
         self._no_scores = np.zeros((width, self.copies, self.num_actions), np.float32)
+        self._remembers = all(remembers_targets(run) for run in self.runs)
+        self._known: np.ndarray | None = None  # (W, S, A) values of the target networks, where they are remembered
         self._target_calls = np.maximum(self.own["target_update_interval"].astype(np.int64) // self.copies, 1)
 
     def network_of_lane(self) -> QNetworks:
@@ -76,6 +79,7 @@ class DQNLane(Lane):
     def copy_to_targets(self, runs: np.ndarray) -> None:
         """Move the target networks of some runs towards the online ones, all the way where tau is 1."""
         rows, tau = torch.from_numpy(runs), torch.from_numpy(self.own["tau"][runs]).float()[:, None]
+        self._known = None
         self.target[rows] = self.target[rows].mul_(1.0 - tau) + self.parameters[rows] * tau
 
     def update(self) -> None:
@@ -90,17 +94,39 @@ class DQNLane(Lane):
     def learn_minibatch(self) -> None:
         """One step of gradient descent on the minibatch that the replay memory has drawn."""
         batch = self.replay
-        following = self.observed(batch.next_states)
-        q_next = self.network.scores(self.target_values, following).clone()
-        q_choice = self.network.scores(self.values, following).clone() if self.shared["double"] else q_next
+        q_next = q_choice = self._target_scores(batch.next_states)
+        if self.shared["double"]:
+            q_choice = self.network.scores(self.values, self.observed(batch.next_states)).numpy().copy()
         q = self.network.scores(self.values, self.observed(batch.states))
-        dq = torch.empty_like(q_next)
+        dq = torch.empty(q.shape)
         learning.huber(
-            q.numpy(), q_next.numpy(), q_choice.numpy(), batch.actions, batch.rewards, batch.discounts, dq.numpy(),
-            self.losses,
-        )  # fmt: skip
+            q.numpy(), q_next, q_choice, batch.actions, batch.rewards, batch.discounts, dq.numpy(), self.losses
+        )
         self.network.backward(self.values, self.gradient_views, dq)
         self.adam(self._learns())
+
+    def _target_scores(self, states: np.ndarray) -> np.ndarray:
+        """(W, B, A) values of states (W, B) by the target networks."""
+        if not self._remembers:
+            return self.network.scores(self.target_values, self.observed(states)).numpy().copy()
+        if self._known is None:
+            self._known = self._all_target_scores(states.shape[1])
+        return self._known[np.arange(self.width)[:, None], states]
+
+    def _all_target_scores(self, size: int) -> np.ndarray:
+        """(W, S, A) of all states, `size` of each run at a time; runs with fewer states repeat their last one."""
+        numbers = np.array([run.mdp.num_states for run in self.runs])
+        known = np.empty((self.width, int(numbers.max()), self.num_actions), np.float32)
+        for first in range(0, known.shape[1], size):
+            states = np.minimum(np.arange(first, first + size), numbers[:, None] - 1)
+            part = known[:, first : first + size]
+            part[:] = self.network.scores(self.target_values, self.observed(states)).numpy()[:, : part.shape[1]]
+        return known
+
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        """Go on from what `arrays` gave."""
+        super().restore(arrays)
+        self._known = None
 
     def own_arrays(self) -> dict[str, np.ndarray]:
         """As `Lane` says."""

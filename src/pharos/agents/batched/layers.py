@@ -122,9 +122,12 @@ class Layer:
             _whole(y).tanh_()
 
     def _before_activation(self, dy: Tensor, y: Tensor) -> Tensor:
+        """The gradient before the activation, in the place of dy."""
         if self.activation == RELU:
-            return torch.ops.aten.threshold_backward(dy, y, 0)
-        return torch.ops.aten.tanh_backward(dy, y) if self.activation == TANH else dy
+            return torch.ops.aten.threshold_backward.grad_input(dy, y, 0, grad_input=dy)
+        if self.activation == TANH:
+            return torch.ops.aten.tanh_backward.grad_input(dy, y, grad_input=dy)
+        return dy
 
 
 class Linear(Layer):

@@ -70,6 +70,7 @@ ONLY: dict[str, Any] = {
     "sde_sample_freq": -1,
     "clip_range_vf": None,
 }
+MOST_REMEMBERED = 1 << 14  # states whose target values are kept
 BLOCK = 4096  # states that are observed at once
 
 
@@ -191,7 +192,17 @@ def group_key(agent: str, run: BatchRun) -> Hashable:
     options = resolved(agent, run.hyperparameters)
     shared = tuple((name, repr(options[name])) for name in OF_A_BATCH[agent])
     observation = (tuple(run.observe.shape), str(run.observe.dtype), run.observe.is_image)
-    return agent, run.steps, run.mdp.num_actions, observation, shared
+    remembers = agent == "dqn" and remembers_targets(run)
+    return agent, run.steps, run.mdp.num_actions, observation, shared, remembers
+
+
+def remembers_targets(run: BatchRun) -> bool:
+    """Whether DQN asks its target network about every state once a copy, as that is less than all minibatches ask."""
+    options = resolved("dqn", run.hyperparameters)
+    rollout = options["train_freq"] * options["n_envs"]
+    updates = options["gradient_steps"] if options["gradient_steps"] >= 0 else rollout
+    asked = options["target_update_interval"] / rollout * updates * options["batch_size"]
+    return 2 * run.mdp.num_states <= min(asked, 2 * MOST_REMEMBERED)
 
 
 def _net_arch(hyperparameters: Mapping[str, Any]) -> Any:
