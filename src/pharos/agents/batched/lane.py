@@ -43,7 +43,7 @@ class Lane:
         self.own = {name: np.array([options[name] for options in every], np.float64) for name in numbers}
         self.total, self.copies = runs[0].steps, int(self.shared["n_envs"])
         self.num_actions = runs[0].mdp.num_actions
-        self.keys = np.array([run.key for run in self.runs], np.uint64)
+        self.keys = np.array([run.key % 2**64 for run in self.runs], np.uint64)
         self.is_idle = np.arange(width) >= len(runs)
         self.worlds = Worlds(self.runs, self.keys, self.copies)
         self.actions = np.zeros((width, self.copies), np.int64)

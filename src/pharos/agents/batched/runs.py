@@ -178,7 +178,7 @@ def resolved(agent: str, hyperparameters: Mapping[str, Any]) -> dict[str, Any]:
     """All hyperparameters of an agent; ParameterError where the engine lacks one."""
     lacking = supports(agent, hyperparameters)
     if lacking is not None:
-        raise ParameterError(f"{lacking}; try the engine 'stable_baselines3'")
+        raise ParameterError(f"{lacking}; the engine sb3 has it")
     known = {**OF_A_RUN[agent], **OF_A_BATCH[agent]}
     result = {**known, **{name: value for name, value in hyperparameters.items() if name in known}}
     result["net_arch"] = _net_arch(hyperparameters)

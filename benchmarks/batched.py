@@ -1,0 +1,125 @@
+"""How fast is the batched engine beside Stable-Baselines3? Agent-steps per second of processor time of one thread.
+
+    python benchmarks/batched.py [--instance NAME] [--rounds R] [--seconds S] [--agents dqn ppo] [--observations ...]
+
+Both with the hyperparameters of pharos' table, after `learning_starts` and some updates. Rounds go through all
+contestants in turn, so that a busy machine slows all alike; the ratio is the median over rounds. The last columns:
+arithmetic of the networks in GFLOP/s, and its share of what a plain product of matrices reached in the same round.
+"""
+
+import argparse
+import math
+import statistics
+import time
+
+import torch
+
+from pharos.agents import hyperparameters, make_model
+from pharos.agents.batched import BatchRun, ObservationSource, make_batch
+from pharos.experiments import Task
+from pharos.interaction import make_sb3_vec
+
+RUNS = {"vector": 32, "simple_image": 8, "complex_image": 8}
+STEPS = 1_000_000  # of the training that the schedules belong to
+
+
+def peak() -> float:
+    """FLOP/s of a product of matrices, the best of some."""
+    size, best = 768, 0.0
+    a, b = torch.randn(size, size), torch.randn(size, size)
+    for _ in range(8):
+        began = time.process_time()
+        torch.mm(a, b)
+        best = max(best, 2 * size**3 / (time.process_time() - began))
+    return best
+
+
+class Alone:
+    """A model of Stable-Baselines3 as `pharos train` makes it."""
+
+    runs = 1
+
+    def __init__(self, agent: str, task: Task, options: dict, runs: int):
+        self.model = make_model(
+            agent, make_sb3_vec(task.env, options.get("n_envs", 1), seed=0, **task.interaction), options, seed=0
+        )
+        self.model.learn(1, reset_num_timesteps=False)
+
+    def learn(self, steps: int) -> None:
+        self.model.learn(steps, reset_num_timesteps=False)
+
+
+class Together:
+    """As many runs of the batched engine as make a lane."""
+
+    def __init__(self, agent: str, task: Task, options: dict, runs: int):
+        source = ObservationSource.of(task.space, task.sight.observe)
+        made = [BatchRun(task.mdp, source, task.time_limit, options, STEPS, i, i) for i in range(runs)]
+        self.batch, self.runs = make_batch(agent, made), runs
+
+    def learn(self, steps: int) -> None:
+        self.batch.learn([self.batch.steps + steps], lambda point: None)
+
+
+def speed(contestant, seconds: float, unit: int) -> float:
+    """Agent-steps per second of processor time."""
+    done, began = 0, time.process_time()
+    while time.process_time() - began < seconds:
+        contestant.learn(unit)
+        done += unit
+    return done * contestant.runs / (time.process_time() - began)
+
+
+def work(agent: str, task: Task, options: dict, lane) -> float:
+    """FLOP of an agent-step by the networks: 2 a weight and sample forwards, 4 backwards (2 in the first layer)."""
+    forward = first = 0.0
+    for each in lane.network.parameters.shapes:
+        if each.name.endswith("weight"):
+            pixels = math.prod(lane.seen.shape[1:]) if "layers.0.0" in each.name else 1
+            forward += 2 * each.size * pixels
+            first = first or forward
+    if agent == "ppo":
+        return forward * (1 + 3 * options["n_epochs"]) - first * options["n_epochs"]
+    updates = options["gradient_steps"] * options["batch_size"] / (options["train_freq"] * options.get("n_envs", 1))
+    return forward + updates * ((3 if lane._remembers else 4) * forward - first)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--instance", default="frozen_lake/8x8")
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--seconds", type=float, default=2.0)
+    parser.add_argument("--agents", nargs="+", default=["dqn", "ppo"])
+    parser.add_argument("--observations", nargs="+", default=["vector", "simple_image"])
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    print(f"{arguments.instance}, torch {torch.__version__}, {torch.backends.cpu.get_cpu_capability()}, one thread")
+    print(f"{'':18}{'runs':>5}{'sb3/s':>9}{'batched/s':>11}{'ratio':>7}{'lowest':>8}{'GFLOP/s':>9}{'of peak':>9}")
+    for agent in arguments.agents:
+        for observation in arguments.observations:
+            task = Task.of(arguments.instance, observation=observation)
+            options = hyperparameters(agent, task.env.name, observation)
+            if agent == "dqn":  # both act by their networks from the first step that is timed
+                options["exploration_fraction"] = 1e-6
+            unit = options["n_envs"] * options["n_steps"] if agent == "ppo" else 200
+            warm = max(2 * unit, options.get("learning_starts", 0) + 200)
+            pair = [kind(agent, task, options, RUNS[observation]) for kind in (Alone, Together)]
+            flop = work(agent, task, options, pair[1].batch.lanes[0])
+            for contestant in pair:
+                contestant.learn(-(-warm // unit) * unit)
+            rounds = [
+                (*(speed(contestant, arguments.seconds, unit) for contestant in pair), peak())
+                for _ in range(arguments.rounds)
+            ]
+            alone, together, _ = (statistics.median(part) for part in zip(*rounds, strict=True))
+            ratios = [b / a for a, b, _ in rounds]
+            share = statistics.median(b * flop / p for _, b, p in rounds)
+            print(
+                f"{agent} {observation:14}{RUNS[observation]:5}{alone:9.0f}{together:11.0f}"
+                f"{statistics.median(ratios):7.1f}{min(ratios):8.1f}{together * flop / 1e9:9.1f}{share:9.2f}",
+                flush=True,
+            )
+
+
+if __name__ == "__main__":
+    main()
