@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from pharos.agents.batched import BatchRun, ObservationSource, group_key, make_batch, supports
+from pharos.agents.batched.arithmetic import TensorArithmetic
 from pharos.environments import make
 from pharos.errors import ParameterError
 from pharos.experiments.task import Task
@@ -98,3 +99,16 @@ def test_runs_of_other_shapes_are_of_another_group(grid):
     assert group_key("dqn", one) == group_key("dqn", alike) != group_key("dqn", other)
     with pytest.raises(ParameterError, match="2 groups"):
         make_batch("dqn", [one, other])
+
+
+@pytest.mark.parametrize("agent", AGENTS)
+def test_tensor_operations_compute_what_the_compiled_loops_do(grid, agent):
+    """What runs on other devices, here on the processor."""
+    runs = runs_of(grid, AGENTS[agent])
+    compiled, tensors = (make_batch(agent, runs) for _ in range(2))
+    tensors.lanes[0].arithmetic = TensorArithmetic("cpu")
+    for batch in (compiled, tensors):
+        batch.learn([60], lambda point: None)
+    for i in range(3):
+        mine, other = compiled.parameters(i), tensors.parameters(i)
+        assert max(np.abs(mine[name] - other[name]).max() for name in mine) <= 1e-5

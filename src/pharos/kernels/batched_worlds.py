@@ -26,6 +26,30 @@ def exploring(keys, step, epsilon, is_warming, out):
 
 
 @njit(cache=True, nogil=True)
+def anneal(first, last, share, passed, out):
+    """out (W,) = what goes from first to last, (W,), over a share (W,) of the training, of which `passed` is over."""
+    for i in range(len(out)):
+        if passed > share[i]:
+            out[i] = last[i]
+        else:
+            out[i] = first[i] + passed * (last[i] - first[i]) / share[i] if share[i] > 0.0 else first[i]
+
+
+@njit(cache=True, nogil=True)
+def look_up(table, begins, states, out):
+    """out (W, pitch): the rows of a table (R, size), one after another, of the states (W, B) of each run.
+
+    begins (W,): the row of each run's first state.
+    """
+    size = table.shape[1]
+    for i in range(states.shape[0]):
+        for b in range(states.shape[1]):
+            row, target = table[begins[i] + states[i, b]], out[i, b * size : (b + 1) * size]
+            for j in range(size):
+                target[j] = row[j]
+
+
+@njit(cache=True, nogil=True)
 def choose(keys, step, explores, q, actions):
     """actions (W, E): random ones where a run explores, else the first of the best of q (W, E, A)."""
     for i in range(actions.shape[0]):

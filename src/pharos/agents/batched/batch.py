@@ -11,7 +11,7 @@ from pharos.agents.batched.ppo import PPOLane
 from pharos.agents.batched.runs import BatchRun, group_key
 from pharos.errors import ParameterError
 
-WIDTH_OF_VECTORS, WIDTH_OF_IMAGES = 32, 8
+WIDTH_OF_VECTORS, WIDTH_OF_IMAGES, WIDTH_ELSEWHERE = 32, 8, 256  # runs of a lane; the last: not on the processor
 LANES: dict[str, type[Lane]] = {"dqn": DQNLane, "ppo": PPOLane}
 
 
@@ -24,14 +24,14 @@ class Batch:
         episodes: (N,) int64, finished ones; returns: (N,) float64, the sums of their returns.
     """
 
-    def __init__(self, agent: str, runs: Sequence[BatchRun]):
+    def __init__(self, agent: str, runs: Sequence[BatchRun], device: str = "cpu"):
         if not runs:
             raise ParameterError("a batch has no runs; expected at least one")
         keys = {group_key(agent, run) for run in runs}
         if len(keys) > 1:
             raise ParameterError(f"{len(runs)} runs are of {len(keys)} groups; expected one batch a group (group_key)")
         self.runs = list(runs)
-        self.width = WIDTH_OF_IMAGES if runs[0].observe.is_image else WIDTH_OF_VECTORS
+        self.width = lane_width(runs[0], device)
         self.lanes = [
             LANES[agent](self.runs[first : first + self.width], self.width) for first in range(0, len(runs), self.width)
         ]
@@ -83,16 +83,21 @@ class Batch:
             lane.restore({name[len(prefix) :]: array for name, array in state.items() if name.startswith(prefix)})
 
 
+def lane_width(run: BatchRun, device: str = "cpu") -> int:
+    """The runs of a lane, chosen by measurement on the processor (docs/decisions/0013-batched-training.md)."""
+    if device != "cpu":
+        return WIDTH_ELSEWHERE
+    return WIDTH_OF_IMAGES if run.observe.is_image else WIDTH_OF_VECTORS
+
+
 def make_batch(agent: str, runs: Sequence[BatchRun], *, device: str = "cpu", threads: int | None = None) -> Batch:
     """A batch of runs of one group.
 
     Args:
-        device: where it runs.
+        device: of torch, where networks are; episodes and replay memories stay on the processor.
         threads: of torch; None for one, as studies use processes.
     Raises:
         ParameterError: the engine lacks a hyperparameter, or the runs are of several groups.
     """
-    if device != "cpu":
-        raise ParameterError(f"device is {device!r}; expected 'cpu'")
     torch.set_num_threads(threads or 1)
-    return Batch(agent, runs)
+    return Batch(agent, runs, device)

@@ -9,7 +9,6 @@ from pharos.agents.batched.lane import Lane
 from pharos.agents.batched.networks import QNetworks
 from pharos.agents.batched.replay import Replay
 from pharos.agents.batched.runs import remembers_targets
-from pharos.kernels import batched_learning as learning
 from pharos.kernels import batched_worlds as kernels
 
 
@@ -22,17 +21,21 @@ class DQNLane(Lane):
     """
 
     agent = "dqn"
+    tensors = (*Lane.tensors, "target")
 
-    def __init__(self, runs: Any, width: int):
-        super().__init__(runs, width)
+    def __init__(self, runs: Any, width: int, device: str = "cpu"):
+        super().__init__(runs, width, device)
+        self._rows = torch.arange(width, device=device)[:, None]
         self.target = self.parameters.clone()
         self.target_values = self.network.parameters.views(self.target)
         self.replay = Replay(self.keys, int(self.shared["buffer_size"]), self.copies, int(self.shared["batch_size"]))
         self.epsilon = np.zeros(width)
+        names = ("initial_eps", "final_eps", "fraction")
+        self._exploration = tuple(self.own[f"exploration_{name}"] for name in names)
         self._explores = np.zeros(width, np.bool_)
         self._no_scores = np.zeros((width, self.copies, self.num_actions), np.float32)
         self._remembers = all(remembers_targets(run) for run in self.runs)
-        self._known: np.ndarray | None = None  # (W, S, A) values of the target networks, where they are remembered
+        self._known: torch.Tensor | None = None  # (W, S, A) values of the target networks, where they are remembered
         self._target_calls = np.maximum(self.own["target_update_interval"].astype(np.int64) // self.copies, 1)
 
     def network_of_lane(self) -> QNetworks:
@@ -51,7 +54,7 @@ class DQNLane(Lane):
         is_warming = self.steps < self.own["learning_starts"]
         kernels.exploring(self.keys, self.calls, self.epsilon, is_warming, self._explores)
         if not self._explores[: self.number].all():
-            scores = self.network.scores(self.values, self.observed(worlds.state)).numpy()
+            scores = self.network.scores(self.values, self.observed(worlds.state)).cpu().numpy()
         kernels.choose(self.keys, self.calls, self._explores, scores, self.actions)
         before = worlds.state.copy()
         self.move()
@@ -72,13 +75,13 @@ class DQNLane(Lane):
         if len(copied):
             self.copy_to_targets(copied)
         passed = 1.0 - (1.0 - self.steps / self.total)
-        first, last, share = (self.own[f"exploration_{name}"] for name in ("initial_eps", "final_eps", "fraction"))
-        slope = (last - first) / np.maximum(share, 1e-300)
-        self.epsilon[:] = np.where(passed > share, last, first + passed * slope)
+        first, last, share = self._exploration
+        kernels.anneal(first, last, share, passed, self.epsilon)
 
     def copy_to_targets(self, runs: np.ndarray) -> None:
         """Move the target networks of some runs towards the online ones, all the way where tau is 1."""
-        rows, tau = torch.from_numpy(runs), torch.from_numpy(self.own["tau"][runs]).float()[:, None]
+        rows = torch.from_numpy(runs).to(self.device)
+        tau = torch.from_numpy(self.own["tau"][runs].astype(np.float32)[:, None]).to(self.device)
         self._known = None
         self.target[rows] = self.target[rows].mul_(1.0 - tau) + self.parameters[rows] * tau
 
@@ -96,31 +99,30 @@ class DQNLane(Lane):
         batch = self.replay
         q_next = q_choice = self._target_scores(batch.next_states)
         if self.shared["double"]:
-            q_choice = self.network.scores(self.values, self.observed(batch.next_states)).numpy().copy()
+            q_choice = self.network.scores(self.values, self.observed(batch.next_states)).clone()
         q = self.network.scores(self.values, self.observed(batch.states))
-        dq = torch.empty(q.shape)
-        learning.huber(
-            q.numpy(), q_next, q_choice, batch.actions, batch.rewards, batch.discounts, dq.numpy(), self.losses
-        )
+        dq = torch.empty(q.shape, device=self.device)
+        minibatch = (batch.actions, batch.rewards, batch.discounts)
+        self.arithmetic.huber(q, q_next, q_choice, minibatch, dq, self.losses)
         self.network.backward(self.values, self.gradient_views, dq)
         self.adam(self._learns())
 
-    def _target_scores(self, states: np.ndarray) -> np.ndarray:
+    def _target_scores(self, states: np.ndarray) -> torch.Tensor:
         """(W, B, A) values of states (W, B) by the target networks."""
         if not self._remembers:
-            return self.network.scores(self.target_values, self.observed(states)).numpy().copy()
+            return self.network.scores(self.target_values, self.observed(states)).clone()
         if self._known is None:
             self._known = self._all_target_scores(states.shape[1])
-        return self._known[np.arange(self.width)[:, None], states]
+        return self._known[self._rows, torch.from_numpy(states).to(self.device)]
 
-    def _all_target_scores(self, size: int) -> np.ndarray:
+    def _all_target_scores(self, size: int) -> torch.Tensor:
         """(W, S, A) of all states, `size` of each run at a time; runs with fewer states repeat their last one."""
         numbers = np.array([run.mdp.num_states for run in self.runs])
-        known = np.empty((self.width, int(numbers.max()), self.num_actions), np.float32)
+        known = torch.empty((self.width, int(numbers.max()), self.num_actions), device=self.device)
         for first in range(0, known.shape[1], size):
             states = np.minimum(np.arange(first, first + size), numbers[:, None] - 1)
             part = known[:, first : first + size]
-            part[:] = self.network.scores(self.target_values, self.observed(states)).numpy()[:, : part.shape[1]]
+            part[:] = self.network.scores(self.target_values, self.observed(states))[:, : part.shape[1]]
         return known
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
@@ -130,7 +132,7 @@ class DQNLane(Lane):
 
     def own_arrays(self) -> dict[str, np.ndarray]:
         """As `Lane` says."""
-        return {"target": self.target.numpy(), "epsilon": self.epsilon, **self.replay.arrays(self.calls)}
+        return {"epsilon": self.epsilon, **self.replay.arrays(self.calls)}
 
     def stored(self, i: int) -> dict[str, np.ndarray]:
         """The online and the target network of run i."""

@@ -6,12 +6,12 @@ from typing import Any
 import numpy as np
 import torch
 
+from pharos.agents.batched.arithmetic import CompiledArithmetic, TensorArithmetic
 from pharos.agents.batched.layers import Shape, Values, room
 from pharos.agents.batched.networks import names_of
 from pharos.agents.batched.observed import Seen
 from pharos.agents.batched.runs import BatchRun, resolved
 from pharos.agents.batched.worlds import Worlds
-from pharos.kernels import batched_learning as learning
 from pharos.kernels import batched_worlds as kernels
 from pharos.kernels import philox
 
@@ -34,8 +34,11 @@ class Lane:
     agent: str
     network: Any
 
-    def __init__(self, runs: Sequence[BatchRun], width: int):
-        self.number, self.width = len(runs), width
+    tensors: tuple[str, ...] = ("parameters", "means", "squares")  # those that have to be remembered
+
+    def __init__(self, runs: Sequence[BatchRun], width: int, device: str = "cpu"):
+        self.number, self.width, self.device = len(runs), width, device
+        self.arithmetic = (CompiledArithmetic if device == "cpu" else TensorArithmetic)(device)
         self.runs = [*runs, *[runs[0]] * (width - len(runs))]
         every = [resolved(self.agent, run.hyperparameters) for run in self.runs]
         self.shared = every[0]
@@ -47,9 +50,9 @@ class Lane:
         self.is_idle = np.arange(width) >= len(runs)
         self.worlds = Worlds(self.runs, self.keys, self.copies)
         self.actions = np.zeros((width, self.copies), np.int64)
-        self.seen = Seen(self.runs)
+        self.seen = Seen(self.runs, device)
         self._rooms: dict[int, torch.Tensor] = {}
-        self.parameters = torch.from_numpy(self.network_of_lane().initial(self._draws))
+        self.parameters = torch.from_numpy(self.network_of_lane().initial(self._draws)).to(device)
         self.gradients = torch.zeros_like(self.parameters)
         self.means, self.squares = torch.zeros_like(self.parameters), torch.zeros_like(self.parameters)
         self.updates = np.zeros(width, np.int64)
@@ -100,7 +103,7 @@ class Lane:
     def observed(self, states: np.ndarray) -> torch.Tensor:
         """(W, B, size) float32 observations of states (W, B); they stay until the next call with as many."""
         if states.shape[1] not in self._rooms:
-            self._rooms[states.shape[1]] = room(self.width, states.shape[1], self.seen.size)
+            self._rooms[states.shape[1]] = room(self.width, states.shape[1], self.seen.size, device=self.device)
         return self.seen.at(states, self._rooms[states.shape[1]])
 
     def move(self) -> None:
@@ -109,10 +112,9 @@ class Lane:
 
     def adam(self, is_active: np.ndarray) -> None:
         """A step down the clipped gradients, for the runs that are active."""
-        learning.adam(
-            self.parameters.numpy(), self.gradients.numpy(), self.means.numpy(), self.squares.numpy(), self.updates,
-            is_active, self.own["learning_rate"], self.own["max_grad_norm"], self.network.eps,
-        )  # fmt: skip
+        state = (self.parameters, self.gradients, self.means, self.squares)
+        rates, max_norms = self.own["learning_rate"], self.own["max_grad_norm"]
+        self.arithmetic.adam(state, self.updates, is_active, rates, max_norms, self.network.eps)
 
     def _draws(self, number: int) -> np.ndarray:
         """(W, number) uniform in (0, 1), for the first parameters."""
@@ -124,7 +126,7 @@ class Lane:
 
     def arrays(self) -> dict[str, np.ndarray]:
         """All that changes, by name; those of more than one number are changed in place."""
-        tensors = {name: getattr(self, name).numpy() for name in ("parameters", "means", "squares")}
+        tensors = {name: getattr(self, name).cpu().numpy() for name in self.tensors}
         counters = np.array([self.steps, self.calls, self.collected, self.is_due], np.int64)
         return {**tensors, "updates": self.updates, "counters": counters, **self.worlds.arrays(), **self.own_arrays()}
 
@@ -134,6 +136,8 @@ class Lane:
         self.is_due = bool(is_due)
         for name, array in self.arrays().items():
             array[...] = arrays[name]
+        for name in self.tensors:
+            getattr(self, name).copy_(torch.from_numpy(arrays[name]))
 
     def stored(self, i: int) -> dict[str, np.ndarray]:
         """The parameters of run i under Stable-Baselines3's names."""
@@ -142,7 +146,7 @@ class Lane:
     def as_stored(self, views: Values, i: int) -> dict[str, np.ndarray]:
         """name -> one run's part of some views of parameters or gradients, in Stable-Baselines3's shapes."""
         shapes: list[Shape] = self.network.parameters.shapes
-        found = {each.name: np.array(each.stored(views[each.name][i].numpy()), order="C") for each in shapes}
+        found = {each.name: np.array(each.stored(views[each.name][i].cpu().numpy()), order="C") for each in shapes}
         return {name: value for known, value in found.items() for name in names_of(known)}
 
 
@@ -156,10 +160,12 @@ class RunPolicy:
         """(M, A) float64 for observations (M, ...) as the environment gives them."""
         lane = self.lane
         values = {name: view[self.i : self.i + 1] for name, view in lane.values.items()}
-        block = torch.zeros((1, ASKED, lane.seen.size))  # of one size, as layers keep room for each size
+        block = torch.zeros(
+            (1, ASKED, lane.seen.size), device=lane.device
+        )  # of one size, as layers keep room for each size
         answers = []
         for first in range(0, len(observations), ASKED):
             rows = lane.seen.encoded(observations[first : first + ASKED])
             block[0, : len(rows)] = rows
-            answers.append(lane.probabilities(lane.network.scores(values, block)[0, : len(rows)].numpy()))
+            answers.append(lane.probabilities(lane.network.scores(values, block)[0, : len(rows)].cpu().numpy()))
         return np.concatenate(answers)

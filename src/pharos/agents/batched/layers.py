@@ -84,7 +84,7 @@ def room(width: int, *shape: int, device: Any = None) -> Tensor:
     return rows[:, :size].view(width, *shape)
 
 
-def _whole(y: Tensor) -> Tensor:
+def whole(y: Tensor) -> Tensor:
     """All the memory of a `room`, in which each run has a multiple of 64 bytes: none is at a loop's ragged end."""
     return y.as_strided((y.shape[0], y.stride(0)), (y.stride(0), 1))
 
@@ -119,7 +119,7 @@ class Layer:
         if self.activation == RELU:
             y.clamp_(min=0.0)
         elif self.activation == TANH:
-            _whole(y).tanh_()
+            whole(y).tanh_()
 
     def _before_activation(self, dy: Tensor, y: Tensor) -> Tensor:
         """The gradient before the activation, in the place of dy."""

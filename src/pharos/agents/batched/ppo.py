@@ -23,8 +23,8 @@ class PPOLane(Lane):
 
     agent = "ppo"
 
-    def __init__(self, runs: Any, width: int):
-        super().__init__(runs, width)
+    def __init__(self, runs: Any, width: int, device: str = "cpu"):
+        super().__init__(runs, width, device)
         shape = (width, int(self.shared["n_steps"]), self.copies)
         self.states, self.next_states, self.actions_taken = (np.zeros(shape, np.int64) for _ in range(3))
         self.log_probabilities, self.kept_values, self.rewards, self.begins, self.advantages = (
@@ -51,11 +51,11 @@ class PPOLane(Lane):
         """As `Lane` says."""
         worlds, t = self.worlds, self.collected
         scores, values = self.network.both(self.values, self.observed(worlds.state))
-        kernels.act(self.keys, self.calls, scores.numpy(), self.actions, self._log_p)
+        kernels.act(self.keys, self.calls, scores.cpu().numpy(), self.actions, self._log_p)
         self.states[:, t] = worlds.state
         self.move()
         self.next_states[:, t], self.actions_taken[:, t] = worlds.next_state, self.actions
-        self.log_probabilities[:, t], self.kept_values[:, t] = self._log_p, values[..., 0].numpy()
+        self.log_probabilities[:, t], self.kept_values[:, t] = self._log_p, values[..., 0].cpu().numpy()
         self.rewards[:, t], self.begins[:, t] = worlds.reward, self.begin
         self.timeouts[:, t] = worlds.flags & kernels.TIMEOUT
         self.begin[:] = worlds.flags & kernels.DONE
@@ -104,7 +104,7 @@ class PPOLane(Lane):
 
     def values_of(self, states: np.ndarray) -> np.ndarray:
         """(W, E) float32 values of states (W, E)."""
-        return self.network.values(self.values, self.observed(states))[..., 0].numpy().copy()
+        return self.network.values(self.values, self.observed(states))[..., 0].cpu().numpy().copy()
 
     def learn_minibatch(self, minibatch: tuple[np.ndarray, ...], is_active: np.ndarray) -> np.ndarray:
         """One step of gradient descent for the active runs, unless the policy has moved too far; (W,) those that did.
@@ -116,10 +116,11 @@ class PPOLane(Lane):
         if self.shared["normalize_advantage"] and states.shape[1] > 1:
             rollouts.normalize(advantages)
         scores, values = self.network.both(self.values, self.observed(states))
-        dscores, dvalues = torch.empty(scores.shape), torch.empty(values.shape)
-        rollouts.clipped_loss(
-            scores.numpy(), values.numpy(), (actions, old, advantages, returns), self.own["clip_range"],
-            self.own["ent_coef"], self.own["vf_coef"], dscores.numpy(), dvalues.numpy(), self.losses, self.divergences,
+        dscores, dvalues = (torch.empty(part.shape, device=self.device) for part in (scores, values))
+        weights = tuple(self.own[name] for name in ("clip_range", "ent_coef", "vf_coef"))
+        self.arithmetic.clipped_loss(
+            scores, values, (actions, old, advantages, returns), weights, (dscores, dvalues), self.losses,
+            self.divergences,
         )  # fmt: skip
         target = self.shared["target_kl"]
         if target is not None:
