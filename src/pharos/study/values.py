@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from pharos.environments import start_distribution
 from pharos.errors import FileFormatError
-from pharos.experiments import RunConfig, TaskValues
+from pharos.experiments import RunConfig
 from pharos.paths import cache_directory
 from pharos.storage import is_intact, read_json, replace_json, sealed
 
@@ -28,6 +28,8 @@ def solve(config: Mapping[str, Any]) -> dict[str, Any]:
     """The values at the start of a task, as `TaskValues.to_dict` writes them; solved now unless they are stored."""
     values = stored_values(config)
     if values is None:
+        from pharos.experiments import TaskValues  # loads what an MDP needs
+
         task = task_of(config)
         values = TaskValues(task.reference, task.return_range).to_dict()
         file = _file(config)
