@@ -5,6 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
+import naive_mdp
 import pharos
 from chance_worlds import ChanceWorld
 from pharos import experiments
@@ -23,6 +24,41 @@ def test_q_learning_learns_and_its_regret_is_exact():
     result = run.result
     assert result["exact"] and result["value_uniform"] < result["final_value"] <= result["value_optimal"]
     assert result["normalized_regret"] < 0.5 and result["final_regret"] < 0.1 * abs(result["value_optimal"])
+
+
+SMALL = {
+    "dqn": {"learning_starts": 100, "buffer_size": 2000, "exploration_fraction": 0.5, "learning_rate": 0.002},
+    "ppo": {"n_envs": 4, "n_steps": 64, "batch_size": 64, "n_epochs": 2, "learning_rate": 0.002},
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("agent", SMALL)
+def test_networks_learn_and_their_regret_is_that_of_the_policy_read_off_them(agent, tmp_path):
+    """The last policy, asked in every state and solved by an independent route, is worth what the run says."""
+    pytest.importorskip("torch")
+    env = pharos.make("cliff_walking", height=2, width=3, slippery=True)
+    run = experiments.train(
+        agent, env, steps=800, seed=1, evaluation_interval=400, horizon=20, hyperparameters=SMALL[agent], out=tmp_path
+    )
+    result = run.result
+    assert result["exact"]
+    policy, task = run.agent, Task(env, horizon=20)
+    chosen = np.asarray(policy.action_probabilities(pharos.observe(env, "vector")(task.space.states())))
+    chosen = chosen / chosen.sum(axis=1, keepdims=True)
+    P, R, start = naive_mdp.augmented(task.mdp)
+    rows = np.append(np.repeat(chosen, env.num_actions + 1, axis=0), chosen[:1], axis=0)
+    value, best = np.zeros(len(P)), np.zeros(len(P))
+    for _ in range(task.horizon_steps):
+        value = (rows * (R + P @ value)).sum(axis=1)
+        best = (R + P @ best).max(axis=1)
+    low, high = task.return_range
+    rounding = 20 * env.num_actions * 2.0**-22 * (high - low)  # of probabilities in single precision, at each step
+    assert result["final_value"] == pytest.approx(start @ value, abs=rounding)
+    assert result["value_optimal"] == pytest.approx(start @ best, abs=1e-6)
+    assert result["final_regret"] == pytest.approx(start @ (best - value), abs=rounding + 1e-6)
+    assert result["value_worst"] <= result["final_value"] <= result["value_optimal"]
+    assert run.curve[-1]["expected_regret"] == pytest.approx(result["final_regret"], abs=1e-9)
 
 
 @pytest.mark.slow
