@@ -19,7 +19,7 @@ def outcomes_of(env, state, action):
         probability = env.probability(state, action, outcome)
         if probability > 0:
             following = env.next_state(state, action, outcome)
-            found[following] += probability * np.array([1, env.reward(state, action, following)])
+            found[following] += probability * np.array([1, env.reward_of(state, action, following, outcome)])
     return found
 
 
@@ -62,7 +62,8 @@ def test_the_exported_table_of_slippery_cliff_walking_is_gymnasiums():
     for s in np.flatnonzero(~space.terminal):
         number = np.ravel_multi_index(space.state(s), (4, 12))
         for action in range(4):
-            assert summed(numbered(mine, space)[s][action]) == pytest.approx(summed(theirs[number][action]), abs=1e-12)
+            found, expected = numbered(mine, space)[s][action], theirs[number][action]
+            assert law_of(found) == pytest.approx(law_of(expected), abs=1e-12)  # of next state and reward together
 
 
 def test_rewards_that_are_not_the_environments_are_exported_as_they_are():
@@ -77,13 +78,31 @@ def numbered(table, space):
     return {s: {a: [(p, number[t], r, end) for p, t, r, end in row] for a, row in table[s].items()} for s in table}
 
 
-def summed(row):
-    """(next state, terminated, 0 or 1) -> probability, or reward times it."""
-    sums = Counter()
+def law_of(row):
+    """(next state, reward, terminated) -> probability."""
+    law = Counter()
     for probability, following, reward, terminated in row:
-        sums[int(following), bool(terminated), 0] += probability
-        sums[int(following), bool(terminated), 1] += probability * reward
-    return dict(sums)
+        law[int(following), float(reward), bool(terminated)] += probability
+    return dict(law)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("walk", ["rules", "table"])
+def test_slipping_into_the_cliff_from_the_start_pays_another_reward_than_bumping_into_the_wall(walk):
+    """Of 30 thousand steps right and left from the start, those that stay there: within five standard errors."""
+    space = pharos.build("cliff_walking/4x12-slippery", progress=False)
+    paid = {}
+    for action, name in ((1, "right"), (3, "left")):
+        options = {"space": space, "observation": "index"} if walk == "table" else {}
+        envs = pharos.make_vec(space.environment, 30_000, seed=0, **options)
+        envs.reset(seed=5)
+        _, rewards, _, _, info = envs.step(np.full(30_000, action))
+        stays = info["index"] == space.index((3, 0)) if options else (info["state"] == [3, 0]).all(axis=1)
+        stayed = rewards[stays]
+        assert set(stayed) <= {-100.0, -1.0}
+        paid[name] = np.mean(stayed == -100)
+    assert paid["right"] == pytest.approx(1 / 2, abs=0.02)  # right falls, down bumps, up walks
+    assert paid["left"] == 0
 
 
 @pytest.mark.slow

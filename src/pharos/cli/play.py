@@ -99,7 +99,8 @@ class Game:
             action = self.keys[key]
             outcome = self.env.drawn_outcome(self.state, action, self.rng.random()) if self.env.has_chance else 0
             following = self.env.next_state(self.state, action, outcome)
-            self.history.append((self.state, action, float(self.env.reward(self.state, action, following))))
+            paid = float(self.env.reward_of(self.state, action, following, outcome))
+            self.history.append((self.state, action, paid))
             self.state = following
 
 

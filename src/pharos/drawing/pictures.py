@@ -141,7 +141,7 @@ def episode(
         action = int(policy(state))
         outcome = env.drawn_outcome(state, action, rng.random()) if env.has_chance else 0
         following = env.next_state(state, action, outcome)
-        played.append((state, action, float(env.reward(state, action, following))))
+        played.append((state, action, float(env.reward_of(state, action, following, outcome))))
         state = following
     played.append((state, -1, 0.0))
     return played

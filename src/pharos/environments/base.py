@@ -6,10 +6,11 @@ outside, so that the same state space serves every one of them.
 """
 
 import dataclasses
+import inspect
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -90,6 +91,9 @@ class Environment:
         probability(self, state, action, outcome)   of outcome 0 .. K-1, a float; 0: it is impossible here. They sum to
                                                     1 over the outcomes, up to 1e-9
         transition(self, state, action, outcome, out)    where this outcome leads; asked for possible ones only
+        reward(self, state, action, next_state, outcome)    where outcomes that lead to the same state pay different
+                                    rewards; the shorter form stays for all others. Outcome -1: the action has no effect
+                                    (`lazy`), and next_state is the state
 
     Rules that may be left out
         draw_motion(self, state, planes)    what one picture of `draw` does not tell, such as where a ball comes from:
@@ -165,9 +169,13 @@ class Environment:
         """Whether the episode has ended in `state`. The base class never ends."""
         return False
 
-    def reward(self, state, action, next_state) -> float:
-        """The reward of going from `state` to `next_state` by `action`."""
-        raise NotImplementedError(f"{type(self).__name__} must define reward()")
+    if TYPE_CHECKING:
+        reward: Any  # takes (state, action, next_state), or (state, action, next_state, outcome)
+    else:
+
+        def reward(self, state, action, next_state) -> float:
+            """The reward of going from `state` to `next_state` by `action`."""
+            raise NotImplementedError(f"{type(self).__name__} must define reward()")
 
     def draw(self, state, planes) -> None:
         """Write 1, 2, ... into planes (L, rows, columns) uint8 where the thing of each layer is."""
@@ -196,6 +204,11 @@ class Environment:
     def takes_outcomes(cls) -> bool:
         """Whether the rule of this class is `transition(self, state, action, outcome, out)`."""
         return cls.probability is not Environment.probability
+
+    @classmethod
+    def pays_by_outcome(cls) -> bool:
+        """Whether the rule of this class is `reward(self, state, action, next_state, outcome)`."""
+        return num_arguments(cls.reward) == 5
 
     @property
     def has_chance(self) -> bool:
@@ -276,6 +289,12 @@ class Environment:
             raise ParameterError(f"{self}: an action has one outcome; found outcome {outcome}, expected 0")
         return tuple(int(value) for value in out)
 
+    def reward_of(self, state: Any, action: int, next_state: Any, outcome: int = 0) -> Any:
+        """What a step pays, whichever form of `reward` the class has; interpreted."""
+        if type(self).pays_by_outcome():
+            return self.reward(state, action, next_state, outcome)
+        return self.reward(state, action, next_state)
+
     def drawn_outcome(self, state: Sequence[int], action: int, u: float) -> int:
         """The outcome that a number drawn from [0, 1) stands for: those before it add up to u at most; interpreted."""
         drawn, passed = 0, 0.0
@@ -288,6 +307,16 @@ class Environment:
     def __str__(self) -> str:
         fields = ", ".join(f"{name}={value!r}" for name, value in self.parameters.items())
         return f"{type(self).__name__}({fields})"
+
+
+@cache
+def num_arguments(rule: Any) -> int:
+    """How many arguments a rule takes by their places, `self` among them; 0 where Python cannot tell."""
+    try:
+        parameters = inspect.signature(rule).parameters.values()
+    except (TypeError, ValueError):
+        return 0
+    return sum(each.kind in (each.POSITIONAL_ONLY, each.POSITIONAL_OR_KEYWORD) for each in parameters)
 
 
 def start_distribution(env: Environment) -> tuple[list[State], np.ndarray]:

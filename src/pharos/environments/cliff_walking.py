@@ -23,9 +23,7 @@ class CliffWalking(Environment):
     Reward   -1 a step; a fall over the cliff pays -100 and leads back to the start.
     Ends     on reaching the goal.
     Limit    none in Gymnasium; here 25 steps for each cell of the longer side.
-    Ours     size and limit. One step of a slippery walk can both fall and be stopped by a wall, only at the start: then
-             the two lead to the same state, and either pays the mean of what Gymnasium pays for them (-50.5 where one
-             of each leads there, -34 where two walls do). So expected rewards are Gymnasium's, everywhere.
+    Ours     size and limit.
     Source   Gymnasium CliffWalking-v1; Sutton and Barto (2018), "Reinforcement Learning", example 6.6.
 
     Attributes:
@@ -77,26 +75,18 @@ class CliffWalking(Environment):
         return 1 / 3 if self.slippery else 1.0
 
     def transition(self, state, action, outcome, out):
-        way = (action + outcome - 1) % 4 if self.slippery else action
-        row = min(max(state[ROW] + (way == DOWN) - (way == UP), 0), self.height - 1)
-        column = min(max(state[COLUMN] + (way == RIGHT) - (way == LEFT), 0), self.width - 1)
-        falls = row == self.height - 1 and 0 < column < self.width - 1
+        row, column = cell_ahead(self, state, action, outcome)
         out[ROW] = row
-        out[COLUMN] = 0 if falls else column
+        out[COLUMN] = 0 if is_cliff(self, row, column) else column
 
     def is_terminal(self, state):
         return state[ROW] == self.height - 1 and state[COLUMN] == self.width - 1
 
-    def reward(self, state, action, next_state):
-        if next_state[ROW] != self.height - 1 or next_state[COLUMN] != 0:
+    def reward(self, state, action, next_state, outcome):
+        if outcome < 0:  # without effect
             return STEP
-        if state[ROW] != self.height - 1:  # down from above: beside the start it walks, elsewhere it falls
-            return STEP if state[COLUMN] == 0 else FALL
-        if not self.slippery:
-            return FALL if action == RIGHT else STEP
-        falls = action != LEFT
-        walls = 2 if action in (LEFT, DOWN) else 1
-        return (falls * FALL + walls * STEP) / (falls + walls)
+        row, column = cell_ahead(self, state, action, outcome)
+        return FALL if is_cliff(self, row, column) else STEP
 
     def grid(self):
         return self.height, self.width
@@ -105,3 +95,16 @@ class CliffWalking(Environment):
         planes[0, self.height - 1, 1 : self.width - 1] = 1
         planes[1, self.height - 1, self.width - 1] = 1
         planes[2, state[ROW], state[COLUMN]] = 1
+
+
+def cell_ahead(self, state, action, outcome):
+    """(row, column) of the cell that a step leads to, over the cliff or not."""
+    way = (action + outcome - 1) % 4 if self.slippery else action
+    row = min(max(state[ROW] + (way == DOWN) - (way == UP), 0), self.height - 1)
+    column = min(max(state[COLUMN] + (way == RIGHT) - (way == LEFT), 0), self.width - 1)
+    return row, column
+
+
+def is_cliff(self, row, column):
+    """Whether a cell of the bottom row lies between start and goal."""
+    return row == self.height - 1 and 0 < column < self.width - 1

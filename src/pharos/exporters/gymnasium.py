@@ -1,11 +1,9 @@
 """Gymnasium's `P` table."""
 
-from collections.abc import Callable
-
 import numpy as np
 
 from pharos.errors import ParameterError
-from pharos.mdp import TabularMDP, takes_mdp
+from pharos.mdp import TabularMDP, rewards_of_outcomes, takes_mdp
 from pharos.state_space import load
 
 Outcome = tuple[float, int, float, bool]
@@ -29,7 +27,7 @@ def gym_p(mdp: TabularMDP) -> dict[int, dict[int, list[Outcome]]]:
         )
     end, num_actions, rewards, terminal = mdp.num_states, mdp.num_actions, mdp.rewards, np.asarray(mdp.terminal)
     chosen, _, uniform = mdp.chance.triple
-    own = _rewards_of_environment(mdp)
+    own = _outcomes_of_environment(mdp)
     table: dict[int, dict[int, list[Outcome]]] = {}
     for s in range(mdp.num_states):
         if terminal[s]:
@@ -38,10 +36,12 @@ def gym_p(mdp: TabularMDP) -> dict[int, dict[int, list[Outcome]]]:
         outcomes = mdp.dynamics.outcomes(np.full(num_actions, s), np.arange(num_actions))
         executed: list[list[Outcome]] = [[] for _ in range(num_actions)]
         for x, t, p in zip(*(each.tolist() for each in outcomes), strict=True):
-            executed[x].append((p, t, own(s, x, t), t == end or bool(terminal[t])))
-        for a, row in enumerate(executed):
-            if abs(sum(p * r for p, _, r, _ in row) - rewards[s, a]) > 1e-9 * max(1.0, *(abs(r) for _, _, r, _ in row)):
-                executed[a] = [(p, t, float(rewards[s, a]), ended) for p, t, _, ended in row]
+            executed[x].append((p, t, float(rewards[s, x]), t == end or bool(terminal[t])))
+        for a in range(num_actions if own else 0):
+            row = own[s * num_actions + a]
+            largest = max(1.0, *(abs(r) for _, r in row))
+            if abs(sum(p * r for (_, r), p in row.items()) - rewards[s, a]) <= 1e-9 * largest:
+                executed[a] = [(p, t, r, bool(terminal[t])) for (t, r), p in row.items()]
         mixed = [(uniform / num_actions * p, t, r, e) for each in executed for p, t, r, e in each] if uniform else []
         table[s] = {
             a: ([(chosen * p, t, r, e) for p, t, r, e in executed[a]] if chosen else []) + mixed
@@ -52,12 +52,17 @@ def gym_p(mdp: TabularMDP) -> dict[int, dict[int, list[Outcome]]]:
     return table
 
 
-def _rewards_of_environment(mdp: TabularMDP) -> Callable[[int, int, int], float]:
-    """A function (state, action, next state) -> reward: by the rules where the MDP has chance and is of an environment,
-    else what the MDP says.
+def _outcomes_of_environment(mdp: TabularMDP) -> list[dict[tuple[int, float], float]]:
+    """Of each state and action: (next state, reward) -> probability, by the rules where the MDP has chance and is of an
+    environment; else nothing.
     """
     space = None if mdp.folder is None or mdp.dynamics.is_deterministic else load(mdp.folder, verify=False)
     if space is None or space.environment is None:
-        return lambda s, a, t: float(mdp.rewards[s, a])
-    reward, states = space.environment.reward, [tuple(state) for state in space.states().tolist()]
-    return lambda s, a, t: float(reward(states[s], a, states[t]))
+        return []
+    which, successors, probabilities = space.outcomes.entries(0, space.num_states, space.num_actions)
+    table: list[dict[tuple[int, float], float]] = [{} for _ in range(space.num_states * space.num_actions)]
+    paid = rewards_of_outcomes(space)
+    arrays = (each.tolist() for each in (which, successors, paid, probabilities))
+    for row, following, reward, probability in zip(*arrays, strict=True):
+        table[row][following, reward] = table[row].get((following, reward), 0.0) + probability
+    return table

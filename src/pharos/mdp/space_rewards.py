@@ -22,7 +22,8 @@ def rewards_of_space(space: "StateSpace", rewards: Any = None, *, workers: int |
     """The rewards of all transitions of a state space.
 
     Args:
-        rewards: None, an (S, A) array, or a function reward(self, state, action, next_state) -> float.
+        rewards: None, an (S, A) array, or a function reward(self, state, action, next_state) -> float, or with the
+            outcome as one more argument.
         workers: threads; the result does not depend on them.
     Raises:
         ParameterError: the array has the wrong shape, or holds NaN or infinity.
@@ -68,7 +69,8 @@ def rewards_of_staying(space: "StateSpace", reward: Callable | None = None) -> "
             own = np.repeat(np.arange(count), num_actions)
             if space.has_chance:
                 outcomes = np.arange(len(own)), own, np.ones(len(own))
-                yield start, rules.expected_block(states, outcomes, terminal, 0, count)
+                nothing = np.full(len(own), -1)
+                yield start, rules.expected_block(states, outcomes, terminal, 0, count, nothing)
             else:
                 table = own.reshape(count, num_actions).astype(space.successors.dtype)
                 yield start, rules.block(states, table, terminal, 0, count)
@@ -109,7 +111,8 @@ def rewards_of_outcomes(space: "StateSpace") -> np.ndarray:
         for k in range(int(number.max(initial=-1)) + 1):  # as if the k-th were the only one
             now = number == k
             outcomes = which[now], successors[now], np.ones(int(now.sum()))
-            means = rules.expected_block(space.packed_states, outcomes, space.terminal, start, stop)
+            ranks = np.full(len(outcomes[0]), k)
+            means = rules.expected_block(space.packed_states, outcomes, space.terminal, start, stop, ranks)
             paid[now] = means.reshape(-1)[which[now]]
         blocks.append(paid)
     return np.concatenate(blocks)
@@ -145,7 +148,10 @@ def _blocks(space: "StateSpace", env: Environment, workers: int | None) -> Itera
 def _with_reward(env: Environment, reward: Callable) -> Environment:
     """An environment with the same rules and parameters but another reward function."""
     names = list(inspect.signature(reward).parameters)
-    if len(names) != 4:
-        raise ParameterError(f"a reward function takes (self, state, action, next_state); found ({', '.join(names)})")
+    if len(names) not in (4, 5):
+        raise ParameterError(
+            f"a reward function takes (self, state, action, next_state), or the outcome beside; found "
+            f"({', '.join(names)})"
+        )
     cls: type[Environment] = type(type(env).__name__, (type(env),), {"reward": reward, "__module__": reward.__module__})
     return cls(**env.parameters)

@@ -36,18 +36,29 @@ class BranchingKernels(NamedTuple):
     ages_of: Any
 
 
-def branching(compiler: Any, rules: Any, Parameters: Any, W: int, A: int, K: int) -> BranchingKernels:
-    """The kernels of a class of environments whose states take W words, with A actions of at most K outcomes."""
+def branching(
+    compiler: Any, rules: Any, Parameters: Any, W: int, A: int, K: int, pays: bool = False
+) -> BranchingKernels:
+    """The kernels of a class of environments whose states take W words, with A actions of at most K outcomes.
+
+    pays: whether its reward depends on the outcome.
+    """
     search = compiler.calling(*(rule for rule in rules if rule not in ("reward", "draw", "draw_motion")))
     words = words_functions(search, W)
     expand = expand_function(search, rules, Parameters, words, W, A, K)
     prefetch_states = prefetch_function(search, A * K)
-    rewards_of_class = expected_rewards_kernel if K > 1 else rewards_of_kernel
+    pays_by_outcome = K > 1 and pays
+    paying = compiler.calling("reward", *(("probability",) * pays_by_outcome))
+    rewards_of = (
+        expected_rewards_kernel(paying, rules, Parameters, words, W, A, K if pays_by_outcome else 1)
+        if K > 1
+        else rewards_of_kernel(paying, rules, Parameters, words, W, A)
+    )
     ages = ages_of_kernel(compiler.calling("age"), rules, Parameters, words, W) if "age" in rules else None
     return BranchingKernels(
         explore=explore_kernel(search, expand, prefetch_states, words, W, A * K),
         expand_and_find=expand_and_find_kernel(search, expand, prefetch_states, words, A * K),
-        rewards_of=rewards_of_class(compiler.calling("reward"), rules, Parameters, words, W, A),
+        rewards_of=rewards_of,
         ages_of=ages,
     )
 
@@ -60,6 +71,26 @@ def one_outcome(compiler: Any, transition: Any) -> Any:
         transition(self, state, action, 0, out)
 
     return transition_of_one
+
+
+def reward_of_one_outcome(compiler: Any, reward: Any) -> Any:
+    """The reward of a class that pays by outcome, where there is but outcome 0."""
+
+    @compiler.inlined
+    def reward_of_one(self, state, action, next_state):
+        return reward(self, state, action, next_state, 0)
+
+    return reward_of_one
+
+
+def reward_of_any_outcome(compiler: Any, reward: Any) -> Any:
+    """The reward of a class that does not pay by outcome, as that of one that does."""
+
+    @compiler.inlined
+    def reward_of_any(self, state, action, next_state, outcome):
+        return reward(self, state, action, next_state)
+
+    return reward_of_any
 
 
 def _rules_of_branches(compiler: Any, rules: Any, K: int) -> tuple[Any, Any, Any]:
@@ -144,31 +175,43 @@ def expand_function(compiler: Any, rules: Any, Parameters: Any, words: Words, W:
     return expand
 
 
-def expected_rewards_kernel(compiler: Any, rules: Any, Parameters: Any, words: Words, W: int, A: int) -> Any:
-    """Rewards of stored transitions: what executing an action pays on average."""
-    reward = rules["reward"]
+def expected_rewards_kernel(compiler: Any, rules: Any, Parameters: Any, words: Words, W: int, A: int, K: int) -> Any:
+    """Rewards of stored transitions: what executing an action pays on average.
+
+    K: 1 where rewards do not depend on the outcome, which is not looked for then.
+    """
+    reward, probability = rules["reward"], rules["probability"]
     load = words.load
     WORDS = (0,) * W
 
     @compiler.kernel
-    def rewards_of(parameters, layout, states, which, successors, probabilities, terminal, start, out):
+    def rewards_of(parameters, layout, states, which, successors, probabilities, ranks, terminal, start, out):
         """out[i, a] = expected reward of action a in state start + i; 0 in terminal states; out (n, A), zeros.
 
         which (N,), ascending: i A + a of each outcome; successors, probabilities (N,): where it leads, how likely it
-        is. Rewards that are all the same are their own expectation, to the last bit.
+        is. ranks (N,): which one of the possible outcomes, -1 for none; without entries: they are counted. Rewards that
+        are all the same are their own expectation, to the last bit.
         """
         self = Parameters(*parameters)
         state = read_only_view(WORDS, *layout)
         following = read_only_view(WORDS, *layout)
         before, first, same = int64(-1), 0.0, True
+        passed, outcome = int64(-1), int64(-1)  # possible outcomes of this action passed by, and the last of them
         for j in range(len(which)):
             i, a = which[j] // A, which[j] % A
             if terminal[start + i]:
                 continue
             if which[j] != before:
                 load(state, states, start + i)
+                passed, outcome = int64(-1), int64(-1)
             load(following, states, int64(successors[j]))
-            value = float(reward(self, state, a, following))
+            if K > 1:
+                rank = ranks[j] if len(ranks) > 0 else passed + 1
+                while passed < rank and outcome < K - 1:
+                    outcome += 1
+                    if probability(self, state, a, outcome) > 0.0:
+                        passed += 1
+            value = float(reward(self, state, a, following, outcome))
             if which[j] != before:
                 before, first, same = which[j], value, True
                 out[i, a] = 0.0

@@ -14,6 +14,9 @@ from pharos.errors import RuleError
 from pharos.rules.compiler import exploration_kernels, interaction_kernels, numeric_attributes, type_text
 from pharos.rules.layout import Layout
 
+COUNTED = np.empty(0, np.int64)
+"""No ranks of outcomes: those of a state and action are all its possible ones, in their order."""
+
 _SUSPECTS = 16  # states of which a kernel cannot say in which one a rule failed
 
 
@@ -117,8 +120,8 @@ class CompiledRewards(_Compiled):
     def block(self, states, successors, terminal, start: int, stop: int) -> np.ndarray:
         return self._asked("block", self._rewards_of, states, successors, terminal, start, stop)
 
-    def expected_block(self, states, outcomes, terminal, start: int, stop: int) -> np.ndarray:
-        return self._asked("expected_block", self._expected_rewards_of, states, outcomes, terminal, start, stop)
+    def expected_block(self, states, outcomes, terminal, start: int, stop: int, ranks=COUNTED) -> np.ndarray:
+        return self._asked("expected_block", self._expected_rewards_of, states, outcomes, terminal, start, stop, ranks)
 
     def _asked(self, name: str, compiled: Callable[..., np.ndarray], *arguments: Any) -> np.ndarray:
         try:
@@ -137,9 +140,9 @@ class CompiledRewards(_Compiled):
         self.kernels.rewards_of(self.parameters, self.layout.tables, states, successors, terminal, start, stop, out)
         return out
 
-    def _expected_rewards_of(self, states, outcomes, terminal, start: int, stop: int) -> np.ndarray:
+    def _expected_rewards_of(self, states, outcomes, terminal, start: int, stop: int, ranks=COUNTED) -> np.ndarray:
         out = np.zeros((stop - start, self.env.num_actions))
-        arrays = (_read_only(array) for array in (states, *outcomes, terminal))
+        arrays = (_read_only(array) for array in (states, *outcomes, ranks, terminal))
         self.kernels.rewards_of(self.parameters, self.layout.tables, *arrays, start, out)
         return out
 

@@ -91,7 +91,7 @@ def exploration_kernels(
         return exploration(compiler, rules, parameters, num_words, num_actions)
     from pharos.rules.branching import branching
 
-    return branching(compiler, rules, parameters, num_words, num_actions, outcomes)
+    return branching(compiler, rules, parameters, num_words, num_actions, outcomes, cls.pays_by_outcome())
 
 
 @cache
@@ -111,7 +111,7 @@ def _compiler_of(
 ) -> tuple["Compiler", dict, type]:
     """What a maker needs: the compiler, the compiled rules by their names, and the class of `self`.
 
-    With one outcome, `transition` takes none, whatever the class.
+    With one outcome, `transition` and `reward` take none, whatever the class; with more of them, both do.
     """
     rule_compiler = _RuleCompiler()
     rules = {rule: rule_compiler.compiled(getattr(cls, rule)) for rule in rules_of_class(cls)}
@@ -122,6 +122,14 @@ def _compiler_of(
         from pharos.rules.branching import one_outcome
 
         rules["transition"] = one_outcome(compiler.calling("transition"), rules["transition"])
+    if outcomes == 1 and cls.pays_by_outcome():
+        from pharos.rules.branching import reward_of_one_outcome
+
+        rules["reward"] = reward_of_one_outcome(compiler.calling("reward"), rules["reward"])
+    if outcomes > 1 and not cls.pays_by_outcome():
+        from pharos.rules.branching import reward_of_any_outcome
+
+        rules["reward"] = reward_of_any_outcome(compiler.calling("reward"), rules["reward"])
     return compiler, rules, namedtuple("Parameters", names)
 
 

@@ -68,7 +68,15 @@ def advance_function(compiler: Any, rules: Any, K: int) -> Any:
     def go_by_outcome(self, state, branch, following):
         transition(self, state, branch // K, branch % K, following)
 
-    move = go if K == 1 else go_by_outcome
+    @compiler.inlined
+    def pay(self, state, action, following, outcome):
+        return float(reward(self, state, action, following))
+
+    @compiler.inlined
+    def pay_by_outcome(self, state, action, following, outcome):
+        return float(reward(self, state, action, following, outcome))
+
+    move, paid = (go, pay) if K == 1 else (go_by_outcome, pay_by_outcome)
 
     @compiler.inlined
     def advance(self, ranges, state, branch, following):
@@ -78,12 +86,12 @@ def advance_function(compiler: Any, rules: Any, K: int) -> Any:
         for i in range(len(state)):
             following[i] = state[i]
         if branch < 0:
-            return float(reward(self, state, -1 - branch, following)), int64(0)
+            return paid(self, state, -1 - branch, following, -1), int64(0)
         move(self, state, branch, following)
         for i in range(len(state)):
             if following[i] < ranges[0, i] or following[i] > ranges[1, i]:
                 return 0.0, 2 + i
-        return float(reward(self, state, branch // K, following)), int64(is_terminal(self, following))
+        return paid(self, state, branch // K, following, branch % K), int64(is_terminal(self, following))
 
     return advance
 

@@ -98,7 +98,7 @@ class InterpretedRewards:
                     out[i, a] = self._reward(rows[i], a, following[i])
         return out
 
-    def expected_block(self, states, outcomes, terminal, start: int, stop: int) -> np.ndarray:
+    def expected_block(self, states, outcomes, terminal, start: int, stop: int, ranks=()) -> np.ndarray:
         num_actions = self.env.num_actions
         out = np.zeros((stop - start) * num_actions)
         paid: list[list[float]] = [[] for _ in out]
@@ -110,16 +110,22 @@ class InterpretedRewards:
             for j, (pair, probability) in enumerate(zip(which.tolist(), probabilities.tolist(), strict=True)):
                 i, a = divmod(pair, num_actions)
                 if not ended[i]:
-                    paid[pair].append(float(self._reward(rows[i], a, after[j])))
+                    rank = int(ranks[j]) if len(ranks) else len(paid[pair])
+                    paid[pair].append(float(self._reward(rows[i], a, after[j], rank)))
                     out[pair] += probability * paid[pair][-1]
         for pair, each in enumerate(paid):
             if each and each.count(each[0]) == len(each):
                 out[pair] = each[0]
         return out.reshape(-1, num_actions)
 
-    def _reward(self, state: tuple[int, ...], action: int, following: tuple[int, ...]) -> Any:
+    def _reward(self, state: tuple[int, ...], action: int, following: tuple[int, ...], rank: int = 0) -> Any:
+        """What the possible outcome of this rank pays."""
+        env = self.env
         try:
-            return self.env.reward(state, action, following)
+            if rank >= 0 and env.has_chance and env.pays_by_outcome():
+                possible = [k for k in range(env.outcomes) if env.probability(state, action, k) > 0]
+                rank = possible[rank]
+            return env.reward_of(state, action, following, rank)
         except Exception as error:
             raise refused_reward(self.env, state, action, f"raises {error!r}") from error
 

@@ -20,6 +20,7 @@ import numpy as np
 
 from pharos.environments import Environment
 from pharos.rules.compiled import (
+    COUNTED,
     CompiledAges,
     CompiledDrawing,
     CompiledExploration,
@@ -109,12 +110,15 @@ class Rewards(Protocol):
         terminal: np.ndarray,
         start: int,
         stop: int,
+        ranks: np.ndarray = COUNTED,
     ) -> np.ndarray:
         """The same with chance: what executing an action pays on average.
 
         Args:
             outcomes: three arrays: which (N,) int64, ascending, (s - start) A + a of each outcome; successors
                 (N,) int64, where it leads; probabilities (N,).
+            ranks: (N,) int64, which one of the possible outcomes of its state and action each is, -1 for an action
+                without effect; no entries: they are all, in their order.
         """
 
 

@@ -43,7 +43,7 @@ class InterpretedStepping:
     def step_one(self, parameters, ranges, scale, state, branch, following, vector) -> tuple[float, int]:
         before = tuple(state.tolist())
         if branch < 0:
-            action, after = -1 - branch, before
+            action, outcome, after = -1 - branch, -1, before
         else:
             action, outcome = divmod(branch, self.env.outcomes)
             after = self.env.next_state(before, action, outcome)
@@ -53,7 +53,8 @@ class InterpretedStepping:
         following[:] = after
         if len(vector):
             vector[:] = (following - ranges[0]) * scale
-        return float(self.env.reward(before, action, after)), int(branch >= 0 and bool(self.env.is_terminal(after)))
+        paid = float(self.env.reward_of(before, action, after, outcome))
+        return paid, int(branch >= 0 and bool(self.env.is_terminal(after)))
 
     def is_terminal_one(self, parameters, state) -> bool:
         return bool(self.env.is_terminal(tuple(state.tolist())))
@@ -81,7 +82,7 @@ class InterpretedStepping:
                 for c, value in enumerate(after):
                     if not ranges[0, c] <= value <= ranges[1, c]:
                         return i * len(after) + c
-                rewards[i] = self.env.reward(before, action, after)
+                rewards[i] = self.env.reward_of(before, action, after, -1 if stays else outcome)
                 terminated[i] = not stays and self.env.is_terminal(after)
                 previous[i] = action
                 elapsed[i] += 1

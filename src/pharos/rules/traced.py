@@ -200,8 +200,8 @@ class TracedReward(_Traced):
         half = len(values) // 2
         state = _State(values[:half])
         after = _State(values[half:], half, state.read)
-        says = float(self.env.reward(state, root, after))
-        plain = float(self.env.reward(values[:half], root, values[half:]))
+        says = float(self.env.reward_of(state, root, after))
+        plain = float(self.env.reward_of(values[:half], root, values[half:]))
         if says != plain:
             raise _Untraceable
         self._add(root, values, state.read, {}, says)

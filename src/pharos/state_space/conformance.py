@@ -227,7 +227,9 @@ def _check_compiled_rewards(check: InterpretedCheck, rules: "Rules", states: lis
         if env.has_chance:
             which = np.array([i * env.num_actions + a for i, a in rows], np.int64)
             outcomes = which, successors[..., outcome].ravel()[which], np.ones(len(which))
-            rewards = rules.rewards.expected_block(every, outcomes, terminal, 0, num_states)
+            possible = [sum((states[i], a, k) in check.transitions for k in range(outcome)) for i, a in rows]
+            ranks = np.array(possible, np.int64)
+            rewards = rules.rewards.expected_block(every, outcomes, terminal, 0, num_states, ranks)
         else:
             rewards = rules.rewards.block(every, successors[..., 0].astype(np.int32), terminal, 0, num_states)
         for i, a in rows:

@@ -223,7 +223,9 @@ class InterpretedCheck:
 
     def _reward(self, state: State, action: int, successor: State, outcome: int) -> float:
         where = self.where("reward", state, action, outcome)
-        answers = [self._call(where, self.env.reward, _ReadOnly(state), action, _ReadOnly(successor)) for _ in range(2)]
+        which = (outcome,) if self.env.pays_by_outcome() else ()
+        arguments = (_ReadOnly(state), action, _ReadOnly(successor), *which)
+        answers = [self._call(where, self.env.reward, *arguments) for _ in range(2)]
         for answer in answers:
             if not isinstance(answer, numbers.Real | np.bool_) or not math.isfinite(answer):
                 raise RuleError(f"{where} is {answer!r}; expected a finite number")
