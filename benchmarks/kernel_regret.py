@@ -2,7 +2,7 @@
 
 python benchmarks/kernel_regret.py [--large] [NAME ...]
 
-NAME is an environment, default: a Breakout of 1,658 states and, with --large, a grid of 19,600. Prints a row of a
+NAME is an environment, default: a Breakout of 1,658 states and, with --large, a Catch of 19,764. Prints a row of a
 Markdown table for each.
 """
 
@@ -14,7 +14,7 @@ from pharos import hardness
 from pharos.observations import representation
 
 SMALL = ("breakout", {"height": 7, "columns": 4, "brick_rows": 1})
-LARGE = ("simple_grid", {"height": 140, "width": 140})
+LARGE = ("catch", {"rows": 28, "columns": 27})
 
 
 def main():

@@ -1,7 +1,7 @@
 """Q-learning of a network in expectation: the learner behind `kernel_regret`."""
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -130,8 +130,7 @@ class Learner:
             greedy = _greedy(values)[seen.groups]
             policy = (1 - epsilon) * greedy + epsilon / actions
             played, length = memory.play(self._everywhere(policy), policy, self.episode, period)
-            if not self._is_return:
-                played = self._value(policy)
+            played = played if self._is_return else self._value(policy)
             rows.append((step, self._regret(self._value(greedy)), self._regret(played), period / length))
             if step < schedule.learning_starts:
                 continue
@@ -164,6 +163,9 @@ class Learner:
         return (self.optimal - value) / self.spread
 
     def _value(self, policy: np.ndarray) -> float:
+        if self._is_return:
+            visits = visits_of(self.mdp, self._everywhere(policy), self.episode)
+            return float((visits.executed * self.mdp.rewards).sum())
         if policy.max(axis=1).min() == 1.0:
             actions = np.zeros(self.mdp.num_states, np.int64)
             actions[self.states] = policy.argmax(axis=1)
@@ -189,26 +191,15 @@ class _Memory:
 
     def play(self, table: np.ndarray, policy: np.ndarray, episode: int, period: int) -> tuple[float, float]:
         """Add the visits of `period` steps. Returns (expected return, expected steps) of an episode."""
-        walk = Walk(self.mdp, table, episode)
-        shape = (self.mdp.num_states, self.mdp.width)
-        first, later = np.zeros(shape[0]), np.zeros(shape)
-        for nodes, alive in walk.distributions():
-            if alive <= 1e-12:
-                break
-            if nodes.first:
-                first += nodes.mass[:, 0]
-            else:
-                later += nodes.mass
-        first[~walk.live] = later[~walk.live] = 0.0
-        executed = walk.executed(first, later)
-        length = float(executed.sum())
-        scale = period / length
+        visits = visits_of(self.mdp, table, episode)
+        length = float(visits.executed.sum())
+        scale, later = period / length, visits.later[self.states]
         if self.mdp.is_sticky:
-            self.first += scale * first[self.states, None] * policy
+            self.first += scale * visits.first[self.states, None] * policy
         else:
-            later[:, 0] += first
-        self.later += scale * later[self.states][:, :, None] * policy[:, None]
-        return float((executed[self.states] * self.rewards).sum()), length
+            later[:, 0] += visits.first[self.states]
+        self.later += scale * later[:, :, None] * policy[:, None]
+        return float((visits.executed[self.states] * self.rewards).sum()), length
 
     def targets(self, v: np.ndarray, gamma: float) -> tuple[np.ndarray, np.ndarray]:
         """((N, A), (N, A)): the mean target of each choice, by the values v (N,) of states; and its visits."""
@@ -223,6 +214,30 @@ class _Memory:
         uniform = chance.first_uniform * self.first + chance.uniform * later
         total = chosen * q + uniform * mean + chance.previous * np.einsum("sba,sb->sa", self.later, q)
         return np.divide(total, visits, out=q.copy(), where=visits > 0), visits
+
+
+class Visits(NamedTuple):
+    """Expected visits in an episode: first (S,), of the first step; later (S, W), by the previously executed action;
+    executed (S, A), of all steps by what is executed."""
+
+    first: np.ndarray
+    later: np.ndarray
+    executed: np.ndarray
+
+
+def visits_of(mdp: TabularMDP, policy: np.ndarray, episode: int) -> Visits:
+    """The visits of a policy (S, A) in an episode of some steps, without terminal states."""
+    walk = Walk(mdp, policy, episode)
+    first, later = np.zeros(mdp.num_states), np.zeros((mdp.num_states, mdp.width))
+    for nodes, alive in walk.distributions():
+        if alive <= 1e-12:
+            break
+        if nodes.first:
+            first += nodes.mass[:, 0]
+        else:
+            later += nodes.mass
+    first[~walk.live] = later[~walk.live] = 0.0
+    return Visits(first, later, walk.executed(first, later))
 
 
 def _greedy(values: np.ndarray) -> np.ndarray:
