@@ -73,7 +73,7 @@ def test_a_window_shows_each_state_and_closes(monkeypatch):
 
 def test_without_pygame_the_message_names_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "pygame", None)
-    with pytest.raises(MissingExtra, match=r"pharos\[play\]"):
+    with pytest.raises(MissingExtra, match=r"pharos-rl\[play\]"):
         GymEnv("frozen_lake", size=4, render_mode="human")
 
 

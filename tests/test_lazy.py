@@ -1,5 +1,6 @@
 """Lazy actions: implicit in solvers and measures, drawn in interaction, against chains that are written out."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -7,11 +8,13 @@ import pytest
 from gymnasium.vector import AutoresetMode
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from typer.testing import CliRunner
 
 import naive_mdp
 import pharos
-from pharos import hardness, importers
-from pharos.errors import ParameterError
+from pharos import exporters, hardness, importers, study
+from pharos.cli import app
+from pharos.errors import ParameterError, UnknownName
 from pharos.experiments import ChanceSetting, Task
 from pharos.interaction import GymEnv, make_vec
 from pharos.mdp import Lazy, TabularMDP, lazy_actions, minimize, random_actions, sticky_actions
@@ -270,6 +273,51 @@ def test_a_run_with_lazy_actions_has_exact_values_and_an_id_of_its_own(lake, tmp
     assert run.result["exact"]
     assert str(task.chance) == "lazy 0.2"
     assert ChanceSetting.from_dict(task.chance.to_dict()) == task.chance
+
+
+@pytest.mark.parametrize("slippery", [False, True])
+def test_exported_tables_have_the_chance_of_staying_and_its_pay(grid, slippery):
+    space = pharos.build(pharos.make("cliff_walking", height=2, width=3, slippery=True)) if slippery else grid
+    mdp = lazy_actions(space.mdp(gamma=0.9), 0.25)
+    table, states = exporters.gym_p(mdp), [tuple(state) for state in space.states().tolist()]
+    s = int(np.flatnonzero(~space.terminal)[-1])
+    assert (s, space.environment.reward_of(states[s], 1, states[s], -1)) in [entry[1:3] for entry in table[s][1]]
+    P = np.zeros((mdp.num_states, mdp.num_actions, mdp.num_states))
+    R = np.zeros((mdp.num_states, mdp.num_actions))
+    for s, rows in table.items():
+        for a, outcomes in rows.items():
+            for p, t, r, _ in outcomes:
+                P[s, a, t] += p
+                R[s, a] += p * r
+    np.testing.assert_allclose(
+        P.reshape(-1, mdp.num_states), mdp.dynamics.matrix().toarray()[:, :-1], rtol=0, atol=1e-15
+    )
+    np.testing.assert_allclose(R, mdp.rewards, rtol=8 * 2.0**-53, atol=1e-15)
+    with pytest.raises(ParameterError, match="deterministic MDPs"):
+        exporters.bridge(lazy_actions(RING, 0.1), "ring.npz")
+
+
+@pytest.mark.slow
+def test_the_command_line_and_studies_take_the_knobs():
+    knobs = ["--lazy", "0.25", "--reward-noise", "0.5", "--reward-delay", "2"]
+    done = CliRunner().invoke(app, ["train", "frozen_lake/4x4", "--steps", "200", *knobs])
+    assert "lazy actions 0.25, reward noise 0.5, rewards 2 steps late" in " ".join(done.stdout.split())
+    solved = json.loads(CliRunner().invoke(app, ["solve", "frozen_lake/4x4", "--lazy", "0.25", "--json"]).stdout)
+    task = lazy_actions(pharos.build("frozen_lake/4x4").mdp(gamma=0.99), 0.25)
+    assert solved["lazy"] == 0.25
+    assert abs(solved["value_at_start"] - value_iteration(task).value_at_start) <= 2e-6
+    for verb in (["evaluate", "--policy", "uniform"], ["hardness", "--measures", "diameter"]):
+        shown = CliRunner().invoke(app, [verb[0], "frozen_lake/4x4", *verb[1:], "--lazy", "0.25"])
+        assert "lazy actions 0.25" in " ".join(shown.stdout.split())
+    chances = ["plain", {"lazy": 0.1}, {"reward_delay": 3}, {"sticky": 0.25, "reward_noise": 0.5}]
+    block = {"environments": ["frozen_lake/4x4"], "chance": chances, "agents": ["q_learning"], "seeds": 1}
+    runs = study.specification({"name": "knobs", "blocks": [block]}).runs
+    assert [run.chance for run in runs] == ["plain", "lazy 0.1", "reward_delay 3", "sticky 0.25, reward_noise 0.5"]
+    assert runs[0].config["chance"] == {"sticky": 0.0, "random": 0.0}
+    assert ChanceSetting.from_dict({"reward_delay": 3.0}) == ChanceSetting(reward_delay=3)
+    for name, meant in (("p_rand", "random"), ("p_lazy", "lazy")):
+        with pytest.raises(UnknownName, match=meant):
+            ChanceSetting.from_dict({name: 0.1})
 
 
 def test_a_lazy_mdp_is_not_kept_and_no_environment(lake, tmp_path):

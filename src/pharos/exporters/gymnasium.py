@@ -3,7 +3,7 @@
 import numpy as np
 
 from pharos.errors import ParameterError
-from pharos.mdp import TabularMDP, rewards_of_outcomes, takes_mdp
+from pharos.mdp import TabularMDP, rewards_of_outcomes, rewards_of_space, rewards_of_staying, takes_mdp
 from pharos.state_space import load
 
 Outcome = tuple[float, int, float, bool]
@@ -59,10 +59,17 @@ def _outcomes_of_environment(mdp: TabularMDP) -> list[dict[tuple[int, float], fl
     space = None if mdp.folder is None or mdp.dynamics.is_deterministic else load(mdp.folder, verify=False)
     if space is None or space.environment is None:
         return []
-    which, successors, probabilities = space.outcomes.entries(0, space.num_states, space.num_actions)
-    table: list[dict[tuple[int, float], float]] = [{} for _ in range(space.num_states * space.num_actions)]
-    paid = rewards_of_outcomes(space)
-    arrays = (each.tolist() for each in (which, successors, paid, probabilities))
-    for row, following, reward, probability in zip(*arrays, strict=True):
+    rows = np.arange(space.num_states * space.num_actions)
+    if space.has_chance:
+        which, successors, probabilities = space.outcomes.entries(0, space.num_states, space.num_actions)
+        arrays = [which, successors, rewards_of_outcomes(space), (1.0 - mdp.laziness) * probabilities]
+    else:  # lazy actions alone
+        paid = rewards_of_space(space).array.ravel()
+        arrays = [rows, np.ravel(space.successors), paid, np.full(len(rows), 1.0 - mdp.laziness)]
+    if mdp.laziness:
+        stays = rows // space.num_actions, rewards_of_staying(space).array.ravel(), np.full(len(rows), mdp.laziness)
+        arrays = [np.concatenate(pair) for pair in zip(arrays, (rows, *stays), strict=True)]
+    table: list[dict[tuple[int, float], float]] = [{} for _ in rows]
+    for row, following, reward, probability in zip(*(each.tolist() for each in arrays), strict=True):
         table[row][following, reward] = table[row].get((following, reward), 0.0) + probability
     return table
