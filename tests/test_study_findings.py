@@ -1,5 +1,6 @@
 """The paper's findings, on cells whose truth is known."""
 
+import importlib
 import math
 
 import numpy as np
@@ -8,6 +9,8 @@ import pytest
 from scipy import stats
 
 from pharos import study
+
+_findings = importlib.import_module("pharos.study.findings")
 
 CLASSES = ("simple_grid", "frozen_lake", "breakout", "freeway")
 MEASURES = ("effective_horizon", "sum_of_reciprocal_gaps", "diameter")
@@ -230,3 +233,26 @@ def test_what_is_not_there_is_no_data():
     assert found["models by class explain more than one", "all"].verdict == "no data"
     assert found["DQN and PPO find the same hard", "all"].verdict == "no data"
     assert len(found) == 9
+
+
+def test_the_power_of_an_f_test_is_the_published_one():
+    """Two predictors, f2 = 0.15, power 0.95: 107 observations (the example of G*Power's manual, multiple regression)."""
+    r_squared = 0.15 / 1.15
+    assert _findings._power_of_f(2, 106 - 3, r_squared) < 0.95 <= _findings._power_of_f(2, 107 - 3, r_squared)
+    assert _findings._power_of_f(3, 20, 0.0) == pytest.approx(0.05)
+
+
+def test_the_power_of_a_difference_is_that_of_the_normal_approximation():
+    assert _findings._power_of_mean(0.0, 1.0, 50) == pytest.approx(0.05, abs=1e-4)
+    number = round((1.959964 + 0.841621) ** 2 * math.pi / 3 * 4)  # of 80 %, for half a deviation
+    assert _findings._power_of_mean(0.5, 1.0, number) == pytest.approx(0.8, abs=0.01)
+
+
+def test_each_finding_says_with_what_power_it_could_have_been_found():
+    found = study.findings(made(), study.models(made()), resamples=50)
+    assert found["power"].between(0.04, 1.0).all()
+    few = made(instances=2)
+    fewer = study.findings(few, study.models(few), resamples=50)
+    both = found.merge(fewer, on=["finding", "of"], suffixes=("", "_few"))
+    known = both[both["power_few"].notna() & both["finding"].str.startswith(("models by class", "one model"))]
+    assert len(known) and (known["power_few"] < known["power"]).all()

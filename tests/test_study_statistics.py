@@ -3,6 +3,7 @@
 import numpy as np
 import pandas as pd
 import pytest
+from scipy import stats
 
 from pharos.errors import ParameterError
 from pharos.experiments import bootstrap_interval
@@ -16,6 +17,8 @@ from pharos.study import (
     paper_returns,
     stratified_interval,
 )
+from pharos.study.profiles import improvements, profiles
+from pharos.study.statistics import performance_profile, probability_of_improvement
 
 
 def study_table(noise: float, seed: int = 0, num_instances: int = 12) -> pd.DataFrame:
@@ -167,3 +170,42 @@ def test_the_papers_tables_hold_every_printed_block():
     assert len(returns) == 336
     assert set(returns["environment"]) == {"simple_grid", "frozen_lake", "freeway", "breakout"}
     assert list(paper_regressions()["r_squared"])[:5] == ["0.09", "0.3", "0.6", "0.48", "0.96"]
+
+
+def test_a_performance_profile_is_the_share_of_runs_above_each_score():
+    tasks = [np.array([0.0, 0.5, 1.0]), np.array([0.25, 0.75])]
+    thresholds = np.array([-1.0, 0.0, 0.25, 0.6, 1.0])
+    shares = [np.mean([(task > tau).mean() for task in tasks]) for tau in thresholds]
+    assert performance_profile(tasks, thresholds).tolist() == pytest.approx(shares)
+    drawn = [np.stack([task, task[::-1]]) for task in tasks]
+    assert performance_profile(drawn, thresholds).shape == (2, 5)
+    assert np.allclose(performance_profile(drawn, thresholds), shares)
+
+
+def test_the_probability_of_improvement_is_that_of_mann_and_whitney():
+    rng = np.random.default_rng(0)
+    ours, theirs = ([rng.integers(0, 6, number).astype(float) for number in (5, 7)] for _ in range(2))
+    u = [stats.mannwhitneyu(x, y).statistic / (len(x) * len(y)) for x, y in zip(ours, theirs, strict=True)]
+    assert probability_of_improvement(ours, theirs) == pytest.approx(np.mean(u))
+    assert probability_of_improvement(theirs, ours) == pytest.approx(1 - np.mean(u))
+    assert probability_of_improvement(ours, ours) == 0.5
+
+
+def test_profiles_and_improvements_compare_what_has_runs_on_the_same_tasks():
+    rows = [
+        {"environment": "lake", "instance": instance, "chance": "plain", "agent": "dqn", "observation": observation,
+         "normalized_regret": regret + 0.01 * seed}
+        for instance in ("a", "b") for seed in range(3)
+        for observation, regret in (("vector", 0.2), ("simple_image", 0.5))
+    ]  # fmt: skip
+    rows.append({**rows[0], "observation": "index", "instance": "c"})
+    runs = pd.DataFrame(rows)
+    (row,) = improvements(runs, resamples=50).itertuples()
+    assert (row.ours, row.theirs, row.tasks) == ("dqn, simple_image", "dqn, vector", 2)
+    assert (row.probability, row.lower, row.upper) == (0.0, 0.0, 0.0)
+    table = profiles(runs, resamples=50)
+    assert set(table["observation"]) == {"vector", "simple_image", "index"}
+    seen = table[(table["observation"] == "vector")]
+    assert (seen["lower"] <= seen["share"]).all() and (seen["share"] <= seen["upper"]).all()
+    assert seen.loc[seen["score"] < 0.75, "share"].min() == 1.0 and seen.loc[seen["score"] > 0.81, "share"].max() == 0.0
+    assert improvements(runs.assign(normalized_regret=np.nan)).empty and profiles(runs.iloc[:0]).empty

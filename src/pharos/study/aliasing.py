@@ -56,6 +56,16 @@ def aliasing_table(
     return pd.DataFrame(list(rows.values()), columns=columns)
 
 
+def with_aliasing(cells: "pd.DataFrame", counted: "pd.DataFrame") -> "pd.DataFrame":
+    """Cells with `aliasing` beside their regret: the share of states whose observation another state has; NaN where it
+    was not counted, 0 for the number of the state.
+    """
+    shares = counted[["environment", "instance", "observation", "share"]].rename(columns={"share": "aliasing"})
+    joined = cells.merge(shares.astype({"aliasing": float}), on=["environment", "instance", "observation"], how="left")
+    joined.loc[joined["observation"] == TABULAR_OBSERVATION, "aliasing"] = 0.0
+    return joined
+
+
 def _counted(folder: Path, config: Mapping[str, Any]) -> Aliasing:
     from pharos.observations import observe
     from pharos.state_space import build

@@ -210,13 +210,39 @@ def agents_against_each_other(cells: "pd.DataFrame", value: str, agents: tuple[s
     return figure
 
 
+def performance_profiles(profiles: "pd.DataFrame") -> "Figure | None":
+    """A panel for each class: the share of runs above each score, a line for each agent and observation."""
+    groups = list(profiles.groupby("environment", sort=False))
+    if not groups:
+        return None
+    figure, axes = _panels(len(groups), 3.3, 2.7)
+    for axis, (name, part) in zip(axes, groups, strict=False):
+        for (agent, observation), line in part.groupby(["agent", "observation"], sort=True):
+            color = OBSERVATION_COLORS.get(observation, MORE_COLORS[0])
+            text = label(agent, observation)
+            axis.plot(line["score"], line["share"], LINES.get(agent, ":"), color=color, lw=1.6, label=text)
+            axis.fill_between(line["score"], line["lower"], line["upper"], color=color, alpha=0.18, lw=0)
+        axis.set_title(title(str(name)))
+        axis.set_xlabel("score: 1 - normalised regret")
+        axis.set_ylim(-0.02, 1.02)
+    for axis in axes[:: max(1, _columns(len(groups)))]:
+        axis.set_ylabel("share of runs above it")
+    _legend(figure, axes)
+    return figure
+
+
 def all_figures(
-    points: "pd.DataFrame", cells: "pd.DataFrame", models: Sequence[Models], agents: Sequence[str]
+    points: "pd.DataFrame",
+    cells: "pd.DataFrame",
+    models: Sequence[Models],
+    agents: Sequence[str],
+    profiles: "pd.DataFrame",
 ) -> dict[str, Callable[[], "Figure | None"]]:
     """Name -> function that draws it; fits are drawn for the first agent."""
     drawn: dict[str, Callable[[], Figure | None]] = {
         "regret": lambda: regret_curves(points),
         "regret_by_instance": lambda: regret_curves(points, by="instance"),
+        "profiles": lambda: performance_profiles(profiles),
     }
     for environment, part in points.groupby("environment", sort=False):
         by_task = partial(regret_curves, part, by=["instance", "chance"], seeds=True, resamples=200)

@@ -16,10 +16,15 @@ if TYPE_CHECKING:
     import pandas as pd
 
 LEVEL = 0.05  # of every test; each stands alone, without a correction for their number
-COLUMNS = ["finding", "of", "paper", "ours", "evidence", "p", "verdict"]
+COLUMNS = ["finding", "of", "paper", "ours", "evidence", "p", "power", "verdict"]
 # By the paper's section 4.2
 _HARDER = {"simple_grid": IMAGE, "frozen_lake": IMAGE, "breakout": VECTOR, "freeway": VECTOR}
 _PRINTED_AGREEMENT = 0.81
+# R2 that the paper prints: of one model, of those by representation and by class together, with vectors and with images
+_PRINTED_R2 = {"single": 0.09, "representation": 0.48, "class": 0.65, "vector": 0.6, "image": 0.3}
+# In units of random play's regret: the paper prints no sizes of this, and less would be of no consequence
+SMALLEST_DIFFERENCE = 0.05
+NORMAL = 1.959964  # the 97.5th percentile of the normal distribution
 
 
 def findings(cells: "pd.DataFrame", models: Models, *, resamples: int = 1000) -> "pd.DataFrame":
@@ -43,8 +48,11 @@ def findings(cells: "pd.DataFrame", models: Models, *, resamples: int = 1000) ->
         models: of DQN's cumulative regret.
     Returns:
         One row a finding: what the paper says, ours, the statistic in words, p-value (NaN where an interval decides),
-        and the verdict: "agrees" or "disagrees" where the test is significant at 0.05, "undecided" where it is not, "no
-        data".
+        the power, and the verdict: "agrees" or "disagrees" where the test is significant at 0.05, "undecided" where it
+        is not, "no data".
+        The power is the probability that these tasks find the effect, at 0.05, where it is as large as the paper
+        prints: its R2 for the F tests, its r, its difference of R2; of observations, whose sizes it does not print, a
+        difference of SMALLEST_DIFFERENCE. "undecided" with little power says nothing against the paper.
     Cost: `resamples` small regressions.
     """
     import pandas as pd
@@ -54,8 +62,35 @@ def findings(cells: "pd.DataFrame", models: Models, *, resamples: int = 1000) ->
     return pd.DataFrame(rows, columns=COLUMNS)
 
 
-def _row(finding: str, of: str, paper: str, ours: str, evidence: str, p: float, verdict: str) -> dict[str, Any]:
-    return dict(zip(COLUMNS, (finding, of, paper, ours, evidence, p, verdict), strict=True))
+def _row(
+    finding: str, of: str, paper: str, ours: str, evidence: str, p: float, verdict: str, power: float = math.nan
+) -> dict[str, Any]:
+    return dict(zip(COLUMNS, (finding, of, paper, ours, evidence, p, power, verdict), strict=True))
+
+
+def _power_of_mean(effect: float, deviation: float, number: int) -> float:
+    """That a two-sided test at LEVEL finds a mean difference; the rank test needs pi / 3 as many of normal ones."""
+    from scipy import stats
+
+    if number < 2:
+        return math.nan
+    if deviation == 0:
+        return 1.0
+    shift = effect / deviation * math.sqrt(number * 3 / math.pi)
+    return float(stats.norm.sf(NORMAL - shift) + stats.norm.cdf(-NORMAL - shift))
+
+
+def _power_of_f(added: int, free: int, r_squared: float, without: float = 0.0) -> float:
+    """That an F test at LEVEL finds parameters that raise R2 from `without` to `r_squared`.
+
+    Source: Cohen (1988), Statistical power analysis, chapter 9: f2 (u + v + 1) is the noncentrality.
+    """
+    from scipy import stats
+
+    shift = (r_squared - without) / (1 - r_squared) * (added + free + 1)
+    if shift <= 0:
+        return LEVEL
+    return float(stats.ncf.sf(stats.f.isf(LEVEL, added, free), added, free, shift))
 
 
 def _nothing(finding: str, of: str, paper: str, why: str) -> dict[str, Any]:
@@ -77,7 +112,8 @@ def _representation(cells: "pd.DataFrame", environment: str, harder: str) -> dic
         f"image {both[IMAGE].mean():.3f}, vector {both[VECTOR].mean():.3f} of random play's regret; image harder in "
         f"{int((difference > 0).sum())} of {len(difference)} tasks"
     )
-    return _row(finding, environment, paper, ours, evidence, p, _verdict(ours == paper, p))
+    power = _power_of_mean(SMALLEST_DIFFERENCE, float(difference.std(ddof=1)), len(difference)) if p < 1 else math.nan
+    return _row(finding, environment, paper, ours, evidence, p, _verdict(ours == paper, p), power)
 
 
 def _verdict(agrees: bool, p: float) -> str:
@@ -165,7 +201,8 @@ def _single(models: Models) -> dict[str, Any]:
             added, p_added = _f_test(_rest(tasks.class_design, means), large, measures, number - parameters)
             evidence += f"; class and representation alone {by_class:.2f}, measures add {fit.r_squared - by_class:.2f} "
             evidence += f"(F({measures}, {number - parameters}) = {added:.1f}, p = {p_added:.1g})"
-    return _row(finding, "all", paper, f"R² {fit.r_squared:.2f}", evidence, p, verdict)
+    power = _power_of_f(parameters - 1, number - parameters, _PRINTED_R2["single"])
+    return _row(finding, "all", paper, f"R² {fit.r_squared:.2f}", evidence, p, verdict, power)
 
 
 def _nested(models: Models) -> list[dict[str, Any]]:
@@ -206,7 +243,8 @@ def _more_slopes(finding: str, paper: str, model: str, single: Fit, parts: Seque
     rest = sum(float(((fit.actual - fit.fitted) ** 2).sum()) for fit in parts)
     total = float(((single.actual - single.actual.mean()) ** 2).sum())
     ours = f"R² {1 - rest / total:.2f} together, {single.r_squared:.2f} for one model"
-    return _row(finding, "all", paper, ours, f"F({added}, {free}) = {statistic:.1f} {of}", p, _verdict(True, p))
+    power = _power_of_f(added, free, _PRINTED_R2[model], _PRINTED_R2["single"])
+    return _row(finding, "all", paper, ours, f"F({added}, {free}) = {statistic:.1f} {of}", p, _verdict(True, p), power)
 
 
 def _vectors_explained_better(models: Models, resamples: int) -> dict[str, Any]:
@@ -229,7 +267,17 @@ def _vectors_explained_better(models: Models, resamples: int) -> dict[str, Any]:
     verdict = "agrees" if lower > 0 else "disagrees" if upper < 0 else "undecided"
     ours = f"R² {vector.r_squared:.2f} with vectors, {image.r_squared:.2f} with images"
     evidence = f"difference {lower:+.2f} to {upper:+.2f} (95 %, {len(tasks)} tasks resampled)"
-    return _row(finding, "all", paper, ours, evidence, math.nan, verdict)
+    error = (upper - lower) / (2 * NORMAL)
+    printed = _PRINTED_R2["vector"] - _PRINTED_R2["image"]
+    power = _power_of_error(printed, error)
+    return _row(finding, "all", paper, ours, evidence, math.nan, verdict, power)
+
+
+def _power_of_error(effect: float, error: float) -> float:
+    """That an interval of 95 % whose ends are NORMAL errors away does not hold 0."""
+    from scipy import stats
+
+    return float(stats.norm.sf(NORMAL - effect / error)) if error > 0 else 1.0
 
 
 def _r_squared(fit: Fit, rows: np.ndarray) -> float:
@@ -250,11 +298,12 @@ def _agreement(cells: "pd.DataFrame") -> dict[str, Any]:
     if abs(r) > 1 - 1e-12:
         lower = upper = r
     else:
-        spread = 1.959964 / math.sqrt(number - 3)
+        spread = NORMAL / math.sqrt(number - 3)
         lower, upper = (math.tanh(math.atanh(r) + side * spread) for side in (-1, 1))
     verdict = "agrees" if upper >= _PRINTED_AGREEMENT else "disagrees"
     evidence = f"of returns {lower:.2f} to {upper:.2f} (95 %, {number} cells)"
     for regret in ("normalized_regret", "cumulative_regret"):
         if (other := agreement(cells, regret)) is not None:
             evidence += f"; of {regret.replace('_', ' ')} r = {other[0]:.2f}"
-    return _row(finding, "all", paper, f"r = {r:.2f}", evidence, math.nan, verdict)
+    power = _power_of_error(math.atanh(_PRINTED_AGREEMENT), 1 / math.sqrt(number - 3))
+    return _row(finding, "all", paper, f"r = {r:.2f}", evidence, math.nan, verdict, power)

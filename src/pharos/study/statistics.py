@@ -1,4 +1,6 @@
-"""Aggregates over tasks and seeds: the interquartile mean and its stratified bootstrap interval.
+"""Aggregates over tasks and seeds: interquartile mean, performance profile, probability of improvement.
+
+Their intervals are those of a stratified bootstrap.
 
 Source: Agarwal et al. (2021), Deep reinforcement learning at the edge of the statistical precipice, section 4; computed
 through scipy.stats (the authors' library does not import beside pandas 3).
@@ -65,3 +67,33 @@ def stratified_interval(
     arrays = [np.ravel(np.asarray(task, np.float64)) for task in tasks]
     lower, upper = bootstrap_interval(arrays, statistic, confidence=confidence, resamples=resamples, seed=seed)
     return Estimate(float(statistic(*arrays, axis=-1)), float(lower), float(upper), confidence)
+
+
+def performance_profile(tasks: Sequence[np.ndarray], thresholds: np.ndarray, axis: int = -1) -> np.ndarray:
+    """Return the share of runs whose score exceeds each threshold: the run-score distribution of section 4.2.
+
+        F(tau) = mean over tasks of the share of the task's runs with a score above tau
+
+    Args:
+        tasks: for each task the scores of its runs along `axis`.
+        thresholds: (T,) values of tau.
+    Returns:
+        (..., T), for each entry of the other axes.
+    """
+    shares = [(np.moveaxis(task, axis, -1)[..., None, :] > thresholds[:, None]).mean(axis=-1) for task in tasks]
+    return np.mean(shares, axis=0)
+
+
+def probability_of_improvement(ours: Sequence[np.ndarray], theirs: Sequence[np.ndarray], axis: int = -1) -> Any:
+    """Return how probable it is that a run of ours scores higher than one of theirs on a task drawn at random.
+
+        P(X > Y) = mean over tasks of the mean over pairs of runs of 1 where x > y, 1/2 where x = y   (section 4.3)
+
+    Args:
+        ours, theirs: for each task the scores of its runs along `axis`, the same tasks in the same order.
+    """
+    found = []
+    for one, other in zip(ours, theirs, strict=True):
+        x, y = np.moveaxis(one, axis, -1)[..., :, None], np.moveaxis(other, axis, -1)[..., None, :]
+        found.append(((x > y) + 0.5 * (x == y)).mean(axis=(-1, -2)))
+    return np.mean(found, axis=0)

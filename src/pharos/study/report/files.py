@@ -63,7 +63,8 @@ def report(
     target = Path(out) if out is not None else place / "report"
     target.mkdir(parents=True, exist_ok=True)
     figures = {}
-    for name, draw in all_figures(results.points, results.cells, results.models, results.agents).items():
+    drawings = all_figures(results.points, results.cells, results.models, results.agents, results.profiles)
+    for name, draw in drawings.items():
         tell(f"drawing {name}")
         figures[name] = save(draw, target / "figures" / name)
     tables = _write_tables(target / "tables", results)
@@ -80,6 +81,7 @@ def _write_tables(folder: Path, results: Results) -> list[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     tables = {"runs": results.runs, "cells": results.cells, "hardness": results.hardness}
     tables |= {"aliasing": results.aliasing, "intervals": results.intervals}
+    tables |= {"profiles": results.profiles, "improvements": results.improvements}
     if results.comparison is not None and results.findings is not None:
         tables |= {"paper_returns": results.comparison.returns, "paper_regressions": results.comparison.regressions}
         tables["findings"] = results.findings

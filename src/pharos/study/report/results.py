@@ -6,9 +6,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pharos.agents import TABULAR_OBSERVATION
-from pharos.study.aliasing import aliasing_table
+from pharos.study.aliasing import aliasing_table, with_aliasing
 from pharos.study.analysis import REGRETS, Comparison, Models, compare, intervals, models
 from pharos.study.findings import findings
+from pharos.study.profiles import improvements, profiles
 from pharos.study.specification import Specification
 from pharos.study.status import Status, duration, status
 from pharos.study.tables import cells, finished_runs, hardness_cost, hardness_table, paper_instance
@@ -32,6 +33,8 @@ class Results:
         cells: means over seeds, with hardness.
         models: of each agent that sees observations, for both kinds of regret; the first agent's first.
         intervals: of the normalised regret of each class, agent and observation.
+        profiles, improvements: performance profiles of agents and observations, and how probable one improves on
+            another.
         comparison, findings: beside the paper; None where the study is not the paper's.
     """
 
@@ -45,6 +48,8 @@ class Results:
     cells: "pd.DataFrame"
     models: Sequence[Models]
     intervals: "pd.DataFrame"
+    profiles: "pd.DataFrame"
+    improvements: "pd.DataFrame"
     comparison: Comparison | None
     findings: "pd.DataFrame | None"
 
@@ -79,7 +84,7 @@ def results_of(study: Specification, place: Path, progress: Callable[[str], None
     hardness = hardness_table(study, place, progress=progress, tasks=tasks)
     sizes = dict(zip(hardness["instance"], hardness["num_states"].astype(float), strict=True))
     aliasing = aliasing_table(study, place, sizes, progress)
-    table = cells(done.runs, hardness)
+    table = with_aliasing(cells(done.runs, hardness), aliasing)
     progress("fitting models")
     agents = observing_agents(done.runs) or [PAPER_AGENTS[0]]
     fitted = [
@@ -99,6 +104,8 @@ def results_of(study: Specification, place: Path, progress: Callable[[str], None
         cells=table,
         models=fitted,
         intervals=intervals(done.runs),
+        profiles=profiles(done.runs),
+        improvements=improvements(done.runs),
         comparison=compare(table, study.runs, fitted[: len(REGRETS)]) if of_the_paper else None,
         findings=findings(table, fitted[0]) if of_the_paper else None,
     )

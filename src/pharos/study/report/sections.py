@@ -35,6 +35,7 @@ def sections_of(results: Results, figures: Figures) -> list[Section]:
         _summary(results),
         _findings(results),
         _regret(results, figures),
+        _profiles(results, figures),
         _representations(results, figures, left_out),
         _aliasing(results),
         models_section(results, figures, left_out),
@@ -110,7 +111,9 @@ def _findings(results: Results) -> Section | None:
         table=table(
             decided,
             "What the paper says in words, and the same from these runs. Undecided: not significant at 0.05; no "
-            "correction for the number of tests. Every test counts a task once. How each is tested: docs/study.md.",
+            "correction for the number of tests. Every test counts a task once. Power: how probable it is that these "
+            "tasks find an effect as large as the paper prints; where it is small, undecided says nothing against the "
+            "paper. How each is tested: docs/study.md.",
         ),
     )
 
@@ -142,6 +145,34 @@ def _regret(results: Results, figures: Figures) -> Section:
             "Interquartile mean of the normalised regret (0: optimal from the first episode on; 1: as bad as acting "
             "at random) and its 95 % stratified bootstrap interval. With few seeds such intervals are too narrow. ≈: "
             "some values are estimated.",
+        ),
+    )
+
+
+def _profiles(results: Results, figures: Figures) -> Section | None:
+    """Where there is more than one agent or observation to compare."""
+    if len(results.improvements) == 0:
+        return None
+    shown = results.improvements.assign(
+        interval=[
+            f"{low:.2f} to {high:.2f}"
+            for low, high in zip(results.improvements["lower"], results.improvements["upper"], strict=True)
+        ]
+    ).drop(columns=["lower", "upper"])
+    return Section.of(
+        "Profiles",
+        "regret",
+        figure=image(
+            figures,
+            "profiles",
+            "Performance profiles: the share of runs whose score (1 minus the normalised regret: 1 is optimal, 0 as "
+            "bad as acting at random) exceeds what stands below, with 95 % stratified bootstrap bands.",
+        ),
+        table=table(
+            shown,
+            "How probable it is that a run of the first has less regret than one of the second on the same task, the "
+            "mean over tasks, with the 95 % stratified bootstrap interval; 0.5: no difference.",
+            digits=2,
         ),
     )
 
@@ -185,6 +216,10 @@ def _aliasing(results: Results) -> Section | None:
     if len(shared) == 0:
         return None
     shown = shared.assign(share=[f"{100 * share:.1f} %" for share in shared["share"]])
+    regrets = results.cells.pivot_table(
+        index=["instance", "observation"], columns="agent", values="normalized_regret"
+    ).rename(columns=lambda agent: f"regret of {agent_name(agent)}")
+    shown = shown.merge(regrets.reset_index(), on=["instance", "observation"], how="left")
     return Section.of(
         "States that share an observation",
         "aliasing",
@@ -193,7 +228,8 @@ def _aliasing(results: Results) -> Section | None:
         "of the states. So where vectors and images are compared, a part of the difference may be this.",
         table=table(
             shown,
-            "Reachable states, different observations among them, and the share of states that look like another.",
+            "Reachable states, different observations among them, the share of states that look like another, and the "
+            "normalised regret of agents that see them, the mean over kinds of chance.",
         ),
     )
 
