@@ -236,7 +236,7 @@ def test_what_is_not_there_is_no_data():
 
 
 def test_the_power_of_an_f_test_is_the_published_one():
-    """Two predictors, f2 = 0.15, power 0.95: 107 observations (the example of G*Power's manual, multiple regression)."""
+    """Two predictors, f2 = 0.15, power 0.95: 107 observations (an example of the manual of G*Power)."""
     r_squared = 0.15 / 1.15
     assert _findings._power_of_f(2, 106 - 3, r_squared) < 0.95 <= _findings._power_of_f(2, 107 - 3, r_squared)
     assert _findings._power_of_f(3, 20, 0.0) == pytest.approx(0.05)
