@@ -114,6 +114,7 @@ def test_every_section_is_there_and_every_link_leads_to_one(written):
         "Summary",
         "Findings of the paper",
         "Regret",
+        "Profiles",
         "Vector against image",
         "Hardness and regret",
         "Agreement of agents",
@@ -231,6 +232,7 @@ def test_a_study_without_dqn_says_nothing_false_and_has_no_empty_section(tmp_pat
     assert page.headings == [
         "Summary",
         "Regret",
+        "Profiles",
         "Vector against image",
         "Hardness and regret",
         "Hardness of the instances",
