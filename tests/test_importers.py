@@ -332,7 +332,8 @@ def test_folders_of_older_versions_are_read(imported):
         ({"gamma": "high"}, "damaged"),
         ({"gamma": 7}, "damaged: gamma is 7"),
         ({"horizon": 0.5}, "damaged: horizon is 0.5"),
-        ({"format_version": 3}, "format version 3; this pharos reads versions 1 and 2"),
+        ({"format_version": 4}, "format version 4; this pharos reads versions 1, 2, 3"),
+        ({"format_version": 3}, "expected .*, outcome_rewards"),
         ({"format_version": 2}, "expected .*, observations"),
     ):
         path.write_text(json.dumps(manifest | changes))

@@ -2,7 +2,8 @@
 
 FOLDER/manifest.json     what is there, written last
 FOLDER/NAME.npy          an array of COMMON, and those of one of the forms below
-FOLDER/observations.npy  only in format version 2: what the source shows of each state
+FOLDER/observations.npy  where the source shows states: format version 2 or 3
+FOLDER/outcome_*.npy     in format version 3: outcomes, with the reward of each
 """
 
 import os
@@ -18,12 +19,16 @@ from pharos.errors import FileFormatError
 FORMAT, VERSION, MANIFEST = "pharos mdp", 1, "manifest.json"
 OBSERVED_VERSION = 2
 """Of folders with observations."""
+PAID_VERSION = 3
+"""Of folders that know the reward of each outcome, with observations or without."""
+VERSIONS = (VERSION, OBSERVED_VERSION, PAID_VERSION)
 
 COMMON = ("rewards", "terminal", "start_states", "start_probabilities")
 TABLE = ("next_states",)
 MATRIX = ("transitions_data", "transitions_indices", "transitions_indptr")
 OUTCOMES = ("successors",)  # and, where they are: offsets; probabilities, or codes and palette
 OBSERVATIONS = "observations"
+PAID = ("outcome_offsets", "outcome_states", "outcome_probabilities", "outcome_rewards")
 AGAIN = "import it again"
 
 
@@ -49,10 +54,10 @@ def read_manifest(folder: str | os.PathLike) -> dict[str, Any]:
         raise FileFormatError(f"{path}: no such file; expected a folder that `pharos import` wrote") from None
     if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
         raise FileFormatError(f"{folder}: is no imported MDP; expected a folder that `pharos import` wrote")
-    if manifest.get("format_version") not in (VERSION, OBSERVED_VERSION):
+    if manifest.get("format_version") not in VERSIONS:
         raise FileFormatError(
-            f"{folder}: format version {manifest.get('format_version')!r}; this pharos reads versions {VERSION} and "
-            f"{OBSERVED_VERSION}; {AGAIN}"
+            f"{folder}: format version {manifest.get('format_version')!r}; this pharos reads versions "
+            f"{', '.join(map(str, VERSIONS))}; {AGAIN}"
         )
     if not storage.is_intact(manifest):
         raise FileFormatError(f"{path}: was changed after it was written; {AGAIN}")
@@ -75,10 +80,12 @@ def read_arrays(folder: str | os.PathLike, manifest: Mapping[str, Any]) -> dict[
         offsets = ("offsets",) if "offsets" in checksums else ()
         kind = (*OUTCOMES, *offsets, *(("probabilities",) if "probabilities" in checksums else ("codes", "palette")))
     names = (*COMMON, *kind)
-    shown = (OBSERVATIONS,) if manifest["format_version"] == OBSERVED_VERSION else ()
-    if set(checksums) != {*names, *shown}:
-        raise ValueError(f"its arrays are {', '.join(checksums)}; expected {', '.join((*names, *shown))}")
-    return {name: read_array(folder, manifest, name) for name in names}
+    version = manifest["format_version"]
+    has_shown = version == OBSERVED_VERSION or (version == PAID_VERSION and OBSERVATIONS in checksums)
+    shown, paid = (OBSERVATIONS,) * has_shown, PAID * (version == PAID_VERSION)
+    if set(checksums) != {*names, *shown, *paid}:
+        raise ValueError(f"its arrays are {', '.join(checksums)}; expected {', '.join((*names, *shown, *paid))}")
+    return {name: read_array(folder, manifest, name) for name in (*names, *paid)}
 
 
 def read_array(folder: str | os.PathLike, manifest: Mapping[str, Any], name: str) -> np.ndarray:

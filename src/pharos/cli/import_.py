@@ -83,7 +83,8 @@ def gymnasium(
         raise ParameterError(f"{name}: Gymnasium cannot make it: {said or type(error).__name__}") from None
     mdp = importers.gymnasium(env, gamma=gamma, horizon=horizon, check=check)
     words = " ".join((name, *(option or ())))
-    importers.save(mdp, out, source=f"Gymnasium: {words}", time_limit=env.spec.max_episode_steps if env.spec else None)
+    limit, outcomes = env.spec.max_episode_steps if env.spec else None, importers.gymnasium_outcomes(env)
+    importers.save(mdp, out, source=f"Gymnasium: {words}", time_limit=limit, outcomes=outcomes)
     _tell(words, mdp, out, json)
 
 

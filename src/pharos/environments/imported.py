@@ -38,7 +38,7 @@ class ImportedWorld(Environment):
 
     State    its number in the folder; where transitions end an episode without a next state, S is the end.
     Actions  those of the source by their names, where the import recorded them, else by their numbers.
-    Reward   of the state and action, on average: the folder keeps no other.
+    Reward   of the outcome, where the folder knows it; else of the state and action, on average.
     Ends     in terminal states, and where the source ends.
     Chance   that of the table.
     """
@@ -108,8 +108,10 @@ class ImportedWorld(Environment):
     def is_terminal(self, state):
         return self.terminal[state[0]]
 
-    def reward(self, state, action, next_state):
-        return self.rewards[state[0], action]
+    def reward(self, state, action, next_state, outcome=-1):
+        if outcome < 0:
+            return self.rewards[state[0], action]
+        return self.paid[state[0], action, outcome if self.paid.shape[2] > 1 else 0]
 
     def grid(self):
         return 1, len(str(len(self.successors) - 1))
@@ -156,6 +158,12 @@ class ImportedWorld(Environment):
         """(S, A) float64."""
         return self._with_end(np.asarray(self._arrays["rewards"], np.float64), 0.0)
 
+    @property
+    def paid(self) -> np.ndarray:
+        """(S, A, K) float64, the reward of each outcome; (S, A, 1) where the folder knows the means alone."""
+        paid = self._table[2]
+        return self.rewards[:, :, None] if paid is None else paid
+
     @cached_property
     def recorded(self) -> np.ndarray | None:  # type: ignore[override]
         """(S, ...) what the source shows of each state, zeros for the end; None where the import recorded nothing."""
@@ -178,13 +186,17 @@ class ImportedWorld(Environment):
             raise FileFormatError(f"{self.folder}: the imported MDP is damaged: {error}; {mdp_files.AGAIN}") from None
 
     @cached_property
-    def _table(self) -> tuple[np.ndarray, np.ndarray]:
+    def _table(self) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
         states, actions = self.manifest["num_states"], self.manifest["num_actions"]
         try:
-            table = written_out(*outcomes_of(self._arrays, states, actions), states, actions)
+            table = written_out(*outcomes_of(self._arrays, states, actions), states, actions, self._paid)
         except (ValueError, IndexError, TypeError, OverflowError) as error:
             raise FileFormatError(f"{self.folder}: the imported MDP is damaged: {error}; {mdp_files.AGAIN}") from None
         return table
+
+    @property
+    def _paid(self) -> np.ndarray | None:
+        return self._arrays.get(mdp_files.PAID[3])
 
 
 def is_name(value: object) -> bool:
@@ -200,6 +212,9 @@ def outcomes_of(
     The end of an episode is the successor -1. Raises ValueError where they are no table of an MDP.
     """
     number = states * actions
+    if mdp_files.PAID[0] in arrays:
+        offsets, successors, likely, _ = (arrays[name] for name in mdp_files.PAID)
+        return np.repeat(np.arange(number), np.diff(offsets)), successors, likely
     if mdp_files.TABLE[0] in arrays:
         successors = arrays[mdp_files.TABLE[0]].reshape(number)
         return np.arange(number), successors, np.ones(number)
@@ -223,18 +238,26 @@ def outcomes_of(
 
 
 def written_out(
-    rows: np.ndarray, successors: np.ndarray, likely: np.ndarray, states: int, actions: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """(S, A, K) successors and probabilities that sum to 1, what is impossible left out; S is the end, where there is.
+    rows: np.ndarray,
+    successors: np.ndarray,
+    likely: np.ndarray,
+    states: int,
+    actions: int,
+    paid: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """(S, A, K) successors, probabilities that sum to 1, and rewards, what is impossible left out.
+
+    S is the end, where there is one. paid (N,): the reward of each outcome, if known.
 
     Raises:
         ParameterError: they are more than MOST_ENTRIES numbers. ValueError: they are no table of an MDP.
     """
-    if not len(rows) == len(successors) == len(likely) or not (np.isfinite(likely) & (likely >= 0)).all():
+    given = likely if paid is None else paid
+    if not len(rows) == len(successors) == len(likely) == len(given) or not (np.isfinite(likely) & (likely >= 0)).all():
         raise ValueError("successors and probabilities do not fit")
     order = np.argsort(rows, kind="stable")
     order = order[likely[order] > 0]
-    rows, successors, likely = rows[order], successors[order].astype(np.int64), likely[order]
+    rows, successors, likely, given = rows[order], successors[order].astype(np.int64), likely[order], given[order]
     if len(successors) == 0 or successors.min() < -1 or successors.max() >= states:
         raise ValueError(f"a successor is not among the {states} states")
     counts = np.bincount(rows, minlength=states * actions)
@@ -252,4 +275,9 @@ def written_out(
     chances[rows, place] = likely / np.bincount(rows, likely, minlength=states * actions)[rows]
     if has_end:
         table[states * actions :], chances[states * actions :, 0] = states, 1.0
-    return table.reshape(count, actions, most), chances.reshape(count, actions, most)
+    shape = (count, actions, most)
+    if paid is None:
+        return table.reshape(shape), chances.reshape(shape), None
+    rewards = np.zeros((count * actions, most))
+    rewards[rows, place] = given
+    return table.reshape(shape), chances.reshape(shape), rewards.reshape(shape)

@@ -4,16 +4,18 @@ Nothing here unpickles: files hold plain arrays and JSON, or are refused.
 """
 
 from pharos.importers.bridge import bridge, bridge_screens, has_screens
-from pharos.importers.folder import environment, is_folder, load, save
-from pharos.importers.gymnasium import gymnasium, matrices
+from pharos.importers.folder import Outcomes, environment, is_folder, load, save
+from pharos.importers.gymnasium import gymnasium, gymnasium_outcomes, matrices
 from pharos.importers.minigrid import minigrid, minigrid_grids, minigrid_recording
 from pharos.importers.storm import storm
 
 __all__ = [
+    "Outcomes",
     "bridge",
     "bridge_screens",
     "environment",
     "gymnasium",
+    "gymnasium_outcomes",
     "has_screens",
     "is_folder",
     "load",

@@ -4,7 +4,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -12,7 +12,22 @@ from pharos import mdp_files, paths, storage
 from pharos.environments import Environment, make
 from pharos.errors import FileFormatError, ParameterError
 from pharos.mdp import OutcomeTable, TabularMDP
-from pharos.mdp_files import AGAIN, COMMON, FORMAT, MANIFEST, MATRIX, OBSERVATIONS, OUTCOMES, TABLE, is_folder
+from pharos.mdp_files import AGAIN, COMMON, FORMAT, MANIFEST, MATRIX, OBSERVATIONS, OUTCOMES, PAID, TABLE, is_folder
+
+
+class Outcomes(NamedTuple):
+    """What each state and action may lead to, and what that pays.
+
+    Attributes:
+        offsets: (S A + 1,) where the outcomes of row s A + a begin. next_states: (N,), -1 for the end of the episode.
+        probabilities, rewards: (N,).
+    """
+
+    offsets: np.ndarray
+    next_states: np.ndarray
+    probabilities: np.ndarray
+    rewards: np.ndarray
+
 
 IMAGE, GRID, VECTOR = "image", "grid", "vector"
 OBSERVED = {IMAGE: 4, GRID: 4, VECTOR: 2}
@@ -28,6 +43,7 @@ def save(
     time_limit: int | None = None,
     observations: np.ndarray | None = None,
     observed: str | None = None,
+    outcomes: Outcomes | None = None,
 ) -> Path:
     """Write an MDP without chance into a folder.
 
@@ -39,17 +55,22 @@ def save(
         observations: what the source shows of each state, which agents may see as the observation "recorded".
         observed: what they are: "image", (S, H, W, 3) uint8; "grid", (S, columns, rows, C) uint8 codes of things;
             "vector", (S, N) numbers; None: "image" where they are (S, H, W, 3), else "vector".
+        outcomes: of all states and actions, with the reward of each, which episodes are paid then; None: they are paid
+            the mean reward.
     Raises:
         ParameterError: the folder holds something else, or the MDP has sticky, random or lazy actions (add them after
-            loading); or names, limit or observations do not fit it.
+            loading); or names, limit, observations or outcomes do not fit it.
     """
     told = _told(mdp, actions, time_limit, observations, observed)
+    paid = {} if outcomes is None else _checked_outcomes(mdp, outcomes)
     folder = Path(folder)
     _check_without_chance(mdp)
     if folder.is_dir() and any(folder.iterdir()) and not is_folder(folder):
         raise ParameterError(f"{folder}: is not empty and holds no imported MDP; choose another folder")
     folder.mkdir(parents=True, exist_ok=True)
-    arrays = _arrays_of(mdp) | ({} if observations is None else {OBSERVATIONS: np.asarray(observations)})
+    shown = {} if observations is None else {OBSERVATIONS: np.asarray(observations)}
+    arrays = _arrays_of(mdp) | shown | paid
+    version = mdp_files.PAID_VERSION if paid else mdp_files.OBSERVED_VERSION if shown else mdp_files.VERSION
     checksums = {}
     for name, array in arrays.items():
         path = folder / f"{name}.npy"
@@ -57,7 +78,7 @@ def save(
         checksums[name] = storage.digest_of_file(path)
     manifest = {
         "format": FORMAT,
-        "format_version": mdp_files.VERSION if observations is None else mdp_files.OBSERVED_VERSION,
+        "format_version": version,
         "source": source,
         "num_states": mdp.num_states,
         "num_actions": mdp.num_actions,
@@ -68,6 +89,20 @@ def save(
     }
     storage.replace_json(folder / MANIFEST, storage.sealed(manifest))
     return folder
+
+
+def _checked_outcomes(mdp: TabularMDP, outcomes: Outcomes) -> dict[str, np.ndarray]:
+    """Their arrays by their names; ParameterError where they are not those of the MDP."""
+    offsets, successors, probabilities, rewards = (np.asarray(each) for each in outcomes)
+    pairs = mdp.num_states * mdp.num_actions
+    fits = offsets.shape == (pairs + 1,) and offsets[0] == 0 and offsets[-1] == len(successors)
+    if not (fits and (np.diff(offsets) > 0).all() and successors.shape == probabilities.shape == rewards.shape):
+        raise ParameterError(f"outcomes are {len(successors)}; expected one or more of each of {pairs} rows s A + a")
+    means = np.add.reduceat(probabilities * rewards, offsets[:-1])
+    size = np.maximum(1.0, np.maximum.reduceat(np.abs(rewards), offsets[:-1]))
+    if not (np.abs(means - np.asarray(mdp.rewards).ravel()) <= 1e-6 * size).all():
+        raise ParameterError("rewards of outcomes do not have the rewards of the MDP as their means")
+    return dict(zip(PAID, (offsets, successors, probabilities, rewards), strict=True))
 
 
 def _told(
@@ -169,7 +204,7 @@ def _mdp(manifest: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Tabul
     if TABLE[0] in arrays:
         return TabularMDP.from_arrays(arrays[TABLE[0]], rewards, terminal=arrays["terminal"], **options)
     if OUTCOMES[0] in arrays:
-        parts = {name: array for name, array in arrays.items() if name not in COMMON}
+        parts = {name: array for name, array in arrays.items() if name not in (*COMMON, *PAID)}
         dynamics = OutcomeTable(num_actions=rewards.shape[1], **parts)
         dynamics.check()
         return TabularMDP.from_outcome_table(dynamics, rewards, terminal=arrays["terminal"], **options)

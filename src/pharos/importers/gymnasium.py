@@ -1,12 +1,14 @@
 """MDPs from Gymnasium's `P` tables and from matrices."""
 
 import copy
+import itertools
 from collections import Counter
 from typing import Any
 
 import numpy as np
 
 from pharos.errors import FileFormatError
+from pharos.importers.folder import Outcomes
 from pharos.mdp import TabularMDP
 
 SAMPLED_STEPS = 10_000
@@ -39,18 +41,8 @@ def gymnasium(env: Any, *, gamma: float = 0.99, horizon: int | None = None, chec
         FileFormatError: there is no table, states or actions are missing, probabilities do not sum to 1, or the
         environment does what its table does not say.
     """
-    inner = getattr(env, "unwrapped", env)
-    table = getattr(inner, "P", inner)
-    try:
-        states, actions = len(table), len(table[0])
-        rows = [[list(table[s][a]) for a in range(actions)] for s in range(states)]
-    except (TypeError, KeyError, IndexError) as error:
-        if inner is env or not hasattr(inner, "P"):
-            raise FileFormatError(f"{env}: has no table P[s][a] of its transitions{_native(inner)}") from None
-        raise FileFormatError(
-            f"{env}: has no table P[s][a] with states 0, 1, ... and the same actions everywhere "
-            f"({type(error).__name__}: {error})"
-        ) from None
+    inner, rows = _rows(env)
+    states, actions = len(rows), len(rows[0])
     next_states = np.full((states, actions), -1, np.int64)
     rewards = np.zeros((states, actions))
     single = True
@@ -75,6 +67,45 @@ def gymnasium(env: Any, *, gamma: float = 0.99, horizon: int | None = None, chec
     row, column, data = (np.array(part) for part in zip(*entries, strict=True)) if entries else ([], [], [])
     matrix = sparse.csr_matrix((data, (row, column)), shape=(states * actions, states))
     return TabularMDP.from_matrices(matrix, rewards, gamma=gamma, initial=initial, horizon=horizon)
+
+
+def gymnasium_outcomes(env: Any) -> Outcomes | None:
+    """Return the outcomes of the same table with the reward of each, for `importers.save(..., outcomes=)`.
+
+    None where no action pays different rewards, so that the MDP says it all.
+
+    Raises:
+        FileFormatError: as `gymnasium`.
+    """
+    _, rows = _rows(env)
+    entries = [
+        [(-1 if ended else int(following), p, float(reward)) for p, following, reward, ended in row if p > 0]
+        for state in rows
+        for row in state
+    ]
+    if all(len({reward for _, _, reward in row}) == 1 for row in entries):
+        return None
+    offsets = np.concatenate([[0], np.cumsum([len(row) for row in entries])])
+    next_states, probabilities, rewards = (
+        np.array(each) for each in zip(*itertools.chain.from_iterable(entries), strict=True)
+    )
+    return Outcomes(offsets, next_states.astype(np.int64), probabilities, rewards)
+
+
+def _rows(env: Any) -> tuple[Any, list[list[list]]]:
+    """(the environment without wrappers, rows[s][a] of its table); FileFormatError where it has none."""
+    inner = getattr(env, "unwrapped", env)
+    table = getattr(inner, "P", inner)
+    try:
+        states, actions = len(table), len(table[0])
+        return inner, [[list(table[s][a]) for a in range(actions)] for s in range(states)]
+    except (TypeError, KeyError, IndexError) as error:
+        if inner is env or not hasattr(inner, "P"):
+            raise FileFormatError(f"{env}: has no table P[s][a] of its transitions{_native(inner)}") from None
+        raise FileFormatError(
+            f"{env}: has no table P[s][a] with states 0, 1, ... and the same actions everywhere "
+            f"({type(error).__name__}: {error})"
+        ) from None
 
 
 def _checked(env: Any, s: int, a: int, outcomes: list, states: int) -> dict[tuple[int, bool], tuple[float, float]]:
