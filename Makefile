@@ -1,8 +1,8 @@
-# Two targets do it all on a fresh machine: `make quickstart` and `make test`.
+# Two targets do it all on a fresh machine: `make quickstart` and `make test`; `make docs` builds the site.
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 
-.PHONY: quickstart test test-fast test-long lint clean
+.PHONY: quickstart test test-fast test-long lint docs clean
 
 .venv/.ok: pyproject.toml setup.py constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
@@ -27,5 +27,12 @@ lint: .venv/.ok
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
+.venv/.docs: .venv/.ok
+	$(BIN)/python -m pip install -q -e ".[docs]" -c constraints.txt
+	@touch $@
+
+docs: .venv/.docs
+	$(BIN)/python scripts/build_site.py
+
 clean:
-	rm -rf .venv build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache
+	rm -rf .venv build dist site *.egg-info .pytest_cache .mypy_cache .ruff_cache

@@ -1,0 +1,313 @@
+"""The generated pages of the site: one for each environment, the reference of the API, tutorials, lists of pages.
+
+Each function returns name -> text, or bytes of a picture, in the order of the navigation.
+"""
+
+import base64
+import contextlib
+import importlib
+import inspect
+import io
+import json
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+from pharos.cli.list import list_
+from pharos.environments import classes
+from pharos.interaction.registration import ids_of
+
+DOCS = Path(__file__).parents[1] / "docs"
+MORE = {  # pages that say more of a class
+    **dict.fromkeys(("frozen_lake", "taxi", "cliff_walking", "blackjack"), "toy-text.md"),
+    **dict.fromkeys(("sliding_tiles", "pocket_cube", "sokoban"), "puzzles.md"),
+    **dict.fromkeys(("mini_grid", "mini_grid_empty", "mini_grid_rooms"), "mini-grid.md"),
+    **dict.fromkeys(("river_swim", "deep_sea", "endless_sea", "catch", "memory_chain"), "chains.md"),
+    **dict.fromkeys(("umbrella_chain", "discounting_chain", "corner_grid"), "chains.md"),
+    "game_2048": "game-2048.md",
+}
+CHANGES = {  # class -> version of the rules -> what changed
+    "breakout": {
+        1: "Never released. The paddle's edge sent the ball straight back, so that some walls could not be cleared.",
+        2: "The paddle's edge sends the ball one column back ([why](../decisions/0004-breakout-edges.md)).",
+    }
+}
+POLICIES = ("optimal", "uniform", "worst")
+PACKAGES = {  # page of the reference -> (title, module)
+    "pharos": ("pharos", "pharos"),
+    "environments": ("pharos.environments", "pharos.environments"),
+    "state_space": ("pharos.state_space", "pharos.state_space"),
+    "mdp": ("pharos.mdp", "pharos.mdp"),
+    "solvers": ("pharos.solvers", "pharos.solvers"),
+    "hardness": ("pharos.hardness", "pharos.hardness"),
+    "observations": ("pharos.observations", "pharos.observations"),
+    "interaction": ("pharos.interaction", "pharos.interaction"),
+    "policies": ("pharos.policies", "pharos.policies"),
+    "agents": ("pharos.agents", "pharos.agents"),
+    "experiments": ("pharos.experiments", "pharos.experiments"),
+    "study": ("pharos.study", "pharos.study"),
+    "plots": ("pharos.plots", "pharos.plots"),
+    "importers": ("pharos.importers", "pharos.importers"),
+    "exporters": ("pharos.exporters", "pharos.exporters"),
+    "bisimulation": ("pharos.bisimulation", "pharos.bisimulation"),
+    "errors": ("pharos.errors", "pharos.errors"),
+}
+
+
+# Environments ---------------------------------------------------------------------------------------------------------
+
+
+def environments(files: Mapping[str, Path]) -> dict[str, str]:
+    """A page for each class, and one that shows them all."""
+    stored = json.loads((DOCS / "environments.json").read_text())
+    gallery = sections_of((DOCS / "gallery.md").read_text())
+    pages = {f"environments/{name}.md": page_of(cls, stored, gallery.get(name, "")) for name, cls in classes().items()}
+    cards = [card_of(cls, stored, gallery.get(name, "")) for name, cls in classes().items()]
+    index = (
+        "# Environments\n\nEvery state of these can be enumerated, so that the optimum, the hardness and the regret of "
+        "an agent are numbers. Each is a class with parameters; the named instances are those of the paper, of "
+        "Gymnasium, of MiniGrid and of bsuite. Your own: [adding an environment](../adding-an-environment.md).\n\n"
+        '<div class="cards" markdown="0">\n' + "\n".join(cards) + "\n</div>\n"
+    )
+    return {"environments/index.md": index, **pages}
+
+
+def sections_of(text: str) -> dict[str, str]:
+    """Title -> text, of the sections of the gallery."""
+    parts = re.split(r"^## (\w+)\n", text, flags=re.MULTILINE)[1:]
+    return dict(zip(parts[::2], parts[1::2], strict=True))
+
+
+def animations(section: str) -> list[tuple[str, str]]:
+    """(instance, file), of the pictures that move in a section of the gallery."""
+    return re.findall(r"!\[([^]]+)\]\((gallery/[^)]+\.gif)\)", section)
+
+
+def described(cls) -> dict:
+    """What `pharos list NAME --json` says."""
+    answer = io.StringIO()
+    with contextlib.redirect_stdout(answer):
+        list_(cls.name, json=True)
+    return json.loads(answer.getvalue())
+
+
+def card_of(cls, stored: Mapping[str, dict], section: str) -> str:
+    """A cell of the list of environments, in HTML: the pages are beside it."""
+    states = [n["num_states"] for name, n in stored.items() if name.split("/")[0] == cls.name and "num_states" in n]
+    moving = animations(section)
+    picture = f'<a href="{cls.name}.html"><img src="../{moving[0][1]}" alt="{cls.name}"></a>' if moving else ""
+    span = " to ".join(f"{number:,}" for number in dict.fromkeys((min(states), max(states)))) if states else "many"
+    first = described(cls)["description"]
+    title = f'<a href="{cls.name}.html"><b>{cls.__name__}</b></a>'
+    return f"<div>{picture}<p>{title}</p><p>{first}</p><p>{span} states</p></div>"
+
+
+def page_of(cls, stored: Mapping[str, dict], section: str) -> str:
+    """The page of a class."""
+    facts = described(cls)
+    first_id = next(iter(ids_of(cls)))
+    counts = {name: stored.get(name, {}).get("num_states", 1 << 62) for name in facts["instances"]}
+    smallest = max(counts, key=lambda name: (-counts[name], name)) if counts else cls.name
+    lines = [f"# {cls.__name__}", "", facts["description"], ""]
+    if moving := animations(section):
+        pictures = [f'![{name}, played optimally](../{file}){{ .pixels title="{name}" }}' for name, file in moving]
+        played = ", ".join(f"`{name}`" for name, _ in moving)
+        lines += [" ".join(pictures), "", f"*The optimal policy of {played}.*", ""]
+    lines += [
+        "```python",
+        "import gymnasium, pharos",
+        "",
+        f'env = gymnasium.make("{first_id}")  # to step',
+        f'space = pharos.build("{smallest}")  # every state',
+        "pharos.value_iteration(space.mdp(gamma=0.99)).value_at_start",
+        "```",
+        "",
+        "## Rules",
+        "",
+        *rules_table(facts["rules"]),
+        "",
+        f"**Actions**, in the order of their numbers: {', '.join(f'`{name}`' for name in facts['actions'])}.",
+        "",
+        "## Parameters",
+        "",
+        "| parameter | default | values | meaning |",
+        "|---|---|---|---|",
+    ]
+    for name, entry in facts["parameters"].items():
+        lines.append(f"| `{name}` | `{cell(entry['default'])}` | {cell(entry['values'])} | {cell(entry['meaning'])} |")
+    lines += ["", *instances(cls, stored), "## What agents see", "", observations(section), ""]
+    lines += ["## Versions", "", *versions(cls), ""]
+    if cls.name in MORE:
+        lines += [f"More of this class, and where its numbers come from: [{MORE[cls.name]}](../{MORE[cls.name]}).", ""]
+    return "\n".join(lines)
+
+
+def cell(value) -> str:
+    """Text for a cell of a table."""
+    text = "none" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
+    return text.replace("|", r"\|").replace("\n", " ")
+
+
+def rules_table(docstring: str) -> list[str]:
+    """The docstring of a class up to its attributes: paragraphs, and entries such as `State    (row, column)`."""
+    text = docstring.partition("Attributes:\n")[0].rstrip()
+    paragraphs, entries = [], []
+    for line in text.splitlines()[1:]:
+        entry = re.match(r"([A-Z][a-z]+)  *(\S.*)", line) if not line.startswith(" ") else None
+        if entry and (len(entry[0]) <= 120) and line[len(entry[1]) : 9].strip() == "":
+            entries.append([entry[1], entry[2]])
+        elif entries and line.strip():
+            entries[-1][1] += " " + line.strip()
+        elif line.strip():
+            paragraphs.append(line.strip())
+    table = ["| | |", "|---|---|", *(f"| **{title}** | {cell(text)} |" for title, text in entries)]
+    return [" ".join(paragraphs), "", *table] if paragraphs else table
+
+
+def instances(cls, stored: Mapping[str, dict]) -> list[str]:
+    """The table of named instances, with counts and values at the start."""
+    ids = {name: gymnasium_id for gymnasium_id, name in ids_of(cls).items()}
+    counted = ["| instance | Gymnasium id | states | terminal | depth | steps |", "|---|---|--:|--:|--:|--:|"]
+    values = [
+        "| instance | V\\*, discounted | uniform | worst | V\\* of an episode | uniform | worst |",
+        "|---|--:|--:|--:|--:|--:|--:|",
+    ]
+    for instance in cls.instances:
+        name = f"{cls.name}/{instance}"
+        numbers = stored.get(name, {})
+        start = f"| `{name}` | `{ids[name]}` |"
+        if "num_states" not in numbers:
+            bound = f"more than {numbers['more_than']:,}" if numbers else ""
+            counted.append(f"{start} {bound} | | | |")
+            continue
+        parts = ("num_states", "num_terminal_states", "depth", "episode_limit")
+        counted.append(f"{start} " + " | ".join(f"{numbers[part]:,}" for part in parts) + " |")
+        found = [numbers.get(kind, {}).get(policy) for kind in ("discounted", "episode") for policy in POLICIES]
+        texts = ("" if value is None else f"{value + 0.0:.6g}" for value in found)
+        values.append(f"| `{name}` | {' | '.join(texts)} |")
+    about = (
+        "Values at the start: of the optimal, the uniformly random and the worst policy. *Discounted* by 0.99 without "
+        "a limit; *of an episode*: undiscounted, of as many steps as the table above says (left out where that is long "
+        "to compute). Each is within 1e-6, rounded to six digits. *Depth* is how far the farthest state is from the "
+        "start."
+    )
+    return ["## Named instances", "", *counted, "", about, "", *values, ""]
+
+
+def observations(section: str) -> str:
+    """The pictures of the gallery: what people and agents see."""
+    text = re.sub(r"^The optimal policy of .*\n\n!\[.*\n", "", section, flags=re.MULTILINE)
+    text = text.strip().partition("\n\n")[2].replace("](gallery/", "](../gallery/")
+    if not text.strip():
+        return "The observations of every class: [observations](../observations.md)."
+    about = (
+        "From the left: the drawing for people, the complex image at its natural size and at 84 x 84 pixels, and the "
+        "planes of the simple image, one for each layer, named in their order. [More](../observations.md).\n\n"
+    )
+    return about + text
+
+
+def versions(cls) -> list[str]:
+    """The versions of the rules, and the Gymnasium ids that stand for them."""
+    told = CHANGES.get(cls.name, {})
+    lines = ["| rules | Gymnasium ids | |", "|---|---|---|"]
+    for version in range(cls.version, 0, -1):
+        ids = f"`-v{version - cls.first_version}`" if version >= cls.first_version else "none"
+        lines.append(f"| version {version} | {ids} | {told.get(version, 'The first.')} |")
+    return lines
+
+
+# Reference ------------------------------------------------------------------------------------------------------------
+
+
+def reference() -> dict[str, str]:
+    """A page for each package, with an entry for every name that it publishes."""
+    pages, lines = {}, ["# API", "", "In the order of the data flow; names are imported from where the page says.", ""]
+    shown: dict[str, str] = {}  # where it is defined -> under which name it has its entry
+    for page, (title, module_name) in PACKAGES.items():
+        module = importlib.import_module(module_name)
+        about = (module.__doc__ or "").strip()
+        entries = []
+        for name in published(module):
+            value = getattr(module, name)
+            home = home_of(value, module_name, name)
+            if home is None:
+                continue
+            if home in shown:
+                entries.append(f"## `{title}.{name}`\n\nThe same as [`{shown[home]}`][{home}].\n")
+                continue
+            shown[home] = f"{title}.{name}"
+            options = f"    options:\n      heading: {title}.{name}\n      toc_label: {name}\n"
+            entries.append(f"::: {home}\n{options}")
+        pages[f"api/{page}.md"] = f"# {title}\n\n{about}\n\n" + "\n".join(entries)
+        lines.append(f"- [`{title}`]({page}.md): {first_sentence(about)}")
+    return {"api/index.md": "\n".join(lines) + "\n", **pages}
+
+
+def published(module) -> list[str]:
+    """The names that have an entry: functions and classes."""
+    names = getattr(module, "__all__", None)
+    if names is None:  # a module of classes, such as errors
+        names = [name for name, value in vars(module).items() if getattr(value, "__module__", "") == module.__name__]
+    return [name for name in names if not name.startswith("_") and not inspect.ismodule(getattr(module, name))]
+
+
+def home_of(value, module_name: str, name: str) -> str | None:
+    """Where a function or class is defined; None for values."""
+    value = inspect.unwrap(value) if callable(value) else value
+    if not (inspect.isclass(value) or inspect.isfunction(value)):
+        return None
+    if not value.__module__.startswith("pharos"):
+        return None
+    return f"{value.__module__}.{value.__qualname__}"
+
+
+def first_sentence(text: str) -> str:
+    """Up to the first full stop."""
+    return re.split(r"(?<=\.)\s", " ".join(text.split()), maxsplit=1)[0]
+
+
+# Tutorials and decisions ----------------------------------------------------------------------------------------------
+
+
+def tutorials(folder: Path) -> dict[str, str | bytes]:
+    """Notebooks as pages, with what their cells print and draw."""
+    pages: dict[str, str | bytes] = {}
+    lines = ["# Tutorials", "", "Notebooks, executed by the tests. Each takes a few minutes.", ""]
+    for path in sorted(folder.glob("*.ipynb")):
+        text, pictures = notebook(json.loads(path.read_text(encoding="utf-8")), path.stem)
+        pages[f"tutorials/{path.stem}.md"] = text
+        pages |= {f"tutorials/{name}": data for name, data in pictures.items()}
+        title, about = re.match(r"# (.*)\n+(.*)", text).groups()
+        lines.append(f"- [{title}]({path.stem}.md): {about}")
+    return {"tutorials/index.md": "\n".join(lines) + "\n", **pages}
+
+
+def notebook(document: dict, stem: str) -> tuple[str, dict[str, bytes]]:
+    """(Markdown, pictures by name)."""
+    parts, pictures = [], {}
+    for entry in document["cells"]:
+        source = "".join(entry["source"])
+        if entry["cell_type"] == "markdown":
+            parts.append(source)
+            continue
+        parts.append(f"```python\n{source}\n```")
+        for output in entry["outputs"]:
+            data = output.get("data", {})
+            printed = "".join(output.get("text", data.get("text/plain", [])))
+            if "image/png" in data:
+                name = f"{stem}-{len(pictures) + 1}.png"
+                pictures[name] = base64.b64decode("".join(data["image/png"]))
+                parts.append(f"![what the cell draws]({name})")
+            elif printed:
+                parts.append(f"```text\n{printed.rstrip()}\n```")
+    about = f"*This page is the notebook `docs/tutorials/{stem}.ipynb`.*"
+    return "\n\n".join([*parts, about]) + "\n", pictures
+
+
+def decisions(folder: Path) -> dict[str, str]:
+    """The list of decisions, and their pages as they are."""
+    texts = {path: path.read_text(encoding="utf-8") for path in sorted(folder.glob("*.md"))}
+    lines = ["# Decisions", "", "Why things are as they are, and what was measured.", ""]
+    lines += [f"- [{text.splitlines()[0].removeprefix('# ')}]({path.name})" for path, text in texts.items()]
+    return {"decisions/index.md": "\n".join(lines) + "\n"}

@@ -1,0 +1,141 @@
+"""The documentation site: pages say what is so, links lead somewhere, tutorials run; `make docs` builds it strictly."""
+
+import contextlib
+import importlib
+import io
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from pharos.environments import classes, named_instances
+
+ROOT = Path(__file__).parents[1]
+DOCS, SCRIPTS = ROOT / "docs", ROOT / "scripts"
+BLOCK = re.compile(r"^```python\n(.*?)^```\n(?:```text\n(.*?)^```\n)?", re.MULTILINE | re.DOTALL)
+TUTORIALS = sorted((DOCS / "tutorials").glob("*.ipynb"))
+LONG = ("3-study", "4-own-observation-and-agent", "5-own-loop")
+
+
+@pytest.fixture(scope="module")
+def scripts():
+    """Imports a script."""
+    sys.path.insert(0, str(SCRIPTS))
+    yield importlib.import_module
+    sys.path.remove(str(SCRIPTS))
+
+
+def links_of(text):
+    """Targets in the prose of a page."""
+    prose = re.sub(r"^```.*?^```$|`[^`\n]*`", "", text, flags=re.MULTILINE | re.DOTALL)
+    return re.findall(r"\]\(([^)\s]+)\)", prose) + re.findall(r'src="([^"]+)"', prose)
+
+
+def anchors_of(text):
+    """What a page can be entered at: its headings, as the site and code hosts number them."""
+    titles = re.findall(r"^#+ (.*)$", text, re.MULTILINE)
+    plain = [re.sub(r"`|\*|\[|\]\([^)]*\)", "", title).lower() for title in titles]
+    return {re.sub(r"[^\w\- ]", "", title).replace(" ", "-") for title in plain}
+
+
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(DOCS.rglob("*.md"))]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_links_of_pages_lead_somewhere(page):
+    for link in links_of(page.read_text()):
+        path, _, anchor = link.partition("#")
+        if "://" in path or path.startswith("mailto:"):
+            continue
+        target = page.parent / path if path else page
+        assert target.exists(), link
+        if anchor and target.suffix == ".md":
+            assert anchor in anchors_of(target.read_text()), link
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["start.md", "how-to.md"])
+def test_the_code_of_pages_prints_what_they_say(name):
+    namespace, compared = {}, 0
+    for code, expected in BLOCK.findall((DOCS / name).read_text()):
+        with contextlib.redirect_stdout(io.StringIO()) as printed:
+            exec(compile(code, name, "exec"), namespace)
+        assert printed.getvalue() == expected
+        compared += bool(expected)
+    assert compared >= 3
+
+
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(path.stem, marks=pytest.mark.long if path.stem in LONG else pytest.mark.slow) for path in TUTORIALS],
+)
+def test_tutorials_print_what_they_show(name):
+    done = subprocess.run(
+        [sys.executable, str(SCRIPTS / "notebooks.py"), "--check", name],
+        **{"capture_output": True, "text": True, "timeout": 900, "env": {**os.environ, "MPLBACKEND": "agg"}},
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_there_are_tutorials_and_all_have_been_executed():
+    assert len(TUTORIALS) >= 5
+    for path in TUTORIALS:
+        notebook = json.loads(path.read_text())
+        assert notebook["nbformat"] == 4
+        counts = [cell["execution_count"] for cell in notebook["cells"] if cell["cell_type"] == "code"]
+        assert counts == list(range(1, len(counts) + 1)), path.name
+
+
+def test_stored_numbers_of_environments_are_of_todays_rules(scripts):
+    numbers = scripts("environment_numbers")
+    stored = json.loads(numbers.FILE.read_text())
+    for name, entry in stored.items():
+        assert name in named_instances(), f"{name}: python scripts/environment_numbers.py"
+        for part, value in numbers.key_of(name).items():
+            assert entry[part] == value, f"{name}: python scripts/environment_numbers.py {name}"
+    for name in ("simple_grid/4x4-decoy", "frozen_lake/4x4"):
+        assert numbers.numbers_of(name, 1000) == stored[name]
+
+
+def test_stored_values_are_in_order():
+    for name, entry in json.loads((DOCS / "environments.json").read_text()).items():
+        for kind in ("discounted", "episode"):
+            if kind in entry:
+                value = entry[kind]
+                assert value["worst"] <= value["uniform"] + 2e-6 <= value["optimal"] + 4e-6, name
+
+
+def test_every_environment_has_a_page(scripts):
+    pages = scripts("site_pages").environments({})
+    for name, cls in classes().items():
+        page = pages[f"environments/{name}.md"]
+        for heading in ("Rules", "Parameters", "Named instances", "What agents see", "Versions"):
+            assert f"\n## {heading}\n" in page, (name, heading)
+        assert page.count("\n| **") >= 3, name
+        for instance in cls.instances:
+            assert f"| `{name}/{instance}` |" in page
+        assert f"{name}.html" in pages["environments/index.md"]
+
+
+@pytest.mark.slow
+def test_the_reference_has_every_published_name_once(scripts):
+    pages = scripts("site_pages").reference()
+    text = "\n".join(pages.values())
+    homes = re.findall(r"^::: (\S+)$", text, re.MULTILINE)
+    assert len(homes) == len(set(homes)) > 150
+    assert "heading: pharos.value_iteration" in pages["api/pharos.md"]
+
+
+def test_faults_of_a_built_site_are_found(scripts, tmp_path):
+    (tmp_path / "there.html").write_text('<h1 id="top"></h1>')
+    page = tmp_path / "page.html"
+    page.write_text('<a href="there.html#top"></a><img src="data:,x"><a href="https://elsewhere.org"></a>')
+    faults = scripts("build_site").faults
+    assert faults(tmp_path) == []
+    for wrong in ('<a href="gone.html">', '<a href="there.html#gone">', '<script src="https://elsewhere.org/x.js">'):
+        page.write_text(wrong)
+        assert len(faults(tmp_path)) == 1, wrong
