@@ -1,0 +1,132 @@
+"""What the runs of a batch meet: outcomes as likely as the MDP says, several instances in one batch, any size."""
+
+import numpy as np
+import pytest
+
+from pharos.agents.batched import BatchRun, ObservationSource, make_batch, observed
+from pharos.agents.batched.worlds import Worlds
+from pharos.environments import make
+from pharos.experiments.task import Task
+from pharos.kernels import batched_worlds as kernels
+from pharos.mdp import TabularMDP, random_actions, sticky_actions
+
+DQN = {"learning_rate": 0.01, "buffer_size": 50, "learning_starts": 20, "batch_size": 8, "net_arch": [8], "n_envs": 2}
+SIGMAS = 5.0
+
+
+@pytest.fixture(scope="module")
+def slippery():
+    """Five states; each action has three outcomes, one of which is the end in the last state but one."""
+    rng = np.random.default_rng(1)
+    successors = rng.integers(0, 4, (5, 2, 3))
+    successors[3, :, 2], successors[4] = 4, 4
+    probabilities = rng.dirichlet(np.ones(3), (5, 2))
+    rewards = np.where(np.arange(5)[:, None, None] == 4, 0.0, rng.normal(size=(5, 2, 3)))
+    initial = np.array([0.5, 0.3, 0.2, 0.0, 0.0])
+    mdp = TabularMDP.from_outcomes(successors, probabilities, rewards, initial=initial, terminal=np.arange(5) == 4)
+    return mdp, successors, probabilities, rewards
+
+
+def runs_on(mdp, number, **options):
+    return [BatchRun(mdp, None, 7, {}, 1, i, 91 * i, **options) for i in range(number)]
+
+
+def within(counts, probabilities):
+    """Whether all counts (K,) are what probabilities (K,) make likely."""
+    total = counts.sum()
+    spread = np.sqrt(total * probabilities * (1 - probabilities))
+    return (np.abs(counts - total * probabilities) <= SIGMAS * spread + 1e-9).all()
+
+
+@pytest.mark.parametrize("chance", ("plain", "sticky and random"))
+def test_episodes_are_as_likely_as_the_mdp_says(slippery, chance):
+    mdp, successors, probabilities, rewards = slippery
+    if chance != "plain":
+        mdp = random_actions(sticky_actions(mdp, 0.3), 0.2)
+    rng = np.random.default_rng(2)
+    runs = runs_on(mdp, 40, outcome_rewards=rewards.ravel())
+    worlds = Worlds(runs, np.array([run.key for run in runs], np.uint64), 5)
+    met, executed_after, starts = np.zeros((5, 2, 5)), np.zeros((3, 2, 2)), np.zeros(5)
+    np.add.at(starts, worlds.state, 1)
+    paid = {(s, a, t): rewards[s, a, successors[s, a] == t] for s in range(5) for a in range(2) for t in range(5)}
+    for step in range(400):
+        state, previous = worlds.state.copy(), worlds.previous.copy()
+        chosen = rng.integers(0, 2, state.shape)
+        worlds.step(step, chosen, counts=True)
+        ended = worlds.flags & kernels.DONE > 0
+        np.add.at(starts, worlds.state[ended], 1)
+        executed = worlds.previous[~ended]
+        np.add.at(met, (state[~ended], executed, worlds.next_state[~ended]), 1)
+        np.add.at(executed_after, (previous[~ended], chosen[~ended], executed), 1)
+        for s, a, t, r in zip(state[~ended], executed, worlds.next_state[~ended], worlds.reward[~ended], strict=True):
+            assert r in paid[s, a, t]
+        assert (worlds.elapsed <= 6).all()
+    assert within(starts, mdp.initial)
+    for s in range(3):  # from where no outcome ends
+        for a in range(2):
+            assert within(met[s, a], np.bincount(successors[s, a], probabilities[s, a], 5))
+    if chance == "plain":
+        assert (executed_after == executed_after * np.eye(2)).all()
+        return
+    c = mdp.chance
+    for previous in range(2):
+        for chosen in range(2):
+            likely = c.chosen * np.eye(2)[chosen] + c.previous * np.eye(2)[previous] + c.uniform / 2
+            assert within(executed_after[previous, chosen], likely)
+
+
+def test_returns_are_counted_until_the_end_of_the_training_alone(slippery):
+    mdp, *_ = slippery
+    runs = runs_on(mdp, 3, gamma=0.5)
+    worlds = Worlds(runs, np.array([run.key for run in runs], np.uint64), 4)
+    episodes, sums = np.zeros(3, np.int64), np.zeros(3)
+    running, discount = np.zeros((3, 4)), np.ones((3, 4))
+    for step in range(60):
+        counts = step < 50
+        worlds.step(step, np.full((3, 4), step % 2), counts=counts)
+        running += discount * worlds.reward
+        discount *= 0.5
+        ended = worlds.flags & kernels.DONE > 0
+        if counts:
+            episodes += ended.sum(axis=1)
+            sums += (running * ended).sum(axis=1)
+        running[ended], discount[ended] = 0.0, 1.0
+    assert (worlds.episodes == episodes).all()
+    assert np.abs(worlds.returns - sums).max() <= 1e-12
+
+
+def learned(runs):
+    batch = make_batch("dqn", runs)
+    batch.learn([60], lambda point: None)
+    return [b"".join(value.tobytes() for value in batch.parameters(i).values()) for i in range(len(runs))]
+
+
+@pytest.fixture(scope="module")
+def mixed():
+    """Runs of two instances and three kinds of chance with equal observations."""
+    tasks = [
+        Task.of(make("simple_grid"), sticky=0.25),
+        Task.of(make("simple_grid"), random=0.25),
+        Task.of(make("simple_grid", height=5, width=3, goal=(4, 2))),
+    ]
+    sources = [ObservationSource.of(task.space, task.sight.observe) for task in tasks]
+    return [
+        BatchRun(task.mdp, source, 9 + k, {**DQN, "gamma": 0.9 + 0.01 * k}, 60, k, 5 * k)
+        for k, (task, source) in enumerate(zip(tasks, sources, strict=True))
+    ]
+
+
+def test_runs_of_several_instances_learn_as_they_do_alone(mixed):
+    assert learned(mixed) == [learned([run])[0] for run in mixed]
+
+
+@pytest.mark.parametrize("observation", ("vector", "simple_image"))
+def test_observations_that_fit_no_table_change_nothing(monkeypatch, observation):
+    task = Task.of(make("frozen_lake/4x4"), observation=observation)
+    source = ObservationSource.of(task.space, task.sight.observe)
+    runs = [BatchRun(task.mdp, source, 20, DQN, 60, i, i) for i in range(2)]
+    in_table = learned(runs)
+    monkeypatch.setattr(observed, "LARGEST_TABLE", 0)
+    raw = learned(runs)
+    monkeypatch.setattr(observed, "LARGEST_RAW_TABLE", 0)
+    assert in_table == raw == learned(runs)
