@@ -5,7 +5,7 @@ what Stable-Baselines3 does for one; docs/agents.md says where the arithmetic di
 """
 
 import numpy as np
-from numba import float32, njit
+from numba import float32, njit, uint64
 
 from pharos.kernels.batched_worlds import DONE, SAMPLE, TIMEOUT
 from pharos.kernels.philox import below, philox
@@ -100,3 +100,25 @@ def adam(parameters, gradients, means, squares, counts, is_active, rates, max_no
             root = np.sqrt(1.0 - 0.999 ** counts[i])  # what divides the root of the squares multiplies the rest
             step = float32(rates[i] / (1.0 - 0.9 ** counts[i]) * root)
             _adam(parameters[i], gradients[i], means[i], squares[i], scale, step, float32(eps * root))
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"})
+def linear_row(parameters, weight, bias, x, is_relu, y):
+    """y (W, out) = x (W, in) w + b, at least 0 where `is_relu`; the weights of inputs that are 0 are not read.
+
+    parameters (W, P) float32: w begins at `weight`, in rows of `out`, and b at `bias`.
+    """
+    outputs = y.shape[1]
+    total = np.empty(outputs, np.float32)
+    for i in range(len(parameters)):
+        row = parameters[i]
+        for j in range(outputs):
+            total[j] = row[uint64(bias + j)]
+        for k in range(x.shape[1]):
+            factor = x[i, k]
+            if factor != 0.0:
+                first = uint64(weight + k * outputs)
+                for j in range(outputs):
+                    total[j] += factor * row[first + uint64(j)]
+        for j in range(outputs):
+            y[i, j] = max(total[j], float32(0.0)) if is_relu else total[j]

@@ -13,10 +13,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pharos.kernels import batched_learning
+
 ALIGNED = 16  # floats: each parameter of each run begins at a multiple of 64 bytes
 RELU, TANH, NONE = "relu", "tanh", "none"
+ROWS = "all parameters"
 KERNEL = 3  # of the small convolution
 
+linear_row: Any = batched_learning.linear_row
 Values = dict[str, Tensor]
 
 
@@ -70,11 +74,12 @@ class Parameters:
         self.length += -(-self.shapes[-1].size // ALIGNED) * ALIGNED
 
     def views(self, rows: Tensor) -> Values:
-        """name -> (W, ...) view of (W, P)."""
-        return {
+        """name -> (W, ...) view of (W, P); all of it under the name ROWS."""
+        views = {
             each.name: rows[:, each.offset : each.offset + each.size].view(len(rows), *each.shape)
             for each in self.shapes
         }
+        return {**views, ROWS: rows}
 
 
 def room(width: int, *shape: int, device: Any = None) -> Tensor:
@@ -152,10 +157,16 @@ class Linear(Layer):
 
         parameters.add(f"{name}.weight", (inputs, outputs), inputs, stored, kept)
         parameters.add(f"{name}.bias", (1, outputs), inputs, np.ravel, np.atleast_2d)
+        self._offsets = tuple(each.offset for each in parameters.shapes[-2:])
 
     def forward(self, values: Values, x: Tensor) -> Tensor:
         """The outputs."""
         y, _ = self._room(x)
+        if x.shape[1] == 1 and x.device.type == "cpu" and self.activation != TANH:
+            # to act once is to read all weights; those of inputs that a ReLU made 0 need not be
+            rows = values[ROWS].numpy()
+            linear_row(rows, *self._offsets, x[:, 0].numpy(), self.activation == RELU, y[:, 0].numpy())
+            return y
         torch.baddbmm(values[f"{self.name}.bias"], x, values[f"{self.name}.weight"], out=y)
         self._activate(y)
         return y
