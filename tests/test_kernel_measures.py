@@ -11,7 +11,7 @@ from pharos import hardness
 from pharos.cli import app
 from pharos.errors import ParameterError, UndefinedMeasure
 from pharos.hardness import Representation, Schedule, kernel_regret
-from pharos.mdp import TabularMDP
+from pharos.mdp import TabularMDP, lazy_actions
 from pharos.observations import Network, representation, tangent_kernel
 
 SHORT = Schedule(steps=3000, learning_starts=500)
@@ -117,8 +117,8 @@ def plain_regret(mdp, kernel, schedule, sticky):
 @pytest.mark.parametrize("sticky", [0.0, 0.3])
 @pytest.mark.parametrize("random", [0.0, 0.2])
 def test_the_measure_is_what_its_definition_says(sticky, random):
-    """With outcomes in the rules, two start states, sticky and random actions."""
-    mdp = pharos.random_actions(pharos.sticky_actions(random_mdp(), sticky), random)
+    """With outcomes in the rules, two start states, sticky, random and lazy actions."""
+    mdp = lazy_actions(pharos.random_actions(pharos.sticky_actions(random_mdp(), sticky), random), random)
     schedule = Schedule(steps=2000, period=200, gradient_steps=20, learning_starts=400, gamma=0.9)
     for kernel in (kernel_of(7), np.eye(7)):
         found = kernel_regret(mdp, Representation.of_matrix(kernel), schedule=schedule)

@@ -158,7 +158,10 @@ def _represented(
     if goal.is_imported:  # its table has an order of its own
         from dataclasses import replace
 
-        mdp = replace(space.mdp(gamma=mdp.gamma).with_horizon(mdp.horizon), chance=mdp.chance)
+        from pharos.mdp import lazy_actions
+
+        own = lazy_actions(space.mdp(gamma=mdp.gamma).with_horizon(mdp.horizon), mdp.laziness)
+        mdp = replace(own, chance=mdp.chance)
     with progress_line("observing"):
         return mdp, representation(space, observation, **options)
 

@@ -175,14 +175,20 @@ def report(
     to: Annotated[
         Path | None, typer.Option("--to", metavar="DIR", help="Where to write; DIR/report of the study when not given.")
     ] = None,
+    predictions: Annotated[
+        Path | None,
+        typer.Option("--predictions", metavar="FILE", help="Of `pharos study predict`: what came true of them."),
+    ] = None,
     trust: Trust = False,
     json: Json = False,
 ) -> None:
     """Make the figures and tables of the finished runs: one HTML file, PNG, PDF, CSV and LaTeX."""
     from pharos import study
 
+    foretold = None if predictions is None else study.read_predictions(predictions)
     with progress_line("report") as tell:
-        written = study.report(*study.opened(spec, out, trust=trust or None), out=to, progress=tell)
+        opened, place = study.opened(spec, out, trust=trust or None)
+        written = study.report(opened, place, out=to, progress=tell, predictions=foretold)
     if json:
         files = {"figures": list(map(str, written.figures)), "tables": list(map(str, written.tables))}
         print_json({"html": str(written.html), **files, "notes": written.notes})
@@ -190,6 +196,30 @@ def report(
     for note in written.notes:
         complain(note)
     print(written.html)
+
+
+@app.command("predict")
+def predict(
+    spec: SpecArgument,
+    to: Annotated[Path, typer.Option("--out", metavar="FILE", help="The Parquet file to write.")],
+    trust: Trust = False,
+    json: Json = False,
+) -> None:
+    """Predict the regret of each cell from what its network makes of its states, before any run; hashed and dated."""
+    from pharos import study
+
+    opened, place = study.opened(spec, None, trust=trust or None)
+    with progress_line("predicting") as tell:
+        predictions = study.predict(opened, place, progress=tell)
+    said = study.write_predictions(opened, predictions, to)
+    missing = int(predictions["kernel_regret"].isna().sum())
+    if json:
+        print_json({"file": str(to), "cells": len(predictions), "missing": missing, **said})
+        return
+    print(f"{to}: {many(len(predictions), 'cell')}, {said['date']}, sha256 {said['sha256']}")
+    if missing:
+        notes = predictions.loc[predictions["kernel_regret"].isna(), "notes"]
+        complain(f"{many(missing, 'cell')} without a prediction, such as: {notes.iloc[0]}")
 
 
 @app.command("pack")

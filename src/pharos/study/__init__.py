@@ -18,13 +18,16 @@ from pharos.study.execution import Status, opened, run, status
 from pharos.study.findings import findings
 from pharos.study.forecast import Forecast
 from pharos.study.paper import paper_regressions, paper_returns
+from pharos.study.predictions import PREDICTORS, predict, read_predictions, write_predictions
 from pharos.study.regression import Fit, aggregate_r_squared, fit, fit_models, leave_one_class_out_r_squared
 from pharos.study.report import StudyReport, report
 from pharos.study.specification import presets, specification
 from pharos.study.statistics import Estimate, interquartile_mean, stratified_interval
 from pharos.study.tables import cells, curves, hardness_table, paper_instance, table
+from pharos.study.validation import outcomes, validation
 
 __all__ = [
+    "PREDICTORS",
     "Comparison",
     "Estimate",
     "Fit",
@@ -49,12 +52,15 @@ __all__ = [
     "mean_curve",
     "models",
     "opened",
+    "outcomes",
     "pack",
     "paper_agreement",
     "paper_instance",
     "paper_regressions",
     "paper_returns",
+    "predict",
     "presets",
+    "read_predictions",
     "report",
     "run",
     "run_id",
@@ -65,4 +71,6 @@ __all__ = [
     "submit",
     "table",
     "unpack",
+    "validation",
+    "write_predictions",
 ]

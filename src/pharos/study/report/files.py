@@ -1,7 +1,7 @@
 """Makes a report: the page, the figures and the tables."""
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -9,11 +9,13 @@ from typing import TYPE_CHECKING, Any
 from pharos.storage import replace_file
 from pharos.study.figures import all_figures, save
 from pharos.study.latex import tables_of
+from pharos.study.report.model_sections import predictions_section
 from pharos.study.report.page import render
 from pharos.study.report.results import Results, coefficients, results_of
 from pharos.study.report.sections import sections_of
 from pharos.study.specification import Source
 from pharos.study.status import opened
+from pharos.study.validation import outcomes, validation
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -44,6 +46,7 @@ def report(
     out: str | os.PathLike | None = None,
     progress: Callable[[str], None] | None = None,
     trust: bool | None = None,
+    predictions: "tuple[pd.DataFrame, Mapping[str, str]] | None" = None,
 ) -> StudyReport:
     """Make the paper's figures and tables of the runs that are finished.
 
@@ -53,8 +56,9 @@ def report(
         out: folder to write to; None for `report` in the folder of the study.
         progress: called with what is being done.
         trust: whether code that the study names may be imported; as for `specification`.
+        predictions: of `read_predictions`; a section and a table say what came true of them.
     Raises:
-        ParameterError: no run is finished.
+        ParameterError: no run is finished; or none of those that were predicted, or of fewer than three classes.
     Cost: the measures of hardness of what has finished runs, once, each at most its budget; then seconds.
     """
     tell = progress or (lambda _: None)
@@ -67,9 +71,13 @@ def report(
     for name, draw in drawings.items():
         tell(f"drawing {name}")
         figures[name] = save(draw, target / "figures" / name)
-    tables = _write_tables(target / "tables", results)
+    judged = None if predictions is None else validation(predictions[0], outcomes(results.runs, results.points))
+    tables = _write_tables(target / "tables", results, {} if judged is None else {"predictions": judged})
     tell("drawing instances")
-    page = render(f"Study {study.name}", study.description, sections_of(results, figures))
+    sections = sections_of(results, figures)
+    if predictions is not None and judged is not None:
+        sections.insert(-1, predictions_section(judged, predictions[1]))
+    page = render(f"Study {study.name}", study.description, sections)
     replace_file(target / "report.html", page)
     drawn = [
         target / "figures" / f"{name}.{kind}" for name, images in figures.items() if images for kind in ("png", "pdf")
@@ -77,10 +85,10 @@ def report(
     return StudyReport(target / "report.html", drawn, tables, results.notes)
 
 
-def _write_tables(folder: Path, results: Results) -> list[Path]:
+def _write_tables(folder: Path, results: Results, more: "Mapping[str, pd.DataFrame]") -> list[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     tables = {"runs": results.runs, "cells": results.cells, "hardness": results.hardness}
-    tables |= {"aliasing": results.aliasing, "intervals": results.intervals}
+    tables |= {"aliasing": results.aliasing, "intervals": results.intervals, **more}
     tables |= {"profiles": results.profiles, "improvements": results.improvements}
     if results.comparison is not None and results.findings is not None:
         tables |= {"paper_returns": results.comparison.returns, "paper_regressions": results.comparison.regressions}

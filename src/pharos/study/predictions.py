@@ -1,0 +1,172 @@
+"""Regret predicted before any run: what measures of representations say of each cell of a study, hashed and dated."""
+
+import hashlib
+import json
+import math
+import os
+from collections.abc import Callable, Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pharos import experiments
+from pharos.agents import agent_kind
+from pharos.errors import FileFormatError, ParameterError, PharosError, ResultCorrupted
+from pharos.observations import title
+from pharos.storage import plain
+from pharos.study.blocks import Run, Specification
+from pharos.study.specification import Source
+from pharos.study.status import opened
+from pharos.study.values import task_of
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from pharos.hardness import Schedule
+
+MEASURES = ("kernel_regret", "kernel_learning_time", "kernel_sample_complexity", "aliasing_floor", "exploration_time")
+PREDICTORS = (
+    *("kernel_regret", "kernel_regret_played", "tabular_regret", "tabular_regret_played"),
+    *("kernel_learning_time", "kernel_sample_complexity", "aliasing_floor", "exploration_time", "num_states"),
+)
+"""Columns of predictions, numbers; the larger, the harder."""
+_KEY = b"pharos.predictions"
+
+
+def predict(
+    source: Source, folder: str | os.PathLike | None = None, *, progress: Callable[[str], None] | None = None
+) -> "pd.DataFrame":
+    """Return what is predicted of each cell of a study whose agent learns from observations: a row each.
+
+    Args:
+        source, folder: as for `run`; no run is looked at.
+        progress: called with what is being done.
+    Returns:
+        Columns `environment`, `instance`, `chance`, `agent`, `observation`; PREDICTORS; `network`; `estimated_error`,
+        that of `kernel_regret` where landmarks stand for the kernel; `notes`, why a number is missing. The idealised
+        learner has the steps of the run, and of a DQN its discount, exploration and target network.
+    Raises:
+        ParameterError: the study has no such cell.
+    Cost: measures of hardness are kept beside the state spaces, so that a second call is quick.
+    """
+    import pandas as pd
+
+    study, _ = opened(source, folder)
+    rows: dict[tuple[str, ...], dict[str, Any]] = {}
+    for run in study.runs:
+        config = run.config
+        if agent_kind(config["agent"]).is_tabular:
+            continue
+        seen = title(config["observation"], config["observation_options"])
+        key = (config["environment"], run.instance, run.chance, config["agent"], seen)
+        if key in rows:
+            continue
+        if progress is not None:
+            progress(f"predicting {', '.join(key[1:])}")
+        names = ("environment", "instance", "chance", "agent", "observation")
+        rows[key] = dict(zip(names, key, strict=True)) | _predicted(run)
+    if not rows:
+        raise ParameterError(f"study {study.name!r}: no agent learns from observations, so there is nothing to predict")
+    return pd.DataFrame(list(rows.values()))
+
+
+def _predicted(run: Run) -> dict[str, Any]:
+    from pharos.hardness import report
+    from pharos.observations import representation
+
+    numbers: dict[str, Any] = dict.fromkeys(PREDICTORS, math.nan)
+    row = {**numbers, "network": "", "estimated_error": math.nan, "notes": ""}
+    try:
+        task = task_of(run.config)
+        name, initialisation = _network(run.config, task)
+        seen = representation(
+            task.space, task.observation, name, initialisation=initialisation, **dict(task.observation_options)
+        )
+        found = report(task.mdp, MEASURES, horizon=task.time_limit, representation=seen, schedule=_schedule(run.config))
+    except PharosError as error:
+        return {**row, "notes": str(error)}
+    row |= {"num_states": float(task.mdp.num_states), "network": f"{name}, {initialisation}"}
+    regret = found["kernel_regret"].value
+    if regret is not None:
+        row |= {"kernel_regret": regret["value"], "kernel_regret_played": regret["played"]}
+        row |= {"tabular_regret": regret["tabular"], "tabular_regret_played": regret["tabular_played"]}
+        row["estimated_error"] = regret["estimated_error"]
+    for measure in MEASURES[1:]:
+        value = found[measure].value
+        if value is not None:
+            row[measure] = float(value["value"] if isinstance(value, Mapping) else value)
+    notes = (result.undefined or result.certificate.note for result in found.results.values())
+    return {**row, "notes": "; ".join(note for note in notes if note)}
+
+
+def _network(config: Mapping[str, Any], task: Any) -> tuple[str, str]:
+    """The name and the initialisation of the network of an agent of pharos."""
+    from pharos.observations import default_network, observe
+
+    seen = observe(task.env, task.observation, state_space=task.space, **dict(task.observation_options))
+    name, hidden = default_network(seen.space), config["hyperparameters"].get("net_arch", [128])
+    if isinstance(hidden, list) and hidden != [128]:
+        name = "-".join([name.removesuffix("x2"), *(["128"] if "mlp" not in name else []), *map(str, hidden)])
+    return (name, "pytorch") if config["agent"] == "dqn" else (f"{name}+tanh", "sb3")
+
+
+def _schedule(config: Mapping[str, Any]) -> "Schedule":
+    """That of a DQN by its hyperparameters; of others the steps alone."""
+    from pharos.hardness import Schedule
+
+    given = config["hyperparameters"]
+    if config["agent"] != "dqn":
+        return Schedule(steps=config["steps"])
+    same = ("learning_starts", "exploration_initial_eps", "exploration_final_eps", "exploration_fraction", "gamma")
+    options = {name: given[name] for name in same if name in given}
+    period, every = int(given.get("target_update_interval", 250)), given.get("train_freq", 4)
+    every = every if isinstance(every, int) else 4
+    copies = int(given.get("gradient_steps", 1))
+    steps = max(1, round(period * (copies / every if copies > 0 else 1.0)))
+    return Schedule(steps=config["steps"], period=period, gradient_steps=steps, **options)
+
+
+def write_predictions(study: Specification, predictions: "pd.DataFrame", file: str | os.PathLike) -> dict[str, str]:
+    """Write predictions into a Parquet file with their SHA-256, the date and the version; return these.
+
+    The hash is of the rows alone: the same predictions have the same hash on any day.
+
+    Raises:
+        OSError: the file cannot be written; an older one then stays as it was.
+    """
+    import pyarrow as pa
+
+    from pharos import __version__
+
+    said = {
+        "study": study.name,
+        "sha256": _hash(predictions),
+        "date": datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ"),
+        "version": __version__,
+    }
+    table = pa.Table.from_pandas(predictions, preserve_index=False)
+    Path(file).parent.mkdir(parents=True, exist_ok=True)
+    experiments.write_table(Path(file), table.replace_schema_metadata({_KEY: json.dumps(said).encode()}))
+    return said
+
+
+def read_predictions(file: str | os.PathLike) -> "tuple[pd.DataFrame, dict[str, str]]":
+    """Read what `write_predictions` wrote: the rows; study, hash, date and version.
+
+    Raises:
+        FileFormatError: it is no file of predictions. ResultCorrupted: it was changed after it was written.
+    """
+    table = experiments.read_table(Path(file), "write it again")
+    said = (table.schema.metadata or {}).get(_KEY)
+    if said is None or not {*PREDICTORS, "agent", "observation"} <= {*table.column_names}:
+        raise FileFormatError(f"{file}: holds no predictions; write them with `pharos study predict SPEC --out FILE`")
+    frame, about = table.to_pandas(), json.loads(said)
+    if about.get("sha256") != _hash(frame):
+        raise ResultCorrupted(f"{file}: its rows are not those whose hash it has; it was changed after it was written")
+    return frame, about
+
+
+def _hash(frame: "pd.DataFrame") -> str:
+    columns = {name: frame[name].tolist() for name in sorted(frame.columns)}
+    text = json.dumps(plain(columns), sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()

@@ -1,0 +1,143 @@
+"""Predictions of a study: written before its runs, hashed and dated; and what is said of them afterwards."""
+
+import json
+
+import numpy as np
+import pandas as pd
+import pytest
+from typer.testing import CliRunner
+
+from pharos import study
+from pharos.cli import app
+from pharos.errors import FileFormatError, ParameterError, ResultCorrupted
+from pharos.study import read_predictions, specification, validation, write_predictions
+
+SPEC = {
+    "name": "tiny",
+    "steps": 3000,
+    "seeds": 1,
+    "blocks": [
+        {
+            "environments": [{"name": "simple_grid", "parameters": {"height": 3, "width": 3}}],
+            "observations": ["vector", {"name": "vector", "options": {"hide": "row"}}],
+            "agents": ["dqn", "ppo", "q_learning"],
+        }
+    ],
+}
+
+
+@pytest.fixture(scope="module")
+def predicted(tmp_path_factory):
+    return study.predict(SPEC, tmp_path_factory.mktemp("study"))
+
+
+def test_every_cell_that_sees_observations_is_predicted(predicted):
+    assert predicted["agent"].tolist() == ["dqn", "dqn", "ppo", "ppo"]
+    assert predicted["network"].tolist() == ["mlp128x2, pytorch"] * 2 + ["mlp128x2+tanh, sb3"] * 2
+    assert predicted[list(study.PREDICTORS)].notna().all().all()
+    plain, hidden = predicted.iloc[0], predicted.iloc[1]
+    assert plain["aliasing_floor"] == 0 < hidden["aliasing_floor"]
+    assert plain["kernel_regret"] <= hidden["kernel_regret"]
+    assert plain["tabular_regret"] == hidden["tabular_regret"]
+
+
+def test_a_file_of_predictions_has_its_hash_and_its_date(predicted, tmp_path):
+    said = write_predictions(specification(SPEC), predicted, tmp_path / "p.parquet")
+    frame, about = read_predictions(tmp_path / "p.parquet")
+    pd.testing.assert_frame_equal(frame, predicted)
+    assert about == said
+    assert set(about) == {"study", "sha256", "date", "version"}
+    again = write_predictions(specification(SPEC), predicted, tmp_path / "again.parquet")
+    assert again["sha256"] == said["sha256"]
+    changed = predicted.assign(kernel_regret=predicted["kernel_regret"] + 1e-9)
+    other = write_predictions(specification(SPEC), changed, tmp_path / "q.parquet")
+    assert other["sha256"] != said["sha256"]
+    import pyarrow.parquet as pq
+
+    swapped = pq.read_table(tmp_path / "q.parquet")
+    swapped = swapped.replace_schema_metadata(pq.read_table(tmp_path / "p.parquet").schema.metadata)
+    pq.write_table(swapped, tmp_path / "q.parquet", write_page_checksum=True)
+    with pytest.raises(ResultCorrupted, match="changed after it was written"):
+        read_predictions(tmp_path / "q.parquet")
+    pq.write_table(swapped.replace_schema_metadata({}), tmp_path / "q.parquet", write_page_checksum=True)
+    with pytest.raises(FileFormatError, match="holds no predictions"):
+        read_predictions(tmp_path / "q.parquet")
+
+
+def made_up(noise, classes=8, instances=3, slope=1.0, seed=0):
+    """Cells whose regret is a line in kernel_regret; all else is noise."""
+    rng = np.random.default_rng(seed)
+    rows = [
+        {"environment": f"c{c}", "instance": f"c{c}/{i}", "chance": "plain", "agent": "dqn", "observation": seen}
+        for c in range(classes)
+        for i in range(instances)
+        for seen in ("vector", "image", "hash")
+    ]
+    frame = pd.DataFrame(rows)
+    for name in study.PREDICTORS:
+        frame[name] = rng.random(len(frame)) + 0.1
+    cells = frame[["environment", "instance", "chance", "agent", "observation"]].copy()
+    cells["greedy"] = slope * frame["kernel_regret"] + noise * rng.normal(size=len(frame))
+    cells["played"] = np.nan
+    return frame, cells
+
+
+def test_a_line_without_noise_is_predicted_on_unseen_classes():
+    judged = validation(*made_up(0.0)).set_index("predictor")
+    best = judged.loc["kernel_regret"]
+    assert best["r_squared"] == pytest.approx(1.0)
+    assert best["rho"] == pytest.approx(1.0)
+    assert best["agreement"] == 1.0
+    assert (best["cells"], best["classes"]) == (72, 8)
+    others = judged.drop("kernel_regret")
+    assert (others["r_squared"] < 0.2).all()
+    assert (others["r_squared_lower"] < others["r_squared_upper"]).all()
+    assert set(judged["outcome"]) == {"greedy"}
+
+
+def test_held_out_classes_are_predicted_by_the_others_alone():
+    """One by one with NumPy's least squares."""
+    frame, cells = made_up(0.2, seed=1)
+    found = validation(frame, cells, predictors=["kernel_regret"]).iloc[0]
+    x, y, c = frame["kernel_regret"].to_numpy(), cells["greedy"].to_numpy(), frame["environment"].to_numpy()
+    predicted = np.empty(len(x))
+    for each in np.unique(c):
+        predicted[c == each] = np.polyval(np.polyfit(x[c != each], y[c != each], 1), x[c == each])
+    expected = 1 - ((y - predicted) ** 2).sum() / ((y - y.mean()) ** 2).sum()
+    assert found["r_squared"] == pytest.approx(expected)
+    assert found["r_squared_lower"] < expected < found["r_squared_upper"]
+
+
+def test_a_wrong_sign_within_mdps_is_seen():
+    frame, cells = made_up(0.0, slope=-1.0)
+    judged = validation(frame, cells, predictors=["kernel_regret"]).iloc[0]
+    assert judged["agreement"] == 0.0
+    assert judged["rho_within"] == pytest.approx(-1.0)
+
+
+def test_too_few_classes_are_a_line():
+    with pytest.raises(ParameterError, match="at least three classes"):
+        validation(*made_up(0.0, classes=2))
+    frame, cells = made_up(0.0)
+    with pytest.raises(ParameterError, match="no cell of the predictions"):
+        validation(frame, cells.assign(agent="ppo"))
+
+
+@pytest.mark.slow
+def test_the_command_line_predicts_and_reports(tmp_path):
+    import yaml
+
+    worlds = [("simple_grid", {"height": 3, "width": 3}), ("river_swim", {"length": 4}), ("deep_sea", {"size": 3})]
+    spec = {**SPEC, "steps": 200, "evaluations": 4, "hardness": {"measures": ["minimal_gap"]}}
+    blocks = [{"environments": [{"name": name, "parameters": given}], "agents": ["dqn"]} for name, given in worlds]
+    file = tmp_path / "tiny.yaml"
+    file.write_text(yaml.safe_dump({**spec, "blocks": blocks}))
+    predictions = tmp_path / "predictions.parquet"
+    done = CliRunner().invoke(app, ["study", "predict", str(file), "--out", str(predictions), "--json"])
+    assert json.loads(done.stdout)["cells"] == 3
+    where = ["--out", str(tmp_path / "results")]
+    assert CliRunner().invoke(app, ["study", "run", str(file), *where]).exit_code == 0
+    done = CliRunner().invoke(app, ["study", "report", str(file), *where, "--predictions", str(predictions)])
+    assert done.exit_code == 0, done.output
+    assert "sha256" in (tmp_path / "results" / "report" / "report.html").read_text()
+    assert (tmp_path / "results" / "report" / "tables" / "predictions.csv").exists()
