@@ -16,6 +16,7 @@ from pharos import hardness
 from pharos.errors import DivergenceError, ParameterError, PrecisionError
 from pharos.mdp import TabularMDP, random_actions, sticky_actions
 from pharos.solvers import evaluate_policy, uniform_value, value_iteration, worst_value
+from pharos.solvers.policy_iteration import PolicyIteration
 from strategies import acyclic_mdps, hard_mdps
 
 often = settings(max_examples=150, deadline=None)
@@ -126,6 +127,16 @@ def test_the_bound_of_a_general_mdp_counts_the_rounding_of_its_values(solve, gam
     one = TabularMDP.from_matrices(np.ones((1, 1, 1)), [[0.7]], gamma=gamma)
     truth = Fraction(0.7) / (1 - Fraction(gamma))
     solution = finest(lambda tolerance: solve(one, tolerance))
+    assert abs(Fraction(float(solution.v[0])) - truth) <= Fraction(solution.error_bound)
+
+
+@pytest.mark.parametrize("reward", [0.7, 0.1, 0.3])
+def test_the_bound_counts_the_rounding_of_values_where_sweeps_alone_find_them(reward, monkeypatch):
+    """Linear systems leave less of an error than their bound allows; sweeps alone stop where rounding stops them."""
+    monkeypatch.setattr(PolicyIteration, "is_worth_it", lambda *_: False)
+    one = TabularMDP.from_matrices(np.ones((1, 1, 1)), [[reward]], gamma=0.99)
+    truth = Fraction(reward) / (1 - Fraction(0.99))
+    solution = finest(lambda tolerance: value_iteration(one, tolerance))
     assert abs(Fraction(float(solution.v[0])) - truth) <= Fraction(solution.error_bound)
 
 
