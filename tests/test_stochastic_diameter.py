@@ -17,6 +17,7 @@ from pharos.hardness.hitting_times import HittingTimes
 from pharos.hardness.interval import Spending
 from pharos.hardness.stochastic_diameter import _Diameter
 from pharos.hardness.travel import TravelBounds
+from pharos.kernels import hitting
 from pharos.mdp import TabularMDP, random_actions, sticky_actions
 from strategies import deterministic_mdps, general_mdps, outcome_mdps
 
@@ -256,6 +257,35 @@ def test_long_lakes_have_the_diameter_of_sixty_digits(width, truth):
     found = hardness.diameter(random_actions(lake, 0.8))
     assert found.exact
     assert found.lower <= truth * (1 + 1e-12) and truth * (1 - 1e-12) <= found.upper
+
+
+def test_residuals_count_their_rounding():
+    """Of any J, one float a node or the sum of two, in exact fractions; probabilities are multiples of 2^-20."""
+    rng = np.random.default_rng(0)
+    matrix = rng.multinomial(2**20, np.full(6, 1 / 6), (6, 2)) / 2**20
+    times = HittingTimes(choices_of(TabularMDP.from_matrices(matrix, np.zeros((6, 2))), restart=False))
+    count, size = times.distances(0), len(times.goal)
+    arguments = (*times.arrays, times.goal, times.order, count)
+
+    def changes(j):
+        """T J - J of the nodes 1 to 5; node 0 is the target."""
+        steps = (
+            [sum(Fraction(p) * (j[m] - j[n]) for m, p in enumerate(row)) for row in matrix[n]] for n in range(1, 6)
+        )
+        return [1 + min(each) for each in steps]
+
+    for _ in range(60):
+        high = rng.random(size) * 10.0 ** rng.integers(0, 12)
+        low = rng.uniform(-1, 1, size) * high * 2.0**-54
+        high[times.goal] = low[times.goal] = 0.0
+        above, below, _ = hitting.residuals(*arguments, high, times.policy)
+        exact = changes([Fraction(float(value)) for value in high])
+        assert -Fraction(below) <= min(exact) and max(exact) <= Fraction(above)
+        residual, error = np.zeros(size), np.zeros(size)
+        hitting.residuals_of_pairs(*arguments, high, low, times.policy, residual, error)
+        exact = changes([Fraction(float(one)) + Fraction(float(two)) for one, two in zip(high, low, strict=True)])
+        for n, change in enumerate(exact, start=1):
+            assert abs(change - Fraction(float(residual[n]))) <= Fraction(float(error[n]))
 
 
 @st.composite
