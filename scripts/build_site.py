@@ -23,6 +23,7 @@ import site_pages
 ROOT = Path(__file__).parents[1]
 DOCS, STAGED, SITE = ROOT / "docs", ROOT / "build" / "docs", ROOT / "site"
 OUTSIDE = {"CHANGELOG.md": "changelog.md", "CONTRIBUTING.md": "contributing.md", "README.md": "start.md"}
+FIRST_PAGES = ("index.md", "start.md")  # which lead to the pages of environments where the repository has the gallery
 GENERATED_LISTS = ("docs/decisions", "docs/tutorials")
 CONVERTED = (".ipynb",)
 FOREIGN_WORKER = "https://unpkg.com/iframe-worker/shim"  # what the theme would load instead of assets/search-worker.js
@@ -84,6 +85,8 @@ def relinked(text: str, source: Path, name: str) -> str:
         path = os.path.normpath(source.parent / link)
         if path in OUTSIDE:
             staged = OUTSIDE[path]
+        elif name in FIRST_PAGES and path == "docs/gallery.md":
+            staged = "environments/index.md"
         elif path in GENERATED_LISTS:
             staged = f"{path.removeprefix('docs/')}/index.md"
         elif path.startswith("docs/") and not (ROOT / path).is_dir():

@@ -17,7 +17,7 @@ from pharos.errors import StateSpaceTooLarge
 
 FILE = Path(__file__).parents[1] / "docs" / "environments.json"
 GAMMA = 0.99
-SWEPT = 200_000_000  # state-action pairs times steps, up to which the time limit of episodes is a horizon, too
+SWEPT = 10_000_000_000  # state-action pairs times steps, up to which the time limit of episodes is a horizon, too
 
 
 def key_of(name: str) -> dict:

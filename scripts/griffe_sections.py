@@ -14,5 +14,8 @@ class Sections(griffe.Extension):
         if obj.docstring is None:
             return
         text = re.sub(rf"\n(?=(?:{SECTIONS}):)", "\n\n", obj.docstring.value)
+        text = re.sub(
+            rf"^(?!(?:{SECTIONS}):)(\S[^\n]*)\n(?=    \S)", r"\1\n\n", text, flags=re.MULTILINE
+        )  # lists of ours
         text = re.sub(r"^(Cost|Sources?): ", r"**\1.** ", text, flags=re.MULTILINE)
         obj.docstring.value = re.sub(r"^(Returns|Raises): *(?=\S)", r"\1:\n    ", text, flags=re.MULTILINE)

@@ -33,6 +33,15 @@ CHANGES = {  # class -> version of the rules -> what changed
     }
 }
 POLICIES = ("optimal", "uniform", "worst")
+VALUES = (
+    "Values at the start are those of the optimal, the uniformly random and the worst policy. *Discounted*: by 0.99, "
+    "without a limit. *Of an episode*: undiscounted, of as many steps as its limit (left out where that is long to "
+    "compute). Each is within 1e-6, rounded to six digits."
+)
+VALUES_HEAD = (
+    "| instance | states | limit | V\\*, discounted | uniform | worst | V\\* of an episode | uniform | worst |\n"
+    "|---|--:|--:|--:|--:|--:|--:|--:|--:|"
+)
 PACKAGES = {  # page of the reference -> (title, module)
     "pharos": ("pharos", "pharos"),
     "environments": ("pharos.environments", "pharos.environments"),
@@ -69,7 +78,34 @@ def environments(files: Mapping[str, Path]) -> dict[str, str]:
         "Gymnasium, of MiniGrid and of bsuite. Your own: [adding an environment](../adding-an-environment.md).\n\n"
         '<div class="cards" markdown="0">\n' + "\n".join(cards) + "\n</div>\n"
     )
-    return {"environments/index.md": index, **pages}
+    return {"environments/index.md": index, "environments/values.md": values_of_all(stored), **pages}
+
+
+def values_of_all(stored: Mapping[str, dict]) -> str:
+    """One table of every named instance."""
+    rows = [row for name, numbers in stored.items() if (row := values_row(name, numbers))]
+    return "\n".join(
+        [
+            "# Values of every instance",
+            "",
+            f"{VALUES} An instance without a row has more states than were enumerated for this page. The same in JSON: "
+            "[environments.json](../environments.json).",
+            "",
+            VALUES_HEAD,
+            *rows,
+            "",
+        ]
+    )
+
+
+def values_row(name: str, numbers: Mapping) -> str | None:
+    """The values of an instance, as a row; None where they are not known."""
+    if "num_states" not in numbers:
+        return None
+    found = [numbers.get(kind, {}).get(policy) for kind in ("discounted", "episode") for policy in POLICIES]
+    texts = ("" if value is None else f"{value + 0.0:.6g}" for value in found)
+    page = f"[`{name}`]({name.split('/')[0]}.md)"
+    return f"| {page} | {numbers['num_states']:,} | {numbers['episode_limit']:,} | {' | '.join(texts)} |"
 
 
 def sections_of(text: str) -> dict[str, str]:
@@ -167,30 +203,20 @@ def rules_table(docstring: str) -> list[str]:
 def instances(cls, stored: Mapping[str, dict]) -> list[str]:
     """The table of named instances, with counts and values at the start."""
     ids = {name: gymnasium_id for gymnasium_id, name in ids_of(cls).items()}
-    counted = ["| instance | Gymnasium id | states | terminal | depth | steps |", "|---|---|--:|--:|--:|--:|"]
-    values = [
-        "| instance | V\\*, discounted | uniform | worst | V\\* of an episode | uniform | worst |",
-        "|---|--:|--:|--:|--:|--:|--:|",
-    ]
+    counted = ["| instance | Gymnasium id | states | terminal | depth |", "|---|---|--:|--:|--:|"]
+    values = [VALUES_HEAD]
     for instance in cls.instances:
         name = f"{cls.name}/{instance}"
         numbers = stored.get(name, {})
         start = f"| `{name}` | `{ids[name]}` |"
-        if "num_states" not in numbers:
+        if (row := values_row(name, numbers)) is None:
             bound = f"more than {numbers['more_than']:,}" if numbers else ""
-            counted.append(f"{start} {bound} | | | |")
+            counted.append(f"{start} {bound} | | |")
             continue
-        parts = ("num_states", "num_terminal_states", "depth", "episode_limit")
+        parts = ("num_states", "num_terminal_states", "depth")
         counted.append(f"{start} " + " | ".join(f"{numbers[part]:,}" for part in parts) + " |")
-        found = [numbers.get(kind, {}).get(policy) for kind in ("discounted", "episode") for policy in POLICIES]
-        texts = ("" if value is None else f"{value + 0.0:.6g}" for value in found)
-        values.append(f"| `{name}` | {' | '.join(texts)} |")
-    about = (
-        "Values at the start: of the optimal, the uniformly random and the worst policy. *Discounted* by 0.99 without "
-        "a limit; *of an episode*: undiscounted, of as many steps as the table above says (left out where that is long "
-        "to compute). Each is within 1e-6, rounded to six digits. *Depth* is how far the farthest state is from the "
-        "start."
-    )
+        values.append(row)
+    about = f"*Depth* is how far the farthest state is from the start. {VALUES}"
     return ["## Named instances", "", *counted, "", about, "", *values, ""]
 
 
@@ -224,14 +250,18 @@ def reference() -> dict[str, str]:
     """A page for each package, with an entry for every name that it publishes."""
     pages, lines = {}, ["# API", "", "In the order of the data flow; names are imported from where the page says.", ""]
     shown: dict[str, str] = {}  # where it is defined -> under which name it has its entry
+    pages_of_classes = set(classes().values())
     for page, (title, module_name) in PACKAGES.items():
         module = importlib.import_module(module_name)
         about = (module.__doc__ or "").strip()
-        entries = []
+        entries, worlds = [], []
         for name in published(module):
             value = getattr(module, name)
             home = home_of(value, module_name, name)
             if home is None:
+                continue
+            if value in pages_of_classes:
+                worlds.append(f"[`{name}`](../environments/{value.name}.md)")
                 continue
             if home in shown:
                 entries.append(f"## `{title}.{name}`\n\nThe same as [`{shown[home]}`][{home}].\n")
@@ -239,6 +269,8 @@ def reference() -> dict[str, str]:
             shown[home] = f"{title}.{name}"
             options = f"    options:\n      heading: {title}.{name}\n      toc_label: {name}\n"
             entries.append(f"::: {home}\n{options}")
+        if worlds:
+            about += f"\n\nThe classes, each with a page of its own: {', '.join(worlds)}."
         pages[f"api/{page}.md"] = f"# {title}\n\n{about}\n\n" + "\n".join(entries)
         lines.append(f"- [`{title}`]({page}.md): {first_sentence(about)}")
     return {"api/index.md": "\n".join(lines) + "\n", **pages}
