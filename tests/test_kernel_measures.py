@@ -207,6 +207,33 @@ def test_landmarks_are_exact_where_there_are_enough_of_them_and_say_so_where_not
     np.testing.assert_allclose(identity.curve.greedy, identity.tabular.greedy, atol=1e-3)
 
 
+def test_gradient_steps_in_a_series_are_those_made_one_by_one():
+    """Of all three operators, with 300 observations and rows of more than one block."""
+    from pharos.hardness.kernel_operator import Exact, Identity, Landmarks
+
+    rng = np.random.default_rng(2)
+    kernel, states = kernel_of(300), np.arange(300)
+    weights = rng.dirichlet(np.ones(900)).reshape(300, 3).astype(np.float32)
+    error = rng.normal(size=(300, 3)).astype(np.float32)
+
+    def block(rows, columns):
+        return kernel[np.ix_(rows, columns)]
+
+    for operator in (Identity(), Exact(block, states), Landmarks(block, states, states[:40])):
+        dense = operator(np.eye(300, dtype=np.float32)).astype(float)
+        vector = np.full((300, 1), 300**-0.5, np.float32)
+        largest = operator.largest_eigenvalue(weights.max(axis=1, keepdims=True), vector)
+        expected = np.abs(np.linalg.eigvals(dense * weights.max(axis=1))).max()
+        assert largest == pytest.approx(expected, rel=3e-3)
+        for steps in (1, 2, 5, 62):
+            found = operator.descended(weights, error, 1 / (1.05 * largest), steps)
+            left = error.astype(float)
+            for _ in range(steps):
+                left = left - dense @ (weights * left) / (1.05 * largest)
+            np.testing.assert_allclose(found, error - left, atol=2e-5 * np.abs(error - left).max())
+
+
+@pytest.mark.slow
 def test_a_wide_network_trained_on_expectations_follows_the_kernel():
     """Full gradients of a network of 2,048 units, all actions' weights at once, against its own closed form."""
     torch = pytest.importorskip("torch")

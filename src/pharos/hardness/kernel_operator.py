@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable
 from functools import lru_cache
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -12,21 +12,70 @@ MOST_LANCZOS = 60
 Kernel = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
-class KernelOperator(Protocol):
+class KernelOperator:
     """A positive semidefinite kernel K of C observations; z is (C, A) float32."""
 
     def __call__(self, z: np.ndarray) -> np.ndarray:
         """K z."""
+        raise NotImplementedError
+
+    def largest_eigenvalue(self, weights: np.ndarray, vector: np.ndarray) -> float:
+        """The largest eigenvalue of K diag(weights), weights (C, 1), to 0.1 %, by Lanczos' method from `vector` (C, 1).
+
+        Returns it with the residual added, so that it is not too small; `vector` becomes the eigenvector found.
+        """
+        root = np.sqrt(weights)
+        basis = [vector / np.linalg.norm(vector)]
+        diagonal: list[float] = []
+        beside: list[float] = []
+        while True:
+            after = root * self(root * basis[-1])
+            diagonal.append(float((basis[-1] * after).sum()))
+            rows = np.concatenate(basis, axis=1)
+            after = after - rows @ (rows.T @ after)
+            after = after - rows @ (rows.T @ after)  # twice is enough (Parlett, 1998)
+            length = float(np.linalg.norm(after))
+            small = np.diag(diagonal) + np.diag(beside, 1) + np.diag(beside, -1)
+            values, vectors = np.linalg.eigh(small)
+            residual = length * abs(float(vectors[-1, -1]))
+            if residual <= 1e-3 * values[-1] or len(basis) == min(MOST_LANCZOS, len(vector)):
+                vector[:] = rows @ vectors[:, -1:].astype(np.float32)
+                return max(float(values[-1]), 0.0) + residual
+            basis.append(after / np.float32(length))
+            beside.append(length)
+
+    def descended(self, weights: np.ndarray, error: np.ndarray, rate: float, steps: int) -> np.ndarray:
+        """What gradient descent adds to Q in `steps` steps Q += rate K (weights (target - Q)), from error = target - Q.
+
+        It is K times rate weights times the sum of the errors on the way, a polynomial of degree steps - 1 in
+        rate K diag(weights), whose eigenvalues lie in [0, 1]: a Chebyshev series of about 3.5 sqrt(steps) terms has it
+        to float32's accuracy. weights, error: (C, A) float32.
+        """
+        return rate * self(weights * self.summed(weights, error, rate, _sum_of_powers(steps)))
+
+    def summed(self, weights: np.ndarray, error: np.ndarray, rate: float, series: np.ndarray) -> np.ndarray:
+        """The sum of the terms of a Chebyshev series in 1 - 2 rate K diag(weights), applied to error."""
+        past, now = error, error - 2 * rate * self(weights * error)
+        total = series[0] * past
+        if len(series) > 1:
+            total = total + series[1] * now
+        for coefficient in series[2:]:
+            past, now = now, 2 * now - 4 * rate * self(weights * now) - past
+            total += coefficient * now
+        return total
 
 
-class Identity:
+class Identity(KernelOperator):
     """No likeness between observations: a table."""
 
     def __call__(self, z: np.ndarray) -> np.ndarray:
         return z
 
+    def largest_eigenvalue(self, weights: np.ndarray, vector: np.ndarray) -> float:
+        return float(weights.max())
 
-class Exact:
+
+class Exact(KernelOperator):
     """The kernel itself, 4 C^2 bytes."""
 
     def __init__(self, kernel: Kernel, states: np.ndarray):
@@ -36,7 +85,7 @@ class Exact:
         return self.matrix @ z
 
 
-class Landmarks:
+class Landmarks(KernelOperator):
     """K ~ F F' + a diagonal, F = K(., L) K(L, L)^-1/2: exact between landmarks L and others, and on the diagonal.
 
     The diagonal keeps what an observation learns for itself alone (Snelson and Ghahramani, 2006, for regression).
@@ -59,51 +108,22 @@ class Landmarks:
     def __call__(self, z: np.ndarray) -> np.ndarray:
         return self.features @ (self.features.T @ z) + self.diagonal * z
 
+    def summed(self, weights: np.ndarray, error: np.ndarray, rate: float, series: np.ndarray) -> np.ndarray:
+        """As for others, with one pass over the features a term in place of two."""
+        from pharos.kernels import landmarks
 
-def largest_eigenvalue(apply: KernelOperator, weights: np.ndarray, vector: np.ndarray) -> float:
-    """The largest eigenvalue of K diag(weights), weights (C, 1), to 0.1 %, by Lanczos' method from `vector` (C, 1).
-
-    Returns it with the residual added, so that it is not too small; `vector` becomes the eigenvector found.
-    """
-    if isinstance(apply, Identity):
-        return float(weights.max())
-    root = np.sqrt(weights)
-    basis = [vector / np.linalg.norm(vector)]
-    diagonal: list[float] = []
-    beside: list[float] = []
-    while True:
-        after = root * apply(root * basis[-1])
-        diagonal.append(float((basis[-1] * after).sum()))
-        rows = np.concatenate(basis, axis=1)
-        after = after - rows @ (rows.T @ after)
-        after = after - rows @ (rows.T @ after)  # twice is enough (Parlett, 1998)
-        length = float(np.linalg.norm(after))
-        small = np.diag(diagonal) + np.diag(beside, 1) + np.diag(beside, -1)
-        values, vectors = np.linalg.eigh(small)
-        residual = length * abs(float(vectors[-1, -1]))
-        if residual <= 1e-3 * values[-1] or len(basis) == min(MOST_LANCZOS, len(vector)):
-            vector[:] = rows @ vectors[:, -1:].astype(np.float32)
-            return max(float(values[-1]), 0.0) + residual
-        basis.append(after / np.float32(length))
-        beside.append(length)
-
-
-def descended(apply: KernelOperator, weights: np.ndarray, error: np.ndarray, rate: float, steps: int) -> np.ndarray:
-    """What gradient descent adds to Q in `steps` steps Q += rate K (weights (target - Q)), where target - Q is `error`.
-
-    It is K times rate weights times the sum of the errors on the way, a polynomial of degree steps - 1 in
-    rate K diag(weights), whose eigenvalues lie in [0, 1]: a Chebyshev series of about 4 sqrt(steps) terms has it to
-    float32's accuracy. weights, error: (C, A) float32.
-    """
-    series = _sum_of_powers(steps)
-    past, now = error, error - 2 * rate * apply(weights * error)
-    total = series[0] * past
-    if len(series) > 1:
-        total = total + series[1] * now
-    for coefficient in series[2:]:
-        past, now = now, 2 * now - 4 * rate * apply(weights * now) - past
-        total += coefficient * now
-    return rate * apply(weights * total)
+        if len(series) < 3:
+            return super().summed(weights, error, rate, series)
+        past, now = error.copy(), error - np.float32(2 * rate) * self(weights * error)
+        total = series[0] * past + series[1] * now
+        projected = np.empty((error.shape[1], self.features.shape[1]))
+        landmarks.project(self.features, weights * now, projected)
+        for coefficient in series[2:]:
+            across = projected.astype(np.float32)
+            landmarks.step(self.features, self.diagonal, weights, np.float32(rate), across, now, past, projected)
+            past, now = now, past
+            total += coefficient * now
+        return total
 
 
 @lru_cache(maxsize=16)

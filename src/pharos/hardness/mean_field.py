@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pharos.errors import ParameterError, UndefinedMeasure
-from pharos.hardness.kernel_operator import KernelOperator, descended, largest_eigenvalue
+from pharos.hardness.kernel_operator import KernelOperator
 from pharos.hardness.occupancy import Walk
 from pharos.hardness.representation import Grouped
 from pharos.mdp import TabularMDP
@@ -144,10 +144,10 @@ class Learner:
 
     def _learnt(self, apply: KernelOperator, weights: np.ndarray, error: np.ndarray, vector: np.ndarray) -> np.ndarray:
         """(C, A): what the gradient steps of a phase add. vector (C, 1): the last phase's eigenvector, replaced."""
-        largest = largest_eigenvalue(apply, weights.max(axis=1, keepdims=True), vector)
+        largest = apply.largest_eigenvalue(weights.max(axis=1, keepdims=True), vector)
         before = float((weights * error**2).sum())
         while largest > 0 and before > 0:
-            added = descended(apply, weights, error, 1 / (MARGIN * largest), self.schedule.gradient_steps)
+            added = apply.descended(weights, error, 1 / (MARGIN * largest), self.schedule.gradient_steps)
             after = float((weights * (error - added) ** 2).sum())
             if after <= 1.001 * before:  # no step of a stable size makes it larger
                 return added

@@ -19,6 +19,7 @@ __all__ = [
     "hash_table",
     "hitting",
     "horizon",
+    "landmarks",
     "learning",
     "many_searches",
     "observation_kernels",

@@ -1,0 +1,45 @@
+"""Products with a kernel F F' + diagonal, in passes over the rows of F (C, M): each row is read once a product."""
+
+import numpy as np
+from numba import njit
+
+ROWS = 256  # sums over so many rows are float32, sums of these float64
+
+
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "nsz"})
+def project(features, z, out):
+    """out (A, M) float64 = (F' z)', z (C, A) float32."""
+    part = np.zeros(out.shape, np.float32)
+    out[:] = 0.0
+    for first in range(0, len(features), ROWS):
+        part[:] = 0.0
+        for s in range(first, min(first + ROWS, len(features))):
+            for a in range(z.shape[1]):
+                value = z[s, a]
+                for m in range(features.shape[1]):
+                    part[a, m] += features[s, m] * value
+        out += part
+
+
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "nsz"})
+def step(features, diagonal, weights, rate, projected, now, past, out):
+    """One term of a Chebyshev series: past = 2 now - 4 rate K (weights now) - past, in place.
+
+    projected (A, M) float32 = (F' (weights now))'; out (A, M) float64 = the same of the new term. now, past, weights
+    (C, A) float32; diagonal (C, 1).
+    """
+    part = np.zeros(out.shape, np.float32)
+    out[:] = 0.0
+    for first in range(0, len(features), ROWS):
+        part[:] = 0.0
+        for s in range(first, min(first + ROWS, len(features))):
+            for a in range(now.shape[1]):
+                total = np.float32(0.0)
+                for m in range(features.shape[1]):
+                    total += features[s, m] * projected[a, m]
+                total += diagonal[s, 0] * weights[s, a] * now[s, a]
+                past[s, a] = np.float32(2.0) * now[s, a] - np.float32(4.0) * rate * total - past[s, a]
+                value = weights[s, a] * past[s, a]
+                for m in range(features.shape[1]):
+                    part[a, m] += features[s, m] * value
+        out += part
