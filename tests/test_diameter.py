@@ -1,6 +1,7 @@
 """The diameter of deterministic MDPs: against all pairs, theory, and its own intervals."""
 
 import math
+from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -221,15 +222,25 @@ def test_the_distance_from_several_start_states_is_its_mean():
 def test_the_start_eccentricity_is_the_largest_mean_distance(mdp, data):
     starts = data.draw(st.lists(st.integers(0, mdp.num_states - 1), min_size=1, max_size=4))
     mdp = mdp.with_initial(starts)
-    d = distances(mdp.with_initial(0), restart=False)
-    weights = np.bincount(starts, minlength=len(d)) / len(starts)
-    expected = d[weights > 0].T @ weights[weights > 0]
+    d = distances(mdp.with_initial(0), restart=False)[sorted(starts)]
     found = hardness.start_eccentricity_interval(mdp, restart=False)
     assert found.exact
-    if np.isinf(expected).any():
+    if np.isinf(d).any():
         assert found.lower == found.upper == math.inf
     else:
-        assert found.lower * (1 - 1e-15) <= expected.max() <= found.upper * (1 + 1e-15)
+        expected = Fraction(int(d.sum(axis=0).max()), len(starts))
+        assert Fraction(found.lower) <= expected <= Fraction(found.upper)
+
+
+def test_the_interval_of_a_mean_distance_holds_its_exact_fraction():
+    """Round a ring; starts that are likelier than others stand there several times."""
+    rng = np.random.default_rng(0)
+    for _ in range(200):
+        length = int(rng.integers(3, 40))
+        starts = rng.integers(0, length, rng.integers(2, 9))
+        expected = max(Fraction(sum((t - int(s)) % length for s in starts), len(starts)) for t in range(length))
+        found = hardness.start_eccentricity_interval(ring(length, starts))
+        assert found.exact and Fraction(found.lower) <= expected <= Fraction(found.upper)
 
 
 def test_a_budget_that_ends_between_start_states_leaves_an_interval():
