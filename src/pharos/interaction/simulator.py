@@ -93,7 +93,7 @@ class Simulator:
         chance = _chance(options)
         self.chance, self.first_chosen = chance.triple, float(chance.first_chosen)
         self.lazy = float(options.lazy)
-        self._weights = (*self.chance, self.first_chosen, self.lazy)
+        self._weights = (*self.chance, self.first_chosen, *([self.lazy] if self.lazy else []))
         self.pays_otherwise = _pays_otherwise(options)
         self.has_chance = self.chance != (1.0, 0.0, 0.0)
         self.has_outcomes = self.env.has_chance

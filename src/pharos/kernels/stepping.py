@@ -17,8 +17,8 @@ class Setting(NamedTuple):
     Attributes:
         ranges: (2, D) int64, lowest and highest value of each component; (2, 0) on a table.
         scale: (D,) float64, of the vectors that `step_many` writes.
-        chance: (chosen, previous, uniform, first_chosen, lazy), weights of the executed action, of which the fourth is
-            that of the chosen one where there is no previous action; and the probability that it has no effect.
+        chance: (chosen, previous, uniform, first_chosen), weights of the executed action; the last is that of the
+            chosen one where there is no previous action. With lazy actions, also the probability that it has no effect.
         limit: steps after which an episode is truncated.
         mode: NEXT_STEP, SAME_STEP or DISABLED.
         first_previous: the previous action on the first step of an episode, -1 for none.
@@ -28,7 +28,7 @@ class Setting(NamedTuple):
 
     ranges: Any
     scale: Any
-    chance: tuple[float, float, float, float, float]
+    chance: tuple[float, ...]
     limit: int
     mode: int
     first_previous: int
@@ -131,10 +131,28 @@ def executed_action(chosen, previous, chance, num_actions, rng, i):
     return executed_by_number(chosen, previous, chance, num_actions, uniform_number(rng, i))
 
 
-@njit(forceinline=True)
+def laziness(chance):
+    """The probability that an executed action has no effect."""
+
+
+@overload(laziness, inline="always")
+def _laziness(chance):
+    if len(chance) == 4:
+        return lambda chance: 0.0
+    return lambda chance: chance[4]
+
+
 def has_no_effect(chance, rng, i):
-    """Whether the executed action of stream i changes nothing; nothing is drawn where each has an effect."""
-    return chance[4] > 0.0 and uniform_number(rng, i) < chance[4]
+    """Whether the executed action of stream i changes nothing; nothing is drawn where each has an effect, and the
+    compiler knows it.
+    """
+
+
+@overload(has_no_effect, inline="always")
+def _has_no_effect(chance, rng, i):
+    if len(chance) == 4:
+        return lambda chance, rng, i: False
+    return lambda chance, rng, i: uniform_number(rng, i) < chance[4]
 
 
 @njit(forceinline=True)
@@ -212,10 +230,10 @@ def walk_table(transitions, table_rewards, staying, is_terminal, setting, batch,
             continue
         action = executed_action(actions[i], previous[i], chance, num_actions, rng, i)
         if has_no_effect(chance, rng, i):
-            rewards[i], p = staying[index[i], action], chance[4]
+            rewards[i], p = staying[index[i], action], laziness(chance)
         else:
             index[i], rewards[i], p = outcome_on_table(transitions, table_rewards, index[i], action, rng, i)
-            p *= 1.0 - chance[4]
+            p *= 1.0 - laziness(chance)
         if len(likely) > 0:
             likely[i] = p
         previous[i] = executed[i] = action

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import int64
 
-from pharos.kernels.stepping import SAME_STEP, drawn_start, executed_action, has_no_effect, uniform_number
+from pharos.kernels.stepping import SAME_STEP, drawn_start, executed_action, has_no_effect, laziness, uniform_number
 
 
 class InteractionKernels(NamedTuple):
@@ -39,16 +39,16 @@ def interaction(compiler: Any, rules: Any, Parameters: Any, A: int, K: int = 1, 
     if L:
         drawing = compiler.calling("draw", "draw_motion")
         rules = {**rules, "draw": draw_all_function(drawing, rules, L)}
-    advance = advance_function(step, rules, K)
+    advances = advance_functions(step, rules, K)
     outcome = compiler.calling("transition", *chance)
     drawn_outcome = drawn_outcome_function(outcome, rules, K)
     draw_flat = draw_flat_function(drawing, rules)
     stepped = compiler.calling(*(rule for rule in rules if rule != "draw_motion" or L))
     return InteractionKernels(
-        step_one=step_one_kernel(step, Parameters, advance),
+        step_one=step_one_kernel(step, Parameters, advances),
         outcome_one=outcome_one_kernel(outcome, Parameters, drawn_outcome),
-        step_and_draw_one=step_and_draw_one_kernel(stepped, Parameters, advance, draw_flat),
-        step_many=step_many_kernel(step, Parameters, advance, drawn_outcome, A, K),
+        step_and_draw_one=step_and_draw_one_kernel(stepped, Parameters, advances, draw_flat),
+        step_many=step_many_kernel(step, Parameters, advances, drawn_outcome, A, K),
         is_terminal_one=is_terminal_one_kernel(compiler.calling("is_terminal"), rules, Parameters),
         draw_simple=draw_simple_kernel(drawing, rules, Parameters, draw_flat),
         draw_complex=draw_complex_kernel(drawing, rules, Parameters),
@@ -56,8 +56,8 @@ def interaction(compiler: Any, rules: Any, Parameters: Any, A: int, K: int = 1, 
     )
 
 
-def advance_function(compiler: Any, rules: Any, K: int) -> Any:
-    """One step by the rules, checked."""
+def advance_functions(compiler: Any, rules: Any, K: int) -> tuple[Any, Any]:
+    """One step by the rules, checked; and one by an action without effect."""
     transition, is_terminal, reward = rules["transition"], rules["is_terminal"], rules["reward"]
 
     @compiler.inlined
@@ -85,15 +85,20 @@ def advance_function(compiler: Any, rules: Any, K: int) -> Any:
         """
         for i in range(len(state)):
             following[i] = state[i]
-        if branch < 0:
-            return paid(self, state, -1 - branch, following, -1), int64(0)
         move(self, state, branch, following)
         for i in range(len(state)):
             if following[i] < ranges[0, i] or following[i] > ranges[1, i]:
                 return 0.0, 2 + i
         return paid(self, state, branch // K, following, branch % K), int64(is_terminal(self, following))
 
-    return advance
+    @compiler.inlined
+    def stay(self, state, action, following):
+        """The same of an action without effect: the successor is the state."""
+        for i in range(len(state)):
+            following[i] = state[i]
+        return paid(self, state, action, following, -1), int64(0)
+
+    return advance, stay
 
 
 def drawn_outcome_function(compiler: Any, rules: Any, K: int) -> Any:
@@ -129,15 +134,20 @@ def outcome_one_kernel(compiler: Any, Parameters: Any, drawn_outcome: Any) -> An
     return outcome_one
 
 
-def step_one_kernel(compiler: Any, Parameters: Any, advance: Any) -> Any:
+def step_one_kernel(compiler: Any, Parameters: Any, advances: tuple[Any, Any]) -> Any:
     """One step of one environment."""
+    advance, stay = advances
 
     @compiler.kernel
     def step_one(parameters, ranges, scale, state, branch, following, vector):
         """One step: `advance`, and vector[i] = (following[i] - low[i]) * scale[i] where `vector` has room (0 entries:
         not wanted).
         """
-        value, code = advance(Parameters(*parameters), ranges, state, branch, following)
+        self = Parameters(*parameters)
+        if branch < 0:
+            value, code = stay(self, state, -1 - branch, following)
+        else:
+            value, code = advance(self, ranges, state, branch, following)
         if len(vector) > 0:
             for i in range(len(state)):
                 vector[i] = (following[i] - ranges[0, i]) * scale[i]
@@ -181,8 +191,9 @@ def draw_flat_function(compiler: Any, rules: Any) -> Any:
     return draw_flat
 
 
-def step_and_draw_one_kernel(compiler: Any, Parameters: Any, advance: Any, draw_flat: Any) -> Any:
+def step_and_draw_one_kernel(compiler: Any, Parameters: Any, advances: tuple[Any, Any], draw_flat: Any) -> Any:
     """One step of one environment, and its image."""
+    advance, stay = advances
 
     @compiler.kernel
     def step_and_draw_one(parameters, ranges, state, branch, following, shades, image):
@@ -191,7 +202,10 @@ def step_and_draw_one_kernel(compiler: Any, Parameters: Any, advance: Any, draw_
         shades (L, 256) uint8 as in `draw_simple`; image (L, rows, columns) uint8, zero.
         """
         self = Parameters(*parameters)
-        value, code = advance(self, ranges, state, branch, following)
+        if branch < 0:
+            value, code = stay(self, state, -1 - branch, following)
+        else:
+            value, code = advance(self, ranges, state, branch, following)
         if code <= 1:
             draw_flat(self, following, shades, image)
         return value, code
@@ -199,8 +213,11 @@ def step_and_draw_one_kernel(compiler: Any, Parameters: Any, advance: Any, draw_
     return step_and_draw_one
 
 
-def step_many_kernel(compiler: Any, Parameters: Any, advance: Any, drawn_outcome: Any, A: int, K: int) -> Any:
+def step_many_kernel(
+    compiler: Any, Parameters: Any, advances: tuple[Any, Any], drawn_outcome: Any, A: int, K: int
+) -> Any:
     """One step of many environments."""
+    advance, stay = advances
 
     @compiler.kernel
     def step_many(parameters, setting, batch, first, last):
@@ -223,16 +240,17 @@ def step_many_kernel(compiler: Any, Parameters: Any, advance: Any, drawn_outcome
             restart = ended[i]
             if not restart:
                 action = executed_action(actions[i], previous[i], chance, A, rng, i)
-                branch = action
                 if has_no_effect(chance, rng, i):
-                    branch = -1 - action
+                    value, code = stay(self, states[i], action, following)
                     if K > 1:
-                        likely[i] = chance[4]
-                elif K > 1:  # nothing is drawn where an action has one outcome
-                    outcome, p = drawn_outcome(self, states[i], action, uniform_number(rng, i))
-                    likely[i] = p * (1.0 - chance[4])
-                    branch = action * K + outcome
-                value, code = advance(self, ranges, states[i], branch, following)
+                        likely[i] = laziness(chance)
+                else:
+                    branch = action
+                    if K > 1:  # nothing is drawn where an action has one outcome
+                        outcome, p = drawn_outcome(self, states[i], action, uniform_number(rng, i))
+                        likely[i] = p * (1.0 - laziness(chance))
+                        branch = action * K + outcome
+                    value, code = advance(self, ranges, states[i], branch, following)
                 if code > 1:
                     executed[i] = action
                     return i * length + code - 2

@@ -71,11 +71,12 @@ class InterpretedStepping:
                 action = self._executed(int(actions[i]), int(previous[i]), chance, rng, i)
                 before = tuple(states[i].tolist())
                 outcome, after = 0, before
-                if stays := chance[4] > 0 and _uniform_number(rng, i) < chance[4]:
-                    likely[i : i + 1] = chance[4]
+                lazy = chance[4] if len(chance) > 4 else 0.0
+                if stays := lazy > 0 and _uniform_number(rng, i) < lazy:
+                    likely[i : i + 1] = lazy
                 elif self.env.has_chance:
                     outcome, p = self._drawn_outcome(before, action, _uniform_number(rng, i))
-                    likely[i] = p * (1.0 - chance[4])
+                    likely[i] = p * (1.0 - lazy)
                 if not stays:
                     after = self.env.next_state(before, action, outcome)
                 executed[i] = action
