@@ -2,6 +2,7 @@
 
 import importlib
 import math
+from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -152,6 +153,17 @@ def test_the_mismatch_counts_terminal_states_and_the_end_alike():
     for mdp in (plain, terminal, ending):
         found = hardness.distribution_mismatch(mdp)
         assert found.exact and found.lower <= 2.0 <= found.upper
+
+
+@pytest.mark.parametrize("tolerance", [5.0, 1.0, 0.1, 1e-3, 1e-9])
+def test_the_mismatch_lies_in_its_interval_however_coarse_the_visits_are(tolerance):
+    """The best action goes to and fro between two states for ever, the other leaves them."""
+    rewards = [[1.0, 0.0], [1.0, 0.0], [0.0, 0.0]]
+    mdp = TabularMDP.from_arrays([[1, 2], [0, 2], [2, 2]], rewards, gamma=0.9)
+    gamma = Fraction(0.9)
+    best, uniform = gamma / (1 - gamma**2), gamma / 2 / (1 - gamma**2 / 4)
+    found = hardness.distribution_mismatch(mdp, tolerance=tolerance)
+    assert Fraction(found.lower) <= best / uniform <= Fraction(found.upper)
 
 
 @pytest.mark.parametrize("backwards", [False, True])

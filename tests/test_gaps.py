@@ -281,6 +281,8 @@ def test_the_interval_holds_the_truth_where_values_are_off_by_all_of_their_bound
     assert result.lower <= 4.0 <= result.upper
     minimal = result.certified_minimal
     assert minimal.lower <= 0.25 <= minimal.upper
+    regularized = result.certified_regularized
+    assert regularized.lower <= 5 / 0.1 + 1 / (0.25 + 0.1) <= regularized.upper
 
 
 @pytest.mark.parametrize("gamma", [0.5, 0.9, 1.0])
