@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections import deque
 from pathlib import Path
 
 import pytest
@@ -14,7 +15,7 @@ import fake_training
 from pharos import study
 from pharos.errors import ParameterError
 from pharos.experiments import read_record
-from pharos.study.batches import VECTORS
+from pharos.study.batches import VECTORS, Batches
 
 TESTS = Path(__file__).parent
 
@@ -126,3 +127,15 @@ def test_a_runner_that_is_killed_leaves_nothing_half_done(tmp_path, sizes):
     end = run(specification(seeds=6), tmp_path / "out")
     assert (end.finished, end.failed) == (6, 0)
     assert all(read_record(path)["status"] == "finished" for path in (tmp_path / "out" / "runs").iterdir())
+
+
+def test_the_papers_instances_share_batches_where_shapes_and_numbers_of_states_allow_it():
+    paper = study.specification("paper").model_dump(mode="json", exclude_unset=True)
+    runs = study.specification({**paper, "engine": "batched"}).runs
+    batches, pending = Batches(Path("nowhere")), deque((0.0, run) for run in runs)
+    units = []
+    while pending:
+        units.append(batches.unit(pending.popleft()[1], pending))
+    assert sum(map(len, units)) == len(runs) == 2100 and min(map(len, units)) >= 6
+    for unit in units:
+        assert len({batches.key(run) for run in unit}) == 1 and len(unit) <= batches.width(unit[0])

@@ -17,7 +17,10 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
+
 from pharos import storage
+from pharos.environments import Environment
 from pharos.errors import FolderLocked
 from pharos.study import values as _values
 from pharos.study import worker as _worker
@@ -55,6 +58,7 @@ class Batches:
         self.folder = folder / BATCHES
         self.most: dict[str, int] = {}  # of runs whose batch was too large for memory: how many may be together
         self.shapes: dict[str, Hashable] = {}
+        self.keys: dict[str, Hashable] = {}  # by id
         self.stored: dict[str, frozenset[str]] = {}
         self.look()
 
@@ -96,23 +100,28 @@ class Batches:
 
     def key(self, run: Run) -> Hashable:
         """Runs with equal keys fit together; one whose key cannot be told is alone."""
+        if run.id not in self.keys:
+            self.keys[run.id] = self._key(run)
+        return self.keys[run.id]
+
+    def _key(self, run: Run) -> Hashable:
         from pharos.agents.batched import group_key
 
         config = run.configuration
         if config.is_tabular:
             return (config.agent, config.environment)
+        shape, dtype, is_image = self._shape(run)
         try:
-            (shape, dtype, is_image), actions = self._shape(run), run_actions(run)
+            env = config.make_environment(trust=True)
+            mdp = SimpleNamespace(num_actions=env.num_actions, num_states=most_states(env))
             seen = SimpleNamespace(shape=shape, dtype=dtype, is_image=is_image)
-            stand_in: Any = SimpleNamespace(
-                observe=seen,
-                mdp=SimpleNamespace(num_actions=actions),
-                hyperparameters=config.hyperparameters,
-                steps=config.steps,
+            run_in_short: Any = SimpleNamespace(
+                observe=seen, mdp=mdp, hyperparameters=config.hyperparameters, steps=config.steps
             )
-            return (config.agent, config.steps, config.evaluation_interval, group_key(config.agent, stand_in))
+            key = group_key(config.agent, run_in_short)
         except Exception:  # what is wrong with it, the run will say
             return run.id
+        return (config.agent, config.steps, config.evaluation_interval, key)
 
     def _shape(self, run: Run) -> Any:
         """(shape, type, whether it is an image) of what the agent sees, told without the states."""
@@ -148,9 +157,9 @@ class Batches:
         self.stored = {id: others for id, others in self.stored.items() if not others & ids}
 
 
-def run_actions(run: Run) -> int:
-    """How many actions the environment of a run has."""
-    return int(run.configuration.make_environment(trust=True).num_actions)
+def most_states(environment: Environment) -> float:
+    """At most how many states an environment has: the product of the ranges of its variables."""
+    return float(np.prod(environment.components.size.astype(float)))
 
 
 # As a process --------------------------------------------------------------------------------------------------------

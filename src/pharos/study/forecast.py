@@ -7,6 +7,7 @@ measured by a few hundred steps and one evaluation, where much depends on it; el
 
 import contextlib
 import json
+import math
 import multiprocessing
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -17,7 +18,7 @@ from typing import Any
 from pharos.errors import FileFormatError
 from pharos.storage import read_json, replace_json
 from pharos.study import worker as _worker
-from pharos.study.batches import IMAGES, VECTORS
+from pharos.study.batches import IMAGES, VECTORS, most_states
 from pharos.study.blocks import Run
 from pharos.study.processes import end_processes, one_thread
 from pharos.study.status import duration
@@ -26,9 +27,10 @@ from pharos.wording import many
 NIGHT_HOURS = 10
 # Below so many seconds in all, guesses do
 WORTH_MEASURING = 600.0
-# What measuring a kind may take, building its state space included
-MEASURE_SECONDS = 60.0
-WARM, MEASURED, MEASURED_OF_TABLES = 200, 800, 200_000
+# What measuring may take, building state spaces included; kinds that are left are guessed
+MEASURE_SECONDS = 120.0
+MANY_STATES = 1e6
+WARM, MEASURED, MEASURED_OF_TABLES, MEASURED_OF_BATCHES = 200, 800, 200_000, 300
 FINISHED, EARLIER, NOW, GUESS = "finished runs", "earlier studies", "measured now", "a guess"
 # Steps/s by what is seen: vectors, pictures, tables; and how much faster many runs at once are
 GUESSES = {"vector": 1200.0, "simple_image": 500.0, "complex_image": 60.0, "index": 1e6}
@@ -82,7 +84,7 @@ def forecast(
         measure: whether paces that are not known are measured, where the whole takes long.
         tell: told what is measured.
     """
-    kinds = {run.kind: run for run in reversed(runs)}
+    kinds = dict.fromkeys(run.kind for run in runs)
     stored = _stored_paces()
     paces: dict[Kind, tuple[float, str]] = {}
     for kind in kinds:
@@ -93,8 +95,13 @@ def forecast(
         )
     guessed = [kind for kind, (_, source) in paces.items() if source == GUESS]
     if measure and guessed and _seconds(runs, paces) / workers > WORTH_MEASURING:
-        for kind, pace in _measured([kinds[kind] for kind in guessed], tell).items():
+        share = {kind: _seconds([run for run in runs if run.kind == kind], paces) for kind in guessed}
+        longest = sorted(guessed, key=lambda kind: -share[kind])
+        for kind, pace in _measured([_smallest(kind, runs) for kind in longest], tell).items():
             paces[kind] = (pace, NOW)
+        known_now = [pace / _guess(kind) for kind, (pace, source) in paces.items() if source == NOW]
+        slower = math.prod(known_now) ** (1 / len(known_now)) if known_now else 1.0  # this machine than the guesses
+        paces |= {kind: (pace * slower, GUESS) for kind, (pace, source) in paces.items() if source == GUESS}
     _keep({json.dumps(kind): pace for kind, (pace, source) in paces.items() if source in (FINISHED, NOW)}, stored)
     night, passed = 0, 0.0
     for run in runs:
@@ -106,6 +113,12 @@ def forecast(
 
 def _seconds(runs: Sequence[Run], paces: Mapping[Kind, tuple[float, str]]) -> float:
     return sum(run.config["steps"] * paces[run.kind][0] for run in runs)
+
+
+def _smallest(kind: Kind, runs: Sequence[Run]) -> Run:
+    """The run of a kind whose instance has the fewest states, as far as its variables tell."""
+    first = {run.instance: run for run in reversed(runs) if run.kind == kind}
+    return min(first.values(), key=lambda run: most_states(run.configuration.make_environment(trust=True)))
 
 
 def _guess(kind: Kind) -> float:
@@ -140,43 +153,56 @@ def _keep(paces: Mapping[str, float], stored: Mapping[str, float]) -> None:
 
 
 def _measured(runs: Sequence[Run], tell: Callable[[str], Any]) -> dict[Kind, float]:
-    """The paces of these runs, one of each kind, measured in a process of its own; without those that fail."""
+    """The paces of these runs, one of each kind, measured in a process of its own; without those that fail, and those
+    that MEASURE_SECONDS did not suffice for.
+    """
     context = multiprocessing.get_context("spawn")
+    receiver, sender = context.Pipe(duplex=False)
+    process = context.Process(target=_send_paces, args=([dict(run.config) for run in runs], sender))
+    with one_thread():
+        process.start()
+    sender.close()
     found: dict[Kind, float] = {}
-    for run in runs:
-        tell(f"measuring the pace of {run.kind[1]} on {run.instance}, {run.kind[2]}")
-        receiver, sender = context.Pipe(duplex=False)
-        process = context.Process(target=_send_pace, args=(dict(run.config), sender))
-        with one_thread():
-            process.start()
-        sender.close()
-        try:
-            if receiver.poll(MEASURE_SECONDS):
-                found[run.kind] = receiver.recv()
-        except EOFError:
-            pass
-        finally:
-            receiver.close()
-            end_processes([process])
+    latest = time.monotonic() + MEASURE_SECONDS
+    try:
+        for number, run in enumerate(runs, start=1):
+            tell(f"measuring the pace of {run.kind[1]} on {run.kind[0]}, {run.kind[2]} ({number} of {len(runs)})")
+            if not receiver.poll(max(0.0, latest - time.monotonic())):
+                break
+            pace = receiver.recv()
+            if pace is not None:
+                found[run.kind] = pace
+    except EOFError:
+        pass
+    finally:
+        receiver.close()
+        end_processes([process])
     return found
 
 
-def _send_pace(config: Mapping[str, Any], sender: Any) -> None:
+def _send_paces(configs: Sequence[Mapping[str, Any]], sender: Any) -> None:
     _worker.end_cleanly()
     _worker.end_with_parent()
-    with contextlib.suppress(Exception):  # the run will fail with the same error, and say so
-        sender.send(pace_of(config))
+    for config in configs:
+        pace = None
+        with contextlib.suppress(Exception):  # the run will fail with the same error, and say so
+            pace = pace_of(config)
+        sender.send(pace)
 
 
 def pace_of(config: Mapping[str, Any]) -> float:
-    """Seconds for a step of a run, with its share of an evaluation, measured on some steps; learning begins at once."""
+    """Seconds for a step of a run, measured on some steps, with learning from the beginning; with its share of an
+    evaluation, unless a large space would have to be built for that.
+    """
     from pharos.experiments import RunConfig, evaluate_agent, steps_in_seconds
 
     made = RunConfig.from_dict(config)
     together = 1 if made.engine != "batched" else VECTORS if "image" not in made.observation else IMAGES
     task = made.task(trust=True, strict=True)
-    measured = MEASURED_OF_TABLES if made.is_tabular else MEASURED
+    measured = MEASURED_OF_TABLES if made.is_tabular else MEASURED if together == 1 else MEASURED_OF_BATCHES
     seconds, agent = steps_in_seconds(made, task, WARM, measured, together)
+    if made.engine != "batched" and most_states(task.env) > MANY_STATES:  # its space would be built for this alone
+        return seconds / (measured * together)
     evaluate_agent(agent, task)
     began = time.perf_counter()
     evaluate_agent(agent, task)
