@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 # As the paper orders them
 COLUMNS = (("ppo", IMAGE), ("ppo", VECTOR), ("dqn", IMAGE), ("dqn", VECTOR))
 TITLES = {"ppo": "PPO", "dqn": "DQN", IMAGE: "IMAGE", VECTOR: "MINIMAL"}
-CHANCES = {"plain": "None", "random": "random", "sticky": "stick", "lazy": "lazy"}
+CHANCES = {"plain": "None", "random": "random", "sticky": "stick"}
 
 
 def tables_of(cells: "pd.DataFrame", measured: "pd.DataFrame", models: Sequence[Models]) -> dict[str, str]:
