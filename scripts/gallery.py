@@ -41,6 +41,7 @@ INSTANCES = {
     "catch": (("catch/10x5", 4),),
     "memory_chain": (("memory_chain/bits-4", 1),),
     "umbrella_chain": (("umbrella_chain/length-10", 3),),
+    "discounting_chain": (("discounting_chain/delays-10", 4),),
 }
 PLAYED = {  # names of instances
     "simple_grid": "simple_grid/6x6-decoy",
@@ -64,11 +65,12 @@ PLAYED = {  # names of instances
     "catch": "catch/10x5",
     "memory_chain": "memory_chain/bits-4",
     "umbrella_chain": "umbrella_chain/length-10",
+    "discounting_chain": "discounting_chain/delays-10",
 }
 SEVERAL = ("taxi", "blackjack", "catch", "memory_chain", "umbrella_chain")  # games, from drawn starts: one is soon over
 FRAMES_PER_SECOND = {  # others: 12
     **{"sliding_tiles": 4, "pocket_cube": 3, "sokoban": 6, "game_2048": 3, "taxi": 4, "blackjack": 2},
-    **{"river_swim": 4, "catch": 6, "memory_chain": 2, "umbrella_chain": 6},
+    **{"river_swim": 4, "catch": 6, "memory_chain": 2, "umbrella_chain": 6, "discounting_chain": 6},
 }
 FRAMES = 90
 NUMBERS = 8  # of a vector

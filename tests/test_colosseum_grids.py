@@ -40,6 +40,27 @@ CONTINUOUS = {
 }
 
 
+# n_rooms, room_size, p_lazy, p_rand, seed -> printed, all with two start states
+ROOMS_EPISODIC = {
+    (4, 3, 0.0, 0.001, 0): 16.025672912597656,
+    (4, 3, 0.15, 0.0, 0): 25.142902374267578,
+    (4, 3, 0.15, 0.0, 2): 70.6382827758789,
+    (4, 4, 0.0, 0.0, 0): 20.5,
+    (4, 4, 0.01, 0.1, 2): 49.68860626220703,
+    (9, 3, 0.01, 0.1, 0): 46.987674713134766,
+    (9, 3, 0.05, 0.0, 2): 47.17371368408203,
+    (9, 3, 0.1, 0.0, 0): 35.200687408447266,
+    (9, 3, 0.1, 0.0, 2): 93.2818832397461,
+}
+ROOMS_CONTINUOUS = {
+    (9, 3, 0.5, 0.0, 0): 51.9982,
+    (9, 5, 0.3, 0.0, 0): 54.284725,
+    (9, 5, 0.4, 0.3, 0): 98.76637,
+    (9, 5, 0.5, 0.0, 0): 75.997345,
+    (16, 3, 0.4, 0.1, 0): 64.1765,
+}
+
+
 def some(published, quick):
     return [pytest.param(row, id=str(row), marks=() if row[0] <= quick else pytest.mark.slow) for row in published]
 
@@ -49,15 +70,29 @@ def made(row):
     return pharos.make("mini_grid_empty", size=size, p_lazy=p_lazy, p_rand=p_rand, n_starting_states=n)
 
 
+def made_of_rooms(row):
+    n_rooms, room_size, p_lazy, p_rand, seed = row
+    options = {"p_lazy": p_lazy, "p_rand": p_rand, "n_starting_states": 2, "seed": seed}
+    return pharos.make("mini_grid_rooms", n_rooms=n_rooms, room_size=room_size, **options)
+
+
 def mdp_of(P, rho, **kwargs):
     return TabularMDP.from_matrices(P, np.zeros((P.shape[1], P.shape[0] // P.shape[1])), initial=rho, **kwargs)
 
 
 @pytest.mark.parametrize("row", some(EPISODIC, 6))
 def test_the_episodic_diameter_is_that_of_colosseum(row):
-    env = made(row)
+    assert_episodic_diameter(made(row), EPISODIC[row])
+
+
+@pytest.mark.parametrize("row", some(ROOMS_EPISODIC, 4))
+def test_the_episodic_diameter_of_rooms_is_that_of_colosseum(row):
+    assert_episodic_diameter(made_of_rooms(row), ROOMS_EPISODIC[row])
+
+
+def assert_episodic_diameter(env, printed):
     _, P, rho = law(env)
-    horizon, printed = env.max_episode_steps, EPISODIC[row]
+    horizon = env.max_episode_steps
     exact = colosseum_diameter(mdp_of(P, rho), horizon=horizon)
     targets = farthest(P, rho)
     assert any(within_ulps(episodic_diameter(P, rho, horizon, targets, stop, np.float32), printed) for stop in STOPS)
@@ -72,6 +107,16 @@ def test_the_diameter_without_episodes_is_that_of_colosseum(row):
     targets = np.array([i for i, (_, column, way) in enumerate(states) if way == 0 and column < (row[0] + 1) // 2])
     found = hardness.diameter(mdp_of(P, rho, gamma=1.0))
     printed = CONTINUOUS[row]
+    assert within_ulps(diameter(P, targets), printed)
+    assert found.exact and found.lower * (1 + 1e-7) >= printed
+
+
+@pytest.mark.parametrize("row", some(ROOMS_CONTINUOUS, 4))
+def test_the_diameter_of_rooms_without_episodes_is_that_of_colosseum(row):
+    states, P, rho = law(made_of_rooms(row))
+    targets = np.array([i for i, (_, _, way) in enumerate(states) if way == 0])
+    found = hardness.diameter(mdp_of(P, rho, gamma=1.0))
+    printed = ROOMS_CONTINUOUS[row]
     assert within_ulps(diameter(P, targets), printed)
     assert found.exact and found.lower * (1 + 1e-7) >= printed
 

@@ -4,6 +4,7 @@ import json
 import random
 import subprocess
 import sys
+from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -16,6 +17,7 @@ import naive_environments as naive
 import pharos
 from pharos.drawing import text_drawing
 from pharos.environments import Environment, catalog, named_instances, register
+from pharos.environments.built_in import BUILT_IN
 from pharos.errors import ParameterError, UnknownName
 
 GRIDS = ("simple_grid", "frozen_lake")
@@ -571,3 +573,9 @@ def test_later_layers_cover_earlier_ones():
 @pytest.mark.parametrize("game", golden_games.GAMES)
 def test_golden_game_is_played_as_it_was_read(game):
     assert golden_games.played(game) == golden_games.file_of(game).read_text()
+
+
+def test_every_class_stands_in_the_gallery():
+    page = (Path(__file__).parent.parent / "docs" / "gallery.md").read_text()
+    sections = [line.removeprefix("## ") for line in page.splitlines() if line.startswith("## ")]
+    assert sorted(sections) == sorted(each.name for each in BUILT_IN)

@@ -76,7 +76,7 @@ BUILT_IN = (  # in the order in which they are listed
     BuiltIn("catch", "Catch", "10x5"),
     BuiltIn("memory_chain", "MemoryChain", "length-10 bits-4"),
     BuiltIn("umbrella_chain", "UmbrellaChain", "length-10 length-100"),
-    BuiltIn("discounting_chain", "DiscountingChain", "bonus-1 bonus-100"),
+    BuiltIn("discounting_chain", "DiscountingChain", "bonus-1 bonus-100 delays-10"),
     BuiltIn("game_2048", "Game2048", "2x2 2x3 3x3 2x2-to-32 3x3-to-64 3x3-to-256 3x3-to-512 3x3-to-1024"),
 )
 

@@ -42,7 +42,11 @@ class DiscountingChain(Environment):
         "agent": Layer("A", (66, 72, 200)),
     }
     look = Look(color="#9467BD")
-    instances = {"bonus-1": {}, "bonus-100": {"mapping_seed": 4}}
+    instances = {
+        "bonus-1": {},
+        "bonus-100": {"mapping_seed": 4},
+        "delays-10": {"delays": (1, 3, 10), "mapping_seed": 2},
+    }
     hyperparameters = {"q_learning": {"default": {"gamma": 1.0}}, "dqn": {"default": {"gamma": 1.0}}}  # by hand
 
     def validate(self) -> None:
