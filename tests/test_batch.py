@@ -202,6 +202,12 @@ def test_the_engine_belongs_to_the_id_only_where_it_is_another():
     )
 
 
+def test_a_device_that_is_not_there_is_named_before_anything_is_trained(engine):
+    with pytest.raises(ParameterError, match="device is 'tpu', which torch does not have here"):
+        many(device="tpu")
+    assert engine.made == []
+
+
 def test_an_engine_that_lacks_the_agent_is_refused_with_the_one_that_has_it():
     with pytest.raises(ParameterError, match="agent 'a2c': the batched engine has dqn, ppo and q_learning;"):
         config(agent="a2c")

@@ -60,6 +60,11 @@ def test_more_runs_than_a_lane_are_several_batches(tmp_path, sizes):
     assert sizes() == [2, VECTORS]
 
 
+def test_batches_are_larger_where_networks_are_not_on_the_processor(tmp_path):
+    run = specification(seeds=1).runs[0]
+    assert (Batches(tmp_path).width(run), Batches(tmp_path, "cuda").width(run)) == (VECTORS, 256)
+
+
 def test_the_engine_is_said_for_the_study_for_a_block_and_for_an_agent():
     agents = {"agents": ["dqn", "ppo", "q_learning"], "seeds": 1}
 

@@ -83,6 +83,7 @@ def run(
     workers: Annotated[
         int | None, typer.Option("--workers", min=1, help="Processes; as many as processors when not given.")
     ] = None,
+    device: Annotated[str, typer.Option("--device", help="Of batches: cpu or cuda.")] = "cpu",
     on: Annotated[str, typer.Option("--on", metavar="local|slurm|ray", help="Where the runs are executed.")] = "local",
     shards: Annotated[
         int | None, typer.Option("--shards", min=1, help="With --on slurm: jobs of the array; 8 when not given.")
@@ -140,6 +141,7 @@ def run(
                 workers=workers,
                 progress=progress,
                 foretold=_say,
+                device=device,
             )
     _answer(end, json)
     if end.failed:

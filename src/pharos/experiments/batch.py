@@ -79,12 +79,26 @@ def train_configs(
     Returns:
         The result of each run, or why it has none.
     Raises:
-        FileFormatError: not the configuration of a run. MissingExtra: PyTorch is not installed.
+        FileFormatError: not the configuration of a run. ParameterError: there is no such device.
+        MissingExtra: PyTorch is not installed.
     """
+    _check_device(device)
     made = [config if isinstance(config, RunConfig) else RunConfig.from_dict(config) for config in configs]
     work = _Work(made, folders, checkpoints, progress, members or Members(), device, lane)
     work.run()
     return [work.results[place] for place in range(len(made))]
+
+
+def _check_device(device: str) -> None:
+    if device == "cpu":
+        return
+    import torch
+
+    try:
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError) as error:  # torch has a type for each of its builds
+        reason = (str(error).splitlines() or [""])[0]
+        raise ParameterError(f"device is {device!r}, which torch does not have here: {reason}; try cpu") from None
 
 
 class _Work:
@@ -375,7 +389,7 @@ class _Batch:
                 returns = float(self.batch.returns[i])
                 publish_network(member.folder, self.batch.parameters(i), counters, returns)
                 _results.write_curve(member.folder, curve)
-                size = {"runs": len(self.group), "seconds": seconds}
+                size = {"runs": len(self.group), "seconds": seconds, "device": self.work.device}
                 member.record.write("finished", seconds=share, batch=size, result=result)
             rows = [{name: row[name] for name in _results.COLUMNS} for row in curve]
             self.work.results[member.place] = TrainingResult(

@@ -28,13 +28,15 @@ from pharos.study.blocks import Run
 
 BATCHES = "batches"
 # Runs of one program: what the engine takes at once on the processor; tables are learnt one after the other
-VECTORS, IMAGES, TABLES = 32, 8, 16
+VECTORS, IMAGES, TABLES, ELSEWHERE = 32, 8, 16, 256  # the last: not on the processor
 
 BatchRunner = Callable[[Sequence[Mapping[str, Any]], Sequence[Path], Path], Sequence[str | None]]
 """runner(configs, folders, folder for checkpoints) -> for each run None, or why it failed."""
 
 
-def train_batch(configs: Sequence[Mapping[str, Any]], folders: Sequence[Path], checkpoints: Path) -> list[str | None]:
+def train_batch(
+    configs: Sequence[Mapping[str, Any]], folders: Sequence[Path], checkpoints: Path, *, device: str = "cpu"
+) -> list[str | None]:
     """The usual one: `pharos.experiments.train_configs`, with the values that the study has solved already."""
     from pharos.experiments import FailedRun, Members, RunConfig, TaskValues, train_configs
 
@@ -43,7 +45,7 @@ def train_batch(configs: Sequence[Mapping[str, Any]], folders: Sequence[Path], c
         return None if known is None else TaskValues.from_dict(known)
 
     members = Members(values, trust=True, strict=True)
-    ends = train_configs(configs, folders, checkpoints=checkpoints, members=members)
+    ends = train_configs(configs, folders, checkpoints=checkpoints, members=members, device=device)
     return [end.error if isinstance(end, FailedRun) else None for end in ends]
 
 
@@ -52,9 +54,11 @@ class Batches:
 
     Args:
         folder: of the study.
+        device: where networks are trained.
     """
 
-    def __init__(self, folder: Path):
+    def __init__(self, folder: Path, device: str = "cpu"):
+        self.on_processor = device == "cpu"
         self.folder = folder / BATCHES
         self.most: dict[str, int] = {}  # of runs whose batch was too large for memory: how many may be together
         self.shapes: dict[str, Hashable] = {}
@@ -95,7 +99,8 @@ class Batches:
     def width(self, run: Run) -> int:
         """How many runs may be in a batch of this one."""
         is_image = not run.configuration.is_tabular and len(self._shape(run)[0]) == 3
-        usual = IMAGES if is_image else TABLES if run.configuration.is_tabular else VECTORS
+        networks = ELSEWHERE if not self.on_processor else IMAGES if is_image else VECTORS
+        usual = TABLES if run.configuration.is_tabular else networks
         return min(usual, self.most.get(run.id, usual))
 
     def key(self, run: Run) -> Hashable:

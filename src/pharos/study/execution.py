@@ -12,6 +12,7 @@ import time
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from multiprocessing import connection
 from pathlib import Path
 from typing import Any
@@ -78,6 +79,7 @@ def run(
     prepare: Callable[[Mapping[str, Any]], Any] | None = None,
     batch_runner: _batches.BatchRunner | None = None,
     foretold: Callable[[Forecast], None] | None = None,
+    device: str = "cpu",
 ) -> Status:
     """Execute the runs of a study that are not over, on this machine.
 
@@ -99,6 +101,7 @@ def run(
             the usual one for the usual runner, else each of them alone.
         foretold: called before the first run with how long all of them will take; paces that nothing tells are
             measured where the whole takes long. None: nothing is foretold.
+        device: where batches are trained, as torch names it: "cpu", "cuda".
     Returns:
         The Status at the end. Failed runs do not stop the others.
     Raises:
@@ -117,7 +120,10 @@ def run(
         workers=workers or processors(),
         progress=progress,
         runner=runner,
-        batch_runner=_batches.train_batch if batch_runner is None and runner is train else batch_runner,
+        batch_runner=partial(_batches.train_batch, device=device)
+        if batch_runner is None and runner is train
+        else batch_runner,
+        device=device,
         status_file=name,
     )
     execution = Execution(study, place, runs, options)
@@ -141,6 +147,7 @@ class Options:
     progress: Callable[[Status], None] | None = None
     runner: _worker.Runner = train
     batch_runner: _batches.BatchRunner | None = None
+    device: str = "cpu"
     status_file: str = "status.json"
 
 
@@ -157,7 +164,7 @@ class Execution:
         self.repeated: set[str] = set()
         self.pending: deque[tuple[float, Run]] = deque()
         self.running: dict[int, tuple[Any, tuple[Run, ...], float]] = {}
-        self.batches = _batches.Batches(folder)
+        self.batches = _batches.Batches(folder, options.device)
         self.kills: dict[str, int] = defaultdict(int)
         self.lost_servers = 0
         self.seconds_per_step: dict[tuple, tuple[float, int]] = {}
