@@ -1,5 +1,8 @@
 """How long a study will take, told at its start."""
 
+import subprocess
+import sys
+
 import fake_training
 from pharos import study
 from pharos.study.forecast import EARLIER, FINISHED, GUESS, NIGHT_HOURS, forecast, pace_of
@@ -42,3 +45,23 @@ def test_a_study_says_it_before_its_first_run(tmp_path):
     assert [each.runs for each in said] == [5]
     study.run(spec, tmp_path, runner=fake_training.train, workers=2, foretold=said.append)
     assert len(said) == 1
+
+
+ENDING = """
+import atexit, time
+from pharos.study import worker
+
+worker.end_cleanly()
+atexit.register(lambda: (print("ending", flush=True), time.sleep(0.5)))
+worker.is_ending()
+"""
+
+
+def test_a_process_that_ends_by_itself_is_not_interrupted_in_it():
+    process = subprocess.Popen(
+        [sys.executable, "-c", ENDING], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert process.stdout.readline() == "ending\n"
+    process.terminate()
+    _, errors = process.communicate()
+    assert (process.returncode, errors) == (0, "")

@@ -188,6 +188,7 @@ def _send_paces(configs: Sequence[Mapping[str, Any]], sender: Any) -> None:
         with contextlib.suppress(Exception):  # the run will fail with the same error, and say so
             pace = pace_of(config)
         sender.send(pace)
+    _worker.is_ending()
 
 
 def pace_of(config: Mapping[str, Any]) -> float:

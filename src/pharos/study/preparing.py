@@ -76,6 +76,7 @@ def _prepare_all(
         with contextlib.suppress(Exception):  # the runs of this instance will fail with the same error, and say so
             unless_locked(prepare, config, sender.send)
         sender.send("")
+    _worker.is_ending()
 
 
 def unless_locked(

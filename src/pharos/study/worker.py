@@ -237,6 +237,11 @@ def end_cleanly() -> None:
     signal.signal(signal.SIGTERM, leave)
 
 
+def is_ending() -> None:
+    """Ignore SIGTERM from now on: this process ends by itself, and an exception among what is given back is printed."""
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+
+
 def end_with_parent() -> None:
     """End this process when the one that started it is gone, however it went: cleanly, and if that takes long, at
     once."""
