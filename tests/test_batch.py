@@ -23,6 +23,7 @@ from pharos.experiments import (
     train_many,
     tune,
 )
+from pharos.experiments.parts import parts_of
 from pharos.experiments.results import COLUMNS
 
 run_folder = importlib.import_module("pharos.experiments.run_folder")
@@ -256,3 +257,31 @@ def test_a_trial_of_a_search_is_one_batch(engine, tmp_path):
     assert found.first_score == pytest.approx(sum(rows) / len(rows))
     with pytest.raises(PharosError, match="the batched engine: it has no hyperparameter"):
         tune("dqn", instances, trials=1, space={"optimize_memory_usage": ("one of", True)}, **options)
+
+
+def test_whole_lanes_are_dealt_out_to_processes():
+    runs = [config(seed) for seed in range(70)]
+    assert [len(part) for part in parts_of(runs, 2)] == [32 + 6, 32]
+    assert [len(part) for part in parts_of(runs, 9)] == [32, 32, 6]
+    assert sorted(place for part in parts_of(runs, 2) for place in part) == list(range(70))
+    assert len(parts_of(runs[:32], 2)) == len(parts_of(runs, 1)) == 1
+    assert len(parts_of([config(seed, engine="sb3") for seed in range(70)], 2)) == 1
+    assert len(parts_of([config(seed, observation="simple_image") for seed in range(9)], 2)) == 2
+
+
+@pytest.mark.slow
+def test_processes_leave_what_one_leaves(tmp_path, monkeypatch):
+    monkeypatch.setattr(importlib.import_module("pharos.experiments.parts"), "VECTORS", 2)
+    small = {"learning_starts": 50, "buffer_size": 500, "optimize_memory_usage": False}
+    options = {"seeds": (0, 1, 2), "steps": 200, "evaluation_interval": 100, "hyperparameters": small}
+    done = []
+    parts = many(tmp_path / "parts", workers=2, progress=lambda now: done.append(now.done), **options)
+    whole = many(tmp_path / "whole", **options)
+    assert done[-1] == 600 and done == sorted(done)
+    assert [end.result for end in parts] == [end.result for end in whole]
+    for seed in options["seeds"]:
+        assert bytes_of(tmp_path / "parts" / f"seed-{seed}") == bytes_of(tmp_path / "whole" / f"seed-{seed}")
+    lacking = many(
+        tmp_path / "bad", workers=2, seeds=(0, 1, 2), steps=200, hyperparameters={"optimize_memory_usage": True}
+    )
+    assert all(isinstance(end, FailedRun) and "optimize_memory_usage" in end.error for end in lacking)

@@ -77,6 +77,10 @@ def train(
     interval: Annotated[
         int | None, typer.Option("--interval", min=1, help="Steps between evaluations; a hundredth when not given.")
     ] = None,
+    workers: Annotated[
+        int | None,
+        typer.Option("--workers", min=1, help="Processes for many seeds; as many as processors when not given."),
+    ] = None,
     sticky: Sticky = 0.0,
     random: Random = 0.0,
     lazy: Lazy = 0.0,
@@ -131,7 +135,10 @@ def train(
         if seed or tensorboard:
             raise ParameterError("--seeds goes with neither --seed nor --tensorboard; expected one of them")
         title = f"{agent} on {' '.join((target, *(parameters or ())))}"
-        _train_many(title, agent, env, {**setting, "seeds": parse_seeds(seeds), "device": device}, json)
+        from pharos.workers import usable_workers
+
+        together = {"seeds": parse_seeds(seeds), "device": device, "workers": usable_workers(workers)}
+        _train_many(title, agent, env, {**setting, **together}, json)
         return
     with progress_bar("training", steps, "loading, building, compiling, first evaluation") as show:
         result = learn(agent, env, seed=seed, tensorboard=tensorboard, progress=_telling(show), **setting)

@@ -9,6 +9,7 @@ from pharos.environments import Environment
 from pharos.errors import ParameterError
 from pharos.experiments.batch import FailedRun, Members, Tell, train_configs
 from pharos.experiments.config import RunConfig
+from pharos.experiments.parts import parts_of, train_parts
 from pharos.experiments.run_folder import TrainingResult
 from pharos.experiments.train import given_hyperparameters, task_for
 
@@ -32,6 +33,7 @@ def train_many(
     hyperparameters: Mapping[str, Any] | str | os.PathLike | None = None,
     engine: str = "batched",
     device: str = "cpu",
+    workers: int = 1,
     out: str | os.PathLike | None = None,
     progress: Tell | None = None,
     **parameters: Any,
@@ -43,6 +45,8 @@ def train_many(
         engine: "batched", all runs as one program (dqn, ppo, and q_learning one after the other); or "sb3", one after
             the other.
         device: of the batched engine: "cpu" or "cuda".
+        workers: processes that share whole lanes of the batched engine, where there is a folder for results; a script
+            that asks for more than one needs `if __name__ == "__main__":`. Results do not depend on it.
         out: a folder, in which each run has its own, seed-0 and so on; None: nothing is written. Finished runs there
             are returned, and what was killed goes on from its last checkpoint.
         progress: called after each evaluation.
@@ -83,6 +87,15 @@ def train_many(
         for seed in numbers
     ]
     folder = None if out is None else Path(out)
+    if folder is not None and len(parts := parts_of(configs, workers)) > 1:
+        return train_parts(
+            configs,
+            [folder / f"seed-{seed}" for seed in numbers],
+            parts,
+            checkpoints=folder / "checkpoints",
+            device=device,
+            progress=progress,
+        )
     members = Members()
     members.adopt(configs[0], task)
     return train_configs(
