@@ -233,6 +233,31 @@ def test_gradient_steps_in_a_series_are_those_made_one_by_one():
             np.testing.assert_allclose(found, error - left, atol=2e-5 * np.abs(error - left).max())
 
 
+def test_adams_kernel_has_the_square_roots_of_eigenvalues():
+    """Under the weights; by landmarks that are all observations as exactly."""
+    from pharos.hardness.kernel_operator import Exact, Landmarks
+
+    kernel, states, weights = kernel_of(9), np.arange(9), np.random.default_rng(1).dirichlet(np.ones(9))
+
+    def block(rows, columns):
+        return kernel[np.ix_(rows, columns)]
+
+    root = np.sqrt(weights)
+    before = np.linalg.eigvalsh(root[:, None] * kernel.astype(float) * root)
+    for operator in (Exact(block, states), Landmarks(block, states, states)):
+        operator.preconditioned(weights)
+        after = np.linalg.eigvalsh(root[:, None] * operator(np.eye(9, dtype=np.float32)).astype(float) * root)
+        large = before > 1e-4 * before[-1]
+        np.testing.assert_allclose(after[large], np.sqrt(before[large]), rtol=0.02)
+    mdp = chain(6)
+    schedule = Schedule(steps=3000, learning_starts=500, optimizer="adam")
+    found = kernel_regret(mdp, Representation.of_matrix(np.eye(6)), schedule=schedule)
+    assert found.conventions["schedule"]["optimizer"] == "adam"
+    assert 0 < found.value < 1.5
+    with pytest.raises(ParameterError, match="expected gradient or adam"):
+        Schedule(optimizer="lion")
+
+
 @pytest.mark.slow
 def test_a_wide_network_trained_on_expectations_follows_the_kernel():
     """Full gradients of a network of 2,048 units, all actions' weights at once, against its own closed form."""

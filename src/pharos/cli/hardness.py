@@ -88,6 +88,9 @@ def hardness(
     initialisation: Annotated[
         str, typer.Option("--initialisation", help="Of the network: pytorch (as DQN has), or sb3 (as PPO and A2C).")
     ] = "pytorch",
+    optimizer: Annotated[
+        str, typer.Option("--optimizer", help="Of the idealised learner: gradient, or adam, which rescales gradients.")
+    ] = "gradient",
     landmarks: Annotated[
         int | None,
         typer.Option(
@@ -125,6 +128,7 @@ def hardness(
         words = parse_parameters(option)
         named = {"network": network, "initialisation": initialisation, "landmarks": landmarks}
         mdp, seen = _represented(goal, mdp, observation, building, {**words, **named})
+    from pharos.hardness import Schedule
     from pharos.hardness import report as measure
 
     with progress_line("measuring") as tell:
@@ -138,6 +142,7 @@ def hardness(
             keep=not fresh,
             progress=lambda what, line: tell(f"{what}  {line}"),
             representation=seen,
+            schedule=None if seen is None else Schedule(optimizer=optimizer),
         )
     if json:
         print_json({**report.to_dict(), "compiling_seconds": compiling.seconds()})

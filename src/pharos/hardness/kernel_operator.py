@@ -44,6 +44,15 @@ class KernelOperator:
             basis.append(after / np.float32(length))
             beside.append(length)
 
+    def preconditioned(self, weights: np.ndarray) -> None:
+        """Become W^-1/2 (W^1/2 K W^1/2)^1/2 W^-1/2, the kernel of full-matrix Adam; W the weights (C,) of observations.
+
+        Its second moments of gradients are J' W J for errors of one size, J the network's Jacobian, K = J J'; dividing
+        gradients by their square root leaves each eigenvalue of K under W as its square root. Weights are positive.
+        Source: Duchi, Hazan and Singer (2011) for full matrices; Kingma and Ba (2015) keep the diagonal alone.
+        """
+        raise NotImplementedError
+
     def descended(self, weights: np.ndarray, error: np.ndarray, rate: float, steps: int) -> np.ndarray:
         """What gradient descent adds to Q in `steps` steps Q += rate K (weights (target - Q)), from error = target - Q.
 
@@ -84,6 +93,12 @@ class Exact(KernelOperator):
     def __call__(self, z: np.ndarray) -> np.ndarray:
         return self.matrix @ z
 
+    def preconditioned(self, weights: np.ndarray) -> None:
+        root = np.sqrt(weights)[:, None]
+        values, vectors = np.linalg.eigh(root * self.matrix * root.T)
+        vectors *= np.maximum(values, 0.0) ** 0.25
+        self.matrix = np.ascontiguousarray((vectors @ vectors.T) / root / root.T, np.float32)
+
 
 class Landmarks(KernelOperator):
     """K ~ F F' + a diagonal, F = K(., L) K(L, L)^-1/2: exact between landmarks L and others, and on the diagonal.
@@ -107,6 +122,16 @@ class Landmarks(KernelOperator):
 
     def __call__(self, z: np.ndarray) -> np.ndarray:
         return self.features @ (self.features.T @ z) + self.diagonal * z
+
+    def preconditioned(self, weights: np.ndarray) -> None:
+        """Of the features and of the diagonal, each for itself."""
+        column = weights.astype(np.float32)[:, None]
+        values, vectors = np.linalg.eigh((self.features.T @ (column * self.features)).astype(np.float64))
+        kept = values > 1e-7 * values[-1]
+        self.features = np.ascontiguousarray(
+            self.features @ (vectors[:, kept] * values[kept] ** -0.25).astype(np.float32)
+        )
+        self.diagonal = np.sqrt(self.diagonal / column)
 
     def summed(self, weights: np.ndarray, error: np.ndarray, rate: float, series: np.ndarray) -> np.ndarray:
         """As for others, with one pass over the features a term in place of two."""

@@ -12,12 +12,14 @@ from typing import Any
 
 import numpy as np
 
-from pharos.hardness.kernel_operator import Exact, Identity, Landmarks
+from pharos.hardness.kernel_operator import Exact, Identity, KernelOperator, Landmarks
 from pharos.hardness.mean_field import MARGIN, WORST_GREEDY, WORST_PLAYED, Learner, LearningCurve, Schedule
 from pharos.hardness.representation import LANDMARKS, MOST_EXACT, Grouped, Representation
 from pharos.hardness.standard_occupancy import drawn, standard_occupancy
 from pharos.mdp import TabularMDP, takes_mdp
 from pharos.solvers import Solution
+
+RAREST = 1e-9  # of the largest weight: observations are taken to be at least as frequent where gradients are rescaled
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,13 +127,22 @@ def kernel_regret(
     if landmarks is None and len(seen) > MOST_EXACT:
         landmarks = LANDMARKS
     observed, error = seen.representatives, 0.0
-    if not landmarks or landmarks >= len(seen):
-        landmarks, curve = None, learner.curve(seen, Exact(representation.kernel, observed))
-    else:
+    is_exact = not landmarks or landmarks >= len(seen)
+    if not is_exact or schedule.optimizer == "adam":
         weights = seen.sums(standard_occupancy(mdp, schedule.gamma, episode).states[everything])
+
+    def learnt(operator: KernelOperator) -> LearningCurve:
+        if schedule.optimizer == "adam":
+            operator.preconditioned(np.maximum(weights, RAREST * weights.max()))
+        return learner.curve(seen, operator)
+
+    if is_exact:
+        landmarks, curve = None, learnt(Exact(representation.kernel, observed))
+    else:
+        assert landmarks is not None
         chosen = observed[drawn(weights, landmarks)]
         curve, half = (
-            learner.curve(seen, Landmarks(representation.kernel, observed, some))
+            learnt(Landmarks(representation.kernel, observed, some))
             for some in (chosen, chosen[: max(1, landmarks // 2)])
         )
         error = abs(curve.mean_greedy - half.mean_greedy)

@@ -30,6 +30,8 @@ class Schedule:
         exploration_initial_eps, exploration_final_eps, exploration_fraction: epsilon falls linearly from one to the
             other over this share of the steps; before `learning_starts` it is 1.
         gamma: the learner's own discount; that of values is the MDP's.
+        optimizer: "gradient", descent with the largest stable step; or "adam", the same with gradients rescaled as by
+            full-matrix Adam at the standard occupancy, see `KernelOperator.preconditioned`.
     """
 
     steps: int = 30_000
@@ -40,6 +42,7 @@ class Schedule:
     exploration_final_eps: float = 0.05
     exploration_fraction: float = 0.3
     gamma: float = 0.95
+    optimizer: str = "gradient"
 
     def __post_init__(self) -> None:
         for name in ("steps", "period", "gradient_steps"):
@@ -51,6 +54,9 @@ class Schedule:
         for name in ("exploration_initial_eps", "exploration_final_eps", "exploration_fraction", "gamma"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ParameterError(f"schedule: {name} is {getattr(self, name)!r}; expected a number in [0, 1]")
+
+        if self.optimizer not in ("gradient", "adam"):
+            raise ParameterError(f"schedule: optimizer is {self.optimizer!r}; expected gradient or adam")
 
     def epsilon(self, step: int) -> float:
         """The share of uniform actions at a step."""

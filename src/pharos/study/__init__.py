@@ -24,7 +24,7 @@ from pharos.study.report import StudyReport, report
 from pharos.study.specification import presets, specification
 from pharos.study.statistics import Estimate, interquartile_mean, stratified_interval
 from pharos.study.tables import cells, curves, hardness_table, paper_instance, table
-from pharos.study.validation import outcomes, validation
+from pharos.study.unseen_classes import outcomes, validation
 
 __all__ = [
     "PREDICTORS",

@@ -5,6 +5,7 @@ import json
 import math
 import os
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -26,10 +27,11 @@ if TYPE_CHECKING:
 
 MEASURES = ("kernel_regret", "kernel_learning_time", "kernel_sample_complexity", "aliasing_floor", "exploration_time")
 PREDICTORS = (
-    *("kernel_regret", "kernel_regret_played", "tabular_regret", "tabular_regret_played"),
+    *("kernel_regret", "kernel_regret_played", "adam_regret", "adam_regret_played"),
+    *("tabular_regret", "tabular_regret_played"),
     *("kernel_learning_time", "kernel_sample_complexity", "aliasing_floor", "exploration_time", "num_states"),
 )
-"""Columns of predictions, numbers; the larger, the harder."""
+"""Columns of predictions, numbers; the larger, the harder. `adam_regret` is kernel regret with `optimizer="adam"`."""
 _KEY = b"pharos.predictions"
 
 
@@ -82,7 +84,10 @@ def _predicted(run: Run) -> dict[str, Any]:
         seen = representation(
             task.space, task.observation, name, initialisation=initialisation, **dict(task.observation_options)
         )
-        found = report(task.mdp, MEASURES, horizon=task.time_limit, representation=seen, schedule=_schedule(run.config))
+        options: dict[str, Any] = {"horizon": task.time_limit, "representation": seen}
+        schedule = _schedule(run.config)
+        found = report(task.mdp, MEASURES, schedule=schedule, **options)
+        rescaled = report(task.mdp, ["kernel_regret"], schedule=replace(schedule, optimizer="adam"), **options)
     except PharosError as error:
         return {**row, "notes": str(error)}
     row |= {"num_states": float(task.mdp.num_states), "network": f"{name}, {initialisation}"}
@@ -91,6 +96,9 @@ def _predicted(run: Run) -> dict[str, Any]:
         row |= {"kernel_regret": regret["value"], "kernel_regret_played": regret["played"]}
         row |= {"tabular_regret": regret["tabular"], "tabular_regret_played": regret["tabular_played"]}
         row["estimated_error"] = regret["estimated_error"]
+    regret = rescaled["kernel_regret"].value
+    if regret is not None:
+        row |= {"adam_regret": regret["value"], "adam_regret_played": regret["played"]}
     for measure in MEASURES[1:]:
         value = found[measure].value
         if value is not None:

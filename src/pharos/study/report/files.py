@@ -15,7 +15,7 @@ from pharos.study.report.results import Results, coefficients, results_of
 from pharos.study.report.sections import sections_of
 from pharos.study.specification import Source
 from pharos.study.status import opened
-from pharos.study.validation import outcomes, validation
+from pharos.study.unseen_classes import outcomes, validation
 
 if TYPE_CHECKING:
     import pandas as pd

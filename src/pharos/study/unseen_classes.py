@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 OUTCOMES = {"greedy": "mean normalised regret of the greedy policies", "played": "that of the training episodes"}
-LINEAR = ("kernel_regret", "kernel_regret_played", "tabular_regret", "tabular_regret_played", "aliasing_floor")
+LINEAR = tuple(name for name in PREDICTORS if "regret" in name or name == "aliasing_floor")
 """Predictors that enter as they are; the others as logarithms."""
 CLEAR = 0.05  # difference of regret between two observations of one MDP that counts
 RESAMPLES = 1000
