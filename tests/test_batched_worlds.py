@@ -127,6 +127,4 @@ def test_observations_that_fit_no_table_change_nothing(monkeypatch, observation)
     runs = [BatchRun(task.mdp, source, 20, DQN, 60, i, i) for i in range(2)]
     in_table = learned(runs)
     monkeypatch.setattr(observed, "LARGEST_TABLE", 0)
-    raw = learned(runs)
-    monkeypatch.setattr(observed, "LARGEST_RAW_TABLE", 0)
-    assert in_table == raw == learned(runs)
+    assert in_table == learned(runs)

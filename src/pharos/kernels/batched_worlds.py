@@ -50,6 +50,19 @@ def look_up(table, begins, states, out):
 
 
 @njit(cache=True, nogil=True)
+def write_drawn(raw, places, members, out):
+    """out (W, pitch): the entries `places` (size,) of observations, B of each of the runs `members`, one run after
+    another in raw (len(members) B, M).
+    """
+    size, number = len(places), len(raw) // len(members)
+    for k in range(len(members)):
+        for b in range(number):
+            row, target = raw[k * number + b], out[members[k], b * size : (b + 1) * size]
+            for j in range(size):
+                target[j] = row[places[j]]
+
+
+@njit(cache=True, nogil=True)
 def choose(keys, step, explores, q, actions):
     """actions (W, E): random ones where a run explores, else the first of the best of q (W, E, A)."""
     for i in range(actions.shape[0]):

@@ -11,16 +11,16 @@ from pharos.agents.batched.networks import is_small
 from pharos.agents.batched.runs import BLOCK, BatchRun
 from pharos.kernels import batched_worlds
 
-look_up: Any = batched_worlds.look_up
+kernels: Any = batched_worlds  # compiled functions, whose types are hidden
 LARGEST_TABLE = 1 << 28  # bytes of observations as networks take them
-LARGEST_RAW_TABLE = 1 << 30  # bytes of images as they are
 
 
 class Seen:
     """The observations of runs that see alike.
 
-    Images are kept as bytes. Those of the small convolution are kept with the 9 C neighbours of each pixel where they
-    fit, so that nothing is unfolded while runs learn.
+    Images are kept as bytes, those of the small convolution with the 9 C neighbours of each pixel, so that nothing is
+    unfolded while runs learn. Where they do not fit, minibatches are drawn: 0.3 us an image of a small Breakout, and
+    as much again for each ten pixels to copy their neighbours.
 
     Attributes:
         shape: of an observation as Stable-Baselines3's networks take it, images with their channels first.
@@ -38,55 +38,55 @@ class Seen:
         place = {id(source): i for i, source in enumerate(self.sources)}
         self._which = np.array([place[id(run.observe)] for run in runs])
         begins = np.cumsum([0, *(source.num_states for source in self.sources)])
-        self._begins = begins[self._which][:, None]
+        self._begins = begins[self._which]
+        self._places = self._places_of_inputs()
         kind = torch.uint8 if self.is_image else torch.float32
         self._table: torch.Tensor | None = None
-        self._is_encoded = begins[-1] * self.size * kind.itemsize <= LARGEST_TABLE
-        size = self.size if self._is_encoded else int(np.prod(self.shape))
-        if self._is_encoded or begins[-1] * size * kind.itemsize <= LARGEST_RAW_TABLE:
-            table = torch.empty((int(begins[-1]), size), dtype=kind)
+        if begins[-1] * self.size * kind.itemsize <= LARGEST_TABLE:
+            table = torch.empty((int(begins[-1]), self.size), dtype=kind)
             for source, begin in zip(self.sources, begins, strict=False):
                 for row in range(0, source.num_states, BLOCK):
                     rows = np.arange(row, min(row + BLOCK, source.num_states))
-                    raw = self._turned(source.at(rows))
-                    table[begin + row : begin + row + len(rows)] = torch.from_numpy(
-                        self._encoded(raw) if self._is_encoded else raw.reshape(len(raw), -1)
-                    )
+                    found = torch.from_numpy(self._encoded(source.at(rows)))
+                    table[begin + row : begin + row + len(rows)] = found
             self._table = table.to(device)
 
     def at(self, states: np.ndarray, out: torch.Tensor) -> torch.Tensor:
         """Write what is seen in states (W, B) into out (W, B, size) float32; images from 0 to 255."""
-        if self._table is not None and self._is_encoded and self._table.device.type == "cpu":
-            look_up(self._table.numpy(), self._begins[:, 0], states, whole(out).numpy())
+        if self._table is None:
+            drawn = whole(out) if out.device.type == "cpu" else whole(torch.empty_like(out, device="cpu"))
+            for i, source in enumerate(self.sources):
+                members = np.flatnonzero(self._which == i)
+                raw = self._raw(source.at(states[members].ravel()))
+                kernels.write_drawn(raw, self._places, members, drawn.numpy())
+            return out if out.device.type == "cpu" else out.copy_(drawn[:, : out[0].numel()].view(out.shape))
+        if self._table.device.type == "cpu":
+            kernels.look_up(self._table.numpy(), self._begins, states, whole(out).numpy())
             return out
-        if self._table is not None:
-            rows = torch.from_numpy((states + self._begins).ravel()).to(self.device)
-            found = self._table.index_select(0, rows)
-            if not self._is_encoded:
-                raw = found.cpu().numpy().reshape(len(found), *self.shape)
-                found = torch.from_numpy(self._encoded(raw)).to(self.device)
-            return out.copy_(found.view(out.shape))
-        for i, source in enumerate(self.sources):
-            members = np.flatnonzero(self._which == i)
-            drawn = self.encoded(source.at(states[members].ravel()))
-            out[torch.from_numpy(members).to(self.device)] = drawn.view(len(members), states.shape[1], -1)
-        return out
+        rows = torch.from_numpy((states + self._begins[:, None]).ravel()).to(self.device)
+        return out.copy_(self._table.index_select(0, rows).view(out.shape))
 
     def encoded(self, observations: np.ndarray) -> torch.Tensor:
         """(N, size) float32 of observations (N, ...) as the environment gives them."""
-        return torch.from_numpy(self._encoded(self._turned(observations))).to(self.device).float()
+        return torch.from_numpy(self._encoded(observations)).to(self.device).float()
 
-    def _turned(self, observations: np.ndarray) -> np.ndarray:
-        return np.moveaxis(observations, -1, 1) if self._turns else observations
+    def _raw(self, observations: np.ndarray) -> np.ndarray:
+        """(N, M + 1) observations with their channels first, and a 0."""
+        turned = np.moveaxis(observations, -1, 1) if self._turns else observations
+        return np.pad(turned.reshape(len(turned), -1), ((0, 0), (0, 1)))
 
     def _encoded(self, observations: np.ndarray) -> np.ndarray:
-        """(N, size) of observations (N, *shape)."""
-        count = len(observations)
+        """(N, size) of observations."""
+        return self._raw(observations)[:, self._places]
+
+    def _places_of_inputs(self) -> np.ndarray:
+        """(size,): where each input of the first layer is in a `_raw` observation; beyond the border in its 0."""
+        inside = np.arange(int(np.prod(self.shape)))
         if not self._is_small:
-            return np.ascontiguousarray(observations).reshape(count, -1)
-        padded = np.pad(observations, ((0, 0), (0, 0), (1, 1), (1, 1)))
-        windows = np.lib.stride_tricks.sliding_window_view(padded, (KERNEL, KERNEL), axis=(2, 3))  # type: ignore[call-overload]
-        return np.ascontiguousarray(windows.transpose(0, 2, 3, 1, 4, 5)).reshape(count, -1)
+            return inside
+        padded = np.pad(inside.reshape(self.shape), ((0, 0), (1, 1), (1, 1)), constant_values=len(inside))
+        windows = np.lib.stride_tricks.sliding_window_view(padded, (KERNEL, KERNEL), axis=(1, 2))  # type: ignore[call-overload]
+        return np.ascontiguousarray(windows.transpose(1, 2, 0, 3, 4)).ravel()
 
 
 def as_networks_see(shape: tuple[int, ...], is_image: bool) -> tuple[tuple[int, ...], bool]:
