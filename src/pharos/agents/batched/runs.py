@@ -105,22 +105,9 @@ class ObservationSource:
         """The observations of a state space."""
         return ObservationSource(space, observe)
 
-    @property
-    def bytes(self) -> int:
-        """Of the observations of all states."""
-        return self.num_states * int(np.prod(self.shape)) * self.dtype.itemsize
-
     def at(self, indices: np.ndarray) -> np.ndarray:
         """(N, ...): the observations of states (N,)."""
         return self.observe(self.space.states(indices))
-
-    def table(self) -> np.ndarray:
-        """(S, ...): the observations of all states."""
-        table = np.empty((self.num_states, *self.shape), self.dtype)
-        for first in range(0, self.num_states, BLOCK):
-            rows = np.arange(first, min(first + BLOCK, self.num_states))
-            table[rows] = self.at(rows)
-        return table
 
 
 @dataclass(frozen=True, eq=False)
