@@ -13,6 +13,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from pharos.agents import make_model
 from pharos.agents.batched import BatchRun, make_batch
+from pharos.kernels import batched_learning as learning
 from pharos.kernels import batched_worlds as worlds
 from pharos.kernels import philox
 from pharos.mdp import TabularMDP
@@ -165,20 +166,24 @@ def assert_same_memory(lane, model):
 
 def assert_same_minibatch(lane, model, monkeypatch):
     """The same rows and copies of both memories: returns of n steps, the states they end in, what follows is worth."""
-    lane.replay.sample(lane.calls, 0, lane.own["gamma"], int(lane.shared["n_steps"]))
-    ours, size = lane.replay, int(lane.shared["batch_size"])
+    memory, size, filled = lane.replay, 500, min(lane.calls, lane.replay.size)
+    states, nexts, actions = (np.zeros((lane.width, size), np.int64) for _ in range(3))
+    rewards, factors = (np.zeros((lane.width, size), np.float32) for _ in range(2))
+    batch, place, steps = (states, nexts, actions, rewards, factors), lane.calls % memory.size, lane.shared["n_steps"]
+    learning.sample(lane.keys, 7, 0, place, filled, lane.own["gamma"], int(steps), memory.memory, batch)
     words = np.zeros((lane.width, size, 4), np.uint32)
-    philox.words(lane.keys, worlds.SAMPLE, lane.calls, words)
-    rows, copies = ((words[RUN, :, k].astype(np.uint64) * n) >> 32 for k, n in ((0, ours.filled), (1, lane.copies)))
+    philox.words(lane.keys, worlds.SAMPLE, 7, words)
+    rows, copies = ((words[RUN, :, k].astype(np.uint64) * n) >> 32 for k, n in ((0, filled), (1, lane.copies)))
+    assert {place, (place - 1) % filled} & set(rows.tolist()), "the ends of the memory are among them"
     monkeypatch.setattr(np.random, "randint", lambda *_, **__: copies.astype(np.int64))
     theirs = model.replay_buffer._get_samples(rows.astype(np.int64))
     discounts = model.gamma if theirs.discounts is None else theirs.discounts.numpy()[:, 0]
-    assert (theirs.observations.numpy().argmax(axis=1) == ours.states[RUN]).all()
-    assert (theirs.actions.numpy()[:, 0] == ours.actions[RUN]).all()
-    assert np.abs(theirs.rewards.numpy()[:, 0] - ours.rewards[RUN]).max() <= 1e-6
+    assert (theirs.observations.numpy().argmax(axis=1) == states[RUN]).all()
+    assert (theirs.actions.numpy()[:, 0] == actions[RUN]).all()
+    assert np.abs(theirs.rewards.numpy()[:, 0] - rewards[RUN]).max() <= 1e-6
     continues = (1 - theirs.dones.numpy()[:, 0]) * discounts
-    assert np.abs(continues - ours.discounts[RUN]).max() <= 1e-6
-    assert (theirs.next_observations.numpy().argmax(axis=1) == ours.next_states[RUN])[continues > 0].all()
+    assert np.abs(continues - factors[RUN]).max() <= 1e-6
+    assert (theirs.next_observations.numpy().argmax(axis=1) == nexts[RUN])[continues > 0].all()
 
 
 def test_ppo_gathers_what_stable_baselines3_gathers(table, monkeypatch):

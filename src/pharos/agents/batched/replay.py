@@ -15,7 +15,6 @@ class Replay:
         width, self.keys = len(keys), keys
         self.size = max(buffer_size // copies, 1)
         shape = (width, self.size, copies)
-        self.filled = 0
         self.memory: tuple[np.ndarray, ...] = (
             np.zeros(shape, np.int32),
             np.zeros(shape, np.int32),
@@ -45,8 +44,8 @@ class Replay:
     def sample(self, calls: int, draw: int, gammas: np.ndarray, num_steps: int) -> None:
         """Draw a minibatch for each run, after `calls` steps; see `kernels.sample`."""
         batch = (self.states, self.next_states, self.actions, self.rewards, self.discounts)
-        self.filled = min(calls, self.size)
-        kernels.sample(self.keys, calls, draw, calls % self.size, self.filled, gammas, num_steps, self.memory, batch)
+        filled = min(calls, self.size)
+        kernels.sample(self.keys, calls, draw, calls % self.size, filled, gammas, num_steps, self.memory, batch)
 
     def arrays(self, calls: int) -> dict[str, np.ndarray]:
         """The rows that are filled, by name."""
