@@ -209,6 +209,15 @@ def test_a_device_that_is_not_there_is_named_before_anything_is_trained(engine):
     assert engine.made == []
 
 
+def test_what_the_caller_raises_ends_the_training_and_fails_no_run(engine, tmp_path):
+    with pytest.raises(Killed):
+        many(tmp_path / "batch", progress=kill_at(1))
+    with pytest.raises(ZeroDivisionError):
+        many(tmp_path / "table", agent="q_learning", progress=lambda now: 1 / 0)
+    for folder in (tmp_path / "batch" / "seed-0", tmp_path / "table" / "seed-0"):
+        assert read_record(folder)["status"] == "running"
+
+
 def test_an_engine_that_lacks_the_agent_is_refused_with_the_one_that_has_it():
     with pytest.raises(ParameterError, match="agent 'a2c': the batched engine has dqn, ppo and q_learning;"):
         config(agent="a2c")

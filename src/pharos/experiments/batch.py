@@ -51,7 +51,7 @@ class Progress:
 Tell = Callable[[Progress], None]
 
 
-class Stopped(Exception):
+class Stopped(BaseException):
     """What the caller's own function raised, which is not an error of a run."""
 
 

@@ -4,6 +4,7 @@ Results do not depend on it, as a run does not depend on its batch.
 """
 
 import multiprocessing
+import signal
 import sys
 from collections.abc import Sequence
 from multiprocessing import connection
@@ -77,7 +78,8 @@ def train_parts(
 
 
 def _train(entries: Sequence[tuple[dict[str, Any], Path]], checkpoints: Path | None, device: str, sender: Any) -> None:
-    """What a process does: it tells how far it is, and ends when nobody listens."""
+    """What a process does: it tells how far it is, and ends when nobody listens; interrupts are for the first one."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
     def tell(now: Progress) -> None:
         try:
