@@ -11,7 +11,7 @@ import naive
 import pharos
 from chance_worlds import ChanceWorld, chance_worlds
 from pharos.environments import Environment
-from pharos.errors import RuleError, StateSpaceError
+from pharos.errors import RuleError, StateSpaceError, StateSpaceTooLarge
 from pharos.plots import states_by_depth
 
 search = importlib.import_module("pharos.state_space.search")
@@ -288,3 +288,28 @@ def test_an_age_without_chance_is_checked_too(tmp_path):
     assert space.manifest["format_version"] == 1 and (space.ages == space.states()[:, 0]).all()
     with pytest.raises(RuleError, match=r"action 'on_too' leads from state \(50,\) of age 50 to state \(3,\) of age 3"):
         build(Steps(back=True), tmp_path / "back")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("workers", [1, 3])
+def test_a_build_forgets_states_that_are_younger_than_all_that_wait(workers, tmp_path, monkeypatch, small_blocks):
+    """2048 on 2 x 3, 21,752 states: the same files from a table with room for a fifth of them, after a stop as well."""
+    env, tables = pharos.make("game_2048/2x3"), []
+    expected = files_of(build(env, tmp_path / "whole", workers=1).folder)
+
+    def slots_for(self, count):
+        return 1 << max(8, int((1.4 * count + self._margin) / table.LOAD - 1).bit_length())
+
+    def grow(self, *arguments, plain=table.MemoryTable.grow):
+        plain(self, *arguments)
+        tables.append(len(self.slots))
+
+    monkeypatch.setattr(table.MemoryTable, "_slots_for", slots_for)
+    monkeypatch.setattr(table.MemoryTable, "grow", grow)
+    monkeypatch.setattr(search, "WORTH_FORGETTING", 0)
+    monkeypatch.setattr(search, "FORGETTING_BLOCK", 1000)
+    with pytest.raises(StateSpaceTooLarge):
+        build(env, tmp_path / "stopped", workers=workers, max_states=9000)
+    for folder in ("stopped", "at once"):
+        assert files_of(build(env, tmp_path / folder, workers=workers).folder) == expected
+    assert max(tables) <= 8192

@@ -108,5 +108,5 @@ def test_a_reward_function_in_place_of_the_rules_may_look_at_the_outcome(tmp_pat
         return float(outcome)
 
     assert space.mdp(rewards=outcome_itself).rewards[0, 0] == 0.5 * 1 + 0.25 * 2 + 0.25 * 3
-    with pytest.raises(ParameterError, match="or the outcome beside"):
+    with pytest.raises(ParameterError, match="may be a fifth argument"):
         space.mdp(rewards=lambda state: 0.0)

@@ -150,8 +150,8 @@ def _with_reward(env: Environment, reward: Callable) -> Environment:
     names = list(inspect.signature(reward).parameters)
     if len(names) not in (4, 5):
         raise ParameterError(
-            f"a reward function takes (self, state, action, next_state), or the outcome beside; found "
-            f"({', '.join(names)})"
+            f"a reward function takes (self, state, action, next_state); found ({', '.join(names)}); the outcome may "
+            f"be a fifth argument"
         )
     cls: type[Environment] = type(type(env).__name__, (type(env),), {"reward": reward, "__module__": reward.__module__})
     return cls(**env.parameters)

@@ -36,6 +36,9 @@ PIECES = 4
 WIDE = 1 << 13
 # States that one thread expands before it looks at the width of the frontier again.
 NARROW = 2048
+# States from which on a table forgets those that a class with an age has left behind, and how many are asked at a time.
+WORTH_FORGETTING = 1 << 16
+FORGETTING_BLOCK = 1 << 18
 # A table that holds nothing, where the slot of a state is its bucket.
 _NOTHING = np.full(1 << 16, -1, np.int32)
 
@@ -215,10 +218,36 @@ class Search:
 
     def _grow_table(self, pool: ThreadPoolExecutor) -> None:
         """A larger table; on disk where memory is not enough."""
-        if self.table.fits(self.position.count, self.journal.index_dtype):
-            self.table.grow(self.position.count, self.journal.index_dtype, pool, self.workers)
+        count, dtype, kept = self.position.count, self.journal.index_dtype, self._within_reach()
+        if self.table.fits(count, dtype, 0 if kept is None else count - sum(map(len, kept))):
+            self.table.grow(count, dtype, pool, self.workers, kept)
         else:
             self._spill()
+
+    def _within_reach(self) -> list[np.ndarray] | None:
+        """The states that a successor may still be, where the class has an age: those older than the youngest that
+        waits to be expanded. None: all of them.
+        """
+        count = self.position.count
+        if not self.env.has_age or count < WORTH_FORGETTING:
+            return None
+        states, slots = self.table.states.view(), self.table.slots
+        states.flags.writeable = False
+        ages = rules_of(self.env).ages
+        first = max(self.position.first - 8, 0)  # the last ones may be expanded again
+        waiting = (
+            ages.block(states, i, min(i + FORGETTING_BLOCK, count)) for i in range(first, count, FORGETTING_BLOCK)
+        )
+        youngest = min(int(part.min()) for part in waiting)
+        entries = slots if len(slots) else np.arange(count)
+        kept = []
+        for i in range(0, len(entries), FORGETTING_BLOCK):
+            part = entries[i : i + FORGETTING_BLOCK]
+            part = part[part >= 0]
+            packed = states[part]
+            packed.flags.writeable = False
+            kept.append(part[ages.block(packed, 0, len(part)) > youngest])
+        return kept
 
     def _needs_wide_indices(self, successors: int) -> bool:
         """Whether as many more states may be more than int32 can number."""

@@ -38,6 +38,7 @@ class MemoryTable:
     Attributes:
         states: (capacity, W) uint64, in the order of discovery.
         slots: index of a state, or -1; see kernels/hash_table.py.
+        forgotten: how many states the table leaves out, as no search comes to them again.
     """
 
     def __init__(self, num_words: int, margin: int, memory: int | None):
@@ -50,31 +51,48 @@ class MemoryTable:
         self.slots = np.empty(0, np.int32)
         self._space = reserved_table()
         self._margin, self._memory = margin, memory
+        self.forgotten = 0
 
     @property
     def room(self) -> int:
         """States that table and array of states can hold."""
-        return min(int(len(self.slots) * LOAD), len(self.states))
+        return min(int(len(self.slots) * LOAD) + self.forgotten, len(self.states))
 
     def is_full(self, count: int) -> bool:
         """Whether the table must grow before a kernel goes on from `count` states."""
         return count + self._margin > self.room
 
-    def fits(self, count: int, dtype: np.dtype) -> bool:
+    def fits(self, count: int, dtype: np.dtype, forgotten: int = 0) -> bool:
         """Whether memory holds a table with room for about twice as many states, and the states."""
         if count + self._margin > len(self.states):
             return False
-        slots = self._slots_for(count)
-        needed = slots * dtype.itemsize + int(slots * LOAD) * self.states.shape[1] * 8
+        slots = self._slots_for(count - forgotten)
+        needed = slots * dtype.itemsize + (int(slots * LOAD) + forgotten) * self.states.shape[1] * 8
         return needed <= (self._memory if self._memory is not None else machine.available_memory())
 
-    def grow(self, count: int, dtype: np.dtype, pool: ThreadPoolExecutor, workers: int) -> None:
-        """A table with room for about twice as many states, filled from the array of states."""
-        slots = self._slots_for(count)
+    def grow(
+        self,
+        count: int,
+        dtype: np.dtype,
+        pool: ThreadPoolExecutor,
+        workers: int,
+        kept: list[np.ndarray] | None = None,
+    ) -> None:
+        """A table with room for about twice as many states, filled from the array of states.
+
+        kept: the only ones that are wanted, parts of their indices; None: all.
+        """
+        self.forgotten = 0 if kept is None else count - sum(map(len, kept))
+        slots = max(self._slots_for(count - self.forgotten), len(self.slots) if kept is not None else 0)
         self.slots = np.empty(0, dtype)  # free the old one first, where it cannot grow in its place
         if self._space.nbytes < slots * dtype.itemsize:
             self._space = huge_pages(slots, dtype)
         self.slots = self._space.view(dtype)[:slots]
+        if kept is not None:
+            self.slots.fill(-1)
+            for part in kept:
+                fill_more(self.slots, self.states, part.astype(np.int64))
+            return
         if workers == 1 or count < PARALLEL_FILL:
             self._fill(count)
             return
