@@ -65,6 +65,7 @@ _PACKAGES = (
     "policies",
     "agents",
     "experiments",
+    "leaderboard",
     "plots",
     "study",
 )

@@ -17,6 +17,7 @@ from pharos.cli import (
     export,
     hardness,
     import_,
+    leaderboard,
     observations,
     play,
     plot,
@@ -138,6 +139,9 @@ app.command("render")(render.render)
 app.command("play")(play.play)
 app.command("train")(train.train)
 app.command("tune")(tune.tune)
+app.command("submit")(leaderboard.submit)
+app.command("verify")(leaderboard.verify)
+app.command("board")(leaderboard.board)
 app.command("warm")(warm.warm)
 app.add_typer(plot.app, name="plot")
 app.add_typer(study.app, name="study")

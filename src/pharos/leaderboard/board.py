@@ -1,0 +1,245 @@
+"""The page of a leaderboard: every entry of a folder verified, and ranked by what was computed, not by what is claimed.
+
+The page loads nothing and executes nothing but its own few lines, which sort tables; its policy of contents says so to
+the browser. Whatever comes from entries is escaped.
+"""
+
+import base64
+import hashlib
+import math
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pharos import storage
+from pharos.environments import Environment, make
+from pharos.errors import MissingExtra, ParameterError, PharosError
+from pharos.experiments import TaskValues
+from pharos.leaderboard.entry import SUFFIX
+from pharos.leaderboard.verification import MAX_STATES, REACHED, TOLERANCE, Verdict, task_key, verify
+from pharos.observations import title as observation_title
+
+if TYPE_CHECKING:
+    import jinja2
+
+Progress = Callable[[int, int, str], None]
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A cell of a table: its text, and the number or the text that it is sorted by."""
+
+    text: str
+    key: str = ""
+    hint: str = ""
+
+
+@dataclass(frozen=True)
+class Ranking:
+    """The verified entries of one task, best first."""
+
+    title: str
+    setting: str
+    rows: Sequence[Sequence[Cell]]
+
+
+@dataclass
+class Board:
+    """What was made of a folder.
+
+    Attributes:
+        file: the page.
+        verified: entries whose claim holds.
+        refused: name of each other file -> why.
+    """
+
+    file: Path
+    verified: list[Verdict] = field(default_factory=list)
+    refused: dict[str, str] = field(default_factory=dict)
+
+
+COLUMNS = (
+    ("rank", "n"),
+    ("entry", "s"),
+    ("author", "s"),
+    ("agent", "s"),
+    ("observation", "s"),
+    ("steps", "n"),
+    ("value", "n"),
+    ("regret", "n"),
+    ("normalized", "n"),
+    ("certainty", "s"),
+    ("while learning", "n"),
+    ("run", "s"),
+)
+
+
+def board(
+    folder: str | os.PathLike,
+    out: str | os.PathLike,
+    *,
+    title: str = "Leaderboard",
+    trust: bool = False,
+    tolerance: float = TOLERANCE,
+    max_states: int = MAX_STATES,
+    max_reached: int = REACHED,
+    progress: Progress | None = None,
+) -> Board:
+    """Verify every entry in a folder, and write a page that ranks them; entries of one task share its solution.
+
+    Args:
+        folder: entries, *.safetensors, in it and below.
+        out: the page, one self-contained file of HTML.
+        title: of the page.
+        trust, tolerance, max_states, max_reached: as for `verify`.
+        progress: called with how many entries are done, how many there are, and the next one.
+    Returns:
+        What holds and what was refused; those refused stand at the end of the page, with the reason.
+    Raises:
+        ParameterError: there is no such folder, or no entry in it. MissingExtra: Jinja2 is not installed.
+    """
+    place = Path(folder)
+    files = sorted(path for path in place.rglob(f"*{SUFFIX}") if path.is_file())
+    if not files:
+        raise ParameterError(f"{place}: expected a folder with entries, *{SUFFIX}; `pharos submit RUN` makes one")
+    template = _templates().get_template("board.html.j2")
+    made, values = Board(Path(out)), dict[str, TaskValues]()
+    for k, path in enumerate(files):
+        name = path.relative_to(place).as_posix()
+        if progress is not None:
+            progress(k, len(files), name)
+        try:
+            verdict = verify(
+                path, trust=trust, tolerance=tolerance, max_states=max_states, max_reached=max_reached, values=values
+            )
+        except (PharosError, OSError, MemoryError) as error:
+            made.refused[name] = " ".join(str(error).split()).removeprefix(f"{path}: ")
+            continue
+        if verdict.holds:
+            made.verified.append(verdict)
+        else:
+            made.refused[name] = why_not(verdict)
+    script = _script()
+    text = template.render(
+        title=title,
+        rankings=_rankings(made.verified),
+        columns=COLUMNS,
+        refused=made.refused,
+        verified=len(made.verified),
+        version=_version(),
+        script=script,
+        script_hash=base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
+    )
+    made.file.parent.mkdir(parents=True, exist_ok=True)
+    storage.replace_file(made.file, text.encode(errors="replace"))  # names of files may be no text
+    return made
+
+
+def why_not(verdict: Verdict) -> str:
+    """Why a claim does not hold, in a line."""
+    wrong = [
+        f"{check.name.replace('_', ' ')} is {check.found:.8g}, the entry claims {check.claimed:.8g}"
+        for check in verdict.checks
+        if not check.holds
+    ]
+    if verdict.claims_too_much:
+        wrong.append(f"the value is claimed to be exact, and is an estimate here (± {verdict.error_bound:.2g})")
+    return "; ".join(wrong)
+
+
+def _rankings(verdicts: Sequence[Verdict]) -> list[Ranking]:
+    """A table for each task, by name; the least regret first, and of equal ones the fewest steps."""
+    groups: dict[str, list[Verdict]] = {}
+    for verdict in verdicts:
+        groups.setdefault(task_key(verdict.entry.config), []).append(verdict)
+    rankings = []
+    for group in groups.values():
+        group.sort(key=lambda each: (max(0.0, round(each.regret, 9)), each.entry.config.steps, each.entry.id))
+        first = group[0]
+        config = first.entry.config
+        horizon = "no horizon" if config.horizon is None else f"horizon {config.horizon}"
+        setting = (
+            f"Chance added: {config.chance}. Discount {config.gamma:g}, {horizon}. "
+            f"V* = {first.value_optimal:.6g}, V of acting at random = {first.value_uniform:.6g}."
+        )
+        rows = [_row(rank, verdict) for rank, verdict in enumerate(group, 1)]
+        name = _name_of(config.environment, first.entry.config.parameters)
+        rankings.append(Ranking(f"{name}{'' if not config.chance else f', {config.chance}'}", setting, rows))
+    return sorted(rankings, key=lambda ranking: (ranking.title, ranking.setting))
+
+
+def _row(rank: int, verdict: Verdict) -> list[Cell]:
+    entry, config = verdict.entry, verdict.entry.config
+    learning = entry.training.get("normalized_regret")
+    learning = learning if isinstance(learning, int | float) and math.isfinite(learning) else math.nan
+    seen = observation_title(config.observation, config.observation_options)
+    certainty = "exact" if verdict.exact else f"estimated ± {verdict.error_bound:.2g}"
+    return [
+        _number(rank, "d"),
+        Cell(entry.name, entry.name, entry.note),
+        Cell(entry.author, entry.author),
+        Cell(config.agent, config.agent),
+        Cell(seen, seen),
+        _number(config.steps, ",d"),
+        _number(verdict.value, ".6g"),
+        _number(verdict.regret if abs(verdict.regret) > 1e-9 else 0.0, ".6g"),
+        _number(verdict.normalized_regret if abs(verdict.normalized_regret) > 1e-9 else 0.0, ".4g")
+        if math.isfinite(verdict.normalized_regret)
+        else Cell("–"),
+        Cell(certainty, certainty),
+        _number(learning, ".4g") if math.isfinite(learning) else Cell("–"),
+        Cell(entry.id, entry.id, f"seed {config.seed}, pharos {entry.versions.get('pharos', 'unknown')}"),
+    ]
+
+
+def _number(value: Any, style: str) -> Cell:
+    return Cell(format(value, style), repr(value))
+
+
+def _name_of(environment: str, parameters: Any) -> str:
+    """The named instance that has these parameters, or the class with what is not its default."""
+    if ":" in environment:
+        return environment
+    try:
+        cls = type(make(environment))
+    except (PharosError, TypeError):
+        return environment
+    wanted = storage.plain(parameters)
+    for instance in cls.instances:
+        if _plain_parameters(make(f"{environment}/{instance}")) == wanted:
+            return f"{environment}/{instance}"
+    usual = _plain_parameters(make(environment))
+    words = [f"{name}={value}" for name, value in wanted.items() if usual.get(name) != value]
+    return " ".join((environment, *words))
+
+
+def _plain_parameters(env: Environment) -> Any:
+    return storage.plain(env.parameters)
+
+
+def _version() -> str:
+    import pharos
+
+    return pharos.__version__
+
+
+def _script() -> str:
+    return (Path(__file__).parent / "templates" / "sort.js.j2").read_text(encoding="utf-8")
+
+
+@cache
+def _templates() -> "jinja2.Environment":
+    try:
+        import jinja2
+    except ImportError as error:
+        raise MissingExtra("the page of a leaderboard", "jinja2", "study") from error
+    return jinja2.Environment(
+        loader=jinja2.PackageLoader("pharos.leaderboard"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        keep_trailing_newline=True,
+    )

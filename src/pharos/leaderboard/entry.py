@@ -1,0 +1,273 @@
+"""The file of an entry: numbers and JSON in the layout of safetensors, read without executing anything.
+
+    8 bytes      length N of the header, little-endian
+    N bytes      JSON: name of each array -> dtype, shape, data_offsets; "__metadata__": {"pharos": the record, as JSON}
+    the rest     the arrays one after another, little-endian, in the order of the header, without gaps
+
+The record says what was trained and what is claimed; its `digest` is that of all it says, and its `arrays` has the
+digest of each array. Digests find what was damaged, not who lies: what is claimed has to be computed again (`verify`).
+
+Source of the layout: the format of safetensors, https://github.com/huggingface/safetensors.
+"""
+
+import json
+import math
+import os
+import struct
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pharos import storage
+from pharos.errors import FileFormatError, ParameterError, ResultCorrupted
+from pharos.experiments import RunConfig, run_id
+
+FORMAT = 1
+SUFFIX = ".safetensors"
+POLICY = "policy"
+"""The array of a tabular agent; a network has arrays by the names of its parameters."""
+LARGEST_HEADER = 1 << 22
+LARGEST_FILE = 1 << 30
+LONGEST_TEXT = 2000
+_METADATA, _RECORD, _ARRAYS = "__metadata__", "pharos", "arrays"
+_AGAIN = "fetch it again, or ask for it again"
+_DTYPES = {
+    "BOOL": "|b1",
+    "U8": "|u1",
+    "U16": "<u2",
+    "U32": "<u4",
+    "I8": "|i1",
+    "I16": "<i2",
+    "I32": "<i4",
+    "I64": "<i8",
+    "F16": "<f2",
+    "F32": "<f4",
+    "F64": "<f8",
+}
+_NAMES = {text: name for name, text in _DTYPES.items()}
+
+
+@dataclass(frozen=True)
+class Claim:
+    """What an entry says of the policy in it, in the setting of its configuration.
+
+    Attributes:
+        value: expected return of an episode.
+        regret: V* - value.
+        value_optimal, value_uniform: V*, and the value of acting uniformly at random.
+        exact: whether the value was computed, not estimated.
+        error_bound: how far the value may be off; of an estimate half the width of a 99 % interval.
+    """
+
+    value: float
+    regret: float
+    value_optimal: float
+    value_uniform: float
+    exact: bool
+    error_bound: float
+
+
+@dataclass(frozen=True, eq=False)
+class Entry:
+    """What the file of an entry holds.
+
+    Attributes:
+        name, author, note: as whoever submitted it wrote them.
+        config: of the run.
+        hyperparameters: all of the agent.
+        versions: of what the run depended on.
+        rules_version: of the environment's rules.
+        claim: of the policy.
+        training: what the run says of its learning (cumulative regret, episodes ...), which only training again could
+            verify.
+        arrays: what was learnt.
+    """
+
+    name: str
+    config: RunConfig
+    hyperparameters: Mapping[str, Any]
+    versions: Mapping[str, str]
+    rules_version: int
+    claim: Claim
+    training: Mapping[str, Any] = field(default_factory=dict)
+    arrays: Mapping[str, np.ndarray] = field(default_factory=dict)
+    author: str = ""
+    note: str = ""
+
+    @property
+    def id(self) -> str:
+        """The name of the run: a digest of its configuration."""
+        return self.config.id
+
+
+def write(entry: Entry, file: str | os.PathLike) -> None:
+    """Replace a file by an entry, in one step; the same entry gives the same bytes."""
+    arrays = {name: _little_endian(name, array) for name, array in entry.arrays.items()}
+    record = {
+        "format": FORMAT,
+        "name": entry.name,
+        "author": entry.author,
+        "note": entry.note,
+        "id": entry.id,
+        "config": entry.config.to_dict(),
+        "hyperparameters": dict(entry.hyperparameters),
+        "versions": dict(entry.versions),
+        "rules_version": entry.rules_version,
+        "claim": asdict(entry.claim),
+        "training": dict(entry.training),
+        _ARRAYS: {name: _digest(array) for name, array in arrays.items()},
+    }
+    text = json.dumps(storage.sealed(record), sort_keys=True, allow_nan=False)
+    header: dict[str, Any] = {_METADATA: {_RECORD: text}}
+    end = 0
+    for name, array in arrays.items():
+        begin, end = end, end + array.nbytes
+        header[name] = {"dtype": _NAMES[array.dtype.str], "shape": list(array.shape), "data_offsets": [begin, end]}
+    head = json.dumps(header, separators=(",", ":")).encode()
+    head += b" " * (-len(head) % 8)
+    if len(head) > LARGEST_HEADER or end > LARGEST_FILE:
+        raise ParameterError(f"{file}: the entry would have {end:,} bytes; expected at most {LARGEST_FILE:,}")
+    with storage.replacing(file) as out:
+        out.write(struct.pack("<Q", len(head)) + head)
+        for array in arrays.values():
+            out.write(array.tobytes())
+
+
+def read(file: str | os.PathLike) -> Entry:
+    """Read an entry; nothing is allocated before the sizes in the file were held against the size of the file.
+
+    Raises:
+        ParameterError: there is no such file. FileFormatError: it is no entry, or of another format.
+        ResultCorrupted: it was cut short, or changed after it was written.
+    """
+    path = Path(file)
+    if not path.is_file():
+        raise ParameterError(f"{path}: no such file")
+    try:
+        header, begin, size = _header(path)
+        text = header.pop(_METADATA)[_RECORD]
+        record = json.loads(text)
+        if not isinstance(record, dict):
+            raise TypeError("its record is no object")
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise FileFormatError(f"{path}: is no entry of a leaderboard: {_reason(error)}; {_AGAIN}") from None
+    if not storage.is_intact(record) or storage.DIGEST not in record:
+        raise ResultCorrupted(f"{path}: what it says was changed after it was written; {_AGAIN}")
+    if record.get("format") != FORMAT:
+        raise FileFormatError(f"{path}: is in format {record.get('format')!r}; this version of pharos reads {FORMAT}")
+    try:
+        places = _places(header, size)
+        if list(record[_ARRAYS]) != sorted(places):
+            raise ValueError("its arrays are not those that it was written with")
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
+        raise ResultCorrupted(f"{path}: was cut short or changed: {_reason(error)}; {_AGAIN}") from None
+    data = np.fromfile(path, np.uint8, size, offset=begin)
+    arrays = {}
+    for name, (dtype, shape, first, last) in places.items():
+        arrays[name] = data[first:last].view(dtype).reshape(shape)
+        if _digest(arrays[name]) != record[_ARRAYS][name]:
+            raise ResultCorrupted(f"{path}: its array {name!r} was changed after it was written; {_AGAIN}")
+    try:
+        return _entry(record, arrays)
+    except (FileFormatError, ParameterError) as error:
+        raise FileFormatError(f"{path}: {error}") from None
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise FileFormatError(f"{path}: its record is damaged: {_reason(error)}; {_AGAIN}") from None
+
+
+def _header(path: Path) -> tuple[dict[str, Any], int, int]:
+    """The header, where the data begin, and how many bytes they are."""
+    with open(path, "rb") as file:
+        total = os.fstat(file.fileno()).st_size
+        if not 8 < total <= LARGEST_FILE:
+            raise ValueError(f"it has {total:,} bytes; expected at most {LARGEST_FILE:,}")
+        (length,) = struct.unpack("<Q", file.read(8))
+        if length > min(LARGEST_HEADER, total - 8):
+            raise ValueError(f"its header would have {length:,} bytes, of {total:,} in the file")
+        header = json.loads(file.read(length))
+    if not isinstance(header, dict):
+        raise TypeError("its header is no object")
+    return header, 8 + length, total - 8 - length
+
+
+def _places(header: Mapping[str, Any], size: int) -> dict[str, tuple[np.dtype, tuple[int, ...], int, int]]:
+    """Name -> dtype, shape, first and last byte of each array; ValueError unless they fill the file without gaps."""
+    places, end = {}, 0
+    for name, place in header.items():
+        shape, (first, last) = tuple(place["shape"]), place["data_offsets"]
+        dtype = np.dtype(_DTYPES[place["dtype"]])
+        if not all(type(number) is int and number >= 0 for number in (*shape, first, last)) or len(shape) > 8:
+            raise ValueError(f"the array {name!r} has a strange shape")
+        if first != end or last - first != math.prod(shape) * dtype.itemsize:
+            raise ValueError(f"the array {name!r} is not where its shape and type say")
+        places[name], end = (dtype, shape, first, last), last
+    if end != size:
+        raise ValueError(f"its arrays have {end:,} bytes; found {size:,}")
+    return places
+
+
+def _entry(record: Mapping[str, Any], arrays: dict[str, np.ndarray]) -> Entry:
+    _check_texts(record)
+    config = RunConfig.from_dict(record["config"])
+    if record["id"] != run_id(record["config"]):
+        raise ValueError("its configuration is not that of its run")
+    claim = {name: record["claim"][name] for name in Claim.__dataclass_fields__}
+    numbers = [value for name, value in claim.items() if name != "exact"]
+    if not all(type(number) in (int, float) and math.isfinite(number) for number in numbers):
+        raise ValueError("what it claims are no numbers")
+    for name in ("hyperparameters", "versions", "training"):
+        if not isinstance(record[name], dict):
+            raise TypeError(f"its {name} are no object")
+    texts = {name: record[name] for name in ("name", "author", "note")}
+    if not all(isinstance(text, str) for text in (*texts.values(), *record["versions"].values())):
+        raise TypeError("its name, author, note and versions are no texts")
+    if type(claim["exact"]) is not bool or type(record["rules_version"]) is not int or claim["error_bound"] < 0:
+        raise ValueError("what it claims is not what a claim is")
+    return Entry(
+        config=config,
+        hyperparameters=record["hyperparameters"],
+        versions=record["versions"],
+        rules_version=record["rules_version"],
+        claim=Claim(**claim),
+        training=record["training"],
+        arrays=arrays,
+        **texts,
+    )
+
+
+def _check_texts(value: Any, name: str = "record") -> None:
+    """Refuse texts that would do something to a terminal, or hide what they say."""
+    if isinstance(value, Mapping):
+        for key, item in value.items():
+            _check_texts(key, name)
+            _check_texts(item, key)
+    elif isinstance(value, list):
+        for item in value:
+            _check_texts(item, name)
+    elif isinstance(value, str):
+        if not all(character.isprintable() or character == "\n" for character in value):
+            raise ValueError(f"a text of its {name} has characters that cannot be printed")
+        if name in ("name", "author", "note") and len(value) > LONGEST_TEXT:
+            raise ValueError(f"its {name} has {len(value):,} characters; expected at most {LONGEST_TEXT:,}")
+
+
+def _little_endian(name: str, array: np.ndarray) -> np.ndarray:
+    array = np.ascontiguousarray(array).reshape(array.shape)
+    array = array.astype(array.dtype.newbyteorder("<"), copy=False)
+    if array.dtype.str not in _NAMES:
+        raise ParameterError(f"the array {name!r} holds {array.dtype}; expected integers or floats of at most 64 bits")
+    return array
+
+
+def _digest(array: np.ndarray) -> str:
+    data = np.ascontiguousarray(array).reshape(-1).view(np.uint8)
+    return storage.digest_of_json([array.dtype.str, list(array.shape), storage.digest_of_bytes(data.data)])
+
+
+def _reason(error: BaseException) -> str:
+    if isinstance(error, KeyError):
+        return f"it lacks {error}"
+    return (" ".join(str(error).split()) or type(error).__name__)[:200]

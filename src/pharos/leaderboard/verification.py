@@ -1,0 +1,200 @@
+"""Verifying an entry: value and regret of its policy, computed again from the rules and held against its claim."""
+
+import math
+import os
+import time
+from collections.abc import MutableMapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from pharos import storage
+from pharos.environments import BUILT_IN
+from pharos.errors import FileFormatError, ParameterError, StateSpaceTooLarge, UntrustedCode
+from pharos.experiments import RunConfig, Task, TaskValues, evaluate_agent
+from pharos.leaderboard.entry import POLICY, Entry, read
+from pharos.leaderboard.policy import policy_of
+from pharos.observations import names as observation_names
+from pharos.sources import is_reference
+from pharos.state_space import build
+
+TOLERANCE = 1e-6
+MAX_STATES = 10_000_000
+REACHED = 100_000
+SEED = 1
+"""Of estimates; another one than that of runs, so that an estimate is not compared with itself."""
+
+
+@dataclass(frozen=True)
+class Check:
+    """A number of the claim beside what was computed.
+
+    Attributes:
+        name: "value", "regret", "value_optimal" or "value_uniform".
+        claimed, found: the two numbers.
+        within: how far apart they may be.
+    """
+
+    name: str
+    claimed: float
+    found: float
+    within: float
+
+    @property
+    def holds(self) -> bool:
+        """Whether they are no farther apart than that."""
+        return abs(self.claimed - self.found) <= self.within
+
+
+@dataclass(frozen=True, eq=False)
+class Verdict:
+    """What was computed of an entry.
+
+    Attributes:
+        file, entry: what was verified.
+        value, regret: of the policy, as they were computed.
+        normalized_regret: regret / (V* - U); NaN where V* = U.
+        value_optimal, value_uniform: V* and U, computed.
+        exact: whether the value is computed; else it is estimated from episodes.
+        error_bound: how far the value may be off; of an estimate half the width of a 99 % interval.
+        states: in which the policy was asked; episodes: behind an estimate.
+        checks: the claim, number by number.
+        seconds: that it took.
+    """
+
+    file: Path
+    entry: Entry
+    value: float
+    regret: float
+    normalized_regret: float
+    value_optimal: float
+    value_uniform: float
+    exact: bool
+    error_bound: float
+    states: int
+    episodes: int
+    checks: tuple[Check, ...]
+    seconds: float
+
+    @property
+    def holds(self) -> bool:
+        """Whether all that can be computed is as claimed, and nothing is claimed to be exact that is not."""
+        return all(check.holds for check in self.checks) and not self.claims_too_much
+
+    @property
+    def claims_too_much(self) -> bool:
+        """Whether the entry says that a value is exact which is only estimated here."""
+        return self.entry.claim.exact and not self.exact
+
+
+def verify(
+    file: str | os.PathLike,
+    *,
+    trust: bool = False,
+    tolerance: float = TOLERANCE,
+    max_states: int = MAX_STATES,
+    max_reached: int = REACHED,
+    values: MutableMapping[str, TaskValues] | None = None,
+) -> Verdict:
+    """Compute the value and the regret of an entry's policy again, and compare them with its claim.
+
+    The states are enumerated from pharos' own rules, solved, and the policy is evaluated on them; of the file only
+    numbers and names are used. A claim holds where its interval (its error bound) and the one found here meet. A value
+    that can only be estimated is estimated from other episodes than the run's own.
+
+    Args:
+        trust: whether code that the entry names may be imported: an environment, observation or agent that is no part
+            of pharos or Stable-Baselines3. It comes from this machine; no file of an entry holds any.
+        tolerance: how far exact numbers may be apart, for rounding of networks on another processor; times V* where
+            that is larger than 1.
+
+        Cost only:
+        max_states: StateSpaceTooLarge beyond. A table says itself how many states there are.
+        max_reached: up to so many reached states a value is exact.
+        values: filled with the values of each task, for the entries that follow.
+    Raises:
+        ParameterError: there is no such file. FileFormatError: it is no entry, or not one of this version of the rules.
+        ResultCorrupted: it was cut short or changed. UntrustedCode: it names code, and is not trusted.
+    """
+    began, path = time.perf_counter(), Path(file)
+    entry = read(path)
+    try:
+        task = _task(entry, trust, max_states, values)
+        policy = policy_of(entry, task, trust=trust)
+        found = evaluate_agent(policy, task, max_states=max_reached, seed=SEED)
+    except UntrustedCode as error:
+        raise UntrustedCode(f"{path}: {error}") from None
+    except (ParameterError, FileFormatError) as error:
+        raise FileFormatError(f"{path}: {error}") from None
+    except StateSpaceTooLarge as error:
+        raise StateSpaceTooLarge(f"{path}: {error}") from None
+    reference, claim = task.reference, entry.claim
+    slack = tolerance * max(1.0, abs(reference.optimal)) + reference.error_bound
+    apart = slack + found.error_bound + (min(claim.error_bound, slack) if claim.exact else claim.error_bound)
+    regret, spread = reference.optimal - found.value, reference.spread()
+    checks = (
+        Check("value", claim.value, found.value, apart),
+        Check("regret", claim.regret, regret, apart + slack),
+        Check("value_optimal", claim.value_optimal, reference.optimal, slack),
+        Check("value_uniform", claim.value_uniform, reference.uniform, slack),
+    )
+    return Verdict(
+        path,
+        entry,
+        found.value,
+        regret,
+        regret / spread if math.isfinite(spread) else math.nan,
+        reference.optimal,
+        reference.uniform,
+        found.exact,
+        found.error_bound,
+        found.states,
+        found.episodes,
+        checks,
+        time.perf_counter() - began,
+    )
+
+
+def _task(entry: Entry, trust: bool, max_states: int, values: MutableMapping[str, TaskValues] | None) -> Task:
+    """The task of an entry, its state space built, within limits that hold before it is."""
+    config = entry.config
+    _check_code(config, trust)
+    key = task_key(config)
+    task = config.task(None if values is None else values.get(key), trust=trust, strict=True)
+    env = task.env
+    if storage.plain(env.parameters) != storage.plain(config.parameters):
+        raise FileFormatError(f"its parameters are not those of {env}; expected all parameters, as the class has them")
+    if env.version != entry.rules_version:
+        raise FileFormatError(
+            f"is of version {entry.rules_version} of the rules of {env.name}; this pharos has version {env.version}, "
+            f"another MDP: train again, or verify with the pharos of then ({entry.versions.get('pharos', 'unknown')})"
+        )
+    table = entry.arrays.get(POLICY)
+    limit = len(table) if config.is_tabular and table is not None and table.ndim else max_states
+    space = build(env, max_states=max(1, limit), progress=False)
+    if space.num_states > limit:
+        raise StateSpaceTooLarge(f"{env} has {space.num_states:,} states; expected at most {limit:,}")
+    if values is not None and key not in values:
+        values[key] = TaskValues(task.reference, task.return_range)
+    return task
+
+
+def task_key(config: RunConfig) -> str:
+    """A digest of what an entry is compared in: environment, chance, and the setting of values."""
+    chance = config.chance.to_dict()
+    return storage.digest_of_json([config.environment, config.parameters, chance, config.gamma, config.horizon])
+
+
+def _check_code(config: RunConfig, trust: bool) -> None:
+    """Refuse whatever is not part of pharos; agents are looked at where they are made."""
+    if trust:
+        return
+    if config.sources:
+        part, source = next(iter(config.sources.items()))
+        raise UntrustedCode(
+            f"the {part} {source.name!r} is code, which is executed only if you trust it: add --trust (in Python: "
+            f"trust=True)"
+        )
+    if config.environment not in {entry.name for entry in BUILT_IN}:
+        raise UntrustedCode(f"the environment {config.environment!r} is no part of pharos: add --trust if you trust it")
+    if is_reference(config.observation) or config.observation not in observation_names():
+        raise UntrustedCode(f"the observation {config.observation!r} is no part of pharos: add --trust if you trust it")

@@ -1,0 +1,248 @@
+"""Entries of a leaderboard: what is verified, what is refused in one line, and what the page says."""
+
+import dataclasses
+import json
+import struct
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import pharos
+from pharos import leaderboard
+from pharos.cli import app
+from pharos.errors import FileFormatError, ParameterError, ResultCorrupted, UntrustedCode
+from pharos.leaderboard.entry import write
+
+OWN = """
+from dataclasses import dataclass
+from pathlib import Path
+from pharos import Environment
+Path(__file__).with_name("executed").touch()
+
+@dataclass(frozen=True, kw_only=True)
+class Two(Environment):
+    "Two cells."
+    name = "two_cells"
+    actions = ("stay", "go")
+    max_episode_steps = 3
+    def variables(self):
+        return {"cell": range(2)}
+    def initial_state(self):
+        return (0,)
+    def transition(self, state, action, out):
+        out[0] = action
+    def is_terminal(self, state):
+        return state[0] == 1
+    def reward(self, state, action, next_state):
+        return 1.0 * next_state[0]
+"""
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A run of Q-learning on 9 cells with random actions."""
+    folder = tmp_path_factory.mktemp("runs") / "grid"
+    pharos.train("q_learning", "simple_grid", height=3, width=3, steps=2000, random=0.1, out=folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def entry(run):
+    """What it submits."""
+    return leaderboard.read(leaderboard.submit(run, run.parent / "grid.safetensors", author="A. Turing"))
+
+
+@pytest.fixture
+def file(entry, tmp_path):
+    """The file of the entry, one for each test."""
+    write(entry, tmp_path / "grid.safetensors")
+    return tmp_path / "grid.safetensors"
+
+
+def pharos_(*words):
+    return CliRunner().invoke(app, [str(word) for word in words])
+
+
+def changed(entry, file, **changes):
+    """The file with another entry, with digests that fit."""
+    write(dataclasses.replace(entry, **changes), file)
+    return file
+
+
+def test_what_a_table_claims_is_computed_again(run, file):
+    result, verdict = json.loads((run / "run.json").read_text())["result"], leaderboard.verify(file)
+    assert verdict.holds and verdict.exact and verdict.states == 9
+    assert abs(verdict.value - result["final_value"]) <= verdict.error_bound + 1e-9
+    assert abs(verdict.regret - result["final_regret"]) <= 1e-6
+    assert [check.name for check in verdict.checks] == ["value", "regret", "value_optimal", "value_uniform"]
+
+
+def test_the_same_run_gives_the_same_bytes(run, tmp_path):
+    one, two = (leaderboard.submit(run, tmp_path / f"{k}.safetensors", note="x") for k in range(2))
+    assert one.read_bytes() == two.read_bytes()
+    assert leaderboard.read(one).arrays["policy"].dtype == np.uint8
+
+
+def test_an_entry_is_a_file_of_safetensors(file):
+    length = struct.unpack("<Q", file.read_bytes()[:8])[0]
+    header = json.loads(file.read_bytes()[8 : 8 + length])
+    assert header["policy"] == {"dtype": "U8", "shape": [9], "data_offsets": [0, 9]}
+    assert all(isinstance(text, str) for text in header["__metadata__"].values())
+
+
+@pytest.mark.parametrize("name", ["value", "regret", "value_optimal", "value_uniform"])
+def test_a_claim_that_is_not_true_does_not_hold(entry, file, name):
+    claim = dataclasses.replace(entry.claim, **{name: getattr(entry.claim, name) + 1e-4, "error_bound": 1.0})
+    verdict = leaderboard.verify(changed(entry, file, claim=claim))
+    assert not verdict.holds
+    assert [check.name for check in verdict.checks if not check.holds] == [name]
+
+
+def test_another_policy_than_the_one_of_the_claim_does_not_hold(entry, file):
+    verdict = leaderboard.verify(changed(entry, file, arrays={"policy": np.zeros(9, np.uint8)}))
+    assert not verdict.holds and verdict.regret > 0.1
+
+
+def test_every_byte_that_is_cut_off_or_changed_is_told_in_one_line(file):
+    whole = file.read_bytes()
+    places = [*range(0, len(whole), 97), len(whole) - 1]
+    damaged = [whole[:k] for k in places] + [whole[:k] + bytes([whole[k] ^ 1]) + whole[k + 1 :] for k in places]
+    for data in [*damaged, whole + b"\0"]:
+        file.write_bytes(data)
+        with pytest.raises(FileFormatError, match=r"grid\.safetensors: ") as told:
+            leaderboard.read(file)
+        assert "\n" not in str(told.value)
+
+
+@pytest.mark.parametrize(
+    "place",
+    [
+        {"dtype": "F64", "shape": [1 << 40], "data_offsets": [0, 9]},
+        {"dtype": "F64", "shape": [1 << 62, 1 << 62], "data_offsets": [0, 1 << 127]},
+        {"dtype": "U8", "shape": [-9], "data_offsets": [0, 9]},
+        {"dtype": "object", "shape": [9], "data_offsets": [0, 9]},
+        {"dtype": "U8", "shape": [4], "data_offsets": [5, 9]},
+        {"dtype": "U8", "shape": "9", "data_offsets": [0, 9]},
+    ],
+)
+def test_sizes_are_held_against_the_file_before_anything_is_allocated(file, place):
+    data = file.read_bytes()
+    length = struct.unpack("<Q", data[:8])[0]
+    header = {**json.loads(data[8 : 8 + length]), "policy": place}
+    text = json.dumps(header).encode()
+    file.write_bytes(struct.pack("<Q", len(text)) + text + data[8 + length :])
+    with pytest.raises(ResultCorrupted, match="cut short or changed"):
+        leaderboard.read(file)
+    file.write_bytes(struct.pack("<Q", 1 << 60) + data[8:])
+    with pytest.raises(FileFormatError, match="its header would have"):
+        leaderboard.read(file)
+
+
+@pytest.mark.parametrize("text", ["\x1b[2J", "left\u202eright", "\ud800", "x" * 3000])
+def test_texts_that_would_not_be_shown_as_they_are_are_refused(entry, run, file, text):
+    with pytest.raises(FileFormatError, match=r"its author|its record is damaged"):
+        leaderboard.read(changed(entry, file, author=text))
+    with pytest.raises(ParameterError):
+        leaderboard.submit(run, file, author=text)
+    assert not file.exists()
+
+
+def test_tables_that_are_none_of_the_task_are_refused(entry, file):
+    for table in (np.full(9, 7, np.uint8), np.zeros(8, np.uint8), np.zeros((9, 2))):
+        with pytest.raises((FileFormatError, pharos.errors.StateSpaceTooLarge), match=r"grid\.safetensors: "):
+            leaderboard.verify(changed(entry, file, arrays={"policy": table}))
+
+
+def test_another_version_of_the_rules_is_another_mdp(entry, file):
+    with pytest.raises(FileFormatError, match="version 99 of the rules of simple_grid"):
+        leaderboard.verify(changed(entry, file, rules_version=99))
+
+
+@pytest.mark.parametrize(
+    ("part", "name"),
+    [("environment", "evil.py:Two"), ("observation", "evil.py:see"), ("agent", "stable_baselines3.common.utils:os")],
+)
+def test_names_of_code_are_refused_without_trust(entry, file, part, name):
+    config = dataclasses.replace(entry.config, **{part: name})
+    with pytest.raises(UntrustedCode, match="--trust"):
+        leaderboard.verify(changed(entry, file, config=config))
+
+
+def test_a_world_of_ones_own_is_executed_only_where_it_is_trusted(tmp_path, monkeypatch):
+    (tmp_path / "two.py").write_text(OWN)
+    monkeypatch.chdir(tmp_path)
+    pharos.train("q_learning", "two.py:Two", steps=200, out="run")
+    file = leaderboard.submit("run", "two.safetensors")
+    (tmp_path / "executed").unlink()
+    pharos.sources._MODULES.clear()
+    pharos.sources._LOADED.clear()
+    with pytest.raises(UntrustedCode, match=r"two\.py:Two.*--trust"):
+        leaderboard.verify(file)
+    assert not (tmp_path / "executed").exists()
+    assert leaderboard.verify(file, trust=True).holds
+    assert (tmp_path / "executed").exists()
+
+
+def test_an_estimate_says_that_it_is_one_and_holds_within_its_interval(entry, file):
+    exact = leaderboard.verify(file)
+    claim = dataclasses.replace(entry.claim, exact=False, error_bound=0.2)
+    verdict = leaderboard.verify(changed(entry, file, claim=claim), max_reached=1)
+    assert verdict.holds and not verdict.exact and verdict.episodes == 2000
+    assert abs(verdict.value - exact.value) <= verdict.error_bound
+    assert "estimated from 2,000 episodes" in pharos_("verify", file, "--max-reached", 1).stdout
+    overstated = leaderboard.verify(changed(entry, file, claim=entry.claim), max_reached=1)
+    assert overstated.claims_too_much and not overstated.holds
+
+
+def test_the_command_line_packs_verifies_and_tells(run, entry, file, tmp_path):
+    out = tmp_path / "mine.safetensors"
+    answer = json.loads(pharos_("submit", run, "--out", out, "--name", "mine", "--json").stdout)
+    assert answer["id"] == entry.id and answer["bytes"] == out.stat().st_size
+    done = pharos_("verify", out)
+    assert done.exit_code == 0 and "the claim holds" in done.stdout and "exact: evaluated in 9 states" in done.stdout
+    changed(entry, file, claim=dataclasses.replace(entry.claim, value=2.0))
+    failed = pharos_("verify", file, "--json")
+    assert failed.exit_code == 1 and not json.loads(failed.stdout)["checks"]["value"]["holds"]
+    out.write_bytes(out.read_bytes()[:-1])
+    both = pharos_("verify", out, file)
+    assert both.exit_code == 1 and "FAILS" in both.stdout
+    cut = pharos_("verify", out)
+    assert cut.exit_code == 1 and len(cut.stderr.splitlines()) == 1 and "cut short" in cut.stderr
+    assert pharos_("verify", tmp_path / "none.safetensors").exit_code == 2
+
+
+def test_the_page_ranks_what_was_computed_and_escapes_what_it_shows(entry, tmp_path):
+    folder = tmp_path / "entries"
+    folder.mkdir()
+    evil = "<img src=x onerror=alert(1)>"
+    changed(entry, folder / "good.safetensors", name=evil, author='"><script>', note='" onmouseover="x')
+    changed(entry, folder / "liar.safetensors", claim=dataclasses.replace(entry.claim, value=9.0, regret=-8.0))
+    (folder / "cut<b>.safetensors").write_bytes(b"abc")
+    made = leaderboard.board(folder, tmp_path / "board.html", title="<i>")
+    page = made.file.read_text()
+    assert len(made.verified) == 1 and set(made.refused) == {"liar.safetensors", "cut<b>.safetensors"}
+    assert "value is" in made.refused["liar.safetensors"]
+    for wrong in (evil, '"><script>', '" onmouseover="x', "<i>", "cut<b>", "http"):
+        assert wrong not in page.replace("http-equiv", "")
+    assert page.count("<script>") == 1 and "&lt;img src=x" in page and "A. Turing" not in page
+    assert "script-src 'sha256-" in page
+    with pytest.raises(ParameterError, match="expected a folder with entries"):
+        leaderboard.board(tmp_path / "nothing", tmp_path / "board.html")
+
+
+@pytest.mark.slow
+def test_what_a_network_claims_is_computed_again(tmp_path):
+    pytest.importorskip("stable_baselines3")
+    options = {"net_arch": [16, 8], "buffer_size": 500}
+    pharos.train("dqn", "simple_grid", height=3, width=3, steps=300, hyperparameters=options, out=tmp_path / "run")
+    file = leaderboard.submit(tmp_path / "run", tmp_path / "dqn.safetensors")
+    entry = leaderboard.read(file)
+    assert not any("optimizer" in name for name in entry.arrays)
+    assert leaderboard.verify(file).holds
+    for given in ({"net_arch": [1 << 20, 1 << 20]}, {"net_arch": [16, 16]}, {"policy_kwargs": {"activation_fn": "x"}}):
+        with pytest.raises(FileFormatError, match=r"dqn\.safetensors: its"):
+            leaderboard.verify(changed(entry, file, hyperparameters={**entry.hyperparameters, **given}))
+    few = dict(list(entry.arrays.items())[1:])
+    with pytest.raises(FileFormatError, match=r"its network is none of dqn|does not have"):
+        leaderboard.verify(changed(entry, file, arrays=few))
