@@ -47,6 +47,12 @@ def clipped(lane, i, max_norm):
     return {name: value * scale for name, value in lane.as_stored(lane.gradient_views, i).items()}
 
 
+def as_stored(observations):
+    """Images as Stable-Baselines3 keeps them: channels first."""
+    is_turned = observations.ndim == 4 and observations.shape[-1] < observations.shape[1]
+    return np.ascontiguousarray(observations.transpose(0, 3, 1, 2)) if is_turned else observations
+
+
 def losses_of(model):
     """The losses that the model records, as they come."""
     losses = []
@@ -61,7 +67,17 @@ def task(request):
 
 @pytest.mark.parametrize("max_grad_norm", (0.05, 10.0))
 def test_updates_of_dqn_are_those_of_stable_baselines3(task, max_grad_norm):
-    hyperparameters = {**DQN, "max_grad_norm": max_grad_norm}
+    check_updates_of_dqn(task, {**DQN, "max_grad_norm": max_grad_norm}, 6)
+
+
+@pytest.mark.slow
+def test_updates_of_the_three_convolutions_are_those_of_stable_baselines3():
+    task = Task.of(make("frozen_lake/4x4"), observation="complex_image")
+    assert min(task.sight.observe.space.shape[:2]) >= 36
+    check_updates_of_dqn(task, {**DQN, "batch_size": 4, "learning_starts": 59}, 2)
+
+
+def check_updates_of_dqn(task, hyperparameters, number):
     batch = batch_of("dqn", task, hyperparameters)
     batch.learn([60], lambda point: None)
     lane, i = batch.lanes[0], 1
@@ -74,17 +90,18 @@ def test_updates_of_dqn_are_those_of_stable_baselines3(task, max_grad_norm):
 
     def minibatch(size, env=None):
         drawn = lane.replay
-        parts = (source.at(drawn.states[i]), drawn.actions[i][:, None], source.at(drawn.next_states[i]))
+        seen, following = (as_stored(source.at(states[i])) for states in (drawn.states, drawn.next_states))
+        parts = (seen, drawn.actions[i][:, None], following)
         ends = (drawn.discounts[i] == 0).astype(np.float32)
         return ReplayBufferSamples(*map(torch.from_numpy, (*parts, ends[:, None], drawn.rewards[i][:, None])))
 
     model.replay_buffer.sample = minibatch
-    for update in range(6):
+    for update in range(number):
         lane.replay.sample(60, update, lane.own["gamma"], 1)
         lane.learn_minibatch()
-        model.train(1, 16)
+        model.train(1, hyperparameters["batch_size"])
         assert abs(losses[-1] - lane.losses[i]) <= 1e-6
-        gradients = clipped(lane, i, max_grad_norm)
+        gradients = clipped(lane, i, hyperparameters["max_grad_norm"])
         for name, parameter in model.policy.q_net.named_parameters():
             assert np.abs(parameter.grad.numpy() - gradients[f"q_net.{name}"]).max() <= 1e-6
         assert_same_parameters(model, batch.parameters(i))
