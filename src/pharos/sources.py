@@ -122,11 +122,11 @@ def load(source: Source) -> Any:
     """
     try:
         module = _module_of_file(source) if source.module is None else _module_called(source)
-        found = getattr(module, source.attribute, None) if source.attribute else None
+        target = getattr(module, source.attribute, None) if source.attribute else None
     except Exception as error:
         raise ParameterError(f"{source.name!r}: {_in_a_line(error)}; {_EXPECTED}") from error
-    _LOADED[source.name] = (source, found)
-    return found
+    _LOADED[source.name] = (source, target)
+    return target
 
 
 def resolve(source: Source, *, trust: bool = False, strict: bool = False) -> Any:
@@ -210,14 +210,14 @@ def _module_of_file(source: Source) -> ModuleType:
 def _module_called(source: Source) -> ModuleType:
     """The module; its folder is searched first while it is imported."""
     name = source.module or ""
-    known = sys.modules.get(name)
-    if known is not None:
-        file = getattr(known, "__file__", None)
+    module = sys.modules.get(name)
+    if module is not None:
+        file = getattr(module, "__file__", None)
         if file and source.file and Path(file).resolve() != Path(source.file):
             raise ImportError(
                 f"the module {name} of {file} is loaded already; name the file: {source.file}:{source.attribute}"
             )
-        return known
+        return module
     root = Path(source.file).parent
     for _ in range(name.count(".") + (Path(source.file).name == "__init__.py")):
         root = root.parent

@@ -67,16 +67,16 @@ def check_hyperparameters(agent: str | type, hyperparameters: Mapping[str, Any])
             one.
     """
     name = _title(agent)
-    taken = inspect.signature(algorithm(agent)).parameters
-    if all(each.kind is not inspect.Parameter.VAR_KEYWORD for each in taken.values()):
-        known = sorted({*taken, "n_envs", "n_timesteps", "net_arch"} - OURS)
-        for given in hyperparameters:
-            if given not in known:
-                raise UnknownName(f"hyperparameter of {name}", given, known)
-    for given, value in hyperparameters.items():
-        expected = _expected(given, value)
+    parameters = inspect.signature(algorithm(agent)).parameters
+    if all(each.kind is not inspect.Parameter.VAR_KEYWORD for each in parameters.values()):
+        names = sorted({*parameters, "n_envs", "n_timesteps", "net_arch"} - OURS)
+        for hyperparameter in hyperparameters:
+            if hyperparameter not in names:
+                raise UnknownName(f"hyperparameter of {name}", hyperparameter, names)
+    for hyperparameter, value in hyperparameters.items():
+        expected = _expected(hyperparameter, value)
         if expected is not None:
-            raise ParameterError(f"agent {name!r}: {given} is {value!r}; expected {expected}")
+            raise ParameterError(f"agent {name!r}: {hyperparameter} is {value!r}; expected {expected}")
 
 
 def _title(agent: str | type) -> str:

@@ -43,7 +43,7 @@ def build(
 
     env = parse_environment(environment, parameters)
     limit = parse_size(memory)
-    found = _is_there(out or cached_folder(env))
+    was_there = _is_there(out or cached_folder(env))
     watch = Stopwatch()
     space = state_space.build(env, out, memory=limit, workers=workers, max_states=max_states)
     seconds = watch.seconds
@@ -62,7 +62,7 @@ def build(
         "peak_memory_bytes": peak,
         "bytes_on_disk": bytes_on_disk,
         "folder": str(space.folder),
-        "found": found,
+        "found": was_there,
     }
     if json:
         print_json(answer)
@@ -74,7 +74,10 @@ def build(
             ("actions", f"{space.num_actions} ({', '.join(env.actions)})"),
             *_outcomes(space),
             ("depth", f"{space.depth:,}"),
-            ("seconds", f"{seconds:.2f} (it was there already)" if found else f"{seconds:.2f} ({rate:,.0f} states/s)"),
+            (
+                "seconds",
+                f"{seconds:.2f} (it was there already)" if was_there else f"{seconds:.2f} ({rate:,.0f} states/s)",
+            ),
             *compiling_fact(),
             ("peak memory", size_text(peak)),
             ("on disk", size_text(bytes_on_disk)),

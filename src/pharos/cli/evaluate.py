@@ -64,14 +64,14 @@ def evaluate(
     """Evaluate a policy exactly, and say where it stands: regret 0 is optimal, 1 is as bad as playing at random."""
     building = build_options(memory, workers, max_states)
     goal = parse_target(target, parameters)
-    given = None if policy in POLICIES else read_policy(policy, trust=trust)
+    decisions = None if policy in POLICIES else read_policy(policy, trust=trust)
     if goal.is_imported and Path(policy).expanduser().is_dir():  # what was learnt on the environment of the table
         table = goal.mdp()
         gamma, horizon = table.gamma if gamma is None else gamma, table.horizon if horizon is None else horizon
         goal = Target(target, environment=goal.found_environment())
     mdp = goal.mdp(gamma=gamma, horizon=horizon, sticky=sticky, random=random, lazy=lazy, **building)
     with progress_line("evaluating"):
-        values = _values(mdp, policy, given, tolerance)
+        values = _values(mdp, policy, decisions, tolerance)
     best, uniform, worst = (values[name].value_at_start for name in POLICIES)
     solution = values["given"]
     value = solution.value_at_start
@@ -112,20 +112,20 @@ def evaluate(
     )
 
 
-def _values(mdp: "TabularMDP", policy: str, given: "Given | None", tolerance: float) -> dict[str, Any]:
-    values: dict[str, Any] = {} if given is None else {"given": solution_of(mdp, policy, given, tolerance)}
+def _values(mdp: "TabularMDP", policy: str, decisions: "Given | None", tolerance: float) -> dict[str, Any]:
+    values: dict[str, Any] = {} if decisions is None else {"given": solution_of(mdp, policy, decisions, tolerance)}
     values |= {name: solution_of(mdp, name, None, tolerance) for name in POLICIES}
     values.setdefault("given", values.get(policy))
     return values
 
 
-def solution_of(mdp: "TabularMDP", policy: str, given: "Given | None", tolerance: float) -> "Solution":
+def solution_of(mdp: "TabularMDP", policy: str, decisions: "Given | None", tolerance: float) -> "Solution":
     """The values of a policy: one of POLICIES, or what `read_policy` gave."""
     from pharos.policies import evaluate_policy
     from pharos.solvers import uniform_value, value_iteration, worst_value
 
-    if given is not None:
-        return evaluate_policy(mdp, given[0], tolerance, **given[1])
+    if decisions is not None:
+        return evaluate_policy(mdp, decisions[0], tolerance, **decisions[1])
     return {"optimal": value_iteration, "uniform": uniform_value, "worst": worst_value}[policy](mdp, tolerance)
 
 

@@ -123,11 +123,11 @@ def hardness(
         lazy=lazy,
         **building,
     )
-    seen = None
+    representation = None
     if observation is not None:
         words = parse_parameters(option)
         named = {"network": network, "initialisation": initialisation, "landmarks": landmarks}
-        mdp, seen = _represented(goal, mdp, observation, building, {**words, **named})
+        mdp, representation = _represented(goal, mdp, observation, building, {**words, **named})
     from pharos.hardness import Schedule
     from pharos.hardness import report as measure
 
@@ -141,8 +141,8 @@ def hardness(
             budget=budget,
             keep=not fresh,
             progress=lambda what, line: tell(f"{what}  {line}"),
-            representation=seen,
-            schedule=None if seen is None else Schedule(optimizer=optimizer),
+            representation=representation,
+            schedule=None if representation is None else Schedule(optimizer=optimizer),
         )
     if json:
         print_json({**report.to_dict(), "compiling_seconds": compiling.seconds()})

@@ -75,9 +75,9 @@ def gymnasium(
 
     from pharos import importers
 
-    given = parse_parameters(option)
+    options = parse_parameters(option)
     try:
-        env = package.make(name, disable_env_checker=True, **given)
+        env = package.make(name, disable_env_checker=True, **options)
     except Exception as error:  # whatever an environment does with options that are none of its own
         said = " ".join(str(error).split())
         raise ParameterError(f"{name}: Gymnasium cannot make it: {said or type(error).__name__}") from None

@@ -72,16 +72,16 @@ def observations(
     options = parse_parameters(option)
     if options and not observation:
         raise ParameterError("--option goes with --observation NAME")
-    asked = tuple((name, options) for name in observation) if observation else COUNTED
+    choices = tuple((name, options) for name in observation) if observation else COUNTED
     space = parse_target(target, parameters).space(**build_options(memory, workers, max_states))
     if space.environment is None:
         raise ParameterError(f"{target}: pharos does not know the class of this environment; name it as module:Class")
     if not observation and not space.environment.has_motion:
-        asked = tuple((name, options) for name, options in asked if "motion" not in options)
+        choices = tuple((name, options) for name, options in choices if "motion" not in options)
     if not observation and space.environment.recorded is not None:
-        asked += (("recorded", {}),)
+        choices += (("recorded", {}),)
     price = _Price(space, discount(gamma, None), random, budget)
-    entries = [_entry(space, name, options, price, strict=bool(observation)) for name, options in asked]
+    entries = [_entry(space, name, options, price, strict=bool(observation)) for name, options in choices]
     if json:
         answer = {"environment": space.environment.name, "parameters": space.environment.parameters}
         terminal = int(space.terminal.sum())
@@ -140,20 +140,20 @@ def _entry(space: "StateSpace", name: str, options: dict[str, Any], price: _Pric
     entry: dict[str, Any] = {"observation": name, "options": options}
     env: Any = space.environment
     try:
-        seen = observe(env, name, state_space=space, **options)
+        observer = observe(env, name, state_space=space, **options)
     except ParameterError as error:
         if strict:
             raise
         return entry | {"unavailable": str(error)}
     with progress_bar("observing", space.num_states, name) as progress:
-        if seen.frames > 1:
-            classes, counts = None, history_aliasing(space, seen, progress=progress)
+        if observer.frames > 1:
+            classes, counts = None, history_aliasing(space, observer, progress=progress)
         else:
-            classes = observation_classes(space, seen, progress=progress)
+            classes = observation_classes(space, observer, progress=progress)
             counts = counted(classes, np.asarray(space.terminal))
     return entry | {
-        "shape": list(seen.space.shape or ()),
-        "dtype": str(seen.space.dtype),
+        "shape": list(observer.space.shape or ()),
+        "dtype": str(observer.space.dtype),
         "num_observations": counts.num_observations,
         "num_sharing": counts.num_sharing,
         "share": counts.share,

@@ -66,12 +66,12 @@ def value(
     """Draw the values and the actions of a policy over the cells of a grid."""
     check_format(out, FIGURES)
     goal = parse_target(target, parameters)
-    given = None if policy in POLICIES else read_policy(policy, trust=trust)
+    decisions = None if policy in POLICIES else read_policy(policy, trust=trust)
     mdp = goal.mdp(gamma=gamma, horizon=horizon, random=random)
     from pharos import plots
     from pharos.cli.evaluate import solution_of
 
-    solution = solution_of(mdp, policy, given, 1e-6)
+    solution = solution_of(mdp, policy, decisions, 1e-6)
     name = policy if policy in POLICIES else Path(policy).name
     title = f"{' '.join((target, *(parameters or ())))}, {name}"
     if random:
@@ -111,8 +111,8 @@ def plane(
             mdp = parse_target(text).mdp(gamma=gamma)
             reports[text] = hardness.report(mdp, [visitation, estimation], budget=budget)
     drawn = plots.hardness_plane(reports, visitation=visitation, estimation=estimation)
-    found = {text: {name: report[name].value for name in (visitation, estimation)} for text, report in reports.items()}
-    _save(drawn, out, json, {"measures": found})
+    values = {text: {name: report[name].value for name in (visitation, estimation)} for text, report in reports.items()}
+    _save(drawn, out, json, {"measures": values})
 
 
 @app.command()

@@ -59,8 +59,8 @@ def render(
     goal = parse_target(target, parameters)
     suffix = check_format(out, (".png", ".gif", ".txt")) if out else ""
     options = parse_parameters(option)
-    if observation != "text" and observation not in (known := observations.renderers()):
-        raise UnknownName("observation to render", observation, [*known, "text"])
+    if observation != "text" and observation not in (renderers := observations.renderers()):
+        raise UnknownName("observation to render", observation, [*renderers, "text"])
     if policy not in POLICIES:
         raise UnknownName("policy", policy, POLICIES)
     env = environment_of(goal)

@@ -284,12 +284,12 @@ def _answer(status: Any, json: bool) -> None:
 def _progress() -> Iterator[Callable[[Any], None]]:
     """A bar on a terminal; elsewhere a line on standard error now and then."""
     if not sys.stderr.isatty():
-        told = time.monotonic()
+        last_line = time.monotonic()
 
         def say(status: Any) -> None:
-            nonlocal told
-            if time.monotonic() - told > LINE_SECONDS:
-                told = time.monotonic()
+            nonlocal last_line
+            if time.monotonic() - last_line > LINE_SECONDS:
+                last_line = time.monotonic()
                 complain(status)
 
         yield say

@@ -110,10 +110,10 @@ def train(
     from pharos.agents import hyperparameters as hyperparameters_of
     from pharos.experiments import train as learn
 
-    given = parse_parameters(hyperparameter)
+    hyperparameters = parse_parameters(hyperparameter)
     if table is not None:
-        seen = agent_kind(agent).observation(observation)
-        given = hyperparameters_of(agent, env.name, seen, given, table=table)
+        sight = agent_kind(agent).observation(observation)
+        hyperparameters = hyperparameters_of(agent, env.name, sight, hyperparameters, table=table)
 
     setting: dict[str, Any] = {
         "steps": steps,
@@ -127,7 +127,7 @@ def train(
         "gamma": gamma if gamma is not None else 0.99 if endless else 1.0,
         "horizon": None if endless else horizon or "default",
         "evaluation_interval": interval,
-        "hyperparameters": given,
+        "hyperparameters": hyperparameters,
         "engine": engine,
         "out": out,
     }
@@ -191,8 +191,8 @@ def _quartiles(values: list[float | None]) -> list[float] | None:
     """Lower quartile, median, upper quartile; None where there is no number."""
     import numpy as np
 
-    known = [value for value in values if value is not None and math.isfinite(value)]
-    return [float(value) for value in np.quantile(known, (0.25, 0.5, 0.75))] if known else None
+    numbers = [value for value in values if value is not None and math.isfinite(value)]
+    return [float(value) for value in np.quantile(numbers, (0.25, 0.5, 0.75))] if numbers else None
 
 
 def _facts_of_many(
@@ -203,8 +203,8 @@ def _facts_of_many(
     setting: Mapping[str, Any],
 ) -> list[tuple[str, object]]:
     facts: list[tuple[str, object]] = []
-    for name, found in spread.items():
-        low, middle, high = found or (math.nan,) * 3
+    for name, quartiles in spread.items():
+        low, middle, high = quartiles or (math.nan,) * 3
         facts.append((name.replace("_", " "), f"median {middle:.4g}, quartiles {low:.4g} to {high:.4g}"))
     if results:
         some = next(iter(results.values())).result

@@ -199,14 +199,14 @@ def _random_tiles(size: int, seed: int, frozen_probability: float) -> np.ndarray
 
 def _has_a_way(tiles: np.ndarray) -> bool:
     frontier = [tuple(cell) for cell in np.argwhere(tiles == START)]
-    seen = set(frontier)
+    region = set(frontier)
     while frontier:
         row, column = frontier.pop()
         if tiles[row, column] == GOAL:
             return True
         for cell in ((row - 1, column), (row + 1, column), (row, column - 1), (row, column + 1)):
             inside = 0 <= cell[0] < tiles.shape[0] and 0 <= cell[1] < tiles.shape[1]
-            if inside and cell not in seen and tiles[cell] != HOLE:
-                seen.add(cell)
+            if inside and cell not in region and tiles[cell] != HOLE:
+                region.add(cell)
                 frontier.append(cell)
     return False

@@ -252,12 +252,15 @@ def written_out(
     Raises:
         ParameterError: they are more than MOST_ENTRIES numbers. ValueError: they are no table of an MDP.
     """
-    given = likely if paid is None else paid
-    if not len(rows) == len(successors) == len(likely) == len(given) or not (np.isfinite(likely) & (likely >= 0)).all():
+    payments = likely if paid is None else paid
+    if (
+        not len(rows) == len(successors) == len(likely) == len(payments)
+        or not (np.isfinite(likely) & (likely >= 0)).all()
+    ):
         raise ValueError("successors and probabilities do not fit")
     order = np.argsort(rows, kind="stable")
     order = order[likely[order] > 0]
-    rows, successors, likely, given = rows[order], successors[order].astype(np.int64), likely[order], given[order]
+    rows, successors, likely, payments = rows[order], successors[order].astype(np.int64), likely[order], payments[order]
     if len(successors) == 0 or successors.min() < -1 or successors.max() >= states:
         raise ValueError(f"a successor is not among the {states} states")
     counts = np.bincount(rows, minlength=states * actions)
@@ -279,5 +282,5 @@ def written_out(
     if paid is None:
         return table.reshape(shape), chances.reshape(shape), None
     rewards = np.zeros((count * actions, most))
-    rewards[rows, place] = given
+    rewards[rows, place] = payments
     return table.reshape(shape), chances.reshape(shape), rewards.reshape(shape)

@@ -130,9 +130,9 @@ class MiniGrid(Environment):
     }
 
     def validate(self) -> None:
-        given = {name: getattr(self, name) for name in ("size", "seed", "rows", "rooms", "crossings", "strip")}
+        options = {name: getattr(self, name) for name in ("size", "seed", "rows", "rooms", "crossings", "strip")}
         if self.level is not None:
-            others = [name for name, value in {"kind": self.kind, **given}.items() if value is not None]
+            others = [name for name, value in {"kind": self.kind, **options}.items() if value is not None]
             if others:
                 raise ParameterError(f"MiniGrid: level was given with {', '.join(others)}; expected a level alone")
             store(self, "level", "/".join(rows_of(self.level)))
@@ -141,7 +141,7 @@ class MiniGrid(Environment):
             if self.target is not None:
                 raise ParameterError(f"MiniGrid: target={self.target!r} goes with level=...; a kind has its own")
             store(self, "kind", self.kind or "empty")
-            for name, value in given.items():
+            for name, value in options.items():
                 store(self, name, self._completed(name, value))
         _ = self.parsed
 
@@ -222,8 +222,8 @@ class MiniGrid(Environment):
         return KINDS[str(self.kind)].max_steps(self.size or 0, self.rooms or 0)
 
     def __str__(self) -> str:
-        given = ", ".join(f"{name}={value!r}" for name, value in self.parameters.items() if value is not None)
-        return f"MiniGrid({given})"
+        arguments = ", ".join(f"{name}={value!r}" for name, value in self.parameters.items() if value is not None)
+        return f"MiniGrid({arguments})"
 
     # The rules ------------------------------------------------------------------------------------------------------
 

@@ -89,25 +89,25 @@ def _target(target: str | None, doors: list[str], things: list[str]) -> tuple[in
     """(door, thing) that is the target; -1: none."""
     if target is None:
         return -1, -1
-    found = [(i, -1) for i, text in enumerate(doors) if text == target and text[0] != "O"]
-    found += [(-1, i) for i, text in enumerate(things) if text == target]
-    if len(found) != 1:
-        known = sorted({*things, *(text for text in doors if text[0] != "O")})
+    matches = [(i, -1) for i, text in enumerate(doors) if text == target and text[0] != "O"]
+    matches += [(-1, i) for i, text in enumerate(things) if text == target]
+    if len(matches) != 1:
+        names = sorted({*things, *(text for text in doors if text[0] != "O")})
         raise ParameterError(
-            f"MiniGrid: target={target!r} is {len(found)} of the closed doors and things of the level; "
-            f"expected one of {', '.join(known) or 'none'} that is there once"
+            f"MiniGrid: target={target!r} is {len(matches)} of the closed doors and things of the level; "
+            f"expected one of {', '.join(names) or 'none'} that is there once"
         )
-    return found[0]
+    return matches[0]
 
 
 def _check_walls(cells: np.ndarray, start: tuple[int, int]) -> None:
     """ParameterError where the player can come to the border of the grid, through doors of any condition."""
-    seen, frontier = {start}, [start]
+    region, frontier = {start}, [start]
     while frontier:
         row, column = frontier.pop()
         if not (0 < row < len(cells) - 1 and 0 < column < cells.shape[1] - 1):
             raise ParameterError(f"MiniGrid: level has a way out at row {row}, column {column}; close it with ##")
         for cell in ((row - 1, column), (row + 1, column), (row, column - 1), (row, column + 1)):
-            if cell not in seen and cells[cell] != BLOCKED:
-                seen.add(cell)
+            if cell not in region and cells[cell] != BLOCKED:
+                region.add(cell)
                 frontier.append(cell)

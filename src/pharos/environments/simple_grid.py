@@ -84,16 +84,16 @@ class SimpleGrid(Environment):
             store(self, "goal", (self.height - 1, self.width - 1))
         if self.goal == (0, 0):
             raise ParameterError("SimpleGrid: goal=(0, 0); expected another cell than the start")
-        taken = {(0, 0): "the start", self.goal: "the goal"}
+        contents = {(0, 0): "the start", self.goal: "the goal"}
         for name in ("rewards", "penalties"):
             for place, value in getattr(self, name):
-                if place in taken:
+                if place in contents:
                     raise ParameterError(
-                        f"SimpleGrid: {name} has {place}, which is {taken[place]}; expected another cell"
+                        f"SimpleGrid: {name} has {place}, which is {contents[place]}; expected another cell"
                     )
                 if name == "penalties" and value >= 0:
                     raise ParameterError(f"SimpleGrid: penalties has {value} at {place}; expected a value below 0")
-                taken[place] = f"already among the {name}"
+                contents[place] = f"already among the {name}"
 
     def variables(self):
         return {"row": range(self.height), "column": range(self.width)}

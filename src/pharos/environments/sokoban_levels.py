@@ -20,16 +20,16 @@ LARGEST_FILE = 2**26
 Cell = tuple[int, int]
 
 
-def level_text(given: str) -> str:
+def level_text(source: str) -> str:
     """The level in one line: of a text, or of a file, `levels.txt` or `levels.txt:3`; ValueError says what is wrong.
 
     In a file a line such as "; 3" begins level 3, as in Boxoban's; without such lines empty lines separate levels, and
     they count from 0.
     """
-    if set(given) <= set(LETTERS + " _/\n"):
-        rows = re.split(r"[/\n]", given.strip("\n"))
+    if set(source) <= set(LETTERS + " _/\n"):
+        rows = re.split(r"[/\n]", source.strip("\n"))
     else:
-        file, _, number = given.rpartition(":") if re.search(r":\d+$", given) else (given, "", "0")
+        file, _, number = source.rpartition(":") if re.search(r":\d+$", source) else (source, "", "0")
         rows = _levels_of(Path(file)).get(int(number), [])
         if not rows:
             raise ValueError(f"the file has no level {number}")

@@ -58,10 +58,10 @@ class ChanceSetting:
         Raises:
             UnknownName: another kind of chance. ParameterError: noise or delay is out of range.
         """
-        known = [each.name for each in fields(ChanceSetting)]
+        names = [each.name for each in fields(ChanceSetting)]
         for name in entry:
-            if name not in known:
-                raise UnknownName("kind of chance", name, known)
+            if name not in names:
+                raise UnknownName("kind of chance", name, names)
         delay = entry.get("reward_delay", 0)
         whole = int(delay) if isinstance(delay, float) and delay.is_integer() else delay  # as `--chance` reads it
         return ChanceSetting(**{**entry, "reward_delay": whole})  # type: ignore[arg-type]
@@ -248,12 +248,12 @@ class RunConfig:
         Raises:
             FileFormatError: an entry is missing, unknown or of another type.
         """
-        known = [each.name for each in fields(RunConfig)]
-        missing = [name for name in known if name not in entry and name not in ("sources", "engine")]
-        unknown = [name for name in entry if name not in known]
+        names = [each.name for each in fields(RunConfig)]
+        missing = [name for name in names if name not in entry and name not in ("sources", "engine")]
+        unknown = [name for name in entry if name not in names]
         if missing or unknown:
             wrong = f"lacks {', '.join(missing)}" if missing else f"has the unknown entry {unknown[0]!r}"
-            raise FileFormatError(f"the configuration of a run {wrong}; expected {', '.join(known)}")
+            raise FileFormatError(f"the configuration of a run {wrong}; expected {', '.join(names)}")
         try:
             sources = {part: Source.from_dict(source) for part, source in entry.get("sources", {}).items()}
             return RunConfig(**{**entry, "chance": ChanceSetting.from_dict(entry["chance"]), "sources": sources})

@@ -17,18 +17,18 @@ class Curve:
 
     def add(self, step: int, episodes: int, returns: float, agent: Any) -> dict[str, Any]:
         """Evaluate the policy after `step` steps and `episodes` finished episodes, whose returns sum to `returns`."""
-        found = evaluate_agent(agent, self.task)
+        evaluation = evaluate_agent(agent, self.task)
         best, uniform = self.task.reference.optimal, self.task.reference.uniform
         last = self.rows[-1] if self.rows else None
         finished = episodes - (last["episodes"] if last else 0)
         gained = returns - (last["returns"] if last else 0.0)
         mean = gained / finished if finished else math.nan
-        regret = best - found.value
+        regret = best - evaluation.value
         spread = best - uniform
         row = {
             "step": step,
             "episodes": episodes,
-            "value": found.value,
+            "value": evaluation.value,
             "expected_regret": regret,
             "cumulative_expected_regret": (
                 last["cumulative_expected_regret"] + finished * last["expected_regret"] if last else 0.0
@@ -37,8 +37,8 @@ class Curve:
             "mean_return": mean,
             "realised_regret": best - mean,
             "cumulative_realised_regret": episodes * best - returns,
-            "exact": found.exact,
-            "error_bound": found.error_bound,
+            "exact": evaluation.exact,
+            "error_bound": evaluation.error_bound,
             "returns": returns,
         }
         self.rows.append(row)

@@ -73,7 +73,7 @@ def train_many(
         gamma=gamma,
         horizon=horizon,
     )
-    given = given_hyperparameters(agent, task, hyperparameters)
+    values = given_hyperparameters(agent, task, hyperparameters)
     configs = [
         RunConfig.of_task(
             task,
@@ -81,7 +81,7 @@ def train_many(
             steps=steps,
             seed=seed,
             evaluation_interval=evaluation_interval,
-            hyperparameters=given,
+            hyperparameters=values,
             engine=engine,
         )
         for seed in numbers

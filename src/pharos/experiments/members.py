@@ -99,8 +99,8 @@ class Members:
         self._once("task", config, TASK, lambda: task)
 
     def _task(self, config: RunConfig) -> Task:
-        known = self.values(config) if self.values is not None else None
-        task = config.task(known, trust=self.trust, strict=self.strict)
+        values = self.values(config) if self.values is not None else None
+        task = config.task(values, trust=self.trust, strict=self.strict)
         space, plain = self._once("world", config, WORLD, lambda: (task.space, task.space.mdp(gamma=task.gamma)))
         vars(task).update(space=space, mdp=task.chance.of(plain.with_horizon(task.horizon_steps)))
         return task

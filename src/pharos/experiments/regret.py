@@ -135,8 +135,8 @@ class RegretCurve:
         """
         curve, result = _results.read_curve(folder), _results.read_record(folder)["result"]
         episodes = curve["episodes"].to_numpy(np.int64)
-        found = [result[f"value_{name}"] for name in ("optimal", "uniform", "worst")]
-        values = ReferenceValues(*(math.nan if value is None else value for value in found))
+        entries = [result[f"value_{name}"] for name in ("optimal", "uniform", "worst")]
+        values = ReferenceValues(*(math.nan if value is None else value for value in entries))
         returns = episodes * values.optimal - curve["cumulative_realised_regret"].to_numpy(np.float64)
         return RegretCurve(curve["step"].to_numpy(np.int64), episodes, curve["value"].to_numpy(float), returns, values)
 

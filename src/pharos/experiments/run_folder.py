@@ -124,10 +124,10 @@ class Checkpoint:
         """(rows of the curve, seconds spent) of the last checkpoint, from which the learner goes on; or None."""
         for folder in (self.folder, self.folder.with_name(f"{self.folder.name}.old")):
             try:
-                kept = json.loads((folder / "curve.json").read_text())
+                record = json.loads((folder / "curve.json").read_text())
             except (FileNotFoundError, ValueError):
                 continue
-            if kept.get("id") == self.id:
+            if record.get("id") == self.id:
                 learner.load(folder)
-                return kept["rows"], kept["seconds"]
+                return record["rows"], record["seconds"]
         return None

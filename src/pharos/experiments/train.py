@@ -112,10 +112,10 @@ def task_for(
     agent: str, environment: Environment | str, parameters: Mapping[str, Any], *, observation: str, **setting: Any
 ) -> Task:
     """The task of an agent that asks for an observation, which tables do not get; `setting` as `train` takes it."""
-    seen = agent_kind(agent).observation(observation)
+    sight = agent_kind(agent).observation(observation)
     options = dict(setting.pop("observation_options") or {})
     made = make(environment, **parameters) if isinstance(environment, str) else environment
-    return Task(made, observation=own_observation(seen) or seen, observation_options=options, **setting)
+    return Task(made, observation=own_observation(sight) or sight, observation_options=options, **setting)
 
 
 def train_on(
@@ -145,12 +145,12 @@ def train_on(
 
 
 def given_hyperparameters(
-    agent: str, task: Task, given: Mapping[str, Any] | str | os.PathLike | None
+    agent: str, task: Task, source: Mapping[str, Any] | str | os.PathLike | None
 ) -> Mapping[str, Any] | None:
     """Those of a mapping, or of a YAML file for this agent and task."""
-    if given is None or isinstance(given, Mapping):
-        return given
-    return hyperparameters_of(agent, task.env.name, str(task.observation), table=Path(given))
+    if source is None or isinstance(source, Mapping):
+        return source
+    return hyperparameters_of(agent, task.env.name, str(task.observation), table=Path(source))
 
 
 def train_config(

@@ -320,12 +320,12 @@ def _claim(folder: Path, config: Mapping[str, Any]) -> None:
     """Make the folder; ParameterError where another search lies there."""
     folder.mkdir(parents=True, exist_ok=True)
     try:
-        kept = json.loads((folder / "tuning.json").read_text(encoding="utf-8"))["config"]
+        record = json.loads((folder / "tuning.json").read_text(encoding="utf-8"))["config"]
     except FileNotFoundError:
         return
     except (ValueError, KeyError, TypeError):
         raise ParameterError(f"{folder}/tuning.json: is not the record of a search; choose another folder") from None
-    different = [key for key in config if kept.get(key) != config[key]]
+    different = [key for key in config if record.get(key) != config[key]]
     if different:
         raise ParameterError(f"{folder}: holds a search with another {', '.join(different)}; choose another folder")
 

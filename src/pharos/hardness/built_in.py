@@ -183,8 +183,8 @@ def _of_representation(function: Any) -> Any:
     """A measure of what the agent sees, as a report takes it."""
 
     def measure(problem: Problem) -> Any:
-        seen = problem.seen(function.__name__)
-        return function(problem.mdp, seen, schedule=problem.schedule, horizon=problem.horizon)
+        representation = problem.seen(function.__name__)
+        return function(problem.mdp, representation, schedule=problem.schedule, horizon=problem.horizon)
 
     return measure
 

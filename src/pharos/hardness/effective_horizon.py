@@ -113,12 +113,12 @@ def _vectorized(tree: Steps) -> dict[str, Any]:
 def _compiled(table: Any) -> dict[str, Any]:
     """The same, for each k in turn."""
     steps, best = table.steps, float(table.steps)
-    found: list[tuple[int, int, float, float]] = []
+    rows: list[tuple[int, int, float, float]] = []
     greedy: list[float] = []
     k_min, k = 0, 1
     while k < best or k <= GREEDY_RETURNS or not k_min:
         if k < best and (needed := table.samples(k)) is not None:
-            found.append((k, *needed))
+            rows.append((k, *needed))
             best = min(best, k + (math.log(needed[0]) / math.log(table.num_actions) if table.num_actions > 1 else 0.0))
         if not k_min and (table.is_greedy_optimal() or k == steps):
             k_min = k
@@ -131,7 +131,7 @@ def _compiled(table: Any) -> dict[str, Any]:
     while not table.is_greedy_optimal() and window < steps:
         table.advance(spread=False)
         window += 1
-    ks, ms, gaps, variances = (list(each) for each in zip(*found, strict=True)) if found else ([], [], [], [])
+    ks, ms, gaps, variances = (list(each) for each in zip(*rows, strict=True)) if rows else ([], [], [], [])
     optimal, random, worst = table.returns
     return {
         **{"value": best, "ks": ks, "ms": ms, "gaps": gaps, "vars": variances, "k_min": k_min},
@@ -166,9 +166,9 @@ def _simple_bound(tree: Steps) -> tuple[float, list[int], list[int], list[float]
     variances: list[float] = []
     k = 1
     while k < best:
-        found = _samples(tree, values, variance, math.log(2 * horizon) + k * math.log(actions))
-        if found is not None:
-            samples, gap, spread = found
+        requirement = _samples(tree, values, variance, math.log(2 * horizon) + k * math.log(actions))
+        if requirement is not None:
+            samples, gap, spread = requirement
             ks.append(k)
             ms.append(samples)
             gaps.append(gap)

@@ -238,9 +238,9 @@ def optimal_solution(mdp: TabularMDP, solution: Solution | None) -> Solution:
     if solution is None:
         return value_iteration(mdp, 1e-9)
     shape = (mdp.num_states, mdp.num_actions)
-    given = (solution.mdp.num_states, solution.mdp.num_actions)
+    solution_shape = (solution.mdp.num_states, solution.mdp.num_actions)
     chance, other = ((each.chance, each.laziness) for each in (mdp, solution.mdp))
-    if solution.kind != "optimal" or given != shape or chance != other:
+    if solution.kind != "optimal" or solution_shape != shape or chance != other:
         raise ParameterError(
             f"solution is of kind {solution.kind!r} for {solution.mdp}; expected the optimal one of {mdp}"
         )
@@ -287,11 +287,11 @@ def _summed(mdp: TabularMDP, solution: Solution, tie_tolerance: float | None) ->
     proof = UnresolvedTies(mdp, tolerance, error, tie_tolerance is not None)
     minimal, num_rows = math.inf, 0
     for part in weighted_gaps(mdp, solution):
-        seen = counts.copy()
+        previous = counts.copy()
         arguments = (tolerance, error, REGULARIZER, sums, counts, histogram)
         minimal = kernels.add_up(part.gap, part.weight, part.counted, minimal, *arguments)
         num_rows += int(part.counted.sum())
-        proof.look_at(part, *(counts - seen)[1:].tolist())
+        proof.look_at(part, *(counts - previous)[1:].tolist())
     total, low, high, regularized = sums[0].tolist()
     count = int(counts[0])
     num_ties = num_rows * mdp.num_actions - count

@@ -108,13 +108,13 @@ def gorp_bound(
     values: list[float] = []
     failures: list[float] = []
     for k in range(1, int(max_k) + 1):
-        found, failure = search.samples(k)
-        ms.append(found)
+        samples, failure = search.samples(k)
+        ms.append(samples)
         failures.append(failure)
-        if found is None:
+        if samples is None:
             values.append(math.inf)
         else:
-            values.append(k + (math.log(found) / math.log(mdp.num_actions) if mdp.num_actions > 1 else 0.0))
+            values.append(k + (math.log(samples) / math.log(mdp.num_actions) if mdp.num_actions > 1 else 0.0))
     return GorpBound(
         min(values),
         list(range(1, int(max_k) + 1)),
@@ -194,18 +194,18 @@ def run_gorp(
     assert tree.table is not None
     start = tree.starts[0][0]
     sequences = sequences_of(mdp.num_actions, int(k))
-    found = np.empty((int(runs), steps), np.int64)
+    actions = np.empty((int(runs), steps), np.int64)
     returns = np.zeros(int(runs))
     for run, generator in enumerate(np.random.default_rng(seed).spawn(int(runs))):
         node = start
         for t in range(steps):
             total = _completions(tree, node, t, sequences, int(m), generator)
             best = sequences[int(total.reshape(len(sequences), int(m)).mean(axis=1).argmax()), 0]
-            found[run, t] = best
+            actions[run, t] = best
             returns[run] += tree.rewards[node, best]
             node = tree.table[node, best]
     optimal = tree.at_start(tree.best.max(axis=2)[0])
-    return GorpRuns(returns, found, optimal, steps**2 * len(sequences) * int(m))
+    return GorpRuns(returns, actions, optimal, steps**2 * len(sequences) * int(m))
 
 
 def _completions(
@@ -285,7 +285,7 @@ class Search:
         least, result = f.min(axis=1), f.max(axis=1)
         for name in reversed(self.methods):  # the cheap ones first
             todo = result - least > 1e-9
-            found = getattr(tails, name)(m, todo) if todo.any() else None
-            if found is not None:
-                result[todo] = np.minimum(result[todo], knapsack(found[0], found[1], each[todo]))
+            tail = getattr(tails, name)(m, todo) if todo.any() else None
+            if tail is not None:
+                result[todo] = np.minimum(result[todo], knapsack(tail[0], tail[1], each[todo]))
         return result

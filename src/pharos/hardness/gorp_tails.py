@@ -117,22 +117,24 @@ class Tails:
                 edges = np.where(deviation > 0, m * p[..., None] + deviation * ndtri(levels), m * p[..., None])
             edges = np.floor(edges.clip(0, m))
         else:
-            known = bdtr(np.arange(m + 1.0), m, p[..., None])
-            edges = (known[..., None, :] < levels[:, None]).sum(axis=-1).clip(0, m).astype(float)
+            distribution = bdtr(np.arange(m + 1.0), m, p[..., None])
+            edges = (distribution[..., None, :] < levels[:, None]).sum(axis=-1).clip(0, m).astype(float)
         rows, n = p.shape
-        kept = np.ones(edges.shape, np.bool_)
-        kept[..., 1:] = edges[..., 1:] > edges[..., :-1]  # cells that are not empty
-        where, own, _ = np.nonzero(kept)
+        is_cell = np.ones(edges.shape, np.bool_)
+        is_cell[..., 1:] = edges[..., 1:] > edges[..., :-1]  # cells that are not empty
+        where, own, _ = np.nonzero(is_cell)
         first = np.flatnonzero(np.concatenate([[True], (np.diff(where) != 0) | (np.diff(own) != 0)]))
         # the distribution function is what costs: once for sequences with the same mean, the first of which leads
         leader = (p[:, :, None] == p[:, None, :]).argmax(axis=2)
         leads, begin = leader == np.arange(n), first.reshape(rows, n)
         if leads.all():
-            cdf = bdtr(edges[kept][:, None], m, p[where])
+            cdf = bdtr(edges[is_cell][:, None], m, p[where])
         else:
-            asked = leads[where] & leads[where, own][:, None]
-            cdf = np.zeros(asked.shape)
-            cdf[asked] = bdtr(np.broadcast_to(edges[kept][:, None], asked.shape)[asked], m, p[where][asked])
+            is_leading = leads[where] & leads[where, own][:, None]
+            cdf = np.zeros(is_leading.shape)
+            cdf[is_leading] = bdtr(
+                np.broadcast_to(edges[is_cell][:, None], is_leading.shape)[is_leading], m, p[where][is_leading]
+            )
             led = np.arange(len(own)) - begin[where, own] + begin[where, leader[where, own]]
             cdf = np.take_along_axis(cdf[led], leader[where], axis=1)
         lows = np.roll(cdf, 1, axis=0)

@@ -109,9 +109,9 @@ class Landmarks(KernelOperator):
 
     def __init__(self, kernel: Kernel, states: np.ndarray, landmarks: np.ndarray, block: int = 4096):
         values, vectors = np.linalg.eigh(kernel(landmarks, landmarks).astype(np.float64))
-        kept = values > 1e-6 * values[-1]
-        root = (vectors[:, kept] / np.sqrt(values[kept])).astype(np.float32)
-        self.features = np.empty((len(states), int(kept.sum())), np.float32)
+        is_large = values > 1e-6 * values[-1]
+        root = (vectors[:, is_large] / np.sqrt(values[is_large])).astype(np.float32)
+        self.features = np.empty((len(states), int(is_large.sum())), np.float32)
         self.diagonal = np.empty((len(states), 1), np.float32)
         for start in range(0, len(states), block):
             rows = states[start : start + block]
@@ -127,9 +127,9 @@ class Landmarks(KernelOperator):
         """Of the features and of the diagonal, each for itself."""
         column = weights.astype(np.float32)[:, None]
         values, vectors = np.linalg.eigh((self.features.T @ (column * self.features)).astype(np.float64))
-        kept = values > 1e-7 * values[-1]
+        is_large = values > 1e-7 * values[-1]
         self.features = np.ascontiguousarray(
-            self.features @ (vectors[:, kept] * values[kept] ** -0.25).astype(np.float32)
+            self.features @ (vectors[:, is_large] * values[is_large] ** -0.25).astype(np.float32)
         )
         self.diagonal = np.sqrt(self.diagonal / column)
 

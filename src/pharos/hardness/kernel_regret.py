@@ -121,20 +121,20 @@ def kernel_regret(
     schedule = schedule or Schedule()
     learner = Learner(mdp, schedule, episode, solution)
     everything = learner.numbers[learner.states]
-    seen = Grouped(representation.classes, everything)
+    observations = Grouped(representation.classes, everything)
     tabular = learner.curve(Grouped(np.arange(mdp.num_states), everything), Identity())
     landmarks = representation.landmarks
-    if landmarks is None and len(seen) > MOST_EXACT:
+    if landmarks is None and len(observations) > MOST_EXACT:
         landmarks = LANDMARKS
-    observed, error = seen.representatives, 0.0
-    is_exact = not landmarks or landmarks >= len(seen)
+    observed, error = observations.representatives, 0.0
+    is_exact = not landmarks or landmarks >= len(observations)
     if not is_exact or schedule.optimizer == "adam":
-        weights = seen.sums(standard_occupancy(mdp, schedule.gamma, episode).states[everything])
+        weights = observations.sums(standard_occupancy(mdp, schedule.gamma, episode).states[everything])
 
     def learnt(operator: KernelOperator) -> LearningCurve:
         if schedule.optimizer == "adam":
             operator.preconditioned(np.maximum(weights, RAREST * weights.max()))
-        return learner.curve(seen, operator)
+        return learner.curve(observations, operator)
 
     if is_exact:
         landmarks, curve = None, learnt(Exact(representation.kernel, observed))
@@ -155,4 +155,4 @@ def kernel_regret(
         "clipped": {"greedy": WORST_GREEDY, "played": WORST_PLAYED},
         **representation.conventions,
     }
-    return KernelRegret(curve, tabular, len(seen), len(everything), landmarks, error, conventions)
+    return KernelRegret(curve, tabular, len(observations), len(everything), landmarks, error, conventions)

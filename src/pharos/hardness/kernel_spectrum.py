@@ -125,15 +125,15 @@ def aliasing_floor(
     """
     setting = _setting(mdp, representation, schedule, horizon, "aliasing_floor")
     states = np.flatnonzero(setting.states > 0)
-    weights, q, seen = setting.states[states], setting.q[states], Grouped(representation.classes, states)
-    if len(seen) == len(states):
+    weights, q, observations = setting.states[states], setting.q[states], Grouped(representation.classes, states)
+    if len(observations) == len(states):
         return 0.0
     centred = q - weights @ q
     total = float(weights @ (centred**2).sum(axis=1))
     if total <= 1e-24:
         raise UndefinedMeasure("aliasing_floor: the optimal values are the same everywhere")
-    mean = seen.sums(weights[:, None] * centred) / seen.sums(weights)[:, None]
-    return float(weights @ ((centred - mean[seen.groups]) ** 2).sum(axis=1)) / total
+    mean = observations.sums(weights[:, None] * centred) / observations.sums(weights)[:, None]
+    return float(weights @ ((centred - mean[observations.groups]) ** 2).sum(axis=1)) / total
 
 
 def _setting(
@@ -155,20 +155,20 @@ def _spectral(
     """A function of (kernel (C, C), weights (C,), mean values (C, A)) of the different observations."""
     setting = _setting(mdp, representation, schedule, horizon, name)
     states = np.flatnonzero(setting.states > 0)
-    seen = Grouped(representation.classes, states)
-    weights = seen.sums(setting.states[states])
-    q = seen.sums(setting.states[states, None] * setting.q[states]) / weights[:, None]
+    observations = Grouped(representation.classes, states)
+    weights = observations.sums(setting.states[states])
+    q = observations.sums(setting.states[states, None] * setting.q[states]) / weights[:, None]
 
     def of(count: int) -> float:
         places, share = _drawn(weights, count)
-        rows = seen.representatives[places]
+        rows = observations.representatives[places]
         return function(representation.kernel(rows, rows).astype(np.float64), share, q[places])
 
     value = of(MOST_EIGENVALUES)
-    count = min(MOST_EIGENVALUES, len(seen))
-    error = 0.0 if count == len(seen) else abs(float(np.log(value / of(count // 2))))
+    count = min(MOST_EIGENVALUES, len(observations))
+    error = 0.0 if count == len(observations) else abs(float(np.log(value / of(count // 2))))
     conventions = {"left": LEFT, "gamma": (schedule or Schedule()).gamma, **representation.conventions}
-    return Spectral(name, value, count, len(seen), error, conventions)
+    return Spectral(name, value, count, len(observations), error, conventions)
 
 
 def _drawn(weights: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:

@@ -65,7 +65,7 @@ class LargeHorizon:
         self.returns = tuple(self._at_start(values) for values in (best[0], self.ahead[0], worst[0]))
         small = np.int32 if states < 2**31 else np.int64
         self.nodes = (np.empty(states, small), np.empty(states, small))
-        self.seen = np.zeros(states, np.bool_)
+        self.is_visited = np.zeros(states, np.bool_)
         self.num_visitable = int(mdp.states_within(steps - 1).sum())
 
     def _at_start(self, values: np.ndarray) -> float:
@@ -98,7 +98,7 @@ class LargeHorizon:
         for t in range(self.steps):
             n = self.kernels.walk(
                 *(self.next_states, self.rewards, self.ahead[t + 1], self.optimal[t], self.spread[t], log, near),
-                *(now, n, following, self.seen, most),
+                *(now, n, following, self.is_visited, most),
             )
             if n < 0:
                 yield None, 0.0, 0.0

@@ -124,26 +124,26 @@ class Learner:
             met = np.ones(len(self.numbers), np.bool_)
         self.states = np.flatnonzero(met & ~np.asarray(self.mdp.terminal))
 
-    def curve(self, seen: Grouped, apply: KernelOperator) -> LearningCurve:
-        """Learn from observations, of which `seen` says which states have them, with a kernel over them."""
+    def curve(self, observations: Grouped, apply: KernelOperator) -> LearningCurve:
+        """Learn from observations, the groups of states that look alike, with a kernel over them."""
         schedule, actions = self.schedule, self.mdp.num_actions
-        values = np.zeros((len(seen), actions))
+        values = np.zeros((len(observations), actions))
         memory = _Memory(self.mdp, self.states)
-        vector = np.full((len(seen), 1), len(seen) ** -0.5, np.float32)
+        vector = np.full((len(observations), 1), len(observations) ** -0.5, np.float32)
         rows = []
         for step in range(0, schedule.steps, schedule.period):
             period, epsilon = min(schedule.period, schedule.steps - step), schedule.epsilon(step)
-            greedy = _greedy(values)[seen.groups]
+            greedy = _greedy(values)[observations.groups]
             policy = (1 - epsilon) * greedy + epsilon / actions
             played, length = memory.play(self._everywhere(policy), policy, self.episode, period)
             played = played if self._is_return else self._value(policy)
             rows.append((step, self._regret(self._value(greedy)), self._regret(played), period / length))
             if step < schedule.learning_starts:
                 continue
-            q = values[seen.groups]
+            q = values[observations.groups]
             target, visits = memory.targets(q.max(axis=1), schedule.gamma)
-            weights = seen.sums(visits / visits.sum())
-            total = seen.sums(visits / visits.sum() * target)
+            weights = observations.sums(visits / visits.sum())
+            total = observations.sums(visits / visits.sum() * target)
             error = np.divide(total, weights, out=values.copy(), where=weights > 0) - values
             values += self._learnt(apply, weights.astype(np.float32), error.astype(np.float32), vector)
         return LearningCurve(*(np.array(column) for column in zip(*rows, strict=True)))

@@ -39,8 +39,8 @@ def orbits(
     for t in rng.integers(0, size, _CANDIDATES):
         if count == 1 or in_vain == _IN_VAIN or steps_left < 0 or is_over():
             break
-        found, steps = kernels.symmetry(next_states, ends, start, pivot, t, image, preimage, queue)
-        if found:
+        is_symmetry, steps = kernels.symmetry(next_states, ends, start, pivot, t, image, preimage, queue)
+        if is_symmetry:
             before, count = count, int(kernels.join(orbit, image))
             in_vain = in_vain + 1 if count == before else 0
         else:

@@ -215,9 +215,11 @@ def _escape(text: str) -> str:
 def _conventions(problem: Problem) -> dict[str, Any]:
     mdp, chance = problem.mdp, problem.mdp.chance
     starts = [[int(s), float(p)] for s, p in zip(mdp.start_states[:100], mdp.start_probabilities, strict=False)]
-    seen = problem.representation
+    representation = problem.representation
     represented = (
-        {} if seen is None else {"representation": dict(seen.conventions), "schedule": asdict(problem.schedule)}
+        {}
+        if representation is None
+        else {"representation": dict(representation.conventions), "schedule": asdict(problem.schedule)}
     )
     return {
         **represented,

@@ -277,8 +277,8 @@ def _on_nodes(solution: Solution, choices: Any, mdp: TabularMDP) -> np.ndarray:
 def _is_greedy_optimal(nodes: _Nodes, values: _Known | _Ahead, optimal: np.ndarray, slack: float) -> bool:
     def greedy(n: np.ndarray) -> np.ndarray | None:
         q = values.at(n)
-        taken = q >= q.max(axis=1, keepdims=True) - slack
-        return None if (taken & ~optimal[n]).any() else taken
+        is_greedy = q >= q.max(axis=1, keepdims=True) - slack
+        return None if (is_greedy & ~optimal[n]).any() else is_greedy
 
     return nodes.closure(greedy) is not None
 

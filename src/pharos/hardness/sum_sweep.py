@@ -150,10 +150,10 @@ class SumSweep:
 
     def _pivot(self, p: int) -> bool:
         """Search from p in both directions; False where p does not reach all nodes, or not all reach p."""
-        found, out_pivot, _ = self.graph.search_forward(p, self.away)
-        reached, in_pivot, _ = self.graph.search_backward(p, self.to)
+        forward, out_pivot, _ = self.graph.search_forward(p, self.away)
+        backward, in_pivot, _ = self.graph.search_backward(p, self.to)
         self.spending.searches += 2
-        if found < self.graph.num_nodes or reached < self.graph.num_nodes:
+        if forward < self.graph.num_nodes or backward < self.graph.num_nodes:
             return False
         kernels.bound_eccentricities(
             self.away, self.to, out_pivot, in_pivot, self.out_lower, self.out_upper, self.in_lower, self.in_upper

@@ -61,7 +61,7 @@ def save(
         ParameterError: the folder holds something else, or the MDP has sticky, random or lazy actions (add them after
             loading); or names, limit, observations or outcomes do not fit it.
     """
-    told = _told(mdp, actions, time_limit, observations, observed)
+    description = _description(mdp, actions, time_limit, observations, observed)
     paid = {} if outcomes is None else _checked_outcomes(mdp, outcomes)
     folder = Path(folder)
     _check_without_chance(mdp)
@@ -85,7 +85,7 @@ def save(
         "gamma": mdp.gamma,
         "horizon": None if mdp.horizon is None else int(mdp.horizon),
         "arrays": checksums,
-        **told,
+        **description,
     }
     storage.replace_json(folder / MANIFEST, storage.sealed(manifest))
     return folder
@@ -105,7 +105,7 @@ def _checked_outcomes(mdp: TabularMDP, outcomes: Outcomes) -> dict[str, np.ndarr
     return dict(zip(PAID, (offsets, successors, probabilities, rewards), strict=True))
 
 
-def _told(
+def _description(
     mdp: TabularMDP,
     actions: Sequence[str] | None,
     time_limit: int | None,
@@ -113,15 +113,15 @@ def _told(
     observed: str | None,
 ) -> dict[str, Any]:
     """What the manifest says beside the MDP; ParameterError where it does not fit."""
-    told: dict[str, Any] = {}
+    description: dict[str, Any] = {}
     if actions is not None:
         if len(actions) != mdp.num_actions or not all(isinstance(name, str) and name for name in actions):
             raise ParameterError(f"actions are {actions!r}; expected {mdp.num_actions} names")
-        told["actions"] = list(actions)
+        description["actions"] = list(actions)
     if time_limit is not None:
         if not isinstance(time_limit, int | np.integer) or time_limit < 1:
             raise ParameterError(f"time_limit is {time_limit!r}; expected a number of steps of at least 1")
-        told["time_limit"] = int(time_limit)
+        description["time_limit"] = int(time_limit)
     if observations is not None:
         shown = np.asarray(observations)
         kind = observed or (IMAGE if shown.ndim == 4 else VECTOR)
@@ -131,8 +131,8 @@ def _told(
                 f"observations have shape {shown.shape} and type {shown.dtype}; expected {mdp.num_states} images "
                 f"(S, H, W, 3) uint8, grids (S, columns, rows, C) uint8, or vectors (S, N)"
             )
-        told[OBSERVATIONS] = kind
-    return told
+        description[OBSERVATIONS] = kind
+    return description
 
 
 def environment(mdp: TabularMDP | str | os.PathLike) -> Environment:

@@ -92,7 +92,7 @@ def minigrid_recording(
     driver = _Driver(env, seed, remember_carried)
     table, rewards = driver.explore(None, max_states)
     names = tuple(action.name for action in driver.env.actions)[: table.shape[1]]
-    grids = np.stack([driver.seen(state) for state in driver.snapshots])
+    grids = np.stack([driver.image(state) for state in driver.snapshots])
     return TabularMDP.from_arrays(table, rewards, gamma=gamma, horizon=horizon), grids, names
 
 
@@ -113,7 +113,7 @@ def minigrid_grids(
     """
     driver = _Driver(env, seed, remember_carried)
     driver.explore(actions, max_states)
-    return np.stack([driver.seen(state) for state in driver.snapshots])
+    return np.stack([driver.image(state) for state in driver.snapshots])
 
 
 class _Driver:
@@ -225,13 +225,13 @@ class _Driver:
         """What is no part of a state and stays where it is: the environment itself, its spaces, its generator."""
         if value is not self.env and not isinstance(value, self.fixed_types):
             return None
-        for number, known in enumerate(self.fixed):
-            if known is value:
+        for number, constant in enumerate(self.fixed):
+            if constant is value:
                 return number
         self.fixed.append(value)
         return len(self.fixed) - 1
 
-    def seen(self, snapshot: bytes) -> np.ndarray:
+    def image(self, snapshot: bytes) -> np.ndarray:
         """(width, height, 3), the grid with the agent in it."""
         from minigrid.core.constants import COLOR_TO_IDX, OBJECT_TO_IDX
 

@@ -57,21 +57,21 @@ def to_gymnax(
     if isinstance(observation, np.ndarray):
         if len(observation) != mdp.num_states:
             raise ParameterError(f"observation has {len(observation)} rows; expected one for each of {mdp.num_states}")
-        seen, low, high = observation, float(observation.min()), float(observation.max())
+        observations, low, high = observation, float(observation.min()), float(observation.max())
     elif space is None or env is None:
         raise ParameterError(f"to_gymnax: {mdp} was not made from a state space; give an array (S, ...) as observation")
     else:
-        seen, low, high = _observed(space, env, observation, dict(observation_options or {}))
+        observations, low, high = _observed(space, env, observation, dict(observation_options or {}))
     made = JoinedEnds if joined_ends else GymnaxEnv
-    return made(mdp, seen, low, high, int(limit), str(env if env is not None else mdp))
+    return made(mdp, observations, low, high, int(limit), str(env if env is not None else mdp))
 
 
 def _observed(space: StateSpace, env: Any, name: Any, options: dict[str, Any]) -> tuple[np.ndarray, float, float]:
     """(S, ...) observations of all states, and their bounds."""
     observation = observe(env, name, state_space=space, **options)
     blocks = [observation(space.states(slice(first, first + BLOCK))) for first in range(0, space.num_states, BLOCK)]
-    seen = np.concatenate(blocks)
-    if seen.ndim == 1:
-        seen = seen[:, None]
-    low, high = getattr(observation.space, "low", seen), getattr(observation.space, "high", seen)
-    return seen, float(np.min(low)), float(np.max(high))
+    observations = np.concatenate(blocks)
+    if observations.ndim == 1:
+        observations = observations[:, None]
+    low, high = getattr(observation.space, "low", observations), getattr(observation.space, "high", observations)
+    return observations, float(np.min(low)), float(np.max(high))

@@ -40,7 +40,7 @@ class Seeing:
 
     def now(self, states: np.ndarray, previous: np.ndarray, elapsed: np.ndarray) -> Any:
         """A batch of N observations of where they are; `follow` has been told."""
-        return self._seen(self._frames, slice(None), states, previous, elapsed)
+        return self._in_context(self._frames, slice(None), states, previous, elapsed)
 
     def final(self, rows: np.ndarray, states: np.ndarray, previous: np.ndarray, elapsed: np.ndarray) -> Any:
         """The last observations of the episodes of environments `rows`, in states (len(rows), D) that `follow` is not
@@ -49,16 +49,16 @@ class Seeing:
         frames = self._frames[rows]
         if self.observation.frames > 1:
             frames = np.concatenate([frames[:, 1:], self.observation.frame(states)[:, None]], axis=1)
-        return self._seen(frames, rows, states, previous, elapsed)
+        return self._in_context(frames, rows, states, previous, elapsed)
 
-    def _seen(
+    def _in_context(
         self, frames: np.ndarray, rows: Any, states: np.ndarray, previous: np.ndarray, elapsed: np.ndarray
     ) -> Any:
-        seen = self.observation.stacked(frames) if self.observation.frames > 1 else None
+        stack = self.observation.stacked(frames) if self.observation.frames > 1 else None
         coins = None
         if self.observation.irrelevant:
             rng = self._rng[rows]
             coins = np.empty((len(states), self.observation.irrelevant), np.float32)
             stepping.throw(rng, coins)
             self._rng[rows] = rng
-        return self.context(states, previous, elapsed, seen=seen, coins=coins)
+        return self.context(states, previous, elapsed, seen=stack, coins=coins)

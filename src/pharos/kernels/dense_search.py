@@ -11,12 +11,12 @@ WORDS = 8  # of 64 sources: a cache line
 
 
 @njit(cache=True, nogil=True)
-def dense_search_backward(next_states, ends, start, sources, seen, front, coming, active, arriving, largest):
+def dense_search_backward(next_states, ends, start, sources, origins, front, coming, active, arriving, largest):
     """largest[i] = the largest distance to sources[i] of a node that leads there; at most 512 sources, a bit for each.
 
     Every node asks, level by level, what its successors have reached: one cache line read for each edge on a level
     where the successor has news, none written but its own. A node that leads to all sources asks no more.
-    seen, front, coming: (N, 8) uint64, active, arriving: (N,) bool; zero before.
+    origins, front, coming: (N, 8) uint64, active, arriving: (N,) bool; zero before.
     Returns the number of lines read from successors.
     Source: Then et al. (2014), bit-parallel search; Beamer, Asanovic and Patterson (2012), asking in place of telling.
     """
@@ -24,7 +24,7 @@ def dense_search_backward(next_states, ends, start, sources, seen, front, coming
     all_sources, news = np.zeros(WORDS, np.uint64), np.zeros(WORDS, np.uint64)
     for i in range(len(sources)):
         bit = np.uint64(1) << np.uint64(i % 64)
-        seen[sources[i], i // 64] |= bit
+        origins[sources[i], i // 64] |= bit
         front[sources[i], i // 64] |= bit
         active[sources[i]] = True
         all_sources[i // 64] |= bit
@@ -34,11 +34,11 @@ def dense_search_backward(next_states, ends, start, sources, seen, front, coming
         level += 1
         goes_on = False
         news[:] = 0
-        for v in range(len(seen)):
+        for v in range(len(origins)):
             arriving[v] = False
             missing = np.uint64(0)
             for w in range(WORDS):
-                missing |= all_sources[w] & ~seen[v, w]
+                missing |= all_sources[w] & ~origins[v, w]
             if not missing:
                 continue
             is_end = v == num_states or ends[v]
@@ -57,9 +57,9 @@ def dense_search_backward(next_states, ends, start, sources, seen, front, coming
             if heard:
                 added = np.uint64(0)
                 for w in range(WORDS):
-                    new = coming[v, w] & ~seen[v, w]
+                    new = coming[v, w] & ~origins[v, w]
                     coming[v, w] = new
-                    seen[v, w] |= new
+                    origins[v, w] |= new
                     news[w] |= new
                     added |= new
                 if added:

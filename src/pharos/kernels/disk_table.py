@@ -5,7 +5,7 @@ entries (slots, W + 1) uint64, a mapped file: W words of a state, then 1 + its i
 it waits for its number. Memory is read and written in order of slots: many candidates are first sorted by the 16
 highest bits of their hash, their bucket, which are the highest bits of their slot in a table of any size.
 
-keys (M, W) uint64: candidates; found (M,) int64: -1 - bucket, or an index where it is known; order (M,) int32:
+keys (M, W) uint64: candidates; indices (M,) int64: -1 - bucket, or an index where it is known; order (M,) int32:
 candidates that are looked up, by bucket, each bucket in the order of candidates.
 """
 
@@ -47,39 +47,39 @@ def _enter(entries, slot, keys, j, entry):
 
 
 @njit(cache=True, nogil=True)
-def sort_by_bucket(found, first, order):
-    """Fill order; returns its length. found[j] >= 0, a state in this block that leads to itself, gets its index: first
-    + found[j].
+def sort_by_bucket(indices, first, order):
+    """Fill order; returns its length. indices[j] >= 0, a state in this block that leads to itself, gets its index:
+    first + indices[j].
     """
     size = 0
-    if len(found) <= _FEW:
-        for j in range(len(found)):
-            if found[j] >= 0:
-                found[j] += first
+    if len(indices) <= _FEW:
+        for j in range(len(indices)):
+            if indices[j] >= 0:
+                indices[j] += first
             else:
                 order[size] = j
                 size += 1
         return size
     place = np.zeros(BUCKETS + 1, np.int64)
-    for j in range(len(found)):
-        if found[j] >= 0:
-            found[j] += first
+    for j in range(len(indices)):
+        if indices[j] >= 0:
+            indices[j] += first
         else:
-            place[-found[j]] += 1
+            place[-indices[j]] += 1
             size += 1
     for bucket in range(BUCKETS):
         place[bucket + 1] += place[bucket]
-    for j in range(len(found)):
-        if found[j] < 0:
-            bucket = -1 - found[j]
+    for j in range(len(indices)):
+        if indices[j] < 0:
+            bucket = -1 - indices[j]
             order[place[bucket]] = j
             place[bucket] += 1
     return size
 
 
 @njit(cache=True, nogil=True)
-def look_up(entries, keys, order, low, high, found, slots):
-    """found[j] for candidates order[low:high]: its index; -1 where it is new, slots[j] then being its slot; -2 - i
+def look_up(entries, keys, order, low, high, indices, slots):
+    """indices[j] for candidates order[low:high]: its index; -1 where it is new, slots[j] then being its slot; -2 - i
     where i is equal.
     """
     capacity = entries.shape[0]
@@ -91,16 +91,16 @@ def look_up(entries, keys, order, low, high, found, slots):
         slots[j] = -1
         if entry == 0:
             _enter(entries, slot, keys, j, _NEW | uint64(j))
-            found[j] = -1
+            indices[j] = -1
             slots[j] = slot
         elif entry & _NEW:
-            found[j] = -2 - int64(entry ^ _NEW)
+            indices[j] = -2 - int64(entry ^ _NEW)
         else:
-            found[j] = int64(entry) - 1
+            indices[j] = int64(entry) - 1
 
 
 @njit(cache=True, nogil=True)
-def number(keys, found, successors, states, appended, progress):
+def number(keys, indices, successors, states, appended, progress):
     """Number what is new in the order of candidates, into states[count - appended :]; row i of successors (rows, A) is
     state progress[FIRST] + i.
 
@@ -111,14 +111,14 @@ def number(keys, found, successors, states, appended, progress):
     for i in range(rows):
         for a in range(num_actions):
             j = i * num_actions + a
-            if found[j] == -1:
+            if indices[j] == -1:
                 for k in range(keys.shape[1]):
                     states[count - appended, k] = keys[j, k]
-                found[j] = count
+                indices[j] = count
                 count += 1
-            elif found[j] < 0:
-                found[j] = found[-2 - found[j]]  # an earlier candidate
-            successors[i, a] = found[j]
+            elif indices[j] < 0:
+                indices[j] = indices[-2 - indices[j]]  # an earlier candidate
+            successors[i, a] = indices[j]
         if first + i + 1 == level_end:
             level_end = count
             depth += 1
@@ -126,13 +126,13 @@ def number(keys, found, successors, states, appended, progress):
 
 
 @njit(cache=True, nogil=True)
-def settle(entries, order, low, high, found, slots):
+def settle(entries, order, low, high, indices, slots):
     """Give the new entries of candidates order[low:high] their numbers."""
     words = entries.shape[1] - 1
     for p in range(low, high):
         j = order[p]
         if slots[j] >= 0:
-            entries[slots[j], words] = uint64(found[j] + 1)
+            entries[slots[j], words] = uint64(indices[j] + 1)
 
 
 @njit(cache=True, nogil=True)

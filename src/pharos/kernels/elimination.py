@@ -16,19 +16,19 @@ def entries_of_factor(first, columns, limit):
     size = len(first) - 1
     entries = np.zeros(size, np.int64)
     parent = np.full(size, -1)
-    seen = np.full(size, -1)
+    marks = np.full(size, -1)
     total = 0
     for row in range(size):
-        seen[row] = row
+        marks[row] = row
         for place in range(first[row], first[row + 1]):
             column = columns[place]
             # row `row` of the factor: the ways up the tree from the entries left of the diagonal
-            while column < row and seen[column] != row:
+            while column < row and marks[column] != row:
                 if parent[column] < 0:
                     parent[column] = row
                 entries[column] += 1
                 total += 1
-                seen[column] = row
+                marks[column] = row
                 column = parent[column]
         if total > limit:
             break

@@ -188,15 +188,15 @@ def open_eccentricities(out_lower, out_upper, in_lower, in_upper, best):
 
 
 @njit(cache=True, nogil=True)
-def onwards(transitions, nodes, n, following, seen):
-    """States that nodes[:n] lead to and that were not seen before; returns how many. seen (S,) bool."""
+def onwards(transitions, nodes, n, following, is_visited):
+    """States that nodes[:n] lead to and that were not seen before; returns how many. is_visited (S,) bool."""
     count = 0
     for i in range(n):
         for a in range(size_of(transitions)[1]):
             for j in outcomes_of(transitions, nodes[i], a):
                 t, _ = outcome(transitions, nodes[i], a, j)
-                if t >= 0 and not seen[t]:
-                    seen[t] = True
+                if t >= 0 and not is_visited[t]:
+                    is_visited[t] = True
                     following[count] = t
                     count += 1
     return count

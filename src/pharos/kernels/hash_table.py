@@ -45,7 +45,7 @@ def _entry(context, builder, array_type, array, index):
 
 
 @intrinsic
-def seen(typing_context, table, slot):
+def entry_at(typing_context, table, slot):
     """table[slot], which another thread may be writing; what it wrote before is seen as well (an acquiring load)."""
 
     def codegen(context, builder, sig, args):
@@ -58,7 +58,7 @@ def seen(typing_context, table, slot):
 
 @intrinsic
 def publish(typing_context, table, slot, index):
-    """table[slot] = index, after everything written before (a releasing store), for threads that read it by `seen`."""
+    """table[slot] = index, after everything written before (a releasing store), for threads that read `entry_at`."""
 
     def codegen(context, builder, sig, args):
         place = _entry(context, builder, sig.args[0], *args[:2])
@@ -184,10 +184,10 @@ def slots_of(keys, capacity, out):
 
 
 @njit(cache=True, nogil=True)
-def insert_missing(table, states, keys, found, successors, progress):
+def insert_missing(table, states, keys, indices, successors, progress):
     """Number the successors that threads did not find, in order; the serial half of a wide frontier.
 
-    found (rows * A,): index, or -1 - slot from which to search on. Row i belongs to state progress[FIRST] + i;
+    indices (rows * A,): index, or -1 - slot from which to search on. Row i belongs to state progress[FIRST] + i;
     successors (rows, A). `progress` goes on by these rows.
     """
     first, count, level_end, depth = progress[FIRST], progress[COUNT], progress[LEVEL_END], progress[DEPTH]
@@ -196,14 +196,14 @@ def insert_missing(table, states, keys, found, successors, progress):
     rows, num_actions = successors.shape
     ahead = 24
     for j in range(min(ahead, rows * num_actions)):
-        if found[j] < 0:
-            prefetch(table, -1 - found[j])
+        if indices[j] < 0:
+            prefetch(table, -1 - indices[j])
     for i in range(rows):
         for a in range(num_actions):
             j = i * num_actions + a
-            if j + ahead < rows * num_actions and found[j + ahead] < 0:
-                prefetch(table, -1 - found[j + ahead])
-            index = found[j]
+            if j + ahead < rows * num_actions and indices[j + ahead] < 0:
+                prefetch(table, -1 - indices[j + ahead])
+            index = indices[j]
             slot = -1 - index
             while index < 0:
                 index = int64(table[slot])

@@ -191,18 +191,18 @@ def _difference(high, low, other_high, other_low):
 
 
 @njit(cache=True, nogil=True)
-def almost_surely(first, node, num_actions, goal, sure, found):
+def almost_surely(first, node, num_actions, goal, sure, attractor):
     """sure[n]: some policy leads from n to the goal with probability 1. A greatest fixed point over least ones (de
     Alfaro 1999)."""
     size = len(goal)
     sure[:] = True
     while True:
-        found[:] = goal
+        attractor[:] = goal
         grew = True
         while grew:
             grew = False
             for n in range(size):
-                if found[n] or not sure[n]:
+                if attractor[n] or not sure[n]:
                     continue
                 for a in range(num_actions):
                     row = n * num_actions + a
@@ -210,16 +210,16 @@ def almost_surely(first, node, num_actions, goal, sure, found):
                     for i in range(first[row], first[row + 1]):
                         m = node[i]
                         stays = stays and sure[m]
-                        hits = hits or found[m]
+                        hits = hits or attractor[m]
                     if stays and hits:
-                        found[n] = True
+                        attractor[n] = True
                         grew = True
                         break
         same = True
         for n in range(size):
-            if sure[n] != found[n]:
+            if sure[n] != attractor[n]:
                 same = False
-            sure[n] = found[n]
+            sure[n] = attractor[n]
         if same:
             return
 

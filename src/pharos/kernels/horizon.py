@@ -80,11 +80,11 @@ def greedy_return(next_states, rewards, after, followed, now):
 
 
 @njit(cache=True, nogil=True)
-def walk(next_states, rewards, after, optimal, variance, log, near, nodes, n, following, seen, most):
+def walk(next_states, rewards, after, optimal, variance, log, near, nodes, n, following, is_visited, most):
     """Go one step on from nodes[:n] along greedy actions (`near` False), or along those better than all that are not
     optimal.
 
-    after (S,): Q(s, a) = r(s, a) + after(next state). seen (S,) bool, all False before and after. most (3,): 16
+    after (S,): Q(s, a) = r(s, a) + after(next state). is_visited (S,) bool, all False before and after. most (3,): 16
     variance log / gap^2 of the node that has the largest, the first among equals, and its gap and variance.
     Returns how many states `following` holds; -1 where an action that is not optimal may be taken.
     """
@@ -110,13 +110,13 @@ def walk(next_states, rewards, after, optimal, variance, log, near, nodes, n, fo
             at = s
         for a in range(num_actions):
             t = next_states[s, a]
-            if t < 0 or seen[t]:
+            if t < 0 or is_visited[t]:
                 continue
             q = rewards[s, a] + after[t]
             if q > second if near else q == top:
-                seen[t] = True
+                is_visited[t] = True
                 following[count] = t
                 count += 1
     for j in range(count):
-        seen[following[j]] = False
+        is_visited[following[j]] = False
     return -1 if fails else count

@@ -10,18 +10,18 @@ from numba import njit
 
 
 @njit(cache=True, nogil=True)
-def search_forward_from_many(next_states, ends, start, sources, seen, front, coming, queue, other, largest):
+def search_forward_from_many(next_states, ends, start, sources, origins, front, coming, queue, other, largest):
     """Searches from up to 64 W sources.
 
-    seen, front, coming: (N, W) uint64, zero before; front and coming are zero again afterwards, seen[v] has the bits of
-    the sources that reach v. queue, other: (N,) scratch. largest (len(sources),): their eccentricities among what they
-    reach. Returns (pairs reached, table entries read).
+    origins, front, coming: (N, W) uint64, zero before; front and coming are zero again afterwards, origins[v] has the
+    bits of the sources that reach v. queue, other: (N,) scratch. largest (len(sources),): their eccentricities among
+    what they reach. Returns (pairs reached, table entries read).
     """
     num_states, num_actions = next_states.shape
-    width = seen.shape[1]
+    width = origins.shape[1]
     for i in range(len(sources)):
         bit = np.uint64(1) << np.uint64(i % 64)
-        seen[sources[i], i // 64] |= bit
+        origins[sources[i], i // 64] |= bit
         front[sources[i], i // 64] |= bit
         queue[i] = sources[i]
         largest[i] = 0
@@ -29,32 +29,34 @@ def search_forward_from_many(next_states, ends, start, sources, seen, front, com
     level, pairs, reads = 0, 0, 0
     while count:
         level += 1
-        found = 0
+        size = 0
         for i in range(count):
             u = queue[i]
             if u == num_states or ends[u]:
                 if start >= 0:
-                    found = _push(u, start, seen, front, coming, other, found)
+                    size = _push(u, start, origins, front, coming, other, size)
                 continue
             reads += num_actions
             for a in range(num_actions):
                 v = next_states[u, a]
                 if v < 0:
                     v = num_states
-                found = _push(u, v, seen, front, coming, other, found)
-        pairs += _settle(queue, count, other, found, seen, front, coming, level, largest, width)
+                size = _push(u, v, origins, front, coming, other, size)
+        pairs += _settle(queue, count, other, size, origins, front, coming, level, largest, width)
         queue, other = other, queue
-        count = found
+        count = size
     return pairs, reads
 
 
 @njit(cache=True, nogil=True)
-def search_backward_from_many(first, previous, restarting, start, sources, seen, front, coming, queue, other, largest):
+def search_backward_from_many(
+    first, previous, restarting, start, sources, origins, front, coming, queue, other, largest
+):
     """As `search_forward_from_many`, against the direction of the edges."""
-    width = seen.shape[1]
+    width = origins.shape[1]
     for i in range(len(sources)):
         bit = np.uint64(1) << np.uint64(i % 64)
-        seen[sources[i], i // 64] |= bit
+        origins[sources[i], i // 64] |= bit
         front[sources[i], i // 64] |= bit
         queue[i] = sources[i]
         largest[i] = 0
@@ -62,39 +64,39 @@ def search_backward_from_many(first, previous, restarting, start, sources, seen,
     level, pairs, reads = 0, 0, 0
     while count:
         level += 1
-        found = 0
+        size = 0
         for i in range(count):
             v = queue[i]
             reads += first[v + 1] - first[v]
             for j in range(first[v], first[v + 1]):
-                found = _push(v, previous[j], seen, front, coming, other, found)
+                size = _push(v, previous[j], origins, front, coming, other, size)
             if v == start:
                 reads += len(restarting)
                 for j in range(len(restarting)):
-                    found = _push(v, restarting[j], seen, front, coming, other, found)
-        pairs += _settle(queue, count, other, found, seen, front, coming, level, largest, width)
+                    size = _push(v, restarting[j], origins, front, coming, other, size)
+        pairs += _settle(queue, count, other, size, origins, front, coming, level, largest, width)
         queue, other = other, queue
-        count = found
+        count = size
     return pairs, reads
 
 
 @njit(cache=True, nogil=True)
-def _push(u, v, seen, front, coming, other, found):
-    """Pass the bits of u that v has not seen on to v; v joins the next level once."""
+def _push(u, v, origins, front, coming, other, size):
+    """Pass the bits of u that v lacks on to v; v joins the `size` nodes of the next level once. Returns its size."""
     waiting, adds = np.uint64(0), np.uint64(0)
-    for w in range(seen.shape[1]):
+    for w in range(origins.shape[1]):
         waiting |= coming[v, w]
-        new = front[u, w] & ~seen[v, w]
+        new = front[u, w] & ~origins[v, w]
         adds |= new
         coming[v, w] |= new
     if adds and not waiting:
-        other[found] = v
-        found += 1
-    return found
+        other[size] = v
+        size += 1
+    return size
 
 
 @njit(cache=True, nogil=True)
-def _settle(queue, count, other, found, seen, front, coming, level, largest, width):
+def _settle(queue, count, other, size, origins, front, coming, level, largest, width):
     """Make the next level the current one; note it as the eccentricity of every source that found something."""
     for i in range(count):
         for w in range(width):
@@ -102,12 +104,12 @@ def _settle(queue, count, other, found, seen, front, coming, level, largest, wid
     pairs = 0
     for w in range(width):
         any_new = np.uint64(0)
-        for i in range(found):
+        for i in range(size):
             v = other[i]
             new = coming[v, w]
             coming[v, w] = 0
             front[v, w] = new
-            seen[v, w] |= new
+            origins[v, w] |= new
             any_new |= new
             pairs += _ones(new)
         for k in range(min(64, len(largest) - 64 * w)):

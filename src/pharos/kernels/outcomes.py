@@ -229,15 +229,15 @@ def drawn(transitions, s, a, u):
     total = 0.0
     for k in outcomes_of(transitions, s, a):
         total += outcome(transitions, s, a, k)[1]
-    passed, found = 0.0, np.int64(-1)
+    passed, successor = 0.0, np.int64(-1)
     for k in outcomes_of(transitions, s, a):
         t, p = outcome(transitions, s, a, k)
         if p > 0.0:
-            found = np.int64(t)
+            successor = np.int64(t)
             passed += p
             if passed > u * total:
                 break
-    return found
+    return successor
 
 
 @njit(cache=True, nogil=True)

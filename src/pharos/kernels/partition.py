@@ -62,35 +62,35 @@ def slots_for(rows):
 
 
 @njit(cache=True, nogil=True)
-def states_to_ask(next_states, changed, asked):
-    """asked[:n] = the states with a next state that changed its class; returns n."""
+def states_to_ask(next_states, changed, candidates):
+    """candidates[:n] = the states with a next state that changed its class; returns n."""
     n = 0
     for s in range(len(next_states)):
         for a in range(next_states.shape[1]):
             t = next_states[s, a]
             if t >= 0 and changed[t]:
-                asked[n] = s
+                candidates[n] = s
                 n += 1
                 break
     return n
 
 
 @njit(cache=True, nogil=True)
-def split(next_states, classes, sizes, count, asked, n, slots, used, new, changed):
+def split(next_states, classes, sizes, count, candidates, n, slots, used, new, changed):
     """Split classes by the classes that the asked states lead to; returns the number of classes.
 
     Members that are not asked lead where their class led before, and keep its number; so does the first group where all
-    are asked. classes (S,), sizes (S,) members of each class; asked (S,) of which n; used, new (S,) scratch; changed
-    (S,) bool: whose class changed.
+    are asked. classes (S,), sizes (S,) members of each class; candidates (S,), of which n are asked; used, new (S,)
+    scratch; changed (S,) bool: whose class changed.
     """
     mask = len(slots) - 1
     num_actions = next_states.shape[1]
     changed[:] = False
     members = np.zeros(count, np.int32)
     for i in range(n):
-        members[classes[asked[i]]] += 1
+        members[classes[candidates[i]]] += 1
     for i in range(n):
-        s = asked[i]
+        s = candidates[i]
         h = mixed(uint64(classes[s]))
         for a in range(num_actions):
             t = next_states[s, a]
@@ -109,7 +109,7 @@ def split(next_states, classes, sizes, count, asked, n, slots, used, new, change
                     new[i] = count
                     count += 1
                 break
-            other = asked[place]
+            other = candidates[place]
             same = classes[other] == classes[s]
             for a in range(num_actions):
                 if not same:
@@ -123,7 +123,7 @@ def split(next_states, classes, sizes, count, asked, n, slots, used, new, change
             slot = (slot + 1) & mask
     for i in range(n):
         slots[used[i]] = -1
-        s = asked[i]
+        s = candidates[i]
         if new[i] != classes[s]:
             sizes[classes[s]] -= 1
             sizes[new[i]] += 1

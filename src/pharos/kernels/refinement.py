@@ -96,7 +96,7 @@ def refine(matrix, num_actions, into, classes, layout, slots):
     """
     size, kind = len(classes), classes.dtype
     count = _laid_out(classes, layout)
-    asked, touched, asked_of = np.arange(size).astype(kind), np.empty(size, kind), np.zeros(size, kind)
+    candidates, touched, asked_of = np.arange(size).astype(kind), np.empty(size, kind), np.zeros(size, kind)
     renumbered, number = np.empty(size, kind), np.empty(size, kind)
     rows = (np.zeros(size), np.empty(size, kind), np.zeros(size), np.empty(size, kind))
     groups = (np.empty(size, kind), np.empty(size, kind), np.empty(size, np.uint64), slots, np.empty(size, kind))
@@ -105,16 +105,16 @@ def refine(matrix, num_actions, into, classes, layout, slots):
     n, rounds = size, 0
     while True:
         rounds += 1
-        num_touched = _to_the_front(asked, n, classes, layout, asked_of, touched)
+        num_touched = _to_the_front(candidates, n, classes, layout, asked_of, touched)
         changed = 0
         for i in range(num_touched):
             c = touched[i]
             k, asked_of[c] = asked_of[c], 0
             if layout[3][c] > 1:
-                found = _grouped(matrix, num_actions, c, k, classes, layout, groups, group_sizes, rows)
-                if found > 1:
+                num_groups = _grouped(matrix, num_actions, c, k, classes, layout, groups, group_sizes, rows)
+                if num_groups > 1:
                     count, changed = _split(
-                        c, k, found, count, layout, groups, group_sizes, renumbered, number, changed
+                        c, k, num_groups, count, layout, groups, group_sizes, renumbered, number, changed
                     )
         if changed == 0:
             return rounds
@@ -126,19 +126,19 @@ def refine(matrix, num_actions, into, classes, layout, slots):
             for k in range(edges[s], edges[s + 1]):
                 if not is_asked[states[k]]:
                     is_asked[states[k]] = True
-                    asked[n] = states[k]
+                    candidates[n] = states[k]
                     n += 1
         for i in range(n):
-            is_asked[asked[i]] = False
+            is_asked[candidates[i]] = False
 
 
 @njit(cache=True, nogil=True)
-def _to_the_front(asked, n, classes, layout, asked_of, touched):
+def _to_the_front(candidates, n, classes, layout, asked_of, touched):
     """Members that are asked come first in their class, asked_of[c] of them; returns how many classes are touched."""
     elements, place, begin, _ = layout
     num_touched = 0
     for i in range(n):
-        s = asked[i]
+        s = candidates[i]
         c = classes[s]
         if asked_of[c] == 0:
             touched[num_touched] = c
@@ -160,7 +160,7 @@ def _grouped(matrix, num_actions, c, k, classes, layout, groups, group_sizes, ro
     elements, _, begin, sizes = layout
     group, member, hashes, slots, used = groups
     mask = len(slots) - 1
-    found = 0
+    num_groups = 0
     for j in range(-1 if k < sizes[c] else 0, k):
         s = elements[begin[c] + (k if j < 0 else j)]
         h = _hash(matrix, num_actions, s, classes, rows[0], rows[1])
@@ -168,10 +168,10 @@ def _grouped(matrix, num_actions, c, k, classes, layout, groups, group_sizes, ro
         while True:
             g = slots[slot]
             if g < 0:
-                g = found
+                g = num_groups
                 slots[slot] = g
                 used[g], hashes[g], member[g], group_sizes[g] = slot, h, s, 0
-                found += 1
+                num_groups += 1
                 break
             if hashes[g] == h and _alike(matrix, num_actions, s, member[g], classes, *rows):
                 break
@@ -179,13 +179,13 @@ def _grouped(matrix, num_actions, c, k, classes, layout, groups, group_sizes, ro
         if j >= 0:
             group[j] = g
         group_sizes[g] += 1 if j >= 0 else sizes[c] - k
-    for g in range(found):
+    for g in range(num_groups):
         slots[used[g]] = -1
-    return found
+    return num_groups
 
 
 @njit(cache=True, nogil=True)
-def _split(c, k, found, count, layout, groups, group_sizes, renumbered, number, changed):
+def _split(c, k, num_groups, count, layout, groups, group_sizes, renumbered, number, changed):
     """Lay the groups of class c side by side and number them anew, but for the largest; returns (classes, renumbered
     states).
 
@@ -194,7 +194,7 @@ def _split(c, k, found, count, layout, groups, group_sizes, renumbered, number, 
     elements, place, begin, sizes = layout
     group, ends, _, _, states = groups
     largest, at = 0, begin[c]
-    for g in range(found - 1, -1, -1):
+    for g in range(num_groups - 1, -1, -1):
         ends[g] = at
         at += group_sizes[g]
         if group_sizes[g] > group_sizes[largest]:
@@ -205,7 +205,7 @@ def _split(c, k, found, count, layout, groups, group_sizes, renumbered, number, 
         elements[ends[group[j]]], place[s] = s, ends[group[j]]
         ends[group[j]] += 1
     at = begin[c]
-    for g in range(found - 1, -1, -1):
+    for g in range(num_groups - 1, -1, -1):
         new = c
         if g != largest:
             new = count

@@ -45,58 +45,58 @@ def outcomes_into(node, num_nodes):
 
 
 @njit(cache=True, nogil=True)
-def _search_back(y, outcomes, owner, into, ball, seen, queue, via):
-    """Nodes by their distance to y: queue[:result]; seen[n] = distance + 1, via[n] = the outcome aimed at first, the
+def _search_back(y, outcomes, owner, into, ball, levels, queue, via):
+    """Nodes by their distance to y: queue[:result]; levels[n] = distance + 1, via[n] = the outcome aimed at first, the
     most probable one of those that lead to the same node. Ends with `ball` nodes."""
     _, _, node, prob = outcomes
     into_first, into_outcome = into
-    seen[y] = 1
+    levels[y] = 1
     queue[0] = y
     head, tail = 0, 1
-    while head < tail and tail < ball and seen[queue[head]] < NONE:
+    while head < tail and tail < ball and levels[queue[head]] < NONE:
         n = queue[head]
         head += 1
         for k in range(into_first[n], into_first[n + 1]):
             x = owner[into_outcome[k]]
-            if seen[x] == 0 and tail < ball:
-                seen[x] = seen[n] + 1
+            if levels[x] == 0 and tail < ball:
+                levels[x] = levels[n] + 1
                 via[x] = into_outcome[k]
                 queue[tail] = x
                 tail += 1
-            elif seen[x] == seen[n] + 1 and node[via[x]] == n and prob[into_outcome[k]] > prob[via[x]]:
+            elif levels[x] == levels[n] + 1 and node[via[x]] == n and prob[into_outcome[k]] > prob[via[x]]:
                 via[x] = into_outcome[k]
     return tail
 
 
 @njit(cache=True, nogil=True)
-def steps_back(low, high, outcomes, owner, into, square, steps, ball, seen, queue, via):
+def steps_back(low, high, outcomes, owner, into, square, steps, ball, levels, queue, via):
     """For outcomes i that lead to nodes low..high: steps[square[i] + j] of a shortest way from outcome j of its state
     to node[i].
 
-    NONE where the `ball` nodes nearest to node[i] do not include it. seen (N,) uint8 is zero before and after.
+    NONE where the `ball` nodes nearest to node[i] do not include it. levels (N,) uint8 is zero before and after.
     """
     first, _, node, _ = outcomes
     into_first, into_outcome = into
     for y in range(low, high):
-        found = _search_back(y, outcomes, owner, into, ball, seen, queue, via)
+        size = _search_back(y, outcomes, owner, into, ball, levels, queue, via)
         for k in range(into_first[y], into_first[y + 1]):
             i = into_outcome[k]
             x = owner[i]
             if square[i] >= 0:
                 for j in range(first[x + 1] - first[x]):
-                    there = seen[node[first[x] + j]]
+                    there = levels[node[first[x] + j]]
                     steps[square[i] + j] = there - 1 if there > 0 else NONE
-        for k in range(found):
-            seen[queue[k]] = 0
+        for k in range(size):
+            levels[queue[k]] = 0
 
 
 @njit(cache=True, nogil=True)
-def ways_back(low, high, outcomes, owner, into, square, steps, start, way, ball, seen, queue, via):
+def ways_back(low, high, outcomes, owner, into, square, steps, start, way, ball, levels, queue, via):
     """Write the outcomes along those ways, outcome after outcome: way[start[i]] on."""
     first, _, node, _ = outcomes
     into_first, into_outcome = into
     for y in range(low, high):
-        found = _search_back(y, outcomes, owner, into, ball, seen, queue, via)
+        size = _search_back(y, outcomes, owner, into, ball, levels, queue, via)
         for k in range(into_first[y], into_first[y + 1]):
             i = into_outcome[k]
             x = owner[i]
@@ -109,8 +109,8 @@ def ways_back(low, high, outcomes, owner, into, square, steps, start, way, ball,
                             way[at] = via[n]
                             at += 1
                             n = node[via[n]]
-        for k in range(found):
-            seen[queue[k]] = 0
+        for k in range(size):
+            levels[queue[k]] = 0
 
 
 @njit(cache=True, nogil=True)
@@ -215,9 +215,9 @@ def times_from(hub, first, node, cost, leak):
         done[x] = True
         for i in range(first[x], first[x + 1]):
             y = node[i]
-            kept = 1 - leak[i] - ROUNDING
-            if not done[y] and kept > 0:
-                there = (so_far + cost[i]) / kept
+            remainder = 1 - leak[i] - ROUNDING
+            if not done[y] and remainder > 0:
+                there = (so_far + cost[i]) / remainder
                 if there < bound[y]:
                     bound[y] = there
                     heapq.heappush(heap, (there, y))

@@ -175,14 +175,14 @@ def _row(rank: int, verdict: Verdict) -> list[Cell]:
     entry, config = verdict.entry, verdict.entry.config
     learning = entry.training.get("normalized_regret")
     learning = learning if isinstance(learning, int | float) and math.isfinite(learning) else math.nan
-    seen = observation_title(config.observation, config.observation_options)
+    observation = observation_title(config.observation, config.observation_options)
     certainty = "exact" if verdict.exact else f"estimated ± {verdict.error_bound:.2g}"
     return [
         _number(rank, "d"),
         Cell(entry.name, entry.name, entry.note),
         Cell(entry.author, entry.author),
         Cell(config.agent, config.agent),
-        Cell(seen, seen),
+        Cell(observation, observation),
         _number(config.steps, ",d"),
         _number(verdict.value, ".6g"),
         _number(verdict.regret if abs(verdict.regret) > 1e-9 else 0.0, ".6g"),

@@ -60,8 +60,8 @@ def _network(entry: Entry, task: Task, trust: bool) -> DeepPolicy:
     else:
         agent, hyperparameters = _known_agent(config.agent), _network_options(entry)
         _check_sizes(entry, task, hyperparameters)
-    taken = inspect.signature(algorithm(agent)).parameters
-    smallest = next((options for options in SMALLEST if set(options) <= set(taken)), {})
+    parameters = inspect.signature(algorithm(agent)).parameters
+    smallest = next((options for options in SMALLEST if set(options) <= set(parameters)), {})
     env = make_sb3_vec(task.env, 1, seed=0, **task.interaction)
     try:
         model = make_model(agent, env, {**hyperparameters, **smallest}, seed=0)
@@ -83,16 +83,16 @@ def _known_agent(name: str) -> str:
     if module in LIBRARIES and attribute.isidentifier():
         from stable_baselines3.common.base_class import BaseAlgorithm
 
-        found = algorithm(name)
-        if isinstance(found, type) and issubclass(found, BaseAlgorithm):
+        cls = algorithm(name)
+        if isinstance(cls, type) and issubclass(cls, BaseAlgorithm):
             return name
     raise UntrustedCode(f"the agent {name!r} is code, which is executed only if you trust it: add --trust")
 
 
 def _network_options(entry: Entry) -> dict[str, Any]:
     """Of the hyperparameters, those that shape the network; plain numbers and truths alone."""
-    given = entry.hyperparameters
-    options = {name: given[name] for name in ("net_arch", "policy_kwargs") if name in given}
+    hyperparameters = entry.hyperparameters
+    options = {name: hyperparameters[name] for name in ("net_arch", "policy_kwargs") if name in hyperparameters}
     kwargs = options.get("policy_kwargs", {})
     if not isinstance(kwargs, dict) or not set(kwargs) <= set(NETWORK_OPTIONS):
         raise FileFormatError(

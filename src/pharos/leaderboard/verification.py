@@ -120,7 +120,7 @@ def verify(
     try:
         task = _task(entry, trust, max_states, values)
         policy = policy_of(entry, task, trust=trust)
-        found = evaluate_agent(policy, task, max_states=max_reached, seed=SEED)
+        evaluation = evaluate_agent(policy, task, max_states=max_reached, seed=SEED)
     except UntrustedCode as error:
         raise UntrustedCode(f"{path}: {error}") from None
     except (ParameterError, FileFormatError) as error:
@@ -129,10 +129,10 @@ def verify(
         raise StateSpaceTooLarge(f"{path}: {error}") from None
     reference, claim = task.reference, entry.claim
     slack = tolerance * max(1.0, abs(reference.optimal)) + reference.error_bound
-    apart = slack + found.error_bound + (min(claim.error_bound, slack) if claim.exact else claim.error_bound)
-    regret, spread = reference.optimal - found.value, reference.spread()
+    apart = slack + evaluation.error_bound + (min(claim.error_bound, slack) if claim.exact else claim.error_bound)
+    regret, spread = reference.optimal - evaluation.value, reference.spread()
     checks = (
-        Check("value", claim.value, found.value, apart),
+        Check("value", claim.value, evaluation.value, apart),
         Check("regret", claim.regret, regret, apart + slack),
         Check("value_optimal", claim.value_optimal, reference.optimal, slack),
         Check("value_uniform", claim.value_uniform, reference.uniform, slack),
@@ -140,15 +140,15 @@ def verify(
     return Verdict(
         path,
         entry,
-        found.value,
+        evaluation.value,
         regret,
         regret / spread if math.isfinite(spread) else math.nan,
         reference.optimal,
         reference.uniform,
-        found.exact,
-        found.error_bound,
-        found.states,
-        found.episodes,
+        evaluation.exact,
+        evaluation.error_bound,
+        evaluation.states,
+        evaluation.episodes,
         checks,
         time.perf_counter() - began,
     )

@@ -93,15 +93,15 @@ class RewardsCollector:
         if self._values is None:
             if self._codes is None:
                 self._codes = np.zeros(self.shape, np.uint8)
-            known = self._palette
-            new = np.setdiff1d(block, known)  # sorted and unique
-            if len(known) + len(new) <= 256:
-                self._palette = palette = np.concatenate([known, new])
+            entries = self._palette
+            new = np.setdiff1d(block, entries)  # sorted and unique
+            if len(entries) + len(new) <= 256:
+                self._palette = palette = np.concatenate([entries, new])
                 order = np.argsort(palette)
                 codes = order[np.searchsorted(palette[order], block)]
                 self._codes[start : start + len(block)] = codes
                 return
-            self._values = known[self._codes] if len(known) else np.zeros(self.shape)
+            self._values = entries[self._codes] if len(entries) else np.zeros(self.shape)
             self._codes = None
         self._values[start : start + len(block)] = block
 

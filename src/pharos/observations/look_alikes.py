@@ -74,10 +74,10 @@ def observation_classes(
             f"history_aliasing counts what it tells"
         )
 
-    def seen(block: slice) -> np.ndarray:
+    def observations_of(block: slice) -> np.ndarray:
         return observation(space.states(block))
 
-    return _numbered(seen, space.num_states, observation.name, progress)
+    return _numbered(observations_of, space.num_states, observation.name, progress)
 
 
 def history_aliasing(
@@ -99,12 +99,12 @@ def history_aliasing(
     """
     histories = _histories(space, observation.frames, most)
 
-    def seen(block: slice) -> np.ndarray:
+    def observations_of(block: slice) -> np.ndarray:
         part = histories[block]
         states = space.states(part.ravel())
         return observation.of_histories(states.reshape(*part.shape, -1))
 
-    classes = _numbered(seen, len(histories), observation.name, progress)
+    classes = _numbered(observations_of, len(histories), observation.name, progress)
     ends, terminal = histories[:, -1], np.asarray(space.terminal)
 
     def sharing(among: np.ndarray) -> int:
@@ -118,8 +118,8 @@ def history_aliasing(
 
 def _histories(space: "StateSpace", length: int, most: int) -> np.ndarray:
     """(H, length) int64, all histories that play can have."""
-    found = np.unique(np.repeat(space.start_states[:, None], length, axis=1), axis=0).astype(np.int64)
-    met, frontier, terminal = set(map(tuple, found.tolist())), found, np.asarray(space.terminal)
+    starts = np.unique(np.repeat(space.start_states[:, None], length, axis=1), axis=0).astype(np.int64)
+    met, frontier, terminal = set(map(tuple, starts.tolist())), starts, np.asarray(space.terminal)
     while len(frontier):
         going = frontier[~terminal[frontier[:, -1]]]
         rows = np.repeat(np.arange(len(going)), space.num_actions)
@@ -138,15 +138,17 @@ def _histories(space: "StateSpace", length: int, most: int) -> np.ndarray:
     return np.array(sorted(met), np.int64)
 
 
-def _numbered(seen: Callable[[slice], np.ndarray], count: int, name: str, progress: Progress | None) -> np.ndarray:
-    """(count,) int64, the numbers of different observations, which `seen` gives for blocks of rows."""
+def _numbered(
+    observations_of: Callable[[slice], np.ndarray], count: int, name: str, progress: Progress | None
+) -> np.ndarray:
+    """(count,) int64, the numbers of different observations, which `observations_of` gives for blocks of rows."""
     import xxhash
 
     digests = np.empty(count, "V16")
     for start in range(0, count, BLOCK):
         if progress is not None:
             progress(start, name)
-        observations = seen(slice(start, min(start + BLOCK, count)))
+        observations = observations_of(slice(start, min(start + BLOCK, count)))
         rows = np.ascontiguousarray(observations).reshape(len(observations), -1).view(np.uint8)
         digests[start : start + len(rows)] = [xxhash.xxh3_128_digest(row.data) for row in rows]
     halves = digests.view(np.uint64).reshape(-1, 2)

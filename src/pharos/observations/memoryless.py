@@ -106,8 +106,8 @@ class _Search:
                 self.solved += 1
                 above = min(upper, solution.value_at_start + solution.error_bound)
                 if above > lower + TOLERANCE:
-                    found, next_conflict = self.rounded(solution, child)
-                    lower = max(lower, found)
+                    value, next_conflict = self.rounded(solution, child)
+                    lower = max(lower, value)
                     heapq.heappush(heap, (-above, next(order), child, next_conflict))
         return lower, lower + TOLERANCE
 
@@ -123,8 +123,8 @@ class _Search:
             chosen_rewards = mdp.rewards[rows, executed]
             return TabularMDP.from_arrays(table[rows, executed], chosen_rewards, terminal=mdp.terminal, **setting)
         matrix, rewards = self.chosen
-        taken = (rows * mdp.num_actions + executed).ravel()
-        return TabularMDP.from_matrices(matrix[taken], rewards[rows, executed], **setting)
+        pairs = (rows * mdp.num_actions + executed).ravel()
+        return TabularMDP.from_matrices(matrix[pairs], rewards[rows, executed], **setting)
 
     @cached_property
     def chosen(self) -> tuple[Any, np.ndarray]:
@@ -151,17 +151,17 @@ class _Search:
         actions = self.best(solution.q, weights, fixed)
         lost = self.lost(solution.q, weights, actions, fixed)
         conflict = int(lost.argmax()) if lost.max() > 0 else -1
-        value, seen = -np.inf, set()
+        value, policies = -np.inf, set()
         for _ in range(MOST_IMPROVEMENTS):
             evaluated = evaluate_policy(self.mdp, actions[self.classes], TOLERANCE)
             self.solved += 1
             value = max(value, evaluated.value_at_start - evaluated.error_bound)
-            seen.add(actions.tobytes())
+            policies.add(actions.tobytes())
             if time.monotonic() > self.deadline:
                 break
             weights = self.visits(actions[self.classes]) + 1e-3 * weights
             actions = self.best(evaluated.q, weights, np.full(self.count, -1))
-            if actions.tobytes() in seen:
+            if actions.tobytes() in policies:
                 break
         return value, conflict
 

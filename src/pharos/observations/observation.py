@@ -87,19 +87,19 @@ class FunctionObservation(Observation):
                 )
 
     def __call__(self, states: np.ndarray) -> np.ndarray:
-        found = np.asarray(self.function(self.env, states))
+        batch = np.asarray(self.function(self.env, states))
         expected = (len(states), *(self.space.shape or ()))
-        if found.shape != expected:
+        if batch.shape != expected:
             raise ParameterError(
-                f"observation {self.name!r} has shape {found.shape} for {len(states)} states; expected {expected}: "
+                f"observation {self.name!r} has shape {batch.shape} for {len(states)} states; expected {expected}: "
                 f"one row a state, each as its space says"
             )
         dtype = np.dtype(self.space.dtype)
-        if found.dtype != dtype and not np.can_cast(found.dtype, dtype, "same_kind"):
+        if batch.dtype != dtype and not np.can_cast(batch.dtype, dtype, "same_kind"):
             raise ParameterError(
-                f"observation {self.name!r} has dtype {found.dtype}; expected {dtype}, as its space says: use .astype"
+                f"observation {self.name!r} has dtype {batch.dtype}; expected {dtype}, as its space says: use .astype"
             )
-        return np.array(found, dtype)  # a copy: functions may return the same buffer twice
+        return np.array(batch, dtype)  # a copy: functions may return the same buffer twice
 
 
 # Name of one of pharos' own -> its file and class, which is loaded when it is first asked for
@@ -184,25 +184,25 @@ def observe(
                 f"observation {observation.name!r} belongs to {observation.env}; expected one of {env}"
             )
         made = observation
-        known: list[str] = []
+        keywords: list[str] = []
     elif (own := _own(observation)) is not None:
-        made, known = _made(own.make, env, state_space, options)
+        made, keywords = _made(own.make, env, state_space, options)
     elif isinstance(observation, tuple) and len(observation) == 2 and callable(observation[0]):
-        made, known = FunctionObservation(env, *observation), []
+        made, keywords = FunctionObservation(env, *observation), []
     elif not isinstance(observation, str):
         raise ParameterError(
             f"observation is {observation!r}; expected one of {', '.join(names())}, or a pair (function, Gymnasium "
             "space)"
         )
     elif observation in _registered:
-        made, known = FunctionObservation(env, *_registered[observation], name=observation), []
+        made, keywords = FunctionObservation(env, *_registered[observation], name=observation), []
     elif observation in _BUILT_IN:
-        made, known = _made(_built_in(observation), env, state_space, options)
+        made, keywords = _made(_built_in(observation), env, state_space, options)
     else:
         raise UnknownName("observation", observation, names())
     for option in options:
-        if option not in known:
-            raise UnknownName(f"option of observation {made.name!r}", option, known)
+        if option not in keywords:
+            raise UnknownName(f"option of observation {made.name!r}", option, keywords)
     return made
 
 
@@ -211,9 +211,9 @@ def _made(
 ) -> tuple[Observation, list[str]]:
     """The observation, and the options that it knows: the keywords of `make`."""
     parameters = inspect.signature(make).parameters
-    known = [name for name, parameter in parameters.items() if parameter.kind is parameter.KEYWORD_ONLY]
+    keywords = [name for name, parameter in parameters.items() if parameter.kind is parameter.KEYWORD_ONLY]
     space = {"state_space": state_space} if "state_space" in parameters else {}
-    return make(env, **space, **{name: value for name, value in options.items() if name in known}), known
+    return make(env, **space, **{name: value for name, value in options.items() if name in keywords}), keywords
 
 
 def _built_in(name: str) -> Callable[..., Observation]:

@@ -44,13 +44,13 @@ def representation(
         raise ParameterError(f"{space}: the class of its environment is not known, so nothing is seen of its states")
     if landmarks is not None and (isinstance(landmarks, bool) or not isinstance(landmarks, int) or landmarks < 0):
         raise ParameterError(f"landmarks is {landmarks!r}; expected a whole number, 0 for none, or None")
-    seen = observe(space.environment, observation, state_space=space, **options)
-    net = Network.of(default_network(seen.space) if network is None else network, initialisation)
-    first = network_inputs(seen, space.states(slice(0, 1)))
+    observer = observe(space.environment, observation, state_space=space, **options)
+    net = Network.of(default_network(observer.space) if network is None else network, initialisation)
+    first = network_inputs(observer, space.states(slice(0, 1)))
     tangent_kernel(net, first)  # what does not fit is said before all states are looked at
 
     def inputs(states: np.ndarray) -> np.ndarray:
-        return network_inputs(seen, space.states(states))
+        return network_inputs(observer, space.states(states))
 
     def kernel(rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
         check_memory(len(rows), len(columns), str(space.environment))
@@ -59,11 +59,11 @@ def representation(
 
     return Representation(
         kernel=kernel,
-        classes=observation_classes(space, seen),
+        classes=observation_classes(space, observer),
         time_limit=int(space.environment.max_episode_steps),
         landmarks=landmarks,
         conventions={
-            "observation": seen.name,
+            "observation": observer.name,
             "options": {
                 name: value if isinstance(value, str | int | float) else str(value) for name, value in options.items()
             },

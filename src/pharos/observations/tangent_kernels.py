@@ -71,14 +71,14 @@ def ntk(
         from pharos.state_space import build
 
         space = build(world)  # type: ignore[arg-type]
-    seen = observe(world, observation, state_space=space, **options)  # type: ignore[arg-type]
-    net = Network.of(default_network(seen.space) if network is None else network, initialisation)
+    observer = observe(world, observation, state_space=space, **options)  # type: ignore[arg-type]
+    net = Network.of(default_network(observer.space) if network is None else network, initialisation)
     if states is None:
         assert space is not None
         check_memory(space.num_states, space.num_states if others is None else len(others), str(world))
         states = space.states()
-    x = network_inputs(seen, np.asarray(states, np.int64))
-    y = None if others is None else network_inputs(seen, np.asarray(others, np.int64))
+    x = network_inputs(observer, np.asarray(states, np.int64))
+    y = None if others is None else network_inputs(observer, np.asarray(others, np.int64))
     return tangent_kernel(net, x, y)
 
 

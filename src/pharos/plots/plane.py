@@ -65,9 +65,9 @@ def _label(axis: Any, points: Mapping[str, tuple[float, float]]) -> None:
     at = {name: scale * axis.transData.transform(point) for name, point in points.items()}
     left, low, right_end, high = (scale * edge for edge in axis.bbox.extents)
     far = 1e4
-    taken = [(x - 4, y - 4, x + 4, y + 4) for x, y in at.values()]
-    taken += [(left - far, -far, left, far), (right_end, -far, right_end + far, far)]  # outside
-    taken += [(-far, low - far, far, low), (-far, high, far, high + far)]
+    obstacles = [(x - 4, y - 4, x + 4, y + 4) for x, y in at.values()]
+    obstacles += [(left - far, -far, left, far), (right_end, -far, right_end + far, far)]  # outside
+    obstacles += [(-far, low - far, far, low), (-far, high, far, high + far)]
     for name, (x, y) in at.items():
         short = name.split("/", 1)[-1]
         width, height = 4.2 * len(short), 8.0
@@ -77,10 +77,11 @@ def _label(axis: Any, points: Mapping[str, tuple[float, float]]) -> None:
                 edge = x + 6 if right else x - 6 - width
                 boxes[right, dy] = (edge, y + dy, edge + width, y + dy + height)
         cost = {
-            place: sum(_overlap(box, other) for other in taken) + 2 * abs(place[1] + 3) for place, box in boxes.items()
+            place: sum(_overlap(box, other) for other in obstacles) + 2 * abs(place[1] + 3)
+            for place, box in boxes.items()
         }
         right, dy = min(cost, key=cost.__getitem__)
-        taken.append(boxes[right, dy])
+        obstacles.append(boxes[right, dy])
         axis.annotate(
             short,
             points[name],

@@ -80,10 +80,10 @@ def _episode(task: "Task", agent: Any, steps: int, seed: int) -> list[tuple["Sta
     """[(state, return so far)] from the start to the end of one episode, as `GymEnv` plays it."""
     env = GymEnv(task.env, **task.interaction)
     choose = _chooser(task, agent, np.random.default_rng(seed))
-    seen, info = env.reset(seed=seed)
+    observation, info = env.reset(seed=seed)
     episode, gained = [(info["state"], 0.0)], 0.0
     for _ in range(steps):
-        seen, reward, terminated, truncated, info = env.step(choose(seen, info["state"]))
+        observation, reward, terminated, truncated, info = env.step(choose(observation, info["state"]))
         gained += float(reward)
         episode.append((info["state"], gained))
         if terminated or truncated:
@@ -101,21 +101,25 @@ def _chooser(task: "Task", agent: Any, rng: np.random.Generator) -> Callable[[An
                 f"the policy has shape {agent.shape}; expected ({task.space.num_states},) actions or "
                 f"({task.space.num_states}, {task.env.num_actions}) probabilities"
             )
-        asked = None
+        answers = None
     else:
-        asked = PolicyAnswers(agent, task.mdp, task.sight)
+        answers = PolicyAnswers(agent, task.mdp, task.sight)
 
-    def choose(seen: Any, state: "State") -> int:
-        if asked is None:
+    def choose(observation: Any, state: "State") -> int:
+        if answers is None:
             row = agent[task.space.index(state)]
             if np.ndim(row) == 0:
                 return int(row)
         else:
-            row = asked.answer(_batch(seen))[0]
+            row = answers.answer(_batch(observation))[0]
         return int(rng.choice(task.env.num_actions, p=row / row.sum()))
 
     return choose
 
 
-def _batch(seen: Any) -> Any:
-    return {name: _batch(value) for name, value in seen.items()} if isinstance(seen, dict) else np.asarray(seen)[None]
+def _batch(observation: Any) -> Any:
+    return (
+        {name: _batch(value) for name, value in observation.items()}
+        if isinstance(observation, dict)
+        else np.asarray(observation)[None]
+    )

@@ -119,14 +119,16 @@ def _label(config: dict[str, Any], configs: list[dict[str, Any]]) -> str:
 def _instance(environment: str, parameters: dict[str, Any]) -> str:
     """`frozen_lake/8x8` where the instance has a name, else the class and what differs from its defaults."""
     cls = class_called(environment)
-    given = as_tuples(parameters)
+    setting = as_tuples(parameters)
     if cls is None:
-        return " ".join([environment, *(f"{name}={value}" for name, value in given.items() if value not in (None, ()))])
+        return " ".join(
+            [environment, *(f"{name}={value}" for name, value in setting.items() if value not in (None, ()))]
+        )
     for name in cls.instances:
-        if make(f"{environment}/{name}").parameters == given:
+        if make(f"{environment}/{name}").parameters == setting:
             return f"{environment}/{name}"
     usual = cls().parameters
-    return " ".join([environment, *(f"{name}={value}" for name, value in given.items() if value != usual.get(name))])
+    return " ".join([environment, *(f"{name}={value}" for name, value in setting.items() if value != usual.get(name))])
 
 
 def _varies(name: str, configs: list[dict[str, Any]]) -> bool:

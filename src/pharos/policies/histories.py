@@ -34,8 +34,8 @@ class HistoryAnswers(PolicyAnswers):
 
     def next_rows(self, rows: np.ndarray, executed: np.ndarray, following: np.ndarray) -> np.ndarray:
         pairs, inverse = np.unique(np.stack([rows, following], axis=1), axis=0, return_inverse=True)
-        found = self._numbers([(*self._histories[row][1:], t) for row, t in pairs.tolist()])
-        return found[inverse.reshape(-1)]
+        numbers = self._numbers([(*self._histories[row][1:], t) for row, t in pairs.tolist()])
+        return numbers[inverse.reshape(-1)]
 
     def states_of(self, rows: np.ndarray) -> np.ndarray:
         return np.array([self._histories[row][-1] for row in rows], np.int64)
@@ -94,8 +94,8 @@ class HistoryAnswers(PolicyAnswers):
             histories = np.array([self._histories[row] for row in rows[start : start + BATCH]], np.int64)
             count, frames = histories.shape
             states = self.sight.space.states(histories.ravel()).reshape(count, frames, -1)
-            seen = context.observation.of_histories(states)
-            answers.append(self.answer(seen, count))
+            observations = context.observation.of_histories(states)
+            answers.append(self.answer(observations, count))
         return np.concatenate(answers)
 
     def _numbers(self, histories: list[tuple[int, ...]]) -> np.ndarray:

@@ -58,11 +58,11 @@ class CompiledExploration(_Compiled):
             failure = error
         self._check(states, None, progress, failure)
 
-    def expand_and_find(self, states, start, stop, base, keys, found, terminal, probabilities, table) -> None:
+    def expand_and_find(self, states, start, stop, base, keys, indices, terminal, probabilities, table) -> None:
         progress = np.zeros(5, np.int64)
         failure: Exception | None = None
         try:
-            self._expand(states, start, stop, base, keys, found, self._rows(terminal, probabilities), table, progress)
+            self._expand(states, start, stop, base, keys, indices, self._rows(terminal, probabilities), table, progress)
         except Exception as error:
             failure = error
         self._check(states, stop, progress, failure)
@@ -91,9 +91,9 @@ class CompiledExploration(_Compiled):
         """
         from pharos.kernels.hash_table import FAULT
 
-        progress, found = np.zeros(5, np.int64), np.empty(len(keys), np.int64)
+        progress, indices = np.zeros(5, np.int64), np.empty(len(keys), np.int64)
         rows = self._rows(terminal, probabilities)
-        self._expand(states, i, i + 1, 0, keys, found, rows, np.full(64, -1, np.int32), progress)
+        self._expand(states, i, i + 1, 0, keys, indices, rows, np.full(64, -1, np.int32), progress)
         fault = int(progress[FAULT])
         return fault - 1 if fault else None
 
@@ -118,12 +118,14 @@ class CompiledRewards(_Compiled):
         return workers
 
     def block(self, states, successors, terminal, start: int, stop: int) -> np.ndarray:
-        return self._asked("block", self._rewards_of, states, successors, terminal, start, stop)
+        return self._rewards_or_error("block", self._rewards_of, states, successors, terminal, start, stop)
 
     def expected_block(self, states, outcomes, terminal, start: int, stop: int, ranks=COUNTED) -> np.ndarray:
-        return self._asked("expected_block", self._expected_rewards_of, states, outcomes, terminal, start, stop, ranks)
+        return self._rewards_or_error(
+            "expected_block", self._expected_rewards_of, states, outcomes, terminal, start, stop, ranks
+        )
 
-    def _asked(self, name: str, compiled: Callable[..., np.ndarray], *arguments: Any) -> np.ndarray:
+    def _rewards_or_error(self, name: str, compiled: Callable[..., np.ndarray], *arguments: Any) -> np.ndarray:
         try:
             return compiled(*arguments)
         except Exception as error:  # of the rule, such as a division by zero: name the state

@@ -54,10 +54,10 @@ def numeric_attributes(env: Environment) -> tuple[tuple[str, ...], tuple[Any, ..
 
     Private ones are left out: a named tuple has no fields with an underscore.
     """
-    known = set(dir(type(env))) | set(vars(env))
-    names = sorted(known & mentioned_names(getattr(type(env), rule) for rule in rules_of_class(type(env))))
-    found = {name: getattr(env, name) for name in names if not name.startswith("_")}
-    numeric = {name: _plain(value) for name, value in found.items() if _is_numeric(value)}
+    attributes = set(dir(type(env))) | set(vars(env))
+    names = sorted(attributes & mentioned_names(getattr(type(env), rule) for rule in rules_of_class(type(env))))
+    values = {name: getattr(env, name) for name in names if not name.startswith("_")}
+    numeric = {name: _plain(value) for name, value in values.items() if _is_numeric(value)}
     return tuple(numeric), tuple(numeric.values())
 
 

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import int64
 
-from pharos.kernels.hash_table import COUNT, DEPTH, FAULT, FIRST, LEVEL_END, mixed, prefetch, seen, slot_of
+from pharos.kernels.hash_table import COUNT, DEPTH, FAULT, FIRST, LEVEL_END, entry_at, mixed, prefetch, slot_of
 from pharos.rules.packed_view import fault, get_word, packed_view, read_only_view, set_word
 
 BATCH = 16  # states expanded before their successors are looked up: enough look-ups to hide the memory's latency
@@ -119,7 +119,7 @@ def prefetch_function(compiler: Any, A: int) -> Any:
         """Fetch the states that sit in the slots, which will be compared soon."""
         for j in range(n * A):
             if slots[j] >= 0:
-                index = seen(table, slots[j])
+                index = entry_at(table, slots[j])
                 if index >= 0:
                     prefetch(states, index)
 
@@ -196,10 +196,10 @@ def expand_and_find_kernel(compiler: Any, expand: Any, prefetch_states: Any, wor
     same = words.same
 
     @compiler.kernel
-    def expand_and_find(parameters, layout, states, start, stop, base, keys, found, terminal, table, progress):
+    def expand_and_find(parameters, layout, states, start, stop, base, keys, indices, terminal, table, progress):
         """Successors of states [start, stop), and the indices of those that the table has.
 
-        keys ((rows * A), W) gets the successors' words; found (rows * A,) their indices, or -1 - slot where the table
+        keys ((rows * A), W) gets the successors' words; indices (rows * A,) their indices, or -1 - slot where the table
         has none; row i belongs to state base + i. The table is only read; another thread may insert meanwhile: what it
         inserts is found or not found, and the one that numbers the states searches on from the slot.
         """
@@ -221,14 +221,14 @@ def expand_and_find_kernel(compiler: Any, expand: Any, prefetch_states: Any, wor
                 slot = slots[buffer, j]
                 index = before + j // A
                 while slot >= 0:
-                    index = seen(table, slot)
+                    index = entry_at(table, slot)
                     if index < 0:
                         index = -1 - slot
                         break
                     if same(keys, first + j, states, index):
                         break
                     slot = slot + 1 if slot + 1 < capacity else 0
-                found[first + j] = index
+                indices[first + j] = index
             prefetch_states(table, states, slots[1 - buffer], n)
             waiting = n
 

@@ -30,13 +30,13 @@ _STABLE = (
 
 def fingerprint_of_rules(env: Any, rules: Iterable[str]) -> str:
     """SHA-256 of these rules of `env` and of the attributes of the instance that they mention."""
-    seen: dict[Any, int] = {}
+    numbers: dict[Any, int] = {}
     functions = [getattr(type(env), rule) for rule in rules]
-    parts = [function_text(function, seen) for function in functions]
+    parts = [function_text(function, numbers) for function in functions]
     for name in sorted(mentioned_names(functions, type(env))):
         if name in dir(type(env)) or name in vars(env):
             value = getattr(env, name)
-            parts.append(f"self.{name}={value_text(getattr(value, '__func__', value), set(), seen)}")
+            parts.append(f"self.{name}={value_text(getattr(value, '__func__', value), set(), numbers)}")
     return hashlib.sha256(repr(parts).encode()).hexdigest()
 
 
@@ -45,13 +45,13 @@ def mentioned_names(functions: Iterable[Any], owner: type | None = None) -> set[
     `owner`.
     """
     names: set[str] = set()
-    seen: set[Any] = set()
+    closure: set[Any] = set()
     pending = [plain_function(function) for function in functions]
     while pending:
         function = pending.pop()
-        if not isinstance(function, types.FunctionType) or function in seen:
+        if not isinstance(function, types.FunctionType) or function in closure:
             continue
-        seen.add(function)
+        closure.add(function)
         mentioned = names_in(function.__code__)
         names |= mentioned
         pending.extend(plain_function(function.__globals__.get(name)) for name in mentioned)
@@ -76,66 +76,74 @@ def names_in(code: types.CodeType) -> set[str]:
 
 def closure_of(function: types.FunctionType) -> dict[str, Any]:
     """Name -> value of the variables that a function takes from an enclosing one."""
-    found = {}
+    variables = {}
     for name, cell in zip(function.__code__.co_freevars, function.__closure__ or (), strict=True):
         try:
-            found[name] = cell.cell_contents
+            variables[name] = cell.cell_contents
         except ValueError:  # not assigned yet
             continue
-    return found
+    return variables
 
 
-def function_text(function: Any, seen: dict[Any, int]) -> str:
+def function_text(function: Any, numbers: dict[Any, int]) -> str:
     """A text for a function and for everything that it reaches by name."""
     function = plain_function(function)
     if not isinstance(function, types.FunctionType):
         return repr(function)
-    if function in seen:
-        return f"again {seen[function]}"
-    seen[function] = len(seen)
+    if function in numbers:
+        return f"again {numbers[function]}"
+    numbers[function] = len(numbers)
     names = names_in(function.__code__)
     parts = [_code_text(function.__code__), repr(function.__defaults__), repr(function.__kwdefaults__)]
     reached = {name: function.__globals__[name] for name in names if name in function.__globals__}
     for name, value in sorted({**reached, **closure_of(function)}.items()):
-        parts.append(f"{name}={value_text(value, names, seen)}")
+        parts.append(f"{name}={value_text(value, names, numbers)}")
     return "\n".join(parts)
 
 
-def value_text(value: Any, names: set[str], seen: dict[Any, int]) -> str:
+def value_text(value: Any, names: set[str], numbers: dict[Any, int]) -> str:
     """A text for a value; of a module, for those of its attributes that are among `names`."""
     value = plain_function(value)
     home = getattr(value, "__module__", None) or ""
     if isinstance(value, types.ModuleType):
         if value.__name__.split(".")[0] in _STABLE:
             return f"{value.__name__} {getattr(value, '__version__', '')}"
-        inside = (f"{name}={value_text(vars(value)[name], names, seen)}" for name in sorted(names & set(vars(value))))
-        return f"{value.__name__}({', '.join(inside)})" if _first_time(value, seen) else value.__name__
+        inside = (
+            f"{name}={value_text(vars(value)[name], names, numbers)}" for name in sorted(names & set(vars(value)))
+        )
+        return f"{value.__name__}({', '.join(inside)})" if _first_time(value, numbers) else value.__name__
     if isinstance(value, types.FunctionType):
-        return f"{home}.{value.__qualname__}" if home.split(".")[0] in _STABLE else function_text(value, seen)
+        return f"{home}.{value.__qualname__}" if home.split(".")[0] in _STABLE else function_text(value, numbers)
     if isinstance(value, np.ndarray):
         return f"{value.dtype}{value.shape}{hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest()}"
     if isinstance(value, type) and home.split(".")[0] not in _STABLE:
         if issubclass(value, enum.Enum):
             return repr([(member.name, repr(member.value)) for member in value])
-        inside = (f"{name}={value_text(vars(value)[name], names, seen)}" for name in sorted(names & set(vars(value))))
-        return f"{home}.{value.__qualname__}({', '.join(inside)})" if _first_time(value, seen) else value.__qualname__
+        inside = (
+            f"{name}={value_text(vars(value)[name], names, numbers)}" for name in sorted(names & set(vars(value)))
+        )
+        return (
+            f"{home}.{value.__qualname__}({', '.join(inside)})" if _first_time(value, numbers) else value.__qualname__
+        )
     if isinstance(value, tuple | list):
-        return f"{type(value).__name__}({', '.join(value_text(item, names, seen) for item in value)})"
+        return f"{type(value).__name__}({', '.join(value_text(item, names, numbers) for item in value)})"
     if isinstance(value, dict):
-        items = (f"{value_text(key, names, seen)}: {value_text(item, names, seen)}" for key, item in value.items())
+        items = (
+            f"{value_text(key, names, numbers)}: {value_text(item, names, numbers)}" for key, item in value.items()
+        )
         return f"{type(value).__name__}({', '.join(items)})"
     if isinstance(value, set | frozenset):  # whose order may vary from process to process
-        return f"{type(value).__name__}({', '.join(sorted(value_text(item, names, seen) for item in value))})"
+        return f"{type(value).__name__}({', '.join(sorted(value_text(item, names, numbers) for item in value))})"
     if type(value).__repr__ is object.__repr__:  # which tells an address, another one in each process
         kind = f"{home}.{type(value).__qualname__}"
-        first = _first_time(f"{kind} {id(value)}", seen)
-        return f"{kind}({value_text(getattr(value, '__dict__', {}), names, seen)})" if first else kind
+        first = _first_time(f"{kind} {id(value)}", numbers)
+        return f"{kind}({value_text(getattr(value, '__dict__', {}), names, numbers)})" if first else kind
     return repr(value)
 
 
-def _first_time(value: Any, seen: dict[Any, int]) -> bool:
-    first = value not in seen
-    seen.setdefault(value, len(seen))
+def _first_time(value: Any, numbers: dict[Any, int]) -> bool:
+    first = value not in numbers
+    numbers.setdefault(value, len(numbers))
     return first
 
 

@@ -42,22 +42,22 @@ class InterpretedExploration:
         stop = min(last, count, first + min(BLOCK, (room - count) // self.branches))
         rows = slice(first - base, stop - base)
         keys = np.empty(((stop - first) * self.branches, self.layout.num_words), np.uint64)
-        found = np.empty(len(keys), np.int64)
-        self.expand_and_find(states, first, stop, first, keys, found, terminal[rows], probabilities[rows], table)
-        insert_missing(table, states, keys, found, successors[rows], progress)
+        indices = np.empty(len(keys), np.int64)
+        self.expand_and_find(states, first, stop, first, keys, indices, terminal[rows], probabilities[rows], table)
+        insert_missing(table, states, keys, indices, successors[rows], progress)
 
-    def expand_and_find(self, states, start, stop, base, keys, found, terminal, probabilities, table) -> None:
+    def expand_and_find(self, states, start, stop, base, keys, indices, terminal, probabilities, table) -> None:
         for first in range(start, stop, BLOCK):
             last = min(first + BLOCK, stop)
             rows = slice(first - base, last - base)
             part = slice(rows.start * self.branches, rows.stop * self.branches)
             self._expand(states[first:last], keys[part], terminal[rows], probabilities[rows])
-            find(table, states, keys[part], found[part])
+            find(table, states, keys[part], indices[part])
         size = (stop - base) * self.branches
-        missing = np.flatnonzero(found[:size] < 0)
+        missing = np.flatnonzero(indices[:size] < 0)
         slots = np.empty(len(missing), np.int64)
         slots_of(keys[missing], len(table), slots)
-        found[missing] = -1 - slots
+        indices[missing] = -1 - slots
 
     def _expand(self, states: np.ndarray, keys: np.ndarray, terminal: np.ndarray, probabilities: np.ndarray) -> None:
         """Successors of packed states to keys, packed; terminal states and impossible outcomes lead to the state."""
@@ -188,14 +188,14 @@ class Interpreters:
         if shares < 2:
             return interpreted_branches(self.env, states.tolist())
         parts = np.array_split(states, shares)
-        asked = [
+        requests = [
             _send(connection, part) for connection, part in zip(self._connections[: shares - 1], parts[1:], strict=True)
         ]
-        found = [interpreted_branches(self.env, parts[0].tolist())]
-        for connection, part, is_asked in zip(self._connections[: shares - 1], parts[1:], asked, strict=True):
+        answers = [interpreted_branches(self.env, parts[0].tolist())]
+        for connection, part, is_asked in zip(self._connections[: shares - 1], parts[1:], requests, strict=True):
             answer = _received(connection, len(part), self.env) if is_asked else None
-            found.append(answer or interpreted_branches(self.env, part.tolist()))
-        following, terminal, probabilities = zip(*found, strict=True)
+            answers.append(answer or interpreted_branches(self.env, part.tolist()))
+        following, terminal, probabilities = zip(*answers, strict=True)
         likely = None if probabilities[0] is None else np.concatenate(probabilities)
         return Branches(np.concatenate(following), np.concatenate(terminal), likely)
 

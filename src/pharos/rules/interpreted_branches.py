@@ -175,7 +175,7 @@ def _outcomes(env: Environment, rows: list[list[int]]) -> Branches:
 
 def outcome_probabilities(env: Environment, state: tuple[int, ...], action: int) -> list[float]:
     """The probabilities of the K outcomes of an action; RuleError where they are no distribution."""
-    found = []
+    probabilities = []
     for outcome in range(env.outcomes):
         where = f"{env}: probability of outcome {outcome} of action {env.actions[action]!r} in state {state}"
         try:
@@ -184,16 +184,16 @@ def outcome_probabilities(env: Environment, state: tuple[int, ...], action: int)
             raise RuleError(f"{where} raises {error!r}") from error
         if not 0 <= probability <= 1 + SUM_TOLERANCE:
             raise RuleError(f"{where} is {probability!r}; expected a number from 0 to 1")
-        found.append(probability if probability > 0 else 0.0)
+        probabilities.append(probability if probability > 0 else 0.0)
     total = 0.0
-    for probability in found:  # in the order of compiled rules
+    for probability in probabilities:  # in the order of compiled rules
         total += probability
     if not abs(total - 1) <= SUM_TOLERANCE:
         raise RuleError(
             f"{env}: the probabilities of outcomes 0 to {env.outcomes - 1} of action {env.actions[action]!r} in state "
             f"{state} sum to {total!r}; expected 1"
         )
-    return found
+    return probabilities
 
 
 def _outcome(env: Environment, state: tuple[int, ...], action: int, outcome: int) -> list[int]:

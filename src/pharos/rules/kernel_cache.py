@@ -107,15 +107,15 @@ def _problem_of(folder: Path) -> str:
         folder.parent.mkdir(parents=True, exist_ok=True)
         with contextlib.suppress(FileExistsError):
             folder.mkdir(mode=0o700)
-        found = folder.stat()
+        status = folder.stat()
     except OSError as error:
         return f"cannot be used ({error.strerror})"
-    if not stat.S_ISDIR(found.st_mode):
+    if not stat.S_ISDIR(status.st_mode):
         return "is no folder"
     if not hasattr(os, "getuid"):
         return ""
-    if found.st_uid != os.getuid():
-        return f"belongs to another user (number {found.st_uid})"
-    if found.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+    if status.st_uid != os.getuid():
+        return f"belongs to another user (number {status.st_uid})"
+    if status.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
         return "can be written to by other users"
     return "" if os.access(folder, os.W_OK | os.X_OK) else "cannot be written to"

@@ -75,13 +75,13 @@ class Exploration(Protocol):
         stop: int,
         base: int,
         keys: np.ndarray,
-        found: np.ndarray,
+        indices: np.ndarray,
         terminal: np.ndarray,
         probabilities: np.ndarray,
         table: np.ndarray,
     ) -> None:
-        """Successors of states [start, stop) to keys, and their indices to found; -1 - slot where the table has
-        none.
+        """Successors of states [start, stop) to keys, and their indices to indices; -1 - slot where the table
+        has none.
         """
 
     def close(self) -> None:

@@ -87,10 +87,10 @@ class _Traced:
         """
         try:
             for row, root in missing[:: max(1, len(missing) // ASKED)][:ASKED].tolist():
-                seen = values(row, root)
-                if not self._trees.knows(self.low, root, seen):
+                inputs = values(row, root)
+                if not self._trees.knows(self.low, root, inputs):
                     self.asked += 1
-                    self._ask(tuple(seen.tolist()), root)
+                    self._ask(tuple(inputs.tolist()), root)
         except Exception:  # of the rule, too: the caller asks every state, and finds out whose it is
             self.is_on = False
         if self.asked >= FAIR_TRIAL and self.asked * WORTH > self.answered:

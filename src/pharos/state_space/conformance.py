@@ -104,15 +104,15 @@ def check_environment(env: Environment, *, max_states: int = 1000, seed: int = 0
 def _some_states(env: Environment, check: InterpretedCheck, max_states: int, seed: int) -> tuple[list[State], bool]:
     """Expanded states, in the order of discovery, and whether these are all that can be reached."""
     starts, _ = start_distribution(env)
-    found = dict.fromkeys(starts)
+    states = dict.fromkeys(starts)
     queue = deque(starts)
-    while queue and len(found) <= max_states:
+    while queue and len(states) <= max_states:
         for successor in check.expand(queue.popleft()):
-            if successor not in found:
-                found[successor] = None
+            if successor not in states:
+                states[successor] = None
                 queue.append(successor)
     if not queue:
-        return list(found), True
+        return list(states), True
     chosen = dict.fromkeys(list(check.terminal)[: (max_states + 1) // 2])
     rng = random.Random(seed)
     stack, visited = list(starts), set()
@@ -141,10 +141,12 @@ def _note_unseen_values(env: Environment, states: list[State], complete: bool, n
     where = "in any reachable state" if complete else f"in the {len(states)} states looked at"
     for variable, part in components.variables.items():
         low, high = components.low[part].min(), components.high[part].max()
-        seen = np.unique(table[:, part])
-        if seen[0] > low or seen[-1] < high or len(seen) < high - low + 1:
-            values = f"{seen[0]} to {seen[-1]}" if len(seen) == seen[-1] - seen[0] + 1 else f"{len(seen)} values"
-            notes.append(f"{variable} is declared as {low} to {high}; {where} it takes {values}")
+        values = np.unique(table[:, part])
+        if values[0] > low or values[-1] < high or len(values) < high - low + 1:
+            description = (
+                f"{values[0]} to {values[-1]}" if len(values) == values[-1] - values[0] + 1 else f"{len(values)} values"
+            )
+            notes.append(f"{variable} is declared as {low} to {high}; {where} it takes {description}")
 
 
 # The rules, compiled ------------------------------------------------------------------------------------------------

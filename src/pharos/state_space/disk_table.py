@@ -51,9 +51,9 @@ class DiskTable:
 
     def fill(self, states: np.ndarray, first: int) -> None:
         """Add states (n, W) that are not there yet, with indices first, first + 1, ..."""
-        found, order = np.empty(len(states), np.int64), np.empty(len(states), np.int32)
-        slots_of(states, kernels.BUCKETS, found)
-        size = kernels.sort_by_bucket(-1 - found, 0, order)
+        buckets, order = np.empty(len(states), np.int64), np.empty(len(states), np.int32)
+        slots_of(states, kernels.BUCKETS, buckets)
+        size = kernels.sort_by_bucket(-1 - buckets, 0, order)
         self._sweep(size, lambda low, high: kernels.place(self.entries, states, order, low, high, first))
 
     def grow(self, states: int) -> None:
@@ -63,19 +63,19 @@ class DiskTable:
             slots *= 2
         if slots == len(self.entries):
             return
-        old, kept = self.entries, self._mapping
+        old, mapping = self.entries, self._mapping
         self._open(slots)
-        self._sweep(len(old), lambda low, high: kernels.place_again(self.entries, old, low, high), also=kept)
+        self._sweep(len(old), lambda low, high: kernels.place_again(self.entries, old, low, high), also=mapping)
 
-    def look_up(self, keys: np.ndarray, found: np.ndarray, first: int, order: np.ndarray, slots: np.ndarray) -> int:
+    def look_up(self, keys: np.ndarray, indices: np.ndarray, first: int, order: np.ndarray, slots: np.ndarray) -> int:
         """Find candidates, or enter them as new; returns how many of `order` were looked up."""
-        size = kernels.sort_by_bucket(found, first, order)
-        self._sweep(size, lambda low, high: kernels.look_up(self.entries, keys, order, low, high, found, slots))
+        size = kernels.sort_by_bucket(indices, first, order)
+        self._sweep(size, lambda low, high: kernels.look_up(self.entries, keys, order, low, high, indices, slots))
         return size
 
-    def settle(self, size: int, found: np.ndarray, order: np.ndarray, slots: np.ndarray) -> None:
+    def settle(self, size: int, indices: np.ndarray, order: np.ndarray, slots: np.ndarray) -> None:
         """Give what was new its numbers."""
-        self._sweep(size, lambda low, high: kernels.settle(self.entries, order, low, high, found, slots))
+        self._sweep(size, lambda low, high: kernels.settle(self.entries, order, low, high, indices, slots))
 
     def _sweep(self, size: int, work: Callable[[int, int], None], also: mmap.mmap | None = None) -> None:
         """Do work(low, high) for parts of range(size), in order of slots, so that a part touches no more than the

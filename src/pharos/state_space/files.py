@@ -65,10 +65,10 @@ class GrowingFile:
     def _note(self, data: memoryview) -> None:
         self.bytes += len(data)
         while len(data):
-            taken = min(len(data), CHECKSUM_BYTES - self._partial_bytes)
-            self._partial.update(data[:taken])
-            self._partial_bytes += taken
-            data = data[taken:]
+            size = min(len(data), CHECKSUM_BYTES - self._partial_bytes)
+            self._partial.update(data[:size])
+            self._partial_bytes += size
+            data = data[size:]
             if self._partial_bytes == CHECKSUM_BYTES:
                 self.checksums.append(self._partial.hexdigest())
                 self._partial, self._partial_bytes = xxhash.xxh3_128(), 0

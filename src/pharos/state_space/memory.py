@@ -45,6 +45,6 @@ def _groups() -> Iterator[tuple[Path, Path, Path]]:
 
 def _of_files(statistics: Path) -> int:
     with contextlib.suppress(OSError, ValueError):
-        found = dict(line.split() for line in statistics.read_text().splitlines())
-        return sum(int(found.get(f"total_{name}", found.get(name, 0))) for name in ("inactive_file", "active_file"))
+        entries = dict(line.split() for line in statistics.read_text().splitlines())
+        return sum(int(entries.get(f"total_{name}", entries.get(name, 0))) for name in ("inactive_file", "active_file"))
     return 0

@@ -101,10 +101,10 @@ class OutcomeJournal(Journal):
         counts = np.empty(len(bits) * self._num_actions, np.int64)
         following, likely = np.empty(bits.size, self.index_dtype), np.empty(bits.size, np.uint64)
         size = palettes.possible(block.successors, bits, self._num_actions, following, likely, counts)
-        known = self._vectors
+        num_vectors = self._vectors
         codes = self._encoded(likely[:size], counts)
         if codes is None and self.palette is not None:
-            self._spell_out(known)
+            self._spell_out(num_vectors)
         files = self._files
         files[STATES].append(states)
         if codes is None:
@@ -114,7 +114,7 @@ class OutcomeJournal(Journal):
         else:
             assert self.palette is not None
             files[PARTS[CODES]].append(codes)
-            files[PARTS[PALETTE]].append(self.palette[known : self._vectors])
+            files[PARTS[PALETTE]].append(self.palette[num_vectors : self._vectors])
         files[self._successors_name].append(following[:size])
         files[TERMINAL].append(np.packbits(block.terminal, bitorder="little"))
         self._written = self._entries(at)
@@ -135,13 +135,14 @@ class OutcomeJournal(Journal):
             self.palette = larger
         return None
 
-    def _spell_out(self, known: int) -> None:
-        """From codes to probabilities, and where the rows begin; `known`: vectors of the palette that are in its file.
+    def _spell_out(self, num_vectors: int) -> None:
+        """From codes to probabilities, and where the rows begin.
 
+        num_vectors: vectors of the palette that are in its file.
         Runs in the thread that writes, between two chunks.
         """
         assert self._written is not None
-        self._vectors = known
+        self._vectors = num_vectors
         parts = self._parts(self._written["num_expanded"])
         for name in (OFFSETS, PROBABILITIES):
             self._files[PARTS[name]] = GrowingFile(self.path / PARTS[name])  # closed with the others, come what may

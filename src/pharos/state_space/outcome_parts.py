@@ -151,7 +151,7 @@ class OutcomeParts:
 
     def of_states(self, states: np.ndarray) -> dict[int, OutcomesOfState]:
         """The outcomes of some states, ascending."""
-        found = {}
+        outcomes = {}
         for row, first, codes, counts in self._counts():
             for state in states[
                 (states >= row // self.num_actions) & (states < (row + len(counts)) // self.num_actions)
@@ -162,8 +162,8 @@ class OutcomeParts:
                 part = self._part(row + place, before, None if codes is None else codes[here], counts[here])
                 ends = np.cumsum(part.counts)[:-1]
                 likely = np.split(self.likely(part).view(np.float64), ends)
-                found[int(state)] = list(zip(np.split(part.successors, ends), likely, strict=True))
-        return found
+                outcomes[int(state)] = list(zip(np.split(part.successors, ends), likely, strict=True))
+        return outcomes
 
 
 def _padded(values: np.ndarray, counts: np.ndarray, most: int, *, fill_with_first: bool) -> np.ndarray:

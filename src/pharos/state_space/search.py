@@ -58,7 +58,7 @@ class Piece:
     """A piece of a wide frontier: what threads write, for the one that numbers the states."""
 
     keys: np.ndarray
-    found: np.ndarray
+    indices: np.ndarray
     terminal: np.ndarray
     probabilities: np.ndarray
     first: int = 0
@@ -186,7 +186,7 @@ class Search:
             self._ahead = self._expand_ahead(pool, piece.stop, next_row, reserved=rows * self.branches)
         progress = position.progress()
         part = block.rows(row, row + rows)
-        self.table.find_or_number(piece.keys, piece.found, part.successors, progress)
+        self.table.find_or_number(piece.keys, piece.indices, part.successors, progress)
         part.terminal[:] = piece.terminal[:rows]
         part.probabilities[:] = piece.probabilities[:rows]
         self._spare.append(piece)
@@ -205,7 +205,7 @@ class Search:
         piece = self._spare.pop() if self._spare else self._new_piece(most)
         cuts = [first + rows * i // self.threads for i in range(self.threads + 1)]
         piece.first, piece.stop = first, first + rows
-        arrays = (first, piece.keys, piece.found, piece.terminal, piece.probabilities, table.slots)
+        arrays = (first, piece.keys, piece.indices, piece.terminal, piece.probabilities, table.slots)
         piece.futures = [
             pool.submit(self.rules.expand_and_find, table.states, cuts[i], cuts[i + 1], *arrays)
             for i in range(self.threads)
@@ -218,9 +218,9 @@ class Search:
 
     def _grow_table(self, pool: ThreadPoolExecutor) -> None:
         """A larger table; on disk where memory is not enough."""
-        count, dtype, kept = self.position.count, self.journal.index_dtype, self._within_reach()
-        if self.table.fits(count, dtype, 0 if kept is None else count - sum(map(len, kept))):
-            self.table.grow(count, dtype, pool, self.workers, kept)
+        count, dtype, parts = self.position.count, self.journal.index_dtype, self._within_reach()
+        if self.table.fits(count, dtype, 0 if parts is None else count - sum(map(len, parts))):
+            self.table.grow(count, dtype, pool, self.workers, parts)
         else:
             self._spill()
 
@@ -240,14 +240,14 @@ class Search:
         )
         youngest = min(int(part.min()) for part in waiting)
         entries = slots if len(slots) else np.arange(count)
-        kept = []
+        parts = []
         for i in range(0, len(entries), FORGETTING_BLOCK):
             part = entries[i : i + FORGETTING_BLOCK]
             part = part[part >= 0]
             packed = states[part]
             packed.flags.writeable = False
-            kept.append(part[ages.block(packed, 0, len(part)) > youngest])
-        return kept
+            parts.append(part[ages.block(packed, 0, len(part)) > youngest])
+        return parts
 
     def _needs_wide_indices(self, successors: int) -> bool:
         """Whether as many more states may be more than int32 can number."""
@@ -297,10 +297,10 @@ class Search:
             first, rows = position.first, min(last, position.count) - position.first
             size = rows * self.branches
             part = block.rows(first - base, first - base + rows)
-            keys, found = spilled.keys[:size], spilled.found[:size]
-            self._expand_rows(pool, self._states(spilled, first, first + rows), keys, found, part)
+            keys, indices = spilled.keys[:size], spilled.indices[:size]
+            self._expand_rows(pool, self._states(spilled, first, first + rows), keys, indices, part)
             progress = position.progress()
-            spilled.find_or_number(keys, found, part.successors, progress)
+            spilled.find_or_number(keys, indices, part.successors, progress)
             position.take(progress)
             self._check_size()
         block = block.rows(0, position.first - base)
@@ -309,12 +309,12 @@ class Search:
         self._report()
 
     def _expand_rows(
-        self, pool: ThreadPoolExecutor, states: np.ndarray, keys: np.ndarray, found: np.ndarray, block: Block
+        self, pool: ThreadPoolExecutor, states: np.ndarray, keys: np.ndarray, indices: np.ndarray, block: Block
     ) -> None:
-        """Successors of states to keys; to found -1 - bucket, or in terminal states their own row."""
+        """Successors of states to keys; to indices -1 - bucket, or in terminal states their own row."""
         threads = self.threads if len(states) >= WIDE else 1
         cuts = [len(states) * i // threads for i in range(threads + 1)]
-        arrays = (0, keys, found, block.terminal, block.probabilities, _NOTHING)
+        arrays = (0, keys, indices, block.terminal, block.probabilities, _NOTHING)
         if threads == 1:
             self.rules.expand_and_find(states, 0, len(states), *arrays)
             return

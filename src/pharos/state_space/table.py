@@ -76,21 +76,21 @@ class MemoryTable:
         dtype: np.dtype,
         pool: ThreadPoolExecutor,
         workers: int,
-        kept: list[np.ndarray] | None = None,
+        parts: list[np.ndarray] | None = None,
     ) -> None:
         """A table with room for about twice as many states, filled from the array of states.
 
-        kept: the only ones that are wanted, parts of their indices; None: all.
+        parts: indices of the only ones that are wanted, part by part; None: all.
         """
-        self.forgotten = 0 if kept is None else count - sum(map(len, kept))
-        slots = max(self._slots_for(count - self.forgotten), len(self.slots) if kept is not None else 0)
+        self.forgotten = 0 if parts is None else count - sum(map(len, parts))
+        slots = max(self._slots_for(count - self.forgotten), len(self.slots) if parts is not None else 0)
         self.slots = np.empty(0, dtype)  # free the old one first, where it cannot grow in its place
         if self._space.nbytes < slots * dtype.itemsize:
             self._space = huge_pages(slots, dtype)
         self.slots = self._space.view(dtype)[:slots]
-        if kept is not None:
+        if parts is not None:
             self.slots.fill(-1)
-            for part in kept:
+            for part in parts:
                 fill_more(self.slots, self.states, part.astype(np.int64))
             return
         if workers == 1 or count < PARALLEL_FILL:
@@ -110,15 +110,17 @@ class MemoryTable:
         for i, over in enumerate(left):
             fill_more(self.slots, self.states, left_over[i, :over])
 
-    def find_or_number(self, keys: np.ndarray, found: np.ndarray, successors: np.ndarray, progress: np.ndarray) -> None:
+    def find_or_number(
+        self, keys: np.ndarray, indices: np.ndarray, successors: np.ndarray, progress: np.ndarray
+    ) -> None:
         """Number the successors that are new, in their order.
 
         Args:
-            keys: (rows * B, W) uint64, successors by B branches. found: (rows * B,), their indices, or -1 - slot from
+            keys: (rows * B, W) uint64, successors by B branches. indices: (rows * B,), their indices, or -1 - slot from
                 which to search on.
             successors: (rows, B), gets the indices. progress: see kernels/hash_table.py; goes on by these rows.
         """
-        insert_missing(self.slots, self.states, keys, found, successors, progress)
+        insert_missing(self.slots, self.states, keys, indices, successors, progress)
 
     def release(self) -> None:
         """Give the memory back, also where a traceback keeps this table alive."""
@@ -141,7 +143,7 @@ class SpilledTable:
 
     Attributes:
         rows: of a chunk: as many as half of the memory holds; the table takes a quarter at a time.
-        states: those that the chunk numbers and that are not in the file yet. keys, found: of its candidates.
+        states: those that the chunk numbers and that are not in the file yet. keys, indices: of its candidates.
         appended: states that are in the file; the first of `states` has this number.
     """
 
@@ -149,7 +151,7 @@ class SpilledTable:
         self.rows = rows_of_chunk(memory, num_words, branches, has_chance)
         candidates = self.rows * branches
         self.states, self.keys = (np.empty((candidates, num_words), np.uint64) for _ in range(2))
-        self.found, self._slots = np.empty(candidates, np.int64), np.empty(candidates, np.int64)
+        self.indices, self._slots = np.empty(candidates, np.int64), np.empty(candidates, np.int64)
         self._order = np.empty(candidates, np.int32)
         self.appended = count
         likely = np.empty((self.rows if has_chance else 0, branches))
@@ -174,22 +176,24 @@ class SpilledTable:
             self._block = self._block._replace(successors=np.empty((self.rows, successors.shape[1]), dtype))
         return self._block
 
-    def find_or_number(self, keys: np.ndarray, found: np.ndarray, successors: np.ndarray, progress: np.ndarray) -> None:
-        """As `MemoryTable.find_or_number`; found: -1 - bucket, or the own row of a terminal state."""
+    def find_or_number(
+        self, keys: np.ndarray, indices: np.ndarray, successors: np.ndarray, progress: np.ndarray
+    ) -> None:
+        """As `MemoryTable.find_or_number`; indices: -1 - bucket, or the own row of a terminal state."""
         first, count = int(progress[0]), int(progress[1])
         self._table.grow(count + len(keys))
-        looked_up = self._table.look_up(keys, found, first, self._order, self._slots)
+        looked_up = self._table.look_up(keys, indices, first, self._order, self._slots)
         from pharos.kernels import disk_table
 
-        disk_table.number(keys, found, successors, self.states, self.appended, progress)
-        self._table.settle(looked_up, found, self._order, self._slots)
+        disk_table.number(keys, indices, successors, self.states, self.appended, progress)
+        self._table.settle(looked_up, indices, self._order, self._slots)
 
 
 def rows_of_chunk(memory: int, num_words: int, branches: int, has_chance: bool = False) -> int:
     """Rows of which half of the memory holds the candidates: a multiple of 8, so that terminal bits fill whole
     bytes.
     """
-    candidate = 2 * 8 * num_words + 8 + 8 + 8 + 4  # words here and as a state, found, slots, a successor, order
+    candidate = 2 * 8 * num_words + 8 + 8 + 8 + 4  # words here and as a state, index, slots, a successor, order
     candidate += 24 * has_chance  # a probability, and once more with its successor when it is written
     bytes_of_a_row = branches * candidate + 8 * num_words + 1
     rows = max(memory // 2 // bytes_of_a_row // 1024, 1) * 1024
