@@ -58,7 +58,12 @@ def stage() -> Path:
             path.unlink()
     config = yaml.safe_load((ROOT / "mkdocs.yml").read_text(encoding="utf-8"))
     config |= {"docs_dir": str(STAGED), "site_dir": str(SITE)}
-    config["nav"] = with_sections(config["nav"], generated)
+    written = {name: text for name, text in pages.items() if name.startswith("decisions/")}
+    decided = {**generated["decisions"], **written}
+    config["nav"] = with_sections(config["nav"], {**generated, "decisions": decided})
+    missing = [name for name in pages if name.endswith(".md") and f"'{name}'" not in repr(config["nav"])]
+    if missing:
+        config["nav"].append({"More": missing})  # pages that mkdocs.yml does not place
     python = config["plugins"][-1]["mkdocstrings"]["handlers"]["python"]
     python["paths"] = [str(ROOT / "src")]
     python["options"]["extensions"] = [str(ROOT / path) for path in python["options"]["extensions"]]
