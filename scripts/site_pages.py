@@ -54,6 +54,7 @@ PACKAGES = {  # page of the reference -> (title, module)
     "policies": ("pharos.policies", "pharos.policies"),
     "agents": ("pharos.agents", "pharos.agents"),
     "experiments": ("pharos.experiments", "pharos.experiments"),
+    "leaderboard": ("pharos.leaderboard", "pharos.leaderboard"),
     "study": ("pharos.study", "pharos.study"),
     "plots": ("pharos.plots", "pharos.plots"),
     "importers": ("pharos.importers", "pharos.importers"),

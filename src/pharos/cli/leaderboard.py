@@ -17,6 +17,7 @@ from pharos.cli.common import (
     size_text,
 )
 from pharos.errors import ParameterError, PharosError
+from pharos.wording import many
 
 if TYPE_CHECKING:
     from pharos.leaderboard import Verdict
@@ -141,7 +142,7 @@ def _print(verdict: "Verdict") -> None:
     )
     to.print(table)
     if verdict.exact:
-        to.print(f"exact: evaluated in {verdict.states:,} states, error at most {verdict.error_bound:.1e}")
+        to.print(f"exact: evaluated in {many(verdict.states, 'state')}, error at most {verdict.error_bound:.1e}")
     else:
         to.print(
             f"estimated from {verdict.episodes:,} episodes: {verdict.value:.6g} ± {verdict.error_bound:.2g} (99 %); "

@@ -162,7 +162,7 @@ def _rankings(verdicts: Sequence[Verdict]) -> list[Ranking]:
         config = first.entry.config
         horizon = "no horizon" if config.horizon is None else f"horizon {config.horizon}"
         setting = (
-            f"Chance added: {config.chance}. Discount {config.gamma:g}, {horizon}. "
+            f"Chance added: {str(config.chance) if config.chance else 'none'}. Discount {config.gamma:g}, {horizon}. "
             f"V* = {first.value_optimal:.6g}, V of acting at random = {first.value_uniform:.6g}."
         )
         rows = [_row(rank, verdict) for rank, verdict in enumerate(group, 1)]
