@@ -154,6 +154,19 @@ def test_tables_that_are_none_of_the_task_are_refused(entry, file):
             leaderboard.verify(changed(entry, file, arrays={"policy": table}))
 
 
+@pytest.mark.parametrize("name", ["parameters", "observation_options", "hyperparameters", "environment", "chance"])
+def test_a_configuration_of_other_types_is_refused_in_one_line(entry, file, name):
+    for odd in (None, 0, "x", [1], ""):
+        config = dataclasses.replace(entry.config)
+        stated = {**entry.config.to_dict(), name: odd}
+        if stated[name] == "x" and name == "environment":
+            continue
+        object.__setattr__(config, "to_dict", lambda stated=stated: stated)
+        with pytest.raises((FileFormatError, UntrustedCode)) as told:
+            leaderboard.verify(changed(entry, file, config=config))
+        assert "\n" not in str(told.value) and "grid.safetensors: " in str(told.value)
+
+
 def test_another_version_of_the_rules_is_another_mdp(entry, file):
     with pytest.raises(FileFormatError, match="version 99 of the rules of simple_grid"):
         leaderboard.verify(changed(entry, file, rules_version=99))

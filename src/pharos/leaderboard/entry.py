@@ -47,6 +47,13 @@ _DTYPES = {
     "F32": "<f4",
     "F64": "<f8",
 }
+_KINDS: dict[str, tuple[type, ...]] = {  # of what a configuration says
+    **dict.fromkeys(("environment", "observation", "agent"), (str,)),
+    **dict.fromkeys(("parameters", "chance", "observation_options", "hyperparameters"), (dict,)),
+    "seed": (int,),
+    "gamma": (int, float),
+    "horizon": (int, type(None)),
+}
 _NAMES = {text: name for name, text in _DTYPES.items()}
 
 
@@ -211,6 +218,9 @@ def _places(header: Mapping[str, Any], size: int) -> dict[str, tuple[np.dtype, t
 
 def _entry(record: Mapping[str, Any], arrays: dict[str, np.ndarray]) -> Entry:
     _check_texts(record)
+    for name, kinds in _KINDS.items():
+        if type(record["config"][name]) not in kinds:
+            raise TypeError(f"its {name} is {str(record['config'][name])[:40]!r}")
     config = RunConfig.from_dict(record["config"])
     if record["id"] != run_id(record["config"]):
         raise ValueError("its configuration is not that of its run")

@@ -159,7 +159,10 @@ def _task(entry: Entry, trust: bool, max_states: int, values: MutableMapping[str
     config = entry.config
     _check_code(config, trust)
     key = task_key(config)
-    task = config.task(None if values is None else values.get(key), trust=trust, strict=True)
+    try:
+        task = config.task(None if values is None else values.get(key), trust=trust, strict=True)
+    except (TypeError, KeyError, AttributeError, OverflowError) as error:  # parameters that are no parameters
+        raise FileFormatError(f"its parameters cannot be read: {' '.join(str(error).split())[:200]}") from None
     env = task.env
     if storage.plain(env.parameters) != storage.plain(config.parameters):
         raise FileFormatError(f"its parameters are not those of {env}; expected all parameters, as the class has them")
