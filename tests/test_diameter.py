@@ -1,6 +1,7 @@
 """The diameter of deterministic MDPs: against all pairs, theory, and its own intervals."""
 
 import math
+import time
 from fractions import Fraction
 
 import numpy as np
@@ -9,8 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from naive_hardness import distances
-from pharos import TabularMDP, hardness, random_actions
+from pharos import TabularMDP, compiling, hardness, random_actions
 from pharos.errors import ParameterError
+from pharos.hardness.interval import Spending
 from pharos.hardness.sum_sweep import Graph
 from pharos.kernels import clocks
 
@@ -241,6 +243,15 @@ def test_the_interval_of_a_mean_distance_holds_its_exact_fraction():
         expected = max(Fraction(sum((t - int(s)) % length for s in starts), len(starts)) for t in range(length))
         found = hardness.start_eccentricity_interval(ring(length, starts))
         assert found.exact and Fraction(found.lower) <= expected <= Fraction(found.upper)
+
+
+def test_seconds_of_compiling_are_not_taken_from_a_budget(monkeypatch):
+    """Else a value is exact on one machine and an interval on a slower one, where nothing is compiled yet."""
+    spending = Spending(hardness.Budget(seconds=0.01), None)
+    time.sleep(0.02)
+    assert spending.is_over
+    monkeypatch.setattr(compiling, "_total", compiling.seconds() + 60)
+    assert not spending.is_over
 
 
 def test_a_budget_that_ends_between_start_states_leaves_an_interval():

@@ -1,11 +1,11 @@
 """What a measure returns that may be out of reach: a proven interval; and how much may be spent on it."""
 
 import math
-import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from pharos.compiling import Stopwatch
 from pharos.errors import ParameterError
 from pharos.mdp import TabularMDP
 
@@ -166,7 +166,7 @@ class Budget:
     """What may be spent before a proven interval is returned instead of the exact value. The first limit met counts.
 
     Attributes:
-        seconds: of wall clock, looked at between searches.
+        seconds: of wall clock, those of compiling apart, looked at between searches.
         searches: searches of the graph, or targets solved; unlike seconds, the same on every machine.
     """
 
@@ -206,18 +206,21 @@ class Progress:
 
 
 class Spending:
-    """A budget being spent: tells when to stop, and reports progress at most every tenth of a second."""
+    """A budget being spent: tells when to stop, and reports progress at most every tenth of a second.
+
+    Seconds of compiling do not count: what is proven must not depend on whether the code was compiled before.
+    """
 
     def __init__(self, budget: Budget, progress: Callable[[Progress], None] | None):
         self.budget, self.progress = budget, progress
-        self.started = time.perf_counter()
+        self._watch = Stopwatch()
         self.searches = 0
         self._reported = -math.inf
 
     @property
     def seconds(self) -> float:
-        """Seconds since the start."""
-        return time.perf_counter() - self.started
+        """Seconds since the start, without those of compiling."""
+        return self._watch.seconds
 
     @property
     def is_over(self) -> bool:
