@@ -114,7 +114,7 @@ def played(game: str) -> str:
     for step, (begin, digit) in enumerate(moves, start=1):
         action = next(i for i, action in enumerate(env.actions) if action.startswith(begin))
         following = env.next_state(state, action, int(digit or 0))
-        reward = env.reward(state, action, following)
+        reward = env.reward_of(state, action, following, int(digit or 0))
         state, total = following, total + reward
         lines += [f"{step}. {env.actions[action]}, reward {reward:g}", f"state {state}", text_drawing(env, state), ""]
         if env.is_terminal(state):

@@ -141,7 +141,7 @@ def test_what_cannot_be_imported_is_refused_in_one_line():
 
 def test_without_the_package_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "minigrid", None)
-    with pytest.raises(MissingExtra, match=r"pharos\[minigrid\]"):
+    with pytest.raises(MissingExtra, match=r"pharos-rl\[minigrid\]"):
         importers.minigrid(CORRIDOR)
 
 
