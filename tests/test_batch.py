@@ -278,7 +278,7 @@ def test_whole_lanes_are_dealt_out_to_processes():
     assert len(parts_of([config(seed, observation="simple_image") for seed in range(9)], 2)) == 2
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_processes_leave_what_one_leaves(tmp_path, monkeypatch):
     monkeypatch.setattr(importlib.import_module("pharos.experiments.parts"), "VECTORS", 2)
     small = {"learning_starts": 50, "buffer_size": 500, "optimize_memory_usage": False}

@@ -49,7 +49,7 @@ def test_seconds_of_compiling_are_not_seconds_of_work():
     assert watch.compiling == compiled and watch.seconds >= 0.05
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_what_warm_has_compiled_no_later_process_compiles(tmp_path):
     cache = {"PHAROS_CACHE_DIR": str(tmp_path / "cache")}
     warmed = json.loads(pharos_command("warm", "simple_grid/4x4-plain", "--json", **cache).stdout)

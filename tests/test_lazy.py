@@ -117,6 +117,7 @@ def test_a_table_pays_for_state_and_action_whatever_happens():
         lazy_actions(RING, 0.5, staying=np.zeros(5))
 
 
+@pytest.mark.slow
 def test_states_that_are_one_may_differ_in_what_staying_pays(grid):
     mdp = grid.mdp(gamma=0.9)
     with pytest.raises(ParameterError, match="add lazy actions before you minimize"):
@@ -191,7 +192,7 @@ def test_results_on_disk_are_of_one_laziness(lake):
 ALL = {"sticky": 0.25, "random": 0.2, "lazy": 0.3}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["lake", "grid", "slippery"])
 def test_every_engine_plays_the_same_lazy_game(name, lake, grid):
     space = {"lake": lake, "grid": grid}.get(name) or pharos.build(pharos.make("frozen_lake", slippery=True))

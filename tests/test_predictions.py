@@ -123,7 +123,7 @@ def test_too_few_classes_are_a_line():
         validation(frame, cells.assign(agent="ppo"))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_command_line_predicts_and_reports(tmp_path):
     import yaml
 
