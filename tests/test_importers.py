@@ -281,10 +281,15 @@ def test_storms_format_says_the_same_values(tmp_path_factory, mdp):
 
 @pytest.mark.parametrize(("format", "name"), [("bridge", "grid.npz"), ("drn", "grid.drn"), ("gym", "grid.json")])
 def test_export_writes_the_format_that_is_asked_for(tmp_path, format, name):
-    done = run("export", "simple_grid", "--format", format, "--out", tmp_path / name, "--json")
+    grid = (
+        "simple_grid",
+        f"height={4 + ('bridge', 'drn', 'gym').index(format)}",
+    )  # one that no other process builds at the same time
+    done = run("export", *grid, "--format", format, "--out", tmp_path / name, "--json")
+    assert done.exit_code == 0, done.output
     assert json.loads(done.stdout)["bytes"] == (tmp_path / name).stat().st_size
-    assert run("export", "simple_grid", "--format", format, "--out", tmp_path / "grid.txt").exit_code == 2
-    assert run("export", "simple_grid", "--format", "prism", "--out", tmp_path / name).exit_code == 2
+    assert run("export", *grid, "--format", format, "--out", tmp_path / "grid.txt").exit_code == 2
+    assert run("export", *grid, "--format", "prism", "--out", tmp_path / name).exit_code == 2
 
 
 @pytest.mark.slow
