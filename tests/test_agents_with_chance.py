@@ -32,7 +32,7 @@ SMALL = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("agent", SMALL)
 def test_networks_learn_and_their_regret_is_that_of_the_policy_read_off_them(agent, tmp_path):
     """The last policy, asked in every state and solved by an independent route, is worth what the run says."""

@@ -227,7 +227,7 @@ def test_an_engine_that_lacks_the_agent_is_refused_with_the_one_that_has_it():
         many(seeds=(1, 1))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_what_the_engine_itself_has_learnt_is_read_and_resumed(tmp_path, monkeypatch):
     monkeypatch.setattr(run_folder, "CHECKPOINT_SECONDS", 0.0)
     small = {"learning_starts": 50, "buffer_size": 500, "target_update_interval": 50}

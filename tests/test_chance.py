@@ -290,7 +290,7 @@ def test_an_age_without_chance_is_checked_too(tmp_path):
         build(Steps(back=True), tmp_path / "back")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("workers", [1, 3])
 def test_a_build_forgets_states_that_are_younger_than_all_that_wait(workers, tmp_path, monkeypatch, small_blocks):
     """2048 on 2 x 3, 21,752 states: the same files from a table with room for a fifth of them, after a stop as well."""

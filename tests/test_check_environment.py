@@ -79,7 +79,7 @@ def test_a_large_space_is_sampled_near_the_start_and_far_from_it():
     assert "a sample of 60 states" in str(report)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_sample_does_not_depend_on_anything_but_the_seed():
     env = pharos.make("breakout")
     assert pharos.check_environment(env, max_states=50) == pharos.check_environment(env, max_states=50)
@@ -344,7 +344,7 @@ def test_slices_of_the_planes_may_be_drawn():
 LAST_BIT = 63  # integers of compiled code have 64 bits, those of Python any number
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_rules_must_say_the_same_compiled():
     def transition(self, state, action, out):
         out[0] = (state[0] + action) % self.length if (1 + state[0]) << LAST_BIT > 0 else 0
@@ -441,7 +441,7 @@ def test_episodes_that_end_before_they_begin_are_noted():
     assert report.num_states == 1
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_truths_and_numbers_of_numpy_are_accepted():
     def reward(self, state, action, next_state):
         return np.float64(next_state[0])
@@ -473,6 +473,7 @@ def windy(**attributes):
     return dataclass(frozen=True, kw_only=True)(type("Broken", (Windy,), attributes))()
 
 
+@pytest.mark.long
 def test_a_good_class_with_chance_passes():
     done = pharos.check_environment(pharos.make("frozen_lake", slippery=True))
     assert done.complete and done.compiled and (done.num_states, done.num_transitions) == (16, 11 * 4 * 3)
@@ -520,7 +521,7 @@ def test_an_outcome_that_leaves_the_range_is_named():
     assert where in message(windy(probability=lambda self, s, a, k: 0.5))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_an_impossible_outcome_is_not_followed():
     done = pharos.check_environment(windy())
     assert done.complete and done.compiled and (done.num_states, done.num_transitions) == (5, 14)

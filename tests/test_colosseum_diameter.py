@@ -44,6 +44,7 @@ RIVERS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("river", RIVERS)
 def test_rivers_have_their_published_diameters(river):
     """Left or right along a row of states, from its left end; episodes are as long as the row."""

@@ -215,7 +215,7 @@ def test_the_folder_of_another_user_is_not_used(cache, monkeypatch):
 # Many actions --------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_more_than_a_thousand_actions_are_solved(tmp_path):
     def transition(self, state, action, out):
         out[0] = (state[0] + action) % self.length

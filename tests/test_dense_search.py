@@ -73,7 +73,7 @@ def test_nodes_that_are_spread_out_are_no_successors_of_those_before(drawn, limi
     assert counted[: len(graph.ends)][~graph.ends].tolist() == np.array(num_successors)[~graph.ends].tolist()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_diameter_of_a_small_tray_is_the_largest_of_all_distances():
     space = pharos.build(pharos.make("sliding_tiles/2x3"), progress=False)
     mdp = space.mdp(gamma=0.9)

@@ -125,7 +125,7 @@ def test_the_compiled_analysis_of_key_corridor_is_the_published_one():
     assert found["value"] == pytest.approx(expected["effective_horizon"], rel=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_larger_games_are_analysed_by_the_compiled_one(monkeypatch):
     mdp = pharos.build(pharos.make("frozen_lake/8x8")).mdp(gamma=1.0)
     expected = hardness.effective_horizon(mdp, horizon=30)

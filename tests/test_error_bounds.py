@@ -99,6 +99,7 @@ def test_one_pass_gives_the_values_of_mdps_that_visit_no_state_twice(drawn, seed
         assert largest_error(solution, naive_exact.values_of(mdp, written_out)) <= Fraction(solution.error_bound)
 
 
+@pytest.mark.slow
 def test_the_bound_of_one_pass_counts_the_longest_path_and_not_the_discount():
     length, gamma = 1000, 1 - 1e-9
     path = TabularMDP.from_arrays([[i + 1] for i in range(length - 1)] + [[-1]], np.full((length, 1), 0.1), gamma=gamma)

@@ -34,7 +34,7 @@ def stack_of(env, name, states, options):
     return np.concatenate([one(np.array([state]))[0] for state in last[-k:]], axis=axis)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("name", IMAGES)
 def test_single_and_vector_environments_show_the_last_frames(name):
     options = {"observation": name, "observation_options": IMAGES[name], "time_limit": 9}

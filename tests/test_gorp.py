@@ -26,7 +26,7 @@ def corridor():
     return importers.bridge(DATA / "key-corridor-s3r1.npz", horizon=100)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_published_bound_of_key_corridor_is_reproduced(corridor):
     published = json.loads((DATA / "key-corridor-s3r1_gorp_bounds.json").read_text())
     found = hardness.gorp_bound(corridor, methods=("binomial", "bennett"))
@@ -46,14 +46,14 @@ def test_the_published_bounds_of_other_games_are_reproduced(name, horizon):
         assert value == pytest.approx(published[str(k)]["effective_horizon"], rel=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_exact_probabilities_give_a_smaller_bound_that_is_proven(corridor):
     found = hardness.gorp_bound(corridor, methods=("exact", "bennett"))
     assert found.proven and found.ms == [50]
     assert found.failure_probabilities[0] <= 0.5
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_gorp_succeeds_as_often_as_the_exact_probability_says(corridor):
     search = Search(corridor, 100, ("exact",))
     runs = hardness.run_gorp(corridor, k=1, m=100, runs=60, seed=3)

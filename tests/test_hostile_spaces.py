@@ -258,7 +258,7 @@ def survive(folder, mutations):
     print(right, wrong)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_mutants_of_a_space_never_end_the_process(tmp_path):
     code = f"import sys, pathlib; sys.path.insert(0, {str(Path(__file__).parent)!r}); import test_hostile_spaces as t\n"
     code += f"t.survive(pathlib.Path({str(tmp_path / 'space')!r}), 400)"

@@ -7,6 +7,8 @@ import sys
 import types
 from pathlib import Path
 
+import pytest
+
 import pharos
 
 PAGE = Path(__file__).parents[1] / "docs" / "how-it-works.md"
@@ -32,6 +34,7 @@ def test_the_folders_that_the_page_names_are_there():
         assert (SOURCE / folder / "__init__.py").exists(), folder
 
 
+@pytest.mark.slow
 def test_the_code_prints_what_the_page_says(monkeypatch, tmp_path):
     module = types.ModuleType("how_it_works_page")
     monkeypatch.setitem(sys.modules, module.__name__, module)

@@ -138,6 +138,7 @@ def test_stable_baselines_accepts_what_is_no_image(env, observation):
     sb3_check(GymEnv(env, observation=observation))
 
 
+@pytest.mark.slow
 def test_stable_baselines_only_says_that_simple_images_are_small_for_its_own_network(env):
     from stable_baselines3.common.env_checker import check_env as sb3_check
 

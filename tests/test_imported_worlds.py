@@ -249,6 +249,7 @@ def test_frequencies_that_are_not_those_of_the_table_are_refused():
     assert importers.gymnasium(Coin(heads=0.6), check=False).rewards == 0.5
 
 
+@pytest.mark.long
 def test_an_imported_world_pays_the_reward_of_the_outcome_that_is_drawn(tmp_path):
     """Gymnasium's slippery cliff walk from its start: -100 for slipping over the cliff, -1 for being stopped."""
     assert (

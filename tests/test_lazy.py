@@ -117,7 +117,7 @@ def test_a_table_pays_for_state_and_action_whatever_happens():
         lazy_actions(RING, 0.5, staying=np.zeros(5))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_states_that_are_one_may_differ_in_what_staying_pays(grid):
     mdp = grid.mdp(gamma=0.9)
     with pytest.raises(ParameterError, match="add lazy actions before you minimize"):
@@ -153,6 +153,7 @@ def test_lazy_and_random_actions_are_p_lazy_and_p_rand_of_colosseum():
 # Hardness -------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 @often
 @given(LAZINESS)
 def test_times_grow_by_the_mean_of_a_geometric_variable(p):

@@ -182,6 +182,7 @@ def test_names_of_code_are_refused_without_trust(entry, file, part, name):
         leaderboard.verify(changed(entry, file, config=config))
 
 
+@pytest.mark.long
 def test_a_world_of_ones_own_is_executed_only_where_it_is_trusted(tmp_path, monkeypatch):
     (tmp_path / "two.py").write_text(OWN)
     monkeypatch.chdir(tmp_path)

@@ -314,6 +314,7 @@ COMMANDS = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
 def test_received_files_execute_nothing(received, sent, words):
     done = here(*(received if word == "RUN" else word for word in words))

@@ -33,6 +33,7 @@ def test_what_is_paid_in_an_episode_is_what_was_earned(episodes, delay):
         assert sum(received) == sum(episode)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("env", [GRID, SLIPPERY], ids=["grid", "slippery"])
 @pytest.mark.parametrize("mode", ["next_step", "same_step", "disabled"])
 def test_many_environments_pay_late_and_walk_as_before(env, mode):

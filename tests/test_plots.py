@@ -179,7 +179,7 @@ def test_the_plane_places_instances_by_their_measures():
         plots.hardness_plane({})
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @given(st.lists(st.floats(1, 1e6), min_size=2, max_size=8))
 @settings(max_examples=20, deadline=None)
 def test_names_in_the_plane_are_each_drawn_once(values):

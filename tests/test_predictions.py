@@ -82,6 +82,7 @@ def made_up(noise, classes=8, instances=3, slope=1.0, seed=0):
     return frame, cells
 
 
+@pytest.mark.slow
 def test_a_line_without_noise_is_predicted_on_unseen_classes():
     judged = validation(*made_up(0.0)).set_index("predictor")
     best = judged.loc["kernel_regret"]

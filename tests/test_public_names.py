@@ -99,6 +99,7 @@ def test_imports_point_to_what_comes_before():
     assert used == set(LICENSED), "a licence that nobody needs"
 
 
+@pytest.mark.slow
 def test_strangers_never_meet():
     met = {(part_of(path), name.split(".")[1]) for path, name, _ in imports()}
     assert {(part, other) for part, others in STRANGERS.items() for other in others} & met == set()

@@ -95,6 +95,7 @@ def test_a_damaged_checkpoint_is_said_to_be_one(agent, file, tmp_path, monkeypat
         train(agent, "simple_grid/4x4-plain", **options)
 
 
+@pytest.mark.slow
 def test_training_leaves_nothing_among_temporary_files(tmp_path, monkeypatch):
     train("dqn", "simple_grid/4x4-plain", steps=50)  # torch makes a folder of its own when it is first used
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))

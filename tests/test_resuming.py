@@ -461,7 +461,7 @@ def test_beyond_32_bit_indices_only_the_width_of_the_successors_changes(widened,
     assert wide.indices(wide.states()).tolist() == list(range(wide.num_states))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("limit", (3000, 25_000, 28_000))  # beyond 24,000 the table grows as well
 def test_indices_widen_while_threads_are_a_piece_ahead(limit, tmp_path, undisturbed, monkeypatch):
     monkeypatch.setattr(search, "CHUNK", 512)
@@ -490,7 +490,7 @@ def test_a_build_that_widens_its_indices_resumes_to_the_same_files(limit, widene
     assert_same_files(folder, widened)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_build_that_dies_while_it_widens_its_indices_resumes_to_the_same_files(widened, tmp_path, monkeypatch):
     monkeypatch.setattr(search, "INT32_STATES", 5000)
     monkeypatch.setattr(search, "CHUNK", 512)

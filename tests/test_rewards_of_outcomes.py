@@ -81,6 +81,7 @@ def test_the_mdp_pays_the_mean_and_an_episode_what_is_drawn(engine, tmp_path):
     assert paid == {10.0, 20.0, -8.0, 0.125}
 
 
+@pytest.mark.long
 def test_an_instance_without_chance_pays_outcome_0(engine, tmp_path):
     space = pharos.build(Toll(chancy=False), tmp_path / engine, progress=False)
     assert not space.has_chance and space.mdp().rewards[0].tolist() == [0.0, 1.0]

@@ -385,7 +385,7 @@ def test_hitting_times_of_random_graphs_take_sweeps_where_factors_would_fill_in(
     assert bounds.meets(1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_hardness_of_blackjack_takes_seconds():
     mdp = pharos.build("blackjack").mdp()
     found = hardness.diameter(mdp, budget=30)

@@ -148,7 +148,7 @@ def same_study(place, folder):
     pd.testing.assert_frame_equal(study.curves(place), study.curves(folder))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_no_bit_of_a_packed_study_changes_its_results(folder, packed, tmp_path):
     data = packed.read_bytes()
     rng = np.random.default_rng(0)

@@ -87,6 +87,7 @@ class RayDouble(SimpleNamespace):
         return reference()
 
 
+@pytest.mark.slow
 def test_on_ray_every_run_is_one_task_and_lost_ones_have_failed(tmp_path, undisturbed, monkeypatch):
     lost = SPECIFICATION.runs[3].id
     double = RayDouble(dies=[lost])

@@ -48,6 +48,7 @@ def test_every_run_is_executed_once_and_a_second_command_finds_nothing_to_do(tmp
     assert json.loads((tmp_path / "out" / "status.json").read_text())["finished"] == 6
 
 
+@pytest.mark.slow
 def test_the_folder_of_a_study_is_a_specification_of_the_same_runs(tmp_path):
     spec = specification(chance=["plain", {"sticky": 0.25}])
     study.run(spec, tmp_path, runner=fake_training.train, workers=2)
@@ -68,6 +69,7 @@ def test_a_run_that_fails_fails_alone_says_why_and_is_repeated_only_on_request(t
     assert len(log.read_text().split()) == 2
 
 
+@pytest.mark.slow
 def test_failed_runs_that_are_repeated_with_success_replace_the_failure(tmp_path):
     spec = specification(agents=["dqn"], seeds=2)
     assert study.run(spec, tmp_path, runner=raise_always, workers=2).failed == 2
@@ -97,11 +99,13 @@ def test_a_runner_that_writes_nothing_has_failed(tmp_path):
     assert "without a finished run.json" in next(iter(end.errors.values()))
 
 
+@pytest.mark.slow
 def test_a_run_that_takes_too_long_is_ended(tmp_path):
     end = study.run(specification(agents=["dqn"], seeds=1), tmp_path, runner=never_end, timeout=0.5)
     assert list(end.errors.values()) == ["took longer than 0.5 s"]
 
 
+@pytest.mark.slow
 def test_a_process_that_dies_three_times_has_failed(tmp_path):
     end = study.run(specification(agents=["dqn"], seeds=1), tmp_path, runner=kill_itself)
     assert "ended by signal 9, 3 times" in next(iter(end.errors.values()))
@@ -117,6 +121,7 @@ def test_shards_are_disjoint_and_together_all(tmp_path):
             shard_of(runs, wrong)
 
 
+@pytest.mark.slow
 def test_shards_share_a_folder(tmp_path, log):
     spec = specification()
     for i in (1, 2):
@@ -126,6 +131,7 @@ def test_shards_share_a_folder(tmp_path, log):
     assert len(list((tmp_path / "out").glob("status-*-of-2.json"))) == 2
 
 
+@pytest.mark.slow
 def test_progress_tells_how_long_it_will_take(tmp_path):
     told = []
     study.run(specification(), tmp_path, runner=fake_training.train, workers=1, progress=told.append)
@@ -246,6 +252,7 @@ def test_two_runners_on_one_folder_share_the_work(tmp_path, log):
     assert set(Counter(log.read_text().split()).values()) == {1}
 
 
+@pytest.mark.slow
 def test_what_another_runner_finishes_is_counted_at_once(tmp_path, log, monkeypatch):
     monkeypatch.setattr(_execution, "OTHERS_SECONDS", 0.0)
     monkeypatch.setenv("PHAROS_FAKE_SECONDS", "0.2")
@@ -326,6 +333,7 @@ def test_one_damaged_run_is_a_line_and_does_not_stop_the_others(tmp_path, log, d
     assert len(report.notes) > 0 and report.html.is_file()
 
 
+@pytest.mark.slow
 def test_a_file_in_the_place_of_a_run_and_foreign_files_beside_it_stop_nothing(tmp_path, log):
     spec = specification()
     (tmp_path / "runs").mkdir()

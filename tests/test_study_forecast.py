@@ -3,6 +3,8 @@
 import subprocess
 import sys
 
+import pytest
+
 import fake_training
 from pharos import study
 from pharos.study.forecast import EARLIER, FINISHED, GUESS, NIGHT_HOURS, forecast, pace_of
@@ -38,6 +40,7 @@ def test_a_pace_is_measured_with_its_evaluations():
     assert 0 < pace_of(run.config) < 1
 
 
+@pytest.mark.slow
 def test_a_study_says_it_before_its_first_run(tmp_path):
     said = []
     spec = {"name": "fake", "steps": 100, "blocks": [{"environments": ["frozen_lake/4x4"], "agents": ["dqn"]}]}
@@ -57,6 +60,7 @@ worker.is_ending()
 """
 
 
+@pytest.mark.slow
 def test_a_process_that_ends_by_itself_is_not_interrupted_in_it():
     process = subprocess.Popen(
         [sys.executable, "-c", ENDING], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True

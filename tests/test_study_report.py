@@ -167,7 +167,7 @@ def test_a_report_made_again_is_the_same_but_for_its_date(written, again):
     assert date.sub("", (again[0] / "report.html").read_text()) == date.sub("", page)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_runs_of_different_length_or_without_regret_leave_a_report(tmp_path):
     block = {"environments": ["frozen_lake/4x4"], "agents": ["q_learning"], "observations": ["vector"]}
     hardness = {"measures": ["diameter"]}

@@ -46,7 +46,7 @@ BOX, IMAGE, FRAME = (
 )
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "space", "x", "net_arch", "policy", "networks"),
     [
@@ -172,6 +172,7 @@ def test_what_has_no_kernel_says_so_in_a_line(grid, monkeypatch):
         ntk(grid, "vector")
 
 
+@pytest.mark.slow
 def test_kernels_need_no_torch():
     code = "import sys; from pharos.observations import ntk; ntk('simple_grid', 'vector', 'mlp8'); "
     code += "assert 'torch' not in sys.modules"
