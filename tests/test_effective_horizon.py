@@ -105,7 +105,7 @@ def test_it_is_what_its_definition_says(mdp, chance, steps):
         assert found.value == pytest.approx(value, rel=1e-5)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @settings(max_examples=150, deadline=None)
 @given(deterministic_mdps(max_states=6, max_actions=3), st.integers(1, 7))
 def test_the_compiled_analysis_is_the_other_one(mdp, steps):

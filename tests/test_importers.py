@@ -292,7 +292,7 @@ def test_export_writes_the_format_that_is_asked_for(tmp_path, format, name):
     assert run("export", *grid, "--format", "prism", "--out", tmp_path / name).exit_code == 2
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_matrices_are_mdps():
     mdp = importers.matrices(np.full((2, 1, 2), 0.5), np.array([[1.0], [0.0]]), gamma=0.5)
     assert isinstance(mdp, TabularMDP)

@@ -132,7 +132,7 @@ def test_a_shard_of_one_worker_finds_nothing_missing(lab):
     assert (done.returncode, done.stdout) == (0, "own: 2 of 2 runs finished\n"), done.stderr
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("observation", ["index", "pair"])
 def test_what_was_learnt_on_ones_own_environment_is_evaluated(lab, observation):
     record = runs_of(lab)[observation]
@@ -143,7 +143,7 @@ def test_what_was_learnt_on_ones_own_environment_is_evaluated(lab, observation):
     assert json.loads(done.stdout)["value_at_start"] == pytest.approx(record["result"]["final_value"], abs=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_what_was_learnt_is_drawn_where_it_is_trusted(lab):
     run = lab / "elsewhere" / "results" / "runs" / runs_of(lab)["corner"]["id"]
     refused = command("plot", "policies", run, "--out", "a.gif", cwd=lab)

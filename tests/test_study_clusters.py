@@ -32,7 +32,7 @@ def undisturbed(tmp_path):
     return fake_training.results(tmp_path / "here")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_submitted_jobs_execute_their_shards(tmp_path, undisturbed, monkeypatch):
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")]))
     parameters = {"timeout_min": 2}
