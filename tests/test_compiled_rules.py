@@ -102,6 +102,8 @@ def test_the_reason_names_the_signature_that_is_missing():
     )
     assert "found for signature: float(unicode_type)" in reason_of(ValueError(message))
     assert '(File "coins.py", line 12)' in reason_of(ValueError(message))
+    coloured = "\x1b[1m\x1b[1mFailed in nopython mode pipeline\x1b[0m\n\x1b[1m\x1b[31m" + message + "\x1b[0m"
+    assert reason_of(ValueError(coloured)) == reason_of(ValueError(message))
 
 
 @pytest.mark.slow

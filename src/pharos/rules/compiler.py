@@ -8,6 +8,7 @@ instance are arguments, not constants: all instances of a class share one compil
 
 import hashlib
 import os
+import re
 import types as python_types
 from collections import namedtuple
 from collections.abc import Callable
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
 
 # Makers of kernels are imported where they are called: a script that steps does not load those that search.
 RULES = ("transition", "is_terminal", "reward", "draw")
+_COLOURS = re.compile("\x1b\\[[0-9;]*m")  # Numba writes them where colorama is installed
 _HERE = Path(__file__).parent
 _KERNELS = _HERE.parent / "kernels"
 _MACHINERY = (
@@ -234,7 +236,7 @@ def type_text(value: Any) -> str:
 
 def reason_of(error: BaseException) -> str:
     """What went wrong and in which line, out of Numba's long message."""
-    message = str(error) or type(error).__name__
+    message = _COLOURS.sub("", str(error)) or type(error).__name__
     lines = [line.strip() for line in message.splitlines() if line.strip()]
     start = next((i for i, line in enumerate(lines) if not line.startswith(("Failed in", "During:"))), 0)
     what = lines[start] if lines else ""
