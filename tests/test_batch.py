@@ -280,7 +280,7 @@ def test_whole_lanes_are_dealt_out_to_processes():
 
 @pytest.mark.long
 def test_processes_leave_what_one_leaves(tmp_path, monkeypatch):
-    monkeypatch.setattr(importlib.import_module("pharos.experiments.parts"), "VECTORS", 2)
+    monkeypatch.setattr(importlib.import_module("pharos.experiments.parts"), "lane_width", lambda _: 2)
     small = {"learning_starts": 50, "buffer_size": 500, "optimize_memory_usage": False}
     options = {"seeds": (0, 1, 2), "steps": 200, "evaluation_interval": 100, "hyperparameters": small}
     done = []

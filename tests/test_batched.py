@@ -112,3 +112,16 @@ def test_tensor_operations_compute_what_the_compiled_loops_do(grid, agent):
     for i in range(3):
         mine, other = compiled.parameters(i), tensors.parameters(i)
         assert max(np.abs(mine[name] - other[name]).max() for name in mine) <= 1e-5
+
+
+@pytest.mark.parametrize("agent", AGENTS)
+def test_networks_are_on_the_device_that_is_asked_for(grid, agent):
+    """Here the processor by the name that devices have, so that no other is needed."""
+    other, usual = (make_batch(agent, runs_of(grid, AGENTS[agent], 1), device=name) for name in ("cpu:0", "cpu"))
+    (lane,) = other.lanes
+    assert lane.device == "cpu:0"
+    assert isinstance(lane.arithmetic, TensorArithmetic)
+    for batch in (other, usual):
+        batch.learn([60], lambda point: None)
+    mine, theirs = other.parameters(0), usual.parameters(0)
+    assert max(np.abs(mine[name] - theirs[name]).max() for name in mine) <= 1e-5

@@ -13,9 +13,10 @@ import pytest
 import fake_batches
 import fake_training
 from pharos import study
+from pharos.agents.batched import lane_width
 from pharos.errors import ParameterError
 from pharos.experiments import read_record
-from pharos.study.batches import VECTORS, Batches
+from pharos.study.batches import Batches
 
 TESTS = Path(__file__).parent
 
@@ -56,13 +57,13 @@ def test_what_fits_together_is_trained_together(tmp_path, sizes):
 
 
 def test_more_runs_than_a_lane_are_several_batches(tmp_path, sizes):
-    assert run(specification(seeds=VECTORS + 2), tmp_path).finished == VECTORS + 2
-    assert sizes() == [2, VECTORS]
+    assert run(specification(seeds=lane_width(is_image=False) + 2), tmp_path).finished == lane_width(is_image=False) + 2
+    assert sizes() == [2, lane_width(is_image=False)]
 
 
 def test_batches_are_larger_where_networks_are_not_on_the_processor(tmp_path):
     run = specification(seeds=1).runs[0]
-    assert (Batches(tmp_path).width(run), Batches(tmp_path, "cuda").width(run)) == (VECTORS, 256)
+    assert (Batches(tmp_path).width(run), Batches(tmp_path, "cuda").width(run)) == (lane_width(is_image=False), 256)
 
 
 def test_the_engine_is_said_for_the_study_for_a_block_and_for_an_agent():

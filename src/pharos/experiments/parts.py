@@ -11,6 +11,7 @@ from multiprocessing import connection
 from pathlib import Path
 from typing import Any
 
+from pharos.agents.batched import lane_width
 from pharos.errors import FileFormatError, ParameterError, PharosError
 from pharos.experiments import results as _results
 from pharos.experiments.batch import Progress, Tell, train_configs
@@ -18,13 +19,10 @@ from pharos.experiments.config import RunConfig
 from pharos.experiments.members import FailedRun, Members
 from pharos.experiments.run_folder import TrainingResult, finished_result
 
-# Runs that the engine takes at once
-VECTORS, IMAGES = 32, 8
-
 
 def parts_of(configs: Sequence[RunConfig], workers: int) -> list[list[int]]:
     """Places of the runs by process: whole lanes, dealt out in turn; one list where there is nothing to share."""
-    width = IMAGES if any("image" in config.observation for config in configs) else VECTORS
+    width = lane_width(any("image" in config.observation for config in configs))
     lanes = [list(range(first, min(first + width, len(configs)))) for first in range(0, len(configs), width)]
     number = min(workers, len(lanes))
     if number < 2 or any(config.engine != "batched" for config in configs):

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from pharos import storage
+from pharos.agents.batched import lane_width
 from pharos.environments import Environment
 from pharos.errors import FolderLocked
 from pharos.study import values as _values
@@ -27,8 +28,7 @@ from pharos.study import worker as _worker
 from pharos.study.blocks import Run
 
 BATCHES = "batches"
-# Runs of one program: what the engine takes at once on the processor; tables are learnt one after the other
-VECTORS, IMAGES, TABLES, ELSEWHERE = 32, 8, 16, 256  # the last: not on the processor
+TABLES = 16  # runs of one program that learn tables, one after the other
 
 BatchRunner = Callable[[Sequence[Mapping[str, Any]], Sequence[Path], Path], Sequence[str | None]]
 """runner(configs, folders, folder for checkpoints) -> for each run None, or why it failed."""
@@ -99,8 +99,8 @@ class Batches:
     def width(self, run: Run) -> int:
         """How many runs may be in a batch of this one."""
         is_image = not run.configuration.is_tabular and len(self._shape(run)[0]) == 3
-        networks = ELSEWHERE if not self.on_processor else IMAGES if is_image else VECTORS
-        usual = TABLES if run.configuration.is_tabular else networks
+        device = "cpu" if self.on_processor else "cuda"
+        usual = TABLES if run.configuration.is_tabular else lane_width(is_image, device)
         return min(usual, self.most.get(run.id, usual))
 
     def key(self, run: Run) -> Hashable:

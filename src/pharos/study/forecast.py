@@ -15,10 +15,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from pharos.agents.batched import lane_width
 from pharos.errors import FileFormatError
 from pharos.storage import read_json, replace_json
 from pharos.study import worker as _worker
-from pharos.study.batches import IMAGES, VECTORS, most_states
+from pharos.study.batches import most_states
 from pharos.study.blocks import Run
 from pharos.study.processes import end_processes, one_thread
 from pharos.study.status import duration
@@ -198,7 +199,7 @@ def pace_of(config: Mapping[str, Any]) -> float:
     from pharos.experiments import RunConfig, evaluate_agent, steps_in_seconds
 
     made = RunConfig.from_dict(config)
-    together = 1 if made.engine != "batched" else VECTORS if "image" not in made.observation else IMAGES
+    together = 1 if made.engine != "batched" else lane_width("image" in made.observation)
     task = made.task(trust=True, strict=True)
     measured = MEASURED_OF_TABLES if made.is_tabular else MEASURED if together == 1 else MEASURED_OF_BATCHES
     seconds, agent = steps_in_seconds(made, task, WARM, measured, together)

@@ -8,10 +8,9 @@ import torch
 from pharos.agents.batched.dqn import DQNLane
 from pharos.agents.batched.lane import Lane, RunPolicy
 from pharos.agents.batched.ppo import PPOLane
-from pharos.agents.batched.runs import BatchRun, group_key
+from pharos.agents.batched.runs import BatchRun, group_key, lane_width
 from pharos.errors import ParameterError
 
-WIDTH_OF_VECTORS, WIDTH_OF_IMAGES, WIDTH_ELSEWHERE = 32, 8, 256  # runs of a lane; the last: not on the processor
 LANES: dict[str, type[Lane]] = {"dqn": DQNLane, "ppo": PPOLane}
 
 
@@ -31,9 +30,10 @@ class Batch:
         if len(keys) > 1:
             raise ParameterError(f"{len(runs)} runs are of {len(keys)} groups; expected one batch a group (group_key)")
         self.runs = list(runs)
-        self.width = lane_width(runs[0], device)
+        self.width = lane_width(runs[0].observe.is_image, device)
         self.lanes = [
-            LANES[agent](self.runs[first : first + self.width], self.width) for first in range(0, len(runs), self.width)
+            LANES[agent](self.runs[first : first + self.width], self.width, device)
+            for first in range(0, len(runs), self.width)
         ]
 
     @property
@@ -85,13 +85,6 @@ class Batch:
         for k, lane in enumerate(self.lanes):
             prefix = f"{k}/"
             lane.restore({name[len(prefix) :]: array for name, array in state.items() if name.startswith(prefix)})
-
-
-def lane_width(run: BatchRun, device: str = "cpu") -> int:
-    """The runs of a lane, chosen by measurement on the processor (docs/decisions/0013-batched-training.md)."""
-    if device != "cpu":
-        return WIDTH_ELSEWHERE
-    return WIDTH_OF_IMAGES if run.observe.is_image else WIDTH_OF_VECTORS
 
 
 def make_batch(agent: str, runs: Sequence[BatchRun], *, device: str = "cpu", threads: int | None = None) -> Batch:

@@ -13,6 +13,8 @@ if TYPE_CHECKING:
     from pharos.observations import ObservationInContext
     from pharos.state_space import StateSpace
 
+WIDTH_OF_VECTORS, WIDTH_OF_IMAGES, WIDTH_ELSEWHERE = 32, 8, 256  # runs of a lane; the last: not on the processor
+
 # What Stable-Baselines3 takes where nothing is given. The first part may differ among the runs of a batch.
 OF_A_RUN: dict[str, dict[str, Any]] = {
     "dqn": {
@@ -199,3 +201,10 @@ def _net_arch(hyperparameters: Mapping[str, Any]) -> Any:
 
 def _is_in_steps(value: Any) -> bool:
     return isinstance(value, int) or (len(value) == 2 and value[1] == "step")
+
+
+def lane_width(is_image: bool, device: str = "cpu") -> int:
+    """The runs of a lane, chosen by measurement on the processor (docs/decisions/0013-batched-training.md)."""
+    if device != "cpu":
+        return WIDTH_ELSEWHERE
+    return WIDTH_OF_IMAGES if is_image else WIDTH_OF_VECTORS
