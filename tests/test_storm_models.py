@@ -1,7 +1,10 @@
 """PRISM, JANI and DRN models through Storm: published numbers of states and values. Needs the extra `storm`."""
 
+import importlib
 import json
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
@@ -15,6 +18,7 @@ try:
 except ImportError:
     models = None
 
+storm = importlib.import_module("pharos.importers.storm")
 needs_storm = pytest.mark.skipif(models is None, reason="stormpy is not installed")
 
 
@@ -28,6 +32,88 @@ def test_without_storm_the_extra_is_named(tmp_path):
         importers.storm(tmp_path / "model.nm")
     done = run("import", "prism", tmp_path / "model.nm", "--out", tmp_path / "out")
     assert done.exit_code == 1 and len(done.stderr.strip().splitlines()) == 1
+
+
+class Rows:
+    """A sparse matrix as stormpy shows it: rows of {column: value}, and where the choices of each state begin."""
+
+    def __init__(self, rows, first=()):
+        self.rows, self.first = rows, first
+
+    def get_row(self, row):
+        return [SimpleNamespace(column=column, value=value) for column, value in self.rows[row].items()]
+
+    def get_row_group_start(self, state):
+        return self.first[state]
+
+    def get_row_group_end(self, state):
+        return [*self.first[1:], len(self.rows)][state]
+
+
+def bet(rewards):
+    """A model as stormpy gives it. State 0 bets, once carefully and once boldly, state 1 has won, state 2 lost and only
+    waits for one of the others."""
+    paid = SimpleNamespace(
+        has_state_rewards=True,
+        get_state_reward=[-1.0, 0.0, -2.0].__getitem__,
+        has_state_action_rewards=True,
+        get_state_action_reward=[0.0, 0.5, 0.0, 0.0].__getitem__,
+        has_transition_rewards=True,
+        transition_rewards=Rows([{}, {1: 8.0}, {}, {0: 3.0, 1: 3.0}]),
+    )
+    labels = {"won": [1], "init": [0]}
+    return SimpleNamespace(
+        nr_states=3,
+        initial_states=[0],
+        labeling=SimpleNamespace(get_labels=lambda: set(labels), get_states=labels.__getitem__),
+        reward_models={name: paid for name in rewards},
+        transition_matrix=Rows([{1: 0.25, 2: 0.75}, {0: 0.5, 1: 0.5}, {1: 1.0}, {0: 0.5, 1: 0.5}], [0, 2, 3]),
+    )
+
+
+def built(monkeypatch, rewards=()):
+    monkeypatch.setattr(storm, "_model", lambda *_: bet(rewards))
+
+
+def law(outcomes, row):
+    part = slice(outcomes.offsets[row], outcomes.offsets[row + 1])
+    return [each[part].tolist() for each in (outcomes.next_states, outcomes.probabilities, outcomes.rewards)]
+
+
+def test_rewards_of_transitions_are_kept_by_outcome_and_their_means_by_the_mdp(monkeypatch, tmp_path):
+    built(monkeypatch, ["money"])
+    mdp, outcomes = importers.storm_recording("bet.nm", target="won", reward="money")
+    assert mdp.rewards.tolist() == [[-1.0, 3.5], [0.0, 0.0], [1.0, 1.0]]
+    assert mdp.terminal.tolist() == [False, True, False]
+    assert law(outcomes, 0) == [[1, 2], [0.25, 0.75], [-1.0, -1.0]]
+    assert law(outcomes, 1) == [[0, 1], [0.5, 0.5], [-0.5, 7.5]]  # only winning boldly pays its 8
+    assert law(outcomes, 2) == law(outcomes, 3) == [[-1], [1.0], [0.0]]
+    assert law(outcomes, 4) == law(outcomes, 5) == [[0, 1], [0.5, 0.5], [1.0, 1.0]]  # the first choice by both actions
+    done = run("import", "prism", "bet.nm", "--target", "won", "--reward", "money", "--out", tmp_path / "bet")
+    assert (done.exit_code, done.stderr) == (0, "")
+    env, back = pharos.make(str(tmp_path / "bet")), importers.load(tmp_path / "bet")
+    np.testing.assert_array_equal(back.rewards, mdp.rewards)
+    drawn = {
+        env.next_state((0,), 1, k)[0]: float(env.reward_of((0,), 1, env.next_state((0,), 1, k), k)) for k in (0, 1)
+    }
+    assert drawn == {0: -0.5, 1: 7.5}
+
+
+def test_reaching_a_target_pays_one_when_it_is_reached(monkeypatch):
+    built(monkeypatch)
+    mdp, outcomes = importers.storm_recording("bet.nm", target="won")
+    assert mdp.rewards.tolist() == [[0.25, 0.5], [0.0, 0.0], [0.5, 0.5]]
+    assert law(outcomes, 0) == [[1, 2], [0.25, 0.75], [1.0, 0.0]]
+    np.testing.assert_array_equal(importers.storm("bet.nm", target="won").rewards, mdp.rewards)
+
+
+def test_where_no_transition_pays_otherwise_the_mdp_says_it_all(monkeypatch):
+    model = bet(["money"])
+    model.reward_models["money"].has_transition_rewards = False
+    monkeypatch.setattr(storm, "_model", lambda *_: model)
+    mdp, outcomes = importers.storm_recording("bet.nm", target="won", reward="money")
+    assert outcomes is None
+    assert mdp.rewards.tolist() == [[-1.0, -0.5], [0.0, 0.0], [-2.0, -2.0]]
 
 
 @needs_storm
@@ -65,6 +151,28 @@ label "there" = s=N;
     assert sorted(mdp.rewards.tolist()) == [[0.0, 0.0], [1.0, 1.0], [1.0, 1.0], [1.25, 1.25]]
     assert pharos.value_iteration(mdp, 1e-9).value_at_start == pytest.approx(6.5, abs=1e-8)
     assert pharos.solvers.worst_value(mdp, 1e-9).value_at_start == pytest.approx(1.25, abs=1e-8)
+
+
+@needs_storm
+def test_a_model_pays_what_its_transitions_pay(tmp_path):
+    text = """mdp
+module walk
+  s : [0..2] init 0;
+  [go] s<2 -> 0.25:(s'=0) + 0.75:(s'=s+1);
+endmodule
+rewards "money"
+  s=1 : 1;
+  [go] s=0 : -2;
+endrewards
+label "there" = s=2;
+"""
+    (tmp_path / "walk.nm").write_text(text)
+    mdp, outcomes = importers.storm_recording(tmp_path / "walk.nm", reward="money", target="there")
+    assert outcomes is None and sorted(mdp.rewards.tolist()) == [[-2.0], [0.0], [1.0]]
+    mdp, outcomes = importers.storm_recording(tmp_path / "walk.nm", target="there")
+    assert sorted(mdp.rewards.tolist()) == [[0.0], [0.0], [0.75]]
+    assert sorted(zip(outcomes.probabilities.tolist(), outcomes.rewards.tolist(), strict=True)) == [
+        (0.25, 0.0), (0.25, 0.0), (0.75, 0.0), (0.75, 1.0), (1.0, 0.0)]  # fmt: skip
 
 
 @needs_storm

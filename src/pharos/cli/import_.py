@@ -108,8 +108,10 @@ def prism(
     """Import a model in PRISM's language, in JANI or in Storm's DRN."""
     from pharos import importers
 
-    mdp = importers.storm(file, constants=constants, reward=reward, target=target, gamma=gamma, horizon=horizon)
-    importers.save(mdp, out, source=f"Storm: {file.name} {constants}".rstrip())
+    mdp, outcomes = importers.storm_recording(
+        file, constants=constants, reward=reward, target=target, gamma=gamma, horizon=horizon
+    )
+    importers.save(mdp, out, source=f"Storm: {file.name} {constants}".rstrip(), outcomes=outcomes)
     _tell(file.name, mdp, out, json)
 
 

@@ -7,7 +7,7 @@ from pharos.importers.bridge import bridge, bridge_screens, has_screens
 from pharos.importers.folder import Outcomes, environment, is_folder, load, save
 from pharos.importers.gymnasium import gymnasium, gymnasium_outcomes, matrices
 from pharos.importers.minigrid import minigrid, minigrid_grids, minigrid_recording
-from pharos.importers.storm import storm
+from pharos.importers.storm import storm, storm_recording
 
 __all__ = [
     "Outcomes",
@@ -25,4 +25,5 @@ __all__ = [
     "minigrid_recording",
     "save",
     "storm",
+    "storm_recording",
 ]

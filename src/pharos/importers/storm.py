@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from pharos.errors import FileFormatError, MissingExtra, ParameterError, UnknownName
+from pharos.importers.folder import Outcomes
 from pharos.mdp import TabularMDP
 
 SUFFIXES = (".prism", ".nm", ".pm", ".sm", ".jani", ".drn")
@@ -35,7 +36,7 @@ def storm(
         path: a model in PRISM's language (.prism, .nm, .pm), in JANI (.jani), or an explicit one (.drn).
         constants: values of its undefined constants, such as "N=3,K=2".
         reward: name of a reward structure; None: the only one, where there is no target. State rewards are paid with
-            every action there.
+            every action there; the MDP pays rewards of transitions on average.
         target: a label whose states end the episode; without a reward structure, reaching one pays 1, so that the
             optimal value at gamma 1 is the maximal probability of reaching it.
         gamma, horizon: of the MDP.
@@ -44,6 +45,25 @@ def storm(
         ParameterError: no such file; UnknownName: no such reward structure or label.
         FileFormatError: Storm cannot read it, constants are missing, or it is of another kind (continuous time, partial
             observability, parameters).
+    """
+    return storm_recording(path, constants=constants, reward=reward, target=target, gamma=gamma, horizon=horizon)[0]
+
+
+def storm_recording(
+    path: str | os.PathLike,
+    *,
+    constants: str = "",
+    reward: str | None = None,
+    target: str | None = None,
+    gamma: float = 1.0,
+    horizon: int | None = None,
+) -> tuple[TabularMDP, Outcomes | None]:
+    """Return the MDP of `storm`, and its outcomes with the reward of each, for `importers.save(..., outcomes=)`.
+
+    The outcomes are None where no choice pays different rewards, so that the MDP says it all.
+
+    Raises:
+        As `storm`.
     """
     model = _model(Path(path), constants)
     labels = sorted(model.labeling.get_labels())
@@ -62,49 +82,68 @@ def storm(
     ended = np.zeros(model.nr_states, np.bool_)
     if target is not None:
         ended[list(model.labeling.get_states(target))] = True
-    return _mdp(model, ended, None if reward is None else model.reward_models[reward], gamma, horizon)
+    outcomes = _outcomes(model, ended, None if reward is None else model.reward_models[reward])
+    return _mdp(model, outcomes, gamma, horizon), outcomes if _differ(outcomes) else None
 
 
-def _mdp(model: Any, ended: np.ndarray, paid: Any, gamma: float, horizon: int | None) -> TabularMDP:
-    from scipy import sparse
-
+def _outcomes(model: Any, ended: np.ndarray, paid: Any) -> Outcomes:
+    """What every state and action may lead to and what that pays; of states that end the episode, its end."""
     matrix, states = model.transition_matrix, model.nr_states
     first = [matrix.get_row_group_start(s) for s in range(states)]
     last = [matrix.get_row_group_end(s) for s in range(states)]
     actions = max(stop - start for start, stop in zip(first, last, strict=True))
-    rewards = np.zeros((states, actions))
-    rows: list[int] = []
-    columns: list[int] = []
+    offsets: list[int] = [0]
+    successors: list[int] = []
     likely: list[float] = []
+    rewards: list[float] = []
     for s in range(states):
-        if ended[s]:
-            continue
         for a in range(actions):
             choice = first[s] + a if first[s] + a < last[s] else first[s]
-            reached = 0.0
-            for entry in matrix.get_row(choice):
-                rows.append(s * actions + a)
-                columns.append(entry.column)
-                likely.append(float(entry.value))
-                reached += likely[-1] * ended[entry.column]
-            rewards[s, a] = reached if paid is None else _reward(paid, s, choice, matrix)
-    table = sparse.csr_matrix((likely, (rows, columns)), shape=(states * actions, states))
+            row = [] if ended[s] else [(int(entry.column), float(entry.value)) for entry in matrix.get_row(choice)]
+            row = row or [(-1, 1.0)]
+            successors += [following for following, _ in row]
+            likely += [p for _, p in row]
+            rewards += [0.0] if ended[s] else _rewards(paid, s, choice, successors[offsets[-1] :], ended)
+            offsets.append(len(successors))
+    return Outcomes(np.array(offsets), np.array(successors, np.int64), np.array(likely), np.array(rewards, np.float64))
+
+
+def _rewards(paid: Any, state: int, choice: int, successors: list[int], ended: np.ndarray) -> list[float]:
+    """What a choice pays with each of its successors: for the state, for the choice, and for the transition."""
+    if paid is None:
+        return [float(following >= 0 and ended[following]) for following in successors]
+    always = 0.0
+    if paid.has_state_rewards:
+        always += float(paid.get_state_reward(state))
+    if paid.has_state_action_rewards:
+        always += float(paid.get_state_action_reward(choice))
+    if not paid.has_transition_rewards:
+        return [always] * len(successors)
+    of = {entry.column: float(entry.value) for entry in paid.transition_rewards.get_row(choice)}
+    return [always + of.get(following, 0.0) for following in successors]
+
+
+def _differ(outcomes: Outcomes) -> bool:
+    """Whether some state and action pays different rewards."""
+    begin = outcomes.offsets[:-1]
+    return bool((np.minimum.reduceat(outcomes.rewards, begin) < np.maximum.reduceat(outcomes.rewards, begin)).any())
+
+
+def _mdp(model: Any, outcomes: Outcomes, gamma: float, horizon: int | None) -> TabularMDP:
+    from scipy import sparse
+
+    begin, counts, states = outcomes.offsets[:-1], np.diff(outcomes.offsets), model.nr_states
+    rows = np.repeat(np.arange(len(counts)), counts)
+    goes_on = outcomes.next_states >= 0
+    table = sparse.csr_matrix(
+        (outcomes.probabilities[goes_on], (rows[goes_on], outcomes.next_states[goes_on])), shape=(len(counts), states)
+    )
+    means = np.add.reduceat(outcomes.probabilities * outcomes.rewards, begin)
+    alike = np.minimum.reduceat(outcomes.rewards, begin) == np.maximum.reduceat(outcomes.rewards, begin)
+    rewards = np.where(alike, outcomes.rewards[begin], means).reshape(states, -1)
     starts = list(model.initial_states)
     initial = starts[0] if len(starts) == 1 else starts
     return TabularMDP.from_matrices(table, rewards, gamma=gamma, initial=initial, horizon=horizon)
-
-
-def _reward(paid: Any, state: int, choice: int, matrix: Any) -> float:
-    """What a choice pays on average: for the state, for the choice, and for its transitions."""
-    reward = 0.0
-    if paid.has_state_rewards:
-        reward += float(paid.get_state_reward(state))
-    if paid.has_state_action_rewards:
-        reward += float(paid.get_state_action_reward(choice))
-    if paid.has_transition_rewards:
-        of = {entry.column: float(entry.value) for entry in paid.transition_rewards.get_row(choice)}
-        reward += sum(float(entry.value) * of.get(entry.column, 0.0) for entry in matrix.get_row(choice))
-    return reward
 
 
 def _model(path: Path, constants: str) -> Any:
