@@ -1,7 +1,7 @@
 """The figures of a study, each a function of tables: matplotlib figures without global state, light or dark."""
 
 import io
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pharos import storage
-from pharos.agents import TABULAR_OBSERVATION
 from pharos.environments import classes
-from pharos.study.analysis import IMAGE, REGRETS, VECTOR, Models, mean_curve
+from pharos.study.analysis import IMAGE, REGRETS, VECTOR, Models
+from pharos.study.curves import MORE_COLORS, Curves, agent_name, slug, title
 from pharos.study.regression import Fit
 
 if TYPE_CHECKING:
@@ -19,12 +19,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 # Okabe and Ito's colours, which people tell apart whatever their sight; those of classes stand in their `look`
-MORE_COLORS = ("#CC79A7", "#E69F00", "#F0E442", "#999999")
-OBSERVATION_COLORS = {TABULAR_OBSERVATION: "#009E73", VECTOR: "#0072B2", IMAGE: "#D55E00"}
 CHANCE_MARKERS = {"plain": "o", "random": "^", "sticky": "s", "lazy": "v", "reward_noise": "P", "reward_delay": "X"}
-LINES = {"q_learning": "-", "dqn": "-", "ppo": "--"}
-NAMES = {"q_learning": "tabular Q-learning", "dqn": "DQN", "ppo": "PPO"}
-OBSERVATIONS = {TABULAR_OBSERVATION: "", VECTOR: "vector", IMAGE: "image"}
 OTHER_IMAGE = "complex_image"
 DPI = 120
 
@@ -41,25 +36,28 @@ def style(dark: bool) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def label(agent: str, observation: str) -> str:
-    """`DQN, image`, `tabular Q-learning`."""
-    seen = OBSERVATIONS.get(observation, observation)
-    return f"{agent_name(agent)}, {seen}" if seen else agent_name(agent)
-
-
-def agent_name(agent: str) -> str:
-    """`DQN`; of an algorithm from a module or a file, the name of its class."""
-    return NAMES.get(agent, agent.rpartition(":")[2])
-
-
-def slug(name: str) -> str:
-    """A name as part of a file's name."""
-    return "".join(c if c.isalnum() else "_" for c in name)
-
-
-def title(name: str) -> str:
-    """A name for people: `frozen lake`."""
-    return name.replace("_", " ")
+def lines(curves: Curves) -> "Figure | None":
+    """A panel for each group, with a line and its interval for each agent and observation; None without panels."""
+    if not curves.panels:
+        return None
+    figure, axes = _panels(len(curves.panels), 3.3, 2.7)
+    for axis, panel in zip(axes, curves.panels, strict=False):
+        for line in panel.lines:
+            axis.plot(line.x, line.mean, line.dash, color=line.color, lw=1.6, label=line.label)
+            axis.fill_between(line.x, line.lower, line.upper, color=line.color, alpha=0.18, lw=0)
+            for run in line.runs.values() if curves.draws_runs else ():
+                axis.plot(line.x, run, line.dash, color=line.color, lw=0.5, alpha=0.5)
+        axis.set_title(panel.title)
+        axis.set_xlabel(curves.x_label)
+        if curves.share:
+            axis.set_ylim(-0.02, 1.02)
+        else:
+            axis.set_ylim(bottom=min(0.0, axis.get_ylim()[0]))
+            axis.xaxis.set_major_formatter(_thousands)
+    for axis in axes[:: max(1, _columns(len(axes)))]:
+        axis.set_ylabel(curves.y_label)
+    _legend(figure, axes)
+    return figure
 
 
 def class_color(name: str, names: Sequence[str]) -> str:
@@ -67,54 +65,6 @@ def class_color(name: str, names: Sequence[str]) -> str:
     own = {other: cls.look.color for other, cls in classes().items() if cls.look.color is not None}
     others = [other for other in names if other not in own]
     return own.get(name) or MORE_COLORS[others.index(name) % len(MORE_COLORS)]
-
-
-def regret_curves(
-    points: "pd.DataFrame", *, by: str | list[str] = "environment", seeds: bool = False, resamples: int = 500
-) -> "Figure":
-    """Cumulative expected regret by steps: a panel for each class (or instance, or task), a line for each agent and
-    observation.
-
-    The mean over instances and kinds of chance, with its 95 % bootstrap interval over runs; with `seeds` a thin line
-    for each run as well. The paper's figure 2.
-    """
-    groups = [
-        (name if isinstance(name, str) else ", ".join(map(str, name)), part)
-        for name, part in points.groupby(by, sort=False)
-    ]
-    figure, axes = _panels(len(groups), 3.3, 2.7)
-    for axis, (name, part) in zip(axes, groups, strict=False):
-        for (agent, observation), lines in part.groupby(["agent", "observation"], sort=True):
-            steps, tasks = _tasks(lines)
-            mean, lower, upper = mean_curve(tasks, resamples=resamples)
-            color = OBSERVATION_COLORS.get(observation, MORE_COLORS[0])
-            axis.plot(steps, mean, LINES.get(agent, ":"), color=color, lw=1.6, label=label(agent, observation))
-            axis.fill_between(steps, lower, upper, color=color, alpha=0.18, lw=0)
-            for run in np.concatenate(tasks) if seeds else ():
-                axis.plot(steps, run, LINES.get(agent, ":"), color=color, lw=0.5, alpha=0.5)
-        axis.set_title(title(str(name)))
-        axis.set_xlabel("steps")
-        axis.set_ylim(bottom=min(0.0, axis.get_ylim()[0]))
-        axis.xaxis.set_major_formatter(_thousands)
-    for axis in axes[:: max(1, _columns(len(groups)))]:
-        axis.set_ylabel("cumulative regret")
-    _legend(figure, axes)
-    return figure
-
-
-def _tasks(lines: "pd.DataFrame") -> tuple[np.ndarray, list[np.ndarray]]:
-    """Steps, and for each task the cumulative regret (runs, T) there, of the runs that were evaluated at the same
-    steps.
-
-    Where blocks of a study differ in steps, those are the steps that most runs have.
-    """
-    by_run = lines.pivot_table(index=["instance", "chance", "id"], columns="step", values="cumulative_expected_regret")
-    present = by_run.notna()
-    kinds = present.apply(lambda row: row.to_numpy().tobytes(), axis=1)
-    same = kinds == kinds.mode().iloc[0]
-    by_run = by_run.loc[same, present[same].all()]
-    tasks = [group.to_numpy() for _, group in by_run.groupby(level=["instance", "chance"], sort=True)]
-    return by_run.columns.to_numpy(), tasks
 
 
 def pairs_of(cells: "pd.DataFrame", agents: Sequence[str]) -> list[tuple[str, str]]:
@@ -210,43 +160,11 @@ def agents_against_each_other(cells: "pd.DataFrame", value: str, agents: tuple[s
     return figure
 
 
-def performance_profiles(profiles: "pd.DataFrame") -> "Figure | None":
-    """A panel for each class: the share of runs above each score, a line for each agent and observation."""
-    groups = list(profiles.groupby("environment", sort=False))
-    if not groups:
-        return None
-    figure, axes = _panels(len(groups), 3.3, 2.7)
-    for axis, (name, part) in zip(axes, groups, strict=False):
-        for (agent, observation), line in part.groupby(["agent", "observation"], sort=True):
-            color = OBSERVATION_COLORS.get(observation, MORE_COLORS[0])
-            text = label(agent, observation)
-            axis.plot(line["score"], line["share"], LINES.get(agent, ":"), color=color, lw=1.6, label=text)
-            axis.fill_between(line["score"], line["lower"], line["upper"], color=color, alpha=0.18, lw=0)
-        axis.set_title(title(str(name)))
-        axis.set_xlabel("score: 1 - normalised regret")
-        axis.set_ylim(-0.02, 1.02)
-    for axis in axes[:: max(1, _columns(len(groups)))]:
-        axis.set_ylabel("share of runs above it")
-    _legend(figure, axes)
-    return figure
-
-
 def all_figures(
-    points: "pd.DataFrame",
-    cells: "pd.DataFrame",
-    models: Sequence[Models],
-    agents: Sequence[str],
-    profiles: "pd.DataFrame",
+    curves: Mapping[str, Curves], cells: "pd.DataFrame", models: Sequence[Models], agents: Sequence[str]
 ) -> dict[str, Callable[[], "Figure | None"]]:
     """Name -> function that draws it; fits are drawn for the first agent."""
-    drawn: dict[str, Callable[[], Figure | None]] = {
-        "regret": lambda: regret_curves(points),
-        "regret_by_instance": lambda: regret_curves(points, by="instance"),
-        "profiles": lambda: performance_profiles(profiles),
-    }
-    for environment, part in points.groupby("environment", sort=False):
-        by_task = partial(regret_curves, part, by=["instance", "chance"], seeds=True, resamples=200)
-        drawn[f"regret_by_task_{slug(str(environment))}"] = by_task
+    drawn: dict[str, Callable[[], Figure | None]] = {name: partial(lines, each) for name, each in curves.items()}
     for agent, seen in pairs_of(cells, agents):
         drawn[representations_figure(agent, seen)] = partial(representations, cells, agent=agent, seen=seen)
     for each in models:

@@ -8,7 +8,7 @@ import numpy as np
 
 from pharos.agents import TABULAR_OBSERVATION
 from pharos.study.analysis import IMAGE, VECTOR, Models
-from pharos.study.figures import agent_name, title
+from pharos.study.curves import agent_name, title
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pharos.storage import replace_file
+from pharos.study.curves import all_curves
 from pharos.study.figures import all_figures, save
 from pharos.study.latex import tables_of
 from pharos.study.report.model_sections import predictions_section
@@ -66,11 +67,13 @@ def report(
     results = results_of(study, place, tell)
     target = Path(out) if out is not None else place / "report"
     target.mkdir(parents=True, exist_ok=True)
-    figures = {}
-    drawings = all_figures(results.points, results.cells, results.models, results.agents, results.profiles)
-    for name, draw in drawings.items():
+    figures: dict[str, dict[str, bytes] | None] = {}
+    curves = all_curves(results.points, results.profiles)
+    for name, draw in all_figures(curves, results.cells, results.models, results.agents).items():
         tell(f"drawing {name}")
-        figures[name] = save(draw, target / "figures" / name)
+        images = figures[name] = save(draw, target / "figures" / name)
+        if images and name in curves:
+            images["curves"] = curves[name].to_json().encode()
     judged = None if predictions is None else validation(predictions[0], outcomes(results.runs, results.points))
     tables = _write_tables(target / "tables", results, {} if judged is None else {"predictions": judged})
     tell("drawing instances")

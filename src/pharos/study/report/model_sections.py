@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pharos.study.analysis import REGRETS, Models, agreement, paper_agreement
-from pharos.study.figures import agent_name, agents_figure
+from pharos.study.curves import agent_name
+from pharos.study.figures import agents_figure
 from pharos.study.regression import Fit
 from pharos.study.report.page import Figures, image, table
 from pharos.study.report.results import Results, coefficients

@@ -1,6 +1,11 @@
-"""The HTML page: data as the templates want them, and the rendering. Templates escape whatever they print."""
+"""The HTML page: data as the templates want them, and the rendering. Templates escape whatever they print.
+
+The page runs one script, its own (templates/page.js.j2), named by its digest: a browser runs no other and loads
+nothing.
+"""
 
 import base64
+import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -40,17 +45,26 @@ class Table:
 
 @dataclass(frozen=True)
 class Image:
-    """A figure for light and for dark pages, as data URLs; its name is that of its file."""
+    """A figure for light and for dark pages, as data URLs; its name is that of its file.
+
+    `curves` is what its lines are made of, as JSON; the page draws them anew, to be pointed at. Empty for others.
+    """
 
     name: str
     caption: str
     light: str
     dark: str
+    curves: str = ""
 
 
 def render(title: str, description: str, sections: "Sequence[Section]") -> str:
     """The page as text."""
-    return _templates().get_template("page.html.j2").render(title=title, description=description, sections=sections)
+    templates = _templates()
+    script = templates.get_template("page.js.j2").render()
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    return templates.get_template("page.html.j2").render(
+        title=title, description=description, sections=sections, script=script, digest=digest
+    )
 
 
 @cache
@@ -71,7 +85,10 @@ def _templates() -> "jinja2.Environment":
 def image(figures: Figures, name: str, caption: str) -> Image | None:
     """A figure with its caption; None where it was not drawn."""
     drawn = figures.get(name)
-    return None if not drawn else Image(name, caption, data_url(drawn["light"]), data_url(drawn["dark"]))
+    if not drawn:
+        return None
+    curves = drawn.get("curves", b"").decode()
+    return Image(name, caption, data_url(drawn["light"]), data_url(drawn["dark"]), curves)
 
 
 def data_url(png: bytes) -> str:

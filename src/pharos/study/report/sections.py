@@ -12,7 +12,8 @@ import numpy as np
 from pharos.environments import start_distribution
 from pharos.errors import PharosError
 from pharos.study.analysis import IMAGE, VECTOR
-from pharos.study.figures import agent_name, label, pairs_of, representations_figure, slug, title
+from pharos.study.curves import agent_name, label, slug, title
+from pharos.study.figures import pairs_of, representations_figure
 from pharos.study.latex import returns_table
 from pharos.study.report.model_sections import agreement_section, models_section
 from pharos.study.report.page import Figures, data_url, image, table
