@@ -5,6 +5,7 @@ import pytest
 
 from pharos.agents.batched import BatchRun, ObservationSource, group_key, make_batch, supports
 from pharos.agents.batched.arithmetic import TensorArithmetic
+from pharos.agents.batched.runs import lane_width, lane_widths
 from pharos.environments import make
 from pharos.errors import ParameterError
 from pharos.experiments.task import Task
@@ -69,6 +70,27 @@ def test_a_run_is_the_same_alone_among_others_and_in_another_order(grid, agent):
     assert outcome(together, 5) == outcome(alone, 0)
     assert all(outcome(together, i) == outcome(backwards, 39 - i) for i in range(40))
     assert len({outcome(together, i) for i in range(40)}) == 40
+
+
+@pytest.mark.parametrize("agent", AGENTS)
+def test_a_run_is_the_same_in_lanes_of_every_width(grid, agent):
+    runs = runs_of(grid, AGENTS[agent], 12)
+    first = outcome(learned(agent, runs[:1]), 0)
+    assert all(outcome(learned(agent, runs[:number]), 0) == first for number in (5, 7, 12))
+
+
+def test_a_lane_has_at_most_three_idle_runs():
+    assert [lane_widths(number, False) for number in (1, 5, 10, 32, 37)] == [[4], [6], [10], [32], [32, 6]]
+    assert lane_widths(9, True) == [8, 4]
+    assert lane_widths(9, False, "cuda") == [lane_width(False, "cuda")]
+
+
+def test_a_policy_asked_about_few_observations_answers_as_about_many(grid):
+    batch = learned("ppo", runs_of(grid, PPO, 1))
+    seen = np.tile(grid.sight.observe.observation(grid.space.states(np.arange(grid.space.num_states))), (30, 1))
+    many = batch.policy(0).action_probabilities(seen)
+    few = np.concatenate([batch.policy(0).action_probabilities(seen[i : i + 7]) for i in range(0, len(seen), 7)])
+    assert np.allclose(many, few, rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("agent", AGENTS)

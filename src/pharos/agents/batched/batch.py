@@ -1,4 +1,4 @@
-"""A batch: any number of runs, packed into lanes of fixed width."""
+"""A batch: any number of runs, packed into lanes."""
 
 from collections.abc import Callable, Sequence
 
@@ -8,7 +8,7 @@ import torch
 from pharos.agents.batched.dqn import DQNLane
 from pharos.agents.batched.lane import Lane, RunPolicy
 from pharos.agents.batched.ppo import PPOLane
-from pharos.agents.batched.runs import BatchRun, group_key, lane_width
+from pharos.agents.batched.runs import BatchRun, group_key, lane_width, lane_widths
 from pharos.errors import ParameterError
 
 LANES: dict[str, type[Lane]] = {"dqn": DQNLane, "ppo": PPOLane}
@@ -30,10 +30,11 @@ class Batch:
         if len(keys) > 1:
             raise ParameterError(f"{len(runs)} runs are of {len(keys)} groups; expected one batch a group (group_key)")
         self.runs = list(runs)
-        self.width = lane_width(runs[0].observe.is_image, device)
+        is_image = runs[0].observe.is_image
+        self.width = lane_width(is_image, device)  # of all lanes but the last
         self.lanes = [
-            LANES[agent](self.runs[first : first + self.width], self.width, device)
-            for first in range(0, len(runs), self.width)
+            LANES[agent](self.runs[i * self.width : (i + 1) * self.width], width, device)
+            for i, width in enumerate(lane_widths(len(runs), is_image, device))
         ]
 
     @property

@@ -15,13 +15,13 @@ from pharos.agents.batched.worlds import Worlds
 from pharos.kernels import batched_worlds as kernels
 from pharos.kernels import philox
 
-ASKED = 256  # observations that a policy is asked about at once
+ASKED = (16, 256)  # rows of the blocks in which a policy is asked: few observations, many
 
 
 class Lane:
     """W runs of one group, the last ones idle where there are fewer: they repeat the first one.
 
-    The width is part of the program: with it the same run has the same bits whoever else is there.
+    The same run has the same bits whoever else is there: each run's part of every buffer and product is apart.
 
     Attributes:
         number: of runs that are not idle.
@@ -160,12 +160,12 @@ class RunPolicy:
         """(M, A) float64 for observations (M, ...) as the environment gives them."""
         lane = self.lane
         values = {name: view[self.i : self.i + 1] for name, view in lane.values.items()}
-        block = torch.zeros(
-            (1, ASKED, lane.seen.size), device=lane.device
-        )  # of one size, as layers keep room for each size
-        answers = []
-        for first in range(0, len(observations), ASKED):
-            rows = lane.seen.encoded(observations[first : first + ASKED])
-            block[0, : len(rows)] = rows
+        answers, first = [], 0
+        while first < len(observations):
+            size = next((size for size in ASKED if size >= len(observations) - first), ASKED[-1])
+            rows = lane.seen.encoded(observations[first : first + size])
+            block = torch.zeros((1, size, lane.seen.size), device=lane.device)
+            block[0, : len(rows)] = rows  # of one of two sizes, as layers keep room for each size
             answers.append(lane.probabilities(lane.network.scores(values, block)[0, : len(rows)].cpu().numpy()))
+            first += size
         return np.concatenate(answers)

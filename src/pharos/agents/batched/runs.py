@@ -13,7 +13,8 @@ if TYPE_CHECKING:
     from pharos.observations import ObservationInContext
     from pharos.state_space import StateSpace
 
-WIDTH_OF_VECTORS, WIDTH_OF_IMAGES, WIDTH_ELSEWHERE = 32, 8, 256  # runs of a lane; the last: not on the processor
+WIDTH_OF_VECTORS, WIDTH_OF_IMAGES, WIDTH_ELSEWHERE = 32, 8, 256  # most runs of a lane; the last: not on the processor
+NARROWEST = 4
 
 # What Stable-Baselines3 takes where nothing is given. The first part may differ among the runs of a batch.
 OF_A_RUN: dict[str, dict[str, Any]] = {
@@ -204,7 +205,18 @@ def _is_in_steps(value: Any) -> bool:
 
 
 def lane_width(is_image: bool, device: str = "cpu") -> int:
-    """The runs of a lane, chosen by measurement on the processor (docs/decisions/0013-batched-training.md)."""
+    """The most runs of a lane, chosen by measurement on the processor (docs/decisions/0013-batched-training.md)."""
     if device != "cpu":
         return WIDTH_ELSEWHERE
     return WIDTH_OF_IMAGES if is_image else WIDTH_OF_VECTORS
+
+
+def lane_widths(number: int, is_image: bool, device: str = "cpu") -> list[int]:
+    """The widths of the lanes of a batch: on the processor the last one has as few idle runs as may be.
+
+    A width is even and at least NARROWEST there, as products of single runs add up in another order.
+    """
+    most = lane_width(is_image, device)
+    full, rest = divmod(number, most)
+    last = most if device != "cpu" else max(rest + rest % 2, NARROWEST)
+    return [most] * full + ([last] if rest else [])
