@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 import pharos
 from naive_hardness import distances
 from pharos import TabularMDP, hardness
+from pharos.hardness.orbits import orbits
 from pharos.kernels import symmetry
 from without_end import without_end
 
@@ -84,3 +85,8 @@ def test_the_8_puzzle_without_an_end_has_the_published_diameter_of_31():
 def test_a_puzzle_with_an_end_has_no_symmetries():
     space = pharos.build(pharos.make("sliding_tiles/2x3"), progress=False)
     assert "orbits" not in hardness.diameter(space.mdp(gamma=0.9)).method
+
+
+def test_where_no_map_is_found_no_orbits_are_numbered():
+    table = np.minimum(np.arange(1000)[:, None] + 1, 999)
+    assert orbits(table, np.zeros(1000, np.bool_), -1, 0, lambda: False) is None

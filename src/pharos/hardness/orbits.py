@@ -36,7 +36,8 @@ def orbits(
     image, preimage = np.full(size, -1, dtype), np.full(size, -1, dtype)
     queue, orbit = np.empty(size, dtype), np.arange(size, dtype=dtype)
     count, in_vain, steps_left = size, 0, 4 * size
-    for t in rng.integers(0, size, _CANDIDATES):
+    others = rng.integers(0, size, _CANDIDATES)
+    for t in others[others != pivot]:
         if count == 1 or in_vain == _IN_VAIN or steps_left < 0 or is_over():
             break
         is_symmetry, steps = kernels.symmetry(next_states, ends, start, pivot, t, image, preimage, queue)
