@@ -232,8 +232,8 @@ class _Work:
             return
         for folder in sorted(self.checkpoints.glob("*")):
             try:
-                kept = json.loads((folder / "batch.json").read_text(encoding="utf-8"))
-                configs = [RunConfig.from_dict(entry) for entry in kept["configs"]]
+                stored = json.loads((folder / "batch.json").read_text(encoding="utf-8"))
+                configs = [RunConfig.from_dict(entry) for entry in stored["configs"]]
             except (OSError, ValueError, KeyError, TypeError, PharosError):
                 continue
             yield [config.id for config in configs], configs
@@ -327,11 +327,11 @@ class _Batch:
         def at_point(step: int) -> None:
             rows = self._evaluate(step)
             if checkpoint is not None and step < steps:
-                kept = [
+                curves = [
                     {"rows": member.curve.rows, "error": member.error and in_one_line(member.error)}
                     for member in self.group
                 ]
-                checkpoint.save(self, kept, time.perf_counter() - began)
+                checkpoint.save(self, curves, time.perf_counter() - began)
             self.work.report(rows, before + step * sum(place is not None for place in self.places))
 
         if points:

@@ -165,8 +165,8 @@ class JoinedEnds(GymnaxEnv):
     @partial(jax.jit, static_argnames=("self",))
     def step(self, key: Any, state: Any, action: Any, params: Any = None) -> tuple[Any, ...]:
         """(observation, state, reward, done, info)."""
-        seen, after, reward, terminated, truncated, info = super().step(key, state, action, params)
-        return seen, after, reward, jnp.logical_or(terminated, truncated), info
+        observation, after, reward, terminated, truncated, info = super().step(key, state, action, params)
+        return observation, after, reward, jnp.logical_or(terminated, truncated), info
 
 
 def _drawn(cumulative: Any, u: Any) -> Any:
@@ -178,15 +178,15 @@ def _outcomes(mdp: TabularMDP) -> tuple[np.ndarray, np.ndarray]:
     """(S + 1, A, K) next states, S for the end, and cumulated probabilities; 1 from the last possible outcome on."""
     num_states, num_actions = mdp.num_states, mdp.num_actions
     states = np.repeat(np.arange(num_states), num_actions)
-    found = mdp.dynamics.outcomes(states, np.tile(np.arange(num_actions), num_states))
-    which = np.asarray(found.which)
+    outcomes = mdp.dynamics.outcomes(states, np.tile(np.arange(num_actions), num_states))
+    which = np.asarray(outcomes.which)
     order = np.argsort(which, kind="stable")
     which = which[order]
     place = np.arange(len(which)) - np.searchsorted(which, which)
     pairs, width = num_states * num_actions, int(place.max(initial=0)) + 1
     successors, cumulative = np.full((pairs, width), num_states), np.zeros((pairs, width))
-    successors[which, place] = np.asarray(found.states)[order]
-    cumulative[which, place] = np.asarray(found.probabilities)[order]
+    successors[which, place] = np.asarray(outcomes.states)[order]
+    cumulative[which, place] = np.asarray(outcomes.probabilities)[order]
     counts = np.bincount(which, minlength=pairs)
     cumulative = np.cumsum(cumulative, axis=1)
     cumulative[np.arange(width) >= counts[:, None] - 1] = 1.0

@@ -41,8 +41,8 @@ def aliasing_table(
     rows: dict[tuple[str, str], dict[str, Any]] = {}
     for run in study.runs:
         key = (run.instance, title(run.config["observation"], run.config["observation_options"]))
-        known = num_states.get(run.instance, np.inf)
-        if key in rows or key[1] == TABULAR_OBSERVATION or not known <= MOST_STATES:
+        number = num_states.get(run.instance, np.inf)
+        if key in rows or key[1] == TABULAR_OBSERVATION or not number <= MOST_STATES:
             continue
         if progress is not None:
             progress(f"states that share an observation: {', '.join(key)}")
@@ -71,18 +71,18 @@ def _counted(folder: Path, config: Mapping[str, Any]) -> Aliasing:
     from pharos.state_space import build
     from pharos.study.values import task_of
 
-    asked = {name: config[name] for name in ("environment", "parameters", "observation", "observation_options")}
+    identity = {name: config[name] for name in ("environment", "parameters", "observation", "observation_options")}
     task = task_of(config)
-    asked = json.loads(json.dumps({**asked, "version": task.env.version}))
-    file = folder / "aliasing" / f"{digest_of_json(asked)[:16]}.json"
+    identity = json.loads(json.dumps({**identity, "version": task.env.version}))
+    file = folder / "aliasing" / f"{digest_of_json(identity)[:16]}.json"
     try:
         stored = read_json(file)
-        if is_intact(stored) and stored["asked"] == asked:
+        if is_intact(stored) and stored["asked"] == identity:
             return Aliasing(**stored["counts"])
     except (FileNotFoundError, FileFormatError, KeyError, TypeError, AttributeError):
         pass
     space = build(task.env, progress=False)
     counts = aliasing(space, observe(task.env, task.observation, **dict(task.observation_options)))
     file.parent.mkdir(parents=True, exist_ok=True)
-    replace_json(file, sealed({"asked": asked, "counts": asdict(counts)}))
+    replace_json(file, sealed({"asked": identity, "counts": asdict(counts)}))
     return counts

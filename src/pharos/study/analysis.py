@@ -53,7 +53,7 @@ class Models:
 
     def get(self, model: str, subset: str) -> Fit | None:
         """One of the fits."""
-        return next((found for found in self.fits if (found.model, found.subset) == (model, subset)), None)
+        return next((one for one in self.fits if (one.model, one.subset) == (model, subset)), None)
 
 
 def models(
@@ -128,7 +128,7 @@ def _class_alone(rows: "pd.DataFrame") -> float:
 
 
 def _together(fits: Sequence[Fit], model: str) -> float | None:
-    parts = [found for found in fits if found.model == model]
+    parts = [one for one in fits if one.model == model]
     return aggregate_r_squared(parts) if len(parts) > 1 else None
 
 
@@ -140,7 +140,7 @@ def intervals(rows: "pd.DataFrame", *, resamples: int = 1000) -> "pd.DataFrame":
     """
     import pandas as pd
 
-    found = []
+    lines = []
     for key, part in rows.groupby(["environment", "agent", "observation"], sort=True):
         defined = part[
             np.isfinite(part["normalized_regret"].to_numpy(float))
@@ -152,9 +152,9 @@ def intervals(rows: "pd.DataFrame", *, resamples: int = 1000) -> "pd.DataFrame":
         line = dict(zip(("environment", "agent", "observation"), key, strict=True))
         line |= {"tasks": len(tasks), "runs": len(defined)}
         ends = (estimate.lower, estimate.upper) if max(map(len, tasks)) > 1 else (float("nan"),) * 2
-        found.append(line | {"iqm": estimate.value, "lower": ends[0], "upper": ends[1]})
+        lines.append(line | {"iqm": estimate.value, "lower": ends[0], "upper": ends[1]})
     columns = ["environment", "agent", "observation", "tasks", "runs", "iqm", "lower", "upper"]
-    return pd.DataFrame(found, columns=columns)
+    return pd.DataFrame(lines, columns=columns)
 
 
 def mean_curve(
@@ -208,7 +208,7 @@ class Comparison:
     notes: Sequence[str] = field(default_factory=list)
 
 
-def compare(cells: "pd.DataFrame", runs: Sequence[Run], found: Sequence[Models]) -> Comparison:
+def compare(cells: "pd.DataFrame", runs: Sequence[Run], models: Sequence[Models]) -> Comparison:
     """Our value beside each number that the paper prints, where the study has one; NaN elsewhere."""
     numbers = {run.instance: paper_instance(run.config["environment"], run.config["parameters"]) for run in runs}
     ours: dict[tuple, tuple[float, ...]] = {}
@@ -228,13 +228,13 @@ def compare(cells: "pd.DataFrame", runs: Sequence[Run], found: Sequence[Models])
     for place, column in enumerate(("ours", "our_deviation", "our_steps")):
         returns[column] = [ours.get(key, nothing)[place] for key in keys]
     returns["difference"] = returns["ours"] - returns["mean"]
-    return Comparison(returns, _regressions(cells, found))
+    return Comparison(returns, _regressions(cells, models))
 
 
-def _regressions(cells: "pd.DataFrame", found: Sequence[Models]) -> "pd.DataFrame":
+def _regressions(cells: "pd.DataFrame", models: Sequence[Models]) -> "pd.DataFrame":
     printed = paper_regressions()
     printed["paper"] = printed["r_squared"].astype(str).str.extract(r"([0-9.]+)")[0].astype(float)
-    for result in found:
+    for result in models:
         values = []
         for row in printed.itertuples():
             values.append(_ours(str(row.model), str(row.subset), result, cells))
@@ -244,14 +244,14 @@ def _regressions(cells: "pd.DataFrame", found: Sequence[Models]) -> "pd.DataFram
     return printed
 
 
-def _ours(model: str, subset: str, found: Models, cells: "pd.DataFrame") -> float:
+def _ours(model: str, subset: str, models: Models, cells: "pd.DataFrame") -> float:
     missing = float("nan")
     if model == "agents":
         agreed = agreement(cells, "return")
         return agreed[0] if agreed else missing
     if "aggregate" in subset:
-        value = found.representation_r_squared if model == "representation" else found.class_r_squared
+        value = models.representation_r_squared if model == "representation" else models.class_r_squared
         return missing if value is None else value
     name = {"image": IMAGE}.get(subset, subset)
-    one = found.get(model.split()[0], name)
+    one = models.get(model.split()[0], name)
     return missing if one is None else one.r_squared

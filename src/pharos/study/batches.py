@@ -41,8 +41,8 @@ def train_batch(
     from pharos.experiments import FailedRun, Members, RunConfig, TaskValues, train_configs
 
     def values(config: RunConfig) -> TaskValues | None:
-        known = _values.stored_values(config.to_dict())
-        return None if known is None else TaskValues.from_dict(known)
+        stored = _values.stored_values(config.to_dict())
+        return None if stored is None else TaskValues.from_dict(stored)
 
     members = Members(values, trust=True, strict=True)
     ends = train_configs(configs, folders, checkpoints=checkpoints, members=members, device=device)
@@ -71,11 +71,11 @@ class Batches:
         self.stored = {id: ids for ids in self._stored_ids() for id in ids}
 
     def _stored_ids(self) -> list[frozenset[str]]:
-        found = []
+        batches = []
         for file in self.folder.glob("*/batch.json"):
             with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
-                found.append(frozenset(json.loads(file.read_text(encoding="utf-8"))["ids"]))
-        return found
+                batches.append(frozenset(json.loads(file.read_text(encoding="utf-8"))["ids"]))
+        return batches
 
     def unit(self, run: Run, pending: "deque[tuple[float, Run]]") -> tuple[Run, ...]:
         """The runs that are trained with this one; they are taken from `pending`."""
@@ -119,9 +119,9 @@ class Batches:
         try:
             env = config.make_environment(trust=True)
             mdp = SimpleNamespace(num_actions=env.num_actions, num_states=most_states(env))
-            seen = SimpleNamespace(shape=shape, dtype=dtype, is_image=is_image)
+            observation = SimpleNamespace(shape=shape, dtype=dtype, is_image=is_image)
             run_in_short: Any = SimpleNamespace(
-                observe=seen, mdp=mdp, hyperparameters=config.hyperparameters, steps=config.steps
+                observe=observation, mdp=mdp, hyperparameters=config.hyperparameters, steps=config.steps
             )
             key = group_key(config.agent, run_in_short)
         except Exception:  # what is wrong with it, the run will say

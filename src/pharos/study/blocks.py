@@ -182,8 +182,8 @@ class Hardness(_Part):
         The stationary effective horizon stands for the effective horizon where that is not taken.
         """
         stand_in = {"effective_horizon": "stationary_effective_horizon"}
-        taken = [name if name in self.measures else stand_in.get(name) for name in MEASURES]
-        return [name for name in taken if name in self.measures] or list(self.measures)
+        names = [name if name in self.measures else stand_in.get(name) for name in MEASURES]
+        return [name for name in names if name in self.measures] or list(self.measures)
 
 
 def _engines(value: Any) -> Any:
@@ -241,11 +241,11 @@ class Specification(_Part):
     @cached_property
     def runs(self) -> tuple[Run, ...]:
         """Every run, each once, in the order of the blocks."""
-        found: dict[str, Run] = {}
+        runs: dict[str, Run] = {}
         for block in self.blocks:
             for run in self._runs_of(block):
-                found.setdefault(run.id, run)
-        return tuple(found.values())
+                runs.setdefault(run.id, run)
+        return tuple(runs.values())
 
     def _runs_of(self, block: Block) -> Iterator[Run]:
         steps = block.steps or self.steps
@@ -266,18 +266,18 @@ class Specification(_Part):
                             "observation": None if observation.own is None else observation.own.source,
                             "agent": agent_from,
                         }
-                        seen = str(observation.own or observation.name)
+                        observation_name = str(observation.own or observation.name)
                         for seed in block.seeds or self.seeds:
                             yield Run(
                                 RunConfig(
                                     environment=environment.instance.name,
                                     parameters=_jsonable(environment.instance.parameters),
                                     chance=chance.setting,
-                                    observation=seen,
+                                    observation=observation_name,
                                     observation_options=dict(observation.options),
                                     agent=agent if agent_from is None else agent_from.name,
                                     hyperparameters=self._hyperparameters(
-                                        block, agent, environment.instance.name, seen
+                                        block, agent, environment.instance.name, observation_name
                                     ),
                                     steps=steps,
                                     seed=seed,
@@ -298,8 +298,8 @@ class Specification(_Part):
 
     def _hyperparameters(self, block: Block, agent: str, environment: str, observation: str) -> dict[str, Any]:
         """All of them, those of the library's table included: when that changes, these are other runs."""
-        given = block.hyperparameters.get(agent, {})
-        own = self.hyperparameters[given] if isinstance(given, str) else given
+        entry = block.hyperparameters.get(agent, {})
+        own = self.hyperparameters[entry] if isinstance(entry, str) else entry
         return hyperparameters(agent, environment, observation, own)
 
 

@@ -48,8 +48,8 @@ def train(config: Mapping[str, Any], folder: Path) -> None:
     from pharos.experiments import TaskValues, train_config
 
     values = _values.stored_values(config)
-    known = None if values is None else TaskValues.from_dict(values)
-    train_config(config, folder, values=known, trust=True, strict=True)
+    task_values = None if values is None else TaskValues.from_dict(values)
+    train_config(config, folder, values=task_values, trust=True, strict=True)
 
 
 def shard_of(runs: Sequence[Run], shard: str | tuple[int, int] | None) -> tuple[Run, ...]:

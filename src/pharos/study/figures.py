@@ -73,15 +73,15 @@ def pairs_of(cells: "pd.DataFrame", agents: Sequence[str]) -> list[tuple[str, st
     for agent in agents:
         own = cells[cells["agent"] == agent]
         wide = own.pivot_table(index=["instance", "chance"], columns="observation", values="normalized_regret")
-        for seen in (IMAGE, OTHER_IMAGE):
-            if {seen, VECTOR} <= set(wide.columns) and len(wide[[seen, VECTOR]].dropna()):
-                pairs.append((agent, seen))
+        for image in (IMAGE, OTHER_IMAGE):
+            if {image, VECTOR} <= set(wide.columns) and len(wide[[image, VECTOR]].dropna()):
+                pairs.append((agent, image))
     return pairs
 
 
-def representations_figure(agent: str, seen: str) -> str:
+def representations_figure(agent: str, image: str) -> str:
     """The name of the figure of `representations`."""
-    parts = ["representations", *([] if agent == "dqn" else [slug(agent)]), *([] if seen == IMAGE else [slug(seen)])]
+    parts = ["representations", *([] if agent == "dqn" else [slug(agent)]), *([] if image == IMAGE else [slug(image)])]
     return "_".join(parts)
 
 
@@ -90,21 +90,21 @@ def agents_figure(one: str, two: str) -> str:
     return "agents" if (one, two) == ("dqn", "ppo") else f"agents_{slug(one)}_{slug(two)}"
 
 
-def representations(cells: "pd.DataFrame", *, agent: str = "dqn", seen: str = IMAGE) -> "Figure | None":
+def representations(cells: "pd.DataFrame", *, agent: str = "dqn", image: str = IMAGE) -> "Figure | None":
     """Normalised regret with a vector against that with an image, a point for each task. The paper's figure 3."""
     wide = cells[cells["agent"] == agent].pivot_table(
         index=["environment", "instance", "chance"], columns="observation", values="normalized_regret"
     )
-    if not {seen, VECTOR} <= set(wide.columns):
+    if not {image, VECTOR} <= set(wide.columns):
         return None
-    wide = wide[[seen, VECTOR]].dropna().reset_index()
+    wide = wide[[image, VECTOR]].dropna().reset_index()
     names = list(dict.fromkeys(wide["environment"]))
     figure, (axis,) = _panels(1, 4.6, 4.2)
     for (environment, chance), part in wide.groupby(["environment", wide["chance"].str.split().str[0]], sort=True):
         marker = CHANCE_MARKERS.get(chance, "D")
         color = class_color(environment, names)
-        axis.scatter(part[seen], part[VECTOR], s=34, color=color, marker=marker, alpha=0.85, lw=0)
-    low, high = min(0.0, wide[[seen, VECTOR]].min().min()), max(1.0, wide[[seen, VECTOR]].max().max())
+        axis.scatter(part[image], part[VECTOR], s=34, color=color, marker=marker, alpha=0.85, lw=0)
+    low, high = min(0.0, wide[[image, VECTOR]].min().min()), max(1.0, wide[[image, VECTOR]].max().max())
     axis.plot([low, high], [low, high], ":", color="#888888", lw=1.2)
     axis.set(xlabel=f"normalised regret of {agent_name(agent)} with an image", aspect="equal")
     axis.set_ylabel(f"normalised regret of {agent_name(agent)} with a vector")
@@ -165,8 +165,8 @@ def all_figures(
 ) -> dict[str, Callable[[], "Figure | None"]]:
     """Name -> function that draws it; fits are drawn for the first agent."""
     drawn: dict[str, Callable[[], Figure | None]] = {name: partial(lines, each) for name, each in curves.items()}
-    for agent, seen in pairs_of(cells, agents):
-        drawn[representations_figure(agent, seen)] = partial(representations, cells, agent=agent, seen=seen)
+    for agent, image in pairs_of(cells, agents):
+        drawn[representations_figure(agent, image)] = partial(representations, cells, agent=agent, image=image)
     for each in models:
         if each.agent != models[0].agent:
             continue

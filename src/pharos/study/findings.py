@@ -153,8 +153,8 @@ def _tasks(fit: Fit) -> _Tasks:
     names = fit.tasks or tuple(map(str, range(fit.num_rows)))
     observations = sorted(set(fit.observations)) or [""]
     rows = {key: row for row, key in enumerate(zip(names, fit.observations or [""] * len(names), strict=True))}
-    complete = [name for name in dict.fromkeys(names) if all((name, seen) in rows for seen in observations)]
-    places = np.array([[rows[name, seen] for seen in observations] for name in complete], int).reshape(
+    complete = [name for name in dict.fromkeys(names) if all((name, each) in rows for each in observations)]
+    places = np.array([[rows[name, each] for each in observations] for name in complete], int).reshape(
         -1, len(observations)
     )
     columns = [str(name) for name in fit.coefficients.index]

@@ -61,9 +61,9 @@ class Forecast:
 
     def __str__(self) -> str:
         """One line; where the whole takes longer than a night, what fits into one."""
-        known = sorted({source for _, source in self.paces.values()})
+        sources = sorted({source for _, source in self.paces.values()})
         text = f"{many(self.runs, 'run')} to come, {self.steps:,} steps: about {duration(self.seconds)} with "
-        text += f"{many(self.workers, 'worker')} (paces: {', '.join(known)})"
+        text += f"{many(self.workers, 'worker')} (paces: {', '.join(sources)})"
         if self.seconds > NIGHT_HOURS * 3600:
             text += f"; a night of {NIGHT_HOURS} h does {self.in_a_night} of them"
         return text
@@ -90,10 +90,11 @@ def forecast(
     paces: dict[Kind, tuple[float, str]] = {}
     for kind in kinds:
         seconds, steps = finished.get(kind, (0.0, 0))
-        known = stored.get(json.dumps(kind))
-        paces[kind] = (
-            (seconds / steps, FINISHED) if steps and seconds else (known, EARLIER) if known else (_guess(kind), GUESS)
-        )
+        earlier = stored.get(json.dumps(kind))
+        if steps and seconds:
+            paces[kind] = seconds / steps, FINISHED
+        else:
+            paces[kind] = (earlier, EARLIER) if earlier else (_guess(kind), GUESS)
     guessed = [kind for kind, (_, source) in paces.items() if source == GUESS]
     if measure and guessed and _seconds(runs, paces) / workers > WORTH_MEASURING:
         share = {kind: _seconds([run for run in runs if run.kind == kind], paces) for kind in guessed}
@@ -137,9 +138,9 @@ def _file() -> Path:
 def _stored_paces() -> dict[str, float]:
     """Seconds for a step by kind, of earlier studies."""
     with contextlib.suppress(FileNotFoundError, FileFormatError):
-        found = read_json(_file())
-        if isinstance(found, dict):
-            return {kind: pace for kind, pace in found.items() if isinstance(pace, float) and 0 < pace < 1e3}
+        paces = read_json(_file())
+        if isinstance(paces, dict):
+            return {kind: pace for kind, pace in paces.items() if isinstance(pace, float) and 0 < pace < 1e3}
     return {}
 
 
@@ -163,7 +164,7 @@ def _measured(runs: Sequence[Run], tell: Callable[[str], Any]) -> dict[Kind, flo
     with one_thread():
         process.start()
     sender.close()
-    found: dict[Kind, float] = {}
+    paces: dict[Kind, float] = {}
     latest = time.monotonic() + MEASURE_SECONDS
     try:
         for number, run in enumerate(runs, start=1):
@@ -172,13 +173,13 @@ def _measured(runs: Sequence[Run], tell: Callable[[str], Any]) -> dict[Kind, flo
                 break
             pace = receiver.recv()
             if pace is not None:
-                found[run.kind] = pace
+                paces[run.kind] = pace
     except EOFError:
         pass
     finally:
         receiver.close()
         end_processes([process])
-    return found
+    return paces
 
 
 def _send_paces(configs: Sequence[Mapping[str, Any]], sender: Any) -> None:

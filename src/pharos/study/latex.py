@@ -46,15 +46,15 @@ def returns_table(cells: "pd.DataFrame", environment: str) -> str:
         name = rf"{{\small {escape(row['instance'])}}}"
         entries = rows.setdefault((name, escape(kind)), {})
         entries[row["agent"], row["observation"]] = _entry(row["return"], row["return_deviation"])
-    seen = sorted({(row.agent, row.observation) for row in part.itertuples()}, key=lambda key: (key[0] != "ppo", *key))
-    titles = [(escape(agent_name(agent)), escape(title(name))) for agent, name in seen]
-    if {key for key in seen if key[1] != TABULAR_OBSERVATION} == set(COLUMNS):
-        seen, titles = list(COLUMNS), [(TITLES[agent], TITLES[name]) for agent, name in COLUMNS]
+    keys = sorted({(row.agent, row.observation) for row in part.itertuples()}, key=lambda key: (key[0] != "ppo", *key))
+    titles = [(escape(agent_name(agent)), escape(title(name))) for agent, name in keys]
+    if {key for key in keys if key[1] != TABULAR_OBSERVATION} == set(COLUMNS):
+        keys, titles = list(COLUMNS), [(TITLES[agent], TITLES[name]) for agent, name in COLUMNS]
     columns = pd.MultiIndex.from_tuples(titles)
     index = pd.MultiIndex.from_tuples(list(rows), names=["instance", "randomization"])
-    data = [[entries.get(column, "--") for column in seen] for entries in rows.values()]
+    data = [[entries.get(column, "--") for column in keys] for entries in rows.values()]
     return _latex(
-        pd.DataFrame(data, index, columns), "ll" + "c" * len(seen), multirow_align="c", clines="skip-last;data"
+        pd.DataFrame(data, index, columns), "ll" + "c" * len(keys), multirow_align="c", clines="skip-last;data"
     )
 
 

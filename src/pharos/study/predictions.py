@@ -59,8 +59,8 @@ def predict(
         config = run.config
         if agent_kind(config["agent"]).is_tabular:
             continue
-        seen = title(config["observation"], config["observation_options"])
-        key = (config["environment"], run.instance, run.chance, config["agent"], seen)
+        observation = title(config["observation"], config["observation_options"])
+        key = (config["environment"], run.instance, run.chance, config["agent"], observation)
         if key in rows:
             continue
         if progress is not None:
@@ -81,17 +81,17 @@ def _predicted(run: Run) -> dict[str, Any]:
     try:
         task = task_of(run.config)
         name, initialisation = _network(run.config, task)
-        seen = representation(
+        features = representation(
             task.space, task.observation, name, initialisation=initialisation, **dict(task.observation_options)
         )
-        options: dict[str, Any] = {"horizon": task.time_limit, "representation": seen}
+        options: dict[str, Any] = {"horizon": task.time_limit, "representation": features}
         schedule = _schedule(run.config)
-        found = report(task.mdp, MEASURES, schedule=schedule, **options)
+        measures = report(task.mdp, MEASURES, schedule=schedule, **options)
         rescaled = report(task.mdp, ["kernel_regret"], schedule=replace(schedule, optimizer="adam"), **options)
     except PharosError as error:
         return {**row, "notes": str(error)}
     row |= {"num_states": float(task.mdp.num_states), "network": f"{name}, {initialisation}"}
-    regret = found["kernel_regret"].value
+    regret = measures["kernel_regret"].value
     if regret is not None:
         row |= {"kernel_regret": regret["value"], "kernel_regret_played": regret["played"]}
         row |= {"tabular_regret": regret["tabular"], "tabular_regret_played": regret["tabular_played"]}
@@ -100,10 +100,10 @@ def _predicted(run: Run) -> dict[str, Any]:
     if regret is not None:
         row |= {"adam_regret": regret["value"], "adam_regret_played": regret["played"]}
     for measure in MEASURES[1:]:
-        value = found[measure].value
+        value = measures[measure].value
         if value is not None:
             row[measure] = float(value["value"] if isinstance(value, Mapping) else value)
-    notes = (result.undefined or result.certificate.note for result in found.results.values())
+    notes = (result.undefined or result.certificate.note for result in measures.results.values())
     return {**row, "notes": "; ".join(note for note in notes if note)}
 
 
@@ -111,8 +111,8 @@ def _network(config: Mapping[str, Any], task: Any) -> tuple[str, str]:
     """The name and the initialisation of the network of an agent of pharos."""
     from pharos.observations import default_network, observe
 
-    seen = observe(task.env, task.observation, state_space=task.space, **dict(task.observation_options))
-    name, hidden = default_network(seen.space), config["hyperparameters"].get("net_arch", [128])
+    observation = observe(task.env, task.observation, state_space=task.space, **dict(task.observation_options))
+    name, hidden = default_network(observation.space), config["hyperparameters"].get("net_arch", [128])
     if isinstance(hidden, list) and hidden != [128]:
         name = "-".join([name.removesuffix("x2"), *(["128"] if "mlp" not in name else []), *map(str, hidden)])
     return (name, "pytorch") if config["agent"] == "dqn" else (f"{name}+tanh", "sb3")
@@ -122,14 +122,14 @@ def _schedule(config: Mapping[str, Any]) -> "Schedule":
     """That of a DQN by its hyperparameters; of others the steps alone."""
     from pharos.hardness import Schedule
 
-    given = config["hyperparameters"]
+    hyperparameters = config["hyperparameters"]
     if config["agent"] != "dqn":
         return Schedule(steps=config["steps"])
     same = ("learning_starts", "exploration_initial_eps", "exploration_final_eps", "exploration_fraction", "gamma")
-    options = {name: given[name] for name in same if name in given}
-    period, every = int(given.get("target_update_interval", 250)), given.get("train_freq", 4)
+    options = {name: hyperparameters[name] for name in same if name in hyperparameters}
+    period, every = int(hyperparameters.get("target_update_interval", 250)), hyperparameters.get("train_freq", 4)
     every = every if isinstance(every, int) else 4
-    copies = int(given.get("gradient_steps", 1))
+    copies = int(hyperparameters.get("gradient_steps", 1))
     steps = max(1, round(period * (copies / every if copies > 0 else 1.0)))
     return Schedule(steps=config["steps"], period=period, gradient_steps=steps, **options)
 

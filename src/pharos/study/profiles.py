@@ -90,5 +90,5 @@ def improvements(runs: "pd.DataFrame", *, resamples: int = 500) -> "pd.DataFrame
 
 def _scores(part: "pd.DataFrame") -> dict[Any, np.ndarray]:
     """Task -> scores of its runs."""
-    known = part[np.isfinite(part["normalized_regret"].to_numpy(float))]
-    return {task: 1.0 - own["normalized_regret"].to_numpy(float) for task, own in known.groupby(TASK, sort=True)}
+    defined = part[np.isfinite(part["normalized_regret"].to_numpy(float))]
+    return {task: 1.0 - own["normalized_regret"].to_numpy(float) for task, own in defined.groupby(TASK, sort=True)}

@@ -187,7 +187,7 @@ def _checked(data: "pd.DataFrame", measures: Sequence[str]) -> "pd.DataFrame":
 
 def _independent(rows: "pd.DataFrame", predictors: Sequence[str]) -> tuple[list[str], list[str]]:
     """The terms of a formula that are linearly independent of those before them, and the predictors left out."""
-    kept: list[str] = []
+    terms: list[str] = []
     dropped: list[str] = []
     columns = [np.ones(len(rows))]
     for predictor in predictors:
@@ -201,11 +201,11 @@ def _independent(rows: "pd.DataFrame", predictors: Sequence[str]) -> tuple[list[
         design = np.column_stack([*columns, *added])
         scaled = design / np.maximum(np.abs(design).max(axis=0), 1e-300)
         if added and np.linalg.matrix_rank(scaled, tol=1e-9 * np.sqrt(len(rows))) == design.shape[1]:
-            kept.append(term)
+            terms.append(term)
             columns += added
         else:
             dropped.append(predictor)
-    return kept, dropped
+    return terms, dropped
 
 
 def _coefficients(result: Any, rows: "pd.DataFrame", tasks: Sequence[str]) -> "pd.DataFrame":

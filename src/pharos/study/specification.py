@@ -193,13 +193,13 @@ def _validated(data: Mapping[str, Any], name: str, root: Any, folder: Path, trus
         folder = (folder / written if isinstance(written, str) else folder).resolve()
         data = {**data, "folder": str(folder)}
     try:
-        found = Specification.model_validate(data, context={"folder": folder})
+        specification = Specification.model_validate(data, context={"folder": folder})
     except ValidationError as error:
         raise ParameterError(_messages(error, name, root)) from error
-    wrong = [*_wrong(found)]
+    wrong = [*_wrong(specification)]
     if wrong:
         raise ParameterError("; ".join(f"{_where(name, root, loc)}: {message}" for loc, message in wrong))
-    return found
+    return specification
 
 
 def _references(data: Mapping[str, Any]) -> Iterator[tuple[Loc, str]]:
@@ -214,13 +214,13 @@ def _references(data: Mapping[str, Any]) -> Iterator[tuple[Loc, str]]:
                     yield ("blocks", i, part, j), name
 
 
-def _wrong(found: Specification) -> Iterator[tuple[Loc, str]]:
+def _wrong(specification: Specification) -> Iterator[tuple[Loc, str]]:
     """What only the whole specification shows: names of agents and of hyperparameters, environments that cannot be
     made."""
     number = 0
-    for i, block in enumerate(found.blocks):
+    for i, block in enumerate(specification.blocks):
         kinds = len(block.environments) * len(block.chance) * len(block.agents) * len(block.observations)
-        number += kinds * len(block.seeds or found.seeds)
+        number += kinds * len(block.seeds or specification.seeds)
         if number > MOST_RUNS:
             yield ("blocks", i), f"{number:,} runs up to here; a study has at most {MOST_RUNS:,}"
             return
@@ -229,10 +229,10 @@ def _wrong(found: Specification) -> Iterator[tuple[Loc, str]]:
                 _ = entry.instance
             except ParameterError as error:
                 yield ("blocks", i, "environments", j), str(error)
-        gamma = found.gamma if block.gamma is None else block.gamma
-        if (block.horizon or found.horizon) == "none" and gamma == 1:
+        gamma = specification.gamma if block.gamma is None else block.gamma
+        if (block.horizon or specification.horizon) == "none" and gamma == 1:
             yield ("blocks", i), "gamma is 1 and horizon is none, so values may be infinite; expected a gamma below 1"
-        said = found.engine if block.engine is None else block.engine
+        said = specification.engine if block.engine is None else block.engine
         for agent in said if isinstance(said, dict) else ():
             if agent not in AGENTS and not is_reference(agent):
                 where: Loc = ("engine",) if block.engine is None else ("blocks", i, "engine")
@@ -241,20 +241,20 @@ def _wrong(found: Specification) -> Iterator[tuple[Loc, str]]:
             try:
                 if agent not in AGENTS and not is_reference(agent):
                     raise UnknownName("agent", agent, AGENTS)
-                agent_source(agent, found.folder, check=False)
-                if found.engine_of(block, agent) == "batched" and agent not in (*BATCHED, "q_learning"):
+                agent_source(agent, specification.folder, check=False)
+                if specification.engine_of(block, agent) == "batched" and agent not in (*BATCHED, "q_learning"):
                     raise ParameterError(
                         f"agent {agent!r}: the batched engine has {', '.join(BATCHED)} and q_learning, the engine sb3 "
                         f"has {agent!r}; write engine: {{{BATCHED[0]}: batched}} for some agents only"
                     )
             except ParameterError as error:
                 yield ("blocks", i, "agents", j), str(error)
-        for agent, given in block.hyperparameters.items():
+        for agent, own in block.hyperparameters.items():
             loc = ("blocks", i, "hyperparameters", agent)
             if agent not in block.agents:
                 yield loc, str(UnknownName("agent of this block", agent, block.agents))
-            elif isinstance(given, str) and given not in found.hyperparameters:
-                yield loc, str(UnknownName("set of hyperparameters", given, found.hyperparameters))
+            elif isinstance(own, str) and own not in specification.hyperparameters:
+                yield loc, str(UnknownName("set of hyperparameters", own, specification.hyperparameters))
 
 
 def _messages(error: ValidationError, name: str, root: Any) -> str:

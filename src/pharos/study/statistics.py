@@ -92,8 +92,8 @@ def probability_of_improvement(ours: Sequence[np.ndarray], theirs: Sequence[np.n
     Args:
         ours, theirs: for each task the scores of its runs along `axis`, the same tasks in the same order.
     """
-    found = []
+    probabilities = []
     for one, other in zip(ours, theirs, strict=True):
         x, y = np.moveaxis(one, axis, -1)[..., :, None], np.moveaxis(other, axis, -1)[..., None, :]
-        found.append(((x > y) + 0.5 * (x == y)).mean(axis=(-1, -2)))
-    return np.mean(found, axis=0)
+        probabilities.append(((x > y) + 0.5 * (x == y)).mean(axis=(-1, -2)))
+    return np.mean(probabilities, axis=0)

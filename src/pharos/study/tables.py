@@ -168,9 +168,10 @@ def _last_return(curve: "pd.DataFrame") -> float:
     """Mean return of training episodes over the last tenth of the evaluations that saw an episode end."""
     ended = np.diff(curve["episodes"].to_numpy(), prepend=0)
     returns = curve["mean_return"].to_numpy(float)
-    known = np.isfinite(returns) & (ended > 0)
-    known[: len(known) - max(1, int(len(known) * LAST))] &= not known[-max(1, int(len(known) * LAST)) :].any()
-    return float(np.average(returns[known], weights=ended[known])) if known.any() else float("nan")
+    is_defined = np.isfinite(returns) & (ended > 0)
+    last = max(1, int(len(returns) * LAST))
+    is_defined[: len(returns) - last] &= not is_defined[-last:].any()
+    return float(np.average(returns[is_defined], weights=ended[is_defined])) if is_defined.any() else float("nan")
 
 
 def _described(run: Run) -> dict[str, Any]:
@@ -235,8 +236,8 @@ def hardness_cost(study: Specification, place: Path, tasks: Container[tuple[str,
     for run in study.runs:
         if (run.instance, run.chance) in tasks:
             for config in (run.config, {**run.config, "chance": PLAIN}):
-                asked, file = _asked(study, place, config)
-                stored = _stored(file, asked) or {"measures": {}}
+                identity, file = _identity_of(study, place, config)
+                stored = _stored(file, identity) or {"measures": {}}
                 missing[file] = sum(name not in stored["measures"] for name in study.hardness.measures)
     return sum(number > 0 for number in missing.values()), sum(missing.values()) * study.hardness.budget
 
@@ -264,21 +265,21 @@ def _usable(measure: dict[str, Any]) -> dict[str, Any]:
     return {"value": None, "why": f"only {measure['lower']:g} to {measure['upper']:g} is proven within the budget"}
 
 
-def _asked(study: Specification, place: Path, config: Mapping[str, Any]) -> tuple[dict[str, Any], Path]:
+def _identity_of(study: Specification, place: Path, config: Mapping[str, Any]) -> tuple[dict[str, Any], Path]:
     """What the measures of a run's task depend on, and the file that keeps them."""
     import xxhash
 
-    asked = {name: config[name] for name in ("environment", "parameters", "chance", "horizon")}
-    asked["gamma"] = study.hardness.gamma
+    identity = {name: config[name] for name in ("environment", "parameters", "chance", "horizon")}
+    identity["gamma"] = study.hardness.gamma
     if "environment" in config.get("sources", {}):  # a class of the user's own, which may change
-        asked["code"] = config["sources"]["environment"]["checksum"]
-    key = xxhash.xxh3_64_hexdigest(json.dumps(asked, sort_keys=True).encode())
-    return asked, place / "hardness" / f"{key}.json"
+        identity["code"] = config["sources"]["environment"]["checksum"]
+    key = xxhash.xxh3_64_hexdigest(json.dumps(identity, sort_keys=True).encode())
+    return identity, place / "hardness" / f"{key}.json"
 
 
 def _measured(study: Specification, place: Path, config: Mapping[str, Any]) -> dict[str, Any]:
-    asked, file = _asked(study, place, config)
-    stored = _stored(file, asked) or {**asked, "measures": {}, "num_states": None}
+    identity, file = _identity_of(study, place, config)
+    stored = _stored(file, identity) or {**identity, "measures": {}, "num_states": None}
     missing = [name for name in study.hardness.measures if name not in stored["measures"]]
     if missing:
         stored, all_measures = _measure(study, config, missing, stored)
@@ -288,7 +289,7 @@ def _measured(study: Specification, place: Path, config: Mapping[str, Any]) -> d
     return stored
 
 
-def _stored(file: Path, asked: Mapping[str, Any]) -> dict[str, Any] | None:
+def _stored(file: Path, identity: Mapping[str, Any]) -> dict[str, Any] | None:
     """What was measured before; None where there is nothing, or not what was written there."""
     try:
         stored = read_json(file)
@@ -296,11 +297,11 @@ def _stored(file: Path, asked: Mapping[str, Any]) -> dict[str, Any] | None:
         return None
     if not isinstance(stored, dict) or not is_intact(stored) or not isinstance(stored.get("measures"), dict):
         return None
-    return stored if all(stored.get(name) == value for name, value in asked.items()) else None
+    return stored if all(stored.get(name) == value for name, value in identity.items()) else None
 
 
 def _measure(
-    study: Specification, config: Mapping[str, Any], names: Sequence[str], kept: dict[str, Any]
+    study: Specification, config: Mapping[str, Any], names: Sequence[str], stored: dict[str, Any]
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """What is kept with the measures added (value, lower, upper, exact; or why there is none); the same with those that
     failed."""
@@ -309,7 +310,7 @@ def _measure(
     environment = make(config["environment"], **config["parameters"])
     mdp = build_mdp(config["environment"], config["parameters"], config["chance"], study.hardness.gamma)
     steps = config["horizon"] or environment.max_episode_steps
-    measures, failed = dict(kept["measures"]), {}
+    measures, failed = dict(stored["measures"]), {}
     for name in names:
         try:
             result = report(mdp, [name], horizon=steps, budget=study.hardness.budget)[name]
@@ -318,8 +319,8 @@ def _measure(
             raise ParameterError(f"study {study.name!r}: {error}") from error
         except Exception as error:  # whatever it is, a report without this measure is better than none
             failed[name] = {"why": _worker.describe(error)}
-    kept = {**kept, "measures": measures, "num_states": mdp.num_states}
-    return kept, {**kept, "measures": {**measures, **failed}}
+    stored = {**stored, "measures": measures, "num_states": mdp.num_states}
+    return stored, {**stored, "measures": {**measures, **failed}}
 
 
 def build_mdp(
@@ -334,25 +335,25 @@ def build_mdp(
 
 def _number(value: Any, exact: bool) -> dict[str, Any]:
     """A measure as one positive number: itself, or the geometric mean of an interval with a finite upper end."""
-    found: dict[str, Any]
+    measure: dict[str, Any]
     if not isinstance(value, Mapping):
         number = None if value is None else float(value)
-        found = {"value": number, "lower": number, "upper": number, "exact": exact}
+        measure = {"value": number, "lower": number, "upper": number, "exact": exact}
     elif value.get("lower") is not None and (value.get("upper") is not None or not value.get("exact", exact)):
         lower, upper = value["lower"], value.get("upper")
         finite = upper is not None and np.isfinite(upper)
         number = lower if value.get("exact") else float(np.sqrt(lower * upper)) if finite else None
-        found = {"value": number, "lower": lower, "upper": upper, "exact": bool(value.get("exact", exact))}
+        measure = {"value": number, "lower": lower, "upper": upper, "exact": bool(value.get("exact", exact))}
         if number is None:
-            found["why"] = f"only a lower bound of {lower:g} is proven within the budget"
+            measure["why"] = f"only a lower bound of {lower:g} is proven within the budget"
     else:
         number = None if value.get("value") is None else float(value["value"])
-        found = {"value": number, "lower": number, "upper": number, "exact": bool(value.get("exact", exact))}
-    if found["value"] is not None and not np.isfinite(found["value"]):
-        found = {"value": None, "why": "it is infinite"}
-    elif found["value"] is None:
-        found.setdefault("why", "it is infinite or undefined")
-    return found
+        measure = {"value": number, "lower": number, "upper": number, "exact": bool(value.get("exact", exact))}
+    if measure["value"] is not None and not np.isfinite(measure["value"]):
+        measure = {"value": None, "why": "it is infinite"}
+    elif measure["value"] is None:
+        measure.setdefault("why", "it is infinite or undefined")
+    return measure
 
 
 # The paper's instances -----------------------------------------------------------------------------------------------
@@ -375,5 +376,5 @@ def _key(parameters: Mapping[str, Any]) -> str:
 def paper_instance(environment: str, parameters: Mapping[str, Any]) -> int | None:
     """The number of the instance among the blocks of its class in the paper's appendix C, counted from 1; None if not
     there."""
-    found = _paper_instances().get((environment, _key(parameters)))
-    return None if found is None else found[1]
+    place = _paper_instances().get((environment, _key(parameters)))
+    return None if place is None else place[1]

@@ -32,13 +32,13 @@ def outcomes(runs: "pd.DataFrame", points: "pd.DataFrame") -> "pd.DataFrame":
     spread = runs.set_index("id")["value_optimal"] - runs.set_index("id")["value_uniform"]
     optimal = points["id"].map(runs.set_index("id")["value_optimal"])
     regret = ((optimal - points["value"]) / points["id"].map(spread)).replace([np.inf, -np.inf], np.nan)
-    found = runs[[*CELL, "id"]].copy()
-    found["greedy"] = found["id"].map(regret.groupby(points["id"]).mean())
-    found["played"] = np.nan
+    cells = runs[[*CELL, "id"]].copy()
+    cells["greedy"] = cells["id"].map(regret.groupby(points["id"]).mean())
+    cells["played"] = np.nan
     if {"cumulative_realised_regret", "episodes"} <= {*runs}:
         lost = runs["cumulative_realised_regret"] / (runs["episodes"] * (runs["value_optimal"] - runs["value_uniform"]))
-        found["played"] = lost.replace([np.inf, -np.inf], np.nan)
-    return found.groupby(CELL, sort=False)[list(OUTCOMES)].mean().reset_index()
+        cells["played"] = lost.replace([np.inf, -np.inf], np.nan)
+    return cells.groupby(CELL, sort=False)[list(OUTCOMES)].mean().reset_index()
 
 
 def validation(

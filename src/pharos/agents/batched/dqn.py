@@ -40,8 +40,8 @@ class DQNLane(Lane):
 
     def network_of_lane(self) -> QNetworks:
         """As `Lane` says."""
-        seen = self.seen
-        self.network = QNetworks(seen.shape, seen.is_image, self.shared["net_arch"], self.num_actions)
+        observations = self.seen
+        self.network = QNetworks(observations.shape, observations.is_image, self.shared["net_arch"], self.num_actions)
         return self.network
 
     def probabilities(self, scores: np.ndarray) -> np.ndarray:
@@ -118,12 +118,12 @@ class DQNLane(Lane):
     def _all_target_scores(self, size: int) -> torch.Tensor:
         """(W, S, A) of all states, `size` of each run at a time; runs with fewer states repeat their last one."""
         numbers = np.array([run.mdp.num_states for run in self.runs])
-        known = torch.empty((self.width, int(numbers.max()), self.num_actions), device=self.device)
-        for first in range(0, known.shape[1], size):
+        scores = torch.empty((self.width, int(numbers.max()), self.num_actions), device=self.device)
+        for first in range(0, scores.shape[1], size):
             states = np.minimum(np.arange(first, first + size), numbers[:, None] - 1)
-            part = known[:, first : first + size]
+            part = scores[:, first : first + size]
             part[:] = self.network.scores(self.target_values, self.observed(states))[:, : part.shape[1]]
-        return known
+        return scores
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """Go on from what `arrays` gave."""

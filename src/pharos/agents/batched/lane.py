@@ -118,9 +118,9 @@ class Lane:
 
     def _draws(self, number: int) -> np.ndarray:
         """(W, number) uniform in (0, 1), for the first parameters."""
-        found = np.empty((self.width, -(-number // 4), 4), np.uint32)
-        philox.words(self.keys, kernels.WEIGHTS, 0, found)
-        return (found.reshape(self.width, -1)[:, :number] + 0.5) * 2.0**-32
+        words = np.empty((self.width, -(-number // 4), 4), np.uint32)
+        philox.words(self.keys, kernels.WEIGHTS, 0, words)
+        return (words.reshape(self.width, -1)[:, :number] + 0.5) * 2.0**-32
 
     # What is kept ---------------------------------------------------------------------------------------------------
 
@@ -146,8 +146,8 @@ class Lane:
     def as_stored(self, views: Values, i: int) -> dict[str, np.ndarray]:
         """name -> one run's part of some views of parameters or gradients, in Stable-Baselines3's shapes."""
         shapes: list[Shape] = self.network.parameters.shapes
-        found = {each.name: np.array(each.stored(views[each.name][i].cpu().numpy()), order="C") for each in shapes}
-        return {name: value for known, value in found.items() for name in names_of(known)}
+        arrays = {each.name: np.array(each.stored(views[each.name][i].cpu().numpy()), order="C") for each in shapes}
+        return {name: value for own_name, value in arrays.items() for name in names_of(own_name)}
 
 
 class RunPolicy:

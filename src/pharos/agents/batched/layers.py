@@ -34,7 +34,7 @@ class Shape:
         offset: where it begins in a row of parameters.
         fan_in: of the layer.
         stored: (shape) -> the array as Stable-Baselines3 has it.
-        kept: the array as Stable-Baselines3 has it -> as it is kept here.
+        own: the array as Stable-Baselines3 has it -> as it is kept here.
     """
 
     name: str
@@ -42,7 +42,7 @@ class Shape:
     offset: int
     fan_in: int
     stored: Callable[[np.ndarray], np.ndarray]
-    kept: Callable[[np.ndarray], np.ndarray]
+    own: Callable[[np.ndarray], np.ndarray]
 
     @property
     def size(self) -> int:
@@ -67,10 +67,10 @@ class Parameters:
         shape: tuple[int, ...],
         fan_in: int,
         stored: Callable[[np.ndarray], np.ndarray],
-        kept: Callable[[np.ndarray], np.ndarray],
+        own: Callable[[np.ndarray], np.ndarray],
     ) -> None:
         """Make room for one more."""
-        self.shapes.append(Shape(name, shape, self.length, fan_in, stored, kept))
+        self.shapes.append(Shape(name, shape, self.length, fan_in, stored, own))
         self.length += -(-self.shapes[-1].size // ALIGNED) * ALIGNED
 
     def views(self, rows: Tensor) -> Values:
@@ -152,10 +152,10 @@ class Linear(Layer):
         def stored(w: np.ndarray) -> np.ndarray:
             return w.reshape(pixels, channels, outputs).transpose(2, 1, 0).reshape(outputs, inputs)
 
-        def kept(w: np.ndarray) -> np.ndarray:
+        def own(w: np.ndarray) -> np.ndarray:
             return w.reshape(outputs, channels, pixels).transpose(2, 1, 0).reshape(inputs, outputs)
 
-        parameters.add(f"{name}.weight", (inputs, outputs), inputs, stored, kept)
+        parameters.add(f"{name}.weight", (inputs, outputs), inputs, stored, own)
         parameters.add(f"{name}.bias", (1, outputs), inputs, np.ravel, np.atleast_2d)
         self._offsets = tuple(each.offset for each in parameters.shapes[-2:])
 

@@ -147,7 +147,7 @@ class ActorCritics:
                 shape = each.stored(np.empty(each.shape)).shape
                 for row, drawn in zip(rows, normal[:, part], strict=True):
                     weights = orthogonal(drawn.reshape(shape[0], -1)) * gains.get(each.name, math.sqrt(2.0))
-                    row[part] = each.kept(weights.reshape(shape)).ravel()
+                    row[part] = each.own(weights.reshape(shape)).ravel()
         return rows
 
 

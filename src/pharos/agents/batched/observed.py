@@ -47,8 +47,8 @@ class Seen:
             for source, begin in zip(self.sources, begins, strict=False):
                 for row in range(0, source.num_states, BLOCK):
                     rows = np.arange(row, min(row + BLOCK, source.num_states))
-                    found = torch.from_numpy(self._encoded(source.at(rows)))
-                    table[begin + row : begin + row + len(rows)] = found
+                    block = torch.from_numpy(self._encoded(source.at(rows)))
+                    table[begin + row : begin + row + len(rows)] = block
             self._table = table.to(device)
 
     def at(self, states: np.ndarray, out: torch.Tensor) -> torch.Tensor:

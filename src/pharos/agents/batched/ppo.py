@@ -38,8 +38,10 @@ class PPOLane(Lane):
 
     def network_of_lane(self) -> ActorCritics:
         """As `Lane` says."""
-        seen = self.seen
-        self.network = ActorCritics(seen.shape, seen.is_image, self.shared["net_arch"], self.num_actions)
+        observations = self.seen
+        self.network = ActorCritics(
+            observations.shape, observations.is_image, self.shared["net_arch"], self.num_actions
+        )
         return self.network
 
     def probabilities(self, scores: np.ndarray) -> np.ndarray:

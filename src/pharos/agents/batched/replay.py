@@ -38,8 +38,8 @@ class Replay:
     ) -> None:
         """Keep the transitions (W, E) of step `calls`, counted from 0."""
         place = calls % self.size
-        for kept, new in zip(self.memory, (state, next_state, actions, reward, flags), strict=True):
-            kept[:, place] = new
+        for array, new in zip(self.memory, (state, next_state, actions, reward, flags), strict=True):
+            array[:, place] = new
 
     def sample(self, calls: int, draw: int, gammas: np.ndarray, num_steps: int) -> None:
         """Draw a minibatch for each run, after `calls` steps; see `kernels.sample`."""
@@ -51,4 +51,4 @@ class Replay:
         """The rows that are filled, by name."""
         names = ("replay_state", "replay_next", "replay_action", "replay_reward", "replay_flags")
         filled = min(calls, self.size)
-        return {name: kept[:, :filled] for name, kept in zip(names, self.memory, strict=True)}
+        return {name: array[:, :filled] for name, array in zip(names, self.memory, strict=True)}

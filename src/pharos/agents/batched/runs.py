@@ -94,13 +94,13 @@ class ObservationSource:
                 "the batched engine sees functions of the state; expected neither previous_action nor remaining_time"
             )
         self.space, self.observe, self.num_states = space, observe.observation, space.num_states
-        seen = observe.space
-        self.shape, self.dtype = tuple(seen.shape or ()), np.dtype(seen.dtype)  # type: ignore[arg-type]
+        box = observe.space
+        self.shape, self.dtype = tuple(box.shape or ()), np.dtype(box.dtype)  # type: ignore[arg-type]
         if not self.shape:
             raise ParameterError("the batched engine has no network for the number of the state; expected 'vector'")
         self.is_image = False
         if len(self.shape) == 3 and self.dtype == np.uint8:
-            low, high = np.asarray(getattr(seen, "low", 1)), np.asarray(getattr(seen, "high", 1))
+            low, high = np.asarray(getattr(box, "low", 1)), np.asarray(getattr(box, "high", 1))
             self.is_image = bool((low == 0).all() and (high == 255).all())
 
     @staticmethod
@@ -169,8 +169,8 @@ def resolved(agent: str, hyperparameters: Mapping[str, Any]) -> dict[str, Any]:
     lacking = supports(agent, hyperparameters)
     if lacking is not None:
         raise ParameterError(f"{lacking}; the engine sb3 has it")
-    known = {**OF_A_RUN[agent], **OF_A_BATCH[agent]}
-    result = {**known, **{name: value for name, value in hyperparameters.items() if name in known}}
+    defaults = {**OF_A_RUN[agent], **OF_A_BATCH[agent]}
+    result = {**defaults, **{name: value for name, value in hyperparameters.items() if name in defaults}}
     result["net_arch"] = _net_arch(hyperparameters)
     if agent == "dqn" and not isinstance(result["train_freq"], int):
         result["train_freq"] = int(result["train_freq"][0])
@@ -191,13 +191,13 @@ def remembers_targets(run: BatchRun) -> bool:
     options = resolved("dqn", run.hyperparameters)
     rollout = options["train_freq"] * options["n_envs"]
     updates = options["gradient_steps"] if options["gradient_steps"] >= 0 else rollout
-    asked = options["target_update_interval"] / rollout * updates * options["batch_size"]
-    return 2 * run.mdp.num_states <= min(asked, 2 * MOST_REMEMBERED)
+    queries = options["target_update_interval"] / rollout * updates * options["batch_size"]
+    return 2 * run.mdp.num_states <= min(queries, 2 * MOST_REMEMBERED)
 
 
 def _net_arch(hyperparameters: Mapping[str, Any]) -> Any:
-    given = hyperparameters.get("net_arch", OF_A_BATCH["dqn"]["net_arch"])
-    return (hyperparameters.get("policy_kwargs") or {}).get("net_arch", given)
+    layers = hyperparameters.get("net_arch", OF_A_BATCH["dqn"]["net_arch"])
+    return (hyperparameters.get("policy_kwargs") or {}).get("net_arch", layers)
 
 
 def _is_in_steps(value: Any) -> bool:

@@ -119,8 +119,8 @@ def _listed(runs: "pd.DataFrame") -> str:
 
 def observing_agents(runs: "pd.DataFrame") -> list[str]:
     """The agents of a study that see observations, those of the paper first."""
-    seen = list(dict.fromkeys(runs.loc[runs["observation"] != TABULAR_OBSERVATION, "agent"]))
-    return sorted(seen, key=lambda agent: PAPER_AGENTS.index(agent) if agent in PAPER_AGENTS else len(PAPER_AGENTS))
+    agents = list(dict.fromkeys(runs.loc[runs["observation"] != TABULAR_OBSERVATION, "agent"]))
+    return sorted(agents, key=lambda agent: PAPER_AGENTS.index(agent) if agent in PAPER_AGENTS else len(PAPER_AGENTS))
 
 
 def is_of_the_paper(study: Specification) -> bool:

@@ -73,8 +73,8 @@ def _summary(results: Results) -> Section:
         )
     if results.comparison is not None:
         returns = results.comparison.returns
-        known = int(returns["ours"].notna().sum())
-        lines.append(f"{known} of the {len(returns)} returns that the paper prints have their counterpart here.")
+        matched = int(returns["ours"].notna().sum())
+        lines.append(f"{matched} of the {len(returns)} returns that the paper prints have their counterpart here.")
     missing = (
         f"{many(now.missing, 'run')} missing: every number below is of the runs that are there." if now.missing else ""
     )
@@ -180,15 +180,15 @@ def _profiles(results: Results, figures: Figures) -> Section | None:
 
 def _representations(results: Results, figures: Figures, left_out: list[str]) -> Section | None:
     parts = []
-    for agent, seen in pairs_of(results.cells, results.agents):
+    for agent, observation in pairs_of(results.cells, results.agents):
         wide = results.cells[results.cells["agent"] == agent].pivot_table(
             index=["environment", "instance", "chance"], columns="observation", values="normalized_regret"
         )
-        wide = wide[[seen, VECTOR]].dropna()
-        harder = (wide[seen] > wide[VECTOR]).groupby(level="environment").agg(["sum", "size"])
+        wide = wide[[observation, VECTOR]].dropna()
+        harder = (wide[observation] > wide[VECTOR]).groupby(level="environment").agg(["sum", "size"])
         lines = [
-            f"{title(str(name))}: the {title(seen) if seen != IMAGE else 'image'} costs {agent_name(agent)} more "
-            f"regret in {row['sum']} of {row['size']} tasks"
+            f"{title(str(name))}: the {title(observation) if observation != IMAGE else 'image'} costs "
+            f"{agent_name(agent)} more regret in {row['sum']} of {row['size']} tasks"
             for name, row in harder.iterrows()
         ]
         caption = (
@@ -197,7 +197,7 @@ def _representations(results: Results, figures: Figures, left_out: list[str]) ->
         )
         if results.comparison is not None and agent == "dqn":
             caption += " The paper's figure 3."
-        parts.append({"figure": image(figures, representations_figure(agent, seen), caption), "lines": lines})
+        parts.append({"figure": image(figures, representations_figure(agent, observation), caption), "lines": lines})
     if not parts:
         left_out.append(
             "Vector against image: there are no cells of DQN with both a vector and an image, nor of another agent."
