@@ -73,8 +73,10 @@ class Curves:
         """What the page needs to draw them: numbers of DIGITS digits; runs where there are at most MOST_RUNS."""
         panels = []
         for panel in self.panels:
-            known = sum(len(line.runs) for line in panel.lines)
-            panels.append({"title": panel.title, "lines": [_numbers(line, known <= MOST_RUNS) for line in panel.lines]})
+            num_runs = sum(len(line.runs) for line in panel.lines)
+            panels.append(
+                {"title": panel.title, "lines": [_numbers(line, num_runs <= MOST_RUNS) for line in panel.lines]}
+            )
         about = {"x": self.x_label, "y": self.y_label, "share": self.share, "runs": self.draws_runs}
         return json.dumps({**about, "panels": panels}, separators=(",", ":"), allow_nan=False)
 
@@ -93,8 +95,8 @@ def _short(values: np.ndarray) -> list[float | int | None]:
 
 def label(agent: str, observation: str) -> str:
     """`DQN, image`, `tabular Q-learning`."""
-    seen = OBSERVATIONS.get(observation, observation)
-    return f"{agent_name(agent)}, {seen}" if seen else agent_name(agent)
+    words = OBSERVATIONS.get(observation, observation)
+    return f"{agent_name(agent)}, {words}" if words else agent_name(agent)
 
 
 def agent_name(agent: str) -> str:
