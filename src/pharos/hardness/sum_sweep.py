@@ -291,6 +291,8 @@ class SumSweep:
         """Where symmetries leave few orbits of states, the exact out(v) of all, by a search from one of each."""
         graph = self.graph
         orbit = orbits(graph.next_states, graph.ends, graph.start, graph.pivot, lambda: self.spending.is_over)
+        if orbit is None:
+            return
         representatives = np.flatnonzero(orbit == np.arange(len(orbit)))
         if len(representatives) > _FEW_ORBITS:
             return
