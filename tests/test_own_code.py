@@ -307,6 +307,7 @@ COMMANDS = [
     ("study", "run", "got"),
     ("study", "pack", "got", "--to", "again.parquet"),
     ("study", "status", "got/study.yaml"),
+    ("study", "run", "got/study.yaml"),
     ("study", "unpack", "got.parquet", "--out", "new"),
     ("evaluate", "frozen_lake/4x4", "--policy", "RUN"),
     ("plot", "value", "frozen_lake/4x4", "--policy", "RUN", "--out", "value.png"),

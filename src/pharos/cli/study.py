@@ -105,7 +105,7 @@ def run(
 
     if on not in ("local", "slurm", "ray"):
         raise UnknownName("place to run on", on, ("local", "slurm", "ray"))
-    opened, place = study.opened(spec, out, trust=trust or Path(spec).is_file() or None)
+    opened, place = study.opened(spec, out, trust=trust or None)
     if on == "slurm":
         jobs = study.submit(
             opened,

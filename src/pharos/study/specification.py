@@ -186,7 +186,7 @@ def _validated(data: Mapping[str, Any], name: str, root: Any, folder: Path, trus
         loc, reference = references[0]
         raise UntrustedCode(
             f"{_where(name, root, loc)}: {reference!r} is code, which is executed only if you trust it: add --trust "
-            f"(in Python: trust=True), or name your own YAML file"
+            f"(in Python: trust=True), or name your own YAML file, which is no {STUDY_FILE} beside results"
         )
     if references:
         written = data.get("folder")
