@@ -34,6 +34,9 @@ def folders(tmp_path_factory):
     return sorted(place.iterdir())
 
 
+LEARNING = "Q-learning on Frozen lake 4x4, 2 k steps"
+
+
 def lines(axis):
     return {line.get_label(): line for line in axis.get_lines() if not line.get_label().startswith("_")}
 
@@ -41,10 +44,10 @@ def lines(axis):
 def test_seeds_become_one_line_with_their_mean(folders):
     left, right = plots.regret(folders[:3]).axes
     curves = [read_curve(folder) for folder in folders[:3]]
-    drawn = lines(left)["q_learning"]
+    drawn = lines(left)[LEARNING]
     np.testing.assert_allclose(drawn.get_ydata(), np.mean([curve["normalized_regret"] for curve in curves], axis=0))
     assert drawn.get_xdata().tolist() == curves[0]["step"].tolist()
-    realised = lines(right)["q_learning"].get_ydata()
+    realised = lines(right)[LEARNING].get_ydata()
     np.testing.assert_allclose(realised, np.mean([curve["cumulative_realised_regret"] for curve in curves], axis=0))
     assert len(left.collections) == 1  # the interval
 
@@ -69,7 +72,9 @@ def test_a_value_map_shows_values_in_their_cells_and_arrows_of_optimal_actions()
     shown = axis.get_images()[0].get_array()
     np.testing.assert_allclose(shown.filled(np.nan), [[0.25, 0.5, 1.0], [0.5, 1.0, np.nan]])  # the goal has no colour
     arrows = {(tuple(text.xy), tuple(text.xyann)) for text in axis.texts if isinstance(text, Annotation)}
-    starts = [start for _, start in arrows]
+    centred = {(0, 1), (1, 1), (2, 0)}  # where one action is best its arrow lies in the middle; two go out from there
+    middles = {tuple(np.add(start, end) / 2) for end, start in arrows} & centred
+    starts = [start for end, start in arrows if tuple(np.add(start, end) / 2) not in centred] + sorted(middles)
     assert [text.get_text() for text in axis.texts if not isinstance(text, Annotation)] == ["1"]
     assert sorted(starts) == [(0, 0), (0, 0), (0, 1), (1, 0), (1, 0), (1, 1), (2, 0)]
 
@@ -111,7 +116,8 @@ def test_regret_that_cannot_be_normalised_is_drawn_in_units_of_return(tmp_path, 
     monkeypatch.setattr(importlib.import_module("pharos.plots.regret"), "read_curve", lambda folder: curve)
     left, _ = plots.regret([run.folder]).axes
     assert left.get_ylabel() == "expected regret"
-    np.testing.assert_allclose(lines(left)["q_learning"].get_ydata(), curve["expected_regret"])
+    (drawn,) = (line for label, line in lines(left).items() if label.startswith("Q-learning on Simple grid"))
+    np.testing.assert_allclose(drawn.get_ydata(), curve["expected_regret"])
 
 
 @settings(max_examples=25, deadline=None)
@@ -254,6 +260,32 @@ def test_a_value_map_of_states_with_more_variables_is_a_slice():
         plots.value_map(space, solution, fix={"key": 7})
     with pytest.raises(ParameterError, match="unknown component of keys to fix 'kee'; did you mean 'key'"):
         plots.value_map(space, solution, fix={"kee": 1})
+    start = plots.value_map(space, solution, rest="start").axes[0].get_images()[0].get_array().filled(np.nan)
+    np.testing.assert_allclose(start[0, 1:], [0.25, 0.125])
+
+
+def test_values_are_drawn_over_any_two_variables():
+    space = pharos.build(pharos.make("freeway", num_cars=1, lane_length=3))
+    solution = pharos.value_iteration(space.mdp(gamma=0.9))
+    with pytest.raises(ParameterError, match=r"say which two to draw over, such as --over \w+,\w+"):
+        plots.value_map(space, solution)
+    names = space.component_names
+    figure = plots.value_map(space, solution, over=names[:2], rest="start")
+    axis, states = figure.axes[0], space.states()
+    slice = np.all(states[:, 2:] == states[0, 2:], axis=1) & ~solution.mdp.terminal
+    shown = axis.get_images()[0].get_array().filled(np.nan)
+    low = states[np.all(states[:, 2:] == states[0, 2:], axis=1)][:, :2].min(axis=0)
+    expected = np.full_like(shown, np.nan)
+    for s in np.flatnonzero(slice):
+        expected[tuple(states[s, :2] - low)] = solution.v[s]
+    np.testing.assert_array_equal(shown, expected)
+    assert np.isfinite(shown).any() and axis.get_ylabel() == names[0] and axis.get_xlabel().startswith(names[1] + "\n")
+    taken = {letter for text in axis.texts for letter in text.get_text()}
+    assert taken & {action[0] for action in space.environment.actions}
+    with pytest.raises(ParameterError, match="unknown component of freeway to draw over 'cra'"):
+        plots.value_map(space, solution, over=(names[0], "cra"))
+    with pytest.raises(ParameterError, match="expected two components"):
+        plots.value_map(space, solution, over=(names[0], names[0]))
 
 
 def test_a_value_map_frames_the_start():
@@ -288,12 +320,14 @@ def test_legends_have_no_empty_fields_and_say_units():
     ]
     labels = [run_label(config, configs) for config in configs]
     assert labels == [
-        "dqn, vector, frozen_lake/4x4, no chance, 20k steps, gamma=0.9",
-        "q_learning, taxi, no chance, 300k steps, gamma=0.9",
-        "dqn, vector, frozen_lake/8x8, sticky=0.25, 20k steps, gamma=0.9",
-        "dqn, vector, frozen_lake size=6 seed=3, no chance, 20k steps, gamma=0.9",
-        "dqn, vector, frozen_lake/4x4, no chance, 20k steps, gamma=0.99",
+        "DQN (vector) on Frozen lake 4x4, 20 k steps, no chance, gamma=0.9",
+        "Q-learning on Taxi, 300 k steps, no chance, gamma=0.9",
+        "DQN (vector) on Frozen lake 8x8, 20 k steps, sticky=0.25, gamma=0.9",
+        "DQN (vector) on Frozen lake size=6 seed=3, 20 k steps, no chance, gamma=0.9",
+        "DQN (vector) on Frozen lake 4x4, 20 k steps, no chance, gamma=0.99",
     ]
+    alone = config_of(agent="q_learning", observation="", environment="taxi", parameters={}, steps=300000)
+    assert run_labels([alone]) == ["Q-learning on Taxi, 300 k steps"]
 
 
 def test_no_two_groups_of_runs_have_one_label():
@@ -304,10 +338,10 @@ def test_no_two_groups_of_runs_have_one_label():
         config_of(agent="ppo"),
     ]
     assert run_labels(configs) == [
-        "dqn, vector, discount 1, 100 steps an episode",
-        "dqn, vector, discount 0.9, no horizon",
-        "dqn, vector, discount 1, 100 steps an episode (3)",
-        "ppo, vector",
+        "DQN (vector) on Frozen lake 4x4, 20 k steps, discount 1, 100 steps an episode",
+        "DQN (vector) on Frozen lake 4x4, 20 k steps, discount 0.9, no horizon",
+        "DQN (vector) on Frozen lake 4x4, 20 k steps, discount 1, 100 steps an episode (3)",
+        "PPO (vector) on Frozen lake 4x4, 20 k steps",
     ]
 
 

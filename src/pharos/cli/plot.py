@@ -1,7 +1,7 @@
 """pharos plot: pictures of runs, values, state spaces, hardness and policies at play."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -58,13 +58,25 @@ def value(
     random: Random = 0.0,
     fix: Annotated[
         list[str] | None,
-        typer.Option("--fix", metavar="NAME=VALUE", help="Draw the slice in which this variable has this value."),
+        typer.Option(
+            "--fix",
+            metavar="NAME=VALUE|start",
+            help="Draw the slice in which this variable has this value; start: all others as where episodes start.",
+        ),
     ] = None,
+    over: Annotated[
+        str, typer.Option("--over", metavar="NAME,NAME", help="Two variables to draw over: down, and to the right.")
+    ] = "row,column",
     trust: Trust = False,
     json: Json = False,
 ) -> None:
-    """Draw the values and the actions of a policy over the cells of a grid."""
+    """Draw the values and the actions of a policy over the cells of a grid, or over any two variables."""
     check_format(out, FIGURES)
+    down, comma, right = over.partition(",")
+    if not comma:
+        raise ParameterError(f"--over is {over!r}; expected two variables, such as row,column")
+    rest: Literal["start"] | None = "start" if "start" in (fix or ()) else None
+    fixed = parse_parameters([text for text in fix or () if text != "start"])
     goal = parse_target(target, parameters)
     decisions = None if policy in POLICIES else read_policy(policy, trust=trust)
     mdp = goal.mdp(gamma=gamma, horizon=horizon, random=random)
@@ -77,7 +89,10 @@ def value(
     if random:
         title += f", {describe_chance(0.0, random)}"
     facts = {"policy": policy, "value_at_start": solution.value_at_start, "gamma": mdp.gamma, "horizon": mdp.horizon}
-    _save(plots.value_map(goal.space(), solution, fix=parse_parameters(fix), title=title), out, json, facts)
+    if fixed:
+        title += f", {' '.join(f'{name}={value}' for name, value in fixed.items())}"
+    drawn = plots.value_map(goal.space(), solution, over=(down, right), fix=fixed, rest=rest, title=title)
+    _save(drawn, out, json, facts)
 
 
 @app.command()

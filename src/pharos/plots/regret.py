@@ -17,6 +17,9 @@ from pharos.plots.style import COLORS, INK, figure, styled, thousands
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+# Two labels up to this long stand beside each other
+WIDE = 60
+
 
 @styled
 def regret(
@@ -66,7 +69,9 @@ def regret(
     right.yaxis.set_major_formatter(thousands)
     right.plot([], [], ":", color=INK, linewidth=1.2, label="at random")
     if axes is None:
-        left.figure.legend(*right.get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize=8)
+        handles, labels = right.get_legend_handles_labels()
+        columns = 2 if max(map(len, labels)) <= WIDE else 1
+        left.figure.legend(handles, labels, loc="outside lower center", ncols=columns, fontsize=8)
     else:
         right.legend(loc="best")
     return left.figure
@@ -96,24 +101,36 @@ def _labels(configs: list[dict[str, Any]]) -> list[str]:
 
 
 def _label(config: dict[str, Any], configs: list[dict[str, Any]]) -> str:
-    """What tells this group of runs from the others."""
+    """Who learnt what, for how long, in words, and what else tells this group of runs from the others."""
 
     def differ(*keys: str) -> bool:
         return any(len({json.dumps(other[key], sort_keys=True) for other in configs}) > 1 for key in keys)
 
-    parts = [config["agent"]]
-    if not agent_kind(config["agent"]).is_tabular:
-        parts.append(title(config["observation"], config.get("observation_options", {})).replace("_", " "))
-    if differ("environment", "parameters"):
-        parts.append(_instance(config["environment"], config["parameters"]))
+    kind = agent_kind(config["agent"])
+    seen = title(config["observation"], config.get("observation_options", {})).replace("_", " ")
+    who = kind.title.removeprefix("tabular ") + ("" if kind.is_tabular or not seen else f" ({seen})")
+    parts = [f"{who} on {_in_words(config)}", f"{_spaced(config['steps'])} steps"]
     if differ("chance"):
         parts.append(" ".join(f"{name}={p:g}" for name, p in config["chance"].items() if p) or "no chance")
-    if differ("steps"):
-        parts.append(f"{thousands(config['steps'])} steps")
     if differ("hyperparameters"):
         own = config["hyperparameters"]
         parts.append(" ".join(f"{name}={own[name]}" for name in own if _varies(name, configs)))
     return ", ".join(part for part in parts if part)
+
+
+def _in_words(config: dict[str, Any]) -> str:
+    """`Frozen lake 8x8`."""
+    name, *setting = _instance(config["environment"], config["parameters"]).split(" ")
+    if class_called(config["environment"]) is not None:
+        name = name.replace("_", " ").replace("/", " ")
+        name = name[:1].upper() + name[1:]
+    return " ".join([name, *setting])
+
+
+def _spaced(steps: int) -> str:
+    """`300 k`."""
+    text = thousands(steps)
+    return f"{text[:-1]} {text[-1]}" if text[-1].isalpha() else text
 
 
 def _instance(environment: str, parameters: dict[str, Any]) -> str:
