@@ -1,11 +1,13 @@
 """Experiments: an agent trained on a task, its policies evaluated exactly, and the result written down."""
 
-from pharos.experiments.batch import FailedRun, Members, Progress, train_configs
+from pharos.experiments.batch import train_configs
 from pharos.experiments.bootstrap import bootstrap_interval
 from pharos.experiments.config import ENGINES, ChanceSetting, Horizon, RunConfig, run_id
 from pharos.experiments.evaluation import Evaluation, evaluate_agent
+from pharos.experiments.ledger import Progress
 from pharos.experiments.loading import load_agent
 from pharos.experiments.many import train_many
+from pharos.experiments.members import FailedRun, Members
 from pharos.experiments.pace import steps_in_seconds
 from pharos.experiments.regret import ReferenceValues, RegretCurve, cumulative_expected_regret, regret
 from pharos.experiments.results import (

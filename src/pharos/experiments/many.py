@@ -7,8 +7,10 @@ from typing import Any
 
 from pharos.environments import Environment
 from pharos.errors import ParameterError
-from pharos.experiments.batch import FailedRun, Members, Tell, train_configs
+from pharos.experiments.batch import train_configs
 from pharos.experiments.config import RunConfig
+from pharos.experiments.ledger import Tell
+from pharos.experiments.members import FailedRun, Members
 from pharos.experiments.parts import parts_of, train_parts
 from pharos.experiments.run_folder import TrainingResult
 from pharos.experiments.train import given_hyperparameters, task_for

@@ -14,8 +14,9 @@ from typing import Any
 from pharos.agents.batched import lane_width
 from pharos.errors import FileFormatError, ParameterError, PharosError
 from pharos.experiments import results as _results
-from pharos.experiments.batch import Progress, Tell, train_configs
+from pharos.experiments.batch import train_configs
 from pharos.experiments.config import RunConfig
+from pharos.experiments.ledger import Progress, Tell
 from pharos.experiments.members import FailedRun, Members
 from pharos.experiments.run_folder import TrainingResult, finished_result
 

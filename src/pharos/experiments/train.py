@@ -232,7 +232,8 @@ def _as_a_batch(
     config: RunConfig, task: Task, folder: Path | None, tensorboard: bool, progress: Progress | None
 ) -> TrainingResult:
     """A single run of the batched engine: a batch of one."""
-    from pharos.experiments.batch import FailedRun, Members, train_configs
+    from pharos.experiments.batch import train_configs
+    from pharos.experiments.members import FailedRun, Members
 
     if tensorboard:
         raise ParameterError("TensorBoard's logs are those of Stable-Baselines3; expected the engine sb3, or none")

@@ -28,9 +28,10 @@ from pharos.agents import hyperparameters as hyperparameters_of
 from pharos.environments import Environment, make
 from pharos.errors import MissingExtra, ParameterError
 from pharos.experiments import results as _results
-from pharos.experiments.batch import Progress, train_configs
+from pharos.experiments.batch import train_configs
 from pharos.experiments.config import ChanceSetting, RunConfig
 from pharos.experiments.journal import JournalLock, mend_journal
+from pharos.experiments.ledger import Progress
 from pharos.experiments.members import FailedRun, Members
 from pharos.experiments.search_space import allows, checked_space, default_value, suggested_value
 from pharos.experiments.task import Task
