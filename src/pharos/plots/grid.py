@@ -110,16 +110,16 @@ def _draw_arrows(
     """Arrows as long as the actions are probable: one alone in the middle of its cell, several from there; a letter for
     each action that leads nowhere."""
     column, row = cell
-    taken = [int(action) for action in np.flatnonzero(lengths > 0.02)]
-    if still := "".join(letters[action] for action in taken if actions[action] not in ARROWS):
+    chosen = [int(action) for action in np.flatnonzero(lengths > 0.02)]
+    if still := "".join(letters[action] for action in chosen if actions[action] not in ARROWS):
         axis.text(column, row, still, ha="center", va="center", color=color, fontsize=8)
-    for action in taken:
+    for action in chosen:
         if actions[action] not in ARROWS:
             continue
         x, y = ARROWS[actions[action]]
         head: Any = {"arrowstyle": "->", "color": color, "lw": 1.3, "shrinkA": 0, "shrinkB": 0}
         length = 0.1 + 0.26 * lengths[action]
-        back = length if len(taken) == 1 else 0.0
+        back = length if len(chosen) == 1 else 0.0
         end = (column + length * x, row + length * y)
         axis.annotate("", end, (column - back * x, row - back * y), arrowprops=head)
 

@@ -107,8 +107,8 @@ def _label(config: dict[str, Any], configs: list[dict[str, Any]]) -> str:
         return any(len({json.dumps(other[key], sort_keys=True) for other in configs}) > 1 for key in keys)
 
     kind = agent_kind(config["agent"])
-    seen = title(config["observation"], config.get("observation_options", {})).replace("_", " ")
-    who = kind.title.removeprefix("tabular ") + ("" if kind.is_tabular or not seen else f" ({seen})")
+    observation = title(config["observation"], config.get("observation_options", {})).replace("_", " ")
+    who = kind.title.removeprefix("tabular ") + ("" if kind.is_tabular or not observation else f" ({observation})")
     parts = [f"{who} on {_in_words(config)}", f"{_spaced(config['steps'])} steps"]
     if differ("chance"):
         parts.append(" ".join(f"{name}={p:g}" for name, p in config["chance"].items() if p) or "no chance")
