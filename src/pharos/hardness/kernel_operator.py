@@ -8,12 +8,14 @@ from typing import Any
 import numpy as np
 
 MOST_LANCZOS = 60
+ELSEWHERE = 0.1  # of a first vector: the last phase's eigenvector may be one still, and no longer the largest
+FEW = 8  # columns up to which half of a symmetric matrix is read sooner than BLAS has packed all of it
 
 Kernel = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
 class KernelOperator:
-    """A positive semidefinite kernel K of C observations; z is (C, A) float32."""
+    """A positive semidefinite kernel K of C observations; z is (C, A) float64."""
 
     def __call__(self, z: np.ndarray) -> np.ndarray:
         """K z."""
@@ -25,7 +27,9 @@ class KernelOperator:
         Returns it with the residual added, so that it is not too small; `vector` becomes the eigenvector found.
         """
         root = np.sqrt(weights)
-        basis = [vector / np.linalg.norm(vector)]
+        vector *= 1.0 if vector.sum() >= 0 else -1.0
+        begin = vector / np.linalg.norm(vector) + ELSEWHERE / math.sqrt(len(vector))
+        basis = [begin / np.linalg.norm(begin)]
         diagonal: list[float] = []
         beside: list[float] = []
         while True:
@@ -39,9 +43,9 @@ class KernelOperator:
             values, vectors = np.linalg.eigh(small)
             residual = length * abs(float(vectors[-1, -1]))
             if residual <= 1e-3 * values[-1] or len(basis) == min(MOST_LANCZOS, len(vector)):
-                vector[:] = rows @ vectors[:, -1:].astype(np.float32)
+                vector[:] = rows @ vectors[:, -1:]
                 return max(float(values[-1]), 0.0) + residual
-            basis.append(after / np.float32(length))
+            basis.append(after / length)
             beside.append(length)
 
     def preconditioned(self, weights: np.ndarray) -> None:
@@ -58,7 +62,7 @@ class KernelOperator:
 
         It is K times rate weights times the sum of the errors on the way, a polynomial of degree steps - 1 in
         rate K diag(weights), whose eigenvalues lie in [0, 1]: a Chebyshev series of about 3.5 sqrt(steps) terms has it
-        to float32's accuracy. weights, error: (C, A) float32.
+        to float32's accuracy, in each eigenvector for itself. weights, error: (C, A) float64.
         """
         return rate * self(weights * self.summed(weights, error, rate, _sum_of_powers(steps)))
 
@@ -91,7 +95,14 @@ class Exact(KernelOperator):
         self.matrix = np.ascontiguousarray(kernel(states, states), np.float32)
 
     def __call__(self, z: np.ndarray) -> np.ndarray:
-        return self.matrix @ z
+        from pharos.kernels import symmetric
+
+        if z.shape[1] > FEW:
+            return self.matrix @ z
+        rows = np.ascontiguousarray(z.T, np.float64)
+        out = np.empty_like(rows)
+        symmetric.product(self.matrix, rows, out)
+        return out.T
 
     def preconditioned(self, weights: np.ndarray) -> None:
         root = np.sqrt(weights)[:, None]
@@ -121,6 +132,7 @@ class Landmarks(KernelOperator):
             self.diagonal[start : start + block, 0] = np.maximum(own - np.einsum("nm,nm->n", part, part), 0.0)
 
     def __call__(self, z: np.ndarray) -> np.ndarray:
+        z = z.astype(np.float32)
         return self.features @ (self.features.T @ z) + self.diagonal * z
 
     def preconditioned(self, weights: np.ndarray) -> None:
@@ -139,25 +151,26 @@ class Landmarks(KernelOperator):
 
         if len(series) < 3:
             return super().summed(weights, error, rate, series)
+        weights, error = weights.astype(np.float32), error.astype(np.float32)
         past, now = error.copy(), error - np.float32(2 * rate) * self(weights * error)
-        total = series[0] * past + series[1] * now
+        total = np.float32(series[0]) * past + np.float32(series[1]) * now
         projected = np.empty((error.shape[1], self.features.shape[1]))
         landmarks.project(self.features, weights * now, projected)
         for coefficient in series[2:]:
             across = projected.astype(np.float32)
             landmarks.step(self.features, self.diagonal, weights, np.float32(rate), across, now, past, projected)
             past, now = now, past
-            total += coefficient * now
+            total += np.float32(coefficient) * now
         return total
 
 
 @lru_cache(maxsize=16)
 def _sum_of_powers(steps: int) -> np.ndarray:
-    """Chebyshev coefficients in u = 1 - 2 x of the sum of (1 - x)^t, t < steps, on [0, 1]; float32."""
+    """Chebyshev coefficients in u = 1 - 2 x of the sum of (1 - x)^t, t < steps, on [0, 1]."""
     degree = min(steps - 1, math.ceil(3.5 * math.sqrt(steps)))
 
     def total(u: Any) -> Any:
         x = (1 - u) / 2
         return np.where(x > 1e-9, -np.expm1(steps * np.log1p(-np.minimum(x, 1 - 1e-16))) / np.maximum(x, 1e-9), steps)
 
-    return np.polynomial.chebyshev.chebinterpolate(total, degree).astype(np.float32)
+    return np.polynomial.chebyshev.chebinterpolate(total, degree)

@@ -129,7 +129,7 @@ class Learner:
         schedule, actions = self.schedule, self.mdp.num_actions
         values = np.zeros((len(observations), actions))
         memory = _Memory(self.mdp, self.states)
-        vector = np.full((len(observations), 1), len(observations) ** -0.5, np.float32)
+        vector = np.full((len(observations), 1), len(observations) ** -0.5)
         rows = []
         for step in range(0, schedule.steps, schedule.period):
             period, epsilon = min(schedule.period, schedule.steps - step), schedule.epsilon(step)
@@ -145,7 +145,7 @@ class Learner:
             weights = observations.sums(visits / visits.sum())
             total = observations.sums(visits / visits.sum() * target)
             error = np.divide(total, weights, out=values.copy(), where=weights > 0) - values
-            values += self._learnt(apply, weights.astype(np.float32), error.astype(np.float32), vector)
+            values += self._learnt(apply, weights, error, vector)
         return LearningCurve(*(np.array(column) for column in zip(*rows, strict=True)))
 
     def _learnt(self, apply: KernelOperator, weights: np.ndarray, error: np.ndarray, vector: np.ndarray) -> np.ndarray:
@@ -153,8 +153,9 @@ class Learner:
         largest = apply.largest_eigenvalue(weights.max(axis=1, keepdims=True), vector)
         before = float((weights * error**2).sum())
         while largest > 0 and before > 0:
-            added = apply.descended(weights, error, 1 / (MARGIN * largest), self.schedule.gradient_steps)
-            after = float((weights * (error - added) ** 2).sum())
+            with np.errstate(over="ignore", invalid="ignore"):  # where the eigenvalue was far too small
+                added = apply.descended(weights, error, 1 / (MARGIN * largest), self.schedule.gradient_steps)
+                after = float((weights * (error - added) ** 2).sum())
             if after <= 1.001 * before:  # no step of a stable size makes it larger
                 return added
             largest *= 1.1
