@@ -41,7 +41,7 @@ ORDER = (
     ),
     *("state_space", "mdp", "solvers"),
     *("hardness", "importers", "exporters", "observations", "interaction", "policies", "agents", "experiments"),
-    *("leaderboard", "plots", "study", "sb3_env", "bisimulation", "cli", "__main__"),
+    *("leaderboard", "plots", "study", "sb3_env", "bisimulation", "explorer", "cli", "__main__"),
 )
 
 # These never meet, though one stands before the other: a solver knows tables, and neither games nor agents.

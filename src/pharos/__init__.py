@@ -46,6 +46,7 @@ _HOMES = {
     "to_gymnax": "pharos.interaction",
     "train": "pharos.experiments",
     "train_many": "pharos.experiments",
+    "explore": "pharos.explorer",
     "PharosError": "pharos.errors",
 }
 # Modules that stand in another folder than their public name says.
@@ -68,6 +69,7 @@ _PACKAGES = (
     "leaderboard",
     "plots",
     "study",
+    "explorer",
 )
 
 __all__ = [*_HOMES, *_PACKAGES, "bisimulation", "__version__"]

@@ -14,6 +14,7 @@ from pharos.cli import (
     cache,
     count,
     evaluate,
+    explore,
     export,
     hardness,
     import_,
@@ -137,6 +138,7 @@ app.command("evaluate")(evaluate.evaluate)
 app.command("observations")(observations.observations)
 app.command("render")(render.render)
 app.command("play")(play.play)
+app.command("explore")(explore.explore)
 app.command("train")(train.train)
 app.command("tune")(tune.tune)
 app.command("submit")(leaderboard.submit)

@@ -12,6 +12,7 @@ import typer
 from pharos.cli.common import Json, Parameters, TargetArgument, console, parse_target, print_json
 from pharos.cli.render import environment_of, find_state
 from pharos.errors import PharosError
+from pharos.explorer import keys_of
 from pharos.wording import many
 
 if TYPE_CHECKING:
@@ -19,7 +20,6 @@ if TYPE_CHECKING:
 
     from pharos.environments import Environment, State
 
-ARROWS = {"up": "w", "left": "a", "down": "s", "right": "d"}  # action -> letter
 ESCAPES = {"[A": "up", "[B": "down", "[C": "right", "[D": "left", "OA": "up", "OB": "down", "OC": "right", "OD": "left"}
 SIGNS = {"up": "↑", "left": "←", "down": "↓", "right": "→", "space": "space"}
 QUIT, AGAIN, BACK = "q", "r", "u"
@@ -102,23 +102,6 @@ class Game:
             paid = float(self.env.reward_of(self.state, action, following, outcome))
             self.history.append((self.state, action, paid))
             self.state = following
-
-
-def keys_of(actions: tuple[str, ...]) -> dict[str, int]:
-    """Key -> action: arrows and w a s d for directions, space for staying, and the digits for all."""
-    keys: dict[str, int] = {}
-    for number, action in enumerate(actions):
-        if number < 9:
-            keys[str(number + 1)] = number
-        direction = next(
-            (name for name in ARROWS if action.lower() == name or action.lower().endswith(f" {name}")), None
-        )
-        if direction is not None:
-            keys.setdefault(direction, number)
-            keys.setdefault(ARROWS[direction], number)
-        elif action.lower() in ("stay", "noop", "wait", "fire", "none"):
-            keys.setdefault("space", number)
-    return keys
 
 
 def _picture(game: Game) -> "RenderableType":

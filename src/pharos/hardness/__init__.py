@@ -25,7 +25,7 @@ from pharos.hardness.kernel_spectrum import (
 from pharos.hardness.mean_field import LearningCurve, Schedule
 from pharos.hardness.mismatch import distribution_mismatch
 from pharos.hardness.mixing_time import MixingTime, mixing_time
-from pharos.hardness.occupancy import Occupancy, occupancy
+from pharos.hardness.occupancy import Occupancy, discounted_visits, occupancy
 from pharos.hardness.registry import Measure, Problem, chosen, measures, register
 from pharos.hardness.report import Report, Result, report
 from pharos.hardness.representation import Representation
@@ -65,6 +65,7 @@ __all__ = [
     "colosseum_diameter",
     "covering",
     "diameter",
+    "discounted_visits",
     "distribution_mismatch",
     "effective_horizon",
     "environmental_value_norm",

@@ -1,0 +1,46 @@
+"""The explorer: a page that shows an MDP state by state, from a small local server or in one file.
+
+A file is loaded when something in it is first used.
+"""
+
+from typing import TYPE_CHECKING
+
+from pharos import lazy
+
+if TYPE_CHECKING:
+    from pharos.explorer.exploration import Exploration
+    from pharos.explorer.keys import ARROWS, keys_of
+    from pharos.explorer.learnt import Learnt
+    from pharos.explorer.opening import Explorer, exploration_of, explore, open_browser
+    from pharos.explorer.pages import page, write
+    from pharos.explorer.server import Server
+
+_FILES = {
+    "ARROWS": "keys",
+    "Exploration": "exploration",
+    "Explorer": "opening",
+    "Learnt": "learnt",
+    "Server": "server",
+    "exploration_of": "opening",
+    "explore": "opening",
+    "keys_of": "keys",
+    "open_browser": "opening",
+    "page": "pages",
+    "write": "pages",
+}
+
+__all__ = [
+    "ARROWS",
+    "Exploration",
+    "Explorer",
+    "Learnt",
+    "Server",
+    "exploration_of",
+    "explore",
+    "keys_of",
+    "open_browser",
+    "page",
+    "write",
+]
+
+__getattr__ = lazy.attributes(__name__, _FILES)

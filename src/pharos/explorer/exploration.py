@@ -1,0 +1,425 @@
+"""What a page asks of an MDP: states with their values, gaps and successors, paths, layers, maps.
+
+Answers are plain dictionaries, ready for JSON; numbers that JSON cannot say are None. A position is a state and, under
+sticky actions, the action executed before; there is none before the first step.
+"""
+
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from pharos.environments import Environment
+from pharos.errors import ParameterError
+from pharos.explorer.keys import keys_of
+from pharos.explorer.layers import Layers
+from pharos.explorer.learnt import Learnt, probabilities
+from pharos.explorer.picture import Pictures
+from pharos.explorer.states import NumberedStates, SpaceStates, States
+from pharos.hardness import discounted_visits, occupancy
+from pharos.mdp import TabularMDP
+from pharos.solvers import Solution, uniform_value, value_iteration
+from pharos.state_space import StateSpace
+
+OPTIMAL, UNIFORM, LEARNT = "optimal", "uniform", "learnt"
+LONGEST_PATH = 2_000  # steps that are shown
+MOST_STARTS = 100  # start states that are listed
+LISTED = 48  # states of a layer that are listed at a time
+WORST = 24  # states that are listed where a policy goes wrong
+ERRORS_PER_TIE = 2.5  # the gap of a tie is at most this times the bound on errors of values, see hardness.gaps
+
+
+class Exploration:
+    """An MDP without a horizon, solved, and what its states stand for.
+
+    Args:
+        mdp: with its chance. A horizon is left out: values are discounted.
+        env: draws the states and names the actions, where it is known.
+        space: gives the values of their variables, where there is one.
+        learnt: a policy to set beside the optimal and the uniform one.
+        title: for people.
+        progress: called with what is done next.
+    Raises:
+        DivergenceError: gamma is 1, and the value may be infinite. ParameterError: what was learnt does not fit.
+    """
+
+    def __init__(
+        self,
+        mdp: TabularMDP,
+        *,
+        env: Environment | None = None,
+        space: StateSpace | None = None,
+        learnt: Learnt | None = None,
+        title: str = "",
+        chance: str = "",
+        progress: Any = lambda text: None,
+    ):
+        self.mdp = mdp = mdp.with_horizon(None)
+        self.env, self.space, self.learnt, self.chance = env, space, learnt, chance
+        self.title = title or (env.name if env is not None else "MDP")
+        self.actions = env.actions if env is not None else tuple(map(str, range(mdp.num_actions)))
+        self.states: States = NumberedStates(mdp.num_states) if space is None else SpaceStates(space)
+        progress("optimal values")
+        self.solutions: dict[str, Solution] = {OPTIMAL: value_iteration(mdp)}
+        progress("values of the uniform policy")
+        self.solutions[UNIFORM] = uniform_value(mdp)
+        if learnt is not None:
+            progress("values of what was learnt")
+            self.solutions[LEARNT] = learnt.solution(mdp, space)
+        self.tie_tolerance = max(1e-9, ERRORS_PER_TIE * self.solutions[OPTIMAL].error_bound)
+        starts = mdp.starts
+        self.pictures = Pictures(env, self._variables_of(int(starts[0])) if env is not None else None)
+
+    @property
+    def policies(self) -> list[str]:
+        """The names of the policies that are compared."""
+        return list(self.solutions)
+
+    # Of all states --------------------------------------------------------------------------------------------------
+
+    @cached_property
+    def layers(self) -> Layers:
+        """The breadth-first layers."""
+        return Layers(self.mdp, is_numbered=self.space is not None)
+
+    def values(self, name: str, states: np.ndarray) -> np.ndarray:
+        """(N,) values of a policy in states, where there is no action before."""
+        solution = self.solutions[name]
+        if not self.mdp.is_sticky:
+            return np.asarray(solution.x[states, 0])
+        chosen = self.chosen_values(name, states)
+        return (self.chances(name, states, chosen) * chosen).sum(axis=1) * ~self.mdp.terminal[states]
+
+    def chosen_values(self, name: str, states: np.ndarray, previous: int | None = None) -> np.ndarray:
+        """(N, A) values of choosing each action, and following a policy afterwards."""
+        executed = self.solutions[name].q_of(states)
+        return self.mdp.chance.chosen_values(executed, self._before(states, previous))
+
+    def chances(self, name: str, states: np.ndarray, chosen: np.ndarray, previous: int | None = None) -> np.ndarray:
+        """(N, A) how often a policy chooses each action; `chosen`: optimal values of choosing, for the optimal one."""
+        if name == UNIFORM:
+            return np.full(chosen.shape, 1 / self.mdp.num_actions)
+        if name == LEARNT:
+            before = np.full(len(states), self.mdp.num_actions) if previous is None else np.full(len(states), previous)
+            return probabilities(self.solutions[LEARNT], states, before)
+        return np.eye(self.mdp.num_actions)[self.best_actions(chosen)]
+
+    def best_actions(self, chosen: np.ndarray) -> np.ndarray:
+        """(N,) the first of the actions whose values (N, A) are within the tie tolerance of the best."""
+        return (chosen >= chosen.max(axis=1, keepdims=True) - self.tie_tolerance).argmax(axis=1)
+
+    def _before(self, states: np.ndarray, previous: int | None) -> np.ndarray | None:
+        if not self.mdp.is_sticky:
+            return None
+        return np.full(len(states), self.mdp.num_actions if previous is None else previous)
+
+    @cached_property
+    def visits(self) -> "Visits":
+        """How often policies are in states."""
+        return Visits(self)
+
+    # Of one state ---------------------------------------------------------------------------------------------------
+
+    def position(self, state: int, previous: int | None = None) -> dict[str, Any]:
+        """All about a state.
+
+        Args:
+            state: its number.
+            previous: the action executed before, under sticky actions; None: there was none.
+        Returns:
+            state, previous, values (of its variables), terminal, layer, start (probability that an episode starts
+            there), v (policy -> value), the drawing as `Pictures.of` has it, and for each action: `q` and `gap`, of
+            choosing it; `best`, whether the gap is a tie; of each policy, `policies` (how often it chooses it) and
+            `q_of` (the value of choosing it, and following the policy afterwards); `reward`, expected; `outcomes`: a
+            list of state (None for the end), previous action, probability, reward.
+        Raises:
+            ParameterError: there is no such state or action.
+        """
+        state, previous = self._checked(state, previous)
+        variables = self._variables_of(state)
+        here = np.array([state])
+        is_over = bool(self.mdp.terminal[state])
+        answer: dict[str, Any] = {
+            "state": state,
+            "previous": previous,
+            "values": list(variables),
+            "terminal": is_over,
+            "layer": int(self.layers.of(here)[0]),
+            "start": float(self.mdp.start_probabilities[self.mdp.start_states == state].sum()),
+            **self.pictures.of(variables),
+            "v": dict.fromkeys(self.solutions, 0.0),
+            "actions": [],
+        }
+        if is_over:
+            return answer
+        chosen = {name: self.chosen_values(name, here, previous) for name in self.solutions}
+        chances = {name: self.chances(name, here, chosen[OPTIMAL], previous)[0] for name in self.solutions}
+        best = float(chosen[OPTIMAL].max())
+        answer["v"] = {
+            name: best if name == OPTIMAL else number(chances[name] @ chosen[name][0]) for name in self.solutions
+        }
+        for action, executed in enumerate(self._executed(previous)):
+            gap = best - float(chosen[OPTIMAL][0, action])
+            outcomes = self._outcomes(state, executed)
+            answer["actions"].append(
+                {
+                    "q": best - gap,
+                    "gap": gap,
+                    "best": gap <= self.tie_tolerance,
+                    "policies": {name: number(chances[name][action]) for name in self.solutions},
+                    "q_of": {name: number(chosen[name][0, action]) for name in self.solutions},
+                    "reward": sum(probability * reward for _, _, probability, reward in outcomes),
+                    "outcomes": outcomes,
+                }
+            )
+        return answer
+
+    def _executed(self, previous: int | None) -> np.ndarray:
+        """(A, A) the probability that each action is executed, of choosing each."""
+        before = None
+        if self.mdp.is_sticky:
+            before = np.full(self.mdp.num_actions, self.mdp.num_actions if previous is None else previous)
+        return self.mdp.chance.weights(np.eye(self.mdp.num_actions), before)
+
+    def _outcomes(self, state: int, executed: np.ndarray) -> list[list[Any]]:
+        """(state, previous, probability, reward) of what may follow, the likeliest first; executed (A,) chances."""
+        merged: dict[tuple[int | None, int | None, float], float] = {}
+        for action in np.flatnonzero(executed).tolist():
+            for after, probability, reward in self._of_executing(state, action):
+                place = (after, action if self.mdp.is_sticky else None, reward)
+                merged[place] = merged.get(place, 0.0) + float(executed[action]) * probability
+        listed = [[after, previous, probability, reward] for (after, previous, reward), probability in merged.items()]
+        return sorted(listed, key=lambda each: (-each[2], -1 if each[0] is None else each[0]))
+
+    def _of_executing(self, state: int, action: int) -> list[tuple[int | None, float, float]]:
+        """(state, probability, reward) of what executing an action may lead to.
+
+        Outcomes have rewards of their own where the rules are known; else, and with lazy actions, each has the mean.
+        """
+        env, mdp = self.env, self.mdp
+        if env is not None and env.has_chance and not mdp.laziness:
+            before, listed = self._variables_of(state), []
+            for outcome in range(env.outcomes):
+                if (probability := float(env.probability(before, action, outcome))) > 0:
+                    following = env.next_state(before, action, outcome)
+                    reward = float(env.reward_of(before, action, following, outcome))
+                    after = self.states.number(following) if following[0] < mdp.num_states or self.space else None
+                    listed.append((after, probability, reward))
+            return listed
+        mean = float(mdp.reward_table.rows(np.array([state]))[0, action])
+        outcomes = mdp.dynamics.outcomes(np.array([state]), np.array([action]))
+        ends = mdp.num_states
+        return [
+            (None if after == ends else int(after), float(p), mean)
+            for after, p in zip(outcomes.states, outcomes.probabilities, strict=True)
+        ]
+
+    def _variables_of(self, state: int) -> tuple[int, ...]:
+        return tuple(self.states.values(np.array([state]))[0].tolist())
+
+    def _checked(self, state: Any, previous: Any) -> tuple[int, int | None]:
+        if not 0 <= state < self.mdp.num_states:
+            raise ParameterError(f"there is no state {state}; expected 0 to {self.mdp.num_states - 1:,}")
+        if previous is not None and not 0 <= previous < self.mdp.num_actions:
+            raise ParameterError(f"there is no action {previous}; expected 0 to {self.mdp.num_actions - 1}")
+        return int(state), None if previous is None or not self.mdp.is_sticky else int(previous)
+
+    def find(self, text: str) -> dict[str, Any]:
+        """The number of the state that a text names, by it or by the values of its variables: "12", or "2,3,1"."""
+        try:
+            numbers = [int(word) for word in text.replace(",", " ").split()]
+        except ValueError:
+            numbers = []
+        if len(numbers) == 1:
+            return {"state": self._checked(numbers[0], None)[0]}
+        if not numbers:
+            raise ParameterError(f"found {text!r}; expected the number of a state, or its values such as 2,3,1")
+        return {"state": self.states.number(numbers)}
+
+    # Paths ----------------------------------------------------------------------------------------------------------
+
+    def path(self, policy: str, state: int, previous: int | None = None) -> dict[str, Any]:
+        """A likely way of a policy from a position: its likeliest actions, and the likeliest outcomes that are new on
+        the way, until the end, or until nothing new is left.
+
+        Returns:
+            `steps`, a list of state, previous, action, probability (of the outcome), reward, gap (of the action); where
+            it `stops`: state and previous; `why`: "end", "circle", "limit", or "unknown", where the policy was not
+            asked.
+        Raises:
+            ParameterError: there is no such policy or position.
+        """
+        self._check_policy(policy)
+        at: tuple[int | None, int | None] = self._checked(state, previous)
+        steps: list[list[Any]] = []
+        seen: set[tuple[int | None, int | None]] = set()
+        why = "limit"
+        while len(steps) < LONGEST_PATH:
+            if at[0] is None or self.mdp.terminal[at[0]]:
+                why = "end"
+                break
+            seen.add(at)
+            here = np.array([at[0]])
+            chosen = self.chosen_values(OPTIMAL, here, at[1])
+            chances = self.chances(policy, here, chosen, at[1])
+            if np.isnan(chances).any():
+                why = "unknown"
+                break
+            action = int(chances[0].argmax())
+            outcomes = self._outcomes(at[0], self._executed(at[1])[action])
+            new = next((each for each in outcomes if (each[0], each[1]) not in seen), None)
+            if new is None:
+                why = "circle"
+                break
+            steps.append([*at, action, *new[2:], float(chosen.max() - chosen[0, action])])
+            at = new[0], new[1]
+        return {"steps": steps, "stops": list(at), "why": why}
+
+    def _check_policy(self, policy: str) -> None:
+        if policy not in self.solutions:
+            raise ParameterError(f"there is no policy {policy!r}; expected {', '.join(self.solutions)}")
+
+    # Layers ---------------------------------------------------------------------------------------------------------
+
+    def layer(self, layer: int, first: int = 0) -> dict[str, Any]:
+        """Some states of a breadth-first layer, from the number `first` among them on.
+
+        Returns:
+            `layer`, `first`, `count` of all, and `states`: a list of state, optimal value, terminal.
+        Raises:
+            ParameterError: there is no such layer.
+        """
+        if not 0 <= layer < len(self.layers.counts):
+            raise ParameterError(f"there is no layer {layer}; expected 0 to {len(self.layers.counts) - 1:,}")
+        states = self.layers.states(layer)[max(0, first) : max(0, first) + LISTED]
+        values = self.values(OPTIMAL, states)
+        listed = zip(states.tolist(), values.tolist(), self.mdp.terminal[states].tolist(), strict=True)
+        return {
+            "layer": layer,
+            "first": first,
+            "count": int(self.layers.counts[layer]),
+            "states": [list(each) for each in listed],
+        }
+
+    # Where a policy goes wrong --------------------------------------------------------------------------------------
+
+    def wrong(self, policy: str = LEARNT) -> dict[str, Any]:
+        """Where a policy loses: along its likeliest way, and in all.
+
+        Returns:
+            `regret`, V* minus its value at the start; `lost`, the sum of what it loses in all states; `first`, the
+            first step of its likeliest way whose gap is no tie, as `path` has it, with its `number`, or None; `worst`,
+            the states that lose most: state, loss, visits, action chosen most.
+        Raises:
+            ParameterError: there is no such policy.
+        """
+        self._check_policy(policy)
+        start = int(self.mdp.start_states[self.mdp.start_probabilities.argmax()])
+        steps = self.path(policy, start)["steps"]
+        number_of = next((i for i, step in enumerate(steps) if step[-1] > self.tie_tolerance), None)
+        lost, visits, actions = self.visits.losses(policy)
+        worst = np.argsort(-lost, kind="stable")[:WORST]
+        worst = worst[lost[worst] > self.tie_tolerance * 1e-3]
+        best, value = (self.solutions[name].value_at_start for name in (OPTIMAL, policy))
+        return {
+            "regret": number(best - value),
+            "lost": float(lost.sum()),
+            "first": None if number_of is None else {"number": number_of, "step": steps[number_of]},
+            "worst": [[int(s), float(lost[s]), float(visits[s]), int(actions[s])] for s in worst],
+        }
+
+    # The page as a whole --------------------------------------------------------------------------------------------
+
+    def about(self) -> dict[str, Any]:
+        """What the page says of the whole, and needs for what it draws."""
+        from pharos.explorer.maps import about_maps
+
+        mdp, starts = self.mdp, np.argsort(-self.mdp.start_probabilities, kind="stable")[:MOST_STARTS]
+        return {
+            "title": self.title,
+            "num_states": mdp.num_states,
+            "num_actions": mdp.num_actions,
+            "num_terminal": int(np.count_nonzero(mdp.terminal)),
+            "actions": list(self.actions),
+            "keys": keys_of(self.actions),
+            "gamma": mdp.gamma,
+            "chance": self.chance,
+            "is_sticky": mdp.is_sticky,
+            "starts": [[int(mdp.start_states[i]), float(mdp.start_probabilities[i])] for i in starts],
+            "policies": self.policies,
+            "value_at_start": {name: number(each.value_at_start) for name, each in self.solutions.items()},
+            "error_bound": max(float(each.error_bound) for each in self.solutions.values()),
+            "tie_tolerance": self.tie_tolerance,
+            "learnt": None if self.learnt is None else {"name": self.learnt.name, "facts": dict(self.learnt.facts)},
+            "variables": [
+                {"name": name, "low": int(low), "size": int(size)}
+                for name, low, size in zip(self.states.names, self.states.low, self.states.size, strict=True)
+            ],
+            "drawing": self.pictures.kit,
+            "fault": self.pictures.fault,
+            "layers": self.layers.bars(),
+            "num_layers": len(self.layers.counts),
+            **about_maps(self),
+        }
+
+
+class Visits:
+    """How often policies are in states, discounted, from the start: d(s) = sum over t of gamma^t P(s_t = s)."""
+
+    def __init__(self, exploration: Exploration):
+        self.exploration, self._known = exploration, dict[str, np.ndarray]()
+
+    def pairs(self, policy: str) -> np.ndarray:
+        """(S, A) visits of a state in which the policy chooses an action."""
+        mdp = self.exploration.mdp
+        table = self._table(policy)
+        if mdp.is_sticky:
+            return occupancy(mdp, table).visits
+        visits = self.of(policy)
+        if table is None:
+            return np.repeat(visits[:, None] / mdp.num_actions, mdp.num_actions, axis=1)
+        return visits[:, None] * (np.eye(mdp.num_actions)[table] if table.ndim == 1 else table)
+
+    def of(self, policy: str) -> np.ndarray:
+        """(S,) visits of states; kept for the next time."""
+        if policy not in self._known:
+            self._known[policy] = discounted_visits(self.exploration.mdp, self._table(policy))[0]
+        return self._known[policy]
+
+    def losses(self, policy: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(S,) each: what is lost in states, visits, and the action chosen most.
+
+            loss(s) = sum over a of visits(s, a) gap(s, a), which sums to V* minus the value of the policy at the start
+
+        Source: the performance difference lemma, Kakade and Langford (2002).
+        """
+        world = self.exploration
+        mdp, pairs = world.mdp, self.pairs(policy)
+        states = np.flatnonzero(pairs.any(axis=1))
+        executed = world.solutions[OPTIMAL].q_of(states)
+        gaps = executed.max(axis=1, keepdims=True) - executed
+        lost = np.zeros(mdp.num_states)
+        lost[states] = mdp.chance.chosen * (pairs[states] * gaps).sum(axis=1)
+        if mdp.is_sticky:  # the first step, which has no action before
+            first = np.flatnonzero(mdp.start_probabilities > 0)
+            starts, weights = mdp.start_states[first], mdp.start_probabilities[first]
+            q = world.solutions[OPTIMAL].q_of(starts)
+            chances = world.chances(policy, starts, world.chosen_values(OPTIMAL, starts))
+            more = (mdp.chance.first_chosen - mdp.chance.chosen) * chances * (q.max(axis=1, keepdims=True) - q)
+            np.add.at(lost, starts, weights * more.sum(axis=1) * ~mdp.terminal[starts])
+        visits = pairs.sum(axis=1)
+        return lost, visits, pairs.argmax(axis=1)
+
+    def _table(self, policy: str) -> np.ndarray | None:
+        """The policy as solvers take it; None for the uniform one. Where it was not asked, it does anything."""
+        if policy == UNIFORM:
+            return None
+        table = np.asarray(self.exploration.solutions[policy].policy)
+        if table.dtype.kind != "f" or not np.isnan(table).any():
+            return table
+        return np.where(np.isnan(table), 1 / self.exploration.mdp.num_actions, table)
+
+
+def number(value: Any) -> float | None:
+    """A float; None where it is not a number."""
+    return float(value) if np.isfinite(value) else None
