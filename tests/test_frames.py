@@ -1,22 +1,27 @@
 """Several frames in one image, and entries that mean nothing: what environments show, and what policies are worth."""
 
 import itertools
+import json
 
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
+from typer.testing import CliRunner
 
 import naive_mdp
 import pharos
+from pharos import experiments
+from pharos.cli import app
 from pharos.errors import ParameterError
 from pharos.experiments import Task, evaluate_agent
 from pharos.interaction import GymEnv, make_sb3_vec, make_vec
 from pharos.mdp import PolicyTable
 from pharos.observations import aliasing, history_aliasing, observation_classes, observe
-from pharos.policies import estimation
+from pharos.policies import Evaluation, estimation
 from pharos.policies.histories import HistoryAnswers
 
 BREAKOUT = pharos.make("breakout", height=6, columns=3, brick_rows=1)
+WORDS = ["height=6", "columns=3", "brick_rows=1"]
 LAKE = pharos.make("frozen_lake/4x4")
 SLIPPERY = pharos.make("frozen_lake", slippery=True)
 IMAGES = {"simple_image": {"frames": 3}, "complex_image": {"frames": 2, "size": (24, 24), "grey": True}}
@@ -277,7 +282,7 @@ def test_irrelevant_entries_alias_nothing_and_are_few():
         ("dqn", "vector", {"irrelevant": 3}),
     ],
 )
-def test_runs_are_measured_exactly(agent, observation, options, tmp_path):
+def test_runs_are_measured_exactly(agent, observation, options, tmp_path, monkeypatch):
     given = {"learning_starts": 50, "buffer_size": 1000} if agent == "dqn" else {"n_steps": 64}
     run = pharos.train(
         agent, BREAKOUT, steps=200, observation=observation, observation_options=options, hyperparameters=given,
@@ -286,5 +291,16 @@ def test_runs_are_measured_exactly(agent, observation, options, tmp_path):
     assert run.result["exact"]
     assert 0 <= run.result["final_regret"] <= run.result["value_optimal"] - Task(BREAKOUT, horizon=20).reference.worst
     assert run.config["observation_options"] == options
+    evaluate = ["evaluate", "breakout", *WORDS, "--policy", str(tmp_path / "run"), "--horizon", "20"]
+    told = CliRunner().invoke(app, [*evaluate, "--json"])
+    assert (told.exit_code, told.stderr) == (0, "")
+    answer = json.loads(told.stdout)
+    assert (answer["exact"], answer["episodes"]) == (True, 0)
+    assert answer["value_at_start"] == pytest.approx(run.result["final_value"], abs=1e-6)
+    assert answer["regret"] == pytest.approx(run.result["final_regret"], abs=2e-6)
+    if "frames" in options:
+        monkeypatch.setattr(experiments, "evaluate_agent", lambda *_: Evaluation(0.5, False, 0.25, 9, 2000))
+        told = CliRunner().invoke(app, evaluate)
+        assert "0.25 with a probability of 99 % (estimated from 2,000 episodes)" in told.stdout
     with pytest.raises(ParameterError, match="batched engine"):
         pharos.train(agent, BREAKOUT, steps=50, observation=observation, observation_options=options, engine="batched")

@@ -1,5 +1,7 @@
 """pharos evaluate: the exact value of a policy, between those of the best and the worst."""
 
+import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -61,7 +63,10 @@ def evaluate(
     trust: Trust = False,
     json: Json = False,
 ) -> None:
-    """Evaluate a policy exactly, and say where it stands: regret 0 is optimal, 1 is as bad as playing at random."""
+    """Evaluate a policy exactly, and say where it stands: regret 0 is optimal, 1 is as bad as playing at random.
+
+    Only a policy that sees several frames and reaches more than 100,000 histories is estimated, from 2,000 episodes.
+    """
     building = build_options(memory, workers, max_states)
     goal = parse_target(target, parameters)
     decisions = None if policy in POLICIES else read_policy(policy, trust=trust)
@@ -71,15 +76,22 @@ def evaluate(
         goal = Target(target, environment=goal.found_environment())
     mdp = goal.mdp(gamma=gamma, horizon=horizon, sticky=sticky, random=random, lazy=lazy, **building)
     with progress_line("evaluating"):
-        values = _values(mdp, policy, decisions, tolerance)
-    best, uniform, worst = (values[name].value_at_start for name in POLICIES)
-    solution = values["given"]
-    value = solution.value_at_start
-    spread = best - uniform
+        values = {name: _worth(solution_of(mdp, name, None, tolerance)) for name in POLICIES}
+        if decisions is None:
+            values["given"] = values[policy]
+        elif _sees_frames(goal, decisions):
+            values["given"] = _worth_over_histories(goal, mdp, decisions, sticky=sticky, random=random, lazy=lazy)
+        else:
+            values["given"] = _worth(solution_of(mdp, policy, decisions, tolerance))
+    best, uniform, worst = (values[name].value for name in POLICIES)
+    given = values["given"]
+    value, spread = given.value, best - uniform
     answer = {
         "policy": policy,
         "value_at_start": value,
-        "error_bound": solution.error_bound,
+        "error_bound": given.error_bound,
+        "exact": given.episodes == 0,
+        "episodes": given.episodes,
         "regret": best - value,
         "normalized_regret": (best - value) / spread if spread > 4 * tolerance else None,
         "regret_relative_to_worst": (best - value) / (best - worst) if best - worst > 4 * tolerance else None,
@@ -105,18 +117,51 @@ def evaluate(
             ("normalized regret", "-" if relative is None else f"{relative:.6g}  (0: optimal, 1: uniform)"),
             ("relative to worst", "-" if against_worst is None else f"{against_worst:.6g}  (0: optimal, 1: worst)"),
             ("optimal, uniform, worst", f"{best:.8g}, {uniform:.8g}, {worst:.8g}"),
-            ("error at most", f"{max(each.error_bound for each in values.values()):.2g}"),
+            ("error at most", f"{max(each.error_bound for each in values.values()):.2g}{_estimated(given)}"),
             ("discount", describe_discount(mdp.gamma, mdp.horizon)),
             ("chance", describe_chance(sticky, random, mdp.dynamics.has_chance, lazy)),
         ],
     )
 
 
-def _values(mdp: "TabularMDP", policy: str, decisions: "Given | None", tolerance: float) -> dict[str, Any]:
-    values: dict[str, Any] = {} if decisions is None else {"given": solution_of(mdp, policy, decisions, tolerance)}
-    values |= {name: solution_of(mdp, name, None, tolerance) for name in POLICIES}
-    values.setdefault("given", values.get(policy))
-    return values
+@dataclass(frozen=True)
+class Worth:
+    """The value of a policy at the start, how far it may be off, and the episodes behind an estimate (exact: 0)."""
+
+    value: float
+    error_bound: float
+    seconds: float
+    episodes: int = 0
+
+
+def _worth(solution: "Solution") -> Worth:
+    return Worth(solution.value_at_start, solution.error_bound, solution.seconds)
+
+
+def _estimated(given: Worth) -> str:
+    return f" with a probability of 99 % (estimated from {given.episodes:,} episodes)" if given.episodes else ""
+
+
+def _sees_frames(goal: Target, decisions: "Given") -> bool:
+    """Whether the policy sees several frames, so that its values belong to histories of states."""
+    _, seeing = decisions
+    if "observation" not in seeing:
+        return False
+    from pharos.observations import observe
+
+    name, options = seeing["observation"], seeing["observation_options"]
+    return "frames" in options and observe(goal.found_environment(), name, **options).frames > 1
+
+
+def _worth_over_histories(goal: Target, mdp: "TabularMDP", decisions: "Given", **chance: float) -> Worth:
+    """Of a policy that sees several frames: exact where it reaches few histories, else estimated."""
+    from pharos.experiments import Task, evaluate_agent
+
+    agent, seeing = decisions
+    began = time.perf_counter()
+    task = Task(goal.found_environment(), **chance, **seeing, gamma=mdp.gamma, horizon=mdp.horizon)  # type: ignore[arg-type]
+    found = evaluate_agent(agent, task)
+    return Worth(found.value, found.error_bound, time.perf_counter() - began, found.episodes)
 
 
 def solution_of(mdp: "TabularMDP", policy: str, decisions: "Given | None", tolerance: float) -> "Solution":

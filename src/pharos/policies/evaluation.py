@@ -181,7 +181,8 @@ def evaluate_observing(
     sight = Sight(space, space.environment, observation, dict(observation_options or {}), previous_action, mdp.horizon)
     if sight.frames > 1:
         raise ParameterError(
-            "the policy sees several frames, so its values belong to no state; use experiments.evaluate_agent"
+            "the policy sees several frames, so its values belong to no state; use `pharos evaluate`, or "
+            "experiments.evaluate_agent"
         )
     answers = PolicyAnswers(policy, mdp, sight, deterministic=deterministic)
     answers.reach()
