@@ -1,14 +1,21 @@
 """Images with motion tell the state: it is read back from them, on named instances too large to look at every state.
 
-Breakout, Freeway and 2048: any state that their variables can say. MiniGrid: states that a long random walk meets.
+Simple images of Breakout, Freeway and 2048: any state that their variables can say; of MiniGrid: states that a long
+random walk meets. A complex image tells what lies in each cell, as far as a cell can hold it: so it tells what a simple
+image tells.
 """
+
+from itertools import product
 
 import numpy as np
 import pytest
 
 import pharos
+from pharos.drawing import planes_of
 from pharos.environments import mini_grid
+from pharos.environments.freeway import NUM_COLORS
 from pharos.observations import observe
+from pharos.observations.drawn import num_values
 
 NAMES = [name for name in pharos.list_environments() if name.startswith(("breakout/", "freeway/", "game_2048/"))]
 CORRIDOR = "mini_grid/key-corridor-s6r3"
@@ -110,3 +117,120 @@ def test_states_of_the_key_corridor_are_read_back():
             here = [tuple(each) for each in place]
             decoded += [0, carried] if here == [player] else [*here[0]]
         assert tuple(map(int, decoded)) == tuple(state.tolist())
+
+
+# Complex images: cell by cell -----------------------------------------------------------------------------------------
+
+
+def any_values(env, layers, _row, _column):
+    """Whatever the layers can show, in any combination."""
+    return list(product(*(range(1 + num_values(layer)) for layer in layers)))
+
+
+def in_a_lane(env, layers, row, _column):
+    """A car of its lane's colour or the player, each with its timer; never both: a hit sends the player back."""
+    assert env.restart_on_hit
+    timers = [1 + num_values(layer) for layer in layers][3:]
+    fixed = row in (0, env.num_cars + 1)
+    color = (row - 1) % NUM_COLORS
+    colors = () if fixed else (1 + color, 1 + color + NUM_COLORS)
+    cars = [(0, car, 0, timer, 0) for car in colors for timer in range(1, timers[0])]
+    players = [(0, 0, 1, 0, timer) for timer in range(1, timers[1])]
+    return [(int(fixed), *each[1:]) for each in [(0,) * 5, *cars, *players]]
+
+
+def on_a_floor(env, layers, row, column):
+    """Of Sokoban: a box or the player, on a target or not; nothing moves on a wall."""
+    walls, targets = (plane[row, column] for plane in still(env)[:2])
+    if walls:
+        return [(walls, targets, 0, 0)]
+    return [(0, targets, *moving) for moving in ((0, 0), (1 + targets, 0), (0, 1))]
+
+
+def in_a_room(env, layers, row, column):
+    """Of MiniGrid: a door open, shut or locked; a thing; the player, and what he carries."""
+    goal, lava, walls, door, *_ = (int(plane[row, column]) for plane in still(env))
+    if walls:
+        return [(goal, lava, walls, 0, 0, 0)]
+    doors = [0] if not door else [1 + 3 * ((door - 1) // 3) + state for state in range(3)]
+    things = [0, *(1 + 3 * env.things[:, 3] + env.things[:, 2]).tolist()] if len(env.things) else [0]
+    return [(goal, lava, 0, *moving) for moving in product(doors, things, range(5))]
+
+
+def still(env):
+    """What lies there at the start."""
+    return planes_of(env, env.initial_states()[0][0])
+
+
+HELD = {
+    "breakout": any_values,
+    "sliding_tiles": any_values,
+    "pocket_cube": any_values,
+    "game_2048": any_values,
+    "freeway": in_a_lane,
+    "sokoban": on_a_floor,
+    "mini_grid": in_a_room,
+}
+"""Class -> what a cell can hold: a list of a value for each layer."""
+LARGE = [name for name in pharos.list_environments() if "/" in name and name.split("/")[0] in HELD]
+
+
+def blocks(made, row, column, held):
+    """(N, pixels) of a cell, for each combination (N, L) of what it holds."""
+    picture, top, left, sprite, place, color, keep = made._tables
+    ground = picture[top[row] : top[row + 1], left[column] : left[column + 1]]
+    height, width = ground.shape[:2]
+    out = np.broadcast_to(ground.astype(np.int64), (len(held), *ground.shape)).copy()
+    for layer, value in sorted({(i, int(v)) for i in range(held.shape[1]) for v in held[:, i] if v}):
+        number = sprite[layer, row, value]
+        if number >= 0:
+            at, pixels = held[:, layer] == value, slice(first := place[number, height, width], first + height * width)
+            out[at] = color[pixels].reshape(height, width, -1) + (
+                out[at] * keep[pixels].reshape(height, width, 1).astype(np.int64) >> 8
+            )
+    return out.reshape(len(held), -1)
+
+
+@pytest.mark.parametrize(
+    "name", [name if name == "breakout/12x8x1" else pytest.param(name, marks=pytest.mark.long) for name in LARGE]
+)
+def test_complex_images_tell_what_each_cell_holds(name):
+    """No two combinations that a cell can hold look alike there, and cells share no pixel."""
+    env = pharos.make(name)
+    made = observe(env, "complex_image", motion=True)
+    made._drawing._compiled = made._drawing._interpret
+    layers = list(made._drawing.layers.values())
+    rows, columns = env.grid()
+    can_hold, looked_at = {}, set()
+    for row, column in product(range(rows), range(columns)):
+        held = np.array(sorted(set(HELD[env.name](env, layers, row, column))))
+        can_hold[row, column] = {tuple(each) for each in held.tolist()}
+        picture, top, left, sprite, *_ = made._tables
+        ground = picture[top[row] : top[row + 1], left[column] : left[column + 1]]
+        key = (ground.shape, ground.tobytes(), sprite[:, row].tobytes(), held.tobytes())
+        if key not in looked_at:
+            looked_at.add(key)
+            assert len(np.unique(blocks(made, row, column, held), axis=0)) == len(held), (row, column)
+    for state in walked(env, 300):  # those combinations are all that are met, and these are the pixels
+        planes = np.zeros((len(layers), rows, columns), np.uint8)
+        made._drawing._draw(state, planes)
+        (image,) = made(np.array([state]))
+        for row, column in product(range(rows), range(columns)):
+            here = planes[:, row, column]
+            assert tuple(here.tolist()) in can_hold[row, column]
+            if here.any():
+                part = image[top[row] : top[row + 1], left[column] : left[column + 1]]
+                assert (blocks(made, row, column, here[None].astype(np.int64))[0] == part.ravel()).all()
+
+
+def walked(env, steps):
+    """Some states of a random walk."""
+    rng, state = np.random.default_rng(0), tuple(env.initial_states()[0][0])
+    for step in range(steps):
+        if step % 25 == 0:
+            yield tuple(map(int, state))
+        action = int(rng.integers(env.num_actions))
+        possible = [k for k in range(env.outcomes) if env.probability(state, action, k) > 0]
+        state = env.next_state(state, action, int(rng.choice(possible)))
+        if env.is_terminal(state):
+            state = tuple(env.initial_states()[0][0])

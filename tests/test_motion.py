@@ -76,6 +76,21 @@ def test_with_motion_no_two_states_look_alike(name):
     assert name in MORE or len(states) <= MOST_STATES
 
 
+LARGE = ("breakout", "freeway", "game_2048", "mini_grid", "pocket_cube", "sliding_tiles", "sokoban")
+
+
+@pytest.mark.parametrize(
+    "name", [name for name in pharos.list_environments() if "/" in name and name.split("/")[0] not in LARGE]
+)
+def test_with_motion_complex_images_of_all_small_instances_differ(name):
+    """Those of LARGE are looked at cell by cell in tests/test_decoded_images.py."""
+    env = pharos.make(name)
+    states = reached(env)
+    size = (84, max(84, 4 * env.grid()[1] * (env.grid()[1] > 84)))  # chains of 101 places have no room in 84 pixels
+    assert len(states) <= MOST_STATES
+    assert different(interpreted(env, "complex_image", motion=True, size=size)(states)) == len(states)
+
+
 @pytest.mark.parametrize("name", SMALL)
 def test_without_motion_some_do(name):
     env = pharos.make(name, **SMALL[name])
