@@ -11,8 +11,8 @@ import pytest
 from rich.console import Console
 from typer.testing import CliRunner
 
-from pharos.cli import app, common
-from pharos.cli.common import parse_parameters, parse_size, parse_value
+from pharos.cli import answers, app
+from pharos.cli.options import parse_parameters, parse_size, parse_value
 from pharos.cli.play import Game
 from pharos.environments import classes, make
 from pharos.errors import ParameterError
@@ -196,8 +196,8 @@ def test_the_shell_completes_verbs_and_options(monkeypatch, words, expected):
 
 def test_a_progress_bar_says_what_happens_before_anything_is_counted(monkeypatch):
     screen = Console(file=io.StringIO(), force_terminal=True, width=120)
-    monkeypatch.setattr(common, "console", lambda stderr=False: screen)
-    with common.progress_bar("training", 20_000, "loading, building, compiling, first evaluation"):
+    monkeypatch.setattr(answers, "console", lambda stderr=False: screen)
+    with answers.progress_bar("training", 20_000, "loading, building, compiling, first evaluation"):
         pass
     assert "0/20000" in screen.file.getvalue() and "first evaluation" in screen.file.getvalue()
 

@@ -12,7 +12,7 @@ import pytest
 
 import pharos
 from pharos import compiling
-from pharos.cli.common import complete_target
+from pharos.cli.options import complete_target
 from pharos.environments import list_environments
 from pharos.environments.built_in import BUILT_IN
 

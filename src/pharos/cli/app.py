@@ -32,7 +32,7 @@ from pharos.cli import (
 from pharos.cli import (
     list as list_,
 )
-from pharos.cli.common import complain
+from pharos.cli.answers import complain
 from pharos.errors import DivergenceError, ParameterError, PharosError
 from pharos.installation import conflict
 

@@ -5,23 +5,17 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pharos.cli.common import (
-    Json,
-    MaxStates,
-    Memory,
-    Parameters,
-    TargetArgument,
-    Workers,
+from pharos.cli.answers import (
     bytes_of,
     compiling_fact,
     describe,
-    parse_environment,
-    parse_size,
     peak_memory_bytes,
     print_facts,
     print_json,
     size_text,
 )
+from pharos.cli.options import Json, MaxStates, Memory, Parameters, TargetArgument, Workers, parse_size
+from pharos.cli.target import parse_environment
 from pharos.compiling import Stopwatch
 
 if TYPE_CHECKING:

@@ -7,7 +7,8 @@ from typing import Annotated, Any
 
 import typer
 
-from pharos.cli.common import Json, bytes_of, console, print_json, size_text
+from pharos.cli.answers import bytes_of, console, print_json, size_text
+from pharos.cli.options import Json
 from pharos.errors import PharosError, StateSpaceLocked, UnknownName
 from pharos.wording import many
 

@@ -5,19 +5,9 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pharos.cli.common import (
-    Json,
-    MaxStates,
-    Memory,
-    Parameters,
-    Target,
-    TargetArgument,
-    Workers,
-    compiling_fact,
-    parse_size,
-    parse_target,
-    print_json,
-)
+from pharos.cli.answers import compiling_fact, print_json
+from pharos.cli.options import Json, MaxStates, Memory, Parameters, TargetArgument, Workers, parse_size
+from pharos.cli.target import Target, parse_target
 from pharos.compiling import Stopwatch
 from pharos.errors import ParameterError, StateSpaceTooLarge
 from pharos.wording import many

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pharos.cli.common import (
+from pharos.cli.answers import describe_chance, describe_discount, print_facts, print_json, progress_line
+from pharos.cli.options import (
     Gamma,
     Horizon,
     Json,
@@ -17,19 +18,13 @@ from pharos.cli.common import (
     Parameters,
     Random,
     Sticky,
-    Target,
     TargetArgument,
     Tolerance,
     Trust,
     Workers,
     build_options,
-    describe_chance,
-    describe_discount,
-    parse_target,
-    print_facts,
-    print_json,
-    progress_line,
 )
+from pharos.cli.target import Target, parse_target
 from pharos.errors import FileFormatError, ParameterError, UnknownName
 
 if TYPE_CHECKING:

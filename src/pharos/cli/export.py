@@ -6,17 +6,9 @@ from typing import Annotated
 
 import typer
 
-from pharos.cli.common import (
-    Gamma,
-    Json,
-    Parameters,
-    Random,
-    TargetArgument,
-    check_format,
-    parse_target,
-    print_facts,
-    print_json,
-)
+from pharos.cli.answers import print_facts, print_json
+from pharos.cli.options import Gamma, Json, Parameters, Random, TargetArgument, check_format
+from pharos.cli.target import parse_target
 from pharos.errors import UnknownName
 
 ENDINGS = {"bridge": ".npz", "drn": ".drn", "gym": ".json"}

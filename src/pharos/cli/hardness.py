@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from pharos import compiling
-from pharos.cli.common import (
+from pharos.cli.answers import compiling_fact, console, describe_chance, print_json, progress_line
+from pharos.cli.options import (
     Json,
     Lazy,
     MaxStates,
@@ -17,19 +18,14 @@ from pharos.cli.common import (
     TargetArgument,
     Workers,
     build_options,
-    compiling_fact,
-    console,
-    describe_chance,
     parse_parameters,
-    parse_target,
-    print_json,
-    progress_line,
 )
+from pharos.cli.target import parse_target
 from pharos.errors import ParameterError
 from pharos.wording import many
 
 if TYPE_CHECKING:
-    from pharos.cli.common import Target
+    from pharos.cli.target import Target
     from pharos.hardness import Representation
     from pharos.mdp import TabularMDP
 

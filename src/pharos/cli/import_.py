@@ -5,7 +5,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pharos.cli.common import Json, parse_parameters, print_facts, print_json
+from pharos.cli.answers import print_facts, print_json
+from pharos.cli.options import Json, parse_parameters
 from pharos.errors import ParameterError
 from pharos.wording import many
 

@@ -5,17 +5,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pharos.cli.common import (
-    Json,
-    Trust,
-    complain,
-    console,
-    print_facts,
-    print_json,
-    progress_bar,
-    progress_line,
-    size_text,
-)
+from pharos.cli.answers import complain, console, print_facts, print_json, progress_bar, progress_line, size_text
+from pharos.cli.options import Json, Trust
 from pharos.errors import ParameterError, PharosError
 from pharos.wording import many
 

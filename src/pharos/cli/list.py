@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pharos.cli.common import Json, complete_target, console, print_json
+from pharos.cli.answers import console, print_json
+from pharos.cli.options import Json, complete_target
 from pharos.environments import class_called, classes, declared_parameters, imported, named_instances
 from pharos.errors import UnknownName
 

@@ -5,7 +5,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pharos.cli.common import (
+from pharos.cli.answers import console, describe_chance, print_json, progress_bar, progress_line
+from pharos.cli.options import (
     Gamma,
     Json,
     MaxStates,
@@ -15,15 +16,10 @@ from pharos.cli.common import (
     TargetArgument,
     Workers,
     build_options,
-    console,
-    describe_chance,
     discount,
     parse_parameters,
-    parse_target,
-    print_json,
-    progress_bar,
-    progress_line,
 )
+from pharos.cli.target import parse_target
 from pharos.errors import ParameterError
 from pharos.wording import many
 

@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pharos.cli.common import Json, Parameters, TargetArgument, console, parse_target, print_json
+from pharos.cli.answers import console, print_json
+from pharos.cli.options import Json, Parameters, TargetArgument
 from pharos.cli.render import environment_of, find_state
+from pharos.cli.target import parse_target
 from pharos.errors import PharosError
 from pharos.explorer import keys_of
 from pharos.wording import many

@@ -5,7 +5,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from pharos.cli.common import (
+from pharos.cli.answers import describe_chance, print_json, progress_line
+from pharos.cli.evaluate import POLICIES, read_policy
+from pharos.cli.options import (
     Gamma,
     Horizon,
     Json,
@@ -14,13 +16,9 @@ from pharos.cli.common import (
     TargetArgument,
     Trust,
     check_format,
-    describe_chance,
     parse_parameters,
-    parse_target,
-    print_json,
-    progress_line,
 )
-from pharos.cli.evaluate import POLICIES, read_policy
+from pharos.cli.target import parse_target
 from pharos.errors import ParameterError
 
 if TYPE_CHECKING:

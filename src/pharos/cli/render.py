@@ -6,19 +6,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pharos.cli.common import (
-    Json,
-    Parameters,
-    Target,
-    TargetArgument,
-    check_format,
-    complain,
-    describe,
-    parse_parameters,
-    parse_target,
-    parse_value,
-    print_json,
-)
+from pharos.cli.answers import complain, describe, print_json
+from pharos.cli.options import Json, Parameters, TargetArgument, check_format, parse_parameters, parse_value
+from pharos.cli.target import Target, parse_target
 from pharos.errors import ParameterError, PharosError, UnknownName
 
 if TYPE_CHECKING:
@@ -168,7 +158,7 @@ def _optimal(target: Target, gamma: float, max_states: int | None) -> Callable[[
 
 def print_in_color(env: "Environment", state: Sequence[int]) -> None:
     """The text drawing, in the colours of the layers where the terminal has them."""
-    from pharos.cli.common import console
+    from pharos.cli.answers import console
     from pharos.drawing import colored_text
 
     console().print(colored_text(env, state))

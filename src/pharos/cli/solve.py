@@ -6,7 +6,15 @@ from typing import Annotated, Any
 import typer
 
 from pharos import compiling
-from pharos.cli.common import (
+from pharos.cli.answers import (
+    compiling_fact,
+    describe_chance,
+    describe_discount,
+    print_facts,
+    print_json,
+    progress_line,
+)
+from pharos.cli.options import (
     Gamma,
     Horizon,
     Json,
@@ -20,14 +28,8 @@ from pharos.cli.common import (
     Workers,
     build_options,
     check_format,
-    compiling_fact,
-    describe_chance,
-    describe_discount,
-    parse_target,
-    print_facts,
-    print_json,
-    progress_line,
 )
+from pharos.cli.target import parse_target
 from pharos.wording import many
 
 

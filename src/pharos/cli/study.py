@@ -11,7 +11,8 @@ from typing import Annotated, Any
 
 import typer
 
-from pharos.cli.common import Json, Trust, complain, console, parse_parameters, print_json, progress_line
+from pharos.cli.answers import complain, console, print_json, progress_line
+from pharos.cli.options import Json, Trust, parse_parameters
 from pharos.errors import UnknownName
 from pharos.observations import title
 from pharos.wording import many

@@ -10,23 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from pharos import compiling
-from pharos.cli.common import (
-    Json,
-    Lazy,
-    Parameters,
-    Random,
-    Sticky,
-    TargetArgument,
-    compiling_fact,
-    complain,
-    describe_chance,
-    parse_environment,
-    parse_parameters,
-    parse_seeds,
-    print_facts,
-    print_json,
-    progress_bar,
-)
+from pharos.cli.answers import compiling_fact, complain, describe_chance, print_facts, print_json, progress_bar
+from pharos.cli.options import Json, Lazy, Parameters, Random, Sticky, TargetArgument, parse_parameters, parse_seeds
+from pharos.cli.target import parse_environment
 from pharos.errors import ParameterError
 from pharos.wording import many
 

@@ -6,17 +6,9 @@ from typing import Annotated, Any
 
 import typer
 
-from pharos.cli.common import (
-    Json,
-    Random,
-    Sticky,
-    parse_environment,
-    parse_seeds,
-    parse_value,
-    print_facts,
-    print_json,
-    progress_bar,
-)
+from pharos.cli.answers import print_facts, print_json, progress_bar
+from pharos.cli.options import Json, Random, Sticky, parse_seeds, parse_value
+from pharos.cli.target import parse_environment
 from pharos.errors import ParameterError
 
 

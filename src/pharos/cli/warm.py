@@ -5,16 +5,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pharos.cli.common import (
-    Json,
-    Random,
-    Sticky,
-    complete_target,
-    parse_target,
-    print_facts,
-    print_json,
-    progress_line,
-)
+from pharos.cli.answers import print_facts, print_json, progress_line
+from pharos.cli.options import Json, Random, Sticky, complete_target
+from pharos.cli.target import parse_target
 from pharos.compiling import Stopwatch
 from pharos.errors import StateSpaceTooLarge
 from pharos.wording import many

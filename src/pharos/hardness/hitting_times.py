@@ -26,14 +26,13 @@ linear solver itself has no correct digit (J beyond 1e15), the bounds of plain f
 
 import math
 from copy import copy
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy import sparse
-from scipy.sparse.linalg import splu
 
 from pharos.hardness.choices import Choices
+from pharos.hardness.hitting_bounds import PRODUCT, Bounds, added, certified
+from pharos.hardness.hitting_equations import Factors, factors_of, without_common
 from pharos.hardness.interval import Spending
 from pharos.kernels import hitting
 
@@ -59,44 +58,6 @@ STALLS = 3
 REFINEMENTS = 12
 # Linear solves without a proper policy as result, one after the other, after which the bounds stand as they are.
 FAILURES = 3
-# Relative rounding of a product of a bound and a factor.
-PRODUCT = 1 + 2.0**-50
-
-
-@dataclass(frozen=True)
-class Bounds:
-    """Bounds of all hitting times of a target: J* lies between J times `low` and J times `high`.
-
-    largest: the largest J. limited: whether floats are too short for closer bounds, so that more time would not help.
-    """
-
-    low: float
-    high: float
-    largest: float
-    limited: bool = False
-
-    @property
-    def lower(self) -> float:
-        """Lower bound of the largest hitting time."""
-        return self.largest * self.low / PRODUCT
-
-    @property
-    def upper(self) -> float:
-        """Upper bound of the largest hitting time."""
-        return self.largest * self.high * PRODUCT
-
-    @property
-    def apart(self) -> float:
-        """Upper divided by lower bound, minus 1."""
-        return self.high / self.low - 1 if self.low > 0 else math.inf
-
-    def meets(self, tolerance: float) -> bool:
-        """Whether the bounds are within `tolerance` of each other."""
-        return math.isfinite(self.high) and self.high - self.low <= tolerance * self.high
-
-    def but_limited(self) -> "Bounds":
-        """The same bounds, as close as floats allow."""
-        return Bounds(self.low, self.high, self.largest, True)
 
 
 class HittingTimes:
@@ -106,7 +67,7 @@ class HittingTimes:
         matrix = choices.matrix
         self.choices = choices
         self.support = (matrix.indptr.astype(np.int64), matrix.indices.astype(np.int64), choices.num_actions)
-        self.arrays = (*_without_common(matrix, choices.num_actions), choices.alike)
+        self.arrays = (*without_common(matrix, choices.num_actions), choices.alike)
         first, previous = choices.reversed
         self.back = (first.astype(np.int64), previous.astype(np.int64))
         self.members = np.argsort(choices.underlying, kind="stable")
@@ -161,7 +122,7 @@ class HittingTimes:
     def bounds(self, j: np.ndarray, count: int) -> Bounds:
         """Bounds by the residuals of J; the greedy policy stands in `policy` then."""
         above, below, largest = hitting.residuals(*self.arrays, self.goal, self.order, count, j, self.policy)
-        return _certified(above, below, largest)
+        return certified(above, below, largest)
 
     def sweep(self, j: np.ndarray, count: int, sweeps: int, enough: float, spending: Spending) -> Bounds:
         """Sweeps in place; ends early where the upper bound is at most `enough`, the budget ends, or J does not
@@ -230,26 +191,13 @@ class HittingTimes:
         """Most nodes at the same distance from the target."""
         return int(np.bincount(self.distance[self.order[:count]]).max(initial=0))
 
-    def _factored(self, count: int) -> "tuple[np.ndarray, _Factors] | None":
+    def _factored(self, count: int) -> "tuple[np.ndarray, Factors] | None":
         """(inner nodes, factors of 1 - P of the greedy policy); None where no policy is proper. Rows are made to sum to
         1."""
         nodes = self.order[:count]
         inner = nodes[~self.goal[nodes]]
-        alike = self.choices.alike[inner]
-        first, unknown = _numbered_once(alike)
-        place = np.full(len(self.goal), first.size)  # what leads elsewhere is left out of the equations
-        place[inner] = unknown
-        solved = inner[first]
-        rows = sparse.csr_matrix(self.choices.matrix[solved * self.choices.num_actions + self.policy[solved]])
-        row, column = np.repeat(np.arange(first.size), np.diff(rows.indptr)), place[rows.indices]
-        data = np.where(row == column, 0.0, rows.data)
-        leaving = np.bincount(row, data, first.size)
-        inside = column < first.size
-        matrix = sparse.coo_matrix((data[inside], (row[inside], column[inside])), shape=(first.size, first.size))
-        try:
-            return inner, _Factors(splu(sparse.csc_matrix(sparse.diags(leaving) - matrix)), first, unknown)
-        except RuntimeError:  # singular
-            return None
+        factors = factors_of(self.choices, self.policy, inner)
+        return None if factors is None else (inner, factors)
 
     def _evaluate(self, count: int) -> np.ndarray | None:
         """The hitting times of the greedy policy; None where it is not proper."""
@@ -281,7 +229,7 @@ class HittingTimes:
             correction = factors.solve(residual[inner])
             if not np.isfinite(correction).all():
                 break
-            high[inner], low[inner] = _added(high[inner], low[inner], correction)
+            high[inner], low[inner] = added(high[inner], low[inner], correction)
             if not (high[inner] > 0).all():
                 break
             if np.abs(correction).max(initial=0.0) > 1e-3 * tolerance * high[inner].max(initial=0.0):
@@ -302,12 +250,12 @@ class HittingTimes:
         cost = 2 * (np.abs(residual[inner]) + error[inner])
         margin = np.zeros_like(high)
         margin[inner] = np.maximum(factors.solve(cost), 0.0)
-        _, _, (above, _) = self._residuals(*_added(high, low, margin), count)
-        upper = _certified(above, 0.0, 1.0).high
+        _, _, (above, _) = self._residuals(*added(high, low, margin), count)
+        upper = certified(above, 0.0, 1.0).high
         ceiling = np.nextafter(high + margin, math.inf) * PRODUCT
         ceiling[self.goal] = 0.0
         for _ in range(REFINEMENTS):
-            below_high, below_low = _added(high, low, -margin)
+            below_high, below_low = added(high, low, -margin)
             residual, error, (_, below) = self._residuals(below_high, below_low, count)
             if below <= 1e-9:
                 break
@@ -318,7 +266,7 @@ class HittingTimes:
             if not np.isfinite(more).all():
                 break
             margin[inner] += np.maximum(more, 0.0)
-        lower = _certified(0.0, below, 1.0).low
+        lower = certified(0.0, below, 1.0).low
         ratio = float(np.min(below_high[inner] / ceiling[inner], initial=1.0)) / PRODUCT
         return Bounds(max(ratio * lower, 0.0), upper, float(ceiling[inner].max(initial=0.0)), True), ceiling
 
@@ -330,76 +278,3 @@ class HittingTimes:
         residual, error = np.zeros_like(high), np.zeros_like(high)
         arrays = (high, low, self.policy, residual, error)
         return residual, error, hitting.residuals_of_pairs(*self.arrays, self.goal, self.order, count, *arrays)
-
-
-@dataclass(frozen=True)
-class _Factors:
-    """Factors of a linear system in which nodes that are alike are one unknown.
-
-    first: (unknowns,) the first node of each. unknown: (inner nodes,) which one a node is.
-    """
-
-    factors: Any
-    first: np.ndarray
-    unknown: np.ndarray
-
-    def solve(self, right: np.ndarray) -> np.ndarray:
-        """(inner nodes,) the solution, given the right side."""
-        solution: np.ndarray = self.factors.solve(right[self.first])[self.unknown]
-        return solution
-
-
-def _numbered_once(alike: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(first member of each group, (N,) its group): nodes that are alike are one group, every other one a group."""
-    opens = ~alike
-    if alike.any():
-        opens[alike.argmax()] = True
-    group = np.cumsum(opens) - 1
-    if alike.any():
-        group[alike] = group[alike.argmax()]
-    return np.flatnonzero(opens), group
-
-
-def _certified(above: float, below: float, largest: float) -> Bounds:
-    """The bounds that follow from T J - J <= above and J - T J <= below."""
-    high = PRODUCT / (1 - above) if above < 1 - 1e-9 else math.inf
-    return Bounds(1 / ((1 + below) * PRODUCT), high, largest)
-
-
-def _added(high: np.ndarray, low: np.ndarray, more: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """high + low + more as two floats, the first of which is the nearest to the sum. Source: Knuth's and Dekker's
-    sums."""
-    total = high + more
-    part = total - high
-    rest = (high - (total - part)) + (more - part) + low
-    result = total + rest
-    return result, rest - (result - total)
-
-
-def _without_common(matrix: Any, num_actions: int) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
-    """What the actions of a node have in common is added up once: under random and sticky actions most of a row.
-
-    Returns:
-        ((first, node, weight) of the rows without it, one for each action; (first, node, weight) of it, one for each
-        node).
-    """
-    nodes = matrix.shape[0] // num_actions
-    row = np.repeat(np.arange(matrix.shape[0]), np.diff(matrix.indptr))
-    pairs, place, times = np.unique(
-        (row // num_actions) * np.int64(nodes) + matrix.indices, return_inverse=True, return_counts=True
-    )
-    least = np.full(len(pairs), np.inf)
-    np.minimum.at(least, place, matrix.data)
-    least[times < num_actions] = 0.0
-    rest = matrix.data - least[place]
-    distinct = rest > 8 * hitting.UNIT * matrix.data  # the kernels count as much as rounding of `least`
-    if distinct.sum() + np.count_nonzero(least) >= matrix.nnz:  # nothing gained
-        least[:] = 0.0
-        rest, distinct = matrix.data, np.ones(matrix.nnz, np.bool_)
-    shared = least > 0
-    first = np.concatenate([[0], np.cumsum(np.bincount(row[distinct], minlength=matrix.shape[0]))])
-    always = np.concatenate([[0], np.cumsum(np.bincount(pairs[shared] // nodes, minlength=nodes))])
-    return (
-        (first.astype(np.int64), matrix.indices[distinct].astype(np.int64), rest[distinct]),
-        (always.astype(np.int64), (pairs[shared] % nodes).astype(np.int64), least[shared]),
-    )

@@ -13,13 +13,14 @@ from pharos.mdp.dynamics import Dynamics, Order
 from pharos.mdp.matrices import Matrices, expected_rewards, transitions_of
 from pharos.mdp.outcome_arrays import checked_outcomes, compact_outcomes
 from pharos.mdp.outcome_table import OutcomeTable
+from pharos.mdp.reachable import pairs_within, restricted_to
 from pharos.mdp.rewards import Rewards
 from pharos.mdp.table import Table
 from pharos.mdp.tabular_arrays import (
     check_gamma,
     check_horizon,
     checked_next_states,
-    mean_rewards,
+    expected_over_outcomes,
     rewards_of_shape,
     start_of,
     terminal_states,
@@ -126,17 +127,9 @@ class TabularMDP:
             ParameterError: as in `from_arrays`, or a probability is not in [0, 1] or a row does not sum to 1.
         """
         table, chances = checked_outcomes(successors, probabilities)
-        paid = np.asarray(rewards, np.float64)
-        if paid.shape == table.shape:
-            paid = mean_rewards(paid, chances)
-        elif paid.shape != table.shape[:2]:
-            raise ParameterError(
-                f"rewards have shape {paid.shape}; expected {table.shape[:2]}, one for each state and action, or "
-                f"{table.shape}, one for each outcome"
-            )
         return TabularMDP.from_outcome_table(
             OutcomeTable(**compact_outcomes(table, chances)),
-            paid,
+            expected_over_outcomes(rewards, chances),
             gamma=gamma,
             initial=initial,
             horizon=horizon,
@@ -301,29 +294,7 @@ class TabularMDP:
         Which actions can be executed after which, chance says: where every action is a repetition, those of the first
         step go on. Start states without a previous action are not among them.
         """
-        if self.chance.executes_any:
-            if steps == 0:
-                return np.zeros((self.num_states, self.num_actions), np.bool_)
-            before = self.states_within(None if steps is None else steps - 1) & ~np.asarray(self.terminal)
-            return self.dynamics.arrivals(np.flatnonzero(before))
-        is_reached = np.zeros((self.num_states + 1, self.num_actions), np.bool_)
-        is_reached[-1] = True
-        states, actions = (
-            np.repeat(self.starts, self.num_actions),
-            np.tile(np.arange(self.num_actions), len(self.starts)),
-        )
-        level = 0
-        while len(states) and (steps is None or level < steps):
-            live = ~np.asarray(self.terminal)[states]
-            states, actions = states[live], actions[live]
-            outcomes = self.dynamics.outcomes(states, actions)
-            pairs = np.unique(outcomes.states * self.num_actions + actions[outcomes.which])
-            states, actions = np.divmod(pairs, self.num_actions)
-            new = ~is_reached[states, actions]
-            states, actions = states[new], actions[new]
-            is_reached[states, actions] = True
-            level += 1
-        return is_reached[:-1]
+        return pairs_within(self, steps)
 
     # Variants -------------------------------------------------------------------------------------------------------
 
@@ -405,19 +376,7 @@ class TabularMDP:
         is_reached[self.start_states] = True
         if is_reached.all():
             return self
-        states = np.flatnonzero(is_reached)
-        number = np.full(self.num_states, -1, np.int64)
-        number[states] = np.arange(len(states))
-        return replace(
-            self,
-            dynamics=self.dynamics.restricted_to(states),
-            reward_table=self.reward_table.of(states),
-            staying=None if self.staying is None else partial(_some, self.staying, states),
-            terminal=np.asarray(self.terminal[states]),
-            start_states=number[self.start_states],
-            folder=None,
-            age=None,
-        )
+        return restricted_to(self, np.flatnonzero(is_reached))
 
     def __repr__(self) -> str:
         kind = "" if self.dynamics.is_deterministic else "general, "
@@ -431,7 +390,3 @@ class TabularMDP:
 
 def _as_is(rewards: Rewards) -> Rewards:
     return rewards
-
-
-def _some(rewards: Callable[[], Rewards], states: np.ndarray) -> Rewards:
-    return rewards().of(states)

@@ -51,16 +51,28 @@ def rewards_of_shape(rewards: Any, shape: tuple[int, ...]) -> Rewards:
     return Rewards.from_array(array)
 
 
-def mean_rewards(rewards: np.ndarray, probabilities: np.ndarray) -> np.ndarray:
-    """(S, A), from the rewards of outcomes (S, A, K); those of impossible ones may be anything."""
+def expected_over_outcomes(rewards: Any, probabilities: np.ndarray) -> np.ndarray:
+    """(S, A) expected rewards: those given, or the mean of those of the outcomes, (S, A, K).
+
+    Raises:
+        ParameterError: they have neither shape, or one of a possible outcome is not finite.
+    """
+    array, shape = np.asarray(rewards, np.float64), probabilities.shape
+    if array.shape == shape[:2]:
+        return array
+    if array.shape != shape:
+        raise ParameterError(
+            f"rewards have shape {array.shape}; expected {shape[:2]}, one for each state and action, or {shape}, one "
+            "for each outcome"
+        )
     possible = probabilities > 0
-    wrong = possible & ~np.isfinite(rewards)
+    wrong = possible & ~np.isfinite(array)
     if wrong.any():
         s, a, k = map(int, np.argwhere(wrong)[0])
         raise ParameterError(
-            f"the reward of state {s}, action {a}, outcome {k} is {rewards[s, a, k]}; expected a finite number"
+            f"the reward of state {s}, action {a}, outcome {k} is {array[s, a, k]}; expected a finite number"
         )
-    return (probabilities * np.where(possible, rewards, 0.0)).sum(axis=2)
+    return (probabilities * np.where(possible, array, 0.0)).sum(axis=2)
 
 
 def terminal_states(terminal: Any, default: np.ndarray, allowed: np.ndarray) -> np.ndarray:

@@ -1,0 +1,164 @@
+"""The two ways of answering, JSON and tables, with progress and complaints on standard error, and facts in words."""
+
+import contextlib
+import dataclasses
+import json
+import math
+import os
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pharos import compiling
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from pharos.environments import Environment
+
+NOTABLE_SECONDS = 0.2  # of compiling, beside those of work
+
+
+def print_json(answer: Mapping[str, Any]) -> None:
+    """One JSON object on standard output; what JSON cannot say (infinity, not a number) is null."""
+    print(json.dumps(_plain(answer), allow_nan=False))
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple | set | frozenset):
+        return [_plain(item) for item in value]
+    if hasattr(value, "tolist"):  # numbers and arrays of NumPy
+        return _plain(value.tolist())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if value is None or isinstance(value, bool | int | str):
+        return value
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return _plain(dataclasses.asdict(value))
+    if hasattr(value, "to_dict"):
+        return _plain(value.to_dict())
+    return str(value)
+
+
+def console(*, stderr: bool = False) -> "Console":
+    """A Rich console; wide where nobody looks, so that a pipe gets whole lines."""
+    from rich.console import Console
+
+    stream = sys.stderr if stderr else sys.stdout
+    width = None if stream.isatty() or "COLUMNS" in os.environ else 160
+    return Console(stderr=stderr, width=width, highlight=False)
+
+
+@contextlib.contextmanager
+def progress_line(what: str) -> Iterator[Callable[[str], None]]:
+    """Report progress in a line on standard error, on a terminal; removed at the end."""
+    if not sys.stderr.isatty():
+        yield lambda _: None
+        return
+    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+    columns = (SpinnerColumn(), TextColumn(what), TextColumn("{task.fields[text]}"), TimeElapsedColumn())
+    with Progress(*columns, console=console(stderr=True), transient=True) as bar:
+        task = bar.add_task(what, total=None, text="")
+        yield lambda text: bar.update(task, text=text)
+
+
+@contextlib.contextmanager
+def progress_bar(what: str, total: int, before: str = "") -> Iterator[Callable[[int, str], None] | None]:
+    """A bar on standard error, on a terminal: call it with how much is done and a text. None elsewhere.
+
+    Args:
+        before: what happens until the first call.
+    """
+    screen = console(stderr=True)
+    if not screen.is_terminal:
+        yield None
+        return
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[text]}"), TimeRemainingColumn())
+    with Progress(*columns, console=screen, transient=True) as bar:
+        task = bar.add_task(what, total=total, text=before)
+        yield lambda done, text: bar.update(task, completed=done, text=text)
+
+
+def print_facts(title: str, facts: Sequence[tuple[str, object]]) -> None:
+    """A table of two columns: what, and how much."""
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table(show_header=False, box=None, pad_edge=False)
+    table.add_column(style="cyan", no_wrap=True)
+    table.add_column(overflow="fold")
+    for name, value in facts:
+        table.add_row(name, escape(str(value)))
+    to = console()
+    to.print(f"[bold]{escape(title)}[/bold]", soft_wrap=True)
+    to.print(table)
+
+
+def describe_chance(
+    sticky: float, random: float, of_the_world: bool = False, lazy: float = 0.0, noise: float = 0.0, delay: int = 0
+) -> str:
+    """Chance in words.
+
+    Args:
+        of_the_world: whether executing an action may have several outcomes itself.
+        noise, delay: of the rewards that are paid.
+    """
+    parts = ["of the world"] * of_the_world
+    parts += [f"sticky actions {sticky:g}"] * bool(sticky) + [f"random actions {random:g}"] * bool(random)
+    parts += [f"lazy actions {lazy:g}"] * bool(lazy) + [f"reward noise {noise:g}"] * bool(noise)
+    parts += [f"rewards {delay} steps late"] * bool(delay)
+    return ", ".join(parts) or "none"
+
+
+def describe_discount(gamma: float, horizon: int | None) -> str:
+    """Discount and horizon in words."""
+    return f"{gamma:g}, {'no horizon' if horizon is None else f'horizon {horizon}'}"
+
+
+def size_text(count: float) -> str:
+    """Bytes for people: 1.5 GiB."""
+    for unit in ("B", "KiB", "MiB", "GiB"):
+        if count < 1024:
+            return f"{count:.0f} {unit}" if unit == "B" else f"{count:.1f} {unit}"
+        count /= 1024
+    return f"{count:.1f} TiB"
+
+
+def describe(environment: "Environment") -> str:
+    """An environment in one line: `breakout height=12 columns=8`, as the command line writes it."""
+    words = (f"{name}={_written(value)}" for name, value in environment.parameters.items())
+    return " ".join((environment.name, *words))
+
+
+def _written(value: Any) -> str:
+    return json.dumps(value, separators=(",", ":")) if isinstance(value, tuple | list) else str(value)
+
+
+def compiling_fact() -> list[tuple[str, str]]:
+    """What this command has spent on compiling, a fact or none: where little was compiled there is nothing to tell."""
+    seconds = compiling.seconds()
+    return [("compiling", f"{seconds:.1f} s, kept for the next time")] if seconds >= NOTABLE_SECONDS else []
+
+
+def peak_memory_bytes() -> int:
+    """The most memory that this process has held so far."""
+    import resource
+
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024
+
+
+def bytes_of(folder: Path) -> int:
+    """Bytes of the files in a folder and below."""
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+
+
+def complain(message: object) -> None:
+    """One line on standard error."""
+    print(f"pharos: {' '.join(str(message).split())}", file=sys.stderr)
