@@ -32,6 +32,7 @@ __all__ = [
     "philox",
     "refinement",
     "stepping",
+    "symmetric",
     "symmetry",
     "tails",
     "tangent",
