@@ -79,14 +79,14 @@ def evaluate(
         else:
             values["given"] = _worth(solution_of(mdp, policy, decisions, tolerance))
     best, uniform, worst = (values[name].value for name in POLICIES)
-    given = values["given"]
-    value, spread = given.value, best - uniform
+    worth = values["given"]
+    value, spread = worth.value, best - uniform
     answer = {
         "policy": policy,
         "value_at_start": value,
-        "error_bound": given.error_bound,
-        "exact": given.episodes == 0,
-        "episodes": given.episodes,
+        "error_bound": worth.error_bound,
+        "exact": worth.episodes == 0,
+        "episodes": worth.episodes,
         "regret": best - value,
         "normalized_regret": (best - value) / spread if spread > 4 * tolerance else None,
         "regret_relative_to_worst": (best - value) / (best - worst) if best - worst > 4 * tolerance else None,
@@ -112,7 +112,7 @@ def evaluate(
             ("normalized regret", "-" if relative is None else f"{relative:.6g}  (0: optimal, 1: uniform)"),
             ("relative to worst", "-" if against_worst is None else f"{against_worst:.6g}  (0: optimal, 1: worst)"),
             ("optimal, uniform, worst", f"{best:.8g}, {uniform:.8g}, {worst:.8g}"),
-            ("error at most", f"{max(each.error_bound for each in values.values()):.2g}{_estimated(given)}"),
+            ("error at most", f"{max(each.error_bound for each in values.values()):.2g}{_estimated(worth)}"),
             ("discount", describe_discount(mdp.gamma, mdp.horizon)),
             ("chance", describe_chance(sticky, random, mdp.dynamics.has_chance, lazy)),
         ],
@@ -133,8 +133,8 @@ def _worth(solution: "Solution") -> Worth:
     return Worth(solution.value_at_start, solution.error_bound, solution.seconds)
 
 
-def _estimated(given: Worth) -> str:
-    return f" with a probability of 99 % (estimated from {given.episodes:,} episodes)" if given.episodes else ""
+def _estimated(worth: Worth) -> str:
+    return f" with a probability of 99 % (estimated from {worth.episodes:,} episodes)" if worth.episodes else ""
 
 
 def _sees_frames(goal: Target, decisions: "Given") -> bool:
@@ -155,8 +155,8 @@ def _worth_over_histories(goal: Target, mdp: "TabularMDP", decisions: "Given", *
     agent, seeing = decisions
     began = time.perf_counter()
     task = Task(goal.found_environment(), **chance, **seeing, gamma=mdp.gamma, horizon=mdp.horizon)  # type: ignore[arg-type]
-    found = evaluate_agent(agent, task)
-    return Worth(found.value, found.error_bound, time.perf_counter() - began, found.episodes)
+    evaluation = evaluate_agent(agent, task)
+    return Worth(evaluation.value, evaluation.error_bound, time.perf_counter() - began, evaluation.episodes)
 
 
 def solution_of(mdp: "TabularMDP", policy: str, decisions: "Given | None", tolerance: float) -> "Solution":

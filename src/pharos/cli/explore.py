@@ -113,8 +113,8 @@ def _learnt(policy: str | None, trust: bool) -> "Learnt | None":
         return None
     from pharos.explorer import Learnt
 
-    found, seeing = read_policy(policy, trust=trust)
-    return Learnt(found, Path(policy).name, **seeing)
+    agent, seeing = read_policy(policy, trust=trust)
+    return Learnt(agent, Path(policy).name, **seeing)
 
 
 def _exploration(goal: Target, building: dict[str, Any], **options: Any) -> "Exploration":

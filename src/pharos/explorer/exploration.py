@@ -252,13 +252,13 @@ class Exploration:
         self._check_policy(policy)
         at: tuple[int | None, int | None] = self._checked(state, previous)
         steps: list[list[Any]] = []
-        seen: set[tuple[int | None, int | None]] = set()
+        pairs: set[tuple[int | None, int | None]] = set()
         why = "limit"
         while len(steps) < LONGEST_PATH:
             if at[0] is None or self.mdp.terminal[at[0]]:
                 why = "end"
                 break
-            seen.add(at)
+            pairs.add(at)
             here = np.array([at[0]])
             chosen = self.chosen_values(OPTIMAL, here, at[1])
             chances = self.chances(policy, here, chosen, at[1])
@@ -267,7 +267,7 @@ class Exploration:
                 break
             action = int(chances[0].argmax())
             outcomes = self._outcomes(at[0], self._executed(at[1])[action])
-            new = next((each for each in outcomes if (each[0], each[1]) not in seen), None)
+            new = next((each for each in outcomes if (each[0], each[1]) not in pairs), None)
             if new is None:
                 why = "circle"
                 break

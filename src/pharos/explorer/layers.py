@@ -26,9 +26,9 @@ class Layers:
             ends = _ends(mdp.dynamics, len(mdp.starts))
         else:
             self._of_states = _distances(mdp)
-            known = np.flatnonzero(self._of_states >= 0)
-            self._order = known[np.argsort(self._of_states[known], kind="stable")]
-            ends = np.cumsum(np.bincount(self._of_states[known]))
+            states = np.flatnonzero(self._of_states >= 0)
+            self._order = states[np.argsort(self._of_states[states], kind="stable")]
+            ends = np.cumsum(np.bincount(self._of_states[states]))
         self._ends = ends
         self.counts = np.diff(ends, prepend=0)
 

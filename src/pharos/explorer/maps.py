@@ -139,7 +139,7 @@ class _Cells:
         else:
             means = self.sum / np.maximum(self.known, 1)
             shown = {MEAN: means, LEAST: self.least, MOST: self.most, SUM: self.sum}[how]
-        listed = [number(value) if known else None for value, known in zip(shown, is_known, strict=True)]
+        listed = [number(value) if there else None for value, there in zip(shown, is_known, strict=True)]
         numbers = shown[is_known]
         return {
             "cells": self._rows(listed),
@@ -169,13 +169,13 @@ def about_maps(world: Exploration) -> dict[str, Any]:
 def _first_axes(axes: Mapping[str, Axis]) -> list[str]:
     """The axes x, y that are drawn first: what is called a column and a row, else the two longest."""
     names = list(axes)
-    found = []
+    usual = []
     for words in reversed(GROUPS):
         parts = ((name, name.lower().replace("[", "_").split("_")) for name in names)
-        found.append(next((name for name, each in parts if words[0] in each or words[1] in each), None))
+        usual.append(next((name for name, each in parts if words[0] in each or words[1] in each), None))
     longest = sorted(names, key=lambda name: -axes[name].count)
-    x = found[0] or next((name for name in longest if name != found[1]), names[0])
-    y = found[1] or next((name for name in longest if name != x), x)
+    x = usual[0] or next((name for name in longest if name != usual[1]), names[0])
+    y = usual[1] or next((name for name in longest if name != x), x)
     return [x, y]
 
 

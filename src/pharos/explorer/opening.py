@@ -93,9 +93,9 @@ def explore(
         ParameterError: there is no such target, the policy does not fit, the port is taken, or the space is too large
             for a file. DivergenceError: gamma is 1, and the value may be infinite.
     """
-    given = None if policy is None else Learnt(policy, observation=observation)
+    agent = None if policy is None else Learnt(policy, observation=observation)
     chance = ChanceSetting(sticky, random, lazy)
-    world = exploration_of(target, learnt=given, gamma=gamma, chance=chance, trust=trust)
+    world = exploration_of(target, learnt=agent, gamma=gamma, chance=chance, trust=trust)
     if out is not None:
         return write(world, out)
     explorer = Explorer(world, port=port)
@@ -200,8 +200,8 @@ def described(chance: ChanceSetting, mdp: TabularMDP) -> str:
 
 def _title(env: Environment) -> str:
     """The environment as a command would name it; parameters that were not given are left out."""
-    given = {name: value for name, value in env.parameters.items() if value is not None and value != ()}
-    return " ".join([env.name, *(f"{name}={_short(value)}" for name, value in given.items())])
+    parameters = {name: value for name, value in env.parameters.items() if value is not None and value != ()}
+    return " ".join([env.name, *(f"{name}={_short(value)}" for name, value in parameters.items())])
 
 
 def _short(value: object) -> str:
