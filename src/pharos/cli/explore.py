@@ -6,7 +6,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pharos.cli.common import (
+from pharos.cli.answers import complain, print_json, progress_line
+from pharos.cli.evaluate import read_policy
+from pharos.cli.options import (
     Json,
     Lazy,
     MaxStates,
@@ -14,18 +16,13 @@ from pharos.cli.common import (
     Parameters,
     Random,
     Sticky,
-    Target,
     TargetArgument,
     Trust,
     Workers,
     build_options,
     check_format,
-    complain,
-    parse_target,
-    print_json,
-    progress_line,
 )
-from pharos.cli.evaluate import read_policy
+from pharos.cli.target import Target, parse_target
 from pharos.errors import ParameterError
 
 if TYPE_CHECKING:
