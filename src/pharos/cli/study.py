@@ -13,7 +13,7 @@ import typer
 
 from pharos.cli.answers import complain, console, print_json, progress_line
 from pharos.cli.options import Json, Trust, parse_parameters
-from pharos.errors import UnknownName
+from pharos.errors import ParameterError, UnknownName
 from pharos.observations import title
 from pharos.wording import many
 
@@ -98,6 +98,10 @@ def run(
     address: Annotated[
         str | None, typer.Option("--address", help="With --on ray: of the cluster; one is started when not given.")
     ] = None,
+    to: Annotated[
+        str | None,
+        typer.Option("--log", metavar="tensorboard|wandb", help="Write curves there as runs finish; see `study log`."),
+    ] = None,
     trust: Trust = False,
     json: Json = False,
 ) -> None:
@@ -120,7 +124,11 @@ def run(
         )
         _print_jobs([str(job.job_id) for job in jobs], json)
         return
-    with _progress() as progress, _termination():
+    if to is not None and on == "slurm":
+        raise ParameterError("--log goes with --on local or ray; write those of a cluster by `pharos study log`")
+    logs = None if to is None else study.RunLog(opened, place, to)
+    with _progress() as shown, _termination():
+        progress = shown if logs is None else _logging(logs, shown)
         if on == "ray":
             end = study.run_on_ray(
                 opened,
@@ -144,9 +152,25 @@ def run(
                 foretold=_say,
                 device=device,
             )
+    if logs is not None:
+        logs.update()
     _answer(end, json)
     if end.failed:
         raise typer.Exit(EXIT_FAILED)
+
+
+def _logging(logs: Any, progress: Callable[[Any], None]) -> Callable[[Any], None]:
+    """Progress that also writes the curves of runs that have finished, every LINE_SECONDS at most."""
+    written = time.monotonic()
+
+    def tell(status: Any) -> None:
+        nonlocal written
+        progress(status)
+        if time.monotonic() - written > LINE_SECONDS:
+            logs.update()
+            written = time.monotonic()
+
+    return tell
 
 
 def _say(forecast: Any) -> None:
@@ -199,6 +223,36 @@ def report(
     for note in written.notes:
         complain(note)
     print(written.html)
+
+
+@app.command("log")
+def log(
+    spec: SpecArgument,
+    to: Annotated[str, typer.Option("--to", metavar="tensorboard|wandb", help="Where the curves are looked at.")],
+    out: Out = None,
+    project: Annotated[
+        str | None, typer.Option("--project", help="Of Weights & Biases; the name of the study when not given.")
+    ] = None,
+    offline: Annotated[
+        bool, typer.Option("--offline", help="Weights & Biases writes files for `wandb sync`, and sends nothing.")
+    ] = False,
+    trust: Trust = False,
+    json: Json = False,
+) -> None:
+    """Write the curves of finished runs, exact values and regret, for TensorBoard or Weights & Biases."""
+    from pharos import study
+
+    if to == "tensorboard" and (project is not None or offline):
+        raise ParameterError("--project and --offline are of Weights & Biases; expected them with --to wandb")
+    with progress_line("log") as tell:
+        opened, place = study.opened(spec, out, trust=trust or None)
+        number = study.RunLog(opened, place, to, project=project, offline=offline).update(tell)
+    if json:
+        print_json({"to": to, "folder": str(place / to), "added": number})
+        return
+    how = f"tensorboard --logdir {place / to}" if to == "tensorboard" else f"wandb sync {place / to}/offline-run-*"
+    remedy = f"; `{how}` {'shows' if to == 'tensorboard' else 'sends'} them" if to == "tensorboard" or offline else ""
+    print(f"{place / to}: {many(number, 'run')} added{remedy}")
 
 
 @app.command("predict")

@@ -17,6 +17,7 @@ from pharos.study.clusters import run_on_ray, submit
 from pharos.study.execution import Status, opened, run, status
 from pharos.study.findings import findings
 from pharos.study.forecast import Forecast
+from pharos.study.logs import LOGGERS, RunLog, log
 from pharos.study.paper import paper_regressions, paper_returns
 from pharos.study.predictions import PREDICTORS, predict, read_predictions, write_predictions
 from pharos.study.regression import Fit, aggregate_r_squared, fit, fit_models, leave_one_class_out_r_squared
@@ -27,6 +28,7 @@ from pharos.study.tables import cells, curves, hardness_table, paper_instance, t
 from pharos.study.unseen_classes import outcomes, validation
 
 __all__ = [
+    "LOGGERS",
     "PREDICTORS",
     "Comparison",
     "Estimate",
@@ -34,6 +36,7 @@ __all__ = [
     "Forecast",
     "Models",
     "Run",
+    "RunLog",
     "Specification",
     "Status",
     "StudyReport",
@@ -49,6 +52,7 @@ __all__ = [
     "interquartile_mean",
     "intervals",
     "leave_one_class_out_r_squared",
+    "log",
     "mean_curve",
     "models",
     "opened",

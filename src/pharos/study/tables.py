@@ -73,14 +73,14 @@ def finished_runs(study: Specification, place: Path) -> FinishedRuns:
             if record is None or record["status"] != _worker.FINISHED:
                 continue
             curve = read_curve(place, run.id)
-            row = {"id": run.id, **_described(run), "seconds": float(record["seconds"])}
+            row = {"id": run.id, **described(run), "seconds": float(record["seconds"])}
             row |= _result_of(record, place / "runs" / run.id) | {"return": _last_return(curve)}
             row["exact"], row["half_width"] = _exactness(curve, row)
         except FileFormatError as error:
             damaged[run.id] = str(error)
             continue
         rows.append(row)
-        points.append(curve.assign(id=run.id, **_described(run)))
+        points.append(curve.assign(id=run.id, **described(run)))
     if not rows:
         raise ParameterError(
             f"{place}: no run of {study.name!r} is finished; execute `pharos study run` first"
@@ -174,7 +174,8 @@ def _last_return(curve: "pd.DataFrame") -> float:
     return float(np.average(returns[is_defined], weights=ended[is_defined])) if is_defined.any() else float("nan")
 
 
-def _described(run: Run) -> dict[str, Any]:
+def described(run: Run) -> dict[str, Any]:
+    """What a run is of: the columns of tables that say so."""
     config = run.config
     return {
         "environment": config["environment"],
