@@ -62,6 +62,12 @@ def test_workflows_and_templates_are_yaml(folder):
     assert files and all(isinstance(yaml.safe_load(file.read_text()), dict) for file in files)
 
 
+def test_workflows_and_recipes_name_no_package_index():
+    files = [*(ROOT / ".github/workflows").glob("*.yml"), ROOT / "conda/meta.yaml"]
+    for file in files:
+        assert not re.search(r"pypi\.org|pythonhosted|download\.pytorch|--(extra-)?index-url", file.read_text()), file
+
+
 def test_the_source_distribution_leaves_nothing_out():
     tracked = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True)
     if tracked.returncode:
