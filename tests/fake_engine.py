@@ -34,6 +34,10 @@ class BatchRun:
     key: int
     gamma: float
     outcome_rewards: Any = None
+    laziness: float = 0.0
+    staying: Any = None
+    reward_noise: float = 0.0
+    reward_delay: int = 0
 
 
 def supports(agent, hyperparameters):
@@ -71,6 +75,13 @@ class Batch:
 
     def policy(self, i):
         return Policy(self.runs[i].mdp.num_actions, int(abs(self.walk[i, 0]) * 100))
+
+    def best_actions(self, states):
+        actions = []
+        for i, source in enumerate(run.observe for run in self.runs):
+            seen = source.observe.observation(source.space.states(states[i : i + 1]))
+            actions.append(self.policy(i).action_probabilities(seen).argmax())
+        return np.array(actions)
 
     def state(self):
         return {

@@ -294,3 +294,13 @@ def test_processes_leave_what_one_leaves(tmp_path, monkeypatch):
         tmp_path / "bad", workers=2, seeds=(0, 1, 2), steps=200, hyperparameters={"optimize_memory_usage": True}
     )
     assert all(isinstance(end, FailedRun) and "optimize_memory_usage" in end.error for end in lacking)
+
+
+def test_knobs_of_chance_and_pay_are_those_of_the_run_alone():
+    knobs = {"lazy": 0.2, "sticky": 0.1, "reward_noise": 0.5, "reward_delay": 2}
+    together = many(seeds=(0, 1, 2), **knobs)
+    alone = many(seeds=(1,), **knobs)[0]
+    assert together[1].result == alone.result
+    assert (
+        alone.result["value_optimal"] == Task.of("simple_grid/4x4-plain", sticky=0.1, lazy=0.2).optimal.value_at_start
+    )

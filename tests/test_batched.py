@@ -1,5 +1,7 @@
 """The batched engine by itself: its random numbers, that runs do not feel each other, and that it can be resumed."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -8,8 +10,10 @@ from pharos.agents.batched.arithmetic import TensorArithmetic
 from pharos.agents.batched.runs import lane_width, lane_widths
 from pharos.environments import make
 from pharos.errors import ParameterError
-from pharos.experiments.task import Task
+from pharos.experiments import Task, evaluate_agent
 from pharos.kernels.philox import philox
+from pharos.mdp import lazy_actions, random_actions
+from pharos.policies import is_walk, walk_values
 
 DQN = {"learning_rate": 0.01, "buffer_size": 60, "learning_starts": 20, "batch_size": 8, "train_freq": 4, "n_envs": 2,
        "target_update_interval": 10, "net_arch": [12], "n_steps": 2}  # fmt: skip
@@ -66,6 +70,8 @@ def test_philox_gives_the_known_answers_of_random123(counter, key, words):
 @pytest.mark.parametrize("agent", AGENTS)
 def test_a_run_is_the_same_alone_among_others_and_in_another_order(grid, agent):
     runs = runs_of(grid, AGENTS[agent], 40)
+    staying = np.zeros((grid.mdp.num_states, grid.mdp.num_actions))
+    runs[5] = replace(runs[5], laziness=0.1, staying=staying, reward_noise=0.1, reward_delay=3)
     together, backwards, alone = learned(agent, runs), learned(agent, runs[::-1]), learned(agent, runs[5:6])
     assert outcome(together, 5) == outcome(alone, 0)
     assert all(outcome(together, i) == outcome(backwards, 39 - i) for i in range(40))
@@ -147,3 +153,22 @@ def test_networks_are_on_the_device_that_is_asked_for(grid, agent):
         batch.learn([60], lambda point: None)
     mine, theirs = other.parameters(0), usual.parameters(0)
     assert max(np.abs(mine[name] - theirs[name]).max() for name in mine) <= 1e-5
+
+
+def test_policies_that_walk_together_are_worth_what_they_are_alone():
+    tasks = [Task.of(make("deep_sea", size=5), gamma=gamma) for gamma in (1.0, 0.9)]
+    runs = [replace(run, mdp=tasks[i % 2].mdp) for i, run in enumerate(runs_of(tasks[0], DQN, 11))]
+    batch = make_batch("dqn", runs)
+    mdps = [tasks[i % 2].mdp for i in range(11)]
+    together = walk_values(mdps, batch.best_actions)
+    alone = [evaluate_agent(batch.policy(i), tasks[i % 2]) for i in range(11)]
+    for one, other in zip(together, alone, strict=True):
+        assert abs(one.value - other.value) <= one.error_bound + other.error_bound
+        assert (one.exact, one.states) == (other.exact, other.states)
+    assert len({one.value for one in together}) > 1
+    assert all(map(is_walk, mdps)) and not is_walk(random_actions(mdps[0], 0.1))
+    assert not is_walk(lazy_actions(mdps[0], 0.1)) and not is_walk(make_slippery())
+
+
+def make_slippery():
+    return Task.of(make("frozen_lake", slippery=True)).mdp

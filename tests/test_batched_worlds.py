@@ -2,11 +2,14 @@
 
 import numpy as np
 import pytest
+from scipy.stats import kstest
 
 from pharos.agents.batched import BatchRun, ObservationSource, make_batch, observed
 from pharos.agents.batched.worlds import Worlds
 from pharos.environments import make
 from pharos.experiments.task import Task
+from pharos.interaction import Interaction
+from pharos.interaction.payment import Payment
 from pharos.kernels import batched_worlds as kernels
 from pharos.mdp import TabularMDP, random_actions, sticky_actions
 
@@ -73,6 +76,53 @@ def test_episodes_are_as_likely_as_the_mdp_says(slippery, chance):
         for chosen in range(2):
             likely = c.chosen * np.eye(2)[chosen] + c.previous * np.eye(2)[previous] + c.uniform / 2
             assert within(executed_after[previous, chosen], likely)
+
+
+def test_lazy_actions_stay_as_often_as_they_should_and_pay_what_staying_pays(slippery):
+    mdp, successors, probabilities, rewards = slippery
+    staying = 100.0 + np.arange(10.0).reshape(5, 2)
+    runs = runs_on(mdp, 40, outcome_rewards=rewards.ravel(), laziness=0.3, staying=staying)
+    worlds = Worlds(runs, np.array([run.key for run in runs], np.uint64), 5)
+    rng, counts, met = np.random.default_rng(3), np.zeros(2), np.zeros(5)
+    for step in range(300):
+        state, chosen = worlds.state.copy(), rng.integers(0, 2, worlds.state.shape)
+        worlds.step(step, chosen, counts=True)
+        lazy = worlds.reward >= 100.0
+        assert (worlds.reward[lazy] == staying[state, chosen][lazy]).all()
+        assert (worlds.next_state[lazy] == state[lazy]).all()
+        counts += lazy.sum(), (~lazy).sum()
+        here = ~lazy & (state == 1) & (chosen == 0)
+        np.add.at(met, worlds.next_state[here], 1)
+    assert within(counts, np.array([0.3, 0.7]))
+    assert within(met, np.bincount(successors[1, 0], probabilities[1, 0], 5))
+
+
+def test_pay_is_late_and_noisy_as_elsewhere_and_returns_are_of_what_is_earned(slippery):
+    mdp, *_, rewards = slippery
+    ways = (
+        {},
+        {"reward_delay": 1},
+        {"reward_delay": 3},
+        {"reward_noise": 2.0},
+        {"reward_delay": 3, "reward_noise": 2.0},
+    )
+    runs = [run for way in ways for run in runs_on(mdp, 8, outcome_rewards=rewards.ravel(), **way)]
+    worlds = Worlds(runs, np.array([run.key for run in runs], np.uint64), 5)
+    payments = [Payment(Interaction(reward_delay=delay), 40) for delay in (1, 3)]
+    rng, noise = np.random.default_rng(4), []
+    for step in range(500):
+        actions = np.tile(rng.integers(0, 2, (8, 5)), (5, 1))
+        worlds.step(step, actions, counts=True)
+        earned, once, thrice, noisy, both = worlds.reward.reshape(5, 40)
+        ended = (worlds.flags[:8].ravel() & kernels.DONE) > 0
+        for payment, paid in zip(payments, (once, thrice), strict=True):
+            assert np.allclose(payment.pay(earned, np.ones(40, np.bool_), ended), paid, rtol=0, atol=1e-12)
+        assert np.allclose(noisy - earned, both - thrice, rtol=0, atol=1e-12)  # named by run and step
+        noise.append((noisy - earned) / 2.0)
+    noise = np.concatenate(noise)
+    assert kstest(noise, "norm").pvalue > 1e-3
+    assert abs(np.corrcoef(noise[:-40], noise[40:])[0, 1]) <= SIGMAS / np.sqrt(len(noise))
+    assert len({tuple(part) for part in worlds.returns.reshape(5, 8)}) == 1
 
 
 def test_returns_are_counted_until_the_end_of_the_training_alone(slippery):

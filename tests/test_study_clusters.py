@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import pytest
 
+import fake_batches
 import fake_training
 from pharos import study
 from pharos.errors import MissingExtra, ParameterError
@@ -82,7 +83,8 @@ class RayDouble(SimpleNamespace):
         return references[:num_returns], references[num_returns:]
 
     def get(self, reference):
-        if reference.args[2] in self.dies:
+        ids = reference.args[2]
+        if self.dies & ({ids} if isinstance(ids, str) else set(ids)):
             raise RuntimeError("the worker died")
         return reference()
 
@@ -101,6 +103,25 @@ def test_on_ray_every_run_is_one_task_and_lost_ones_have_failed(tmp_path, undist
         study.run_on_ray(SPECIFICATION, tmp_path / "ray", runner=fake_training.train, retry_failed=True).finished == 8
     )
     assert fake_training.results(tmp_path / "ray") == undisturbed
+
+
+def test_on_ray_a_batch_is_one_task_and_one_that_is_lost_goes_on_in_halves(tmp_path, monkeypatch):
+    sizes = tmp_path / "sizes"
+    sizes.touch()
+    monkeypatch.setenv("PHAROS_FAKE_BATCHES", str(sizes))
+    block = {"environments": ["frozen_lake"], "agents": ["dqn"], "seeds": 6}
+    spec = study.specification(
+        {"name": "fake", "steps": 100, "evaluations": 10, "engine": "batched", "blocks": [block]}
+    )
+    lost = spec.runs[0].id
+    double = RayDouble(dies=[lost])
+    monkeypatch.setitem(sys.modules, "ray", double)
+    runners = {"runner": fake_training.train, "batch_runner": fake_batches.train}
+    end = study.run_on_ray(spec, tmp_path / "ray", **runners)
+    assert (end.finished, end.errors) == (5, {lost: "RuntimeError: the worker died"})
+    assert sorted(map(int, sizes.read_text().split())) == [1, 1, 3]  # six are lost, then three, then one
+    double.dies.clear()
+    assert study.run_on_ray(spec, tmp_path / "ray", retry_failed=True, **runners).finished == 6
 
 
 def test_without_ray_the_message_names_the_extra(tmp_path, monkeypatch):

@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Any
 
-from pharos.experiments.evaluation import evaluate_agent
+from pharos.experiments.evaluation import Evaluation, evaluate_agent
 from pharos.experiments.task import Task
 
 
@@ -15,9 +15,13 @@ class Curve:
     task: Task
     rows: list[dict[str, Any]] = field(default_factory=list)
 
-    def add(self, step: int, episodes: int, returns: float, agent: Any) -> dict[str, Any]:
-        """Evaluate the policy after `step` steps and `episodes` finished episodes, whose returns sum to `returns`."""
-        evaluation = evaluate_agent(agent, self.task)
+    def add(
+        self, step: int, episodes: int, returns: float, agent: Any, evaluation: Evaluation | None = None
+    ) -> dict[str, Any]:
+        """Evaluate the policy after `step` steps and `episodes` finished episodes, whose returns sum to `returns`;
+        unless its `evaluation` is there.
+        """
+        evaluation = evaluation or evaluate_agent(agent, self.task)
         best, uniform = self.task.reference.optimal, self.task.reference.uniform
         last = self.rows[-1] if self.rows else None
         finished = episodes - (last["episodes"] if last else 0)

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable, Hashable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -101,9 +101,16 @@ class Members:
     def _task(self, config: RunConfig) -> Task:
         values = self.values(config) if self.values is not None else None
         task = config.task(values, trust=self.trust, strict=self.strict)
-        space, plain = self._once("world", config, WORLD, lambda: (task.space, task.space.mdp(gamma=task.gamma)))
+        space, plain = self._world(config, task)
         vars(task).update(space=space, mdp=task.chance.of(plain.with_horizon(task.horizon_steps)))
         return task
+
+    def _world(self, config: RunConfig, task: Task) -> tuple[Any, Any]:
+        """The states of a task, and their MDP without chance and horizon; the same for all tasks of a world."""
+        world: tuple[Any, Any] = self._once(
+            "world", config, WORLD, lambda: (task.space, task.space.mdp(gamma=task.gamma))
+        )
+        return world
 
     def member(self, place: int | None, config: RunConfig, folder: Path | None) -> Member:
         """A run, ready to be grouped.
@@ -118,14 +125,9 @@ class Members:
         lacking = supports(config.agent, chosen)
         if lacking is not None:
             raise ParameterError(f"the batched engine: {lacking}; the engine sb3 has it")
-        if config.chance.lazy or config.chance.pays_otherwise:
-            raise ParameterError(
-                f"the batched engine: {config.chance}: it has no lazy actions, and pays what is earned at once and "
-                f"without noise; the engine sb3 has them"
-            )
-        task = self.task(config)
+        task, chance = self.task(config), config.chance
         run = BatchRun(
-            mdp=task.mdp,
+            mdp=replace(chance, lazy=0.0).of(self._world(config, task)[1]) if chance.lazy else task.mdp,
             observe=self._once("sight", config, SIGHT, lambda: ObservationSource.of(task.space, task.sight.observe)),
             time_limit=task.time_limit,
             hyperparameters=chosen,
@@ -134,6 +136,10 @@ class Members:
             key=int(config.id, 16),
             gamma=config.gamma,
             outcome_rewards=self._once("rewards", config, WORLD, lambda: _drawn_rewards(task)),
+            laziness=chance.lazy,
+            staying=self._once("staying", config, WORLD, lambda: _staying(task)) if chance.lazy else None,
+            reward_noise=chance.reward_noise,
+            reward_delay=chance.reward_delay,
         )
         key = (config.agent, config.steps, config.evaluation_interval, group_key(config.agent, run))
         return Member(place, config, folder, task, chosen, run, key)
@@ -144,6 +150,13 @@ class Members:
         if key not in self.made:
             self.made[key] = make()
         return self.made[key]
+
+
+def _staying(task: Task) -> Any:
+    """(S, A) what an action without effect pays."""
+    from pharos.mdp import rewards_of_staying
+
+    return rewards_of_staying(task.space).array.astype(float)
 
 
 def _drawn_rewards(task: Task) -> Any:

@@ -15,6 +15,7 @@ from pharos.experiments.learners import publish_network
 from pharos.experiments.ledger import Ledger, Stopped
 from pharos.experiments.members import FailedRun, Member, in_one_line
 from pharos.experiments.run_folder import Checkpoint, TrainingResult
+from pharos.experiments.side_by_side import values_together
 from pharos.storage import digest_of_json, lock, replace_json
 from pharos.wording import many
 
@@ -123,13 +124,13 @@ class Batch:
 
     def _evaluate(self, step: int) -> dict[int, dict[str, Any]]:
         """A row for each run that has not failed, by its place."""
-        rows = {}
+        rows, known = {}, values_together(self.batch, self.group)
         for i, member in enumerate(self.group):
             if member.error is not None:
                 continue
             episodes, returns = int(self.batch.episodes[i]), float(self.batch.returns[i])
             try:
-                row = member.curve.add(step, episodes, returns, self.batch.policy(i))
+                row = member.curve.add(step, episodes, returns, self.batch.policy(i), known.get(i))
             except Exception as error:
                 member.fail(error)
                 continue

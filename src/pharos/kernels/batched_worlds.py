@@ -1,8 +1,9 @@
 """Many runs' episodes at once: W runs with E copies of their environment each, on the tables of their MDPs.
 
 Every draw is named by its counter (philox.py): the run is the key, and a step of a copy has one block of four words:
-a random action; what is executed; which outcome; where the next episode starts. Whether a run explores in a step is a
-block of its own, as one draw holds for all copies of a run.
+a random action; what is executed; which outcome; where the next episode starts. Where actions may have no effect or
+pay is noisy there is another block: whether there is an effect; two for the noise. Whether a run explores in a step is
+a block of its own, as one draw holds for all copies of a run.
 """
 
 import numpy as np
@@ -127,19 +128,45 @@ def _start_of(starts, cumulative, word):
     return starts[k]
 
 
+@njit(forceinline=True)
+def _paid_late(pending, delay, elapsed, earned, is_last):
+    """What is paid where everything comes `delay` steps late, and at the end of an episode at once.
+
+    pending (D,), D >= delay: what the last steps earned; elapsed: steps of the episode before this one.
+    """
+    place = elapsed % delay
+    late = pending[place]
+    pending[place] = earned
+    if is_last:
+        for k in range(delay):
+            late += pending[k]
+            pending[k] = 0.0
+    return late
+
+
+@njit(forceinline=True)
+def _normal(first, second):
+    """A standard normal number of two words (Box and Muller 1958)."""
+    return np.sqrt(-2.0 * np.log(unit(first))) * np.cos(2.0 * np.pi * unit(second))
+
+
 @njit(cache=True, nogil=True)
 def advance(
-    transitions, rewards, terminal, starts, cumulative, members, setting, actions, episodes, transition, counts
-):
+    transitions, rewards, staying, terminal, starts, cumulative, members, setting, knobs, actions, episodes, pending,
+    transition, counts,
+):  # fmt: skip
     """One step of every copy of the runs `members`, which share an MDP; what has ended starts anew.
 
-    transitions: see kernels/outcomes.py; rewards: see `paid`; terminal (S,); starts, cumulative: start states and
-    their cumulated probabilities.
+    transitions: see kernels/outcomes.py; rewards: see `paid`; staying (S, A): what an action without effect pays,
+    (0, 0) where all have one; terminal (S,); starts, cumulative: start states and their cumulated probabilities.
     setting: (keys (W,) uint64, step, chances (W, 4), limits (W,), gammas (W,)), as in `stepping.Setting`.
+    knobs (W, 3): the probability that an action has no effect, the deviation of the noise of pay, its delay in steps.
+    pending (W, E, D): what was earned and is due; see `_paid_late`.
     episodes: (state, previous, elapsed (W, E) int64, return, discount (W, E) float64) of the running episodes, and
     (number, sum of returns (W,)) of the finished ones, which this step adds to where `counts` is true.
-    transition: (next state (W, E) int64, reward (W, E) float64, flags (W, E) uint8) of this step, written here. A
-    transition that ends an episode without a next state has the state itself there.
+    transition: (next state (W, E) int64, reward (W, E) float64, flags (W, E) uint8) of this step, written here; the
+    reward is what is paid, returns are of what is earned. A transition that ends an episode without a next state has
+    the state itself there.
     """
     keys, step, chances, limits, gammas = setting
     state, previous, elapsed, running, discount, finished, returns = episodes
@@ -152,14 +179,24 @@ def advance(
             s, action = state[i, e], actions[i, e]
             if chance[0] < 1.0 or chance[3] < 1.0:
                 action = executed_by_number(action, previous[i, e], chance, num_actions, unit(w[1]))
-            t, k = drawn_outcome(transitions, s, action, unit(w[2]))
-            reward[i, e] = paid(rewards, s, action, k)
+            lazy, noise, delay = knobs[i, 0], knobs[i, 1], np.int64(knobs[i, 2])
+            more = philox(2, e, step, STEP, keys[i]) if lazy > 0.0 or noise > 0.0 else w
+            if lazy > 0.0 and unit(more[0]) < lazy:
+                t, earned = s, np.float64(staying[s, action])
+            else:
+                t, k = drawn_outcome(transitions, s, action, unit(w[2]))
+                earned = np.float64(paid(rewards, s, action, k))
             ended = t < 0 or terminal[t]
             elapsed[i, e] += 1
             timeout = not ended and elapsed[i, e] >= limits[i]
             following[i, e] = s if t < 0 else t
             flags[i, e] = (DONE if ended or timeout else 0) | (TIMEOUT if timeout else 0)
-            running[i, e] += discount[i, e] * reward[i, e]
+            reward[i, e] = earned
+            if delay > 0:
+                reward[i, e] = _paid_late(pending[i, e], delay, elapsed[i, e] - 1, earned, ended or timeout)
+            if noise > 0.0:
+                reward[i, e] += noise * _normal(more[1], more[2])
+            running[i, e] += discount[i, e] * earned
             discount[i, e] *= gammas[i]
             state[i, e], previous[i, e] = following[i, e], action
             if ended or timeout:

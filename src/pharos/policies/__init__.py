@@ -9,6 +9,7 @@ from pharos.policies.evaluation import (
     evaluate_seeing,
 )
 from pharos.policies.policy import DeepPolicy, Model, Policy, PolicyLike, TabularAgent, policy_function
+from pharos.policies.walks import is_walk, walk_values
 
 __all__ = [
     "Answers",
@@ -25,5 +26,7 @@ __all__ = [
     "evaluate_observing",
     "evaluate_policy",
     "evaluate_seeing",
+    "is_walk",
     "policy_function",
+    "walk_values",
 ]

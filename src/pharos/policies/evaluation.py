@@ -74,7 +74,7 @@ def evaluate_seeing(
         answers = TableAnswers(table, mdp)
     else:
         answers = answers_of(policy, mdp, sight(), deterministic=deterministic)
-    steps, error = _steps_that_matter(mdp)
+    steps, error = steps_that_matter(mdp)
     if answers.reach(max_states, steps):
         solution = solvers.evaluate_policy(*answers.reached_mdp())
         return Evaluation(solution.value_at_start, True, solution.error_bound + error, len(answers.rows))
@@ -228,7 +228,7 @@ def _scattered(values: np.ndarray, rows: np.ndarray, count: int) -> np.ndarray:
     return out
 
 
-def _steps_that_matter(mdp: TabularMDP) -> tuple[int, float]:
+def steps_that_matter(mdp: TabularMDP) -> tuple[int, float]:
     """The number of steps after which nothing changes the value at the start by more than a bound, and the bound.
 
     Without a horizon 2 gamma^n max |r| / (1 - gamma), below TAIL; what a policy would do later is not asked.

@@ -1,4 +1,4 @@
-"""The same runs on more than one machine: shards as a Slurm array through submitit, or single runs on Ray.
+"""The same runs on more than one machine: shards as a Slurm array through submitit, or runs and batches on Ray.
 
 Runs do not depend on the engine: every one of these executes what is missing in a folder that all machines share, and
 may be killed, repeated, or followed by another.
@@ -6,15 +6,17 @@ may be killed, repeated, or followed by another.
 
 import os
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from pharos.errors import MissingExtra, ParameterError
+from pharos.study import batches as _batches
 from pharos.study import worker as _worker
 from pharos.study.blocks import Run
 from pharos.study.execution import (
     ATTEMPTS,
+    BUSY_SECONDS,
     STATUS_SECONDS,
     Execution,
     Options,
@@ -101,10 +103,12 @@ def run_on_ray(
     resume: bool = False,
     progress: Callable[[Status], None] | None = None,
     runner: _worker.Runner = train,
+    batch_runner: _batches.BatchRunner | None = None,
 ) -> Status:
-    """Execute the runs of a study that are not over on a Ray cluster, one processor a run.
+    """Execute the runs of a study that are not over on a Ray cluster, one processor a run, or a batch of runs.
 
     Args:
+        batch_runner: of the runs that the study says are batched, as for `run`.
         folder: of the results, on a disk that all nodes share.
         address: of the cluster; None for the one of this machine or RAY_ADDRESS, or else a new local one.
     Raises:
@@ -117,14 +121,19 @@ def run_on_ray(
     study, place = opened(source, folder)
     place = place.absolute()
     claim(study, place)
-    options = Options(retry_failed=retry_failed, resume=resume, workers=processors(), progress=progress, runner=runner)
+    options = Options(
+        retry_failed=retry_failed, resume=resume, workers=processors(), progress=progress, runner=runner,
+        batch_runner=_batches.train_batch if batch_runner is None and runner is train else batch_runner,
+    )  # fmt: skip
     execution = Execution(study, place, shard_of(study.runs, shard), options)
     ours = not ray.is_initialized()
     if ours:
         ray.init(address=address, log_to_driver=False, include_dashboard=False if address is None else None)
     try:
-        remote = ray.remote(num_cpus=1, max_retries=ATTEMPTS - 1)(_attempt)
-        return _follow(ray, remote, execution)
+        one, batch = (
+            ray.remote(num_cpus=1, max_retries=ATTEMPTS - 1)(function) for function in (_attempt, _attempt_all)
+        )
+        return _follow(ray, one, batch, execution)
     finally:
         if ours:
             ray.shutdown()
@@ -137,24 +146,65 @@ def _attempt(runner: _worker.Runner, config: Mapping[str, Any], id: str, folder:
     return end
 
 
-def _follow(ray: Any, remote: Any, execution: Execution) -> Status:
-    """Start every run, and await them one by one; one whose process died too often has failed."""
-    started: dict[Any, Run] = {}
-    while execution.pending:
-        _, run = execution.pending.popleft()
-        how = (run.id in execution.repeated, execution.options.resume)
-        arguments = (execution.options.runner, dict(run.config), run.id, str(execution.folder), *how)
-        started[remote.remote(*arguments)] = run
+def _attempt_all(
+    runner: _batches.BatchRunner,
+    configs: Sequence[Mapping[str, Any]],
+    ids: Sequence[str],
+    folder: str,
+    again: Sequence[str],
+) -> None:
+    """The runs of a batch; those that another process is at are left to it."""
+    _worker.use_one_thread()
+    _batches.attempt(runner, configs, ids, Path(folder), again)
+
+
+def _follow(ray: Any, remote: Any, remote_batch: Any, execution: Execution) -> Status:
+    """Start every run or batch, and await them one by one.
+
+    A batch whose process died too often goes on in halves; a run has failed.
+    """
+    started: dict[Any, tuple[Run, ...]] = {}
+
+    def start() -> None:
+        while execution.pending:
+            _, run = execution.pending.popleft()
+            runner, batch_runner = execution.options.runner, execution.options.batch_runner
+            if batch_runner is None or run.engine != "batched":
+                how = (run.id in execution.repeated, execution.options.resume)
+                started[remote.remote(runner, dict(run.config), run.id, str(execution.folder), *how)] = (run,)
+                continue
+            unit = execution.batches.unit(run, execution.pending)
+            arguments = _batches.arguments(batch_runner, unit, execution.folder, execution.repeated)
+            _, configs, ids, folder, again, _ = arguments
+            started[remote_batch.remote(batch_runner, configs, ids, str(folder), again)] = unit
+
+    start()
     while started:
         for reference in ray.wait(list(started), num_returns=1, timeout=STATUS_SECONDS)[0]:
-            run = started.pop(reference)
+            unit = started.pop(reference)
+            error = None
             try:
                 ray.get(reference)
-            except Exception as error:  # of Ray: `attempt` keeps those of the run itself
-                partial = execution.folder / "partial" / run.id
-                partial.mkdir(parents=True, exist_ok=True)
-                _worker.write_failure(partial, run.config, run.id, _worker.describe(error), 0.0)
-                _worker.publish(partial, execution.folder, run.id)
-            execution.note(run)
+            except Exception as raised:  # of Ray: `attempt` keeps those of the run itself
+                error = raised
+            left = [run for run in unit if not execution.note(run)]
+            if error is not None and len(left) > 1:
+                execution.batches.halve(left)
+            elif error is not None:
+                for run in left:
+                    _fail(execution, run, error)
+            if left and unit[0].engine == "batched" and (error is None or len(left) > 1):
+                time.sleep(BUSY_SECONDS)  # another process may be at them
+                execution.pending.extend((0.0, run) for run in left)
+            start()
         execution.report()
     return execution.report(final=True)
+
+
+def _fail(execution: Execution, run: Run, error: Exception) -> None:
+    """A run has failed, as Ray says."""
+    partial = execution.folder / "partial" / run.id
+    partial.mkdir(parents=True, exist_ok=True)
+    _worker.write_failure(partial, run.config, run.id, _worker.describe(error), 0.0)
+    _worker.publish(partial, execution.folder, run.id)
+    execution.note(run)

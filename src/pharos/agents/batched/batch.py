@@ -67,6 +67,12 @@ class Batch:
                 torch.set_flush_denormal(False)
             at_point(point)
 
+    def best_actions(self, states: np.ndarray) -> np.ndarray:
+        """(N,) the action that each run likes best in its own state (N,)."""
+        return np.concatenate(
+            [lane.best_actions(states[k * self.width : (k + 1) * self.width]) for k, lane in enumerate(self.lanes)]
+        )
+
     def policy(self, i: int) -> RunPolicy:
         """The policy of run i, as it is when it is asked: greedy for DQN, probabilities for PPO."""
         return RunPolicy(self.lanes[i // self.width], i % self.width)

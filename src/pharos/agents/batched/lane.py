@@ -106,6 +106,13 @@ class Lane:
             self._rooms[states.shape[1]] = room(self.width, states.shape[1], self.seen.size, device=self.device)
         return self.seen.at(states, self._rooms[states.shape[1]])
 
+    def best_actions(self, states: np.ndarray) -> np.ndarray:
+        """(number,) the action with the highest score in the state (number,) of each run."""
+        asked = np.zeros((self.width, 1), np.int64)
+        asked[: self.number, 0] = states
+        scores: np.ndarray = self.network.scores(self.values, self.observed(asked))[: self.number, 0].cpu().numpy()
+        return scores.argmax(axis=1)
+
     def move(self) -> None:
         """Execute `actions`; episodes that end after the last step of the training do not count."""
         self.worlds.step(self.calls, self.actions, counts=self.steps + self.copies <= self.total)

@@ -118,7 +118,7 @@ class BatchRun:
     """One run, before it exists.
 
     Attributes:
-        mdp: with its chance; runs of one task share the same.
+        mdp: with its chance, apart from lazy actions; runs of one task share the same.
         observe: what the agent sees of the states; runs of one task share the same.
         time_limit: steps of an episode.
         hyperparameters: under the names of Stable-Baselines3.
@@ -128,6 +128,10 @@ class BatchRun:
         gamma: of the returns that are counted, not the agent's own discount.
         outcome_rewards: (N,) what each possible outcome pays, as `rewards_of_outcomes` gives it; None: expected rewards
             are paid.
+        laziness: the probability that an executed action has no effect.
+        staying: (S, A) what an action without effect pays; needed where there is laziness.
+        reward_noise, reward_delay: deviation of the noise in what is paid, and steps by which that comes late. Returns
+            are of what is earned.
     """
 
     mdp: TabularMDP
@@ -139,6 +143,10 @@ class BatchRun:
     key: int
     gamma: float = 1.0
     outcome_rewards: np.ndarray | None = None
+    laziness: float = 0.0
+    staying: np.ndarray | None = None
+    reward_noise: float = 0.0
+    reward_delay: int = 0
 
 
 def supports(agent: str, hyperparameters: Mapping[str, Any]) -> str | None:

@@ -26,6 +26,7 @@ class World:
         self.rewards: tuple[Any, ...] = (mdp.reward_table.table, mdp.reward_table.palette)
         if run.outcome_rewards is not None and table is None:
             self.rewards = dynamics.for_kernels_with(run.outcome_rewards)  # type: ignore[attr-defined]
+        self.staying = np.zeros((0, 0)) if run.staying is None else np.asarray(run.staying, np.float64)
         self.terminal = np.asarray(mdp.terminal, np.bool_)
         self.starts = np.asarray(mdp.start_states, np.int64)
         self.cumulative = np.cumsum(mdp.start_probabilities)
@@ -37,7 +38,7 @@ class Worlds:
     Attributes:
         state: (W, E) int64, where each is.
         episodes, returns: (W,) finished episodes, and the sums of their returns.
-        next_state, reward, flags: (W, E) of the last step.
+        next_state, reward, flags: (W, E) of the last step; the reward is what was paid, late or with noise.
     """
 
     def __init__(self, runs: Sequence[BatchRun], keys: np.ndarray, copies: int):
@@ -45,12 +46,14 @@ class Worlds:
         by_table: dict[Any, list[int]] = {}
         for i, run in enumerate(runs):
             parts = (run.mdp.dynamics, run.mdp.reward_table, run.mdp.terminal, run.mdp.start_states)
-            by_table.setdefault((*map(id, parts), id(run.outcome_rewards)), []).append(i)
+            by_table.setdefault((*map(id, parts), id(run.outcome_rewards), id(run.staying)), []).append(i)
         self.worlds = [World(runs[members[0]], members) for members in by_table.values()]
         self.keys = keys
         self._chances = np.array([(*run.mdp.chance.triple, run.mdp.chance.first_chosen) for run in runs], np.float64)
         self._limits = np.array([run.time_limit for run in runs], np.int64)
         self._gammas = np.array([run.gamma for run in runs], np.float64)
+        self._knobs = np.array([(run.laziness, run.reward_noise, run.reward_delay) for run in runs], np.float64)
+        self.pending = np.zeros((width, copies, max(run.reward_delay for run in runs)))
         self.state = np.zeros((width, copies), np.int64)
         self.previous = np.full((width, copies), -1, np.int64)
         self.elapsed = np.zeros((width, copies), np.int64)
@@ -68,11 +71,11 @@ class Worlds:
         transition = (self.next_state, self.reward, self.flags)
         for world in self.worlds:
             kernels.advance(
-                world.transitions, world.rewards, world.terminal, world.starts, world.cumulative, world.members,
-                setting, actions, episodes, transition, counts,
+                world.transitions, world.rewards, world.staying, world.terminal, world.starts, world.cumulative,
+                world.members, setting, self._knobs, actions, episodes, self.pending, transition, counts,
             )  # fmt: skip
 
     def arrays(self) -> dict[str, np.ndarray]:
         """All that changes."""
-        names = ("state", "previous", "elapsed", "running", "discount", "episodes", "returns")
-        return {name: getattr(self, name) for name in names}
+        names = ["state", "previous", "elapsed", "running", "discount", "episodes", "returns"]
+        return {name: getattr(self, name) for name in [*names, *(["pending"] if self.pending.size else [])]}
