@@ -406,6 +406,17 @@ def test_what_does_not_exist_says_so():
     assert all("give an observation and a network" in missing[name].undefined for name in MEASURES)
 
 
+def test_a_kernel_that_does_not_fit_is_told_before_anything_is_learnt(grid, monkeypatch):
+    def learnt(*_):
+        raise AssertionError("learnt first")
+
+    monkeypatch.setattr("pharos.hardness.mean_field.Learner.curve", learnt)
+    seen = representation(grid, "vector", "mlp16", landmarks=0)
+    monkeypatch.setattr("pharos.state_space.available_memory", lambda: 800)
+    with pytest.raises(ParameterError, match=r"10 states fit into memory.*landmarks"):
+        kernel_regret(grid.mdp(), seen)
+
+
 @pytest.fixture(scope="module")
 def grid(tmp_path_factory):
     env = pharos.make("simple_grid", height=3, width=4)

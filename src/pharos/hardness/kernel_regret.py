@@ -122,12 +122,13 @@ def kernel_regret(
     learner = Learner(mdp, schedule, episode, solution)
     everything = learner.numbers[learner.states]
     observations = Grouped(representation.classes, everything)
-    tabular = learner.curve(Grouped(np.arange(mdp.num_states), everything), Identity())
     landmarks = representation.landmarks
     if landmarks is None and len(observations) > MOST_EXACT:
         landmarks = LANDMARKS
     observed, error = observations.representatives, 0.0
     is_exact = not landmarks or landmarks >= len(observations)
+    operator = Exact(representation.kernel, observed) if is_exact else None  # what does not fit is said at once
+    tabular = learner.curve(Grouped(np.arange(mdp.num_states), everything), Identity())
     if not is_exact or schedule.optimizer == "adam":
         weights = observations.sums(standard_occupancy(mdp, schedule.gamma, episode).states[everything])
 
@@ -136,8 +137,8 @@ def kernel_regret(
             operator.preconditioned(np.maximum(weights, RAREST * weights.max()))
         return learner.curve(observations, operator)
 
-    if is_exact:
-        landmarks, curve = None, learnt(Exact(representation.kernel, observed))
+    if operator is not None:
+        landmarks, curve = None, learnt(operator)
     else:
         assert landmarks is not None
         chosen = observed[drawn(weights, landmarks)]
