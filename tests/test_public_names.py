@@ -30,6 +30,7 @@ ORDER = (
         "paths",
         "wording",
         "storage",
+        "templates",
         "compiling",
         "mdp_files",
         "sources",

@@ -16,7 +16,7 @@ Source: Bergstra et al. (2011), Algorithms for hyper-parameter optimization; Aki
 import json
 import math
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -231,18 +231,17 @@ class _Search:
             if trial.should_prune():
                 raise pruned
 
+        for task, options in self._runs(chosen):
+            train_on(task, self.agent, **options, progress=progress)
+        return sum(regrets) / len(regrets)
+
+    def _runs(self, chosen: Mapping[str, Any]) -> Iterator[tuple[Task, dict[str, Any]]]:
+        """(task, options of its run) with some hyperparameters: all tasks for one seed after the other."""
+        interval = max(1, self.steps // EVALUATIONS)
         for seed in self.seeds:
             for task in self.tasks:
-                train_on(
-                    task,
-                    self.agent,
-                    steps=self.steps,
-                    seed=seed,
-                    evaluation_interval=max(1, self.steps // EVALUATIONS),
-                    hyperparameters={**self.table, **chosen},
-                    progress=progress,
-                )
-        return sum(regrets) / len(regrets)
+                options = {"steps": self.steps, "seed": seed, "evaluation_interval": interval}
+                yield task, {**options, "hyperparameters": {**self.table, **chosen}}
 
     @cached_property
     def _members(self) -> Members:
@@ -251,19 +250,10 @@ class _Search:
     def _score_of_a_batch(self, trial: Any, pruned: type[Exception], chosen: Mapping[str, Any]) -> float:
         """As `score`, of all runs at once: the mean so far is that of all of them at the same step."""
         configs = []
-        for seed in self.seeds:
-            for task in self.tasks:
-                config = RunConfig.of_task(
-                    task,
-                    self.agent,
-                    steps=self.steps,
-                    seed=seed,
-                    evaluation_interval=max(1, self.steps // EVALUATIONS),
-                    hyperparameters={**self.table, **chosen},
-                    engine=self.engine,
-                )
-                self._members.adopt(config, task)
-                configs.append(config)
+        for task, options in self._runs(chosen):
+            config = RunConfig.of_task(task, self.agent, **options, engine=self.engine)
+            self._members.adopt(config, task)
+            configs.append(config)
         regrets: list[float] = []
 
         def progress(now: Progress) -> None:

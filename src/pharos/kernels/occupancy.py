@@ -13,6 +13,15 @@ from pharos.kernels.outcomes import outcome, outcomes_of, size_of
 
 
 @njit(forceinline=True)
+def _mass(now, s):
+    """Probability of being in s."""
+    mass = 0.0
+    for b in range(now.shape[1]):
+        mass += now[s, b]
+    return mass
+
+
+@njit(forceinline=True)
 def _executed(policy, weights, now, s, a, mass):
     """Probability of being in s and executing a."""
     chosen, previous, uniform = weights
@@ -40,9 +49,7 @@ def push(transitions, live, policy, weights, now, after):
     for s in range(num_states):
         if not live[s]:
             continue
-        mass = 0.0
-        for b in range(now.shape[1]):
-            mass += now[s, b]
+        mass = _mass(now, s)
         if mass == 0.0:
             continue
         for a in range(num_actions):
@@ -128,9 +135,7 @@ def record(live, policy, weights, now, scale, total, largest):
     for s in range(len(total)):
         if not live[s]:
             continue
-        mass = 0.0
-        for b in range(now.shape[1]):
-            mass += now[s, b]
+        mass = _mass(now, s)
         if mass == 0.0:
             continue
         for a in range(total.shape[1]):

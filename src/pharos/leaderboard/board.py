@@ -10,20 +10,17 @@ import math
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from pharos import storage
 from pharos.environments import Environment, make
-from pharos.errors import MissingExtra, ParameterError, PharosError
+from pharos.errors import ParameterError, PharosError
 from pharos.experiments import TaskValues
 from pharos.leaderboard.entry import SUFFIX
 from pharos.leaderboard.verification import MAX_STATES, REACHED, TOLERANCE, Verdict, task_key, verify
 from pharos.observations import title as observation_title
-
-if TYPE_CHECKING:
-    import jinja2
+from pharos.templates import templates
 
 Progress = Callable[[int, int, str], None]
 
@@ -105,7 +102,7 @@ def board(
     files = sorted(path for path in place.rglob(f"*{SUFFIX}") if path.is_file())
     if not files:
         raise ParameterError(f"{place}: expected a folder with entries, *{SUFFIX}; `pharos submit RUN` makes one")
-    template = _templates().get_template("board.html.j2")
+    template = templates("pharos.leaderboard", "the page of a leaderboard").get_template("board.html.j2")
     made, values = Board(Path(out)), dict[str, TaskValues]()
     for k, path in enumerate(files):
         name = path.relative_to(place).as_posix()
@@ -228,18 +225,3 @@ def _version() -> str:
 
 def _script() -> str:
     return (Path(__file__).parent / "templates" / "sort.js.j2").read_text(encoding="utf-8")
-
-
-@cache
-def _templates() -> "jinja2.Environment":
-    try:
-        import jinja2
-    except ImportError as error:
-        raise MissingExtra("the page of a leaderboard", "jinja2", "study") from error
-    return jinja2.Environment(
-        loader=jinja2.PackageLoader("pharos.leaderboard"),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        keep_trailing_newline=True,
-    )

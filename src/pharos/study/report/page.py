@@ -8,15 +8,13 @@ import base64
 import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pharos.errors import MissingExtra
+from pharos.templates import templates
 
 if TYPE_CHECKING:
-    import jinja2
     import pandas as pd
 
     from pharos.study.report.sections import Section
@@ -59,26 +57,11 @@ class Image:
 
 def render(title: str, description: str, sections: "Sequence[Section]") -> str:
     """The page as text."""
-    templates = _templates()
-    script = templates.get_template("page.js.j2").render()
+    page = templates("pharos.study.report", "the report of a study")
+    script = page.get_template("page.js.j2").render()
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
-    return templates.get_template("page.html.j2").render(
+    return page.get_template("page.html.j2").render(
         title=title, description=description, sections=sections, script=script, digest=digest
-    )
-
-
-@cache
-def _templates() -> "jinja2.Environment":
-    try:
-        import jinja2
-    except ImportError as error:
-        raise MissingExtra("the report of a study", "jinja2", "study") from error
-    return jinja2.Environment(
-        loader=jinja2.PackageLoader("pharos.study.report"),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        keep_trailing_newline=True,
     )
 
 
