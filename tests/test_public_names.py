@@ -35,6 +35,7 @@ ORDER = (
         "mdp_files",
         "sources",
         "workers",
+        "ranks",
         "kernels",
         "environments",
         "drawing",

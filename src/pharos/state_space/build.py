@@ -9,7 +9,7 @@ import hashlib
 import json
 import os
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pharos import paths, storage
 from pharos.environments import Environment, make
@@ -20,6 +20,10 @@ from pharos.state_space.manifest import ARRAYS, MANIFEST, PARTS, check_lengths, 
 from pharos.state_space.plan import Plan
 from pharos.state_space.progress import Progress, reporter
 from pharos.state_space.store import StateSpace, load
+
+if TYPE_CHECKING:
+    from pharos.state_space.crew import Crew
+    from pharos.state_space.search import Options
 
 OUR_FILES = (*ARRAYS, *PARTS.values(), MANIFEST + ".tmp", storage.LOCK, storage.CLAIM)
 CHECKPOINT_SECONDS = 15.0
@@ -32,6 +36,7 @@ def build(
     max_states: int | None = None,
     memory: int | None = None,
     workers: int | None = None,
+    processes: int | str = 1,
     progress: Progress | bool | None = None,
     checkpoint_seconds: float = CHECKPOINT_SECONDS,
 ) -> StateSpace:
@@ -48,6 +53,9 @@ def build(
             a file without a name in `folder` of 23 to 46 bytes a state (11 to 23 more for each further word), which is
             gone in the end.
         workers: threads, or processes where rules are interpreted; None for all processors.
+        processes: of this machine, that share the work and the table of states, which has to fit in memory then;
+            or "mpi": those that `mpiexec` has started, all of which make this call with a folder that all of them see
+            (`memory` is that of each).
         progress: None for a bar on a terminal; False for silence; or a function that gets a BuildProgress now and then.
         checkpoint_seconds: at most this much work is lost when the process is killed.
     Returns:
@@ -60,8 +68,8 @@ def build(
     Cost: see docs/performance.md; 40 to 110 ns a state, 8 W + 8 to 16 bytes of memory a state (W words of 64 bits).
     Source: the pharos paper, appendix A, Algorithm 1 (whose successors are stored under the wrong index there).
     """
-    from pharos.state_space.outcome_journal import remove_parts
-    from pharos.state_space.search import Options, Search, check_size, journal_of  # loads Numba
+    from pharos.state_space.crew import crew_of  # loads Numba
+    from pharos.state_space.search import Options
 
     if isinstance(env, str):
         env = make(env)
@@ -75,22 +83,33 @@ def build(
         raise ParameterError(f"memory is {memory} bytes; expected at least 16 MiB")
     plan = Plan(env)
     path = Path(folder) if folder is not None else folder_of(plan)
+    options = Options(max_states, memory, workers, checkpoint_seconds)
+    with crew_of(processes, plan, memory) as crew:
+        was_there = crew.is_first and _build(plan, path, crew, options, progress)
+    return load(path, verify=was_there, environment=env)
+
+
+def _build(plan: Plan, path: Path, crew: "Crew", options: "Options", progress: Progress | bool | None) -> bool:
+    """Make the folder hold the finished state space; returns whether it did before."""
+    from pharos.state_space.outcome_journal import remove_parts
+    from pharos.state_space.search import check_size, journal_of
+
     manifest = _manifest_of(plan, path)
     if manifest is not None and manifest["complete"]:
-        check_size(env, manifest["num_states"], 0, max_states)
-        if env.has_chance:
+        check_size(plan.env, manifest["num_states"], 0, options.max_states)
+        if plan.env.has_chance:
             remove_parts(path)
-        return load(path, environment=env)
+        return True
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ParameterError(f"{path}: cannot be made a folder: {error.strerror}; choose another one") from error
-    with lock(path), reporter(progress, env) as report:
+    with lock(path), reporter(progress, plan.env) as report:
         manifest = _manifest_of(plan, path)  # it may have grown while we waited
         if manifest is None or not manifest["complete"]:
-            options = Options(max_states, memory, workers, checkpoint_seconds)
-            Search(plan, journal_of(path, plan), options, report).run(manifest)
-    return load(path, verify=False, environment=env)
+            with crew.search(plan, journal_of(path, plan), options, report) as search:
+                search.run(manifest)
+    return False
 
 
 def cached_folder(env: Environment) -> Path:

@@ -93,13 +93,13 @@ class Search:
             self.position = self.journal.open(manifest)
             self._take_stored_states()
             with ThreadPoolExecutor(self.workers) as pool, self.journal.writing():
-                if self.spilled is None:
+                if self.in_memory:
                     self._grow_table(pool)
                 while self.position.first < self.position.count:
-                    if self.spilled is None:
+                    if self.in_memory:
                         self._expand_chunk(pool)
                     else:
-                        self._expand_chunk_on_disk(pool, self.spilled)
+                        self._expand_chunk_beyond_memory(pool)
                     if time.perf_counter() - self.journal.last_checkpoint >= self.options.checkpoint_seconds:
                         self.journal.checkpoint(complete=False)
                 self.journal.checkpoint(complete=True)
@@ -112,6 +112,11 @@ class Search:
             self.spilled = None
             self.table.release()
         self._report(finished=True)
+
+    @property
+    def in_memory(self) -> bool:
+        """Whether this process's memory holds the table."""
+        return self.spilled is None
 
     def _take_stored_states(self) -> None:
         stored = self.journal.stored_states(self.position.count)
@@ -127,14 +132,14 @@ class Search:
         position, table = self.position, self.table
         if self._needs_wide_indices(self.chunk * self.branches + 32 * self.branches):
             self._widen_indices(pool)
-            if self.spilled:
+            if not self.in_memory:
                 return
         base, last = position.first, position.first + self.chunk
         block = self._block()
         while position.first < min(last, position.count):
             if self._ahead is None and table.is_full(position.count):
                 self._grow_table(pool)
-                if self.spilled:
+                if not self.in_memory:
                     position.first -= (position.first - base) % 8  # what is appended has whole bytes of terminal bits
                     break
             is_wide = self.threads > 1 and min(last, position.count) - position.first >= WIDE
@@ -261,7 +266,7 @@ class Search:
             wait(self._ahead.futures)
             self._ahead = None
         self.journal.widen(self.position)
-        if self.spilled is None:
+        if self.in_memory:
             self._grow_table(pool)
 
     # The table on disk -----------------------------------------------------------------------------------------------
@@ -281,9 +286,10 @@ class Search:
             spilled.fill(self.table.states[:count])
         self.spilled = spilled
 
-    def _expand_chunk_on_disk(self, pool: ThreadPoolExecutor, spilled: SpilledTable) -> None:
+    def _expand_chunk_beyond_memory(self, pool: ThreadPoolExecutor) -> None:
         """Successors of a chunk are looked up in the order of the table, many at once, and then numbered."""
-        position = self.position
+        position, spilled = self.position, self.spilled
+        assert spilled is not None
         if self._needs_wide_indices(spilled.rows * self.branches):
             self._widen_indices(pool)
         self.journal.finish_writes()

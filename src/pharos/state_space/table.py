@@ -41,16 +41,17 @@ class MemoryTable:
         forgotten: how many states the table leaves out, as no search comes to them again.
     """
 
-    def __init__(self, num_words: int, margin: int, memory: int | None):
+    def __init__(self, num_words: int, margin: int, memory: int | None, share: int = 1):
         """
         Args:
             margin: states that a kernel may add between two looks at the room.
             memory: bytes that states and table may take; None for as much as there is.
+            share: how many processes share what there is.
         """
         self.states = reserved_states(num_words)
         self.slots = np.empty(0, np.int32)
         self._space = reserved_table()
-        self._margin, self._memory = margin, memory
+        self._margin, self._memory, self._share = margin, memory, share
         self.forgotten = 0
 
     @property
@@ -68,13 +69,13 @@ class MemoryTable:
             return False
         slots = self._slots_for(count - forgotten)
         needed = slots * dtype.itemsize + (int(slots * LOAD) + forgotten) * self.states.shape[1] * 8
-        return needed <= (self._memory if self._memory is not None else machine.available_memory())
+        return needed <= (self._memory if self._memory is not None else machine.available_memory() // self._share)
 
     def grow(
         self,
         count: int,
         dtype: np.dtype,
-        pool: ThreadPoolExecutor,
+        pool: ThreadPoolExecutor | None,
         workers: int,
         parts: list[np.ndarray] | None = None,
     ) -> None:
@@ -93,7 +94,7 @@ class MemoryTable:
             for part in parts:
                 fill_more(self.slots, self.states, part.astype(np.int64))
             return
-        if workers == 1 or count < PARALLEL_FILL:
+        if pool is None or workers == 1 or count < PARALLEL_FILL:
             self._fill(count)
             return
         cuts = [slots * i // workers for i in range(workers + 1)]

@@ -1,0 +1,161 @@
+"""Ranks that are forked processes of one machine, and exchange through memory that they share.
+
+No locks: each rank counts its exchanges in a place of its own and waits for the counts of the others, so one that is
+killed blocks nobody. Arrays go through the outbox of who sends them. An outbox has two halves, used in turn: nobody
+writes into one before everybody has read what was there, as two exchanges ago all have gone on from it.
+"""
+
+import contextlib
+import mmap
+import multiprocessing
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+
+import numpy as np
+
+from pharos.errors import ParameterError
+from pharos.ranks.rank import Rank, RankFailed, error_of, text_of
+
+_LINE = 8  # int64 entries between two counts: a cache line
+_TEXT = 1 << 12  # bytes of the text of a failure
+_PATIENCE = 200  # looks at the counts before a process sleeps between them
+_NAP, _LONG_NAP = 2e-5, 1e-3
+_ALIGNMENT = 64
+
+
+class _Memory:
+    """What the processes share.
+
+    Attributes:
+        counts: (size * _LINE,) int64, exchanges of each rank. failure: (1 + _TEXT,) bytes: 0, or 1 + rank, and text.
+        outboxes: (size, 2, capacity) bytes.
+    """
+
+    def __init__(self, size: int, capacity: int):
+        self.counts = np.frombuffer(mmap.mmap(-1, size * _LINE * 8), np.int64)
+        self.failure = np.frombuffer(mmap.mmap(-1, 8 + _TEXT), np.uint8)
+        self.capacity = -(-capacity // mmap.PAGESIZE) * mmap.PAGESIZE
+        no_reserve = 0x4000 if sys.platform == "linux" else 0  # MAP_NORESERVE, which Python names from 3.13 on
+        flags = mmap.MAP_SHARED | mmap.MAP_ANONYMOUS | no_reserve
+        memory = mmap.mmap(-1, size * 2 * self.capacity, flags=flags)
+        self.outboxes = np.frombuffer(memory, np.uint8).reshape(size, 2, self.capacity)
+
+
+class _Process(Rank):
+    def __init__(self, rank: int, size: int, memory: _Memory, dead: Callable[[], str | None]):
+        self.rank, self.size, self.neighbors, self._memory, self._dead = rank, size, size, memory, dead
+        self._exchanges = 0
+
+    def exchange(self, parts: Sequence[np.ndarray]) -> list[np.ndarray]:
+        half = self._exchanges % 2
+        outbox = self._memory.outboxes[self.rank, half]
+        self._put(parts, outbox)
+        self._exchanges += 1
+        self._memory.counts[self.rank * _LINE] = self._exchanges
+        self._wait()
+        return [self._take(self._memory.outboxes[rank, half], parts[rank]) for rank in range(self.size)]
+
+    def _put(self, parts: Sequence[np.ndarray], outbox: np.ndarray) -> None:
+        """Where each part begins, how many rows it has, then the parts."""
+        table = outbox[: 16 * self.size].view(np.int64)
+        place = -(-16 * self.size // _ALIGNMENT) * _ALIGNMENT
+        for rank, part in enumerate(parts):
+            if place + part.nbytes > len(outbox):
+                raise ParameterError(f"an exchange of {place + part.nbytes} bytes; expected at most {len(outbox)}")
+            table[2 * rank], table[2 * rank + 1] = place, len(part)
+            if len(part):
+                outbox[place : place + part.nbytes] = np.ascontiguousarray(part).reshape(-1).view(np.uint8)
+            place += -(-part.nbytes // _ALIGNMENT) * _ALIGNMENT
+
+    def _take(self, outbox: np.ndarray, like: np.ndarray) -> np.ndarray:
+        """The part for this rank, copied."""
+        table = outbox[: 16 * self.size].view(np.int64)
+        place, rows = int(table[2 * self.rank]), int(table[2 * self.rank + 1])
+        part = np.empty((rows, *like.shape[1:]), like.dtype)
+        if rows:
+            part.reshape(-1).view(np.uint8)[:] = outbox[place : place + part.nbytes]
+        return part
+
+    def _wait(self) -> None:
+        """Until all have come as far as this rank."""
+        counts, looks, next_look = self._memory.counts[::_LINE], 0, 0.0
+        while (counts < self._exchanges).any():
+            looks += 1
+            if looks < _PATIENCE:
+                time.sleep(0)
+                continue
+            self._raise_failure()
+            if time.monotonic() > next_look:  # whether they live is a question to the system
+                next_look = time.monotonic() + 0.05
+                reason = self._dead()
+                if reason and (counts < self._exchanges).any():
+                    self._raise_failure()
+                    raise RankFailed(reason)
+            time.sleep(_NAP if looks < 10 * _PATIENCE else _LONG_NAP)
+
+    def _raise_failure(self) -> None:
+        failure = self._memory.failure
+        if failure[0]:
+            text = failure[8:].tobytes().rstrip(b"\0").decode(errors="replace")
+            raise error_of(text, int(failure[0]) - 1)
+
+    def fail(self, error: BaseException) -> None:
+        failure = self._memory.failure
+        if failure[0] == 0 and not isinstance(error, RankFailed):
+            text = np.frombuffer(text_of(error).encode()[:_TEXT], np.uint8)
+            failure[8 : 8 + len(text)] = text
+            failure[0] = min(self.rank, 254) + 1
+
+
+@contextlib.contextmanager
+def processes(size: int, answer: Callable[[Rank], None], capacity: int) -> Iterator[Rank]:
+    """Rank 0, while forked processes run `answer` as the others.
+
+    Args:
+        capacity: bytes that a rank sends in an exchange, at most.
+    Raises:
+        ParameterError: this system cannot fork processes.
+    """
+    if "fork" not in multiprocessing.get_all_start_methods():
+        raise ParameterError("several processes are forked, which this system cannot; expected processes=1, or MPI")
+    memory = _Memory(size, capacity)
+    parent = os.getpid()
+    context = multiprocessing.get_context("fork")
+
+    def orphaned() -> str | None:
+        return None if os.getppid() == parent else "rank 0 died"
+
+    def run(rank: int) -> None:
+        there = _Process(rank, size, memory, orphaned)
+        try:
+            answer(there)
+        except BaseException as error:
+            there.fail(error)
+            os._exit(1)
+        os._exit(0)  # without what this process has inherited and would do at its end
+
+    children = [context.Process(target=run, args=(rank,), daemon=True) for rank in range(1, size)]
+
+    def dead() -> str | None:
+        for rank, child in enumerate(children, 1):
+            if not child.is_alive():
+                return f"rank {rank} of {size} died (exit code {child.exitcode}); the same command resumes"
+        return None
+
+    here = _Process(0, size, memory, dead)
+    try:
+        for child in children:
+            child.start()
+        yield here
+    except BaseException as error:
+        here.fail(error)
+        raise
+    finally:
+        for child in children:
+            if child.pid is not None:
+                child.join(5)
+                if child.is_alive():
+                    child.kill()
+                    child.join()

@@ -1,0 +1,235 @@
+"""The table of states that several processes share: what each rank does in a search by ranks.
+
+A *superstep* expands a block of states, in four exchanges. Each rank has an even part of the block's rows, and owns the
+states whose hash falls to it (kernels/key_owner.py).
+
+1. Each rank expands its rows, and asks the owners of the successors for their numbers, saying at which place of the
+   block each stands: row x branches + branch, the order in which one process would meet them.
+2. An owner keeps, of the places that lead to a state that it has not heard of, the first, and tells the rank whose row
+   that is in.
+3. Each rank counts the new states in its rows; with the sum of the ranks before it, they have the numbers that one
+   process would give them. It tells the owners.
+4. Owners answer.
+
+So numbers, and all files, are the same whatever the number of ranks. Rank 0 hands out states and collects rows.
+"""
+
+import numpy as np
+
+from pharos.environments import Environment
+from pharos.errors import StateSpaceError
+from pharos.kernels import key_owner
+from pharos.ranks import Rank, loop
+from pharos.rules import rules_of
+from pharos.state_space.memory_map import huge_pages
+from pharos.state_space.plan import Plan
+from pharos.state_space.table import Block, MemoryTable
+
+ROWS = 1 << 16  # of a rank in a superstep, at most
+SUCCESSORS = 1 << 20  # of a rank's rows, at most
+_END, _TAKE, _EXPAND = range(3)
+_HEADER = np.zeros(4, np.int64)
+_INT32 = np.dtype(np.int32)
+_NOTHING = np.full(1 << 16, -1, np.int32)  # a table that holds nothing, where the slot of a state is its bucket
+
+
+def rows_of_rank(plan: Plan) -> int:
+    """Rows that a rank expands in a superstep, at most: a multiple of 8."""
+    return min(ROWS, max(8, SUCCESSORS // plan.branches // 8 * 8))
+
+
+def bytes_of_exchange(plan: Plan) -> int:
+    """Bytes that a rank sends in an exchange, at most, those for each rank aligned."""
+    candidates = rows_of_rank(plan) * max(plan.branches, plan.layout.num_words)
+    return candidates * 8 * (plan.layout.num_words + 1) + (1 << 16)
+
+
+class Owner:
+    """The states that one rank owns, and their numbers.
+
+    Attributes:
+        table: the states, in the order in which this rank heard of them. numbers: (capacity,) int64, of each.
+        count: how many there are.
+    """
+
+    def __init__(self, env: Environment, rank: Rank, num_words: int, most: int, memory: int | None):
+        """
+        most: states that a superstep may add. memory: bytes that they may take; None for this rank's part of what there
+        is.
+        """
+        self._env, self._rank = env, rank
+        if memory is not None:
+            memory = memory * (num_words + 1) // (num_words + 2)  # the rest is for the numbers
+        self.table = MemoryTable(num_words, most, memory, share=2 * rank.neighbors)
+        self.numbers = huge_pages(len(self.table.states), np.dtype(np.int64))
+        self.count = 0
+
+    def claim(self, asked: np.ndarray, places: np.ndarray) -> np.ndarray:
+        """The entries of the states asked for; new ones wait for their numbers."""
+        if self.table.is_full(self.count):
+            self._grow()
+        entries = np.empty(len(asked), np.int64)
+        arrays = self.table.slots, self.table.states, self.numbers
+        self.count = key_owner.claim(*arrays, self.count, asked, places, entries)
+        return entries
+
+    def _grow(self) -> None:
+        if not self.table.fits(self.count, _INT32):
+            raise StateSpaceError(
+                f"{self._env}: the table of states does not fit in the memory of {self._rank.size} processes; "
+                f"expected more memory, or more processes on more machines, or --processes 1, whose table may be on "
+                f"disk; the same command resumes"
+            )
+        self.table.grow(self.count, _INT32, None, 1)
+
+    def release(self) -> None:
+        """Give the memory back."""
+        self.table.release()
+        self.numbers = self.numbers[:0].copy()
+
+
+class RankedTable:
+    """One rank's part in a search; `answer` is the program of all but rank 0, which calls the other methods.
+
+    A header tells the others what comes: (what to do, first, rows, count), for a superstep that expands states
+    [first, first + rows) when `count` are numbered.
+    """
+
+    def __init__(self, plan: Plan, rank: Rank, memory: int | None):
+        self.rank, self.branches, self.num_words = rank, plan.branches, plan.layout.num_words
+        self.rules = rules_of(plan.env).exploration
+        rows = rows_of_rank(plan)
+        self.rows = rows * rank.size
+        self.owner = Owner(plan.env, rank, self.num_words, self.rows * self.branches, memory)
+        self._keys = np.empty((rows * self.branches, self.num_words), np.uint64)
+        self._indices = np.empty(len(self._keys), np.int64)
+        self._order = np.empty(len(self._keys), np.int64)
+        self._terminal = np.empty(rows, np.uint8)
+        self._probabilities = np.empty((rows if plan.env.has_chance else 0, self.branches))
+
+    def close(self) -> None:
+        """Give the memory back."""
+        self.owner.release()
+        self.rules.close()
+
+    # Rank 0 ----------------------------------------------------------------------------------------------------------
+
+    def take(self, states: np.ndarray) -> None:
+        """Tell the owners of the states that are numbered already; state i has number i."""
+        for first in range(0, len(states), len(self._indices)):
+            part = np.array(states[first : first + len(self._indices)], np.uint64)
+            self._say(_TAKE, first, len(part), first)
+            numbers = np.arange(first, first + len(part))
+            self._indices[: len(part)] = -1
+            order, counts = self._routed(part)
+            self._take(self._parts(part[order], counts), self._parts(numbers[order], counts))
+
+    def expand(self, states: np.ndarray, first: int, count: int) -> tuple[Block, np.ndarray]:
+        """Expand states [first, first + rows), in order, when `count` are numbered.
+
+        Returns:
+            (successors int64, terminal, probabilities) of the rows; and the new states, numbered from `count` on.
+        """
+        self._say(_EXPAND, first, len(states), count)
+        cuts = self._cuts(len(states))
+        parts = [states[cuts[i] : cuts[i + 1]] for i in range(self.rank.size)]
+        block, found = self._superstep(self.rank.scatter(parts, states[:0]), first, cuts, count)
+        rows = [np.concatenate(self.rank.gather(array)) for array in block]
+        return Block(*rows), np.concatenate(self.rank.gather(found))
+
+    def _say(self, *header: int) -> None:
+        self.rank.broadcast(np.array(header, np.int64), _HEADER)
+
+    # The others ------------------------------------------------------------------------------------------------------
+
+    def answer(self) -> None:
+        """Do what rank 0 says, until the end."""
+        no_states = np.empty((0, self.num_words), np.uint64)
+        while True:
+            what, first, rows, count = map(int, self.rank.broadcast(None, _HEADER))
+            if what == _END:
+                return
+            if what == _TAKE:
+                self._take([no_states] * self.rank.size, [np.empty(0, np.int64)] * self.rank.size)
+                continue
+            states = self.rank.scatter(None, no_states)
+            block, found = self._superstep(states, first, self._cuts(rows), count)
+            for array in (*block, found):
+                self.rank.gather(array)
+
+    # All -------------------------------------------------------------------------------------------------------------
+
+    def _take(self, states: list[np.ndarray], numbers: list[np.ndarray]) -> None:
+        for known, number in zip(self.rank.exchange(states), self.rank.exchange(numbers), strict=True):
+            for start in range(0, len(known), self.rows * self.branches):
+                part = slice(start, start + self.rows * self.branches)
+                entries = self.owner.claim(known[part], np.zeros(len(known[part]), np.int64))
+                self.owner.numbers[entries] = number[part]
+
+    def _cuts(self, rows: int) -> list[int]:
+        """Where the rows of each rank begin and end."""
+        return [rows * i // self.rank.size for i in range(self.rank.size + 1)]
+
+    def _superstep(
+        self, states: np.ndarray, first: int, cuts: list[int], count: int
+    ) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], np.ndarray]:
+        """See the head of this file; the rows of this rank, and the new states in them."""
+        rank, owner, branches = self.rank, self.owner, self.branches
+        row, size = cuts[rank.rank], len(states) * branches
+        keys, indices = self._keys[:size], self._indices[:size]
+        terminal, probabilities = self._terminal[: len(states)], self._probabilities[: len(states)]
+        self.rules.expand_and_find(states, 0, len(states), 0, keys, indices, terminal, probabilities, _NOTHING)
+        order, counts = self._routed(keys)
+        asked = rank.exchange(self._parts(keys[order], counts))
+        places = rank.exchange(self._parts(order + row * branches, counts))
+        before = owner.count
+        entries = owner.claim(np.concatenate(asked), np.concatenate(places))
+        fresh = np.arange(before, owner.count)
+        first_places = -1 - owner.numbers[fresh]
+        by_place = np.argsort(first_places)
+        first_places = first_places[by_place]
+        bounds = np.searchsorted(first_places, np.array(cuts) * branches)
+        wins = rank.exchange([first_places[bounds[i] : bounds[i + 1]] for i in range(rank.size)])
+        wins = [each - row * branches for each in wins]
+        is_new = np.zeros(size, bool)
+        for each in wins:
+            is_new[each] = True
+        found = rank.gather_all(np.array([np.count_nonzero(is_new)]))
+        numbers = count + int(sum(each[0] for each in found[: rank.rank])) + np.cumsum(is_new) - 1
+        owner.numbers[fresh[by_place]] = np.concatenate(rank.exchange([numbers[each] for each in wins]))
+        lengths = np.cumsum([len(each) for each in asked])[:-1]
+        answers = rank.exchange(np.split(owner.numbers[entries], lengths))
+        successors = first + row + indices
+        successors[order] = np.concatenate(answers)
+        return (successors.reshape(-1, branches), terminal, probabilities), keys[is_new]
+
+    def _routed(self, keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(candidates to be asked for, sorted by owner; how many of each owner)."""
+        counts = np.empty(self.rank.size, np.int64)
+        key_owner.route(keys, self._indices[: len(keys)], self.rank.size, self._order, counts)
+        return self._order[: counts.sum()], counts
+
+    def _parts(self, array: np.ndarray, counts: np.ndarray) -> list[np.ndarray]:
+        return np.split(array, np.cumsum(counts)[:-1])
+
+
+def end(rank: Rank) -> None:
+    """Rank 0 lets the others go."""
+    rank.broadcast(np.array([_END, 0, 0, 0], np.int64), _HEADER)
+
+
+def answer(plan: Plan, rank: Rank, memory: int | None) -> None:
+    """What all ranks but rank 0 do in a search."""
+    table = RankedTable(plan, rank, memory)
+    try:
+        table.answer()
+    finally:
+        table.close()
+
+
+def warm(plan: Plan) -> None:
+    """Compile what ranks run, once, before they are forked."""
+    with loop(1, lambda rank: None) as rank:
+        table = RankedTable(plan, rank, None)
+        table.expand(np.empty((0, table.num_words), np.uint64), 0, 0)
+        table.close()
