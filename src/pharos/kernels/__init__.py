@@ -19,6 +19,7 @@ __all__ = [
     "hash_table",
     "hitting",
     "horizon",
+    "key_owner",
     "landmarks",
     "learning",
     "many_searches",
