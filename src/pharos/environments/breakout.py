@@ -27,6 +27,16 @@ INSTANCES = {
     for height, columns, width in (*PAPER, *DRAWN)
 }
 
+# found by a search on a court of 11 x 7 under three kinds of chance, docs/agents.md
+VECTOR = {
+    "learning_rate": 0.00045,
+    "gamma": 0.95,
+    "learning_starts": 1000,
+    "target_update_interval": 4000,
+    "exploration_fraction": 0.35,
+    "exploration_final_eps": 0.008,
+}
+
 
 @dataclass(frozen=True, kw_only=True)
 class Breakout(Environment):
@@ -88,7 +98,7 @@ class Breakout(Environment):
     instances = INSTANCES
     paper_instances = tuple(INSTANCES)[: len(PAPER)]
     first_version = 2
-    hyperparameters = ARCADE
+    hyperparameters = {**ARCADE, "dqn": {**ARCADE["dqn"], "vector": VECTOR}}
 
     @property
     def paddle_width(self) -> int:
