@@ -117,6 +117,23 @@ def test_rules_that_mention_a_private_attribute_run_interpreted(cache, tmp_path)
         assert space.mdp().rewards[0].tolist() == [1.5, 1.5]
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("outcomes", [1, 2])
+def test_what_numba_says_of_a_rule_is_the_reason(cache, tmp_path, outcomes):
+    """A parameter that is a word is not handed to compiled rules."""
+
+    def transition(self, state, action, *rest):
+        rest[-1][0] = min(state[0] + self.word.count("o"), 4)
+
+    def probability(self, state, action, outcome):
+        return 0.5
+
+    parts = {"probability": probability, "outcomes": 2} if outcomes == 2 else {}
+    env = corridor_class(transition=transition, word="no", **parts)()
+    with pytest.warns(RuntimeWarning, match="Corridor: Numba cannot compile its rules.*word"):
+        assert pharos.build(env, tmp_path / "space").num_states == 5
+
+
 # The cache -----------------------------------------------------------------------------------------------------------
 
 

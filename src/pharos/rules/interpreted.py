@@ -152,6 +152,8 @@ def blame(env: Environment, layout: Layout, suspects: np.ndarray, failure: BaseE
     interpreted.
     """
     rows = unpack(layout, suspects).tolist()
+    if failure and not rows:  # they were not run yet: it is Numba's, of compiling them
+        raise failure
     interpreted_branches(env, rows)
     raise RuleError(
         f"{env}: compiled rules {f'raise {failure!r}' if failure else 'read or write outside of the declared ranges'} "
