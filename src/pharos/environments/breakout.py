@@ -29,11 +29,12 @@ INSTANCES = {
 
 # found by a search on a court of 11 x 7 under three kinds of chance, docs/agents.md
 VECTOR = {
-    "learning_rate": 0.00045,
-    "gamma": 0.95,
-    "learning_starts": 1000,
+    "learning_rate": 0.0009,
+    "gamma": 0.98,
+    "n_steps": 3,
+    "learning_starts": 5000,
     "target_update_interval": 4000,
-    "exploration_fraction": 0.35,
+    "exploration_fraction": 0.3,
     "exploration_final_eps": 0.008,
 }
 
