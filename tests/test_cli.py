@@ -11,6 +11,7 @@ import pytest
 from rich.console import Console
 from typer.testing import CliRunner
 
+from pharos import build, hardness
 from pharos.cli import answers, app
 from pharos.cli.options import parse_parameters, parse_size, parse_value
 from pharos.cli.play import Game
@@ -511,3 +512,10 @@ def test_a_world_with_chance_is_not_said_to_have_none(pharos, verb):
     assert re.search("chance:? none", plain)
     assert re.search("chance:? of the world", own)
     assert re.search("chance:? of the world, random actions 0.1", both)
+
+
+def test_hardness_tells_how_many_gaps_are_ties_and_at_which_tolerance(pharos):
+    told = pharos("hardness", "frozen_lake/4x4", "--measures", "minimal_gap").stdout
+    gaps = hardness.gaps(build(make("frozen_lake/4x4"), progress=False).mdp(gamma=0.99))
+    proven = gaps.ties - gaps.unresolved
+    assert f"{gaps.ties} ties at a tolerance of {gaps.tie_tolerance:.2g}, {proven} proven" in told

@@ -201,7 +201,21 @@ def _print(title: str, report: Any, chance: str, definitions: bool) -> None:
     error = conventions.get("error_bound")
     if error is not None and math.isfinite(error):
         to.print(f"values are within {error:.2g} of the optimal ones (proven)", style="dim", soft_wrap=True)
+    for ties in _ties(report):
+        to.print(ties, style="dim", soft_wrap=True)
     for _, how_long in compiling_fact():
         to.print(f"compiling: {how_long}", style="dim", soft_wrap=True)
     for note in notes:
         to.print(escape(note), style="dim", soft_wrap=True)
+
+
+def _ties(report: Any) -> list[str]:
+    """How many gaps count as ties, and at which tolerance, where a measure of gaps is among them."""
+    for result in report.results.values():
+        details = {} if result.undefined else result.certificate.details
+        if "ties" in details:
+            ties, tolerance = details["ties"], details["tie_tolerance"]
+            return [
+                f"{many(ties, 'tie')} at a tolerance of {tolerance:.2g}, {ties - details['unresolved_ties']:,} proven"
+            ]
+    return []
