@@ -330,6 +330,12 @@ def test_legends_have_no_empty_fields_and_say_units():
     assert run_labels([alone]) == ["Q-learning on Taxi, 300 k steps"]
 
 
+def test_an_imported_mdp_has_the_name_of_its_folder_in_legends():
+    parameters = {"folder": "/tmp/door-key", "digest": "0" * 32}
+    config = config_of(agent="q_learning", observation="", environment="imported", parameters=parameters)
+    assert run_labels([config]) == ["Q-learning on door-key, 20 k steps"]
+
+
 def test_no_two_groups_of_runs_have_one_label():
     configs = [
         config_of(),

@@ -3,6 +3,7 @@
 import json
 import os
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,6 +18,8 @@ from pharos.plots.style import COLORS, INK, figure, styled, thousands
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+# The class of imported MDPs, which has no parameters but its folder
+IMPORTED = "imported"
 # Two labels up to this long stand beside each other
 WIDE = 60
 
@@ -119,7 +122,9 @@ def _label(config: dict[str, Any], configs: list[dict[str, Any]]) -> str:
 
 
 def _in_words(config: dict[str, Any]) -> str:
-    """`Frozen lake 8x8`."""
+    """`Frozen lake 8x8`; of an imported MDP the name of its folder."""
+    if config["environment"] == IMPORTED:
+        return Path(config["parameters"]["folder"]).name
     name, *setting = _instance(config["environment"], config["parameters"]).split(" ")
     if class_called(config["environment"]) is not None:
         name = name.replace("_", " ").replace("/", " ")
