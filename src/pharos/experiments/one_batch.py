@@ -124,13 +124,13 @@ class Batch:
 
     def _evaluate(self, step: int) -> dict[int, dict[str, Any]]:
         """A row for each run that has not failed, by its place."""
-        rows, known = {}, values_together(self.batch, self.group)
+        rows, values = {}, values_together(self.batch, self.group)
         for i, member in enumerate(self.group):
             if member.error is not None:
                 continue
             episodes, returns = int(self.batch.episodes[i]), float(self.batch.returns[i])
             try:
-                row = member.curve.add(step, episodes, returns, self.batch.policy(i), known.get(i))
+                row = member.curve.add(step, episodes, returns, self.batch.policy(i), values.get(i))
             except Exception as error:
                 member.fail(error)
                 continue

@@ -38,31 +38,31 @@ def route(keys, indices, size, order, counts):
 
 
 @njit(cache=True, nogil=True)
-def claim(table, keys, numbers, count, asked, places, entries):
+def claim(table, keys, numbers, count, candidates, places, entries):
     """Find the entry of each candidate that is asked for, and make one for each that is new.
 
-    asked (N, W), places (N,): candidates and where in the block they stand; entries (N,) int64 gets their entries. Of
+    candidates (N, W), places (N,): states and where in the block they stand; entries (N,) int64 gets their entries. Of
     the places that lead to a new state the first is kept, whatever the order in which they come. Returns the number of
     entries.
     """
     capacity, words = table.shape[0], keys.shape[1]
-    for j in range(len(asked)):
-        if j + _AHEAD < len(asked):
-            prefetch(table, slot_of(hash_of_row(asked, j + _AHEAD), capacity))
-        slot = slot_of(hash_of_row(asked, j), capacity)
+    for j in range(len(candidates)):
+        if j + _AHEAD < len(candidates):
+            prefetch(table, slot_of(hash_of_row(candidates, j + _AHEAD), capacity))
+        slot = slot_of(hash_of_row(candidates, j), capacity)
         while True:
             entry = int64(table[slot])
             if entry < 0:
                 entry = count
                 for k in range(words):
-                    keys[count, k] = asked[j, k]
+                    keys[count, k] = candidates[j, k]
                 numbers[count] = -1 - places[j]
                 table[slot] = count
                 count += 1
                 break
             equal = True
             for k in range(words):
-                equal = equal and keys[entry, k] == asked[j, k]
+                equal = equal and keys[entry, k] == candidates[j, k]
             if equal:
                 if numbers[entry] < 0:
                     numbers[entry] = max(numbers[entry], -1 - places[j])

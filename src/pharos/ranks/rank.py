@@ -71,8 +71,8 @@ def text_of(error: BaseException) -> str:
 def error_of(text: str, rank: int) -> PharosError:
     """The error of another rank: of the same class, where that is one of pharos.errors; a RankFailed otherwise."""
     name, _, message = text.partition("\n")
-    found = getattr(errors, name, None)
+    kind = getattr(errors, name, None)
     # those whose first argument is no message cannot be made of one
-    if isinstance(found, type) and issubclass(found, PharosError) and "__init__" not in vars(found):
-        return found(message)
+    if isinstance(kind, type) and issubclass(kind, PharosError) and "__init__" not in vars(kind):
+        return kind(message)
     return RankFailed(f"rank {rank}: {f'{name}: {message}'.strip().splitlines()[0]}")

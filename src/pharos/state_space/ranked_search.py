@@ -109,11 +109,11 @@ class Queue:
             self._journal.read_states(self.first, states[:done])
         while done < rows:
             part = self._waiting.popleft()
-            taken = min(len(part), rows - done)
-            states[done : done + taken] = part[:taken]
-            done += taken
-            if taken < len(part):
-                self._waiting.appendleft(part[taken:])
+            size = min(len(part), rows - done)
+            states[done : done + size] = part[:size]
+            done += size
+            if size < len(part):
+                self._waiting.appendleft(part[size:])
         self.first += rows
         return states
 

@@ -64,13 +64,13 @@ class Owner:
         self.numbers = huge_pages(len(self.table.states), np.dtype(np.int64))
         self.count = 0
 
-    def claim(self, asked: np.ndarray, places: np.ndarray) -> np.ndarray:
+    def claim(self, candidates: np.ndarray, places: np.ndarray) -> np.ndarray:
         """The entries of the states asked for; new ones wait for their numbers."""
         if self.table.is_full(self.count):
             self._grow()
-        entries = np.empty(len(asked), np.int64)
+        entries = np.empty(len(candidates), np.int64)
         arrays = self.table.slots, self.table.states, self.numbers
-        self.count = key_owner.claim(*arrays, self.count, asked, places, entries)
+        self.count = key_owner.claim(*arrays, self.count, candidates, places, entries)
         return entries
 
     def _grow(self) -> None:
@@ -133,9 +133,9 @@ class RankedTable:
         self._say(_EXPAND, first, len(states), count)
         cuts = self._cuts(len(states))
         parts = [states[cuts[i] : cuts[i + 1]] for i in range(self.rank.size)]
-        block, found = self._superstep(self.rank.scatter(parts, states[:0]), first, cuts, count)
+        block, new = self._superstep(self.rank.scatter(parts, states[:0]), first, cuts, count)
         rows = [np.concatenate(self.rank.gather(array)) for array in block]
-        return Block(*rows), np.concatenate(self.rank.gather(found))
+        return Block(*rows), np.concatenate(self.rank.gather(new))
 
     def _say(self, *header: int) -> None:
         self.rank.broadcast(np.array(header, np.int64), _HEADER)
@@ -153,17 +153,17 @@ class RankedTable:
                 self._take([no_states] * self.rank.size, [np.empty(0, np.int64)] * self.rank.size)
                 continue
             states = self.rank.scatter(None, no_states)
-            block, found = self._superstep(states, first, self._cuts(rows), count)
-            for array in (*block, found):
+            block, new = self._superstep(states, first, self._cuts(rows), count)
+            for array in (*block, new):
                 self.rank.gather(array)
 
     # All -------------------------------------------------------------------------------------------------------------
 
     def _take(self, states: list[np.ndarray], numbers: list[np.ndarray]) -> None:
-        for known, number in zip(self.rank.exchange(states), self.rank.exchange(numbers), strict=True):
-            for start in range(0, len(known), self.rows * self.branches):
+        for keys, number in zip(self.rank.exchange(states), self.rank.exchange(numbers), strict=True):
+            for start in range(0, len(keys), self.rows * self.branches):
                 part = slice(start, start + self.rows * self.branches)
-                entries = self.owner.claim(known[part], np.zeros(len(known[part]), np.int64))
+                entries = self.owner.claim(keys[part], np.zeros(len(keys[part]), np.int64))
                 self.owner.numbers[entries] = number[part]
 
     def _cuts(self, rows: int) -> list[int]:
@@ -180,10 +180,10 @@ class RankedTable:
         terminal, probabilities = self._terminal[: len(states)], self._probabilities[: len(states)]
         self.rules.expand_and_find(states, 0, len(states), 0, keys, indices, terminal, probabilities, _NOTHING)
         order, counts = self._routed(keys)
-        asked = rank.exchange(self._parts(keys[order], counts))
+        candidates = rank.exchange(self._parts(keys[order], counts))
         places = rank.exchange(self._parts(order + row * branches, counts))
         before = owner.count
-        entries = owner.claim(np.concatenate(asked), np.concatenate(places))
+        entries = owner.claim(np.concatenate(candidates), np.concatenate(places))
         fresh = np.arange(before, owner.count)
         first_places = -1 - owner.numbers[fresh]
         by_place = np.argsort(first_places)
@@ -194,10 +194,10 @@ class RankedTable:
         is_new = np.zeros(size, bool)
         for each in wins:
             is_new[each] = True
-        found = rank.gather_all(np.array([np.count_nonzero(is_new)]))
-        numbers = count + int(sum(each[0] for each in found[: rank.rank])) + np.cumsum(is_new) - 1
+        counts_of_new = rank.gather_all(np.array([np.count_nonzero(is_new)]))
+        numbers = count + int(sum(each[0] for each in counts_of_new[: rank.rank])) + np.cumsum(is_new) - 1
         owner.numbers[fresh[by_place]] = np.concatenate(rank.exchange([numbers[each] for each in wins]))
-        lengths = np.cumsum([len(each) for each in asked])[:-1]
+        lengths = np.cumsum([len(each) for each in candidates])[:-1]
         answers = rank.exchange(np.split(owner.numbers[entries], lengths))
         successors = first + row + indices
         successors[order] = np.concatenate(answers)

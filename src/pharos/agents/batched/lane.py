@@ -108,9 +108,9 @@ class Lane:
 
     def best_actions(self, states: np.ndarray) -> np.ndarray:
         """(number,) the action with the highest score in the state (number,) of each run."""
-        asked = np.zeros((self.width, 1), np.int64)
-        asked[: self.number, 0] = states
-        scores: np.ndarray = self.network.scores(self.values, self.observed(asked))[: self.number, 0].cpu().numpy()
+        rows = np.zeros((self.width, 1), np.int64)
+        rows[: self.number, 0] = states
+        scores: np.ndarray = self.network.scores(self.values, self.observed(rows))[: self.number, 0].cpu().numpy()
         return scores.argmax(axis=1)
 
     def move(self) -> None:
