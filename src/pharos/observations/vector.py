@@ -25,7 +25,8 @@ class Vector(Observation):
 
     Args:
         hide: variables that the agent does not see, such as "ball_goes_right" or "bricks", or single components of
-            them, such as "bricks[0,3]": their entries stay, and are always 0.
+            them, such as "bricks[0,3]": their entries stay, and are always 0. Or -1 for the last component, -2 for
+            the last but one, ...: the same rule for all classes.
         irrelevant: how many entries follow that mean nothing: fair coins, 0 or 1, thrown anew at every step, whatever
             the state is. As a function of the state they are 0; environments throw them. At most MOST_IRRELEVANT.
     Attributes:
@@ -35,7 +36,7 @@ class Vector(Observation):
     Source: irrelevant features: Rajan et al. (2023), MDP Playground, whose irrelevant part is a chain of its own.
     """
 
-    def __init__(self, env: Environment, *, hide: str | Sequence[str] = (), irrelevant: int = 0):
+    def __init__(self, env: Environment, *, hide: int | str | Sequence[str] = (), irrelevant: int = 0):
         from gymnasium.spaces import Box
 
         components = env.components
@@ -51,6 +52,8 @@ class Vector(Observation):
         self.low = components.low
         self.scale = np.where(components.size > 1, 1 / np.maximum(components.size - 1, 1), 0.0)
         whose = f"vector of {env.name}"
+        if isinstance(hide, int) and not isinstance(hide, bool) and -len(components.names) <= hide < 0:
+            hide = [components.names[hide]]
         for name in hidden_names(hide, whose, components.variables, components.names):
             self.scale[components.variables.get(name) or components.names.index(name)] = 0.0
         if isinstance(irrelevant, bool) or not isinstance(irrelevant, int) or not 0 <= irrelevant <= MOST_IRRELEVANT:

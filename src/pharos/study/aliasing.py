@@ -10,7 +10,7 @@ import numpy as np
 
 from pharos.agents import TABULAR_OBSERVATION
 from pharos.errors import FileFormatError, PharosError
-from pharos.observations import Aliasing, aliasing, title
+from pharos.observations import Aliasing, aliasing
 from pharos.storage import digest_of_json, is_intact, read_json, replace_json, sealed
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ def aliasing_table(
 
     rows: dict[tuple[str, str], dict[str, Any]] = {}
     for run in study.runs:
-        key = (run.instance, title(run.config["observation"], run.config["observation_options"]))
+        key = (run.instance, run.cell["observation"])
         number = num_states.get(run.instance, np.inf)
         if key in rows or key[1] == TABULAR_OBSERVATION or not number <= MOST_STATES:
             continue
@@ -50,7 +50,7 @@ def aliasing_table(
             count = _counted(folder, run.config)
         except PharosError:
             continue
-        rows[key] = {"environment": run.config["environment"], "instance": key[0], "observation": key[1]}
+        rows[key] = {"environment": run.cell["environment"], "instance": key[0], "observation": key[1]}
         rows[key] |= {"states": count.num_states, "observations": count.num_observations, "share": count.share}
     columns = ["environment", "instance", "observation", "states", "observations", "share"]
     return pd.DataFrame(list(rows.values()), columns=columns)

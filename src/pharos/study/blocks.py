@@ -11,7 +11,7 @@ from pharos.agents import TABULAR_OBSERVATION, agent_kind, agent_source, hyperpa
 from pharos.environments import as_tuples, imported, make, source_of
 from pharos.errors import MissingExtra, ParameterError, UnknownName
 from pharos.experiments import ENGINES, ChanceSetting, Horizon, RunConfig
-from pharos.observations import OwnObservation, names, own_observation
+from pharos.observations import OwnObservation, names, own_observation, title
 from pharos.sources import is_reference
 from pharos.study.regression import MEASURES
 
@@ -30,6 +30,7 @@ except ImportError as error:
 
 # So that a mistake in a number of seeds is told at once.
 MOST_RUNS = 1_000_000
+NAME = r"^([A-Za-z0-9][A-Za-z0-9 ._-]*)?$"
 
 
 @dataclass(frozen=True)
@@ -40,11 +41,15 @@ class Run:
         configuration: what determines its result.
         instance: name of the environment as the specification gives it, such as "frozen_lake/4x4".
         engine: "batched" where it is trained together with others; a table, too, whose configuration does not say so.
+        family: what it counts as where classes are compared: the class of its environment, unless the study says else.
+        setting: what tells its cell from that of other blocks, where the study says so: "tuned".
     """
 
     configuration: RunConfig
     instance: str
     engine: str = "sb3"
+    family: str = ""
+    setting: str = ""
 
     @cached_property
     def config(self) -> Mapping[str, Any]:
@@ -55,6 +60,18 @@ class Run:
     def id(self) -> str:
         """Name of the run's folder: a hash of the config."""
         return self.configuration.id
+
+    @property
+    def cell(self) -> dict[str, str]:
+        """Which cell of the grid it is a seed of: what tables call environment, instance, chance, agent, observation."""
+        config = self.configuration
+        return {
+            "environment": self.family or config.environment,
+            "instance": self.instance,
+            "chance": self.chance,
+            "agent": f"{config.agent} {self.setting}".rstrip(),
+            "observation": title(config.observation, config.observation_options),
+        }
 
     @property
     def chance(self) -> str:
@@ -92,29 +109,6 @@ def _seeds(value: Any) -> Any:
 
 class _Part(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class EnvironmentEntry(_Part):
-    """An environment: a name that `pharos.make` knows, and parameters."""
-
-    name: str
-    parameters: dict[str, Any] = {}
-    _folder: Path | None = PrivateAttr(None)
-
-    def model_post_init(self, context: Any) -> None:
-        self._folder = (context or {}).get("folder") if is_reference(self.name) else None
-
-    @cached_property
-    def instance(self) -> Any:
-        name = imported(self.name, self._folder).name if is_reference(self.name) else self.name
-        return make(name, **{name: as_tuples(value) for name, value in self.parameters.items()})
-
-    @cached_property
-    def label(self) -> str:
-        name = Path(self.name).name if is_reference(self.name) else self.name
-        if not self.parameters:
-            return name
-        return f"{name}({', '.join(f'{name}={value}' for name, value in self.parameters.items())})"
 
 
 class ChanceEntry(_Part):
@@ -156,6 +150,32 @@ class ObservationEntry(_Part):
     def own(self) -> OwnObservation | None:
         """The observation of one's own that is meant; None for one of pharos."""
         return own_observation(self.name, self._folder)
+
+
+class EnvironmentEntry(_Part):
+    """An environment: a name that `pharos.make` knows, and parameters; the class it counts as, if not its own; and what
+    is seen of it, if not what its block says."""
+
+    name: str
+    parameters: dict[str, Any] = {}
+    family: str = Field("", pattern=NAME)
+    observations: list[Annotated[ObservationEntry, BeforeValidator(_entry)]] | None = Field(None, min_length=1)
+    _folder: Path | None = PrivateAttr(None)
+
+    def model_post_init(self, context: Any) -> None:
+        self._folder = (context or {}).get("folder") if is_reference(self.name) else None
+
+    @cached_property
+    def instance(self) -> Any:
+        name = imported(self.name, self._folder).name if is_reference(self.name) else self.name
+        return make(name, **{name: as_tuples(value) for name, value in self.parameters.items()})
+
+    @cached_property
+    def label(self) -> str:
+        name = Path(self.name).name if is_reference(self.name) else self.name
+        if not self.parameters:
+            return name
+        return f"{name}({', '.join(f'{name}={value}' for name, value in self.parameters.items())})"
 
 
 class Hardness(_Part):
@@ -213,6 +233,7 @@ class Block(_Part):
         [ObservationEntry(name="vector")], min_length=1
     )
     agents: list[str] = Field(min_length=1)
+    setting: str = Field("", pattern=NAME)
     seeds: Seeds | None = None
     steps: Steps | None = None
     evaluations: Steps | None = None
@@ -257,7 +278,7 @@ class Specification(_Part):
                 for agent in block.agents:
                     engine = self.engine_of(block, agent)
                     agent_from = agent_source(agent, self.folder, check=False)
-                    observations: Sequence[ObservationEntry] = block.observations
+                    observations: Sequence[ObservationEntry] = environment.observations or block.observations
                     if agent_kind(agent).is_tabular:
                         observations = [ObservationEntry(name=TABULAR_OBSERVATION)]
                     for observation in observations:
@@ -289,6 +310,8 @@ class Specification(_Part):
                                 ),
                                 environment.label,
                                 engine,
+                                environment.family,
+                                block.setting,
                             )
 
     def engine_of(self, block: Block, agent: str) -> str:

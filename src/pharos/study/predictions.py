@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 from pharos import experiments
 from pharos.agents import agent_kind
 from pharos.errors import FileFormatError, ParameterError, PharosError, ResultCorrupted
-from pharos.observations import title
 from pharos.storage import plain
 from pharos.study.blocks import Run, Specification
 from pharos.study.specification import Source
@@ -56,17 +55,14 @@ def predict(
     study, _ = opened(source, folder)
     rows: dict[tuple[str, ...], dict[str, Any]] = {}
     for run in study.runs:
-        config = run.config
-        if agent_kind(config["agent"]).is_tabular:
+        if agent_kind(run.configuration.agent).is_tabular:
             continue
-        observation = title(config["observation"], config["observation_options"])
-        key = (config["environment"], run.instance, run.chance, config["agent"], observation)
+        key = tuple(run.cell.values())
         if key in rows:
             continue
         if progress is not None:
             progress(f"predicting {', '.join(key[1:])}")
-        names = ("environment", "instance", "chance", "agent", "observation")
-        rows[key] = dict(zip(names, key, strict=True)) | _predicted(run)
+        rows[key] = run.cell | _predicted(run)
     if not rows:
         raise ParameterError(f"study {study.name!r}: no agent learns from observations, so there is nothing to predict")
     return pd.DataFrame(list(rows.values()))

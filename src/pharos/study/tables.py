@@ -18,7 +18,6 @@ from pharos import experiments
 from pharos.environments import classes, make
 from pharos.errors import FileFormatError, ParameterError, UnknownName
 from pharos.experiments import ChanceSetting
-from pharos.observations import title
 from pharos.storage import is_intact, read_json, replace_json, sealed
 from pharos.study import worker as _worker
 from pharos.study.blocks import Run, Specification
@@ -176,16 +175,7 @@ def _last_return(curve: "pd.DataFrame") -> float:
 
 def described(run: Run) -> dict[str, Any]:
     """What a run is of: the columns of tables that say so."""
-    config = run.config
-    return {
-        "environment": config["environment"],
-        "instance": run.instance,
-        "chance": run.chance,
-        "agent": config["agent"],
-        "observation": title(config["observation"], config["observation_options"]),
-        "seed": config["seed"],
-        "steps": config["steps"],
-    }
+    return {**run.cell, "seed": run.config["seed"], "steps": run.config["steps"]}
 
 
 # Hardness ------------------------------------------------------------------------------------------------------------
@@ -223,7 +213,7 @@ def hardness_table(
         plain = {**run.config, "chance": PLAIN}
         own = _measured(study, place, run.config)
         without = _measured(study, place, plain) if run.chance != "plain" else own
-        rows[key] = {"environment": run.config["environment"], "instance": run.instance, "chance": run.chance}
+        rows[key] = {"environment": run.cell["environment"], "instance": run.instance, "chance": run.chance}
         rows[key] |= _chosen(study.hardness.measures, own, without)
     return pd.DataFrame(list(rows.values()))
 
