@@ -145,7 +145,7 @@ def test_a_mapping_is_read_as_well_and_a_missing_file_suggests_a_preset():
 
 
 def test_the_presets_are_those_of_the_paper():
-    assert presets() == ["classes", "paper", "quick", "small"]
+    assert presets() == ["classes", "hardness-dev", "hardness-sealed", "paper", "quick", "small"]
     assert len(specification("small").runs) == 8 * 3 * 5 * (2 * 2 + 1)
     paper = specification("paper").runs
     assert len(paper) == 28 * 3 * 5 * (2 * 2 + 1)
@@ -213,3 +213,52 @@ def test_a_million_runs_of_a_product_are_refused_before_they_are_listed():
 def test_aliases_that_share_a_node_are_no_mistake():
     text = "name: a\nblocks:\n  - &b {environments: [frozen_lake/4x4], agents: &g [q_learning]}\n  - *b\n"
     assert len(parse(text).runs) == 5
+
+
+def test_environments_of_a_file_take_the_place_of_those_that_are_given(tmp_path):
+    """Imported MDPs among them: a folder beside the file, a class of its own, with the observations that it has."""
+    import numpy as np
+
+    from pharos import importers
+    from pharos.mdp import TabularMDP
+
+    mdp = TabularMDP.from_outcomes(np.array([[[1], [0]], [[1], [1]]]), np.ones((2, 2, 1)), np.array([[1.0, 0], [0, 0]]))
+    importers.save(mdp, tmp_path / "tiny", observations=np.array([[0.0], [1.0]]))
+    file = tmp_path / "sealed.yaml"
+    file.write_text("- taxi/5x5\n- {name: tiny, observations: [recorded, hash]}\n")
+    found = specification("hardness-sealed", environments=file)
+    cells = [run.cell for run in found.runs]
+    assert {cell["environment"] for cell in cells} == {"taxi", "tiny"}
+    assert {cell["observation"] for cell in cells if cell["environment"] == "tiny"} == {"recorded", "hash"}
+    assert {cell["agent"] for cell in cells} == {"dqn", "dqn 100k", "dqn tuned", "ppo", "ppo 100k", "ppo tuned"}
+    assert len(found.runs) == (5 + 2) * 2 * 2 * 5 * 3
+    again = specification(found.model_dump(mode="json", exclude_unset=True))
+    assert [run.id for run in again.runs] == [run.id for run in found.runs]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("taxi/5x5", "expected a list of environments"),
+        ("- [taxi]", "expected a list of environments"),
+        ("- my.py:Maze", "is code"),
+        ("- taxy/5x5", "did you mean 'taxi"),
+        ("- {name: taxi", "expected ',' or '}'"),
+    ],
+)
+def test_a_wrong_list_of_environments_is_a_line(tmp_path, text, message):
+    file = tmp_path / "list.yaml"
+    file.write_text(text)
+    with pytest.raises(ParameterError, match=message) as error:
+        specification("hardness-sealed", environments=file)
+    assert "\n" not in str(error.value)
+
+
+def test_environments_are_given_to_studies_that_ask_for_them_alone(tmp_path):
+    with pytest.raises(ParameterError, match="--environments FILE"):
+        specification("hardness-sealed")
+    (tmp_path / "list.yaml").write_text("- taxi/5x5")
+    with pytest.raises(ParameterError, match="has environments of its own"):
+        specification("quick", environments=tmp_path / "list.yaml")
+    with pytest.raises(ParameterError, match="cannot be read"):
+        specification("hardness-sealed", environments=tmp_path / "nothing.yaml")

@@ -21,21 +21,30 @@ app = typer.Typer(help="Run a grid of training runs, and make the paper's figure
 
 SpecArgument = Annotated[
     str,
-    typer.Argument(metavar="SPEC", help="A YAML file, a study's folder, or a preset: quick, small, classes, paper."),
+    typer.Argument(
+        metavar="SPEC",
+        help="A YAML file, a study's folder, or a preset: quick, small, classes, paper, hardness-dev, hardness-sealed.",
+    ),
 ]
 Out = Annotated[
     Path | None, typer.Option("--out", metavar="DIR", help="Where results are; studies/NAME when not given.")
+]
+Environments = Annotated[
+    Path | None,
+    typer.Option(
+        "--environments", metavar="FILE", help="YAML: a list of environments, for studies that have none of their own."
+    ),
 ]
 EXIT_FAILED = 1
 LINE_SECONDS = 30.0
 
 
 @app.command("show")
-def show(spec: SpecArgument, trust: Trust = False, json: Json = False) -> None:
+def show(spec: SpecArgument, environments: Environments = None, trust: Trust = False, json: Json = False) -> None:
     """Print the grid: which instances, chances, observations and agents, and how many runs."""
     from pharos.study import specification
 
-    study = specification(spec, trust=trust or None)
+    study = specification(spec, trust=trust or None, environments=environments)
     runs = study.runs
     if json:
         rows = [{"id": run.id, "instance": run.instance, "config": run.config} for run in runs]
@@ -102,6 +111,7 @@ def run(
         str | None,
         typer.Option("--log", metavar="tensorboard|wandb", help="Write curves there as runs finish; see `study log`."),
     ] = None,
+    environments: Environments = None,
     trust: Trust = False,
     json: Json = False,
 ) -> None:
@@ -110,7 +120,7 @@ def run(
 
     if on not in ("local", "slurm", "ray"):
         raise UnknownName("place to run on", on, ("local", "slurm", "ray"))
-    opened, place = study.opened(spec, out, trust=trust or None)
+    opened, place = study.opened(spec, out, trust=trust or None, environments=environments)
     if on == "slurm":
         jobs = study.submit(
             opened,
@@ -188,11 +198,17 @@ def _print_jobs(jobs: list[str], json: bool) -> None:
 
 
 @app.command("status")
-def status(spec: SpecArgument, out: Out = None, trust: Trust = False, json: Json = False) -> None:
+def status(
+    spec: SpecArgument,
+    out: Out = None,
+    environments: Environments = None,
+    trust: Trust = False,
+    json: Json = False,
+) -> None:
     """How many runs are finished, running, missing and failed, and why."""
     from pharos import study
 
-    _answer(study.status(*study.opened(spec, out, trust=trust or None)), json)
+    _answer(study.status(*study.opened(spec, out, trust=trust or None, environments=environments)), json)
 
 
 @app.command("report")
@@ -206,6 +222,7 @@ def report(
         Path | None,
         typer.Option("--predictions", metavar="FILE", help="Of `pharos study predict`: what came true of them."),
     ] = None,
+    environments: Environments = None,
     trust: Trust = False,
     json: Json = False,
 ) -> None:
@@ -214,7 +231,7 @@ def report(
 
     foretold = None if predictions is None else study.read_predictions(predictions)
     with progress_line("report") as tell:
-        opened, place = study.opened(spec, out, trust=trust or None)
+        opened, place = study.opened(spec, out, trust=trust or None, environments=environments)
         written = study.report(opened, place, out=to, progress=tell, predictions=foretold)
     if json:
         files = {"figures": list(map(str, written.figures)), "tables": list(map(str, written.tables))}
@@ -259,13 +276,14 @@ def log(
 def predict(
     spec: SpecArgument,
     to: Annotated[Path, typer.Option("--out", metavar="FILE", help="The Parquet file to write.")],
+    environments: Environments = None,
     trust: Trust = False,
     json: Json = False,
 ) -> None:
     """Predict the regret of each cell from what its network makes of its states, before any run; hashed and dated."""
     from pharos import study
 
-    opened, place = study.opened(spec, None, trust=trust or None)
+    opened, place = study.opened(spec, None, trust=trust or None, environments=environments)
     with progress_line("predicting") as tell:
         predictions = study.predict(opened, place, progress=tell)
     said = study.write_predictions(opened, predictions, to)

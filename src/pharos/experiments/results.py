@@ -10,6 +10,7 @@ import io
 import os
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -70,10 +71,12 @@ def write_record(folder: Path, record: Mapping[str, Any]) -> None:
     """Replace run.json in one step; numbers that JSON cannot say are null.
 
     The record gets a `digest` of all that it says; that of a finished run also `checksums` of the other files of the
-    run, which are written before it: of `curve.parquet` (see `digest_of_curve`), and of what the agent has learnt.
+    run, which are written before it: of `curve.parquet` (see `digest_of_curve`), and of what the agent has learnt; and
+    `written`, the date.
     """
     if record.get("status") == "finished":
-        record = {**record, "checksums": _checksums(folder)}
+        written = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+        record = {**record, "checksums": _checksums(folder), "written": written}
     storage.replace_json(folder / RECORD, storage.sealed(record))
 
 

@@ -52,7 +52,9 @@ class Vector(Observation):
         self.low = components.low
         self.scale = np.where(components.size > 1, 1 / np.maximum(components.size - 1, 1), 0.0)
         whose = f"vector of {env.name}"
-        if isinstance(hide, int) and not isinstance(hide, bool) and -len(components.names) <= hide < 0:
+        if isinstance(hide, int):
+            if not -len(components.names) <= hide < 0:
+                raise ParameterError(f"{whose}: hide is {hide}; expected a name, or -1 to -{len(components.names)}")
             hide = [components.names[hide]]
         for name in hidden_names(hide, whose, components.variables, components.names):
             self.scale[components.variables.get(name) or components.names.index(name)] = 0.0

@@ -63,7 +63,7 @@ class Run:
 
     @property
     def cell(self) -> dict[str, str]:
-        """Which cell of the grid it is a seed of: what tables call environment, instance, chance, agent, observation."""
+        """The cell of the grid that it is a seed of, by the names that tables have."""
         config = self.configuration
         return {
             "environment": self.family or config.environment,
@@ -170,9 +170,19 @@ class EnvironmentEntry(_Part):
         name = imported(self.name, self._folder).name if is_reference(self.name) else self.name
         return make(name, **{name: as_tuples(value) for name, value in self.parameters.items()})
 
+    @property
+    def is_imported(self) -> bool:
+        """Whether it is the folder of an imported MDP."""
+        return bool(self.instance.name == "imported")
+
+    @property
+    def counts_as(self) -> str:
+        """Its family; an imported MDP without one is a class of its own; "": the class of the environment."""
+        return self.family or (self.label if self.is_imported else "")
+
     @cached_property
     def label(self) -> str:
-        name = Path(self.name).name if is_reference(self.name) else self.name
+        name = Path(self.name).name if is_reference(self.name) or self.is_imported else self.name
         if not self.parameters:
             return name
         return f"{name}({', '.join(f'{name}={value}' for name, value in self.parameters.items())})"
@@ -310,7 +320,7 @@ class Specification(_Part):
                                 ),
                                 environment.label,
                                 engine,
-                                environment.family,
+                                environment.counts_as,
                                 block.setting,
                             )
 

@@ -114,6 +114,12 @@ def title(name: str) -> str:
     return name.replace("_", " ")
 
 
+def observation_color(name: str, names: Sequence[str]) -> str:
+    """The colour of an observation among `names`: its own, or one of MORE_COLORS."""
+    others = [other for other in names if other not in OBSERVATION_COLORS]
+    return OBSERVATION_COLORS.get(name) or MORE_COLORS[others.index(name) % len(MORE_COLORS)]
+
+
 def regret_curves(
     points: "pd.DataFrame", *, by: str | list[str] = "environment", draws_runs: bool = False, resamples: int = 500
 ) -> Curves:
@@ -122,13 +128,13 @@ def regret_curves(
 
     The mean over instances and kinds of chance, with its 95 % bootstrap interval over runs. The paper's figure 2.
     """
-    panels = []
+    panels, observations = [], list(dict.fromkeys(points["observation"]))
     for name, part in points.groupby(by, sort=False):
         drawn = []
         for (agent, observation), each in part.groupby(["agent", "observation"], sort=True):
             steps, tasks, runs = same_steps(each)
             mean, lower, upper = mean_curve(tasks, resamples=resamples)
-            color = OBSERVATION_COLORS.get(observation, MORE_COLORS[0])
+            color = observation_color(observation, observations)
             words, dash = label(agent, observation), LINES.get(agent, ":")
             drawn.append(Line(words, color, dash, steps, mean, lower, upper, runs))
         text = name if isinstance(name, str) else ", ".join(map(str, name))
@@ -158,11 +164,11 @@ def same_steps(points: "pd.DataFrame") -> tuple[np.ndarray, list[np.ndarray], di
 
 def performance_profiles(profiles: "pd.DataFrame") -> Curves:
     """A panel for each class: the share of runs above each score, a line for each agent and observation."""
-    panels = []
+    panels, observations = [], list(dict.fromkeys(profiles["observation"]))
     for name, part in profiles.groupby("environment", sort=False):
         drawn = []
         for (agent, observation), line in part.groupby(["agent", "observation"], sort=True):
-            color = OBSERVATION_COLORS.get(observation, MORE_COLORS[0])
+            color = observation_color(observation, observations)
             values = (line[column].to_numpy(np.float64) for column in ("score", "share", "lower", "upper"))
             drawn.append(Line(label(agent, observation), color, LINES.get(agent, ":"), *values))
         panels.append(Panel(title(str(name)), drawn))

@@ -40,7 +40,7 @@ def lines(curves: Curves) -> "Figure | None":
     """A panel for each group, with a line and its interval for each agent and observation; None without panels."""
     if not curves.panels:
         return None
-    figure, axes = _panels(len(curves.panels), 3.3, 2.7)
+    figure, axes = panels(len(curves.panels), 3.3, 2.7)
     for axis, panel in zip(axes, curves.panels, strict=False):
         for line in panel.lines:
             axis.plot(line.x, line.mean, line.dash, color=line.color, lw=1.6, label=line.label)
@@ -56,7 +56,7 @@ def lines(curves: Curves) -> "Figure | None":
             axis.xaxis.set_major_formatter(_thousands)
     for axis in axes[:: max(1, _columns(len(axes)))]:
         axis.set_ylabel(curves.y_label)
-    _legend(figure, axes)
+    legend_below(figure, axes)
     return figure
 
 
@@ -99,7 +99,7 @@ def representations(cells: "pd.DataFrame", *, agent: str = "dqn", image: str = I
         return None
     wide = wide[[image, VECTOR]].dropna().reset_index()
     names = list(dict.fromkeys(wide["environment"]))
-    figure, (axis,) = _panels(1, 4.6, 4.2)
+    figure, (axis,) = panels(1, 4.6, 4.2)
     for (environment, chance), part in wide.groupby(["environment", wide["chance"].str.split().str[0]], sort=True):
         marker = CHANCE_MARKERS.get(chance, "D")
         color = class_color(environment, names)
@@ -118,7 +118,7 @@ def representations(cells: "pd.DataFrame", *, agent: str = "dqn", image: str = I
 
 def fitted_against_actual(fits: Sequence[Fit], regret: str) -> "Figure":
     """A panel for each fit: what the model gives against what was measured; a perfect model is the dotted diagonal."""
-    figure, axes = _panels(len(fits), 3.1, 3.0)
+    figure, axes = panels(len(fits), 3.1, 3.0)
     for axis, fit in zip(axes, fits, strict=False):
         names = list(dict.fromkeys(fit.classes)) or [""]
         for name in names:
@@ -135,7 +135,7 @@ def fitted_against_actual(fits: Sequence[Fit], regret: str) -> "Figure":
     for axis in axes[:: max(1, _columns(len(fits)))]:
         axis.set_ylabel(f"fitted {regret}")
     if len({name for fit in fits for name in fit.classes}) > 1:
-        _legend(figure, axes)
+        legend_below(figure, axes)
     return figure
 
 
@@ -148,7 +148,7 @@ def agents_against_each_other(cells: "pd.DataFrame", value: str, agents: tuple[s
     if len(wide) == 0:
         return None
     names = list(dict.fromkeys(wide["environment"]))
-    figure, (axis,) = _panels(1, 4.2, 3.6)
+    figure, (axis,) = panels(1, 4.2, 3.6)
     for environment, part in wide.groupby("environment", sort=False):
         color = class_color(str(environment), names)
         axis.scatter(
@@ -212,7 +212,8 @@ def _columns(count: int) -> int:
     return min(count, 4) if count <= 4 or count % 3 else 3
 
 
-def _panels(count: int, width: float, height: float) -> tuple["Figure", list[Any]]:
+def panels(count: int, width: float, height: float) -> tuple["Figure", list[Any]]:
+    """A figure of so many axes, each of that width and height in inches."""
     from matplotlib.figure import Figure
 
     columns = _columns(count)
@@ -224,7 +225,7 @@ def _panels(count: int, width: float, height: float) -> tuple["Figure", list[Any
     return figure, axes[:count]
 
 
-def _legend(figure: "Figure", axes: Sequence[Any]) -> None:
+def legend_below(figure: "Figure", axes: Sequence[Any]) -> None:
     """One legend below all panels."""
     handles: dict[str, Any] = {}
     for axis in axes:

@@ -31,6 +31,7 @@ PREDICTORS = (
     *("kernel_learning_time", "kernel_sample_complexity", "aliasing_floor", "exploration_time", "num_states"),
 )
 """Columns of predictions, numbers; the larger, the harder. `adam_regret` is kernel regret with `optimizer="adam"`."""
+CURVE_POINTS = 40
 _KEY = b"pharos.predictions"
 
 
@@ -44,8 +45,9 @@ def predict(
         progress: called with what is being done.
     Returns:
         Columns `environment`, `instance`, `chance`, `agent`, `observation`; PREDICTORS; `network`; `estimated_error`,
-        that of `kernel_regret` where landmarks stand for the kernel; `notes`, why a number is missing. The idealised
-        learner has the steps of the run, and of a DQN its discount, exploration and target network.
+        that of `kernel_regret` where landmarks stand for the kernel; `curve` and `adam_curve`, the learner's steps and
+        greedy regrets as JSON; `notes`, why a number is missing. The idealised learner has the steps of the run, and of
+        a DQN its discount, exploration and target network.
     Raises:
         ParameterError: the study has no such cell.
     Cost: measures of hardness are kept beside the state spaces, so that a second call is quick.
@@ -73,7 +75,7 @@ def _predicted(run: Run) -> dict[str, Any]:
     from pharos.observations import representation
 
     numbers: dict[str, Any] = dict.fromkeys(PREDICTORS, math.nan)
-    row = {**numbers, "network": "", "estimated_error": math.nan, "notes": ""}
+    row = {**numbers, "network": "", "estimated_error": math.nan, "curve": "", "adam_curve": "", "notes": ""}
     try:
         task = task_of(run.config)
         name, initialisation = _network(run.config, task)
@@ -91,16 +93,25 @@ def _predicted(run: Run) -> dict[str, Any]:
     if regret is not None:
         row |= {"kernel_regret": regret["value"], "kernel_regret_played": regret["played"]}
         row |= {"tabular_regret": regret["tabular"], "tabular_regret_played": regret["tabular_played"]}
-        row["estimated_error"] = regret["estimated_error"]
+        row |= {"estimated_error": regret["estimated_error"], "curve": _curve(regret)}
     regret = rescaled["kernel_regret"].value
     if regret is not None:
-        row |= {"adam_regret": regret["value"], "adam_regret_played": regret["played"]}
+        row |= {"adam_regret": regret["value"], "adam_regret_played": regret["played"], "adam_curve": _curve(regret)}
     for measure in MEASURES[1:]:
         value = measures[measure].value
         if value is not None:
             row[measure] = float(value["value"] if isinstance(value, Mapping) else value)
     notes = (result.undefined or result.certificate.note for result in measures.results.values())
     return {**row, "notes": "; ".join(note for note in notes if note)}
+
+
+def _curve(regret: Mapping[str, Any]) -> str:
+    """Steps and greedy regret of the idealised learner, of at most CURVE_POINTS of its phases, as JSON."""
+    steps, greedy = regret["curve"]["steps"], regret["curve"]["greedy"]
+    every = max(1, math.ceil(len(steps) / CURVE_POINTS))
+    return json.dumps(
+        [[int(step), round(value, 4)] for step, value in zip(steps[::every], greedy[::every], strict=True)]
+    )
 
 
 def _network(config: Mapping[str, Any], task: Any) -> tuple[str, str]:

@@ -20,12 +20,14 @@ imported where the user names a folder, for the study.yaml beside results, or fo
 may have written, unless it is trusted.
 """
 
+import os
 import re
 from collections.abc import Iterator, Mapping
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
+from pharos import mdp_files
 from pharos.agents import AGENTS, BATCHED, agent_source, is_known
 from pharos.errors import MissingExtra, ParameterError, UnknownName, UntrustedCode
 from pharos.sources import is_reference
@@ -47,6 +49,7 @@ from pharos.study.blocks import (
 )
 
 STUDIES = "studies"
+GIVEN = "given"
 STUDY_FILE = "study.yaml"
 # So that every mistake is told at once, and aliases do not stand for millions of entries.
 MOST_NODES = 1_000_000
@@ -73,11 +76,15 @@ Source = str | Path | Mapping[str, Any] | Specification
 """What is taken for a study: a YAML file, a preset's name, a mapping, a Specification, or the folder of a study."""
 
 
-def specification(source: Source, *, trust: bool | None = None) -> Specification:
+def specification(
+    source: Source, *, trust: bool | None = None, environments: str | os.PathLike | None = None
+) -> Specification:
     """The specification in a YAML file or a study's folder, of a preset or a study in `studies` by its name, or from a
     mapping.
 
     Args:
+        environments: a YAML file with a list of environments, for blocks that say `environments: given`; see
+            `given_environments`.
         trust: whether code that it names may be imported; None: where `source` is a YAML file, but for the study.yaml
             beside results.
     Raises:
@@ -87,11 +94,12 @@ def specification(source: Source, *, trust: bool | None = None) -> Specification
     """
     if isinstance(source, Specification):
         return source
+    given = None if environments is None else given_environments(environments)
     if isinstance(source, Mapping):
-        return _validated(source, "specification", None, Path.cwd(), trust is not False)
+        return _validated(source, "specification", None, Path.cwd(), trust is not False, given)
     if str(source) in presets():
         file = resources.files("pharos.study").joinpath("presets", f"{source}.yaml")
-        return parse(file.read_text(encoding="utf-8"), f"preset {source}")
+        return parse(file.read_text(encoding="utf-8"), f"preset {source}", given=given)
     path = Path(source)
     if path.is_dir():
         path = path / STUDY_FILE
@@ -100,7 +108,42 @@ def specification(source: Source, *, trust: bool | None = None) -> Specification
     if not path.is_file():
         raise UnknownName("study (no such file, and no such preset)", source, [*presets(), *_studies_here()])
     trusted = path == Path(source) and not _is_of_results(path) if trust is None else trust
-    return parse(_text_of(path), str(path), folder=path.absolute().parent, trust=trusted)
+    return parse(_text_of(path), str(path), folder=path.absolute().parent, trust=trusted, given=given)
+
+
+def given_environments(file: str | os.PathLike) -> list[Any]:
+    """The list in a YAML file: entries as under `environments:` of a block; folders are looked for beside the file.
+
+        - taxi/5x5
+        - {name: taxi, parameters: {size: 7}}
+        - {name: folders/lava, family: lava, observations: [recorded, one_hot]}     # an imported MDP, and what it shows
+
+    Raises:
+        ParameterError: it is no such list, or names code: classes of one's own belong into a study's own YAML file.
+    """
+    path = Path(file)
+    try:
+        entries = yaml.load(_text_of(path), _Loader)
+    except yaml.YAMLError as error:
+        raise ParameterError(f"{path}: {getattr(error, 'problem', None) or 'this is no YAML'}") from error
+    except (ValueError, RecursionError, OverflowError) as error:
+        raise ParameterError(f"{path}: {' '.join(str(error).split())}") from error
+    if not isinstance(entries, list) or not entries or not all(isinstance(each, str | dict) for each in entries):
+        raise ParameterError(
+            f"{path}: expected a list of environments, such as `- taxi/5x5` and `- {{name: taxi, ...}}`"
+        )
+    found = []
+    for entry in entries:
+        entry = {"name": entry} if isinstance(entry, str) else entry
+        name = entry.get("name")
+        if isinstance(name, str) and mdp_files.is_folder(path.parent / name):
+            entry = {**entry, "name": str((path.parent / name).absolute())}
+        elif isinstance(name, str) and is_reference(name):
+            raise ParameterError(
+                f"{path}: {name!r} is code; expected names that `pharos list` shows, or folders of imported MDPs"
+            )
+        found.append(entry)
+    return found
 
 
 def study_folder(source: str | Path) -> Path | None:
@@ -140,13 +183,21 @@ def _text_of(path: Path) -> str:
         raise ParameterError(f"{path}: cannot be read ({error.strerror}); expected a YAML file") from error
 
 
-def parse(text: str, name: str = "specification", *, folder: Path | None = None, trust: bool = False) -> Specification:
+def parse(
+    text: str,
+    name: str = "specification",
+    *,
+    folder: Path | None = None,
+    trust: bool = False,
+    given: list[Any] | None = None,
+) -> Specification:
     """The specification in a text of YAML.
 
     Args:
         name: stands before the line number in messages.
         folder: where modules and files that it names are looked for; None: in the current directory.
         trust: whether they may be imported.
+        given: the environments of blocks that say `environments: given`.
     """
     try:
         root = yaml.compose(text, _Loader)
@@ -167,7 +218,7 @@ def parse(text: str, name: str = "specification", *, folder: Path | None = None,
         raise ParameterError(f"{name}: {' '.join(str(error).split())}") from error
     if not isinstance(data, dict):
         raise ParameterError(f"{name}:1: found {type(data).__name__}; expected a mapping with name and blocks")
-    return _validated(data, name, root, folder or Path.cwd(), trust)
+    return _validated(data, name, root, folder or Path.cwd(), trust, given)
 
 
 class _Loader(yaml.SafeLoader):
@@ -180,7 +231,10 @@ _Loader.add_implicit_resolver(
 )
 
 
-def _validated(data: Mapping[str, Any], name: str, root: Any, folder: Path, trust: bool) -> Specification:
+def _validated(
+    data: Mapping[str, Any], name: str, root: Any, folder: Path, trust: bool, given: list[Any] | None = None
+) -> Specification:
+    data = _with_environments(data, name, given)
     references = [*_references(data)]
     if references and not trust:
         loc, reference = references[0]
@@ -200,6 +254,27 @@ def _validated(data: Mapping[str, Any], name: str, root: Any, folder: Path, trus
     if wrong:
         raise ParameterError("; ".join(f"{_where(name, root, loc)}: {message}" for loc, message in wrong))
     return specification
+
+
+def _with_environments(data: Mapping[str, Any], name: str, given: list[Any] | None) -> Mapping[str, Any]:
+    """With the given environments in blocks that ask for them.
+
+    Raises:
+        ParameterError: some ask and none are given, or none asks.
+    """
+    blocks = data.get("blocks")
+    listed = blocks if isinstance(blocks, list) else []
+    asking = [isinstance(block, Mapping) and block.get("environments") == GIVEN for block in listed]
+    if any(asking) and given is None:
+        raise ParameterError(f"{name}: has no environments of its own; give a list of them: --environments FILE")
+    if given is None:
+        return data
+    if not any(asking):
+        raise ParameterError(
+            f"{name}: has environments of its own; --environments is for blocks with `environments: given`"
+        )
+    pairs = zip(listed, asking, strict=True)
+    return {**data, "blocks": [{**block, "environments": given} if asks else block for block, asks in pairs]}
 
 
 def _references(data: Mapping[str, Any]) -> Iterator[tuple[Loc, str]]:

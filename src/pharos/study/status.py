@@ -84,16 +84,20 @@ def duration(seconds: float) -> str:
 
 
 def opened(
-    source: Source, folder: str | os.PathLike | None = None, *, trust: bool | None = None
+    source: Source,
+    folder: str | os.PathLike | None = None,
+    *,
+    trust: bool | None = None,
+    environments: str | os.PathLike | None = None,
 ) -> tuple[Specification, Path]:
     """A study and where its results are: `folder`; else the source, if it is a study's folder; else studies/NAME.
 
     Args:
-        trust: as for `specification`.
+        trust, environments: as for `specification`.
     """
     if folder is None and isinstance(source, str | Path):
         folder = study_folder(source)
-    study = specification(source, trust=trust)
+    study = specification(source, trust=trust, environments=environments)
     place = Path(STUDIES, study.name) if folder is None else Path(folder)
     warn_of_changes(study, place)
     return study, place

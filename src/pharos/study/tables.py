@@ -8,6 +8,7 @@ import json
 import os
 from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -38,6 +39,7 @@ LAST = 0.1
 NUMBERS = ("cumulative_regret", "normalized_regret", "final_value", "value_optimal", "value_uniform")
 """What the result of a run says at least, numbers or null."""
 POINTS = ("step", "episodes", "value", "cumulative_expected_regret", "normalized_regret", "mean_return")
+DATE = "%Y-%m-%dT%H:%M:%SZ"
 # Numbers beyond this are no results, and no figure can hold them
 LARGEST = 1e100
 
@@ -72,7 +74,7 @@ def finished_runs(study: Specification, place: Path) -> FinishedRuns:
             if record is None or record["status"] != _worker.FINISHED:
                 continue
             curve = read_curve(place, run.id)
-            row = {"id": run.id, **described(run), "seconds": float(record["seconds"])}
+            row = {"id": run.id, **described(run), "seconds": float(record["seconds"]), "began": _began(record)}
             row |= _result_of(record, place / "runs" / run.id) | {"return": _last_return(curve)}
             row["exact"], row["half_width"] = _exactness(curve, row)
         except FileFormatError as error:
@@ -92,7 +94,8 @@ def table(source: Source, folder: str | os.PathLike | None = None) -> "pd.DataFr
     """One row a finished run; runs whose files are damaged are left out.
 
     Returns:
-        Columns `id`, `environment` (class), `instance`, `chance`, `agent`, `observation`, `seed`, `steps`, `seconds`;
+        Columns `id`, `environment` (class), `instance`, `chance`, `agent`, `observation`, `seed`, `steps`, `seconds`,
+        `began` (date; "" where the record does not say);
         the result of the run (`cumulative_regret`, `normalized_regret`, `value_optimal`, ...); `return`, the mean
         return of the training episodes in the last tenth of the run, undiscounted; `exact`, whether every value behind
         the regret is computed; and `half_width`, by how much `normalized_regret` may at worst be wrong where some are
@@ -116,6 +119,16 @@ def _result_of(record: Mapping[str, Any], folder: Path) -> dict[str, Any]:
         if isinstance(value, bool) or not isinstance(value, int | float | None) or abs(value or 0) > LARGEST:
             raise FileFormatError(f"{folder / 'run.json'}: {name} is {str(value)[:30]}; expected a number below 1e100")
     return {name: float("nan") if value is None else value for name, value in result.items()}
+
+
+def _began(record: Mapping[str, Any]) -> str:
+    """When a run began, told by when its record was written and how long its program took; "": it does not say."""
+    try:
+        seconds = float(record.get("batch", {}).get("seconds") or record["seconds"])
+        began = datetime.strptime(record["written"], DATE).replace(tzinfo=UTC) - timedelta(seconds=seconds)
+        return began.strftime(DATE)
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError):
+        return ""
 
 
 def _exactness(curve: "pd.DataFrame", row: Mapping[str, Any]) -> tuple[bool, float]:

@@ -10,17 +10,18 @@ from pharos.storage import replace_file
 from pharos.study.curves import all_curves
 from pharos.study.figures import all_figures, save
 from pharos.study.latex import tables_of
-from pharos.study.report.model_sections import predictions_section
 from pharos.study.report.page import render
 from pharos.study.report.results import Results, coefficients, results_of
 from pharos.study.report.sections import sections_of
+from pharos.study.report.unseen_section import judged, unseen_section
 from pharos.study.specification import Source
 from pharos.study.status import opened
-from pharos.study.unseen_classes import outcomes, validation
+from pharos.study.unseen_figures import unseen_figures
 
 if TYPE_CHECKING:
     import pandas as pd
 
+MODELS = "Hardness and regret"
 FORMULA = ("=", "+", "-", "@", "\t", "\r")
 
 
@@ -57,7 +58,8 @@ def report(
         out: folder to write to; None for `report` in the folder of the study.
         progress: called with what is being done.
         trust: whether code that the study names may be imported; as for `specification`.
-        predictions: of `read_predictions`; a section and a table say what came true of them.
+        predictions: of `read_predictions`; figures, a section and a table say what came true of them, and how many runs
+            had begun before they were written.
     Raises:
         ParameterError: no run is finished; or none of those that were predicted, or of fewer than three classes.
     Cost: the measures of hardness of what has finished runs, once, each at most its budget; then seconds.
@@ -74,12 +76,21 @@ def report(
         images = figures[name] = save(draw, target / "figures" / name)
         if images and name in curves:
             images["curves"] = curves[name].to_json().encode()
-    judged = None if predictions is None else validation(predictions[0], outcomes(results.runs, results.points))
-    tables = _write_tables(target / "tables", results, {} if judged is None else {"predictions": judged})
+    tell("leaving out classes")
+    found, outcomes = judged(results, predictions)
+    more = {"outcomes": outcomes}
+    if predictions is not None:
+        more["predicted"] = predictions[0]
+        for name, draw in unseen_figures(predictions[0], outcomes, results.points, results.runs).items():
+            figures[name] = save(draw, target / "figures" / name)
+    if found is not None:
+        more["predictions" if predictions is not None else "unseen_classes"] = found
+    tables = _write_tables(target / "tables", results, more)
     tell("drawing instances")
     sections = sections_of(results, figures)
-    if predictions is not None and judged is not None:
-        sections.insert(-1, predictions_section(judged, predictions[1]))
+    if found is not None:
+        models = next((i for i, each in enumerate(sections) if each.title == MODELS), len(sections) - 2)
+        sections.insert(models + 1, unseen_section(found, results, predictions, figures))
     page = render(f"Study {study.name}", study.description, sections)
     replace_file(target / "report.html", page)
     drawn = [

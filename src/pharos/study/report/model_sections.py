@@ -1,7 +1,6 @@
 """The sections on models of regret, and on the agreement of agents."""
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -13,9 +12,6 @@ from pharos.study.report.page import Figures, image, table
 from pharos.study.report.results import Results, coefficients
 from pharos.study.report.section import Section
 from pharos.wording import many
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 
 def models_section(results: Results, figures: Figures, left_out: list[str]) -> Section | None:
@@ -115,16 +111,3 @@ def agreement_section(results: Results, figures: Figures, left_out: list[str]) -
         lines=lines,
         figures=[each for each in drawn if each is not None],
     )
-
-
-def predictions_section(judged: "pd.DataFrame", about: Mapping[str, str]) -> Section:
-    """What came true of predictions; `judged` of `validation`, `about` what their file says of itself."""
-    caption = (
-        "Each class is predicted by a straight line through the others, and classes weigh alike: R² and rank "
-        "correlation (rho) of these predictions with their 95 % intervals over classes drawn anew; rho within classes; "
-        "and of pairs of observations of one MDP whose regrets differ by more than 0.05 the share that is ordered "
-        "rightly. "
-        f"{len(judged)} lines: read p-values into none of them without dividing by their number."
-    )
-    made = f"Written {about['date']} by pharos {about['version']}, sha256 {about['sha256']}."
-    return Section.of("Predictions", "hardness", table=table(judged, caption, digits=2), complete=made)

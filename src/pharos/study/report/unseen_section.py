@@ -1,0 +1,202 @@
+"""The sections on classes that a predictor has not seen: tables, figures, and what the file of predictions says."""
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pharos.errors import ParameterError
+from pharos.study.curves import agent_name, slug
+from pharos.study.report.page import Figures, image, table
+from pharos.study.report.results import Results
+from pharos.study.report.section import Section
+from pharos.study.unseen_classes import OUTCOMES, late, outcomes, validation
+from pharos.wording import many
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+FEW_PERMUTATIONS = 499
+
+
+def judged(
+    results: Results, predictions: "tuple[pd.DataFrame, Mapping[str, str]] | None"
+) -> "tuple[pd.DataFrame | None, pd.DataFrame]":
+    """(statistics of predictors, or None where there are fewer than two classes; cells with outcomes).
+
+    Raises:
+        ParameterError: there are predictions, but of other cells, or of fewer than three classes.
+    """
+    cells = outcomes(results.runs, results.points)
+    if predictions is not None:
+        return validation(predictions[0], cells, measures=results.hardness), cells
+    seen = cells[cells["agent"].isin(results.agents)]
+    try:
+        found = validation(None, seen, measures=results.hardness, least_classes=2, permutations=FEW_PERMUTATIONS)
+    except ParameterError:
+        return None, cells
+    return (found if len(found) else None), cells
+
+
+def unseen_section(
+    found: "pd.DataFrame",
+    results: Results,
+    predictions: "tuple[pd.DataFrame, Mapping[str, str]] | None",
+    figures: Figures,
+) -> Section:
+    """What came true of predictors on classes, MDPs and observations; baselines beside."""
+    parts = []
+    for agent in dict.fromkeys(found["agent"]):
+        for outcome in dict.fromkeys(found["outcome"]):
+            rows = found[(found["agent"] == agent) & (found["outcome"] == outcome)]
+            if len(rows):
+                parts.append(_part(str(agent), str(outcome), rows, figures))
+    return Section.of(
+        "Unseen classes",
+        "unseen",
+        text=_text(found),
+        said=_said(results, predictions),
+        parts=parts,
+    )
+
+
+def _text(found: "pd.DataFrame") -> list[str]:
+    number = int(found["tests"].max())
+    return [
+        "Does a number that is known before training predict regret on classes that it has not met? Each class is "
+        "predicted by a line through the others, classes weighing alike; baselines stand first, and a measure that "
+        "does not beat them says nothing that is new. R² below 0 is worse than the mean of the other classes.",
+        f"{many(number, 'test')} in all; p-values are corrected for that number (Holm). Intervals are over classes "
+        "drawn anew, and permutations exchange whole classes: instances and observations of a class are not "
+        "independent. The floor is what 95 % of such permutations stay below; the ceiling is what noise over "
+        "seeds leaves.",
+    ]
+
+
+def _said(results: Results, predictions: "tuple[pd.DataFrame, Mapping[str, str]] | None") -> list[str]:
+    """What the file of predictions says of itself, and whether it came first."""
+    if predictions is None:
+        return ["Without predictions (pharos study predict), of tabular measures alone."]
+    about = predictions[1]
+    before, unknown = late(results.runs, about)
+    lines = [f"Predictions written {about['date']} by pharos {about['version']}, sha256 {about['sha256']}."]
+    if before:
+        lines.append(
+            f"NOT A PREDICTION: {before:,} of {many(len(results.runs), 'run')} had begun when they were written."
+        )
+    elif unknown:
+        lines.append(f"{many(unknown, 'run')} of {len(results.runs):,} do not say when they were made.")
+    else:
+        lines.append("All runs began after that.")
+    return lines
+
+
+def _part(agent: str, outcome: str, rows: "pd.DataFrame", figures: Figures) -> dict[str, Any]:
+    drawn = []
+    if outcome == "greedy":
+        texts = {
+            "predicted_by_class": "Regret against what was predicted for it when its class was left out; a point a "
+            "cell. On the dotted line the prediction was right.",
+            "observations_of_mdps": "The same MDP under its observations: regret of the agent (full) and as predicted "
+            "(hollow).",
+            "idealised_curves": "Regret of the greedy policy while learning: of the agent (full line, the mean over "
+            "seeds) and of the idealised learner (dashed), which was never trained.",
+        }
+        drawn = [image(figures, f"{name}_{slug(agent)}", text) for name, text in texts.items()]
+    return {
+        "title": f"{agent_name(agent)}: {OUTCOMES[outcome]}",
+        "tables": [each for each in (_left_out(rows), _within(rows), _mixed(rows)) if each is not None],
+        "figures": [each for each in drawn if each is not None],
+    }
+
+
+def _left_out(rows: "pd.DataFrame") -> Any:
+    import pandas as pd
+
+    shown = pd.DataFrame(
+        {
+            "predictor": [_name(row) for row in rows.to_dict("records")],
+            "cells": rows["cells"],
+            "classes": rows["classes"],
+            "R²": _with_interval(rows, "r_squared"),
+            "rho": _with_interval(rows, "rho"),
+            "floor of rho": rows["floor_rho"],
+            "p": [_p(value) for value in rows["p_rho_holm"]],
+            "R² of MDPs": rows["r_squared_mdp"],
+            "calibration": rows["calibration"],
+            "ceiling of R²": rows["ceiling"],
+        }
+    )
+    caption = (
+        "Classes left out one by one (R² of MDPs: instances one by one): R², Spearman's rho, with 95 % intervals; "
+        "calibration: slope of the outcome on what was predicted, 1 is perfect."
+    )
+    return table(shown, caption, digits=2)
+
+
+def _within(rows: "pd.DataFrame") -> Any:
+    import pandas as pd
+
+    rows = rows[(rows["pairs"] > 0) & rows["p_agreement"].notna() | rows["agreement_lower"].notna()]
+    if not len(rows):
+        return None
+    shown = pd.DataFrame(
+        {
+            "predictor": [_name(row) for row in rows.to_dict("records")],
+            "pairs": rows["pairs"],
+            "rightly ordered": _with_interval(rows, "agreement"),
+            "p": [_p(value) for value in rows["p_agreement_holm"]],
+            "image and vector": rows["image_pairs"],
+            "rightly ordered of these": rows["image_agreement"],
+            "rho within a class": rows["rho_within"],
+        }
+    )
+    caption = (
+        "Pairs of observations of one MDP whose outcomes differ by more than 0.05, and the share that is ordered "
+        "rightly. Tabular measures have no opinion, 0.5. p: observations change names, in all MDPs of a class alike."
+    )
+    return table(shown, caption, digits=2)
+
+
+def _mixed(rows: "pd.DataFrame") -> Any:
+    import pandas as pd
+
+    rows = rows[rows["slope"].notna()]
+    if not len(rows):
+        return None
+    shown = pd.DataFrame(
+        {
+            "predictor": [_name(row) for row in rows.to_dict("records")],
+            "slope": rows["slope"],
+            "error": rows["slope_error"],
+            "p": [_p(value) for value in rows["p_slope_holm"]],
+            "classes' share": rows["class_share"],
+            "MDPs' share": rows["mdp_share"],
+            "rho given tabular measures": _with_interval(rows, "given_tabular"),
+            "rho given the tabular learner": _with_interval(rows, "given_tabular_regret"),
+        }
+    )
+    caption = (
+        "Mixed models: slope of the standardised predictor, with random intercepts of classes and of MDPs, and their "
+        "shares of the variance that is left. Partial rank correlations, 95 % intervals over classes."
+    )
+    return table(shown, caption, digits=2)
+
+
+def _name(row: Mapping[str, Any]) -> str:
+    return f"{str(row['predictor']).replace('_', ' ')}{', baseline' if row['baseline'] else ''}"
+
+
+def _with_interval(rows: "pd.DataFrame", name: str) -> list[str]:
+    """`0.61 (0.36 to 0.79)`."""
+    texts = []
+    for value, low, high in zip(rows[name], rows[f"{name}_lower"], rows[f"{name}_upper"], strict=True):
+        if not np.isfinite(value):
+            texts.append("–")
+        else:
+            texts.append(f"{value:.2f}" + (f" ({low:.2f} to {high:.2f})" if np.isfinite(low) else ""))
+    return texts
+
+
+def _p(value: float) -> str:
+    return "–" if not np.isfinite(value) else "< 0.001" if value < 0.001 else f"{value:.3f}"

@@ -1,0 +1,149 @@
+"""Figures of predictions: by class, by observation of one MDP, and curves of the idealised learner and the agent."""
+
+import json
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pharos.study import held_out
+from pharos.study.curves import agent_name, observation_color, slug, title
+from pharos.study.figures import legend_below, panels
+from pharos.study.tables import CELL
+from pharos.study.unseen_classes import Cells
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
+
+MOST_PANELS = 24
+PREDICTOR = "kernel_regret"
+DIAGONAL = "#888888"
+
+
+def unseen_figures(
+    predictions: "pd.DataFrame", cells: "pd.DataFrame", points: "pd.DataFrame", runs: "pd.DataFrame"
+) -> dict[str, Callable[[], "Figure | None"]]:
+    """Name -> function that draws it, three for each agent that has predictions.
+
+    Args:
+        predictions: of `predict`. cells: of `outcomes`. points, runs: of `curves` and `table`.
+    """
+    both = predictions.merge(cells, on=CELL, how="inner")
+    drawn: dict[str, Callable[[], Figure | None]] = {}
+    for agent, part in both.groupby("agent", sort=False):
+        name = slug(str(agent))
+        drawn[f"predicted_by_class_{name}"] = partial(predicted_by_class, part)
+        drawn[f"observations_of_mdps_{name}"] = partial(observations_of_mdps, part)
+        drawn[f"idealised_curves_{name}"] = partial(idealised_curves, part, points, runs)
+    return drawn
+
+
+def predicted_by_class(part: "pd.DataFrame", predictor: str = PREDICTOR) -> "Figure | None":
+    """A panel for each class: regret against what a line through the other classes predicts for it."""
+    cells = Cells.of(part, [predictor], "greedy")
+    if len(np.unique(cells.classes)) < 2:
+        return None
+    frame = cells.frame.assign(predicted=held_out.predictions(cells.x, cells.y, cells.classes, cells.classes))
+    observations = list(dict.fromkeys(frame["observation"]))
+    groups = list(frame.groupby("environment", sort=False))
+    figure, axes = panels(len(groups), 2.3, 2.3)
+    low, high = min(0.0, frame[["predicted", "greedy"]].min().min()), frame[["predicted", "greedy"]].max().max()
+    for axis, (name, rows) in zip(axes, groups, strict=True):
+        others = frame[frame["environment"] != name]
+        axis.scatter(others["predicted"], others["greedy"], s=5, color=DIAGONAL, alpha=0.25, lw=0)
+        for seen, some in rows.groupby("observation", sort=False):
+            color = observation_color(str(seen), observations)
+            axis.scatter(some["predicted"], some["greedy"], s=30, color=color, alpha=0.9, lw=0, label=str(seen))
+        axis.plot([low, high], [low, high], ":", color=DIAGONAL, lw=1.2)
+        axis.set_title(title(str(name)))
+        axis.set(xlim=(low - 0.05, high + 0.05), ylim=(low - 0.05, high + 0.05))
+    _label_edges(axes, "predicted regret", f"regret of {agent_name(str(part['agent'].iloc[0]))}")
+    legend_below(figure, axes)
+    return figure
+
+
+def observations_of_mdps(part: "pd.DataFrame", predictor: str = PREDICTOR) -> "Figure | None":
+    """A panel for each MDP, up to MOST_PANELS: regret under each observation, of the agent and as predicted."""
+    observations = list(dict.fromkeys(part["observation"]))
+    groups = [
+        (key, rows) for key, rows in part.groupby(["environment", "instance", "chance"], sort=False) if len(rows) > 1
+    ]
+    if len(observations) < 2 or not groups:
+        return None
+    groups = _spread(groups)
+    figure, axes = panels(len(groups), 2.3, 1.9)
+    for axis, (key, rows) in zip(axes, groups, strict=True):
+        rows = rows.set_index("observation").reindex(observations)
+        places = np.arange(len(observations))
+        for i, seen in enumerate(observations):
+            color = observation_color(seen, observations)
+            pair = rows[[predictor, "greedy"]].iloc[i].to_numpy(float)
+            axis.plot([i, i], pair, color=color, lw=1.2, alpha=0.7)
+            axis.scatter([i], pair[:1], s=34, facecolors="none", edgecolors=color, lw=1.4)
+            axis.scatter([i], pair[1:], s=34, color=color, lw=0, label=seen)
+        axis.set_title(_short(*map(str, key)), fontsize=8)
+        axis.set(xticks=places, xticklabels=[], ylim=(-0.05, 1.3), xlim=(-0.6, len(observations) - 0.4))
+    _label_edges(axes, "", "regret")
+    legend_below(figure, axes)
+    return figure
+
+
+def idealised_curves(part: "pd.DataFrame", points: "pd.DataFrame", runs: "pd.DataFrame") -> "Figure | None":
+    """A panel for each MDP, up to MOST_PANELS / 2: regret by steps of the agent and of the idealised learner."""
+    if "curve" not in part:
+        return None
+    observations = list(dict.fromkeys(part["observation"]))
+    groups = _spread(list(part.groupby(["environment", "instance", "chance"], sort=False)), MOST_PANELS // 2)
+    of_run = runs.set_index("id")
+    spread = of_run["value_optimal"] - of_run["value_uniform"]
+    points = points.assign(
+        regret=(points["id"].map(of_run["value_optimal"]) - points["value"]) / points["id"].map(spread)
+    )
+    figure, axes = panels(len(groups), 3.0, 2.2)
+    for axis, (key, rows) in zip(axes, groups, strict=True):
+        for row in rows.to_dict("records"):
+            color = observation_color(row["observation"], observations)
+            own = points[(points[CELL] == [row[name] for name in CELL]).all(axis=1)]
+            mean = own.groupby("step")["regret"].mean()
+            axis.plot(mean.index, mean.to_numpy(), color=color, lw=1.5, label=row["observation"])
+            curve = json.loads(row["curve"] or "[]")
+            if curve:
+                axis.plot(*zip(*curve, strict=True), "--", color=color, lw=1.2, alpha=0.9)
+        axis.set_title(_short(*map(str, key)), fontsize=8)
+        axis.set(ylim=(-0.05, 1.5))
+    _label_edges(axes, "steps", "regret")
+    legend_below(figure, axes)
+    return figure
+
+
+def _spread(groups: list[Any], most: int = MOST_PANELS) -> list[Any]:
+    """All of them, or as many, one class after the other, so that each class has some; in their order."""
+    if len(groups) <= most:
+        return groups
+    by_class: dict[str, list[int]] = {}
+    for i, (key, _) in enumerate(groups):
+        by_class.setdefault(key[0], []).append(i)
+    turns = sorted((turn, i) for rows in by_class.values() for turn, i in enumerate(rows))
+    return [groups[i] for i in sorted(i for _, i in turns[:most])]
+
+
+def _short(environment: str, instance: str, chance: str) -> str:
+    """`taxi: size 7`, with the chance where there is some."""
+    inside = instance[instance.find("(") + 1 : -1] if instance.endswith(")") else instance.partition("/")[2] or instance
+    words = [part.strip().replace("=", " ") for part in inside.split(",")][:2]
+    text = f"{title(environment)}: {', '.join(words).replace('_', ' ')}"
+    return text[:34] + ("" if chance == "plain" else f", {chance}")
+
+
+def _label_edges(axes: Sequence[Any], below: str, beside: str) -> None:
+    """Labels on the panels of the first column, and on all of the last row."""
+    first = {round(axis.get_subplotspec().colspan.start) for axis in axes}
+    last = max(axis.get_subplotspec().rowspan.start for axis in axes)
+    for axis in axes:
+        place = axis.get_subplotspec()
+        if place.colspan.start == min(first):
+            axis.set_ylabel(beside)
+        if place.rowspan.start == last:
+            axis.set_xlabel(below)

@@ -1,0 +1,85 @@
+"""Whether a predictor orders the observations of one MDP: the one question that no tabular measure can answer."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+BLOCK = 250  # permutations at a time
+CLEAR = 0.05  # difference of an outcome between two observations of one MDP that counts
+
+
+@dataclass(frozen=True, eq=False)
+class Pairs:
+    """Pairs of cells of one MDP that differ in the observation and whose outcomes differ by more than CLEAR.
+
+    Attributes:
+        first, second: (M,) rows of the cells.
+        sign: (M,) 1 where the outcome of the first is the larger one, else -1.
+    """
+
+    first: np.ndarray
+    second: np.ndarray
+    sign: np.ndarray
+
+    @staticmethod
+    def of(y: np.ndarray, mdps: np.ndarray, clear: float = CLEAR) -> "Pairs":
+        """Those of outcomes y (N,) and MDPs (N,)."""
+        first, second = np.triu_indices(len(y), 1)
+        same = mdps[first] == mdps[second]
+        first, second = first[same], second[same]
+        counts = np.abs(y[first] - y[second]) > clear
+        first, second = first[counts], second[counts]
+        return Pairs(first, second, np.sign(y[first] - y[second]))
+
+    def only(self, chosen: np.ndarray) -> "Pairs":
+        """Some of them: chosen (M,) bool."""
+        return Pairs(self.first[chosen], self.second[chosen], self.sign[chosen])
+
+    def right(self, x: np.ndarray) -> np.ndarray:
+        """(M,) 1 where x (N,) orders the pair as the outcome does, 1/2 where it says that both are alike, else 0."""
+        return 0.5 + 0.5 * np.sign(x[self.first] - x[self.second]) * self.sign
+
+    def agreement(self, x: np.ndarray) -> float:
+        """The share of pairs that x orders rightly; NaN without pairs."""
+        return float(self.right(x).mean()) if len(self.first) else np.nan
+
+    def interval(self, x: np.ndarray, classes: np.ndarray, counts: np.ndarray) -> tuple[float, float]:
+        """95 % interval of that over samples of classes, counts (R, C)."""
+        number = counts.shape[1]
+        right = np.bincount(classes[self.first], self.right(x), minlength=number)
+        pairs = np.bincount(classes[self.first], minlength=number)
+        total = counts @ pairs
+        shares = (counts @ right)[total > 0] / total[total > 0]
+        if len(shares) == 0:
+            return np.nan, np.nan
+        return float(np.percentile(shares, 2.5)), float(np.percentile(shares, 97.5))
+
+    def permuted(
+        self,
+        x: np.ndarray,
+        classes: np.ndarray,
+        mdps: np.ndarray,
+        observations: Sequence[str],
+        permutations: int,
+        seed: int,
+    ) -> np.ndarray:
+        """(R,) agreement where observations change names, in all MDPs of a class alike, but in each class otherwise.
+
+        So a class whose instances all prefer the same observation counts once.
+        """
+        names = {name: i for i, name in enumerate(dict.fromkeys(observations))}
+        seen = np.array([names[each] for each in observations])
+        row_at = np.full((mdps.max() + 1, len(names)), -1)
+        row_at[mdps, seen] = np.arange(len(x))
+        rng = np.random.default_rng(seed)
+        found = np.full(permutations, np.nan)
+        for start in range(0, permutations, BLOCK):
+            size = min(BLOCK, permutations - start)
+            orders = np.broadcast_to(np.arange(len(names)), (size, classes.max() + 1, len(names)))
+            rows = row_at[mdps, rng.permuted(orders, axis=2)[:, classes, seen]]
+            other = np.where(rows >= 0, x[rows], np.nan)
+            right = 0.5 + 0.5 * np.sign(other[:, self.first] - other[:, self.second]) * self.sign
+            some = np.isfinite(right).any(axis=1)
+            found[start : start + size][some] = np.nanmean(right[some], axis=1)
+        return found
