@@ -231,7 +231,7 @@ def test_environments_of_a_file_take_the_place_of_those_that_are_given(tmp_path)
     assert {cell["environment"] for cell in cells} == {"taxi", "tiny"}
     assert {cell["observation"] for cell in cells if cell["environment"] == "tiny"} == {"recorded", "hash"}
     assert {cell["agent"] for cell in cells} == {"dqn", "dqn 100k", "dqn tuned", "ppo", "ppo 100k", "ppo tuned"}
-    assert len(found.runs) == (5 + 2) * 2 * 2 * 5 * 3
+    assert len(found.runs) == (5 + 2) * 2 * 5 * (2 + 2 + 1)  # agents, seeds; chance, but for tuned ones
     again = specification(found.model_dump(mode="json", exclude_unset=True))
     assert [run.id for run in again.runs] == [run.id for run in found.runs]
 
