@@ -13,15 +13,14 @@ from pharos.environments import Environment
 from pharos.errors import ParameterError
 from pharos.explorer.keys import keys_of
 from pharos.explorer.layers import Layers
-from pharos.explorer.learnt import Learnt, probabilities
+from pharos.explorer.learnt import LEARNT, OPTIMAL, UNIFORM, Learnt, probabilities
 from pharos.explorer.picture import Pictures
 from pharos.explorer.states import NumberedStates, SpaceStates, States
-from pharos.hardness import discounted_visits, occupancy
+from pharos.explorer.visits import Visits
 from pharos.mdp import TabularMDP
 from pharos.solvers import Solution, uniform_value, value_iteration
 from pharos.state_space import StateSpace
 
-OPTIMAL, UNIFORM, LEARNT = "optimal", "uniform", "learnt"
 LONGEST_PATH = 2_000  # steps that are shown
 MOST_STARTS = 100  # start states that are listed
 LISTED = 48  # states of a layer that are listed at a time
@@ -114,7 +113,7 @@ class Exploration:
         return np.full(len(states), self.mdp.num_actions if previous is None else previous)
 
     @cached_property
-    def visits(self) -> "Visits":
+    def visits(self) -> Visits:
         """How often policies are in states."""
         return Visits(self)
 
@@ -361,63 +360,6 @@ class Exploration:
             "num_layers": len(self.layers.counts),
             **about_maps(self),
         }
-
-
-class Visits:
-    """How often policies are in states, discounted, from the start: d(s) = sum over t of gamma^t P(s_t = s)."""
-
-    def __init__(self, exploration: Exploration):
-        self.exploration, self._known = exploration, dict[str, np.ndarray]()
-
-    def pairs(self, policy: str) -> np.ndarray:
-        """(S, A) visits of a state in which the policy chooses an action."""
-        mdp = self.exploration.mdp
-        table = self._table(policy)
-        if mdp.is_sticky:
-            return occupancy(mdp, table).visits
-        visits = self.of(policy)
-        if table is None:
-            return np.repeat(visits[:, None] / mdp.num_actions, mdp.num_actions, axis=1)
-        return visits[:, None] * (np.eye(mdp.num_actions)[table] if table.ndim == 1 else table)
-
-    def of(self, policy: str) -> np.ndarray:
-        """(S,) visits of states; kept for the next time."""
-        if policy not in self._known:
-            self._known[policy] = discounted_visits(self.exploration.mdp, self._table(policy))[0]
-        return self._known[policy]
-
-    def losses(self, policy: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(S,) each: what is lost in states, visits, and the action chosen most.
-
-            loss(s) = sum over a of visits(s, a) gap(s, a), which sums to V* minus the value of the policy at the start
-
-        Source: the performance difference lemma, Kakade and Langford (2002).
-        """
-        world = self.exploration
-        mdp, pairs = world.mdp, self.pairs(policy)
-        states = np.flatnonzero(pairs.any(axis=1))
-        executed = world.solutions[OPTIMAL].q_of(states)
-        gaps = executed.max(axis=1, keepdims=True) - executed
-        lost = np.zeros(mdp.num_states)
-        lost[states] = mdp.chance.chosen * (pairs[states] * gaps).sum(axis=1)
-        if mdp.is_sticky:  # the first step, which has no action before
-            first = np.flatnonzero(mdp.start_probabilities > 0)
-            starts, weights = mdp.start_states[first], mdp.start_probabilities[first]
-            q = world.solutions[OPTIMAL].q_of(starts)
-            chances = world.chances(policy, starts, world.chosen_values(OPTIMAL, starts))
-            more = (mdp.chance.first_chosen - mdp.chance.chosen) * chances * (q.max(axis=1, keepdims=True) - q)
-            np.add.at(lost, starts, weights * more.sum(axis=1) * ~mdp.terminal[starts])
-        visits = pairs.sum(axis=1)
-        return lost, visits, pairs.argmax(axis=1)
-
-    def _table(self, policy: str) -> np.ndarray | None:
-        """The policy as solvers take it; None for the uniform one. Where it was not asked, it does anything."""
-        if policy == UNIFORM:
-            return None
-        table = np.asarray(self.exploration.solutions[policy].policy)
-        if table.dtype.kind != "f" or not np.isnan(table).any():
-            return table
-        return np.where(np.isnan(table), 1 / self.exploration.mdp.num_actions, table)
 
 
 def number(value: Any) -> float | None:

@@ -12,6 +12,7 @@ from pharos.policies import PolicyAnswers, PolicyLike, Sight, TabularAgent, eval
 from pharos.solvers import Solution, evaluate_policy
 from pharos.state_space import StateSpace
 
+OPTIMAL, UNIFORM, LEARNT = "optimal", "uniform", "learnt"  # the policies, by name
 ASKED_EVERYWHERE = 200_000  # states and, where it matters, previous actions; above, a policy is asked where it gets to
 
 

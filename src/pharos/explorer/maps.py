@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from pharos.errors import ParameterError, UnknownName
-from pharos.explorer.exploration import LEARNT, OPTIMAL, UNIFORM, Exploration, number
+from pharos.explorer.exploration import Exploration, number
+from pharos.explorer.learnt import LEARNT, OPTIMAL, UNIFORM
 from pharos.explorer.states import Axis, axes_of, find_axis
 
 BLOCK = 1 << 18  # states that are looked at in one go
