@@ -23,7 +23,7 @@ def class_weights(classes: np.ndarray) -> np.ndarray:
 
 def predictions(x: np.ndarray, y: np.ndarray, blocks: np.ndarray, classes: np.ndarray) -> np.ndarray:
     """(N,): each block of rows predicted by least squares through all other rows, classes weighing alike."""
-    found = np.empty(len(y))
+    estimates = np.empty(len(y))
     for block in np.unique(blocks):
         out = blocks == block
         rest = np.unique(classes[~out], return_inverse=True)[1]
@@ -32,8 +32,8 @@ def predictions(x: np.ndarray, y: np.ndarray, blocks: np.ndarray, classes: np.nd
         scale = np.abs(design).max(axis=0)
         scale[scale == 0] = 1.0
         line = np.linalg.lstsq(root * design / scale, root[:, 0] * y[~out], rcond=1e-10)[0]
-        found[out] = (_with_one(x[out]) / scale) @ line
-    return found
+        estimates[out] = (_with_one(x[out]) / scale) @ line
+    return estimates
 
 
 def r_squared(y: np.ndarray, predicted: np.ndarray, classes: np.ndarray) -> float:
@@ -133,8 +133,8 @@ def permuted_classes(
     rng = np.random.default_rng(seed)
     orders = np.stack([np.arange(number), *(rng.permutation(number) for _ in range(permutations))])
     values, aims = (x - x.mean(axis=0)) / np.where(x.std(axis=0) > 0, x.std(axis=0), 1.0), y[row_at]
-    found = [_exchanged(values[row_at], aims, some) for some in np.array_split(orders, len(orders) // BLOCK + 1)]
-    return np.concatenate([one for one, _ in found]), np.concatenate([other for _, other in found])
+    parts = [_exchanged(values[row_at], aims, some) for some in np.array_split(orders, len(orders) // BLOCK + 1)]
+    return np.concatenate([one for one, _ in parts]), np.concatenate([other for _, other in parts])
 
 
 def _exchanged(x: np.ndarray, y: np.ndarray, orders: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -161,10 +161,10 @@ def _exchanged(x: np.ndarray, y: np.ndarray, orders: np.ndarray) -> tuple[np.nda
 
 def p_of(value: float, permuted: np.ndarray) -> float:
     """The share of permutations that are as large, the observed order among them; NaN without any."""
-    known = permuted[np.isfinite(permuted)]
-    if not np.isfinite(value) or len(known) == 0:
+    finite = permuted[np.isfinite(permuted)]
+    if not np.isfinite(value) or len(finite) == 0:
         return np.nan
-    return (1 + int((known >= value - 1e-12).sum())) / (1 + len(known))
+    return (1 + int((finite >= value - 1e-12).sum())) / (1 + len(finite))
 
 
 def ceiling(means: np.ndarray, noise: np.ndarray, classes: np.ndarray) -> float:
@@ -177,39 +177,39 @@ def ceiling(means: np.ndarray, noise: np.ndarray, classes: np.ndarray) -> float:
     Returns:
         NaN where no cell has two seeds.
     """
-    known, weights = np.isfinite(noise), class_weights(classes)
+    finite, weights = np.isfinite(noise), class_weights(classes)
     total = float(weights @ (means - weights @ means) ** 2)
-    if not known.any() or total <= 0:
+    if not finite.any() or total <= 0:
         return np.nan
-    return 1 - float(weights[known] @ noise[known] / weights[known].sum()) / total
+    return 1 - float(weights[finite] @ noise[finite] / weights[finite].sum()) / total
 
 
 def partial_correlation(
-    x: np.ndarray, y: np.ndarray, given: np.ndarray, classes: np.ndarray, counts: Counts
+    x: np.ndarray, y: np.ndarray, others: np.ndarray, classes: np.ndarray, counts: Counts
 ) -> np.ndarray:
     """(R,) rank correlation of x (N,) and y given the ranks of other predictors (N, Q), for samples of classes."""
     from scipy.stats import rankdata
 
-    ranks = np.column_stack([rankdata(x), rankdata(y), *(rankdata(each) for each in given.T)]) / len(y)
-    sizes, found = np.bincount(classes), np.empty(len(counts))
+    ranks = np.column_stack([rankdata(x), rankdata(y), *(rankdata(each) for each in others.T)]) / len(y)
+    sizes, correlations = np.bincount(classes), np.empty(len(counts))
     for r, count in enumerate(counts):
         root = np.sqrt((count / sizes)[classes])
         design = root[:, None] * _with_one(ranks[:, 2:])
         left = root[:, None] * ranks[:, :2]
         left = left - design @ np.linalg.lstsq(design, left, rcond=1e-10)[0]
         lengths = np.linalg.norm(left, axis=0)
-        found[r] = left[:, 0] @ left[:, 1] / lengths.prod() if (lengths > 1e-9).all() else np.nan
-    return found
+        correlations[r] = left[:, 0] @ left[:, 1] / lengths.prod() if (lengths > 1e-9).all() else np.nan
+    return correlations
 
 
 def holm(p: np.ndarray) -> np.ndarray:
     """p-values corrected for their number (Holm, 1979); NaN stays, and does not count."""
-    found = np.full(len(p), np.nan)
-    known = np.flatnonzero(np.isfinite(p))
-    order = known[np.argsort(p[known], kind="stable")]
+    corrections = np.full(len(p), np.nan)
+    finite = np.flatnonzero(np.isfinite(p))
+    order = finite[np.argsort(p[finite], kind="stable")]
     steps = (len(order) - np.arange(len(order))) * p[order]
-    found[order] = np.minimum(np.maximum.accumulate(steps), 1.0) if len(order) else steps
-    return found
+    corrections[order] = np.minimum(np.maximum.accumulate(steps), 1.0) if len(order) else steps
+    return corrections
 
 
 def _with_one(x: np.ndarray) -> np.ndarray:

@@ -94,12 +94,12 @@ def specification(
     """
     if isinstance(source, Specification):
         return source
-    given = None if environments is None else given_environments(environments)
+    entries = None if environments is None else given_environments(environments)
     if isinstance(source, Mapping):
-        return _validated(source, "specification", None, Path.cwd(), trust is not False, given)
+        return _validated(source, "specification", None, Path.cwd(), trust is not False, entries)
     if str(source) in presets():
         file = resources.files("pharos.study").joinpath("presets", f"{source}.yaml")
-        return parse(file.read_text(encoding="utf-8"), f"preset {source}", given=given)
+        return parse(file.read_text(encoding="utf-8"), f"preset {source}", entries=entries)
     path = Path(source)
     if path.is_dir():
         path = path / STUDY_FILE
@@ -108,7 +108,7 @@ def specification(
     if not path.is_file():
         raise UnknownName("study (no such file, and no such preset)", source, [*presets(), *_studies_here()])
     trusted = path == Path(source) and not _is_of_results(path) if trust is None else trust
-    return parse(_text_of(path), str(path), folder=path.absolute().parent, trust=trusted, given=given)
+    return parse(_text_of(path), str(path), folder=path.absolute().parent, trust=trusted, entries=entries)
 
 
 def given_environments(file: str | os.PathLike) -> list[Any]:
@@ -132,7 +132,7 @@ def given_environments(file: str | os.PathLike) -> list[Any]:
         raise ParameterError(
             f"{path}: expected a list of environments, such as `- taxi/5x5` and `- {{name: taxi, ...}}`"
         )
-    found = []
+    result = []
     for entry in entries:
         entry = {"name": entry} if isinstance(entry, str) else entry
         name = entry.get("name")
@@ -142,8 +142,8 @@ def given_environments(file: str | os.PathLike) -> list[Any]:
             raise ParameterError(
                 f"{path}: {name!r} is code; expected names that `pharos list` shows, or folders of imported MDPs"
             )
-        found.append(entry)
-    return found
+        result.append(entry)
+    return result
 
 
 def study_folder(source: str | Path) -> Path | None:
@@ -189,7 +189,7 @@ def parse(
     *,
     folder: Path | None = None,
     trust: bool = False,
-    given: list[Any] | None = None,
+    entries: list[Any] | None = None,
 ) -> Specification:
     """The specification in a text of YAML.
 
@@ -197,7 +197,7 @@ def parse(
         name: stands before the line number in messages.
         folder: where modules and files that it names are looked for; None: in the current directory.
         trust: whether they may be imported.
-        given: the environments of blocks that say `environments: given`.
+        entries: the environments of blocks that say `environments: given`.
     """
     try:
         root = yaml.compose(text, _Loader)
@@ -218,7 +218,7 @@ def parse(
         raise ParameterError(f"{name}: {' '.join(str(error).split())}") from error
     if not isinstance(data, dict):
         raise ParameterError(f"{name}:1: found {type(data).__name__}; expected a mapping with name and blocks")
-    return _validated(data, name, root, folder or Path.cwd(), trust, given)
+    return _validated(data, name, root, folder or Path.cwd(), trust, entries)
 
 
 class _Loader(yaml.SafeLoader):
@@ -232,9 +232,9 @@ _Loader.add_implicit_resolver(
 
 
 def _validated(
-    data: Mapping[str, Any], name: str, root: Any, folder: Path, trust: bool, given: list[Any] | None = None
+    data: Mapping[str, Any], name: str, root: Any, folder: Path, trust: bool, entries: list[Any] | None = None
 ) -> Specification:
-    data = _with_environments(data, name, given)
+    data = _with_environments(data, name, entries)
     references = [*_references(data)]
     if references and not trust:
         loc, reference = references[0]
@@ -256,7 +256,7 @@ def _validated(
     return specification
 
 
-def _with_environments(data: Mapping[str, Any], name: str, given: list[Any] | None) -> Mapping[str, Any]:
+def _with_environments(data: Mapping[str, Any], name: str, entries: list[Any] | None) -> Mapping[str, Any]:
     """With the given environments in blocks that ask for them.
 
     Raises:
@@ -265,16 +265,16 @@ def _with_environments(data: Mapping[str, Any], name: str, given: list[Any] | No
     blocks = data.get("blocks")
     listed = blocks if isinstance(blocks, list) else []
     asking = [isinstance(block, Mapping) and block.get("environments") == GIVEN for block in listed]
-    if any(asking) and given is None:
+    if any(asking) and entries is None:
         raise ParameterError(f"{name}: has no environments of its own; give a list of them: --environments FILE")
-    if given is None:
+    if entries is None:
         return data
     if not any(asking):
         raise ParameterError(
             f"{name}: has environments of its own; --environments is for blocks with `environments: given`"
         )
     pairs = zip(listed, asking, strict=True)
-    return {**data, "blocks": [{**block, "environments": given} if asks else block for block, asks in pairs]}
+    return {**data, "blocks": [{**block, "environments": entries} if asks else block for block, asks in pairs]}
 
 
 def _references(data: Mapping[str, Any]) -> Iterator[tuple[Loc, str]]:

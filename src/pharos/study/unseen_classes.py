@@ -52,18 +52,18 @@ def outcomes(runs: "pd.DataFrame", points: "pd.DataFrame") -> "pd.DataFrame":
     spread = of_run["value_optimal"] - of_run["value_uniform"]
     optimal = points["id"].map(of_run["value_optimal"])
     regret = ((optimal - points["value"]) / points["id"].map(spread)).replace([np.inf, -np.inf], np.nan)
-    found = runs[[*CELL, "id"]].copy()
-    found["greedy"] = found["id"].map(regret.groupby(points["id"]).mean())
+    cells = runs[[*CELL, "id"]].copy()
+    cells["greedy"] = cells["id"].map(regret.groupby(points["id"]).mean())
     reached = points["step"].where(regret <= TENTH).groupby(points["id"]).min()
     share = (reached / points.groupby("id")["step"].max()).fillna(1.0)
-    found["steps_to_tenth"] = found["id"].map(share).where(found["greedy"].notna())
+    cells["steps_to_tenth"] = cells["id"].map(share).where(cells["greedy"].notna())
     for name in ("played", "cumulative", "random_scale"):
-        found[name] = np.nan
+        cells[name] = np.nan
     if {"cumulative_realised_regret", "episodes"} <= {*runs}:
-        found["cumulative"] = runs["cumulative_realised_regret"]
-        found["random_scale"] = runs["episodes"] * (runs["value_optimal"] - runs["value_uniform"])
-        found["played"] = (found["cumulative"] / found["random_scale"]).replace([np.inf, -np.inf], np.nan)
-    groups = found.groupby(CELL, sort=False)
+        cells["cumulative"] = runs["cumulative_realised_regret"]
+        cells["random_scale"] = runs["episodes"] * (runs["value_optimal"] - runs["value_uniform"])
+        cells["played"] = (cells["cumulative"] / cells["random_scale"]).replace([np.inf, -np.inf], np.nan)
+    groups = cells.groupby(CELL, sort=False)
     table = groups[[*OUTCOMES, "random_scale"]].mean()
     noise = groups[list(OUTCOMES)].var(ddof=1).div(groups.size(), axis=0)
     return table.join(noise.add_suffix("_noise")).reset_index()
@@ -90,14 +90,14 @@ def models_of(frame: "pd.DataFrame", predictors: Sequence[str], measures: Sequen
     Args:
         measures: tabular ones; each alone too, where there are no predictions.
     """
-    found = [Model(name, (name,), name in BASELINES) for name in predictors if name in frame]
-    if not found:
-        found = [Model(name, (name,), True) for name in measures]
+    models = [Model(name, (name,), name in BASELINES) for name in predictors if name in frame]
+    if not models:
+        models = [Model(name, (name,), True) for name in measures]
     if measures:
-        found.append(Model(TABULAR, tuple(measures), True))
+        models.append(Model(TABULAR, tuple(measures), True))
     if "random_scale" in frame:
-        found.append(Model(SCALE, ("random_scale",), True))
-    return [*found, Model(CLASSES, (), True)]
+        models.append(Model(SCALE, ("random_scale",), True))
+    return [*models, Model(CLASSES, (), True)]
 
 
 def validation(
@@ -146,9 +146,9 @@ def validation(
         raise ParameterError(f"predictions on unseen classes need at least {words} classes with finished runs")
     tabular: list[str] = []
     if measures is not None:
-        known = measures.drop(columns=["notes"], errors="ignore").rename(columns={"num_states": "states"})
-        tabular = [name for name in known if name not in CELL and known[name].dtype.kind in "fiu" and known[name].any()]
-        both = both.merge(known[["environment", "instance", "chance", *tabular]], on=CELL[:3], how="left")
+        table = measures.drop(columns=["notes"], errors="ignore").rename(columns={"num_states": "states"})
+        tabular = [name for name in table if name not in CELL and table[name].dtype.kind in "fiu" and table[name].any()]
+        both = both.merge(table[["environment", "instance", "chance", *tabular]], on=CELL[:3], how="left")
     rows = []
     for agent, part in both.groupby("agent", sort=False):
         for outcome in OUTCOMES:
@@ -202,11 +202,11 @@ class Cells:
     def places(self) -> list[tuple[int, str, str]]:
         """Of each row: the position of its instance in its class, chance and observation."""
         position: dict[int, int] = {}
-        seen: dict[int, int] = {}
+        counts: dict[int, int] = {}
         for family, instance in zip(self.classes, self.instances, strict=True):
             if instance not in position:
-                position[instance] = seen.get(family, 0)
-                seen[family] = position[instance] + 1
+                position[instance] = counts.get(family, 0)
+                counts[family] = position[instance] + 1
         instances = [position[each] for each in self.instances]
         return list(zip(instances, self.frame["chance"], self.frame["observation"], strict=True))
 
@@ -242,8 +242,8 @@ def _left_out(cells: Cells, outcome: str, permutations: int, seed: int) -> dict[
     ends = np.full((2, 2), np.nan)
     if count >= 3:
         samples = np.stack(_held_out.held_out(x, y, classes, drawn))
-        known = [row[np.isfinite(row)] for row in samples]
-        ends = np.array([np.percentile(row, [2.5, 97.5]) if len(row) else [np.nan] * 2 for row in known])
+        finite = [row[np.isfinite(row)] for row in samples]
+        ends = np.array([np.percentile(row, [2.5, 97.5]) if len(row) else [np.nan] * 2 for row in finite])
     predicted = _held_out.predictions(x, y, classes, classes)
     dummies = np.eye(count)[classes][:, 1:] if not x.shape[1] else x
     by_mdp = _held_out.predictions(dummies, y, cells.instances, classes)
@@ -274,34 +274,34 @@ def _left_out(cells: Cells, outcome: str, permutations: int, seed: int) -> dict[
 
 
 def _percentile(values: np.ndarray, share: float) -> float:
-    known = values[np.isfinite(values)]
-    return float(np.percentile(known, share)) if len(known) else np.nan
+    finite = values[np.isfinite(values)]
+    return float(np.percentile(finite, share)) if len(finite) else np.nan
 
 
 def _within(cells: Cells, permutations: int, seed: int) -> dict[str, float]:
-    found = {"rho_within": np.nan, "pairs": 0, "agreement": np.nan}
-    found |= dict.fromkeys(("agreement_lower", "agreement_upper", "p_agreement"), np.nan)
-    found |= {"image_pairs": 0, "image_agreement": np.nan}
+    row = {"rho_within": np.nan, "pairs": 0, "agreement": np.nan}
+    row |= dict.fromkeys(("agreement_lower", "agreement_upper", "p_agreement"), np.nan)
+    row |= {"image_pairs": 0, "image_agreement": np.nan}
     if cells.x.shape[1] != 1:
-        return found
+        return row
     x, y, classes = cells.x[:, 0], cells.y, cells.classes
     within = [_held_out.spearman(x[classes == each], y[classes == each]) for each in range(classes.max() + 1)]
     if np.isfinite(within).any():
-        found["rho_within"] = float(np.nanmean(within))
+        row["rho_within"] = float(np.nanmean(within))
     pairs = Pairs.of(y, cells.mdps)
-    found |= {"pairs": len(pairs.first), "agreement": pairs.agreement(x)}
+    row |= {"pairs": len(pairs.first), "agreement": pairs.agreement(x)}
     names = cells.frame["observation"].to_numpy()
     kinds = np.array([_kind(name) for name in names])
     of_both = pairs.only((kinds[pairs.first] != kinds[pairs.second]) & (np.minimum(*_both(kinds, pairs)) > 0))
-    found |= {"image_pairs": len(of_both.first), "image_agreement": of_both.agreement(x)}
+    row |= {"image_pairs": len(of_both.first), "image_agreement": of_both.agreement(x)}
     if (x[pairs.first] == x[pairs.second]).all():
-        return found
+        return row
     drawn = _held_out.resampled_classes(classes.max() + 1, RESAMPLES, seed)
-    found["agreement_lower"], found["agreement_upper"] = pairs.interval(x, classes, drawn)
+    row["agreement_lower"], row["agreement_upper"] = pairs.interval(x, classes, drawn)
     if permutations:
         shuffled = pairs.permuted(x, classes, cells.mdps, names, permutations, seed)
-        found["p_agreement"] = _held_out.p_of(pairs.agreement(x), shuffled)
-    return found
+        row["p_agreement"] = _held_out.p_of(pairs.agreement(x), shuffled)
+    return row
 
 
 def _both(kinds: np.ndarray, pairs: Pairs) -> tuple[np.ndarray, np.ndarray]:
@@ -315,34 +315,34 @@ def _kind(observation: str) -> int:
 
 def _mixed(cells: Cells, model: Model, tabular: Sequence[str], seed: int) -> dict[str, float]:
     names = ("slope", "slope_error", "p_slope", "class_share", "mdp_share")
-    found: dict[str, float] = dict.fromkeys(names, np.nan)
+    row: dict[str, float] = dict.fromkeys(names, np.nan)
     for name in ("given_tabular", "given_tabular_regret"):
-        found |= dict.fromkeys((name, f"{name}_lower", f"{name}_upper"), np.nan)
+        row |= dict.fromkeys((name, f"{name}_lower", f"{name}_upper"), np.nan)
     if len(model.columns) != 1:
-        return found
+        return row
     x, y, classes = cells.x[:, 0], cells.y, cells.classes
     fit = mixed_fit(x, y, classes, cells.mdps)
     if fit is not None:
         total = fit.class_variance + fit.mdp_variance + fit.residual_variance
         shares = (fit.class_variance / total, fit.mdp_variance / total) if total > 0 else (np.nan, np.nan)
-        found |= dict(zip(names, (fit.slope, fit.error, fit.p_value, *shares), strict=True))
+        row |= dict(zip(names, (fit.slope, fit.error, fit.p_value, *shares), strict=True))
     for name, columns in {"given_tabular": tabular, "given_tabular_regret": (CONTROL,)}.items():
         if not columns or model.name in columns or not {*columns} <= {*cells.frame}:
             continue
-        given = np.column_stack([scaled(cells.frame, column) for column in columns])
-        some = np.isfinite(given).all(axis=1)
+        others = np.column_stack([scaled(cells.frame, column) for column in columns])
+        some = np.isfinite(others).all(axis=1)
         if some.sum() < len(columns) + 4 or len(np.unique(classes[some])) < 3:
             continue
         numbers = np.unique(classes[some], return_inverse=True)[1]
         drawn = _held_out.resampled_classes(numbers.max() + 1, RESAMPLES // 2, seed)
         counts = np.vstack([np.ones((1, drawn.shape[1]), int), drawn])
-        values = _held_out.partial_correlation(x[some], y[some], given[some], numbers, counts)
-        found |= {
+        values = _held_out.partial_correlation(x[some], y[some], others[some], numbers, counts)
+        row |= {
             name: values[0],
             f"{name}_lower": _percentile(values[1:], 2.5),
             f"{name}_upper": _percentile(values[1:], 97.5),
         }
-    return found
+    return row
 
 
 def late(runs: "pd.DataFrame", about: Mapping[str, str]) -> tuple[int, int]:

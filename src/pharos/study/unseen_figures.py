@@ -53,9 +53,9 @@ def predicted_by_class(part: "pd.DataFrame", predictor: str = PREDICTOR) -> "Fig
     for axis, (name, rows) in zip(axes, groups, strict=True):
         others = frame[frame["environment"] != name]
         axis.scatter(others["predicted"], others["greedy"], s=5, color=DIAGONAL, alpha=0.25, lw=0)
-        for seen, some in rows.groupby("observation", sort=False):
-            color = observation_color(str(seen), observations)
-            axis.scatter(some["predicted"], some["greedy"], s=30, color=color, alpha=0.9, lw=0, label=str(seen))
+        for observation, some in rows.groupby("observation", sort=False):
+            color = observation_color(str(observation), observations)
+            axis.scatter(some["predicted"], some["greedy"], s=30, color=color, alpha=0.9, lw=0, label=str(observation))
         axis.plot([low, high], [low, high], ":", color=DIAGONAL, lw=1.2)
         axis.set_title(title(str(name)))
         axis.set(xlim=(low - 0.05, high + 0.05), ylim=(low - 0.05, high + 0.05))
@@ -77,12 +77,12 @@ def observations_of_mdps(part: "pd.DataFrame", predictor: str = PREDICTOR) -> "F
     for axis, (key, rows) in zip(axes, groups, strict=True):
         rows = rows.set_index("observation").reindex(observations)
         places = np.arange(len(observations))
-        for i, seen in enumerate(observations):
-            color = observation_color(seen, observations)
+        for i, observation in enumerate(observations):
+            color = observation_color(observation, observations)
             pair = rows[[predictor, "greedy"]].iloc[i].to_numpy(float)
             axis.plot([i, i], pair, color=color, lw=1.2, alpha=0.7)
             axis.scatter([i], pair[:1], s=34, facecolors="none", edgecolors=color, lw=1.4)
-            axis.scatter([i], pair[1:], s=34, color=color, lw=0, label=seen)
+            axis.scatter([i], pair[1:], s=34, color=color, lw=0, label=observation)
         axis.set_title(_short(*map(str, key)), fontsize=8)
         axis.set(xticks=places, xticklabels=[], ylim=(-0.05, 1.3), xlim=(-0.6, len(observations) - 0.4))
     _label_edges(axes, "", "regret")

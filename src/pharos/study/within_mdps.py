@@ -69,17 +69,17 @@ class Pairs:
         So a class whose instances all prefer the same observation counts once.
         """
         names = {name: i for i, name in enumerate(dict.fromkeys(observations))}
-        seen = np.array([names[each] for each in observations])
+        columns = np.array([names[each] for each in observations])
         row_at = np.full((mdps.max() + 1, len(names)), -1)
-        row_at[mdps, seen] = np.arange(len(x))
+        row_at[mdps, columns] = np.arange(len(x))
         rng = np.random.default_rng(seed)
-        found = np.full(permutations, np.nan)
+        agreements = np.full(permutations, np.nan)
         for start in range(0, permutations, BLOCK):
             size = min(BLOCK, permutations - start)
             orders = np.broadcast_to(np.arange(len(names)), (size, classes.max() + 1, len(names)))
-            rows = row_at[mdps, rng.permuted(orders, axis=2)[:, classes, seen]]
+            rows = row_at[mdps, rng.permuted(orders, axis=2)[:, classes, columns]]
             other = np.where(rows >= 0, x[rows], np.nan)
             right = 0.5 + 0.5 * np.sign(other[:, self.first] - other[:, self.second]) * self.sign
             some = np.isfinite(right).any(axis=1)
-            found[start : start + size][some] = np.nanmean(right[some], axis=1)
-        return found
+            agreements[start : start + size][some] = np.nanmean(right[some], axis=1)
+        return agreements

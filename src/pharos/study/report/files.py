@@ -77,20 +77,20 @@ def report(
         if images and name in curves:
             images["curves"] = curves[name].to_json().encode()
     tell("leaving out classes")
-    found, outcomes = judged(results, predictions)
+    judgement, outcomes = judged(results, predictions)
     more = {"outcomes": outcomes}
     if predictions is not None:
         more["predicted"] = predictions[0]
         for name, draw in unseen_figures(predictions[0], outcomes, results.points, results.runs).items():
             figures[name] = save(draw, target / "figures" / name)
-    if found is not None:
-        more["predictions" if predictions is not None else "unseen_classes"] = found
+    if judgement is not None:
+        more["predictions" if predictions is not None else "unseen_classes"] = judgement
     tables = _write_tables(target / "tables", results, more)
     tell("drawing instances")
     sections = sections_of(results, figures)
-    if found is not None:
+    if judgement is not None:
         models = next((i for i, each in enumerate(sections) if each.title == MODELS), len(sections) - 2)
-        sections.insert(models + 1, unseen_section(found, results, predictions, figures))
+        sections.insert(models + 1, unseen_section(judgement, results, predictions, figures))
     page = render(f"Study {study.name}", study.description, sections)
     replace_file(target / "report.html", page)
     drawn = [

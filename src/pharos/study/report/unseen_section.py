@@ -30,38 +30,38 @@ def judged(
     cells = outcomes(results.runs, results.points)
     if predictions is not None:
         return validation(predictions[0], cells, measures=results.hardness), cells
-    seen = cells[cells["agent"].isin(results.agents)]
+    own = cells[cells["agent"].isin(results.agents)]
     try:
-        found = validation(None, seen, measures=results.hardness, least_classes=2, permutations=FEW_PERMUTATIONS)
+        judgement = validation(None, own, measures=results.hardness, least_classes=2, permutations=FEW_PERMUTATIONS)
     except ParameterError:
         return None, cells
-    return (found if len(found) else None), cells
+    return (judgement if len(judgement) else None), cells
 
 
 def unseen_section(
-    found: "pd.DataFrame",
+    judgement: "pd.DataFrame",
     results: Results,
     predictions: "tuple[pd.DataFrame, Mapping[str, str]] | None",
     figures: Figures,
 ) -> Section:
     """What came true of predictors on classes, MDPs and observations; baselines beside."""
     parts = []
-    for agent in dict.fromkeys(found["agent"]):
-        for outcome in dict.fromkeys(found["outcome"]):
-            rows = found[(found["agent"] == agent) & (found["outcome"] == outcome)]
+    for agent in dict.fromkeys(judgement["agent"]):
+        for outcome in dict.fromkeys(judgement["outcome"]):
+            rows = judgement[(judgement["agent"] == agent) & (judgement["outcome"] == outcome)]
             if len(rows):
                 parts.append(_part(str(agent), str(outcome), rows, figures))
     return Section.of(
         "Unseen classes",
         "unseen",
-        text=_text(found),
+        text=_text(judgement),
         said=_said(results, predictions),
         parts=parts,
     )
 
 
-def _text(found: "pd.DataFrame") -> list[str]:
-    number = int(found["tests"].max())
+def _text(judgement: "pd.DataFrame") -> list[str]:
+    number = int(judgement["tests"].max())
     return [
         "Does a number that is known before training predict regret on classes that it has not met? Each class is "
         "predicted by a line through the others, classes weighing alike; baselines stand first, and a measure that "
