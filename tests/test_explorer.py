@@ -18,6 +18,7 @@ from pharos.explorer import Exploration, Explorer, Learnt, exploration_of, page,
 from pharos.explorer.maps import heat_map, quantities, quantity
 from pharos.explorer.pages import contents
 from pharos.explorer.picture import Pictures
+from pharos.explorer.states import NumberedStates, axes_of
 from pharos.mdp import TabularMDP
 
 TOLERANCE = 1e-6  # of values, as value_iteration promises
@@ -177,11 +178,20 @@ def test_a_slice_of_a_map_holds_the_states_that_have_its_values(lake):
         heat_map(lake, "column", "row", fixed={"lane": 1})
 
 
-def test_states_without_variables_fill_a_square_by_their_number(sticky):
-    told = heat_map(sticky, "state mod 3", "state div 3", "value")
+def test_states_without_variables_are_drawn_by_their_number(sticky):
+    told = heat_map(sticky, "state", "all", "value")
     values = sticky.values("optimal", np.arange(4)).tolist()
-    assert [value for row in told["cells"] for value in row][:5] == [*map(pytest.approx, values), None]
+    assert told["cells"] == [[*map(pytest.approx, values), None]]
     assert set(quantities(sticky)) >= {"value", "value_learnt", "regret_learnt", "visits_learnt", "best_action"}
+
+
+@pytest.mark.parametrize("size", [25, 100, 30_000])
+def test_many_states_without_variables_fill_rows(size):
+    x, y = axes_of(NumberedStates(size)).values()
+    places = y.places(np.arange(size)) * x.count + x.places(np.arange(size))
+    assert (np.diff(np.unique(places)) == 1).all() and x.count <= 128 and y.count <= 128
+    assert np.bincount(places).max() == y.width  # one state a cell, where there are cells enough
+    assert size > 128**2 or y.width == 1
 
 
 # Pages and their data -------------------------------------------------------------------------------------------------

@@ -119,7 +119,7 @@ def _exploration(goal: Target, building: dict[str, Any], **options: Any) -> "Exp
     from pharos.explorer import exploration_of
 
     if goal.path is not None and (goal.path / "run.json").is_file():
-        return exploration_of(goal.path, **options)
+        return exploration_of(goal.path, **options | {"title": ""})
     if goal.is_imported:
         assert goal.path is not None
         env = goal.found_environment() if goal.path.is_dir() else None

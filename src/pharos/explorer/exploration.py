@@ -60,11 +60,11 @@ class Exploration:
         self.states: States = NumberedStates(mdp.num_states) if space is None else SpaceStates(space)
         progress("optimal values")
         self.solutions: dict[str, Solution] = {OPTIMAL: value_iteration(mdp)}
-        progress("values of the uniform policy")
-        self.solutions[UNIFORM] = uniform_value(mdp)
         if learnt is not None:
             progress("values of what was learnt")
             self.solutions[LEARNT] = learnt.solution(mdp, space)
+        progress("values of the uniform policy")
+        self.solutions[UNIFORM] = uniform_value(mdp)
         self.tie_tolerance = max(1e-9, ERRORS_PER_TIE * self.solutions[OPTIMAL].error_bound)
         starts = mdp.starts
         self.pictures = Pictures(env, self._variables_of(int(starts[0])) if env is not None else None)

@@ -4,19 +4,20 @@ The states of a large space are gone through in blocks, so that no more than som
 """
 
 from collections.abc import Mapping
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
 from pharos.errors import ParameterError, UnknownName
 from pharos.explorer.exploration import Exploration, number
-from pharos.explorer.learnt import LEARNT, OPTIMAL, UNIFORM
+from pharos.explorer.learnt import OPTIMAL
 from pharos.explorer.states import Axis, axes_of, find_axis
 
 BLOCK = 1 << 18  # states that are looked at in one go
 MEAN, LEAST, MOST, SUM = "mean", "least", "most", "sum"
 HOW = (MEAN, LEAST, MOST, SUM)
-GROUPS = ("row", "y"), ("column", "x")  # words in the names of variables that are drawn first, downwards and across
+GROUPS = {"column", "x"}, {"row", "y"}  # words in the names of variables that are drawn first, across and down
 
 
 def quantities(world: Exploration) -> dict[str, str]:
@@ -86,7 +87,7 @@ def heat_map(
     """
     axes = axes_of(world.states)
     across, down = find_axis(axes, x), find_axis(axes, y)
-    if across is down and len(axes) > 1:
+    if across is down:
         raise ParameterError(f"both axes are {x!r}; expected two of {', '.join(axes)}")
     if how not in HOW:
         raise UnknownName("summary", how, HOW)
@@ -103,7 +104,7 @@ def heat_map(
         here = start + states
         terminal = world.mdp.terminal[here]
         cells.add(places[0] * across.count + places[1], here, quantity(world, what, here), terminal)
-    return {"x": across.to_dict(), "y": down.to_dict(), "what": what, "how": how} | cells.answer(what, how)
+    return {"x": asdict(across), "y": asdict(down), "what": what, "how": how} | cells.answer(what, how)
 
 
 def _variable(world: Exploration, name: str) -> int:
@@ -161,23 +162,16 @@ def about_maps(world: Exploration) -> dict[str, Any]:
     """What the page offers: `axes`, `quantities`, and which are drawn first, `first`: x, y."""
     axes = axes_of(world.states)
     return {
-        "axes": [axis.to_dict() for axis in axes.values()],
+        "axes": [asdict(axis) for axis in axes.values()],
         "quantities": quantities(world),
         "first": _first_axes(axes),
     }
 
 
 def _first_axes(axes: Mapping[str, Axis]) -> list[str]:
-    """The axes x, y that are drawn first: what is called a column and a row, else the two longest."""
-    names = list(axes)
-    usual = []
-    for words in reversed(GROUPS):
-        parts = ((name, name.lower().replace("[", "_").split("_")) for name in names)
-        usual.append(next((name for name, each in parts if words[0] in each or words[1] in each), None))
-    longest = sorted(names, key=lambda name: -axes[name].count)
-    x = usual[0] or next((name for name in longest if name != usual[1]), names[0])
-    y = usual[1] or next((name for name in longest if name != x), x)
-    return [x, y]
-
-
-__all__ = ["LEARNT", "UNIFORM", "about_maps", "heat_map", "quantities", "quantity"]
+    """The axes x, y that are drawn first: what is called a column and a row, else the longest that are left."""
+    words = {name: set(name.lower().replace("[", "_").split("_")) for name in axes}
+    column, row = (next((name for name in axes if words[name] & group), None) for group in GROUPS)
+    longest = sorted(axes, key=lambda name: -axes[name].count)
+    x = column or next(name for name in longest if name != row)
+    return [x, row or next(name for name in longest if name != x)]

@@ -150,7 +150,6 @@ class _Handler(BaseHTTPRequestHandler):
 
     def refuse(self) -> None:
         """Any other method."""
-        self.close_connection = True
         self._send(*_said(HTTPStatus.METHOD_NOT_ALLOWED, "this server answers GET alone"), with_content=True)
 
     do_POST = do_PUT = do_PATCH = do_DELETE = do_OPTIONS = do_TRACE = do_CONNECT = refuse
@@ -159,7 +158,9 @@ class _Handler(BaseHTTPRequestHandler):
         self._send(*self._answer(self.server.owner), with_content=with_content)
 
     def _send(self, status: HTTPStatus, kind: str, content: bytes, *, with_content: bool) -> None:
+        self.close_connection = True  # so that nobody is answered after `close`
         self.send_response(status)
+        self.send_header("Connection", "close")
         self.send_header("Content-Type", kind)
         self.send_header("Content-Length", str(len(content)))
         self.send_header("Cache-Control", "no-store")

@@ -2,12 +2,16 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 
 from pharos.errors import ParameterError, UnknownName
 from pharos.state_space import StateSpace
+
+MOST = 128  # intervals of an axis
+ROW = 24  # values of an only variable that make one row
 
 
 class States(Protocol):
@@ -99,52 +103,55 @@ class NumberedStates:
         return int(values[0])
 
 
+@dataclass(frozen=True)
 class Axis:
-    """An axis of a heat map: a variable, or a part of the only one, in at most `MOST` intervals of equal width.
+    """An axis of a heat map: a variable, or a part of the only one, in intervals of equal width.
+
+        interval = ((value - origin) // divisor % modulus) // width, without `% modulus` where that is 0
 
     Attributes:
         name: as the page asks for it.
         variable: number of the variable.
-        low, count, width: the least value; how many intervals; values in each of them.
+        origin: its least value.
+        low, count, width: what the first interval is called; how many intervals; values in each of them.
     """
 
-    MOST = 128
-
-    def __init__(self, name: str, variable: int, low: int, size: int, divisor: int = 1, modulus: int = 0):
-        self.name, self.variable, self.low = name, variable, low
-        self.divisor, self.modulus = divisor, modulus
-        self.width = -(-size // self.MOST)
-        self.count = -(-size // self.width)
+    name: str
+    variable: int
+    origin: int
+    low: int
+    count: int
+    width: int = 1
+    divisor: int = 1
+    modulus: int = 0
 
     def places(self, values: np.ndarray) -> np.ndarray:
         """(N,) the intervals of values of the variable."""
-        part = values // self.divisor
-        part = part % self.modulus if self.modulus else part
-        return (part - self.low) // self.width
-
-    def to_dict(self) -> dict:
-        """What the page needs to label it, and to compute the same."""
-        return {name: getattr(self, name) for name in ("name", "low", "count", "width", "divisor", "modulus")} | {
-            "variable": self.variable
-        }
+        part = (values - self.origin) // self.divisor
+        return (part % self.modulus if self.modulus else part) // self.width
 
 
 def axes_of(states: States) -> dict[str, Axis]:
-    """Name -> axis. A variable each; where there is but one, what remains and what results of dividing it, so that its
-    values fill a square."""
-    axes = {
-        name: Axis(name, i, int(low), int(size))
-        for i, (name, low, size) in enumerate(zip(states.names, states.low, states.size, strict=True))
-    }
-    if len(axes) == 1:
-        ((name, only),) = axes.items()
-        low, size = only.low, int(states.size[0])
-        side = min(Axis.MOST, math.ceil(math.sqrt(size)))
-        if low == 0:
-            rest, result = f"{name} mod {side}", f"{name} div {side}"
-            folded = [Axis(rest, 0, 0, side, 1, side), Axis(result, 0, 0, -(-size // side), side)]
-            axes = {axis.name: axis for axis in folded}
-    return axes
+    """Name -> axis. A variable each; where there is but one, its values fill a row, or rows if there are many."""
+    if len(states.names) == 1:
+        return {axis.name: axis for axis in _folded(states.names[0], int(states.low[0]), int(states.size[0]))}
+    listed = enumerate(zip(states.names, states.low.tolist(), states.size.tolist(), strict=True))
+    return {name: Axis(name, i, low, low, *_intervals(size)) for i, (name, low, size) in listed}
+
+
+def _folded(name: str, low: int, size: int) -> tuple[Axis, Axis]:
+    """The axes across and down of the only variable."""
+    if size <= ROW:
+        return Axis(name, 0, low, low, size), Axis("all", 0, low, 0, 1, 1, size)
+    side = min(MOST, math.ceil(math.sqrt(size)))
+    rows = Axis(f"{name} div {side}", 0, low, 0, *_intervals(-(-size // side)), side)
+    return Axis(f"{name} mod {side}", 0, low, 0, side, 1, 1, side), rows
+
+
+def _intervals(size: int) -> tuple[int, int]:
+    """How many intervals of how many values."""
+    width = -(-size // MOST)
+    return -(-size // width), width
 
 
 def find_axis(axes: Mapping[str, Axis], name: str) -> Axis:

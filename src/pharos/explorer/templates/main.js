@@ -86,7 +86,13 @@ function best() {
   return action === null ? null : act(action);
 }
 
+// On wide screens a card takes as many rows of 2 pixels as it is high, so that both columns are filled.
+const placed = new ResizeObserver((cards) => {
+  for (const { target } of cards) target.style.gridRowEnd = `span ${Math.ceil((target.offsetHeight + 14) / 2)}`;
+});
+
 async function begin() {
+  document.querySelectorAll(".card").forEach((card) => placed.observe(card));
   const about = await attempt(() => source.ask("about"));
   if (!about) return;
   world.about = about;
@@ -98,9 +104,9 @@ async function begin() {
   const [state, previous] = location.hash.slice(1).split(",").map((word) => (/^\d+$/.test(word) ? Number(word) : null));
   if (!(state !== null && state !== undefined && state < about.num_states && (await go(state, previous ?? null)))) await go(...world.start);
   if (!world.here) return;
-  panels.initWay(); panels.initLayers(); panels.initWrong();
+  panels.initWay(); panels.loadWay(world.start);
   maps.init(about);
-  panels.loadWay(world.start);
+  panels.initLayers(); panels.initWrong();
   document.addEventListener("keydown", pressed);
   $("undo").addEventListener("click", () => back(world.walk.length - 1));
   $("restart").addEventListener("click", again);
@@ -113,10 +119,14 @@ async function begin() {
       await go(found);
     } catch (error) { $("goto-fault").textContent = error.message; }
   });
-  const again_drawn = () => { maps.draw(); panels.strip(); panels.bars(); };
-  let later = null;
-  new ResizeObserver(() => { clearTimeout(later); later = setTimeout(again_drawn, 60); }).observe(document.querySelector("main"));
-  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", again_drawn);
+  const drawnAgain = () => { if (maps.answer) maps.redraw(); panels.strip(); if (panels.layer) panels.bars(); };
+  let width = innerWidth, later = null;
+  addEventListener("resize", () => {
+    if (innerWidth === width) return;
+    width = innerWidth;
+    clearTimeout(later); later = setTimeout(drawnAgain, 60);
+  });
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", drawnAgain);
   document.documentElement.dataset.ready = "yes";
 }
 

@@ -20,7 +20,7 @@ const maps = {
     fill("map-what", options(about.quantities));
     fill("map-x", options(axes)); fill("map-y", options(axes));
     [$("map-x").value, $("map-y").value] = about.first;
-    for (const id of ["map-x", "map-y"]) $(id).disabled = about.axes.length < 3 && about.variables.length < 2;
+    for (const id of ["map-x", "map-y"]) $(id).disabled = about.variables.length < 2;
     for (const id of ["map-what", "map-how"]) $(id).addEventListener("change", () => this.load());
     for (const id of ["map-x", "map-y"]) $(id).addEventListener("change", () => {
       const other = $(id === "map-x" ? "map-y" : "map-x");
@@ -146,8 +146,8 @@ const maps = {
     if (!this.answer || !world.here) return null;
     const { x, y } = this.answer;
     const at = (axis) => {
-      const part = Math.floor(world.here.values[axis.variable] / axis.divisor);
-      return Math.floor(((axis.modulus ? part % axis.modulus : part) - axis.low) / axis.width);
+      const part = Math.floor((world.here.values[axis.variable] - axis.origin) / axis.divisor);
+      return Math.floor((axis.modulus ? part % axis.modulus : part) / axis.width);
     };
     return [at(y), at(x)];
   },

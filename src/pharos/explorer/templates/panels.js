@@ -23,6 +23,20 @@ const panels = {
     return keys.sort((a, b) => /\d/.test(a) - /\d/.test(b))[0];
   },
 
+  // Variables by name, those of an array together: a list of name, rows of numbers of variables
+  groups() {
+    if (this.grouped) return this.grouped;
+    const groups = new Map();
+    world.about.variables.forEach(({ name }, i) => {
+      const [, base, index] = name.match(/^(.*?)(?:\[([\d,]+)\])?$/s), row = index ? index.split(",").slice(0, -1).join() : "";
+      if (!groups.has(base)) groups.set(base, new Map());
+      const rows = groups.get(base);
+      rows.set(row, [...(rows.get(row) || []), i]);
+    });
+    this.grouped = [...groups].map(([name, rows]) => ({ name, rows: [...rows.values()] }));
+    return this.grouped;
+  },
+
   here(position, before) {
     const { about } = world;
     $("here-title").textContent = `State ${position.state.toLocaleString("en")}`;
@@ -31,7 +45,10 @@ const panels = {
       position.layer >= 0 ? h("span", {}, `layer ${position.layer.toLocaleString("en")}`) : null,
       about.is_sticky ? h("span", {}, position.previous === null ? "no action before" : `before: ${about.actions[position.previous]}`) : null,
       position.terminal ? h("span", { class: "end" }, "terminal") : null);
-    fill("variables", about.variables.map(({ name }, i) => h("div", { class: before && before.values[i] !== position.values[i] ? "changed" : null }, h("dt", {}, name), h("dd", {}, position.values[i]))));
+    fill("variables", this.groups().map(({ name, rows }) => {
+      const changed = before && rows.flat().some((i) => before.values[i] !== position.values[i]);
+      return h("div", { class: changed ? "changed" : null }, h("dt", {}, name), h("dd", {}, rows.map((row) => row.map((i) => position.values[i]).join(" ")).join("\n")));
+    }));
     drawing.show(position);
     const told = about.variables.slice(0, 12).map(({ name }, i) => `${name} ${position.values[i]}`).join(", ");
     $("board").setAttribute("aria-label", `Drawing of state ${position.state}: ${told}`);
@@ -198,7 +215,7 @@ const panels = {
     counts.forEach((number, i) => {
       context.fillStyle = style(i === here ? "--accent" : "--bar");
       const high = Math.max(2, (112 * number) / most);
-      context.fillRect(i * each, 120 - high, Math.max(0.7, Math.min(60, each - gap)), high);
+      context.fillRect(i * each, 120 - high, Math.max(0.7, each - gap), high);
     });
   },
 
@@ -208,11 +225,14 @@ const panels = {
     names.sort((a, b) => (b === "learnt") - (a === "learnt"));
     fill("wrong-policy", names.map((name) => h("option", { value: name }, name === "learnt" ? `learnt: ${world.about.learnt.name}` : name)));
     $("wrong-policy").addEventListener("change", () => this.loadWrong());
-    this.loadWrong();
+    if (world.about.num_states <= 100000 || names[0] === "learnt") { this.loadWrong(); return; }
+    $("wrong-first").textContent = "What this policy loses, state by state, takes some seconds here.";
+    fill("wrong-states", h("button", { type: "button", onclick: () => this.loadWrong() }, "Compute"));
   },
   async loadWrong() {
     const policy = $("wrong-policy").value, { about } = world;
-    fill("wrong-facts", h("dt", {}, "..."));
+    fill("wrong-facts", h("dt", {}, "computing ..."));
+    fill("wrong-states"); $("wrong-first").textContent = "";
     const answer = await attempt(() => source.ask("wrong", { policy }));
     if (!answer || policy !== $("wrong-policy").value) return;
     const facts = [["value at the start", text(about.value_at_start[policy], 6)], ["optimal value", text(about.value_at_start.optimal, 6)], ["regret", text(answer.regret, 6)]];

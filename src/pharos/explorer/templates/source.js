@@ -68,9 +68,9 @@ function ofData(data) {
     const axis = (name) => about.axes.find((each) => each.name === name);
     const names = about.variables.map((each) => each.name);
     const fixed = Object.entries(words).filter(([name]) => name.startsWith("fix.")).map(([name, value]) => [names.indexOf(name.slice(4)), Number(value)]);
-    const at = (each, values) => {
-      const part = Math.floor(values[each.variable] / each.divisor);
-      return Math.floor(((each.modulus ? part % each.modulus : part) - each.low) / each.width);
+    const at = (each, values) => {  // as Axis.places
+      const part = Math.floor((values[each.variable] - each.origin) / each.divisor);
+      return Math.floor((each.modulus ? part % each.modulus : part) / each.width);
     };
     const x = axis(words.x), y = axis(words.y);
     const grid = (value) => Array.from({ length: y.count }, () => Array(x.count).fill(value));
