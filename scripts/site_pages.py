@@ -10,11 +10,14 @@ import inspect
 import io
 import json
 import re
+import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 
+import pharos
+from pharos import explorer as explorers
 from pharos.cli.list import list_
-from pharos.environments import classes
+from pharos.environments import classes, make
 from pharos.interaction.registration import ids_of
 
 DOCS = Path(__file__).parents[1] / "docs"
@@ -32,6 +35,13 @@ CHANGES = {  # class -> version of the rules -> what changed
         2: "The paddle's edge sends the ball one column back ([why](../decisions/0004-breakout-edges.md)).",
     }
 }
+LIVE = "assets/explorer/frozen_lake.html"
+FRAME = (
+    f'<iframe src="{LIVE}" title="Explorer of a slippery lake" loading="lazy" style="width: 100%; height: 52rem; '
+    f'border: 1px solid var(--md-default-fg-color--lightest); border-radius: .4rem"></iframe>\n\n'
+    f"[Open it alone]({LIVE})"
+)
+MARK = "<!-- The site has it live here: scripts/site_pages.py, explorer. -->"
 POLICIES = ("optimal", "uniform", "worst")
 VALUES = (
     "Values at the start are those of the optimal, the uniformly random and the worst policy. *Discounted*: by 0.99, "
@@ -245,6 +255,14 @@ def versions(cls) -> list[str]:
 
 
 # Reference ------------------------------------------------------------------------------------------------------------
+
+
+def explorer() -> dict[str, str | bytes]:
+    """The explorer of a small lake, with what Q-learning has learnt there too soon, as one file; and its frame."""
+    with tempfile.TemporaryDirectory() as folder:
+        run = pharos.train("q_learning", make("frozen_lake", slippery=True), steps=4000, seed=3, out=f"{folder}/run")
+        world = explorers.exploration_of(run.folder, title="frozen_lake/4x4 slippery=true")
+    return {LIVE: explorers.page(world, explorers.contents(world))}
 
 
 def reference() -> dict[str, str]:

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from pharos.explorer.keys import ARROWS, keys_of
     from pharos.explorer.learnt import Learnt
     from pharos.explorer.opening import Explorer, exploration_of, explore, open_browser
-    from pharos.explorer.pages import page, write
+    from pharos.explorer.pages import contents, page, write
     from pharos.explorer.server import Server
 
 _FILES = {
@@ -21,6 +21,7 @@ _FILES = {
     "Explorer": "opening",
     "Learnt": "learnt",
     "Server": "server",
+    "contents": "pages",
     "exploration_of": "opening",
     "explore": "opening",
     "keys_of": "keys",
@@ -35,6 +36,7 @@ __all__ = [
     "Explorer",
     "Learnt",
     "Server",
+    "contents",
     "exploration_of",
     "explore",
     "keys_of",
