@@ -1,6 +1,7 @@
 """Do the batched engine and Stable-Baselines3 learn alike? The same cells with many seeds of both, and two tests.
 
-    python benchmarks/agreement.py --out build/agreement [--seeds 30] [--batched-seeds 90] [--steps 10000] [--workers 2]
+    python benchmarks/agreement.py --out build/agreement [--seeds 30] [--batched-seeds 90] [--steps 10000]
+        [--evaluations 20] [--workers 2]
     python benchmarks/agreement.py --out build/agreement --report         # the table of what is finished
 
 Trains every cell (instance, chance, observation, agent) with both engines: two studies, in OUT/sb3 and OUT/batched. It
@@ -49,7 +50,7 @@ SMALL = {
 }
 
 
-def specification(engine, seeds, steps):
+def specification(engine, seeds, steps, evaluations=20):
     """The study of one engine."""
     blocks = [
         {
@@ -68,7 +69,7 @@ def specification(engine, seeds, steps):
             "name": f"agreement-{engine}",
             "engine": engine,
             "steps": steps,
-            "evaluations": 20,
+            "evaluations": evaluations,
             "seeds": seeds,
             "blocks": blocks,
         }
@@ -150,12 +151,13 @@ def main():
     parser.add_argument("--seeds", type=int, default=30)
     parser.add_argument("--batched-seeds", type=int, default=90)
     parser.add_argument("--steps", type=int, default=10_000)
+    parser.add_argument("--evaluations", type=int, default=20)
     parser.add_argument("--workers", type=int)
     parser.add_argument("--report", action="store_true", help="only the table of what is finished")
     arguments = parser.parse_args()
     specifications = {
-        "batched": specification("batched", arguments.batched_seeds, arguments.steps),
-        "sb3": specification("sb3", arguments.seeds, arguments.steps),
+        engine: specification(engine, seeds, arguments.steps, arguments.evaluations)
+        for engine, seeds in (("batched", arguments.batched_seeds), ("sb3", arguments.seeds))
     }
     if not arguments.report:
         for engine, spec in specifications.items():

@@ -29,13 +29,13 @@ INSTANCES = {
 
 # found by a search on a court of 11 x 7 under three kinds of chance, docs/agents.md
 VECTOR = {
-    "learning_rate": 0.0009,
+    "learning_rate": 0.00036,
     "gamma": 0.98,
-    "n_steps": 3,
+    "n_steps": 5,
     "learning_starts": 5000,
-    "target_update_interval": 4000,
-    "exploration_fraction": 0.3,
-    "exploration_final_eps": 0.008,
+    "target_update_interval": 1000,
+    "exploration_fraction": 0.1,
+    "exploration_final_eps": 0.005,
 }
 
 
