@@ -152,8 +152,14 @@ def numbers(env, space, state):
     ones = int(one_hot(states)[0].sum())
     return (
         f"`vector`, {len(parts)} numbers: {shown}. `one_hot`: {len(one_hot.names):,} bits, {ones} of them set. "
-        f"`index`: {space.index(state):,}."
+        f"`index`: {space.index(state):,}. `hash`: {word_of(env, states)}."
     )
+
+
+def word_of(env, states):
+    """The word of a state, in groups of eight bits."""
+    bits = "".join(map(str, observe(env, "hash")(states)[0]))
+    return f"`{' '.join(bits[i : i + 8] for i in range(0, len(bits), 8))}`"
 
 
 HEAD = """# Gallery

@@ -154,6 +154,31 @@ def test_the_identity_is_expected_tabular_q_learning():
     assert found.curve.greedy[1] == pytest.approx(lost / (1 - pharos.solvers.uniform_value(mdp).value_at_start))
 
 
+def test_with_uniform_play_and_enough_steps_a_phase_is_a_backup():
+    """Of a table: after k phases the greedy policy is that of k Bellman backups from 0."""
+    schedule = Schedule(
+        steps=1250,
+        learning_starts=0,
+        gradient_steps=100_000,
+        exploration_final_eps=1.0,
+        exploration_fraction=0,
+        gamma=0.9,
+    )
+    mdp = random_mdp(seed=2)
+    found = kernel_regret(mdp, Representation.of_matrix(np.eye(7)), schedule=schedule).curve.greedy
+    P = np.asarray(mdp.dynamics.matrix().todense())[:, :7].reshape(7, 3, 7)
+    optimal, uniform = (
+        each.value_at_start for each in (pharos.value_iteration(mdp), pharos.solvers.uniform_value(mdp))
+    )
+    q, expected = np.zeros((7, 3)), [1.0]
+    for _ in range(4):
+        q = mdp.rewards + 0.9 * P @ np.where(mdp.terminal, 0.0, q.max(axis=1))
+        value = pharos.evaluate_policy(mdp, q.argmax(axis=1)).value_at_start
+        expected.append((optimal - value) / (optimal - uniform))
+    assert len(set(np.round(expected, 6))) > 2
+    np.testing.assert_allclose(found, expected, atol=2e-5)
+
+
 @settings(deadline=None, max_examples=10)
 @given(with_chance(outcome_mdps(FEW)), st.sampled_from([None, 1, 2, 6]), st.integers(0, 3))
 def test_learners_on_any_mdp_begin_as_uniform_play_and_know_no_scale(mdp, horizon, seed):
