@@ -2,9 +2,11 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import gymnasium
 import numba
@@ -58,6 +60,19 @@ def test_what_warm_has_compiled_no_later_process_compiles(tmp_path):
         words = ("simple_grid", "height=5", "width=4", "goal=[4,3]")  # another instance of the class
         answer = json.loads(pharos_command(verb, *words, "--json", **cache).stdout)
         assert answer["compiling_seconds"] == 0, verb
+
+
+@pytest.mark.long
+def test_the_first_listing_of_the_readme_is_what_is_printed():
+    text = (Path(__file__).parents[1] / "README.md").read_text()
+    command, shown = re.search(r"^```\n\$ pharos (.*)\n((?:.*\n)*?)```$", text, re.MULTILINE).groups()
+    printed = pharos_command(*command.split()).stdout + "\n"
+    printed = re.sub(r"^compiling: .*\n", "", printed, flags=re.MULTILINE)  # the first time
+
+    def lines(listing):
+        return [re.sub(r"(\d+\.\d\d|kept)$", "", line.rstrip()).rstrip() for line in listing.strip().splitlines()]
+
+    assert len(lines(shown)) == 14 and lines(printed) == lines(shown)
 
 
 def test_a_space_too_large_to_measure_is_compiled_for_all_the_same(tmp_path, monkeypatch):

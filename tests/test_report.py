@@ -256,6 +256,15 @@ def test_a_digit_that_was_edited_is_measured_anew(digit):
     assert hardness.report(mdp, "diameter")["diameter"].kept
 
 
+def test_kept_results_say_how_wrong_their_values_may_be():
+    mdp = grid()
+    first = hardness.report(mdp)
+    again = hardness.report(mdp)
+    assert again["minimal_gap"].kept
+    assert again.conventions["error_bound"] == first.conventions["error_bound"] > 0
+    assert "error_bound" not in hardness.report(mdp, "diameter").conventions
+
+
 def test_results_of_another_space_are_not_taken():
     """The same chance, start and restart: without the manifest, the diameter of one would be that of the other."""
     small, large = grid(), pharos.build(pharos.make("simple_grid", height=5, width=5)).mdp()

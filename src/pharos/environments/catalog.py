@@ -7,6 +7,7 @@ joins the catalogue with `register`.
 import dataclasses
 import importlib
 import os
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -141,7 +142,11 @@ def register(cls: type[Environment]) -> type[Environment]:
         raise ParameterError(f"register: found {cls!r}; expected a subclass of pharos.Environment")
     name = getattr(cls, "name", None)
     if not isinstance(name, str) or not name or "/" in name or ":" in name:
-        raise ParameterError(f"register: {cls.__name__}.name is {name!r}; expected a text without '/' and ':'")
+        words = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", cls.__name__).lower()
+        raise ParameterError(
+            f"register: {cls.__name__}.name is {name!r}; expected a text without '/' and ':', such as name = {words!r} "
+            "in the class"
+        )
     if name in _OWN:
         raise ParameterError(f"register: {name!r} is the name of a built-in class; choose another name")
     _REGISTERED[name] = cls

@@ -155,8 +155,9 @@ def report(
     conventions = _conventions(problem)
     file = ResultsFile(mdp, conventions) if keep else None
     results = {measure.name: _measured(measure, problem, file) for measure in wanted}
-    if "solution" in vars(problem):
-        conventions["error_bound"] = problem.solution.error_bound
+    bounds = (_error_bound(problem), None if file is None else file.error_bound)
+    if known := [bound for bound in bounds if bound is not None]:
+        conventions["error_bound"] = max(known)
     return Report(results, conventions, watch.seconds)
 
 
@@ -174,8 +175,14 @@ def _measured(measure: Measure, problem: Problem, file: ResultsFile | None) -> R
     certificate, seconds = certificate_of(outcome), watch.seconds
     result = replace(empty, value=_plain(outcome), text=_text(outcome), certificate=certificate, seconds=seconds)
     if file is not None:
-        file.put(measure, result.value, result.text, certificate, seconds, problem.budget)
+        error_bound = _error_bound(problem)
+        file.put(measure, result.value, result.text, certificate, seconds, problem.budget, error_bound)
     return result
+
+
+def _error_bound(problem: Problem) -> float | None:
+    """How wrong the optimal values may be; None where no measure has asked for them."""
+    return problem.solution.error_bound if "solution" in vars(problem) else None
 
 
 def _plain(value: Any) -> Any:

@@ -40,6 +40,7 @@ class ResultsFile:
     def __init__(self, mdp: TabularMDP, conventions: Mapping[str, Any]):
         self.path = None if mdp.folder is None else Path(mdp.folder) / FILE
         self.mdp, self.conventions = mdp, dict(conventions)
+        self.error_bound: float | None = None  # the largest of the values behind the results that were read
         self._has_warned = False
 
     def get(self, measure: Measure, budget: Budget) -> dict[str, Any] | None:
@@ -60,15 +61,27 @@ class ResultsFile:
                 return None
             _check(content["value"])
             text, seconds = str(content["text"]), float(content["seconds"])
+            bound = content.get("error_bound")
+            bound = None if bound is None else float(bound)
         except (KeyError, TypeError, ValueError):
             self._warn(f"the result of {measure.name} is not as pharos wrote it")
             return None
+        if bound is not None:
+            self.error_bound = max(bound, self.error_bound or 0.0)
         return {"value": content["value"], "text": text, "seconds": seconds, "certificate": certificate}
 
     def put(
-        self, measure: Measure, value: Any, text: str, certificate: Certificate, seconds: float, budget: Budget
+        self,
+        measure: Measure,
+        value: Any,
+        text: str,
+        certificate: Certificate,
+        seconds: float,
+        budget: Budget,
+        error_bound: float | None = None,
     ) -> None:
-        """Keep a result. A folder that cannot be written to (another's, or a full disk) keeps nothing."""
+        """Keep a result, and how wrong the optimal values behind it may be. A folder that cannot be written to
+        (another's, or a full disk) keeps nothing."""
         if self.path is None or measure.version is None:
             return
         content = {
@@ -77,6 +90,7 @@ class ResultsFile:
             "seconds": seconds,
             "certificate": vars(certificate),
             "budget": {"seconds": budget.seconds, "searches": budget.searches},
+            "error_bound": None if measure.depends == "structure" else error_bound,
         }
         try:  # as text: JSON proper has no infinity
             entry = storage.sealed({"key": self._key(measure), "content": json.dumps(content)})
