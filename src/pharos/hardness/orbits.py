@@ -29,7 +29,7 @@ def orbits(
         start: the state to which those lead that end the episode; -1: nowhere.
         is_over: whether to stop looking for more.
     Cost: at most four passes over the table for maps that fail, one for each that is found. Without symmetries mostly
-        some hundred entries are read, and no more memory is touched: the scratch arrays are zero pages until then.
+        some thousand entries are read, and no more memory is touched: the scratch arrays are zero pages until then.
     Source: ours.
     """
     size, rng = len(next_states), np.random.Generator(np.random.PCG64(0))
