@@ -222,10 +222,10 @@ def test_hardness_of_changed_code_is_measured_anew(tmp_path):
     )
     file = tmp_path / "measured.py"
     file.write_text(TAXI)
-    before, again = (tables._asked(spec, tmp_path, config_of(file)) for _ in range(2))
+    before, again = (tables._identity_of(spec, tmp_path, config_of(file)) for _ in range(2))
     file.write_text(TAXI + "\n# changed\n")
-    assert before == again != tables._asked(spec, tmp_path, config_of(file))
-    assert "code" not in tables._asked(spec, tmp_path, spec.runs[0].config)[0]
+    assert before == again != tables._identity_of(spec, tmp_path, config_of(file))
+    assert "code" not in tables._identity_of(spec, tmp_path, spec.runs[0].config)[0]
 
 
 @pytest.mark.parametrize("reference", ["corners:corner", "corners.py:corner", "corners.py:pair"])
