@@ -156,8 +156,8 @@ def report(
     file = ResultsFile(mdp, conventions) if keep else None
     results = {measure.name: _measured(measure, problem, file) for measure in wanted}
     bounds = (_error_bound(problem), None if file is None else file.error_bound)
-    if known := [bound for bound in bounds if bound is not None]:
-        conventions["error_bound"] = max(known)
+    if numbers := [bound for bound in bounds if bound is not None]:
+        conventions["error_bound"] = max(numbers)
     return Report(results, conventions, watch.seconds)
 
 
