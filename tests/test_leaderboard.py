@@ -1,6 +1,7 @@
 """Entries of a leaderboard: what is verified, what is refused in one line, and what the page says."""
 
 import dataclasses
+import importlib
 import json
 import struct
 
@@ -12,6 +13,7 @@ import pharos
 from pharos import leaderboard
 from pharos.cli import app
 from pharos.errors import FileFormatError, ParameterError, ResultCorrupted, UntrustedCode
+from pharos.experiments import read_record
 from pharos.leaderboard.entry import write
 
 OWN = """
@@ -180,6 +182,18 @@ def test_names_of_code_are_refused_without_trust(entry, file, part, name):
     config = dataclasses.replace(entry.config, **{part: name})
     with pytest.raises(UntrustedCode, match="--trust"):
         leaderboard.verify(changed(entry, file, config=config))
+
+
+def test_the_version_of_the_rules_is_that_of_the_run_though_its_class_is_not_loaded(run, entry, tmp_path, monkeypatch):
+    submission = importlib.import_module("pharos.leaderboard.submission")
+    monkeypatch.setattr(submission, "class_called", lambda name: None)
+    packed = leaderboard.read(leaderboard.submit(run, tmp_path / "again.safetensors"))
+    assert packed.rules_version == entry.rules_version == pharos.make("simple_grid").version
+    record = {**read_record(run)}
+    del record["rules_version"]
+    monkeypatch.setattr(submission, "read_record", lambda folder: record)  # of an older run
+    with pytest.raises(ParameterError, match="does not say the version of the rules of 'simple_grid'"):
+        leaderboard.submit(run, tmp_path / "older.safetensors")
 
 
 @pytest.mark.long

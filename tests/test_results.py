@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pharos.errors import FileFormatError, ResultCorrupted
-from pharos.experiments import load_agent, read_curve, read_record, run_id, train
+from pharos.experiments import evaluate_agent, load_agent, read_curve, read_record, run_id, train
 from pharos.experiments import results as _results
 
 run_folder = importlib.import_module("pharos.experiments.run_folder")
@@ -112,6 +112,23 @@ def test_tensorboard_gets_the_exact_regret(tmp_path):
     events.Reload()
     scalars = events.Scalars("pharos/expected_regret")
     assert scalars[-1].value == pytest.approx(result.result["final_regret"])
+
+
+def test_the_last_row_is_of_the_policy_that_is_kept_though_one_call_passes_two_points(tmp_path):
+    rollouts = {"n_envs": 8, "n_steps": 4, "batch_size": 16, "learning_rate": 3e-3}  # 8 steps a call, points every 3
+    train(
+        "ppo",
+        "simple_grid/4x4-plain",
+        steps=64,
+        evaluation_interval=3,
+        out=tmp_path / "run",
+        hyperparameters=rollouts,
+    )
+    task, agent = load_agent(tmp_path / "run")
+    kept = evaluate_agent(agent, task).value
+    curve = read_curve(tmp_path / "run")
+    assert curve["value"].iloc[-1] == pytest.approx(kept, abs=1e-6)
+    assert curve["step"].tolist()[-2:] == [63, 64] and abs(curve["value"].iloc[-2] - kept) > 1e-6
 
 
 def test_episodes_after_the_last_step_are_not_counted():

@@ -53,18 +53,18 @@ class AtPoints(BaseCallback):
             self.returns += float(self._running[i])
             self._running[i], self._discount[i] = 0.0, 1.0
         self._owner.finished = (self.episodes, self.returns)
-        if self.points and self.num_timesteps >= self.points[0] and len(self.points) > 1:
-            self._call()
+        if len(self.points) > 1 and self.num_timesteps >= self.points[0]:
+            self._call(self.points[:-1])  # the last one comes after the last update, whatever passed it
         return True
 
     def at_the_end(self) -> None:
         """The last point, after the last update."""
         if self.points:
-            self._call()
+            self._call(self.points)
 
-    def _call(self) -> None:
-        steps = max(point for point in self.points if point <= self.num_timesteps)
-        self.points = [point for point in self.points if point > self.num_timesteps]
+    def _call(self, due: list[int]) -> None:
+        steps = max(point for point in due if point <= self.num_timesteps)
+        self.points = [point for point in self.points if point > steps]
         row = self.at_point(steps, self.episodes, self.returns)
         for name in ("value", "expected_regret", "mean_return"):
             self.logger.record(f"pharos/{name}", row[name])

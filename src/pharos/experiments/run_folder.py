@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
+from pharos.environments import class_called
 from pharos.errors import ParameterError
 from pharos.experiments import results as _results
 from pharos.experiments.config import RunConfig, run_id
@@ -58,6 +59,8 @@ class Record:
         self.folder, self.hyperparameters = folder, hyperparameters
         versions = _results.versions()
         self.run = {"format": _results.FORMAT, "id": config.id, "config": config.to_dict(), "versions": versions}
+        if (rules := class_called(config.environment)) is not None:
+            self.run["rules_version"] = rules.version
 
     def write(self, status: str, **entries: Any) -> None:
         """Replace it: the run is "running", "failed" or "finished"."""

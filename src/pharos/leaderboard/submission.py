@@ -56,7 +56,7 @@ def submit(
             f"{run}: was trained on an imported MDP, which others do not have; "
             f"expected an environment of pharos, or of a class that others can import"
         )
-    rules, result, last = class_called(config.environment), record["result"], read_rows(run)[-1]
+    result, last = record["result"], read_rows(run)[-1]
     claim = Claim(
         last["value"],
         last["expected_regret"],
@@ -72,7 +72,7 @@ def submit(
         config=config,
         hyperparameters=record["hyperparameters"],
         versions=record.get("versions", {}),
-        rules_version=0 if rules is None else rules.version,
+        rules_version=_rules_version(run, record, config),
         claim=claim,
         training={key: result.get(key) for key in TRAINING} | {"seconds": record.get("seconds")},
         arrays=_table(run) if config.is_tabular else _network(run),
@@ -88,6 +88,20 @@ def submit(
         target.unlink()
         raise ParameterError(str(error)) from None
     return target
+
+
+def _rules_version(run: Path, record: dict[str, Any], config: RunConfig) -> int:
+    """The version of the rules that the run says; of older runs, which say none, that of the class here."""
+    stored = record.get("rules_version")
+    if isinstance(stored, int) and not isinstance(stored, bool):
+        return stored
+    rules = class_called(config.environment)
+    if rules is None:
+        raise ParameterError(
+            f"{run}: does not say the version of the rules of {config.environment!r}, which is not loaded here; "
+            "train it again into another folder"
+        )
+    return rules.version
 
 
 def _table(run: Path) -> dict[str, np.ndarray]:
