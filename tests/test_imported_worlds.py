@@ -9,7 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 import pharos
-from pharos import drawing, importers
+from pharos import drawing, experiments, importers, study
 from pharos.cli import app
 from pharos.errors import FileFormatError, ParameterError
 from pharos.mdp import TabularMDP
@@ -220,6 +220,21 @@ def test_what_was_learnt_on_a_folder_is_evaluated_on_it(folders, tmp_path):
     assert (answer["gamma"], answer["horizon"]) == (0.9, None)
     words = ("evaluate", folders["matrices"], "--policy", tmp_path / "run", "--gamma", 1, "--horizon", 20, "--json")
     assert json.loads(run(*words).stdout)["regret"] == pytest.approx(learnt["final_regret"], abs=4e-6)
+
+
+@pytest.mark.long
+def test_a_study_has_imported_worlds_beside_others(folders, tmp_path):
+    block = {
+        "environments": [str(folders["matrices"]), "simple_grid"],
+        "agents": ["q_learning"],
+        "seeds": 1,
+        "steps": 200,
+    }
+    runs = study.specification({"name": "mixed", "blocks": [block]}).runs
+    assert [each.config["environment"] for each in runs] == ["imported", "simple_grid"]
+    assert runs[0].config["parameters"]["folder"] == str(folders["matrices"])
+    (result, _) = experiments.train_configs([each.config for each in runs])
+    assert result.result["exact"] and result.result["conventions"]["time_limit"] == 20
 
 
 # From Gymnasium ------------------------------------------------------------------------------------------------------
