@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 import headless
-from pharos.explorer import Explorer, Learnt, exploration_of, write
+from pharos.explorer import Exploration, Explorer, Learnt, exploration_of, write
 from pharos.explorer.server import QUESTIONS
+from pharos.mdp import TabularMDP
 
 pytestmark = [
     pytest.mark.long,
@@ -242,6 +243,22 @@ def test_everything_that_takes_the_focus_has_a_name(page):
             unnamed.append(node["role"]["value"])
     page.send("Accessibility.disable")
     assert len(nodes) > 100 and unnamed == []
+
+
+def test_an_episode_that_ends_without_a_state_is_over(browser, tmp_path):
+    mdp = TabularMDP.from_arrays([[1, -1], [0, -1]], [[0.0, 2.0], [0.0, 1.0]], gamma=0.9)
+    browser.size(1280)
+    browser.open(write(Exploration(mdp, title="two states"), tmp_path / "two.html").as_uri())
+    browser.press("2")
+    browser.until("document.getElementById('badges').innerText.includes('ended after it')")
+    for key in ("1", "2", "o"):
+        browser.press(key)
+    assert browser.value("world.walk.map((move) => move.reward)") == [2]
+    browser.press("u")
+    browser.press("1")
+    at(browser, 1)
+    assert "There is no drawing" in browser.text("#no-drawing")
+    assert browser.faults == []
 
 
 def test_the_served_page_works_under_its_policy_of_contents(browser, world):

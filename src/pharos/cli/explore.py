@@ -68,7 +68,12 @@ def explore(
             "gamma": gamma,
             "chance": ChanceSetting(sticky, random, lazy),
         }
-        options |= {"trust": trust, "title": " ".join((target, *(parameters or ()))), "progress": report}
+        options |= {
+            "trust": trust,
+            "title": " ".join((target, *(parameters or ()))),
+            "progress": report,
+            "in_one_page": out is not None,
+        }
         world = _exploration(goal, building, **options)
         if out is not None:
             file = write(world, out)

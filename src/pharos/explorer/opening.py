@@ -14,7 +14,7 @@ from pharos.errors import ParameterError
 from pharos.experiments import ChanceSetting, load_agent, read_record
 from pharos.explorer.exploration import Exploration
 from pharos.explorer.learnt import Learnt
-from pharos.explorer.pages import write
+from pharos.explorer.pages import check_size, write
 from pharos.explorer.server import Server
 from pharos.mdp import TabularMDP
 from pharos.policies import PolicyLike
@@ -95,7 +95,7 @@ def explore(
     """
     agent = None if policy is None else Learnt(policy, observation=observation)
     chance = ChanceSetting(sticky, random, lazy)
-    world = exploration_of(target, learnt=agent, gamma=gamma, chance=chance, trust=trust)
+    world = exploration_of(target, learnt=agent, gamma=gamma, chance=chance, trust=trust, in_one_page=out is not None)
     if out is not None:
         return write(world, out)
     explorer = Explorer(world, port=port)
@@ -113,9 +113,14 @@ def exploration_of(
     trust: bool = False,
     title: str = "",
     env: Environment | None = None,
+    in_one_page: bool = False,
     progress: Callable[[str], None] = lambda text: None,
 ) -> Exploration:
-    """What `explore` shows. `title`, `progress`: as for `Exploration`; `env`: draws the states of an MDP."""
+    """What `explore` shows. `title`, `progress`: as for `Exploration`; `env`: draws the states of an MDP.
+
+    Args:
+        in_one_page: whether it is for a page of its own; what is too large for that is refused before it is solved.
+    """
     chance = chance or ChanceSetting()
     if isinstance(target, str | os.PathLike) and (Path(target) / RECORD).is_file():
         return _of_run(Path(target), learnt, gamma, chance, trust, title, progress)
@@ -137,12 +142,16 @@ def exploration_of(
         mdp = space.mdp()
     else:
         raise ParameterError(f"target is {target!r}; expected an environment, a state space, an MDP or a folder")
+    title = title or (_title(env) if env is not None else "")
+    mdp_with_chance = chance.of(mdp.with_gamma(GAMMA if gamma is None else gamma))
+    if in_one_page:
+        check_size(mdp_with_chance, title or str(mdp))
     return Exploration(
-        chance.of(mdp.with_gamma(GAMMA if gamma is None else gamma)),
+        mdp_with_chance,
         env=env,
         space=space,
         learnt=learnt,
-        title=title or (_title(env) if env is not None else ""),
+        title=title,
         chance=described(chance, mdp),
         progress=progress,
     )

@@ -16,6 +16,7 @@ from pharos import storage
 from pharos.errors import ParameterError
 from pharos.explorer.exploration import Exploration
 from pharos.explorer.maps import quantities, quantity
+from pharos.mdp import TabularMDP
 
 MOST_POSITIONS = 10_000  # states, under sticky actions times previous ones, that a page of its own holds
 MOST_BYTES = 64 << 20  # of such a page
@@ -72,13 +73,7 @@ def contents(world: Exploration) -> dict[str, Any]:
         ParameterError: there are more than MOST_POSITIONS.
     """
     mdp = world.mdp
-    width = mdp.num_actions + 1 if mdp.is_sticky else 1
-    if mdp.num_states * width > MOST_POSITIONS:
-        raise ParameterError(
-            f"{world.title}: has {mdp.num_states * width:,} "
-            f"{'pairs of a state and a previous action' if width > 1 else 'states'}; a page of its own holds at most "
-            f"{MOST_POSITIONS:,}: choose a smaller instance, or leave out --out (out= in Python) for a local server"
-        )
+    check_size(mdp, world.title)
     states = np.arange(mdp.num_states)
     before: list[int | None] = [None, *range(mdp.num_actions)] if mdp.is_sticky else [None]
     positions = {
@@ -89,6 +84,17 @@ def contents(world: Exploration) -> dict[str, Any]:
     fields = {name: [_plain(value) for value in quantity(world, name, states)] for name in quantities(world)}
     wrong = {name: world.wrong(name) for name in world.policies}
     return _shortened({"about": world.about(), "positions": positions, "fields": fields, "wrong": wrong})
+
+
+def check_size(mdp: TabularMDP, title: str) -> None:
+    """ParameterError where a page of its own does not hold all positions of an MDP."""
+    width = mdp.num_actions + 1 if mdp.is_sticky else 1
+    if mdp.num_states * width > MOST_POSITIONS:
+        raise ParameterError(
+            f"{title}: has {mdp.num_states * width:,} "
+            f"{'pairs of a state and a previous action' if width > 1 else 'states'}; a page of its own holds at most "
+            f"{MOST_POSITIONS:,}: choose a smaller instance, or leave out --out (out= in Python) for a local server"
+        )
 
 
 def write(world: Exploration, path: str | os.PathLike) -> Path:

@@ -1,5 +1,5 @@
 // What is shown now, and what keys and clicks do.
-const world = { about: null, here: null, walk: [], start: [0, null] };
+const world = { about: null, here: null, walk: [], start: [0, null], isOver: false };  // isOver: ended without a state
 
 const say = (line) => { $("said").textContent = line; };
 
@@ -21,6 +21,7 @@ async function go(state, previous = null, move = null) {
   const position = await attempt(() => source.ask("position", { state, previous }));
   if (!position || asked !== go.asked) return false;
   const before = world.here;
+  world.isOver = false;
   if (move) world.walk.push(move); else if (!move && move !== false) { world.walk = []; world.from = [position.state, position.previous]; }
   world.here = position;
   panels.here(position, before);
@@ -36,10 +37,13 @@ async function go(state, previous = null, move = null) {
 // The user chose an action, and this is what came of it.
 function moved(action, [state, previous, , reward]) {
   const { here } = world;
+  if (world.isOver) return null;
   const move = { state: here.state, previous: here.previous, action, reward, gap: here.actions[action].gap };
   if (state === null) {
     world.walk.push(move);
+    world.isOver = true;
     panels.moves();
+    panels.ended(move);
     say(`The episode has ended. Reward ${text(reward)}.`);
     return null;
   }
@@ -48,7 +52,7 @@ function moved(action, [state, previous, , reward]) {
 
 function act(action) {
   const { here } = world;
-  if (!here || !here.actions[action]) return null;
+  if (!here || world.isOver || !here.actions[action]) return null;
   let left = Math.random();
   const { outcomes } = here.actions[action];
   return moved(action, outcomes.find(([, , probability]) => (left -= probability) < 0) || outcomes[0]);

@@ -81,6 +81,12 @@ const panels = {
     $("choices-note").textContent = `Q* is the value of choosing the action and playing optimally afterwards; a gap is what choosing it loses. Columns ${about.policies.map((name) => NAMES[name]).join(", ")} say how often each policy chooses it.`;
   },
 
+  // The episode has ended without a state, as some tables have it
+  ended(move) {
+    $("badges").append(h("span", { class: "end" }, "ended after it"));
+    fill("actions", h("p", { class: "muted" }, `After ${world.about.actions[move.action]} in this state the episode has ended. Undo, or start again.`));
+  },
+
   outcomes(each, action, position, shown = 6) {
     const chip = ([state, previous, probability, reward]) => {
       const paid = reward ? ` ${reward > 0 ? "+" : ""}${text(reward, 3)}` : "";
