@@ -1,17 +1,21 @@
 """The instances of the study `hardness-dev`, by their rule.
 
-python benchmarks/hardness_dev.py
+python benchmarks/hardness_dev.py [--predictions FILE]
 
 Each class has a ladder: its instances by one size n, everything else as in LADDERS. Three of them are taken: the
 smallest with at least LEAST states; the largest with at most MOST states whose picture has at most MOST_CELLS cells, so
 that networks for pictures can be trained on two cores in a night; and the one whose number of states is nearest to the
-geometric mean of these two. Nothing but these sizes is looked at. Prints them as the preset has them.
+geometric mean of these two. Nothing but these sizes is looked at. Prints them as the preset has them; with
+--predictions, of `pharos study predict`, a table of kernel regret in their place, a row a class, the mean over its
+instances.
 """
 
+import argparse
 import math
 from itertools import count
 
 import pharos
+from pharos import study
 from pharos.observations import observe
 
 LEAST, MOST, MOST_CELLS = 16, 20_480, 1_024
@@ -33,10 +37,27 @@ FIRST = {"mini_grid": 5, "river_swim": 3, "freeway": 1}
 
 
 def main():
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--predictions")
+    file = parser.parse_args().predictions
+    if file is not None:
+        print(predicted(study.read_predictions(file)[0]))
+        return
     for name, rung in LADDERS.items():
         for parameters, states in instances(name, rung):
             given = ", ".join(f"{key}: {value}" for key, value in parameters.items())
             print(f"{{name: {name}, parameters: {{{given}}}}}  # {states:,} states", flush=True)
+
+
+def predicted(frame):
+    """Rows of a Markdown table: kernel regret by class and observation, and that of the tabular learner."""
+    columns = list(dict.fromkeys(frame["observation"]))
+    lines = ["| class | " + " | ".join(columns) + " | tabular learner |", "|---" * (len(columns) + 2) + "|"]
+    for name, part in frame.groupby("environment", sort=False):
+        means = part.groupby("observation")["kernel_regret"].mean()
+        cells = [f"{means[column]:.2f}" for column in columns]
+        lines.append(f"| `{name}` | {' | '.join(cells)} | {part['tabular_regret'].mean():.2f} |")
+    return "\n".join(lines)
 
 
 def instances(name, rung):

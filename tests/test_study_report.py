@@ -244,7 +244,6 @@ def test_a_study_without_dqn_says_nothing_false_and_has_no_empty_section(tmp_pat
         "Profiles",
         "Vector against image",
         "Hardness and regret",
-        "Unseen classes",
         "Hardness of the instances",
         "Returns",
         "Instances",

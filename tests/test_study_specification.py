@@ -242,7 +242,8 @@ def test_environments_of_a_file_take_the_place_of_those_that_are_given(tmp_path)
         ("taxi/5x5", "expected a list of environments"),
         ("- [taxi]", "expected a list of environments"),
         ("- my.py:Maze", "is code"),
-        ("- taxy/5x5", "did you mean 'taxi"),
+        ("- taxy/5x5", r"list.yaml: unknown environment 'taxy/5x5'; did you mean 'taxi/5x5'\?$"),
+        ("- {name: taxi, sise: 3}", "unknown key 'sise'"),
         ("- {name: taxi", "expected ',' or '}'"),
     ],
 )

@@ -197,6 +197,18 @@ def test_runs_that_had_begun_are_told():
     assert unseen_classes.late(runs, {"date": "2026-01-02T00:00:00Z"}) == (1, 1)
 
 
+def test_predictions_that_came_after_runs_are_no_predictions():
+    from types import SimpleNamespace
+
+    from pharos.study.report.unseen_section import doubts
+
+    about = {"date": "2026-01-02T00:00:00Z"}
+    results = SimpleNamespace(runs=pd.DataFrame({"id": ["a"], "began": ["2026-01-02T00:00:01Z"]}))
+    assert doubts(results, about) == []
+    results.runs["began"] = "2026-01-01T00:00:00Z"
+    assert doubts(results, about) == ["not a prediction: 1 of 1 run had begun when the predictions were written"]
+
+
 def test_settings_and_families_make_cells_of_their_own():
     block = {"environments": ["simple_grid/4x4-plain"], "agents": ["dqn"]}
     other = {

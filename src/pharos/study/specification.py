@@ -142,6 +142,12 @@ def given_environments(file: str | os.PathLike) -> list[Any]:
             raise ParameterError(
                 f"{path}: {name!r} is code; expected names that `pharos list` shows, or folders of imported MDPs"
             )
+        try:
+            _ = EnvironmentEntry.model_validate(entry).instance
+        except ValidationError as error:
+            raise ParameterError(_messages(error, str(path), None)) from error
+        except ParameterError as error:
+            raise ParameterError(f"{path}: {error}") from error
         result.append(entry)
     return result
 

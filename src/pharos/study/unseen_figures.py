@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 MOST_PANELS = 24
 PREDICTOR = "kernel_regret"
 DIAGONAL = "#888888"
+LONGEST_TITLE = 34
 
 
 def unseen_figures(
@@ -74,6 +75,7 @@ def observations_of_mdps(part: "pd.DataFrame", predictor: str = PREDICTOR) -> "F
         return None
     groups = _spread(groups)
     figure, axes = panels(len(groups), 2.3, 1.9)
+    most = max(1.0, part[[predictor, "greedy"]].max().max())
     for axis, (key, rows) in zip(axes, groups, strict=True):
         rows = rows.set_index("observation").reindex(observations)
         places = np.arange(len(observations))
@@ -84,7 +86,7 @@ def observations_of_mdps(part: "pd.DataFrame", predictor: str = PREDICTOR) -> "F
             axis.scatter([i], pair[:1], s=34, facecolors="none", edgecolors=color, lw=1.4)
             axis.scatter([i], pair[1:], s=34, color=color, lw=0, label=observation)
         axis.set_title(_short(*map(str, key)), fontsize=8)
-        axis.set(xticks=places, xticklabels=[], ylim=(-0.05, 1.3), xlim=(-0.6, len(observations) - 0.4))
+        axis.set(xticks=places, xticklabels=[], ylim=(-0.05, most + 0.08), xlim=(-0.6, len(observations) - 0.4))
     _label_edges(axes, "", "regret")
     legend_below(figure, axes)
     return figure
@@ -132,9 +134,13 @@ def _spread(groups: list[Any], most: int = MOST_PANELS) -> list[Any]:
 def _short(environment: str, instance: str, chance: str) -> str:
     """`taxi: size 7`, with the chance where there is some."""
     inside = instance[instance.find("(") + 1 : -1] if instance.endswith(")") else instance.partition("/")[2] or instance
-    words = [part.strip().replace("=", " ") for part in inside.split(",")][:2]
-    text = f"{title(environment)}: {', '.join(words).replace('_', ' ')}"
-    return text[:34] + ("" if chance == "plain" else f", {chance}")
+    first, *others = [part.strip().replace("=", " ").replace("_", " ") for part in inside.split(",")]
+    text = f"{title(environment)}: {first}"
+    for word in others:
+        if len(text) + len(word) > LONGEST_TITLE:
+            break
+        text += f", {word}"
+    return text + ("" if chance == "plain" else f", {chance}")
 
 
 def _label_edges(axes: Sequence[Any], below: str, beside: str) -> None:

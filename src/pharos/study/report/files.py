@@ -13,7 +13,7 @@ from pharos.study.latex import tables_of
 from pharos.study.report.page import render
 from pharos.study.report.results import Results, coefficients, results_of
 from pharos.study.report.sections import sections_of
-from pharos.study.report.unseen_section import judged, unseen_section
+from pharos.study.report.unseen_section import doubts, judged, unseen_section
 from pharos.study.specification import Source
 from pharos.study.status import opened
 from pharos.study.unseen_figures import unseen_figures
@@ -96,7 +96,8 @@ def report(
     drawn = [
         target / "figures" / f"{name}.{kind}" for name, images in figures.items() if images for kind in ("png", "pdf")
     ]
-    return StudyReport(target / "report.html", drawn, tables, results.notes)
+    notes = [*results.notes, *(doubts(results, predictions[1]) if predictions is not None else ())]
+    return StudyReport(target / "report.html", drawn, tables, notes)
 
 
 def _write_tables(folder: Path, results: Results, more: "Mapping[str, pd.DataFrame]") -> list[Path]:

@@ -49,6 +49,7 @@ def unseen_section(
     for agent in dict.fromkeys(judgement["agent"]):
         for outcome in dict.fromkeys(judgement["outcome"]):
             rows = judgement[(judgement["agent"] == agent) & (judgement["outcome"] == outcome)]
+            rows = rows.sort_values("baseline", ascending=False, kind="stable")
             if len(rows):
                 parts.append(_part(str(agent), str(outcome), rows, figures))
     return Section.of(
@@ -78,17 +79,19 @@ def _said(results: Results, predictions: "tuple[pd.DataFrame, Mapping[str, str]]
     if predictions is None:
         return ["Without predictions (pharos study predict), of tabular measures alone."]
     about = predictions[1]
-    before, unknown = late(results.runs, about)
     lines = [f"Predictions written {about['date']} by pharos {about['version']}, sha256 {about['sha256']}."]
+    return [*lines, *(doubts(results, about) or ["All runs began after that."])]
+
+
+def doubts(results: Results, about: Mapping[str, str]) -> list[str]:
+    """Why predictions may be none: runs that had begun when they were written, or that do not say when they were."""
+    before, unknown = late(results.runs, about)
+    total, reasons = f"of {many(len(results.runs), 'run')}", []
     if before:
-        lines.append(
-            f"NOT A PREDICTION: {before:,} of {many(len(results.runs), 'run')} had begun when they were written."
-        )
-    elif unknown:
-        lines.append(f"{many(unknown, 'run')} of {len(results.runs):,} do not say when they were made.")
-    else:
-        lines.append("All runs began after that.")
-    return lines
+        reasons.append(f"not a prediction: {before:,} {total} had begun when the predictions were written")
+    if unknown:
+        reasons.append(f"{unknown:,} {total} do not say whether they began after the predictions were written")
+    return reasons
 
 
 def _part(agent: str, outcome: str, rows: "pd.DataFrame", figures: Figures) -> dict[str, Any]:
