@@ -484,3 +484,40 @@ def test_the_command_line_has_them(grid):
         assert done.exit_code == 2
         assert line in done.stderr
         assert len(done.stderr.strip().splitlines()) == 1
+
+
+OWN = """
+from torch import nn
+
+def small(shape):
+    return nn.Sequential(nn.Flatten(), nn.Linear(shape[0], 16), nn.SiLU(), nn.Linear(16, 1))
+
+def conv(shape):
+    return nn.Conv3d(1, 1, 9)
+
+count = 3
+"""
+
+
+@pytest.mark.slow
+def test_a_network_of_ones_own_has_its_empirical_kernel(grid, tmp_path):
+    """By the name of a function; what landmarks ask for is part of the same kernel."""
+    pytest.importorskip("torch")
+    file = tmp_path / "own.py"
+    file.write_text(OWN)
+    target = ["hardness", "simple_grid", "height=3", "width=4", "--measures", "kernel_regret,kernel_learning_time"]
+    words = [*target, "--observation", "one_hot", "--network", f"{file}:small", "--fresh", "--json"]
+    done = CliRunner().invoke(app, words)
+    answer = json.loads(done.stdout)
+    assert 0 < answer["measures"]["kernel_regret"]["value"] < 1.5
+    said = answer["conventions"]["representation"]
+    assert (said["network"], said["networks"], said["initialisation"]) == ("own.py:small", 20, "its own")
+    seen, states = representation(grid, "one_hot", f"{file}:small"), np.arange(8)
+    whole = seen.kernel(states, states)
+    assert (whole == whole.T).all()
+    np.testing.assert_allclose(seen.kernel(states[:5], states[3:]), whole[:5, 3:], rtol=1e-4)
+    for name, line in (("conv", "network 'own.py:conv' on inputs of shape"), ("count", "found 3; expected a function")):
+        done = CliRunner().invoke(app, [*words[:-3], f"{file}:{name}"])
+        assert done.exit_code == 2
+        assert line in done.stderr
+        assert len(done.stderr.strip().splitlines()) == 1

@@ -79,7 +79,10 @@ def hardness(
     ] = None,
     network: Annotated[
         str | None,
-        typer.Option("--network", help="mlp128, mlp128x2, cnn16, nature; that of the agents when not given."),
+        typer.Option(
+            "--network",
+            help="mlp128, mlp128x2, cnn16, nature; that of the agents when not given. Or file.py:function, your own.",
+        ),
     ] = None,
     initialisation: Annotated[
         str, typer.Option("--initialisation", help="Of the network: pytorch (as DQN has), or sb3 (as PPO and A2C).")

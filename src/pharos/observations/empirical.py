@@ -8,19 +8,22 @@ import numpy as np
 from pharos.errors import MissingExtra, ParameterError
 
 
-def empirical_ntk(make: Callable[[], Any], x: np.ndarray, *, networks: int = 100, seed: int = 0) -> np.ndarray:
+def empirical_ntk(
+    make: Callable[[], Any], x: np.ndarray, *, others: np.ndarray | None = None, networks: int = 100, seed: int = 0
+) -> np.ndarray:
     """Return the mean over random networks of the inner products of gradients of the first output.
 
     Args:
         make: () -> a torch.nn.Module from inputs (N, ...) to outputs (N, A), with parameters drawn anew.
         x: (N, ...) inputs, see `network_inputs`.
+        others: (M, ...) inputs y; None: x.
         networks: how many; the standard error falls with the square root.
         seed: of PyTorch's random numbers, which are left as they were.
     Returns:
-        (N, N) float32, symmetric.
+        (N, M) float32; symmetric where `others` is None.
     Raises:
         MissingExtra: PyTorch is not installed. ParameterError: no network, or none was asked for.
-    Cost: `networks` times N gradients, which lie in memory one network at a time.
+    Cost: `networks` times N + M gradients, which lie in memory one network at a time.
     Source: Jacot, Gabriel and Hongler (2018).
     """
     try:
@@ -30,7 +33,8 @@ def empirical_ntk(make: Callable[[], Any], x: np.ndarray, *, networks: int = 100
     if networks < 1:
         raise ParameterError(f"networks is {networks!r}; expected at least 1")
     inputs = torch.as_tensor(np.asarray(x, np.float32))
-    total = np.zeros((len(x), len(x)))
+    columns = None if others is None else torch.as_tensor(np.asarray(others, np.float32))
+    total = np.zeros((len(x), len(x if others is None else others)))
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         for _ in range(networks):
@@ -38,7 +42,8 @@ def empirical_ntk(make: Callable[[], Any], x: np.ndarray, *, networks: int = 100
             if not isinstance(network, torch.nn.Module):
                 raise ParameterError(f"make returned {network!r}; expected a torch.nn.Module")
             rows = _gradients(torch, network, inputs)
-            total += (rows @ rows.T).double().numpy()
+            facing = rows if columns is None else _gradients(torch, network, columns)
+            total += (rows @ facing.T).double().numpy()
     return (total / networks).astype(np.float32)
 
 

@@ -73,7 +73,7 @@ class Network:
         if match is None or layers is None or (match["mlp"] and not layers):
             raise ParameterError(
                 f"network {network!r} has no closed form that is known; expected {_EXPECTED}; for any network of "
-                "PyTorch: observations.empirical_ntk"
+                "PyTorch file.py:function, a function of the shape of an input, or observations.empirical_ntk"
             )
         filters = int(match["filters"] or 0)
         if match["filters"] and not filters:

@@ -1,11 +1,15 @@
 """An observation and a network as measures of hardness take them."""
 
+from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pharos.errors import ParameterError
+from pharos import sources
+from pharos.errors import ParameterError, PharosError
 from pharos.hardness import Representation
+from pharos.observations.empirical import empirical_ntk
 from pharos.observations.look_alikes import observation_classes
 from pharos.observations.networks import Network, default_network
 from pharos.observations.observation import observe
@@ -14,13 +18,14 @@ from pharos.observations.tangent_kernels import check_memory, network_inputs, ta
 if TYPE_CHECKING:
     from pharos.state_space import StateSpace
 
+NETWORKS = 20  # random ones, where there is no closed form
 SAMPLE = 4096  # states whose observations the digest is of
 
 
 def representation(
     space: "StateSpace",
     observation: Any = "vector",
-    network: Network | str | None = None,
+    network: Network | str | Callable[[tuple[int, ...]], Any] | None = None,
     *,
     initialisation: str = "pytorch",
     landmarks: int | None = None,
@@ -32,7 +37,9 @@ def representation(
 
     Args:
         observation, options: as for `observe`.
-        network, initialisation: as for `ntk`.
+        network, initialisation: as for `ntk`. Or a network of one's own, a function of the shape of an input that
+            returns a torch.nn.Module, or its name, "file.py:function" or "module:function": its kernel is the mean over
+            20 random ones, see `empirical_ntk`; initialisation is the function's.
         landmarks: of the approximation of the kernel; None: where there are more than 4,096 different observations; 0:
             never.
     Raises:
@@ -45,9 +52,13 @@ def representation(
     if landmarks is not None and (isinstance(landmarks, bool) or not isinstance(landmarks, int) or landmarks < 0):
         raise ParameterError(f"landmarks is {landmarks!r}; expected a whole number, 0 for none, or None")
     observer = observe(space.environment, observation, state_space=space, **options)
-    net = Network.of(default_network(observer.space) if network is None else network, initialisation)
     first = network_inputs(observer, space.states(slice(0, 1)))
-    tangent_kernel(net, first)  # what does not fit is said before all states are looked at
+    if callable(network) or sources.is_reference(network):
+        tangent, named = _own_network(network, first.shape[1:])
+    else:
+        net = Network.of(default_network(observer.space) if network is None else network, initialisation)
+        tangent, named = partial(tangent_kernel, net), {"network": net.name, "initialisation": net.initialisation}
+    tangent(first, None)  # what does not fit is said before all states are looked at
 
     def inputs(states: np.ndarray) -> np.ndarray:
         return network_inputs(observer, space.states(states))
@@ -55,7 +66,7 @@ def representation(
     def kernel(rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
         check_memory(len(rows), len(columns), str(space.environment))
         same = rows is columns
-        return tangent_kernel(net, inputs(rows), None if same else inputs(columns))
+        return tangent(inputs(rows), None if same else inputs(columns))
 
     return Representation(
         kernel=kernel,
@@ -67,12 +78,32 @@ def representation(
             "options": {
                 name: value if isinstance(value, str | int | float) else str(value) for name, value in options.items()
             },
-            "network": net.name,
-            "initialisation": net.initialisation,
+            **named,
             "landmarks": landmarks,
             "digest": _digest(inputs, space.num_states),
         },
     )
+
+
+def _own_network(network: Any, shape: tuple[int, ...]) -> tuple[Callable[..., np.ndarray], dict[str, Any]]:
+    """(kernel of inputs x, y; what it is), of a function of the shape or of its name."""
+    source = sources.find(network) if isinstance(network, str) else sources.source_of(network)
+    function = sources.load(source) if isinstance(network, str) and source is not None else network
+    name = source.name if source is not None else str(getattr(network, "__name__", network))
+    if not callable(function):
+        raise ParameterError(f"network {name!r}: found {function!r}; expected a function of the shape of an input")
+
+    def kernel(x: np.ndarray, y: np.ndarray | None = None) -> np.ndarray:
+        try:
+            return empirical_ntk(partial(function, shape), x, others=y, networks=NETWORKS)
+        except PharosError:
+            raise
+        except Exception as error:
+            words = f"{type(error).__name__}: {' '.join(str(error).split())}"
+            raise ParameterError(f"network {name!r} on inputs of shape {shape}: {words}") from error
+
+    checksum = None if source is None else source.checksum
+    return kernel, {"network": name, "initialisation": "its own", "networks": NETWORKS, "code": checksum}
 
 
 def _digest(inputs: Any, num_states: int) -> str:
