@@ -235,15 +235,19 @@ def test_a_tolerance_below_what_floats_can_reach_is_refused():
         value_iteration(ring, 1e-15)
 
 
-def test_linear_systems_that_are_too_large_are_left_to_sweeps_however_many():
+def test_linear_systems_that_are_too_large_are_never_solved_directly_however_many_sweeps_are_left():
     """2 million nodes times actions at most; under sticky actions nodes are pairs. Of two sweeps the second changes as
-    much as the first."""
+    much as the first. What failed is tried again after four times as many."""
     size, actions = 5000, 21
     table = np.tile((np.arange(size) + 1)[:, None] % size, actions)
     slow = TabularMDP.from_arrays(table, np.ones((size, actions)), gamma=1 - 1e-12)
     for mdp, expected in ((random_actions(slow, 0.5), True), (sticky_actions(slow, 0.5), False)):
         decision = PolicyIteration(mdp, BEST)
-        assert [decision.is_worth_it(sweeps, 1.0, 1e-6) for sweeps in (256, 512)] == [False, expected]
+        assert [decision.is_worth_it(sweeps, 1.0, 1e-6) for sweeps in (128, 256, 512)] == [False, True, True]
+        assert not decision.is_direct
+        decision.fail()
+        assert [decision.is_worth_it(sweeps, 1.0, 1e-6) for sweeps in (1024, 2048)] == [False, True]
+        assert decision.is_direct == expected
 
 
 @pytest.mark.parametrize("tolerance", [0, -1, float("nan"), "small"])

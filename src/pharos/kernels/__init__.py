@@ -20,6 +20,7 @@ __all__ = [
     "hitting",
     "horizon",
     "key_owner",
+    "krylov",
     "landmarks",
     "learning",
     "many_searches",

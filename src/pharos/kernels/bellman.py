@@ -2,13 +2,14 @@
 
 Common arguments: transitions: see kernels/outcomes.py; table, palette: see mdp/rewards.py; v (S + 1,) float64,
 under sticky actions (S + 1, A) by the previously executed action, with row S 0, so that index -1 reads 0; weights:
-(chosen, previous, uniform); sign: 1 maximises, -1 minimises; actions: a tuple of A zeros, whose length the compiler
-knows, so that the loops over actions are unrolled (a third faster). Each sweep goes from the last state to the first,
-of an order (S,) or, where that is None, of their numbers, and returns the largest change of an entry.
+(chosen, previous, uniform); choice: 1.0 maximises, -1.0 minimises, (S,) integers are the actions of a policy; actions:
+a tuple of A zeros, whose length the compiler knows, so that the loops over actions are unrolled (a third faster). Each
+sweep goes from the last state to the first, of an order (S,) or, where that is None, of their numbers, and returns the
+largest change of an entry.
 """
 
 import numpy as np
-from numba import njit
+from numba import njit, types
 from numba.extending import overload
 
 from pharos.kernels.outcomes import expectation, expectation_of_pair, size_of
@@ -33,54 +34,90 @@ def _reward_at(table, palette, s, a):
     return lambda table, palette, s, a: table[s, a]
 
 
-@njit(forceinline=True)
-def _backup(transitions, table, palette, gamma, uniform, sign, v, actions, s):
-    """(1 - uniform) max_a q(s, a) + uniform mean_a q(s, a)."""
-    best = -np.inf
-    total = 0.0
-    for a in range(len(actions)):
-        q = reward_at(table, palette, s, a) + gamma * expectation(transitions, v, s, a)
-        best = max(best, sign * q)
-        total += q
-    if uniform > 0.0:
-        return (1.0 - uniform) * (sign * best) + uniform * total / len(actions)
-    return sign * best
+def _backup(transitions, table, palette, gamma, uniform, choice, v, actions, s):
+    """(1 - uniform) q(s, what is chosen) + uniform mean_a q(s, a)."""
+
+
+@overload(_backup, jit_options={"forceinline": True})
+def _backup_of(transitions, table, palette, gamma, uniform, choice, v, actions, s):
+    if isinstance(choice, types.Float):
+
+        def of_extreme(transitions, table, palette, gamma, uniform, choice, v, actions, s):
+            best = -np.inf
+            total = 0.0
+            for a in range(len(actions)):
+                q = reward_at(table, palette, s, a) + gamma * expectation(transitions, v, s, a)
+                best = max(best, choice * q)
+                total += q
+            if uniform > 0.0:
+                return (1.0 - uniform) * (choice * best) + uniform * total / len(actions)
+            return choice * best
+
+        return of_extreme
+
+    def of_policy(transitions, table, palette, gamma, uniform, choice, v, actions, s):
+        chosen = np.int64(choice[s])
+        q = reward_at(table, palette, s, chosen) + gamma * expectation(transitions, v, s, chosen)
+        if uniform > 0.0:
+            total = 0.0
+            for a in range(len(actions)):
+                total += reward_at(table, palette, s, a) + gamma * expectation(transitions, v, s, a)
+            return (1.0 - uniform) * q + uniform * total / len(actions)
+        return q
+
+    return of_policy
 
 
 @njit(cache=True, nogil=True)
-def optimal_sweep(transitions, table, palette, gamma, uniform, sign, v, actions, order):
-    """v[s] = (1 - uniform) max_a q(s, a) + uniform mean_a q(s, a), in place."""
+def optimal_sweep(transitions, table, palette, gamma, uniform, choice, v, actions, order):
+    """v[s] = (1 - uniform) q(s, what is chosen) + uniform mean_a q(s, a), in place."""
     change = 0.0
     for i in range(size_of(transitions)[0] - 1, -1, -1):
         s = state_at(order, i)
-        value = _backup(transitions, table, palette, gamma, uniform, sign, v, actions, s)
+        value = _backup(transitions, table, palette, gamma, uniform, choice, v, actions, s)
         change = max(change, abs(value - v[s]))
         v[s] = value
     return change
 
 
 @njit(cache=True, nogil=True)
-def optimal_block(transitions, table, palette, gamma, uniform, sign, v, out, actions, start, stop):
+def optimal_block(transitions, table, palette, gamma, uniform, choice, v, out, actions, start, stop):
     """out[s] = the backup of v for s in [start, stop), not in place: what threads share, and horizons need."""
     for s in range(start, stop):
-        out[s] = _backup(transitions, table, palette, gamma, uniform, sign, v, actions, s)
+        out[s] = _backup(transitions, table, palette, gamma, uniform, choice, v, actions, s)
 
 
 @njit(forceinline=True)
-def _sticky_values(transitions, table, palette, gamma, sign, v, actions, q, s):
-    """q[a] = r(s, a) + gamma v(next, a). Returns (the best of them, their sum)."""
-    best = -np.inf
+def _sticky_values(transitions, table, palette, gamma, choice, v, actions, q, s):
+    """q[a] = r(s, a) + gamma v(next, a). Returns (that of what is chosen, their sum)."""
     total = 0.0
     for a in range(len(actions)):
         q[a] = reward_at(table, palette, s, a) + gamma * expectation_of_pair(transitions, v, s, a)
-        best = max(best, sign * q[a])
         total += q[a]
-    return sign * best, total
+    return _chosen(choice, q, actions, s), total
+
+
+def _chosen(choice, q, actions, s):
+    """The entry of q (A,) that is chosen."""
+
+
+@overload(_chosen, jit_options={"forceinline": True})
+def _chosen_of(choice, q, actions, s):
+    if not isinstance(choice, types.Float):
+        return lambda choice, q, actions, s: q[choice[s]]
+
+    def extreme(choice, q, actions, s):
+        best = -np.inf
+        for a in range(len(actions)):
+            best = max(best, choice * q[a])
+        return choice * best
+
+    return extreme
 
 
 @njit(cache=True, nogil=True)
-def sticky_sweep(transitions, table, palette, gamma, weights, sign, v, actions, q, order):
-    """v[s, b] = chosen max_a q(s, a) + previous q(s, b) + uniform mean_a q(s, a), in place.
+def sticky_sweep(transitions, table, palette, gamma, weights, choice, v, actions, q, order):
+    """v[s, b] = chosen q(s, what is chosen) + previous q(s, b) + uniform mean_a q(s, a), in place.
 
     v (S + 1, A); q (A,) scratch.
     """
@@ -88,7 +125,7 @@ def sticky_sweep(transitions, table, palette, gamma, weights, sign, v, actions, 
     change = 0.0
     for i in range(size_of(transitions)[0] - 1, -1, -1):
         s = state_at(order, i)
-        best, total = _sticky_values(transitions, table, palette, gamma, sign, v, actions, q, s)
+        best, total = _sticky_values(transitions, table, palette, gamma, choice, v, actions, q, s)
         shared = chosen * best + uniform * total / len(actions)
         for b in range(len(actions)):
             value = shared + previous * q[b]
@@ -98,12 +135,12 @@ def sticky_sweep(transitions, table, palette, gamma, weights, sign, v, actions, 
 
 
 @njit(cache=True, nogil=True)
-def sticky_block(transitions, table, palette, gamma, weights, sign, v, out, actions, start, stop):
+def sticky_block(transitions, table, palette, gamma, weights, choice, v, out, actions, start, stop):
     """out[s, b] = the backup of v for s in [start, stop), not in place."""
     chosen, previous, uniform = weights
     q = np.empty(len(actions))
     for s in range(start, stop):
-        best, total = _sticky_values(transitions, table, palette, gamma, sign, v, actions, q, s)
+        best, total = _sticky_values(transitions, table, palette, gamma, choice, v, actions, q, s)
         shared = chosen * best + uniform * total / len(actions)
         for b in range(len(actions)):
             out[s, b] = shared + previous * q[b]

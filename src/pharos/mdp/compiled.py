@@ -9,7 +9,7 @@ import numpy as np
 
 from pharos.kernels import bellman, graph, occupancy
 from pharos.mdp.dynamics import BellmanEquation, Dynamics, Order, Play
-from pharos.mdp.selection import Extreme, PolicyTable
+from pharos.mdp.selection import Extreme, PolicyTable, Selection
 
 
 class CompiledDynamics(Dynamics):
@@ -32,7 +32,8 @@ class CompiledDynamics(Dynamics):
 
     def backup(self, equation: BellmanEquation, x: np.ndarray, out: np.ndarray) -> None:
         rewards, gamma, chance, select = equation
-        if not isinstance(select, Extreme):
+        choice = _choice(select)
+        if choice is None:
             return super().backup(equation, x, out)
         tables = (self.for_sweeps, rewards.table, rewards.palette, gamma)
         actions = bellman.actions_of(self.num_actions)
@@ -42,9 +43,7 @@ class CompiledDynamics(Dynamics):
             else (bellman.optimal_block, chance.uniform, x[:, 0], out[:, 0])
         )
         out[-1] = 0.0
-        _shared(
-            lambda start, stop: kernel(*tables, weights, select.sign, x_, out_, actions, start, stop), self.num_states
-        )
+        _shared(lambda start, stop: kernel(*tables, weights, choice, x_, out_, actions, start, stop), self.num_states)
 
     def sweep(self, equation: BellmanEquation, x: np.ndarray) -> float:
         return swept(self.for_sweeps, self.num_actions, equation, x, None)
@@ -89,15 +88,24 @@ def swept(
     rewards, gamma, chance, select = equation
     tables = (transitions, rewards.table, rewards.palette, gamma)
     actions, scratch = bellman.actions_of(num_actions), np.empty(num_actions)
-    if isinstance(select, PolicyTable):
+    choice = _choice(select)
+    if choice is None:
+        assert isinstance(select, PolicyTable)
         if chance.is_sticky:
             return bellman.sticky_policy_sweep(*tables, chance.triple, select.later, x, scratch, order)
         weights = (float(chance.chosen), float(chance.uniform))
         return bellman.policy_sweep(*tables, *weights, select.later[:, 0], x[:, 0], order)
-    assert isinstance(select, Extreme)
     if chance.is_sticky:
-        return bellman.sticky_sweep(*tables, chance.triple, select.sign, x, actions, scratch, order)
-    return bellman.optimal_sweep(*tables, chance.uniform, select.sign, x[:, 0], actions, order)
+        return bellman.sticky_sweep(*tables, chance.triple, choice, x, actions, scratch, order)
+    return bellman.optimal_sweep(*tables, chance.uniform, choice, x[:, 0], actions, order)
+
+
+def _choice(select: Selection) -> "float | np.ndarray | None":
+    """The argument `choice` of kernels; None for policies that draw actions, or look back."""
+    if isinstance(select, Extreme):
+        return select.sign
+    assert isinstance(select, PolicyTable)
+    return None if select.actions is None else np.ascontiguousarray(select.actions, np.int64)
 
 
 def _shared(block: Callable[[int, int], None], num_states: int) -> None:

@@ -25,6 +25,8 @@ from pharos.mdp import BellmanEquation, Selection, TabularMDP
 from pharos.solvers.policy_iteration import PolicyIteration
 
 _UNIT = 2.0**-53
+# Sweeps that gain nothing, after values of the best policy were found, until it is clear that rounding stops them.
+SETTLING = 64
 # Rounding of the computation of a bound itself, and products of rounding errors.
 _MARGIN = 1 + 2.0**-40
 
@@ -54,9 +56,10 @@ class Backup:
         is_exact = select.mass == 1.0 and mdp.dynamics.mass == 1.0 and not chance.is_sticky and not chance.is_random
         mass = 1.0 if is_exact else max(1.0, executed * mdp.dynamics.mass) * (1 + 8 * _UNIT)
         self.factor = mdp.gamma * mass
-        # q: a product and a sum; the mean over actions; a product and a sum for each of three weights, and their
-        # rounding
-        self.operations = mdp.num_actions + 12 + select.operations(mdp.num_actions) + mdp.dynamics.operations
+        # q: a product and a sum, each of two half units; with chance of choosing the mean over actions, too, and a
+        # product and a sum for each of three weights, and their rounding
+        chosen = 4 if chance.is_none else mdp.num_actions + 12
+        self.operations = chosen + select.operations(mdp.num_actions) + mdp.dynamics.operations
         self.largest_reward = max(abs(mdp.reward_table.lowest), abs(mdp.reward_table.highest))
 
     def zeros(self) -> np.ndarray:
@@ -100,7 +103,7 @@ def fixed_point(
     if not least <= tolerance:
         raise _imprecise(mdp, least, tolerance)
     x, sweeps = backup.zeros(), 0
-    better = PolicyIteration(mdp, select)
+    better, least, since = PolicyIteration(mdp, select), math.inf, 0
     while True:
         change = backup.sweep(x)
         sweeps += 1
@@ -110,10 +113,13 @@ def fixed_point(
             progress(sweeps, bound)
         if bound <= tolerance:
             return FixedPoint(x, bound, sweeps)
-        if not rho * change > rounding:  # also where values are infinite
-            raise _imprecise(mdp, bound, tolerance)
+        if bound < 0.9 * least:
+            least, since = bound, sweeps
+        # x is exact up to rounding, also where values are infinite; or sweeps move rounding errors about
+        if not rho * change > rounding or (better.is_exact and sweeps - since > SETTLING):
+            raise _imprecise(mdp, least if better.is_exact else bound, tolerance)
         if better.is_worth_it(sweeps, change, tolerance):
-            better.improve(x)
+            better.improve(x, tolerance)
 
 
 def backward_induction(

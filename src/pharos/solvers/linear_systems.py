@@ -7,6 +7,8 @@ What has neither is not solved here.
 Source: Cuthill and McKee (1969); Liu (1990), elimination trees; van der Vorst (1992), BiCGSTAB.
 """
 
+import math
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -61,8 +63,8 @@ def _iterated(system: "csr_matrix", right: np.ndarray, x: np.ndarray) -> np.ndar
     """By BiCGSTAB from x, again for what is left, as far as rounding allows; NaN where it does not converge."""
     residual = right - system @ x
     for call in range(CALLS):
-        step, converged = bicgstab(system, residual)
-        if call == 0 and not converged:
+        step, left, _ = bicgstab(lambda y: system @ y, residual, SHRINKAGE, STEPS)
+        if call == 0 and not left <= SHRINKAGE:
             return np.full(len(right), np.nan)
         after = right - system @ (x + step)
         if not np.abs(after).max() < np.abs(residual).max():
@@ -71,39 +73,50 @@ def _iterated(system: "csr_matrix", right: np.ndarray, x: np.ndarray) -> np.ndar
     return x
 
 
-def bicgstab(system: "csr_matrix", right: np.ndarray) -> tuple[np.ndarray, bool]:
-    """(x, whether the residual shrank enough) of system x = right, from 0.
+def bicgstab(
+    times: Callable[[np.ndarray], np.ndarray], right: np.ndarray, shrinkage: float, steps: int
+) -> tuple[np.ndarray, float, int]:
+    """(x, norm of its residual divided by that of `right`, applications of the operator) of `times(x) = right`, from 0.
 
+    Args:
+        times: the image of a vector (n,), a new array, or one that the next call may overwrite.
+        shrinkage: at most this ratio of norms is enough.
+        steps: of two applications each, at most.
     SciPy's adds up by BLAS, whose sums depend on the number of threads, and which waits for them on a busy machine.
     """
-    constant = (system @ np.ones_like(right)).mean()
+    from pharos.kernels import krylov
 
-    def conditioned(y: np.ndarray) -> np.ndarray:
-        """Preconditioned: where episodes do not end, constant vectors shrink to 1 - gamma, which slows all methods."""
-        return y + y.mean() / constant
-
-    x, residual, direction = np.zeros_like(right), right, right
-    rho, enough = _product(right, right), SHRINKAGE * SHRINKAGE * _product(right, right)
+    size = len(right)
+    constant = float(times(np.ones(size)).mean())
+    x, towards, onwards = np.zeros(size), np.empty(size), np.empty(size)
+    residual, direction, moved = right.copy(), right.copy(), np.empty(size)
+    total = float(right.sum())
+    rho = norm = whole = krylov.products(right, right)[1]
+    enough, step = shrinkage * shrinkage * norm, 0
+    best = norm
     with np.errstate(all="ignore"):  # a breakdown is NaN, and does not converge
-        for _ in range(STEPS):
-            if _product(residual, residual) <= enough:
-                return x, True
-            towards = conditioned(direction)
-            moved = system @ towards
-            alpha = np.float64(rho) / _product(right, moved)
-            halfway = residual - alpha * moved
-            onwards = conditioned(halfway)
-            stabilised = system @ onwards
-            omega = np.float64(_product(stabilised, halfway)) / _product(stabilised, stabilised)
-            x += alpha * towards + omega * onwards
-            residual = halfway - omega * stabilised
-            before, rho = rho, _product(right, residual)
-            direction = residual + (rho / np.float64(before)) * (alpha / omega) * (direction - omega * moved)
-    return x, False
-
-
-def _product(a: np.ndarray, b: np.ndarray) -> float:
-    return float(np.einsum("i,i->", a, b))
+        while norm > enough and step < steps:
+            step += 1
+            # Preconditioned: where episodes do not end, constant vectors shrink to 1 - gamma, which slows all methods.
+            krylov.shift(direction, np.float64(total) / size / constant, towards)
+            moved[:] = times(towards)
+            alpha = np.float64(rho) / krylov.products(right, moved)[0]
+            total = krylov.advance(residual, -alpha, moved)
+            krylov.shift(residual, np.float64(total) / size / constant, onwards)
+            stabilised = times(onwards)
+            across, own = krylov.products(residual, stabilised)
+            omega = np.float64(across) / own
+            krylov.advance(x, alpha, towards)
+            krylov.advance(x, omega, onwards)
+            krylov.advance(residual, -omega, stabilised)
+            before = rho
+            rho, norm = krylov.products(right, residual)
+            total = krylov.turn(direction, (rho / np.float64(before)) * (alpha / omega), omega, moved, residual)
+            if not norm < 1e8 * best:
+                break
+            best = min(best, norm)
+    ratio = math.sqrt(norm / whole) if whole > 0 and norm >= 0 else math.nan if norm != 0 else 0.0
+    return x, ratio, 2 * step + 1
 
 
 def fills_little(matrix: "csr_matrix") -> bool:

@@ -1,27 +1,34 @@
 """Policy iteration: values of the greedy policy by linear algebra, where sweeps would take too long.
 
 What it gives is only a better place to go on sweeping from: the bound of `fixed_point` comes from the next sweep alone.
-Source: Howard (1960); Puterman (1994), section 6.4.
+Three ways, by what the operator is: a deterministic policy without chance has a functional graph, one pass over it
+gives its values; small systems are solved directly; large ones inexactly, by a Krylov method whose operator is a sweep
+of the policy, so that nothing is stored but some vectors.
+Source: Howard (1960); Puterman (1994), section 6.4; inexact: Gargiani et al. (2024), "Inexact policy iteration methods
+for large-scale Markov decision processes".
 """
 
 import math
 
 import numpy as np
 
-from pharos.kernels import bellman
-from pharos.mdp import BellmanEquation, PolicyTable, Selection, TabularMDP
-from pharos.solvers.linear_systems import solution_of_system
+from pharos.kernels import bellman, krylov
+from pharos.mdp import BellmanEquation, PolicyTable, Rewards, Selection, TabularMDP
+from pharos.solvers.linear_systems import bicgstab, solution_of_system
 
-# Sweeps before the first attempt, and before that of more than LARGE nodes: most games are solved by then. Later
-# attempts come after twice as many sweeps each.
-FIRST_ATTEMPT, FIRST_ATTEMPT_OF_LARGE, LARGE = 64, 512, 10_000
-# Nodes (states, or pairs with a previous action) of the largest functional graph, which takes 48 bytes a state; nodes
-# times actions of the largest linear system.
-MOST_OF_CHAIN, MOST_ENTRIES = 5_000_000, 2_000_000
+# Sweeps before the first attempt, and before that of the inexact way, which gains less: most games are solved by then.
+# Later attempts come after twice as many sweeps each, four times where they failed.
+FIRST_ATTEMPT, FIRST_INEXACT = 64, 256
+# Nodes times actions of the largest linear system that is solved directly, and nodes of the largest that is tried so
+# at once. (Nodes are states, or pairs with a previous action.)
+MOST_ENTRIES, DIRECTLY = 2_000_000, 3000
 # States whose greedy actions are worked out in one go.
 BLOCK = 1 << 16
 # Improvements of one attempt, and the relative change by a sweep that is no more than rounding.
 MOST_IMPROVEMENTS, SETTLED = 60, 2.0**-47
+# Inexact: improvements of one attempt, sweeps after each, by how much each shrinks the residual of its policy, and in
+# how many steps at most.
+MOST_INEXACT, SWEEPS_AFTER, FORCING, STEPS = 500, 20, 0.1, 100
 # Operations that calling a sweep costs, however few states there are; and those of policy iteration by sparse systems,
 # for each node.
 CALL, SPARSE = 5000, 50_000.0
@@ -34,29 +41,39 @@ class PolicyIteration:
         self.mdp, self.select = mdp, select
         self.equation = BellmanEquation(mdp.reward_table, mdp.gamma, mdp.chance, select)
         self.nodes = mdp.num_states * mdp.width
-        self._change = math.inf
+        self._change, self._sweeps, self._rate = math.inf, 0, 1.0
         self._has_failed = False
+        self.is_exact = False
+        self._next = FIRST_ATTEMPT if self.is_chain or self.is_direct else FIRST_INEXACT
+        self._left = 0.0
 
     def is_worth_it(self, sweeps: int, change: float, tolerance: float) -> bool:
-        """Whether the sweeps that are left cost more than solving some linear systems.
+        """Whether the sweeps that are left cost more than an attempt.
 
         How many are left, the last half of the sweeps tells: changes often shrink by much more than gamma in each.
         """
         if sweeps & (sweeps - 1) or self.mdp.gamma == 0.0:
             return False
         change = max(change, 1e-300)
-        before, self._change = self._change, change
-        if sweeps < (FIRST_ATTEMPT if self.nodes <= LARGE else FIRST_ATTEMPT_OF_LARGE):
+        before, self._change, self._sweeps = self._change, change, sweeps
+        if sweeps < self._next:
             return False
         gamma = self.mdp.gamma
-        rate = min(gamma, max(change / before, 1e-300) ** (2 / sweeps))
-        left = math.log(change / (tolerance * (1 - gamma))) / -math.log(rate)
+        self._rate = min(gamma, max(change / before, 1e-300) ** (2 / sweeps))
+        left = math.log(max(change / (tolerance * (1 - gamma)), 1.0)) / -math.log(self._rate)
+        self._left = left
         of_sweeps = left * (CALL + 4.0 * self.nodes * self.mdp.num_actions)
         if self.is_chain:
-            return self.nodes <= MOST_OF_CHAIN and of_sweeps > 1000.0 * self.nodes
-        if self._has_failed or self.nodes * self.mdp.num_actions > MOST_ENTRIES:
-            return False
-        return of_sweeps > self.nodes * min(SPARSE, float(self.nodes) ** 2)
+            return of_sweeps > 1000.0 * self.nodes and not self.is_exact
+        if self.is_direct:
+            return of_sweeps > self.nodes * min(SPARSE, float(self.nodes) ** 2)
+        return left > 2.0 * sweeps
+
+    @property
+    def is_direct(self) -> bool:
+        """Whether linear systems are solved directly: where they are small, or the inexact way has failed."""
+        most = MOST_ENTRIES if self._has_failed else DIRECTLY
+        return self.nodes <= most and self.nodes * self.mdp.num_actions <= MOST_ENTRIES
 
     @property
     def is_chain(self) -> bool:
@@ -64,23 +81,102 @@ class PolicyIteration:
         policy = self.select
         return self.mdp.is_deterministic and not (isinstance(policy, PolicyTable) and policy.actions is None)
 
-    def improve(self, x: np.ndarray) -> None:
+    def improve(self, x: np.ndarray, tolerance: float) -> None:
         """Replace x (S + 1, W) by values of a policy that is greedy in its own values, or nearly so."""
+        with np.errstate(all="ignore"):  # what is not finite is in vain, and forgotten
+            if self.is_chain or self.is_direct:
+                return self._improve_exactly(x)
+            before = x.copy()
+            if not self._improve_inexactly(x, 0.5 * tolerance * (1 - self.mdp.gamma)):
+                self.fail()
+                x[:] = before
+
+    def fail(self) -> None:
+        """Note that an attempt was in vain."""
+        self._has_failed, self._next = True, 4 * self._sweeps
+
+    def _improve_exactly(self, x: np.ndarray) -> None:
         policy = self._greedy(x)
         for _ in range(MOST_IMPROVEMENTS):
-            if self.is_chain and policy.actions is not None:
-                values = chain_values(self.mdp.gamma, *chain(self.mdp, policy.actions))[0][:, None]
-            else:
-                values = linear_values(self.mdp, policy, x[:-1])
-            if not np.isfinite(values).all():
-                self._has_failed = True
+            before = x.copy()
+            self._evaluate(x, policy)
+            if not np.isfinite(x).all():
+                self.fail()
+                x[:] = before
                 return
-            x[:-1] = values
-            if self.mdp.dynamics.sweep(self.equation, x) <= SETTLED * np.abs(x).max():
-                return  # all that still changes is the policy, between actions that are equal up to rounding
-            before, policy = policy, self._greedy(x)
-            if policy is before or np.array_equal(policy.table, before.table):
-                return
+            change, largest = self.mdp.dynamics.sweep(self.equation, x), np.abs(x).max()
+            before_this, policy = policy, self._greedy(x)
+            # what still changes may be the policy alone, between actions that are equal up to rounding
+            is_settled = change <= SETTLED * largest
+            if is_settled or policy is before_this or np.array_equal(policy.table, before_this.table):
+                self.is_exact = True
+                break
+        if self.is_chain and policy.actions is not None:
+            self._refine(x, policy)
+
+    def _evaluate(self, x: np.ndarray, policy: PolicyTable) -> None:
+        """The values of a policy, in place of x (S + 1, W)."""
+        if self.is_chain and policy.actions is not None:
+            x[:-1, 0] = chain_values(self.mdp.gamma, *chain(self.mdp, policy.actions))[0]
+        else:
+            x[:-1] = linear_values(self.mdp, policy, x[:-1])
+
+    def _refine(self, x: np.ndarray, policy: PolicyTable) -> None:
+        """Solve once more, for what rounding has left: along a cycle of n steps it adds up, and counts 1 / (1 - gamma)
+        times."""
+        assert policy.actions is not None
+        successor, reward = chain(self.mdp, policy.actions)
+        left = reward + self.mdp.gamma * x[successor, 0] - x[:-1, 0]
+        step = chain_values(self.mdp.gamma, successor, left)[0]
+        if np.isfinite(step).all():
+            x[:-1, 0] += step
+
+    def _improve_inexactly(self, x: np.ndarray, target: float) -> bool:
+        """Go on until a sweep changes x by at most the target, or rounding ends it; whether it beats sweeps alone.
+
+        An attempt may cost a third of the sweeps that seem to be left, and more as long as it is ahead of them.
+        """
+        # an application of the operator is a sweep and a dozen passes over vectors
+        weight = 1.0 + 3.0 * self.mdp.width / self.mdp.num_actions
+        most, cost, least, in_vain = max(self._sweeps, self._left / 3), 0.0, self._change, 0
+        for _ in range(MOST_INEXACT):
+            cost += weight * self._evaluate_roughly(x, self._greedy(x)) + SWEEPS_AFTER
+            for _ in range(SWEEPS_AFTER):
+                change = self.mdp.dynamics.sweep(self.equation, x)
+            if not math.isfinite(change):
+                return False
+            if change <= max(target, SETTLED * float(np.abs(x).max())):
+                return True
+            in_vain = 0 if change < least else in_vain + 1
+            least = min(least, change)
+            is_ahead = least < self._change * self._rate**cost
+            if cost > most and (not is_ahead or in_vain > 3):
+                return is_ahead and in_vain == 0
+        return change < self._change
+
+    def _evaluate_roughly(self, x: np.ndarray, policy: PolicyTable) -> float:
+        """Move x (S + 1, W) towards the values of a policy; the cost, in sweeps.
+
+        One sweep in place is x -> G x + g with the fixed point that is sought; (1 - G) d = G x + g - x is solved for
+        the step d, to a tenth. G y is a sweep from y without rewards.
+        """
+        mdp = self.mdp
+        equation = self.equation._replace(select=policy)
+        silent = equation._replace(rewards=without_rewards(mdp.reward_table))
+        swept = x.copy()
+        mdp.dynamics.sweep(equation, swept)
+        right = (swept - x)[:-1].reshape(self.nodes)
+        image = swept[:-1].reshape(self.nodes)  # a view; the row of the end stays 0
+
+        def times(y: np.ndarray) -> np.ndarray:
+            image[:] = y
+            mdp.dynamics.sweep(silent, swept)
+            krylov.take_from(y, image)
+            return image
+
+        step, _, applications = bicgstab(times, right, FORCING, STEPS)
+        x[:-1] += step.reshape(x[:-1].shape)
+        return applications + 2.0
 
     def _greedy(self, x: np.ndarray) -> PolicyTable:
         """The policy of the best (or worst) actions by x; a given policy as it is."""
@@ -92,6 +188,11 @@ class PolicyIteration:
             q = mdp.reward_table.rows(states) + mdp.gamma * mdp.dynamics.expected(x, states)
             actions[states] = self.select.policy(q).table
         return PolicyTable(mdp.num_actions, actions=actions)
+
+
+def without_rewards(rewards: Rewards) -> Rewards:
+    """Rewards of 0, kept in the same way."""
+    return Rewards(np.zeros_like(rewards.table), np.zeros_like(rewards.palette))
 
 
 def chain(mdp: TabularMDP, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
