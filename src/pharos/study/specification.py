@@ -21,7 +21,6 @@ may have written, unless it is trusted.
 """
 
 import os
-import re
 from collections.abc import Iterator, Mapping
 from importlib import resources
 from pathlib import Path
@@ -47,13 +46,11 @@ from pharos.study.blocks import (
     ObservationEntry,
     Specification,
 )
+from pharos.study.yaml_nodes import Loader, Loc, check_nodes, where
 
 STUDIES = "studies"
 GIVEN = "given"
 STUDY_FILE = "study.yaml"
-# So that every mistake is told at once, and aliases do not stand for millions of entries.
-MOST_NODES = 1_000_000
-Loc = tuple[int | str, ...]
 
 
 _PARTS: dict[Loc, type[BaseModel]] = {
@@ -123,7 +120,7 @@ def given_environments(file: str | os.PathLike) -> list[Any]:
     """
     path = Path(file)
     try:
-        entries = yaml.load(_text_of(path), _Loader)
+        entries = yaml.load(_text_of(path), Loader)
     except yaml.YAMLError as error:
         raise ParameterError(f"{path}: {getattr(error, 'problem', None) or 'this is no YAML'}") from error
     except (ValueError, RecursionError, OverflowError) as error:
@@ -168,7 +165,7 @@ def _studies_here() -> list[str]:
 def study_name(file: Path) -> str | None:
     """The name in a YAML file of a study, which is not looked at otherwise; None where there is none."""
     try:
-        data = yaml.load(_text_of(file), _Loader)
+        data = yaml.load(_text_of(file), Loader)
     except (yaml.YAMLError, ParameterError, ValueError, RecursionError, OverflowError):
         return None
     name = data.get("name") if isinstance(data, dict) else None
@@ -206,16 +203,16 @@ def parse(
         entries: the environments of blocks that say `environments: given`.
     """
     try:
-        root = yaml.compose(text, _Loader)
+        root = yaml.compose(text, Loader)
         if root is None:
             raise ParameterError(f"{name}: is empty; expected a mapping with name and blocks")
-        _check_nodes(root, name)
-        data = yaml.load(text, _Loader)
+        check_nodes(root, name)
+        data = yaml.load(text, Loader)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
-        where = f"{name}:{mark.line + 1}" if mark is not None else name
+        place = f"{name}:{mark.line + 1}" if mark is not None else name
         problem = getattr(error, "problem", None) or "this is no YAML"
-        raise ParameterError(f"{where}: {problem}") from error
+        raise ParameterError(f"{place}: {problem}") from error
     except RecursionError:
         raise ParameterError(f"{name}: is nested too deeply; expected a mapping with name and blocks") from None
     except ParameterError:
@@ -227,16 +224,6 @@ def parse(
     return _validated(data, name, root, folder or Path.cwd(), trust, entries)
 
 
-class _Loader(yaml.SafeLoader):
-    """Safe YAML in which 1e-4 is a number, not a text."""
-
-
-_Loader.yaml_implicit_resolvers = {k: list(v) for k, v in yaml.SafeLoader.yaml_implicit_resolvers.items()}
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float", re.compile(r"^[-+]?(\d+(\.\d*)?|\.\d+)[eE][-+]?\d+$"), list("-+0123456789.")
-)
-
-
 def _validated(
     data: Mapping[str, Any], name: str, root: Any, folder: Path, trust: bool, entries: list[Any] | None = None
 ) -> Specification:
@@ -245,7 +232,7 @@ def _validated(
     if references and not trust:
         loc, reference = references[0]
         raise UntrustedCode(
-            f"{_where(name, root, loc)}: {reference!r} is code, which is executed only if you trust it: add --trust "
+            f"{where(name, root, loc)}: {reference!r} is code, which is executed only if you trust it: add --trust "
             f"(in Python: trust=True), or name your own YAML file, which is no {STUDY_FILE} beside results"
         )
     if references:
@@ -258,7 +245,7 @@ def _validated(
         raise ParameterError(_messages(error, name, root)) from error
     wrong = [*_wrong(specification)]
     if wrong:
-        raise ParameterError("; ".join(f"{_where(name, root, loc)}: {message}" for loc, message in wrong))
+        raise ParameterError("; ".join(f"{where(name, root, loc)}: {message}" for loc, message in wrong))
     return specification
 
 
@@ -356,66 +343,5 @@ def _messages(error: ValidationError, name: str, root: Any) -> str:
         else:
             expected = problem["msg"][0].lower() + problem["msg"][1:]
             message = f"{key}: found {problem['input']!r}; expected: {expected.removeprefix('input should be ')}"
-        said[f"{_where(name, root, loc)}: {message}"] = None
+        said[f"{where(name, root, loc)}: {message}"] = None
     return "; ".join(said)
-
-
-def _where(name: str, root: Any, loc: Loc) -> str:
-    """`file:line`, the line of the innermost node on the path that exists; the path itself where there is no file."""
-    if root is None:
-        return ".".join(map(str, (name, *loc)))
-    node, line = root, root.start_mark.line
-    for part in loc:
-        if isinstance(node, yaml.MappingNode):
-            pair = next(((key, value) for key, value in node.value if key.value == str(part)), None)
-            if pair is None:
-                break
-            line, node = pair[0].start_mark.line, pair[1]
-        elif isinstance(node, yaml.SequenceNode) and isinstance(part, int) and part < len(node.value):
-            node = node.value[part]
-            line = node.start_mark.line
-        else:
-            break
-    return f"{name}:{line + 1}"
-
-
-def _check_nodes(root: Any, name: str) -> None:
-    """Refuse what no specification needs: keys that are no words or repeated, nodes within themselves, millions by
-    aliases.
-
-    A node that aliases share is looked at once; its size counts wherever it stands.
-    """
-    sizes: dict[int, int] = {}
-
-    def size(node: Any) -> int:
-        """How many nodes stand below this one, aliases written out."""
-        if id(node) in sizes:
-            if not sizes[id(node)]:
-                raise ParameterError(f"{name}:{node.start_mark.line + 1}: an alias stands within what it names")
-            return sizes[id(node)]
-        sizes[id(node)] = 0  # until all below it are counted
-        children: list[Any] = []
-        if isinstance(node, yaml.MappingNode):
-            _check_keys(node, name)
-            children = [value for _, value in node.value]
-        elif isinstance(node, yaml.SequenceNode):
-            children = node.value
-        total = 1 + sum(map(size, children))
-        if total > MOST_NODES:
-            line = node.start_mark.line + 1
-            raise ParameterError(f"{name}:{line}: stands for more than {MOST_NODES:,} entries, aliases written out")
-        sizes[id(node)] = total
-        return total
-
-    size(root)
-
-
-def _check_keys(node: Any, name: str) -> None:
-    lines: dict[str, int] = {}
-    for key, _ in node.value:
-        line = key.start_mark.line + 1
-        if not isinstance(key, yaml.ScalarNode):
-            raise ParameterError(f"{name}:{line}: a key is a list or a mapping; expected a word")
-        if key.value in lines:
-            raise ParameterError(f"{name}:{line}: the key {key.value!r} stands there twice (line {lines[key.value]})")
-        lines[key.value] = line
