@@ -10,6 +10,7 @@ import numpy as np
 
 from pharos.hardness.interval import Interval, Spending
 from pharos.hardness.orbits import orbits
+from pharos.hardness.restored import largest_distances, restored
 from pharos.kernels import clocks, dense_search, graph, many_searches
 from pharos.mdp import TabularMDP
 from pharos.wording import many
@@ -121,7 +122,8 @@ class SumSweep:
         clock = self._from_clock()
         if isinstance(clock, Interval):
             return clock
-        self._search_orbits()
+        if not self._search_orbits():
+            self._search_restored()
         self._sweep()
         upper = self._upper()
         if upper > self.best:
@@ -287,21 +289,47 @@ class SumSweep:
 
     # Symmetries -------------------------------------------------------------------------------------------------------
 
-    def _search_orbits(self) -> None:
-        """Where symmetries leave few orbits of states, the exact out(v) of all, by a search from one of each."""
+    def _search_orbits(self) -> bool:
+        """Where symmetries leave few orbits of states, the exact out(v) of all, by a search from one of each; whether
+        there are symmetries."""
         graph = self.graph
         orbit = orbits(graph.next_states, graph.ends, graph.start, graph.pivot, lambda: self.spending.is_over)
         if orbit is None:
-            return
+            return False
         representatives = np.flatnonzero(orbit == np.arange(len(orbit)))
         if len(representatives) > _FEW_ORBITS:
-            return
+            return True
         for v in representatives:
             if self.spending.is_over:
-                return
+                return True
             self._search_out(int(v))
             self.out_upper[: len(orbit)][orbit == v] = self.out_upper[v]
         self.method = f"searches from one state of each of {len(representatives)} orbits of symmetries"
+        return True
+
+    def _search_restored(self) -> None:
+        """Where the only end hides symmetries, upper bounds on out(v), as `pharos.hardness.restored` says."""
+        graph = self.graph
+        if graph.start < 0 or graph.has_end:
+            return
+        space = restored(graph.next_states, graph.ends, graph.pivot, lambda: self.spending.is_over)
+        if space is None:
+            return
+        representatives = np.flatnonzero(space.orbit == np.arange(graph.num_nodes))
+        if len(representatives) > _FEW_ORBITS:
+            return
+        bounds = largest_distances(space, representatives)
+        if bounds is None:
+            return
+        self.spending.searches += len(bounds)
+        for v, bound in zip(representatives, bounds, strict=True):
+            alike = space.orbit == v
+            alike[space.end] = False
+            self.out_upper[alike] = np.minimum(self.out_upper[alike], bound)
+        self._search_out(space.end)
+        self.method = (
+            f"detours from one of each of {len(representatives)} kinds of states that the end alone tells apart"
+        )
 
     # Clocks -----------------------------------------------------------------------------------------------------------
 

@@ -33,6 +33,7 @@ __all__ = [
     "paths",
     "philox",
     "refinement",
+    "replacement",
     "stepping",
     "symmetric",
     "symmetry",
