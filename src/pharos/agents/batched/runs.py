@@ -91,7 +91,8 @@ class ObservationSource:
     def __init__(self, space: "StateSpace", observe: "ObservationInContext"):
         if not observe.is_plain:
             raise ParameterError(
-                "the batched engine sees functions of the state; expected neither previous_action nor remaining_time"
+                "the batched engine sees functions of the state; expected neither previous_action nor remaining_time, "
+                "frames or irrelevant entries; the engine sb3 has them"
             )
         self.space, self.observe, self.num_states = space, observe.observation, space.num_states
         box = observe.space
