@@ -14,7 +14,7 @@ import numpy as np
 
 import pharos
 from pharos.hardness.choices import choices_of
-from pharos.hardness.diameter import Graph
+from pharos.hardness.transition_graph import Graph
 
 SMALL = {
     "frozen_lake 100": ("frozen_lake", {"size": 100, "seed": 0}),

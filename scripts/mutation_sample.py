@@ -56,6 +56,7 @@ TESTED_BY = {  # path in src/pharos: weight of its faults (kernels compile again
     "solvers/values.py": (1.0, "test_solvers test_error_bounds"),
     "hardness/diameter.py": (0.6, "test_diameter"),
     "hardness/sum_sweep.py": (0.6, "test_diameter"),
+    "hardness/transition_graph.py": (0.6, "test_diameter"),
     "hardness/stochastic_diameter.py": (0.6, "test_stochastic_diameter"),
     "hardness/hitting_times.py": (0.6, "test_stochastic_diameter"),
     "hardness/hitting_bounds.py": (0.6, "test_stochastic_diameter"),

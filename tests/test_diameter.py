@@ -13,7 +13,7 @@ from naive_hardness import distances
 from pharos import TabularMDP, compiling, hardness, random_actions
 from pharos.errors import ParameterError
 from pharos.hardness.interval import Spending
-from pharos.hardness.sum_sweep import Graph
+from pharos.hardness.transition_graph import Graph
 from pharos.kernels import clocks
 
 

@@ -14,7 +14,8 @@ from pharos.errors import ParameterError, UndefinedMeasure
 from pharos.hardness.interval import Budget, Interval, Progress, Spending, conventions_of
 from pharos.hardness.stochastic_diameter import stochastic_diameter
 from pharos.hardness.stochastic_eccentricity import stochastic_start_eccentricity
-from pharos.hardness.sum_sweep import Graph, SumSweep
+from pharos.hardness.sum_sweep import SumSweep
+from pharos.hardness.transition_graph import Graph
 from pharos.mdp import TabularMDP, takes_mdp
 from pharos.wording import many
 

@@ -63,13 +63,13 @@ def restored(next_states: np.ndarray, ends: np.ndarray, pivot: int, is_over: Cal
     for t in rng.integers(0, size, _CANDIDATES):
         if steps_left < 0 or is_over():
             return None
-        found, steps = maps.symmetry(table, going_on, -1, pivot, t, image, preimage, queue)
+        is_symmetry, steps = maps.symmetry(table, going_on, -1, pivot, t, image, preimage, queue)
         alike = image[end] - 1
-        if found and alike != end:
+        if is_symmetry and alike != end:
             table[end] = preimage[table[alike]] - 1
             orbit = orbits(table, going_on, -1, pivot, is_over)
             return None if orbit is None else Restored(table, end, orbit)
-        steps_left -= 0 if found else steps
+        steps_left -= 0 if is_symmetry else steps
         maps.forget(image, preimage, queue, steps)
     return None
 
