@@ -184,6 +184,12 @@ def test_nothing_is_wider_than_the_window(page, width):
         "&& a.top < b.bottom - 1 && b.top < a.bottom - 1)).length; })()"
     )
     assert over == 0
+    gaps = page.value(  # between a card and the next one below it in its column
+        "(() => { const boxes = [...document.querySelectorAll('.card')].map((each) => each.getBoundingClientRect());"
+        "return boxes.map((a) => Math.min(...boxes.filter((b) => b.left === a.left && b.top > a.top)"
+        ".map((b) => b.top - a.bottom))).filter(Number.isFinite); })()"
+    )
+    assert len(gaps) == (5 if width >= 940 else 6) and all(13 <= gap <= 18 for gap in gaps)
 
 
 @pytest.mark.parametrize("dark", [False, True])

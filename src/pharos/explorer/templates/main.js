@@ -92,7 +92,7 @@ function best() {
 
 // On wide screens a card takes as many rows of 2 pixels as it is high, so that both columns are filled.
 const placed = new ResizeObserver((cards) => {
-  for (const { target } of cards) target.style.gridRowEnd = `span ${Math.ceil((target.offsetHeight + 14) / 2)}`;
+  for (const { target } of cards) target.style.setProperty("--rows", Math.ceil((target.offsetHeight + 14) / 2));
 });
 
 async function begin() {
