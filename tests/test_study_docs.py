@@ -23,10 +23,12 @@ def test_the_study_on_the_page_is_valid():
     assert f"pharos: {caught.value}\n" in PAGE
 
 
-def test_the_numbers_of_runs_on_the_page_are_those_of_the_presets():
-    printed = dict(re.findall(r"^\| `(\w+)` \|.*\| (\d+) \|$", PAGE, re.MULTILINE))
+def test_the_numbers_of_runs_on_the_page_are_those_of_the_presets(tmp_path):
+    (tmp_path / "one.yaml").write_text("- taxi/5x5")
+    lists = {"hardness-sealed": tmp_path / "one.yaml"}  # the number is of each environment that is given
+    printed = dict(re.findall(r"^\| `([\w-]+)` \|.*\| (\d+)(?: an instance)? \|$", PAGE, re.MULTILINE))
     assert {name: int(count) for name, count in printed.items()} == {
-        name: len(study.specification(name).runs) for name in study.presets()
+        name: len(study.specification(name, environments=lists.get(name)).runs) for name in study.presets()
     }
 
 
