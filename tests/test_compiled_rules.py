@@ -118,7 +118,7 @@ def test_rules_that_mention_a_private_attribute_run_interpreted(cache, tmp_path)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("outcomes", [1, 2])
+@pytest.mark.parametrize("outcomes", [pytest.param(1, marks=pytest.mark.long), 2])
 def test_what_numba_says_of_a_rule_is_the_reason(cache, tmp_path, outcomes):
     """A parameter that is a word is not handed to compiled rules."""
 
