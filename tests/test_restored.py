@@ -70,7 +70,10 @@ def test_detours_are_the_distances_without_a_node(size, turns, seed):
     assert found == (None if np.isinf(expected) else [max(expected, whole)])
 
 
-@pytest.mark.parametrize(("name", "diameter"), [("sliding_tiles/2x3", 22), ("sliding_tiles/3x3", 32)])
+@pytest.mark.parametrize(
+    ("name", "diameter"),  # one more than the published numbers of moves, as the end leads to the start
+    [("sliding_tiles/2x3", 22), ("sliding_tiles/3x3", 32), ("pocket_cube/half", 12), ("pocket_cube/quarter", 15)],
+)
 def test_puzzles_with_an_end_need_few_searches(name, diameter):
     found = hardness.diameter(pharos.build(pharos.make(name), progress=False).mdp(gamma=0.9))
     assert (found.lower, found.upper, found.exact) == (diameter, diameter, True)

@@ -42,7 +42,7 @@ class PolicyIteration:
         self.equation = BellmanEquation(mdp.reward_table, mdp.gamma, mdp.chance, select)
         self.nodes = mdp.num_states * mdp.width
         self._change, self._sweeps, self._rate = math.inf, 0, 1.0
-        self._has_failed = False
+        self._failures = 0
         self.is_exact = False
         self._next = FIRST_ATTEMPT if self.is_chain or self.is_direct else FIRST_INEXACT
         self._left = 0.0
@@ -71,8 +71,8 @@ class PolicyIteration:
 
     @property
     def is_direct(self) -> bool:
-        """Whether linear systems are solved directly: where they are small, or the inexact way has failed."""
-        most = MOST_ENTRIES if self._has_failed else DIRECTLY
+        """Whether linear systems are solved directly: where they are small, or the inexact way has failed twice."""
+        most = MOST_ENTRIES if self._failures > 1 else DIRECTLY
         return self.nodes <= most and self.nodes * self.mdp.num_actions <= MOST_ENTRIES
 
     @property
@@ -93,7 +93,7 @@ class PolicyIteration:
 
     def fail(self) -> None:
         """Note that an attempt was in vain."""
-        self._has_failed, self._next = True, 4 * self._sweeps
+        self._failures, self._next = self._failures + 1, 4 * self._sweeps
 
     def _improve_exactly(self, x: np.ndarray) -> None:
         policy = self._greedy(x)
