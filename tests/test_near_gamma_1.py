@@ -88,8 +88,8 @@ def attempts_at_once(request):
         yield request.param
 
 
-@pytest.mark.slow
-@settings(max_examples=60, deadline=None)
+@pytest.mark.long
+@settings(max_examples=30, deadline=None)
 @given(mdp=hard_mdps(), gamma=nearly_1)
 def test_values_near_gamma_1_are_within_their_bound_whatever_way_finds_them(attempts_at_once, mdp, gamma):
     mdp = mdp.with_gamma(gamma)
