@@ -83,7 +83,7 @@ def attempts_at_once(request):
         for name in ("FIRST_ATTEMPT", "FIRST_INEXACT"):
             patch.setattr(policy_iteration, name, 2)
         if request.param == "inexactly":
-            patch.setattr(policy_iteration, "MOST_ENTRIES", 0)
+            patch.setattr(policy_iteration, "DIRECTLY", 0)
             patch.setattr(policy_iteration, "MOST_INEXACT", 20)
         yield request.param
 

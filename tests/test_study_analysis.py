@@ -216,6 +216,16 @@ def test_classes_that_a_model_has_not_seen_need_a_model():
     assert "the class model of a has 2 rows; needs at least 4 for its 1 predictor: run more" in " ".join(found.notes)
 
 
+def test_a_class_with_as_many_observations_as_rows_has_no_model():
+    rows = [(name, task, look) for name, tasks in (("a", "xyz"), ("b", "w")) for task in tasks for look in "12345"]
+    cells = pd.DataFrame(rows, columns=["environment", "instance", "observation"])
+    rng = np.random.default_rng(0)
+    cells = cells.assign(agent="dqn", chance="plain", normalized_regret=rng.random(20), diameter=1.0)
+    found = study.models(cells, agent="dqn", regret="normalized_regret", measures=["diameter"])
+    assert [fit.subset for fit in found.fits if fit.model == "class"] == ["a"]
+    assert "the class model of b has 5 rows; needs at least 7 for its 4 predictors: run more" in " ".join(found.notes)
+
+
 def test_the_models_without_rows_are_a_note():
     empty = pd.DataFrame({"agent": ["ppo"], "observation": ["vector"], "cumulative_regret": [1.0]})
     assert study.models(empty).notes[-1] == "no cell of dqn has all measures: there are no models"

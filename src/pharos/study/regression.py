@@ -85,12 +85,12 @@ def fit(rows: "pd.DataFrame", model: str, subset: str, predictors: Sequence[str]
     """One fit; predictors that are constant or collinear in these rows are dropped and named."""
     import statsmodels.formula.api as smf
 
-    terms, dropped = _independent(rows, predictors)
-    needed = len(terms) + 3
+    terms, columns, dropped = _independent(rows, predictors)
+    needed = columns + 2
     if len(rows) < needed:
         raise ParameterError(
             f"the {model} model of {subset} has {many(len(rows), 'row')}; needs at least {needed} for its "
-            f"{many(len(terms), 'predictor')}: run more instances or fewer predictors"
+            f"{many(columns - 1, 'predictor')}: run more instances or fewer predictors"
         )
     formula = "regret ~ " + (" + ".join(terms) if terms else "1")
     result = smf.ols(formula, rows).fit()
@@ -160,7 +160,7 @@ def leave_one_class_out_r_squared(data: "pd.DataFrame", *, measures: Sequence[st
         inside = (checked["environment"] == environment).to_numpy()
         if inside.all():
             raise ParameterError(f"leaving one class out needs at least two classes; found only {environment!r}")
-        terms, _ = _independent(checked[~inside], ["observation", *measures])
+        terms, _, _ = _independent(checked[~inside], ["observation", *measures])
         result = smf.ols("regret ~ " + (" + ".join(terms) or "1"), checked[~inside]).fit()
         predicted[inside] = result.predict(checked[inside])
     actual = checked["regret"].to_numpy(float)
@@ -185,8 +185,10 @@ def _checked(data: "pd.DataFrame", measures: Sequence[str]) -> "pd.DataFrame":
     return data.reset_index(drop=True)
 
 
-def _independent(rows: "pd.DataFrame", predictors: Sequence[str]) -> tuple[list[str], list[str]]:
-    """The terms of a formula that are linearly independent of those before them, and the predictors left out."""
+def _independent(rows: "pd.DataFrame", predictors: Sequence[str]) -> tuple[list[str], int, list[str]]:
+    """The terms of a formula that are linearly independent of those before them, how many coefficients they have, the
+    constant included, and the predictors left out.
+    """
     terms: list[str] = []
     dropped: list[str] = []
     columns = [np.ones(len(rows))]
@@ -205,7 +207,7 @@ def _independent(rows: "pd.DataFrame", predictors: Sequence[str]) -> tuple[list[
             columns += added
         else:
             dropped.append(predictor)
-    return terms, dropped
+    return terms, len(columns), dropped
 
 
 def _coefficients(result: Any, rows: "pd.DataFrame", tasks: Sequence[str]) -> "pd.DataFrame":
