@@ -155,6 +155,7 @@ def test_networks_are_on_the_device_that_is_asked_for(grid, agent):
     assert max(np.abs(mine[name] - theirs[name]).max() for name in mine) <= 1e-5
 
 
+@pytest.mark.long
 def test_policies_that_walk_together_are_worth_what_they_are_alone():
     tasks = [Task.of(make("deep_sea", size=5), gamma=gamma) for gamma in (1.0, 0.9)]
     runs = [replace(run, mdp=tasks[i % 2].mdp) for i, run in enumerate(runs_of(tasks[0], DQN, 11))]

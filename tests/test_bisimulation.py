@@ -122,6 +122,7 @@ def bisimilar_general(mdp):
         same = new
 
 
+@pytest.mark.long
 @settings(max_examples=100, deadline=None)
 @given(st.one_of(general_mdps(), outcome_mdps()))
 def test_classes_of_general_mdps_are_those_of_the_greatest_bisimulation(mdp):
@@ -161,7 +162,7 @@ def rounds_of_all(mdp):
 ROAD = {"num_cars": 7, "lane_length": 6}  # 19,284 states
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(("name", "parameters"), [("freeway", ROAD), ("frozen_lake/8x8", {}), ("simple_grid", {})])
 def test_classes_of_games_are_those_of_refinement_in_full(name, parameters):
     mdp = pharos.build(pharos.make(name, **parameters)).mdp()

@@ -114,7 +114,7 @@ def test_several_recurrent_classes_never_mix():
     assert found.to_dict()["infinite"]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @settings(max_examples=100, deadline=None)
 @given(small_mdps(max_states=5, max_actions=3))
 def test_the_mismatch_contains_the_largest_ratio_of_visits(mdp):

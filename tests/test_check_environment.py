@@ -547,7 +547,7 @@ def test_one_outcome_is_certain():
     assert "those of outcomes 0 to 0 sum to 0.75; expected 1" in message(windy(outcomes=1))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_chance_must_be_the_same_compiled():
     def probability(self, state, action, outcome):
         return 0.25 if ((1 + state[0]) << LAST_BIT > 0) == (outcome == 0) else 0.75

@@ -147,7 +147,7 @@ def test_every_representation_gives_the_same_answers(mdp, seed):
     assert (mdp.dynamics.pushed(mass)[:, 0] * values[:-1]).sum() == pytest.approx(adjoint)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @often
 @given(st.one_of(small_mdps(), with_chance(outcome_mdps()), lazy_mdps()), st.integers(0, 2**32))
 def test_compiled_backups_and_moves_are_those_of_the_formulas(mdp, seed):

@@ -81,7 +81,7 @@ def test_values_of_a_deterministic_policy_are_within_their_bound(mdp, seed):
     assert largest_error(solution, naive_exact.values_of(mdp, written_out)) <= Fraction(solution.error_bound)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @often
 @given(acyclic_mdps(), st.integers(0, 2**32))
 def test_one_pass_gives_the_values_of_mdps_that_visit_no_state_twice(drawn, seed):

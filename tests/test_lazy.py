@@ -163,7 +163,7 @@ def test_times_grow_by_the_mean_of_a_geometric_variable(p):
     assert lazy.upper >= exact / (1 - p) * (1 - 1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_measures_are_those_of_the_chain_that_is_written_out(lake, grid):
     for space in (lake, grid):
         mdp = random_actions(lazy_actions(space.mdp(gamma=0.9), 0.3), 0.1)

@@ -49,7 +49,7 @@ def test_values_of_a_long_cycle_are_as_good_as_one_backup_allows():
     assert solution.sweeps < 300
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_large_systems_are_solved_inexactly_and_agree_with_sweeps():
     """A random walk with a goal, of more nodes than are solved directly at once."""
     size = 60

@@ -262,7 +262,7 @@ def test_an_exchange_that_is_too_large_is_refused():
 # Processes and MPI ----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_forked_processes_write_the_same_files_and_go_on_after_a_kill(tmp_path, monkeypatch):
     monkeypatch.setattr(ranked_search, "WIDE", 0)
     monkeypatch.setattr(ranked_search.RankedSearch.__init__, "__defaults__", (0,))

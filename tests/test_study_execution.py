@@ -240,7 +240,7 @@ def test_killing_runner_and_workers_loses_and_repeats_nothing(tmp_path, log):
     assert not (out / "partial").exists()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_two_runners_on_one_folder_share_the_work(tmp_path, log):
     spec = specification(seeds=4)
     study.run(spec, tmp_path / "undisturbed", runner=fake_training.train, workers=2)
@@ -344,7 +344,7 @@ def test_a_file_in_the_place_of_a_run_and_foreign_files_beside_it_stop_nothing(t
     assert study.run(spec, tmp_path, runner=fake_training.train, workers=2).finished == 6
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_process_that_forks_workers_is_begun_again_when_it_dies(tmp_path, log, monkeypatch):
     from multiprocessing.forkserver import _forkserver
 

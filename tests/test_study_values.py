@@ -77,7 +77,7 @@ def test_values_of_other_rules_are_not_taken(config, monkeypatch):
     assert _values.stored_values(config) is None
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_study_with_the_usual_runner_ends_with_the_results_of_training_alone(config, tmp_path):
     block = {"environments": ["frozen_lake/4x4"], "chance": [{"sticky": 0.25}], "agents": ["q_learning"], "seeds": 2}
     spec = study.specification({"name": "a", "steps": 300, "evaluations": 3, "blocks": [block]})

@@ -103,7 +103,7 @@ class _Process(Rank):
 
     def fail(self, error: BaseException) -> None:
         failure = self._memory.failure
-        if failure[0] == 0 and not isinstance(error, RankFailed):
+        if failure[0] == 0:
             text = np.frombuffer(text_of(error).encode()[:_TEXT], np.uint8)
             failure[8 : 8 + len(text)] = text
             failure[0] = min(self.rank, 254) + 1
