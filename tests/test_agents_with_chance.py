@@ -19,6 +19,7 @@ def task() -> Task:
     return Task.of(pharos.make("cliff_walking", **CLIFF), sticky=0.2)
 
 
+@pytest.mark.long
 def test_q_learning_learns_and_its_regret_is_exact():
     run = experiments.train("q_learning", pharos.make("cliff_walking", **CLIFF), steps=60_000, seed=0)
     result = run.result

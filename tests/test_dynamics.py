@@ -184,7 +184,7 @@ def test_compiled_backups_and_moves_are_those_of_the_formulas(mdp, seed):
     assert ((fast > 0) == (slow > 0))[live].all()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @often
 @given(st.one_of(small_mdps(), lazy_mdps()))
 def test_solvers_take_any_representation(mdp):

@@ -40,7 +40,7 @@ def grid():
 # Values ---------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @often
 @given(lazy_mdps(), st.integers(1, 6), st.integers(0, 2**32))
 def test_values_are_those_of_the_chain_that_is_written_out(mdp, horizon, seed):

@@ -299,7 +299,7 @@ def rare_rows(draw, max_states=4, max_actions=2):
     return draw(st.lists(row, min_size=num_states, max_size=num_states))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @settings(max_examples=150, deadline=None)
 @given(rare_rows())
 def test_intervals_hold_the_hitting_times_of_exact_fractions(rows):

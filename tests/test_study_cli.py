@@ -79,7 +79,7 @@ def test_wrong_usage_is_one_line_and_exit_code_2(folder, arguments, message):
     assert message in done.stderr and done.stderr.count("\n") == 1
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_study_with_failed_runs_ends_with_exit_code_1_and_says_where_to_look(folder):
     wrong = SPECIFICATION.replace("name: lake", "name: wrong").replace(
         "[q_learning]", "[q_learning]\n    hyperparameters: {q_learning: {learning_rat: 0.5}}"

@@ -213,7 +213,7 @@ def workers_of(folder):
     return found
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_killing_runner_and_workers_loses_and_repeats_nothing(tmp_path, log):
     spec = specification(seeds=8)
     undisturbed = study.run(spec, tmp_path / "undisturbed", runner=fake_training.train, workers=2)
