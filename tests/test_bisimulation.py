@@ -130,7 +130,7 @@ def test_classes_of_general_mdps_are_those_of_the_greatest_bisimulation(mdp):
     assert ((classes[:, None] == classes[None]) == bisimilar_general(mdp)).all()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @settings(max_examples=80, deadline=None)
 @given(general_mdps(), probabilities, probabilities, st.data())
 def test_values_of_general_mdps_are_kept_when_states_are_doubled(mdp, sticky, random, data):
