@@ -83,7 +83,7 @@ def put(path: Path, data: bytes) -> None:
 
 def relinked(text: str, source: Path, name: str) -> str:
     """A page with links that work where it is staged as `name`; `source`: where it lies in the repository."""
-    repository = yaml.safe_load((ROOT / "mkdocs.yml").read_text(encoding="utf-8"))["repo_url"]
+    repository = yaml.safe_load((ROOT / "mkdocs.yml").read_text(encoding="utf-8"))["extra"]["social"][0]["link"]
 
     def target(match: re.Match) -> str:
         link, hash, anchor = match[2].partition("#")
