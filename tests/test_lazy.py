@@ -182,6 +182,7 @@ def test_measures_are_those_of_the_chain_that_is_written_out(lake, grid):
                     assert lower <= upper * (1 + 1e-9), name
 
 
+@pytest.mark.long
 def test_results_on_disk_are_of_one_laziness(lake):
     mdp = lake.mdp(gamma=0.9)
     found = [hardness.report(lazy_actions(mdp, p), ["diameter"])["diameter"].certificate for p in (0.2, 0.4)]

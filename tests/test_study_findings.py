@@ -80,7 +80,7 @@ def without_effect():
     return found
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_equal_observations_are_undecided_as_often_as_the_level_says(without_effect):
     decided = [
         row.verdict != "undecided"
