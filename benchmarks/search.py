@@ -17,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
+from drawing import drawn_set
 from pharos.agents import hyperparameters
 from pharos.agents.batched import BatchRun, ObservationSource, make_batch
 from pharos.environments import make
@@ -40,19 +41,6 @@ SPACES = {
         "clip_range": ("one of", 0.1, 0.2, 0.3),
     },
 }
-
-
-def drawn_set(rng, space):
-    """Hyperparameters, each on its scale."""
-    drawn = {}
-    for name, (kind, *values) in space.items():
-        if kind == "one of":
-            drawn[name] = values[rng.integers(len(values))]
-        else:
-            low, high = np.log(values) if kind == "log" else values
-            point = rng.uniform(low, high)
-            drawn[name] = float(f"{np.exp(point) if kind == 'log' else point:.3g}")
-    return drawn
 
 
 def trained(agent, tasks, sets, steps, seeds):
@@ -114,7 +102,7 @@ def main():
             continue
         own = {name: json.loads(value) for name, value in (each.split("=") for each in text.split(",") if each)}
         rng = np.random.default_rng(number)
-        given = [{}, *(drawn_set(rng, SPACES[arguments.agent]) for _ in range(arguments.sets - 1))]
+        given = [{}, *(drawn_set(rng, SPACES[arguments.agent], 3) for _ in range(arguments.sets - 1))]
         began = time.process_time()
         means, values = trained(
             arguments.agent, tasks, [{**table, **own, **each} for each in given], arguments.steps, arguments.seeds

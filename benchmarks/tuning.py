@@ -19,9 +19,9 @@ import numpy as np
 import torch
 
 import pharos
+from drawing import drawn_set
 from pharos import experiments
 from pharos.agents import hyperparameters as hyperparameters_of
-from pharos.experiments.search_space import suggested_value
 
 SPACES = {
     "dqn": {
@@ -44,32 +44,13 @@ EVALUATIONS = 10
 """Of a run."""
 
 
-class Drawn:
-    """Draws what Optuna's trial would suggest."""
-
-    def __init__(self, rng):
-        self.rng = rng
-
-    def suggest_categorical(self, _name, values):
-        return values[int(self.rng.integers(len(values)))]
-
-    def suggest_float(self, _name, low, high, log=False):
-        if log:
-            low, high = np.log(low), np.log(high)
-        number = self.rng.uniform(low, high)
-        return float(f"{np.exp(number) if log else number:.2g}")
-
-
 def candidates_of(agent, environment, observation, number, seed, shapes):
     """`number` candidates of each of some shapes; the first one is the table."""
     rng = np.random.default_rng(seed)
     table = hyperparameters_of(agent, environment, observation)
     candidates = []
     for shape in shapes:
-        drawn = [
-            {name: suggested_value(Drawn(rng), name, choices) for name, choices in SPACES[agent].items()}
-            for _ in range(number)
-        ]
+        drawn = [drawn_set(rng, SPACES[agent], 2) for _ in range(number)]
         candidates += [{**table, **shape, **each} for each in drawn]
     return [table, *candidates[1:]] if not shapes[0] else [{**table, **shapes[0]}, *candidates[1:]]
 
