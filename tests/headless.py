@@ -15,10 +15,17 @@ FLAGS = (
 )
 KEYS = {"ArrowUp": 38, "ArrowDown": 40, "ArrowLeft": 37, "ArrowRight": 39, "Enter": 13, "Tab": 9, " ": 32}
 
-BOX = """const box = (each) => {
-  each.scrollIntoView({ block: "center" });
-  const { left, top, width, height } = each.getBoundingClientRect();
-  return [left, top, width, height];
+BOX = """const box = async (each) => {  // once it has stood still for three frames: cards are placed a frame later
+  let now = [], still = 0;
+  while (still < 3) {
+    await new Promise(requestAnimationFrame);
+    const before = now;
+    each.scrollIntoView({ block: "center" });
+    const { left, top, width, height } = each.getBoundingClientRect();
+    now = [left, top, width, height];
+    still = now.every((number, i) => number === before[i]) ? still + 1 : 0;
+  }
+  return now;
 }"""
 
 

@@ -63,10 +63,10 @@ def test_what_warm_has_compiled_no_later_process_compiles(tmp_path):
 
 
 @pytest.mark.long
-def test_the_first_listing_of_the_readme_is_what_is_printed():
+def test_the_first_listing_of_the_readme_is_what_is_printed(tmp_path):
     text = (Path(__file__).parents[1] / "README.md").read_text()
     command, shown = re.search(r"^```\n\$ pharos (.*)\n((?:.*\n)*?)```$", text, re.MULTILINE).groups()
-    printed = pharos_command(*command.split()).stdout + "\n"
+    printed = pharos_command(*command.split(), PHAROS_CACHE_DIR=str(tmp_path)).stdout + "\n"
     printed = re.sub(r"^compiling: .*\n", "", printed, flags=re.MULTILINE)  # the first time
 
     def lines(listing):

@@ -8,7 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 import pharos
-from pharos import hardness
+from pharos import hardness, storage
 from pharos.cli.app import app
 from pharos.errors import ParameterError, UndefinedMeasure, UnknownName
 from pharos.hardness import registry as _registry
@@ -263,6 +263,23 @@ def test_kept_results_say_how_wrong_their_values_may_be():
     assert again["minimal_gap"].kept
     assert again.conventions["error_bound"] == first.conventions["error_bound"] > 0
     assert "error_bound" not in hardness.report(mdp, "diameter").conventions
+
+
+def test_results_of_an_older_pharos_without_an_error_bound_are_measured_anew():
+    mdp = grid()
+    first = hardness.report(mdp)
+
+    def older(results):
+        for key, entry in results.items():
+            content = json.loads(entry["content"])
+            del content["error_bound"]
+            results[key] = storage.sealed({"key": key, "content": json.dumps(content)})
+
+    edited(mdp.folder / "hardness.json", older)
+    again = hardness.report(mdp)
+    assert not again["minimal_gap"].kept
+    assert again.conventions["error_bound"] == first.conventions["error_bound"]
+    assert hardness.report(mdp)["minimal_gap"].kept
 
 
 def test_results_of_another_space_are_not_taken():

@@ -56,13 +56,14 @@ class ResultsFile:
             if entry["key"] != key or storage.DIGEST not in entry or not storage.is_intact(entry):
                 raise ValueError("digest")
             content = json.loads(entry["content"])
+            if "error_bound" not in content:  # of an older pharos, which did not keep it
+                return None
             certificate = Certificate(**content["certificate"])
             if not certificate.is_exact and budget.exceeds(Budget(**content["budget"])):
                 return None
             _check(content["value"])
             text, seconds = str(content["text"]), float(content["seconds"])
-            bound = content.get("error_bound")
-            bound = None if bound is None else float(bound)
+            bound = None if content["error_bound"] is None else float(content["error_bound"])
         except (KeyError, TypeError, ValueError):
             self._warn(f"the result of {measure.name} is not as pharos wrote it")
             return None

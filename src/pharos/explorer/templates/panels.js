@@ -131,9 +131,9 @@ const panels = {
   },
   async loadWay(from) {
     this.stop();
-    const policy = $("way-policy").value;
+    const asked = (this.askedWay = (this.askedWay || 0) + 1), policy = $("way-policy").value;
     const way = await attempt(() => source.ask("path", { policy, state: from[0], previous: from[1] }));
-    if (!way) return;
+    if (!way || asked !== this.askedWay) return;
     this.way = { ...way, from };
     const n = way.steps.length, { about } = world, wrong = way.steps.filter((step) => step[5] > about.tie_tolerance).length;
     let discounted = 0;
@@ -202,8 +202,9 @@ const panels = {
     this.loadLayer(0);
   },
   async loadLayer(layer, first = 0) {
+    const asked = (this.askedLayer = (this.askedLayer || 0) + 1);
     const answer = await attempt(() => source.ask("layer", { layer, first: Math.max(0, first) }));
-    if (!answer) return;
+    if (!answer || asked !== this.askedLayer) return;
     this.layer = answer;
     $("layer").value = layer;
     $("layer-at").textContent = `${layer.toLocaleString("en")}: ${count(answer.count, "state")}`;
