@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from naive_hardness import distances
 from pharos import TabularMDP, compiling, hardness, random_actions
 from pharos.errors import ParameterError
+from pharos.hardness import hidden_clock, sum_sweep
 from pharos.hardness.interval import Spending
 from pharos.hardness.transition_graph import Graph
 from pharos.kernels import clocks
@@ -140,9 +141,13 @@ def test_wrong_options_are_named():
 # Clocks: products of an autonomous clock with a walker ----------------------------------------------------------------
 
 
-def clocked(period, rows, blocked):
-    """A walker on `rows` rows beside a clock of `period` phases; where blocked[phase, row] it falls back to row 0."""
+def clocked(period, rows, blocked, ending=None):
+    """A walker on `rows` rows beside a clock of `period` phases; where blocked[phase, row] it falls back to row 0.
+
+    ending (period, rows) bool: where an episode ends.
+    """
     phase, row = np.divmod(np.arange(period * rows), rows)
+    ends = np.zeros(period * rows, bool) if ending is None else ending.ravel()
     table = np.empty((period * rows, 3), np.int64)
     for a in range(3):
         target = np.clip(row + (a - 1), 0, rows - 1)
@@ -153,10 +158,11 @@ def clocked(period, rows, blocked):
     order, found = [0], {0: 0}
     for s in order:
         for t in table[s]:
-            if int(t) not in found:
+            if not ends[s] and int(t) not in found:
                 found[int(t)] = len(order)
                 order.append(int(t))
-    return TabularMDP.from_arrays([[found[int(t)] for t in table[s]] for s in order], np.zeros((len(order), 3)))
+    following = [[found[int(s if ends[s] else t)] for t in table[s]] for s in order]
+    return TabularMDP.from_arrays(following, np.zeros((len(order), 3)), terminal=ends[order])
 
 
 @pytest.mark.slow
@@ -189,6 +195,45 @@ def test_following_a_clock_may_read_each_entry_of_the_table_200_times(monkeypatc
     mdp = clocked(30, 9, np.zeros((30, 9), bool))
     hardness.diameter(mdp)
     assert limits == [200 * mdp.next_states.size + 10**8]
+
+
+@pytest.mark.long
+@settings(max_examples=150, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(3, 40), st.integers(2, 9), st.floats(0, 0.6), st.sampled_from([1, 8]))
+def test_a_clock_that_restarts_hide_gives_the_largest_distance_to_every_target(seed, period, rows, density, words):
+    rng = np.random.default_rng(seed)
+    blocked = rng.random((period, rows)) < density
+    ending = rng.random((period, rows)) < rng.choice([0.05, 0.3])
+    ending[:, -1] |= rng.random() < 0.5
+    blocked[:, 0] = ending[:, 0] = False
+    mdp = clocked(period, rows, blocked, ending)
+    d = distances(mdp)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(hidden_clock, "_SHORTEST", 2)
+        patch.setattr(hidden_clock, "_ROUNDS", 100)
+        patch.setattr(sum_sweep, "_WORDS", (1, words))
+        graph = Graph.of(mdp, restart=True)
+        clock = hidden_clock.HiddenClock.of(graph, d[:, mdp.initial].astype(int), d[mdp.initial].astype(int))
+        found = hardness.diameter(mdp)
+    assert (found.lower, found.upper) == (d.max(), d.max())
+    if clock is not None:
+        for best in (0, int(np.median(d.max(axis=0))), int(d.max())):
+            targets = rng.permutation(len(d))
+            largest, _ = clock.largest_to(graph, targets, best)
+            assert (largest == np.maximum(d.max(axis=0)[targets], best)).all()
+
+
+@pytest.mark.long
+def test_one_round_of_a_hidden_clock_closes_what_searches_one_by_one_do_not():
+    rng = np.random.default_rng(0)
+    blocked = rng.random((90, 6)) < 0.4
+    blocked[:, 0] = False
+    ending = np.zeros((90, 6), bool)
+    ending[:, -1] = True
+    mdp = clocked(400, 12, blocked, ending)
+    found = hardness.diameter(mdp)
+    assert "restarts hide" in found.method
+    assert (found.lower, found.upper) == (distances(mdp).max(),) * 2
 
 
 def test_a_graph_takes_four_bytes_a_node():

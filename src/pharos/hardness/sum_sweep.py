@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from pharos.hardness.hidden_clock import HiddenClock
 from pharos.hardness.interval import Interval, Spending
 from pharos.hardness.orbits import orbits
 from pharos.hardness.restored import largest_distances, restored
@@ -59,6 +60,7 @@ class SumSweep:
         clock = self._from_clock()
         if isinstance(clock, Interval):
             return clock
+        self._search_in_step()
         if not self._search_orbits():
             self._search_restored()
         self._sweep()
@@ -269,6 +271,21 @@ class SumSweep:
         )
 
     # Clocks -----------------------------------------------------------------------------------------------------------
+
+    def _search_in_step(self) -> None:
+        """Where only restarts hide a clock, in(v) of all that are open, the farthest first."""
+        clock = HiddenClock.of(self.graph, self.to, self.away) if self._open()[0] else None
+        while clock is not None and self._open()[0] and not self.spending.is_over:
+            nodes = np.flatnonzero(np.greater(self.in_upper, self.best))
+            words = _WORDS[-1] if self._fits(_WORDS[-1]) else 1
+            limit = int(min(64 * words, max(1, self.spending.budget.searches - self.spending.searches)))
+            targets = nodes[np.argsort(-self.in_upper[nodes].astype(np.int64), kind="stable")[:limit]]
+            largest, _ = clock.largest_to(self.graph, targets, self.best)
+            self.in_upper[targets] = largest
+            self.best = max(self.best, int(largest.max()))
+            self.spending.searches += len(targets)
+            self.method = f"searches in step with {len(clock.layer_first) - 1} layers of a clock that restarts hide"
+            self.spending.report(self.best, self._upper(), self._open()[0])
 
     def _from_clock(self) -> "Interval | str":
         """D of a graph that contains a clock, or why this argument does not give it ("": there is no clock).

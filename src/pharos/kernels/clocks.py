@@ -96,6 +96,68 @@ def last_gap(next_states, ends, start, order, layer_first, position, current, co
 
 
 @njit(cache=True, nogil=True)
+def search_in_step(
+    next_states, ends, order, layer_first, position, targets, layer, offset, away, home, best, scratch, seen, largest
+):
+    """Searches backward from many targets at once, a bit each, that stand in the same layer at the same time.
+
+    Every edge leads from layer j to layer j + 1 modulo P; states that end lead nowhere. So a tick reads one layer, where
+    searches that keep step by their levels read as many as they have targets in different layers. From a node v there
+    is another way to target i, of home[v] + away[i] steps.
+
+    order (N,): the nodes by layer, layer_first (P + 1,), position (N,): place of a node in its layer. Target i joins at
+    tick offset[i], ascending from 0; `layer` is that of the first. scratch (2, widest layer, words) uint64; seen
+    (N, words) uint64, zero before: by place in `order`, the targets that a node reaches.
+    Returns table entries read. largest[i], `best` before, becomes the largest over all nodes of the lesser of both
+    ways to target i, where that is more.
+    """
+    num_actions = next_states.shape[1]
+    num_layers, words, num_targets = len(layer_first) - 1, seen.shape[1], len(targets)
+    farthest = np.int64(home.max())
+    last = np.int64(0)
+    for i in range(num_targets):
+        last = max(last, offset[i] + away[i] + farthest)
+    joined, reads = 0, np.int64(0)
+    for tick in range(last + 1):
+        low, width = layer_first[layer], layer_first[layer + 1] - layer_first[layer]
+        current, coming = scratch[tick % 2], scratch[1 - tick % 2]
+        for p in range(width):
+            u = order[low + p]
+            for w in range(words):
+                coming[p, w] = 0
+            if tick > 0 and not ends[u]:
+                for a in range(num_actions):
+                    q = position[next_states[u, a]]
+                    for w in range(words):
+                        coming[p, w] |= current[q, w]
+        reads += num_actions * width
+        while joined < num_targets and offset[joined] == tick:
+            coming[position[targets[joined]], joined // 64] |= np.uint64(1) << np.uint64(joined % 64)
+            joined += 1
+        for p in range(width):
+            for w in range(words):
+                new = coming[p, w] & ~seen[low + p, w]
+                seen[low + p, w] |= new
+                if new and tick > best:
+                    for i in range(64 * w, min(64 * w + 64, num_targets)):
+                        if new >> np.uint64(i % 64) & np.uint64(1):
+                            steps = min(np.int64(tick - offset[i]), np.int64(home[order[low + p]] + away[i]))
+                            largest[i] = max(largest[i], steps)
+        layer = layer - 1 if layer else num_layers - 1
+    unseen = np.zeros((farthest + 1, words), np.uint64)
+    for place in range(len(order)):
+        for w in range(words):
+            unseen[home[order[place]], w] |= ~seen[place, w]
+    for i in range(num_targets):
+        steps = farthest
+        while steps > 0 and not unseen[steps, i // 64] >> np.uint64(i % 64) & np.uint64(1):
+            steps -= 1
+        if unseen[steps, i // 64] >> np.uint64(i % 64) & np.uint64(1):
+            largest[i] = max(largest[i], steps + away[i])
+    return reads
+
+
+@njit(cache=True, nogil=True)
 def _gcd(a, b):
     while b:
         a, b = b, a % b
