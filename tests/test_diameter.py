@@ -230,7 +230,7 @@ def test_one_round_of_a_hidden_clock_closes_what_searches_one_by_one_do_not():
     blocked[:, 0] = False
     ending = np.zeros((90, 6), bool)
     ending[:, -1] = True
-    mdp = clocked(400, 12, blocked, ending)
+    mdp = clocked(90, 6, blocked, ending)
     found = hardness.diameter(mdp)
     assert "restarts hide" in found.method
     assert (found.lower, found.upper) == (distances(mdp).max(),) * 2

@@ -101,9 +101,9 @@ def search_in_step(
 ):
     """Searches backward from many targets at once, a bit each, that stand in the same layer at the same time.
 
-    Every edge leads from layer j to layer j + 1 modulo P; states that end lead nowhere. So a tick reads one layer, where
-    searches that keep step by their levels read as many as they have targets in different layers. From a node v there
-    is another way to target i, of home[v] + away[i] steps.
+    Every edge leads from layer j to layer j + 1 modulo P; states that end lead nowhere. So a tick reads one layer,
+    where searches that keep step by their levels read as many as they have targets in different layers. From a node v
+    there is another way to target i, of home[v] + away[i] steps.
 
     order (N,): the nodes by layer, layer_first (P + 1,), position (N,): place of a node in its layer. Target i joins at
     tick offset[i], ascending from 0; `layer` is that of the first. scratch (2, widest layer, words) uint64; seen
