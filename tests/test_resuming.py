@@ -261,7 +261,7 @@ def test_files_do_not_depend_on_where_the_table_is(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("limit", (1 << 16, 1 << 20, 3 << 20))
+@pytest.mark.parametrize("limit", (1 << 16, 1 << 20, 3 << 19))
 @pytest.mark.parametrize("chunk", (64, 1 << 16))
 def test_the_table_moves_to_disk_in_the_middle_of_a_build(limit, chunk, tmp_path, monkeypatch):
     env = pharos.make("breakout", height=8, columns=6)  # 142,063 states: the table grows twice
@@ -276,6 +276,24 @@ def test_the_table_moves_to_disk_in_the_middle_of_a_build(limit, chunk, tmp_path
     build(env, tmp_path / "space", memory=limit)
     assert len(moved) == 1 and (moved[0] > 1000) == (limit > 1 << 16)
     assert_same_files(tmp_path / "space", tmp_path / "undisturbed")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("workers", (1, 2))
+def test_a_fuller_table_stays_in_memory_where_one_of_twice_the_size_does_not_fit(workers, tmp_path, monkeypatch):
+    env = pharos.make("breakout", height=8, columns=6)  # 142,063 states: 4 MiB by a table of which half is used
+    build(env, tmp_path / "undisturbed")
+    monkeypatch.setattr(machine, "LEAST_MEMORY", 1 << 16)
+    monkeypatch.setattr(search.Search, "_spill", lambda *_: pytest.fail("the table moved to disk"))
+    sizes = []
+    grow = table.MemoryTable.grow
+    monkeypatch.setattr(
+        table.MemoryTable, "grow", lambda self, *args: (grow(self, *args), sizes.append((len(self.slots), self.room)))
+    )
+    build(env, tmp_path / "space", workers=workers, memory=3 << 20)
+    assert_same_files(tmp_path / "space", tmp_path / "undisturbed")
+    slots, room = sizes[-1]
+    assert room > 142_063 > 0.5 * slots and 4 * slots + 8 * room <= 3 << 20
 
 
 @pytest.mark.slow

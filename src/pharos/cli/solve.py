@@ -47,6 +47,13 @@ def solve(
     out: Annotated[
         Path | None, typer.Option("--out", help="FILE.npz for the arrays v and policy, FILE.npy for the policy alone.")
     ] = None,
+    values: Annotated[
+        Path | None,
+        typer.Option(
+            "--values",
+            help="Folder that holds the values while they are computed, in place of memory; a killed solve goes on.",
+        ),
+    ] = None,
     memory: Memory = None,
     workers: Workers = None,
     max_states: MaxStates = None,
@@ -62,10 +69,18 @@ def solve(
 
     with progress_line("solving") as report:
         solution = value_iteration(
-            mdp, tolerance, progress=lambda sweeps, bound: report(f"sweep {sweeps}, error at most {bound:.2g}")
+            mdp,
+            tolerance,
+            progress=lambda sweeps, bound: report(f"sweep {sweeps}, error at most {bound:.2g}"),
+            values=None if values is None else values / "optimal.npy",
         )
         report("value of the uniform policy")
-        uniform = uniform_value(mdp, tolerance)
+        uniform = uniform_value(
+            mdp,
+            tolerance,
+            progress=lambda sweeps, bound: report(f"uniform policy, sweep {sweeps}, error at most {bound:.2g}"),
+            values=None if values is None else values / "uniform.npy",
+        )
     if out is not None:
         save(out, solution)
     answer = {

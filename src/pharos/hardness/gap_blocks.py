@@ -61,7 +61,7 @@ def weighted_gaps(mdp: TabularMDP, solution: Solution) -> Iterator[GapBlock]:
             following = mdp.dynamics.expected(step.next_x, block)
             difference = kernels.differences(rewards, following, mdp.gamma)
             live = ~np.asarray(mdp.terminal[block])
-            later = step.later[block]
+            later = step.later[block].astype(np.int64)
             weight = later + (everywhere & (later == 0))
             part = (number, states, rewards, following)
             gap = difference if chance.chosen == 1.0 else chance.chosen * difference
@@ -77,8 +77,8 @@ def weighted_gaps(mdp: TabularMDP, solution: Solution) -> Iterator[GapBlock]:
 def _steps(mdp: TabularMDP, solution: Solution) -> Iterator[Step]:
     """For each step t = 1, ..., T, or once: values, and how many times each state counts.
 
-    later (S,): 1 for a reachable state, under sticky actions the number of actions by which it can be reached; first
-    (S,) bool: start states, which count once more under sticky actions, without a previous action.
+    later (S,): 1, or True, for a reachable state, under sticky actions the number of actions by which it can be
+    reached; first (S,) bool: start states, which count once more under sticky actions, without a previous action.
     """
     nothing = np.zeros(mdp.num_states, np.bool_)
     starts = nothing.copy()
@@ -87,7 +87,7 @@ def _steps(mdp: TabularMDP, solution: Solution) -> Iterator[Step]:
         if mdp.is_sticky:
             yield Step(solution.x, solution.x, mdp.pairs_within().sum(axis=1), starts)
         else:
-            yield Step(solution.x, solution.x, mdp.states_within().astype(np.int64), nothing)
+            yield Step(solution.x, solution.x, mdp.states_within(), nothing)
         return
     all_steps = _all_steps(mdp, solution)
     pairs = np.zeros((mdp.num_states, mdp.num_actions), np.bool_)
@@ -99,7 +99,7 @@ def _steps(mdp: TabularMDP, solution: Solution) -> Iterator[Step]:
             yield Step(own, following, pairs.sum(axis=1), starts if step == 1 else nothing)
             pairs = _pairs_after(mdp, pairs, step == 1)
         else:
-            yield Step(own, following, reached.astype(np.int64), nothing)
+            yield Step(own, following, reached, nothing)
             arrived = mdp.dynamics.arrivals(np.flatnonzero(reached & ~np.asarray(mdp.terminal)))
             reached = np.asarray(arrived.any(axis=1))
 

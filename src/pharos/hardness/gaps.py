@@ -20,6 +20,7 @@ from pharos.hardness.ties import TieProof, UnresolvedTies
 from pharos.kernels import gaps as kernels
 from pharos.mdp import BEST, BellmanEquation, TabularMDP, takes_mdp
 from pharos.solvers import Solution, value_iteration
+from pharos.state_space import large_zeros
 
 # Of Colosseum.
 REGULARIZER = 0.1
@@ -185,7 +186,8 @@ def _settled(mdp: TabularMDP, solution: Solution) -> Solution:
     if rho >= 1:
         return solution
     largest_reward = max(abs(mdp.reward_table.lowest), abs(mdp.reward_table.highest))
-    x, bound, at_rest = solution.x.copy(), solution.error_bound, 0
+    x, bound, at_rest = large_zeros(solution.x.shape, np.float64), solution.error_bound, 0
+    x[:] = solution.x
     largest = max(float(x.max(initial=0.0)), -float(x.min(initial=0.0)))
     sweeps = 0
     while sweeps < _SWEEPS:

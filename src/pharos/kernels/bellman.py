@@ -69,10 +69,10 @@ def _backup_of(transitions, table, palette, gamma, uniform, choice, v, actions, 
 
 
 @njit(cache=True, nogil=True)
-def optimal_sweep(transitions, table, palette, gamma, uniform, choice, v, actions, order):
-    """v[s] = (1 - uniform) q(s, what is chosen) + uniform mean_a q(s, a), in place."""
+def optimal_sweep(transitions, table, palette, gamma, uniform, choice, v, actions, order, start, stop):
+    """v[s] = (1 - uniform) q(s, what is chosen) + uniform mean_a q(s, a), in place, for places [start, stop)."""
     change = 0.0
-    for i in range(size_of(transitions)[0] - 1, -1, -1):
+    for i in range(stop - 1, start - 1, -1):
         s = state_at(order, i)
         value = _backup(transitions, table, palette, gamma, uniform, choice, v, actions, s)
         change = max(change, abs(value - v[s]))

@@ -1,7 +1,7 @@
 """Dynamics that kernels read: the methods that are compiled, without temporary arrays."""
 
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -10,6 +10,10 @@ import numpy as np
 from pharos.kernels import bellman, graph, occupancy
 from pharos.mdp.dynamics import BellmanEquation, Dynamics, Order, Play
 from pharos.mdp.selection import Extreme, PolicyTable, Selection
+from pharos.state_space import read_ahead
+
+# States of a table in a file that are swept while the next ones are read.
+_RANGE = 1 << 22
 
 
 class CompiledDynamics(Dynamics):
@@ -97,7 +101,22 @@ def swept(
         return bellman.policy_sweep(*tables, *weights, select.later[:, 0], x[:, 0], order)
     if chance.is_sticky:
         return bellman.sticky_sweep(*tables, chance.triple, choice, x, actions, scratch, order)
-    return bellman.optimal_sweep(*tables, chance.uniform, choice, x[:, 0], actions, order)
+    change, v = 0.0, x[:, 0]
+    for start, stop in _ranges(transitions, len(x) - 1):
+        part = bellman.optimal_sweep(*tables, chance.uniform, choice, v, actions, order, start, stop)
+        change = float(np.maximum(change, part))
+    return change
+
+
+def _ranges(transitions: Any, num_states: int) -> Iterator[tuple[int, int]]:
+    """Ranges of places, the last one first; where they are read from a mapped file, the next one is asked for."""
+    if not isinstance(transitions, np.memmap):
+        yield 0, num_states
+        return
+    for stop in range(num_states, 0, -_RANGE):
+        start = max(stop - _RANGE, 0)
+        read_ahead(transitions, max(start - _RANGE, 0), start)
+        yield start, stop
 
 
 def _choice(select: Selection) -> "float | np.ndarray | None":

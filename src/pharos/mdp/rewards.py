@@ -10,8 +10,11 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from pharos.errors import ParameterError
+from pharos.state_space import large_zeros
 
 _BLOCK = 1 << 16
+# Entries of a palette that each reward is compared with, before it is searched for.
+_FEW = 4
 
 
 @dataclass(frozen=True)
@@ -92,8 +95,10 @@ class RewardsCollector:
         """Rewards of the states from `start` on."""
         if self._values is None:
             if self._codes is None:
-                self._codes = np.zeros(self.shape, np.uint8)
+                self._codes = large_zeros(self.shape, np.uint8)
             entries = self._palette
+            if self._is_known(start, block):
+                return
             new = np.setdiff1d(block, entries)  # sorted and unique
             if len(entries) + len(new) <= 256:
                 self._palette = palette = np.concatenate([entries, new])
@@ -104,6 +109,18 @@ class RewardsCollector:
             self._values = entries[self._codes] if len(entries) else np.zeros(self.shape)
             self._codes = None
         self._values[start : start + len(block)] = block
+
+    def _is_known(self, start: int, block: np.ndarray) -> bool:
+        """Enter a block whose rewards are all among the first few of the palette; whether they are."""
+        assert self._codes is not None
+        codes, left = np.zeros(block.shape, np.uint8), block.size
+        for code, reward in enumerate(self._palette[:_FEW]):
+            equal = block == reward
+            left -= int(np.count_nonzero(equal))
+            codes += equal.view(np.uint8) * np.uint8(code)
+        if left == 0:
+            self._codes[start : start + len(block)] = codes
+        return left == 0
 
     def finish(self) -> Rewards:
         """The rewards of all states."""

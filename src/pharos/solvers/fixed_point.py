@@ -23,10 +23,13 @@ import numpy as np
 from pharos.errors import DivergenceError, PrecisionError
 from pharos.mdp import BellmanEquation, Selection, TabularMDP
 from pharos.solvers.policy_iteration import PolicyIteration
+from pharos.state_space import large_zeros
 
 _UNIT = 2.0**-53
 # Sweeps that gain nothing, after values of the best policy were found, until it is clear that rounding stops them.
 SETTLING = 64
+# Entries of x that are looked at in one go.
+_BLOCK = 1 << 20
 # Rounding of the computation of a bound itself, and products of rounding errors.
 _MARGIN = 1 + 2.0**-40
 
@@ -63,8 +66,8 @@ class Backup:
         self.largest_reward = max(abs(mdp.reward_table.lowest), abs(mdp.reward_table.highest))
 
     def zeros(self) -> np.ndarray:
-        """(S + 1, W)."""
-        return np.zeros((self.mdp.num_states + 1, self.mdp.width))
+        """(S + 1, W); mapped from a file where memory has little room for it."""
+        return large_zeros((self.mdp.num_states + 1, self.mdp.width), np.float64)
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
         """T x, not in place."""
@@ -88,8 +91,12 @@ def fixed_point(
     select: Selection,
     tolerance: float,
     progress: Callable[[int, float], None] | None = None,
+    x: np.ndarray | None = None,
 ) -> FixedPoint:
     """Sweep until the proven bound is at most the tolerance.
+
+    Args:
+        x: (S + 1, W) float64, where to sweep, from any finite values; None: from zeros.
 
     Raises:
         DivergenceError: gamma is 1, and a state can be visited again, so that the value may be infinite.
@@ -97,12 +104,12 @@ def fixed_point(
     """
     backup = Backup(mdp, select)
     if mdp.gamma == 1.0 or mdp.age is not None:
-        return _in_one_pass(backup, tolerance, progress)
+        return _in_one_pass(backup, tolerance, progress, x)
     rho = backup.factor
     least = backup.rounding(0.0) / (1 - rho) if rho < 1 else math.inf
     if not least <= tolerance:
         raise _imprecise(mdp, least, tolerance)
-    x, sweeps = backup.zeros(), 0
+    x, sweeps = backup.zeros() if x is None else x, 0
     better, least, since = PolicyIteration(mdp, select), math.inf, 0
     while True:
         change = backup.sweep(x)
@@ -170,10 +177,16 @@ def chain_bound(mdp: TabularMDP, select: Selection, x: np.ndarray, successor: np
 def largest_of(x: np.ndarray) -> float:
     """max |x|; NaN where an entry is NaN."""
     flat = x.reshape(-1)  # one long row: faster
-    return max(float(flat.max()), -float(flat.min())) if x.size else 0.0
+    largest = 0.0
+    for start in range(0, flat.size, _BLOCK):  # each is read once, which counts where x is in a file
+        block = flat[start : start + _BLOCK]
+        largest = float(np.maximum(largest, np.maximum(block.max(), -block.min())))
+    return largest
 
 
-def _in_one_pass(backup: Backup, tolerance: float, progress: Callable[[int, float], None] | None) -> FixedPoint:
+def _in_one_pass(
+    backup: Backup, tolerance: float, progress: Callable[[int, float], None] | None, x: np.ndarray | None
+) -> FixedPoint:
     """Where no state can be visited again: each is backed up once, after all that it leads to.
 
     Rounding adds up along the way: that of a state n steps before the end is at most e (1 + rho + ... + rho^n).
@@ -185,7 +198,7 @@ def _in_one_pass(backup: Backup, tolerance: float, progress: Callable[[int, floa
             f"{mdp}: gamma is 1, there is no horizon, and some states can be visited again and again, so the value may "
             "be infinite; give a horizon (the environment's time limit, say), or gamma < 1"
         )
-    x, backups = backup.zeros(), order.longest + 1
+    x, backups = backup.zeros() if x is None else x, order.longest + 1
     with np.errstate(over="ignore", invalid="ignore"):
         mdp.dynamics.sweep_once(backup.equation, x, order)
         series = min(backups, 1 / (1 - rho)) if rho < 1 else backups * np.float64(rho) ** order.longest

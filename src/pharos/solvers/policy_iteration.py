@@ -15,6 +15,7 @@ import numpy as np
 from pharos.kernels import bellman, krylov
 from pharos.mdp import BellmanEquation, PolicyTable, Rewards, Selection, TabularMDP
 from pharos.solvers.linear_systems import bicgstab, solution_of_system
+from pharos.state_space import available_memory
 
 # Sweeps before the first attempt, and before that of the inexact way, which gains less: most games are solved by then.
 # Later attempts come after twice as many sweeps each, four times where they failed.
@@ -29,6 +30,8 @@ MOST_IMPROVEMENTS, SETTLED = 60, 2.0**-47
 # Inexact: improvements of one attempt, sweeps after each, by how much each shrinks the residual of its policy, and in
 # how many steps at most.
 MOST_INEXACT, SWEEPS_AFTER, FORCING, STEPS = 500, 20, 0.1, 100
+# Bytes of a node that an attempt takes, at most, and bytes that there always are.
+BYTES, SMALL = 80, 1 << 28
 # Operations that calling a sweep costs, however few states there are; and those of policy iteration by sparse systems,
 # for each node.
 CALL, SPARSE = 5000, 50_000.0
@@ -52,7 +55,7 @@ class PolicyIteration:
 
         How many are left, the last half of the sweeps tells: changes often shrink by much more than gamma in each.
         """
-        if sweeps & (sweeps - 1) or self.mdp.gamma == 0.0:
+        if sweeps & (sweeps - 1) or self.mdp.gamma == 0.0 or not self._fits:
             return False
         change = max(change, 1e-300)
         before, self._change, self._sweeps = self._change, change, sweeps
@@ -68,6 +71,11 @@ class PolicyIteration:
         if self.is_direct:
             return of_sweeps > self.nodes * min(SPARSE, float(self.nodes) ** 2)
         return left > 2.0 * sweeps
+
+    @property
+    def _fits(self) -> bool:
+        """Whether memory has room for what an attempt takes, some ten vectors of values."""
+        return BYTES * self.nodes <= max(SMALL, available_memory())
 
     @property
     def is_direct(self) -> bool:

@@ -1,5 +1,6 @@
 """Optimal values, worst values and values of uniform play."""
 
+import os
 from collections.abc import Callable
 
 import numpy as np
@@ -8,6 +9,7 @@ from pharos.compiling import Stopwatch
 from pharos.errors import ParameterError
 from pharos.mdp import BEST, WORST, Selection, TabularMDP, random_actions, takes_mdp
 from pharos.solvers.fixed_point import backward_induction, fixed_point
+from pharos.solvers.kept_values import kept_values
 from pharos.solvers.solution import Solution
 
 
@@ -19,6 +21,7 @@ def value_iteration(
     horizon: int | None = None,
     keep_all: bool = False,
     progress: Callable[[int, float], None] | None = None,
+    values: str | os.PathLike | None = None,
 ) -> Solution:
     """The optimal values of an MDP.
 
@@ -31,6 +34,9 @@ def value_iteration(
         keep_all: with a horizon, keep the values of every step as `all_steps`, (T + 1, S), under sticky actions (T + 1,
             S, A): row t has t steps to go.
         progress: called after each sweep with its number and the bound so far.
+        values: a file (.npy) that holds the values while they are computed, in place of memory, and afterwards; what
+            it holds already is where the sweeps begin, so that a solve that was killed goes on. None: memory, or
+            where that has little room a file without a name.
     Returns:
         A Solution of kind "optimal".
     Raises:
@@ -43,7 +49,7 @@ def value_iteration(
         action) times actions are up to 2 million (up to 500 MB then), or nodes are up to 3000.
     Source: Bellman (1957); in place: Puterman (1994), section 6.3.3; the sticky equation: the pharos paper, appendix A.
     """
-    return solution_of(mdp, BEST, tolerance, horizon, keep_all, progress)
+    return solution_of(mdp, BEST, tolerance, horizon, keep_all, progress, values)
 
 
 @takes_mdp
@@ -53,9 +59,19 @@ def worst_value(mdp: TabularMDP, tolerance: float = 1e-6, *, horizon: int | None
 
 
 @takes_mdp
-def uniform_value(mdp: TabularMDP, tolerance: float = 1e-6, *, horizon: int | None = None) -> Solution:
-    """The values of the uniformly random policy: every action is replaced by a uniform one, so nothing is chosen."""
-    return solution_of(random_actions(mdp, 1.0), BEST, tolerance, horizon)
+def uniform_value(
+    mdp: TabularMDP,
+    tolerance: float = 1e-6,
+    *,
+    horizon: int | None = None,
+    progress: Callable[[int, float], None] | None = None,
+    values: str | os.PathLike | None = None,
+) -> Solution:
+    """The values of the uniformly random policy: every action is replaced by a uniform one, so nothing is chosen.
+
+    The arguments are those of `value_iteration`.
+    """
+    return solution_of(random_actions(mdp, 1.0), BEST, tolerance, horizon, progress=progress, values=values)
 
 
 def solution_of(
@@ -65,6 +81,7 @@ def solution_of(
     horizon: int | None,
     keep_all: bool = False,
     progress: Callable[[int, float], None] | None = None,
+    values: str | os.PathLike | None = None,
 ) -> Solution:
     """The values of what is chosen: a fixed point, or those of backward induction where there is a horizon."""
     check_tolerance(tolerance)
@@ -72,13 +89,16 @@ def solution_of(
     watch = Stopwatch()
     steps = None
     if horizon is None:
-        values = fixed_point(mdp, select, tolerance, progress)
-        following = values.x
+        x = None if values is None else kept_values(values, (mdp.num_states + 1, mdp.width))
+        found = fixed_point(mdp, select, tolerance, progress, x)
+        following = found.x
+    elif values is not None:
+        raise ParameterError(f"values={str(values)!r}: a file keeps values without a horizon; found {horizon} steps")
     else:
-        values, following, steps = backward_induction(mdp, select, horizon, keep_all)
+        found, following, steps = backward_induction(mdp, select, horizon, keep_all)
     if steps is not None:
         steps = steps[:, :-1] if mdp.is_sticky else steps[:, :-1, 0]
-    return Solution(mdp, values.bound, values.sweeps, watch.seconds, horizon, select, values.x, following, steps)
+    return Solution(mdp, found.bound, found.sweeps, watch.seconds, horizon, select, found.x, following, steps)
 
 
 def check_tolerance(tolerance: float) -> None:

@@ -5,9 +5,7 @@ kernels/disk_table.py has its layout.
 
 import contextlib
 import mmap
-import os
-import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -15,11 +13,11 @@ import numpy as np
 from pharos.kernels import disk_table as kernels
 from pharos.kernels.hash_table import slots_of
 from pharos.state_space.files import cannot_write
+from pharos.state_space.memory_map import mapped_file
 
 LOAD = 0.7  # the table grows beyond this share of used slots
 LEAST = 1 << 16  # slots of the smallest table
 _AROUND = 1 << 19  # bytes that the system may bring along with a page (large folios)
-_BLOCK = 1 << 24
 
 
 class DiskTable:
@@ -40,7 +38,10 @@ class DiskTable:
         self._open(slots)
 
     def _open(self, slots: int) -> None:
-        self._mapping = _mapped(self.folder, slots * (self.num_words + 1) * 8)
+        try:
+            self._mapping = mapped_file(self.folder, slots * (self.num_words + 1) * 8)
+        except OSError as error:
+            raise cannot_write(self.folder / "the table of states", error) from error
         self.entries = np.frombuffer(self._mapping, np.uint64).reshape(slots, self.num_words + 1)
         self.capacity = int(slots * LOAD)
         self._touched = 0
@@ -98,25 +99,3 @@ def _let_go(mapping: mmap.mmap) -> None:
     if hasattr(mmap, "MADV_DONTNEED"):
         with contextlib.suppress(OSError):
             mapping.madvise(mmap.MADV_DONTNEED)
-
-
-def _mapped(folder: Path, size: int) -> mmap.mmap:
-    """A file of zeros, its room on the disk taken: a mapped file that finds the disk full when it is written kills the
-    process.
-    """
-    try:
-        with tempfile.TemporaryFile(dir=folder) as file:
-            if hasattr(os, "posix_fallocate"):
-                os.posix_fallocate(file.fileno(), 0, size)
-            else:
-                for block in _blocks(size):
-                    file.write(bytes(block))
-                file.flush()
-            return mmap.mmap(file.fileno(), size)
-    except OSError as error:
-        raise cannot_write(folder / "the table of states", error) from error
-
-
-def _blocks(size: int) -> Iterator[int]:
-    for start in range(0, size, _BLOCK):
-        yield min(_BLOCK, size - start)

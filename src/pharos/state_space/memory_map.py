@@ -1,10 +1,26 @@
-"""Arrays in reserved address space: memory is taken as they are written, in huge pages, and never copied to grow."""
+"""Arrays in reserved address space: memory is taken as they are written, in huge pages, and never copied to grow.
+
+And arrays that may be larger than memory: mapped files, of which the system keeps in memory what is used.
+"""
 
 import contextlib
+import math
 import mmap
+import os
 import sys
+import tempfile
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+
+from pharos import paths
+from pharos.errors import DiskFull
+from pharos.state_space import memory as machine
+
+# Bytes that are always taken from memory; beyond them, the share of what is free that one array may take.
+SMALL, SHARE = 1 << 26, 4
+_BLOCK = 1 << 24
 
 
 def reserved_states(num_words: int) -> np.ndarray:
@@ -36,3 +52,54 @@ def huge_pages(length: int, dtype: np.dtype) -> np.ndarray:
         with contextlib.suppress(OSError):
             memory.madvise(mmap.MADV_HUGEPAGE)
     return np.frombuffer(memory, dtype)
+
+
+def large_zeros(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
+    """An array of zeros: in memory, or, where it would take more than a quarter of what is free, a mapped file.
+
+    The file is in the cache's folder and has no name: it is gone with the array, whatever becomes of the process. What
+    is read and written in order, or near to where it was before, costs little more there than in memory.
+
+    Raises:
+        DiskFull: the file cannot be written.
+    """
+    dtype = np.dtype(dtype)
+    size = math.prod(shape) * dtype.itemsize
+    if size <= SMALL or size <= machine.available_memory() // SHARE:
+        return np.zeros(shape, dtype)
+    folder = paths.cache_directory()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        return np.frombuffer(mapped_file(folder, size), dtype).reshape(shape)
+    except OSError as error:
+        raise DiskFull(
+            f"{folder}: {size / 2**30:.1f} GiB of scratch, which memory has no room for: {error.strerror}; "
+            "free room on the disk, or set PHAROS_CACHE_DIR to a folder on another one"
+        ) from error
+
+
+def mapped_file(folder: Path, size: int) -> mmap.mmap:
+    """A file of zeros without a name, its room on the disk taken: a mapped file that finds the disk full when it is
+    written kills the process. OSError where it cannot be.
+    """
+    with tempfile.TemporaryFile(dir=folder) as file:
+        if hasattr(os, "posix_fallocate"):
+            os.posix_fallocate(file.fileno(), 0, size)
+        else:
+            for start in range(0, size, _BLOCK):
+                file.write(bytes(min(_BLOCK, size - start)))
+            file.flush()
+        return mmap.mmap(file.fileno(), size)
+
+
+def read_ahead(array: np.memmap, start: int, stop: int) -> None:
+    """Ask the system for rows of a mapped array, which will be read soon; it does so while this process works.
+
+    It finds out by itself what is read from the first byte to the last, but not what is read the other way round.
+    """
+    mapping = getattr(array, "_mmap", None)
+    if start < stop and isinstance(mapping, mmap.mmap) and hasattr(mmap, "MADV_WILLNEED"):
+        row = array.strides[0]
+        first = start * row // mmap.PAGESIZE * mmap.PAGESIZE
+        with contextlib.suppress(OSError, ValueError):
+            mapping.madvise(mmap.MADV_WILLNEED, first, stop * row - first)

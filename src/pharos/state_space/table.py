@@ -11,6 +11,8 @@ from pharos.state_space import memory as machine
 from pharos.state_space.memory_map import huge_pages, reserved_states, reserved_table
 
 LOAD = 0.5  # the table in memory grows beyond this share of used slots
+FULLEST = 0.8  # the same, where memory has no room for a table of twice the size
+SLOTS = 1 << 16  # a table has a multiple of them
 PARALLEL_FILL = 1 << 16  # states that are worth sharing between threads when the table grows
 LEFT_OVER = 1 << 12  # states that may pass the end of a part of the table, which are a handful
 INT32_STATES = 2**31 - 1
@@ -52,24 +54,39 @@ class MemoryTable:
         self.slots = np.empty(0, np.int32)
         self._space = reserved_table()
         self._margin, self._memory, self._share = margin, memory, share
+        self._load = LOAD
         self.forgotten = 0
 
     @property
     def room(self) -> int:
         """States that table and array of states can hold."""
-        return min(int(len(self.slots) * LOAD) + self.forgotten, len(self.states))
+        return min(int(len(self.slots) * self._load) + self.forgotten, len(self.states))
 
     def is_full(self, count: int) -> bool:
         """Whether the table must grow before a kernel goes on from `count` states."""
         return count + self._margin > self.room
 
     def fits(self, count: int, dtype: np.dtype, forgotten: int = 0) -> bool:
-        """Whether memory holds a table with room for about twice as many states, and the states."""
-        if count + self._margin > len(self.states):
-            return False
+        """Whether memory holds a table with room for more states, and the states."""
+        return count + self._margin <= len(self.states) and self._size_for(count, dtype, forgotten) is not None
+
+    def _size_for(self, count: int, dtype: np.dtype, forgotten: int) -> tuple[int, float] | None:
+        """(slots, share of them that may be used) of a larger table: with room for about twice as many states, or
+        fuller and as large as memory allows; None where that would be hardly more than there are."""
+        memory, bytes_of_state = self._limit(count), self.states.shape[1] * 8
         slots = self._slots_for(count - forgotten)
-        needed = slots * dtype.itemsize + (int(slots * LOAD) + forgotten) * self.states.shape[1] * 8
-        return needed <= (self._memory if self._memory is not None else machine.available_memory() // self._share)
+        if slots * dtype.itemsize + (int(slots * LOAD) + forgotten) * bytes_of_state <= memory:
+            return slots, LOAD
+        each = dtype.itemsize + FULLEST * bytes_of_state
+        slots = int((memory - forgotten * bytes_of_state) / each) // SLOTS * SLOTS
+        enough = slots * FULLEST >= 1.1 * (count - forgotten) + self._margin
+        return (slots, FULLEST) if enough else None
+
+    def _limit(self, count: int) -> int:
+        """Bytes for table and states: what is asked for; or what is free, and what they have already."""
+        if self._memory is not None:
+            return self._memory
+        return machine.available_memory() // self._share + self.slots.nbytes + count * self.states.shape[1] * 8
 
     def grow(
         self,
@@ -79,12 +96,14 @@ class MemoryTable:
         workers: int,
         parts: list[np.ndarray] | None = None,
     ) -> None:
-        """A table with room for about twice as many states, filled from the array of states.
+        """A larger table, see `fits`, filled from the array of states.
 
         parts: indices of the only ones that are wanted, part by part; None: all.
         """
         self.forgotten = 0 if parts is None else count - sum(map(len, parts))
-        slots = max(self._slots_for(count - self.forgotten), len(self.slots) if parts is not None else 0)
+        size = self._size_for(count, dtype, self.forgotten) or (self._slots_for(count - self.forgotten), LOAD)
+        slots = max(size[0], len(self.slots) if parts is not None else 0)
+        self._load = size[1]
         self.slots = np.empty(0, dtype)  # free the old one first, where it cannot grow in its place
         if self._space.nbytes < slots * dtype.itemsize:
             self._space = huge_pages(slots, dtype)
@@ -133,7 +152,7 @@ class MemoryTable:
         fill(self.slots, self.states, count)
 
     def _slots_for(self, count: int) -> int:
-        slots = 1 << 16
+        slots = SLOTS
         while slots * LOAD < 1.4 * count + self._margin:
             slots *= 2
         return slots

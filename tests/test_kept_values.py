@@ -1,0 +1,125 @@
+"""Values in files: the same as in memory, to the last bit, with bounds that hold from whatever a file holds."""
+
+import importlib
+import multiprocessing
+import os
+import signal
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import naive_exact
+from pharos.errors import FileFormatError, FolderLocked, ParameterError
+from pharos.mdp import TabularMDP
+from pharos.solvers import uniform_value, value_iteration
+from strategies import small_mdps
+
+memory_map = importlib.import_module("pharos.state_space.memory_map")
+
+
+def ring(size: int = 400, gamma: float = 0.99) -> TabularMDP:
+    """On by one or by two; the last state pays 1 and leads to the first: a sweep carries values once around."""
+    state = np.arange(size)
+    table = np.stack([(state + 1) % size, (state + 2) % size], axis=1)
+    rewards = np.zeros((size, 2))
+    rewards[-1, 0] = 1.0
+    return TabularMDP.from_arrays(table, rewards, gamma=gamma)
+
+
+@pytest.fixture
+def no_memory(monkeypatch):
+    """Whatever is large is in a mapped file, and nothing is small."""
+    monkeypatch.setattr(memory_map, "SMALL", 0)
+    monkeypatch.setattr(memory_map.machine, "available_memory", lambda: 0)
+
+
+def test_large_zeros_are_a_file_without_a_name_where_memory_has_no_room(tmp_path, monkeypatch, no_memory):
+    monkeypatch.setenv("PHAROS_CACHE_DIR", str(tmp_path / "cache"))
+    array = memory_map.large_zeros((3, 5), np.float64)
+    assert array.shape == (3, 5) and not array.any() and not array.flags.owndata
+    array[:] = np.arange(15).reshape(3, 5)
+    assert array.sum() == 105 and list((tmp_path / "cache").iterdir()) == []
+
+
+def test_values_in_files_are_those_in_memory_to_the_last_bit(tmp_path, monkeypatch):
+    mdp = ring()
+    expected = value_iteration(mdp)
+    kept = value_iteration(mdp, values=tmp_path / "values.npy")
+    assert (kept.x == expected.x).all() and kept.sweeps == expected.sweeps and kept.error_bound == expected.error_bound
+    assert (np.load(tmp_path / "values.npy", mmap_mode="r") == expected.x).all()
+    monkeypatch.setattr(memory_map, "SMALL", 0)
+    monkeypatch.setattr(memory_map.machine, "available_memory", lambda: 0)
+    assert (value_iteration(mdp).x == expected.x).all()
+
+
+def test_a_solve_goes_on_from_the_values_of_one_that_stopped(tmp_path):
+    mdp, path = ring(), tmp_path / "values.npy"
+    whole = value_iteration(mdp)
+    with pytest.raises(KeyboardInterrupt):
+        value_iteration(
+            mdp, values=path, progress=lambda sweeps, bound: _stop() if sweeps == whole.sweeps - 2 else None
+        )
+    resumed = value_iteration(mdp, values=path)
+    assert resumed.sweeps <= 2 and resumed.error_bound <= 1e-6 and (resumed.x == whole.x).all()
+    del resumed
+    assert value_iteration(mdp, values=path).sweeps == 1  # what is solved is solved
+
+
+def _stop():
+    raise KeyboardInterrupt
+
+
+@pytest.mark.long
+@settings(max_examples=60, deadline=None)
+@given(small_mdps(), st.integers(0, 2**32))
+def test_bounds_hold_from_whatever_a_file_holds(tmp_path_factory, mdp, seed):
+    path = tmp_path_factory.mktemp("any") / "values.npy"
+    rng = np.random.default_rng(seed)
+    anything = rng.choice([0.0, 1.0, -3.5, 1e6, np.nan, np.inf, 1e-300], (mdp.num_states + 1, mdp.width))
+    np.save(path, anything)
+    solution = value_iteration(mdp, values=path)
+    assert naive_exact.largest_error(solution.v, naive_exact.extreme_values(mdp)) <= solution.error_bound <= 1e-6
+
+
+@pytest.mark.long
+def test_a_killed_solve_leaves_values_to_go_on_from(tmp_path):
+    mdp, path = ring(20_000, 0.9999), tmp_path / "values.npy"
+    uniform_value(mdp, values=tmp_path / "compiled.npy", tolerance=1e3)  # compiles, before the child is forked
+    process = multiprocessing.get_context("fork").Process(target=_killed_in_sweep, args=(mdp, path, 5))
+    process.start()
+    process.join()
+    assert process.exitcode == -signal.SIGKILL
+    left = np.load(path)
+    assert np.isfinite(left).all() and left.any()
+    fresh = uniform_value(mdp, tolerance=1e-10)
+    resumed = uniform_value(mdp, tolerance=1e-10, values=path)
+    assert resumed.sweeps < fresh.sweeps
+    assert (abs(resumed.v - fresh.v) <= resumed.error_bound + fresh.error_bound).all()
+
+
+def _killed_in_sweep(mdp, path, last):
+    uniform_value(
+        mdp, 1e-10, values=path, progress=lambda n, _: os.kill(os.getpid(), signal.SIGKILL) if n == last else None
+    )
+
+
+def test_a_file_of_values_is_for_one_solve_of_one_mdp_at_a_time(tmp_path):
+    path = tmp_path / "values.npy"
+    solution = value_iteration(ring(), values=path)
+    with pytest.raises(FolderLocked, match="in use"):
+        value_iteration(ring(), values=path)
+    assert solution.v[-1] > 0
+    del solution
+    with pytest.raises(
+        FileFormatError, match=r"holds float64 of shape \(401, 1\); expected float64 of shape \(11, 1\)"
+    ):
+        value_iteration(ring(10), values=path)
+    path.write_bytes(b"something else")
+    with pytest.raises(FileFormatError, match="is no file of values"):
+        value_iteration(ring(), values=path)
+    with pytest.raises(ParameterError, match="without a horizon"):
+        value_iteration(ring(), values=tmp_path / "other.npy", horizon=3)
+    with pytest.raises(ParameterError, match="cannot be used for values"):
+        value_iteration(ring(), values=tmp_path)
