@@ -1,16 +1,22 @@
 """How fast is a state space built? Beside the paper's own method, and a program written by hand in C, all in one run.
 
-    python benchmarks/building.py [--quick]
+    python benchmarks/building.py [--quick] [--pairs] [INSTANCE ...]
 
 Prints states/s (files written, medians after a first run), and ratios: to Algorithm 1 in plain Python with RocksDB (the
 paper's method, once, on the same instance, of which it expands at most the first 3 million states, and with --quick the
 first 60 thousand, where it is faster: its table grows), to C with the same rules (the counts must agree), and for rules
 that are interpreted. Memory is the growth of the resident set of a process of its own.
+
+C and pharos alternate, and each ratio is the median over such pairs: of the time by the clock, and of processor time,
+which other work on the machine moves less. Three programs in C: with a table that doubles, as that of pharos does; the
+same with its files on the disk at the end, as those of pharos are; and one with a table of its final size from the
+start, which nobody knows beforehand. --pairs leaves the rest out.
 """
 
 import importlib.util
 import inspect
 import json
+import resource
 import statistics
 import subprocess
 import sys
@@ -67,30 +73,63 @@ def paper(env, folder, limit):
     return expanded / seconds
 
 
-def by_hand(options, log2, folder):
-    """(states, median states/s) of the C program."""
-    program = folder / "build"
-    source = HERE / "c" / "build.c"
-    subprocess.run(["gcc", "-O3", "-march=native", *options, str(source), "-o", str(program)], check=True)
-    rates = []
-    for _ in range(REPEATS + 1):
-        printed = subprocess.run(
-            [str(program), str(log2), str(folder)], check=True, capture_output=True, text=True
-        ).stdout
-        states, _, _, seconds = printed.split()
-        rates.append(int(states) / float(seconds))
-    return int(states), statistics.median(rates[1:])
+PROGRAMS = {"table doubles": [], "and files synchronised": ["-DSYNC"], "table of final size": ["-DFINAL_SIZE"]}
+WORKERS = {"one thread": 1, "all processors": None}
 
 
-def own(env):
-    """(states, median states/s) of pharos, files included."""
-    rates = []
-    for _ in range(REPEATS + 1):
-        with tempfile.TemporaryDirectory() as folder:
-            began = time.perf_counter()
-            space = pharos.build(env, Path(folder) / "space")
-            rates.append(space.num_states / (time.perf_counter() - began))
-    return space.num_states, statistics.median(rates[1:])
+def processor_seconds() -> float:
+    """Of this process, all its threads."""
+    used = resource.getrusage(resource.RUSAGE_SELF)
+    return used.ru_utime + used.ru_stime
+
+
+def built(env, workers):
+    """(states, seconds by the clock, of processors) of pharos, files included."""
+    with tempfile.TemporaryDirectory() as folder:
+        used, began = processor_seconds(), time.perf_counter()
+        space = pharos.build(env, Path(folder) / "space", workers=workers, progress=False)
+        return space.num_states, time.perf_counter() - began, processor_seconds() - used
+
+
+def built_by_hand(program, log2):
+    """The same of the C program."""
+    with tempfile.TemporaryDirectory() as folder:
+        printed = subprocess.run([str(program), str(log2), folder], check=True, capture_output=True, text=True).stdout
+        states, _, _, seconds, processor = printed.split()
+        return int(states), float(seconds), float(processor)
+
+
+def side_by_side(name):
+    """(states, {way: (N, 2) seconds by the clock and of processors}), all ways in turn, N times after a first."""
+    options, log2 = GAMES[name]
+    env = pharos.make(name)
+    with tempfile.TemporaryDirectory() as folder:
+        source = HERE / "c" / "build.c"
+        for i, flags in enumerate(PROGRAMS.values()):
+            command = ["gcc", "-O3", "-march=native", *options, *flags, str(source), "-o", f"{folder}/{i}"]
+            subprocess.run(command, check=True)
+        seconds, counts = {}, set()
+        for turn in range(REPEATS + 1):
+            runs = {f"C, {way}": built_by_hand(Path(folder) / str(i), log2) for i, way in enumerate(PROGRAMS)}
+            runs |= {f"pharos, {way}": built(env, workers) for way, workers in WORKERS.items()}
+            counts |= {run[0] for run in runs.values()}
+            if turn:
+                for way, run in runs.items():
+                    seconds.setdefault(way, []).append(run[1:])
+    assert len(counts) == 1, f"{name}: pharos and C count {sorted(counts)} states"
+    return counts.pop(), seconds
+
+
+def print_pairs(seconds):
+    """Medians of each way, and of the ratios of pharos to C."""
+    for way, runs in seconds.items():
+        clock, processor = (statistics.median(run[k] for run in runs) for k in range(2))
+        print(f"  {way:30} {clock:7.3f} s by the clock, {processor:7.3f} s of processors", flush=True)
+    for own in (way for way in seconds if way.startswith("pharos")):
+        for other in (way for way in seconds if way.startswith("C")):
+            pairs = list(zip(seconds[own], seconds[other], strict=True))
+            clock, processor = (statistics.median(a[k] / b[k] for a, b in pairs) for k in range(2))
+            print(f"  {own} / {other}: {clock:.2f} by the clock, {processor:.2f} of processors", flush=True)
 
 
 MEMORY = """
@@ -160,20 +199,23 @@ def interpreted(env):
 
 def main() -> None:
     """Measure and print."""
-    for name, (options, log2) in GAMES.items():
+    for name in [name for name in sys.argv[1:] if name in GAMES] or GAMES:
+        states, seconds = side_by_side(name)
+        print(f"{name}: {states:,} states")
+        print_pairs(seconds)
+        if "--pairs" in sys.argv:
+            continue
+        rate = states / statistics.median(run[0] for run in seconds["pharos, all processors"])
         env = pharos.make(name)
-        with tempfile.TemporaryDirectory() as folder:
-            c_states, c_rate = by_hand(options, log2, Path(folder))
-        states, rate = own(env)
-        assert states == c_states, f"{name}: {states} states, {c_states} in C"
         with tempfile.TemporaryDirectory() as folder:
             python_rate = paper(env, Path(folder), min(PYTHON_STATES, states))
         print(
-            f"{name}: {states:,} states; pharos {rate / 1e6:.2f} M states/s, C {c_rate / 1e6:.2f} M, "
-            f"paper's method {python_rate / 1e3:.1f} k; ratio to the paper's method {rate / python_rate:.0f}, "
-            f"time relative to C {c_rate / rate:.2f}, {memory(name):.1f} bytes of memory a state",
+            f"  pharos {rate / 1e6:.2f} M states/s, paper's method {python_rate / 1e3:.1f} k; ratio to the paper's "
+            f"method {rate / python_rate:.0f}, {memory(name):.1f} bytes of memory a state",
             flush=True,
         )
+    if "--pairs" in sys.argv:
+        return
     for name in ("breakout", "freeway"):
         states, rate, reference = interpreted(pharos.make(name))
         print(

@@ -322,3 +322,26 @@ def test_nothing_heavy_is_loaded():
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
     assert Path(storage.__file__).name == "storage.py"
+
+
+def test_what_is_appended_is_sent_on_to_the_disk_without_gaps(tmp_path, monkeypatch):
+    from pharos.state_space.files import SENT_BYTES, GrowingFile
+
+    sent = []
+    monkeypatch.setattr(storage, "write_out", lambda descriptor, start, size: sent.append((start, start + size)))
+    file = GrowingFile(tmp_path / "file")
+    for _ in range(5):
+        file.append(np.zeros(SENT_BYTES // 8 // 2 + 1))
+    file.close()
+    assert len(sent) == 2 and sent[0][0] == 0
+    assert sent[0][1] == sent[1][0]
+
+
+def test_asking_the_system_to_write_out_changes_nothing_and_fails_nowhere(tmp_path, monkeypatch):
+    with open(tmp_path / "file", "wb", buffering=0) as file:
+        file.write(b"abc")
+        storage.write_out(file.fileno(), 0, 3)
+        storage.write_out(-1, 0, 3)
+        monkeypatch.setattr(storage, "_sync_file_range", lambda: None)
+        storage.write_out(file.fileno(), 0, 3)
+    assert (tmp_path / "file").read_bytes() == b"abc"

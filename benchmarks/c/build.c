@@ -5,8 +5,10 @@
  *     build LOG2_OF_TABLE FOLDER
  *
  * First in, first out; a table of 32-bit indices with keys looked up in the array of states, at most half full; a batch of
- * states is expanded and their slots prefetched before they are inserted. Writes states and successors to FOLDER.
- * Prints states, terminal states, depth, seconds.
+ * states is expanded and their slots prefetched before they are inserted. The table begins with 2^16 slots and doubles
+ * when it is half full, as that of pharos does; LOG2_OF_TABLE is its final size, which bounds the arrays, in address space.
+ * With -DFINAL_SIZE it has that size from the start. Writes states and successors to FOLDER; with -DSYNC they are on the
+ * disk at the end. Prints states, terminal states, depth, seconds, and seconds of processor time.
  */
 #define _GNU_SOURCE
 #include <stdint.h>
@@ -15,6 +17,7 @@
 #include <string.h>
 #include <sys/mman.h>
 #include <time.h>
+#include <unistd.h>
 
 #define BATCH 16
 typedef uint64_t u64;
@@ -144,12 +147,51 @@ static void *room(size_t bytes) {
     return p;
 }
 
+/* Twice the slots: zeroed, and filled from the array of states, a batch prefetched at a time. */
+static void fill(int32_t *table, u64 slots, const u64 *states, u64 count) {
+    u64 mask = slots - 1, at[32];
+    memset(table, 0, slots * 4);
+    for (u64 first = 0; first < count; first += 32) {
+        int width = count - first < 32 ? count - first : 32;
+        for (int i = 0; i < width; i++) {
+            at[i] = hash(states + (first + i) * WORDS) & mask;
+            __builtin_prefetch(table + at[i], 1);
+        }
+        for (int i = 0; i < width; i++) {
+            while (table[at[i]]) at[i] = (at[i] + 1) & mask;
+            table[at[i]] = first + i + 1;
+        }
+    }
+}
+
+static void write_file(const char *folder, const char *name, const void *data, size_t size, size_t count) {
+    char path[4096];
+    snprintf(path, sizeof path, "%s/%s", folder, name);
+    FILE *file = fopen(path, "wb");
+    if (!file || fwrite(data, size, count, file) != count) exit(4);
+#ifdef SYNC
+    if (fflush(file) || fsync(fileno(file))) exit(4);
+#endif
+    if (fclose(file)) exit(4);
+}
+
+static double seconds_of(clockid_t clock) {
+    struct timespec at;
+    clock_gettime(clock, &at);
+    return at.tv_sec + 1e-9 * at.tv_nsec;
+}
+
 int main(int argc, char **argv) {
     if (argc != 3) return 2;
-    u64 slots = 1ull << atoi(argv[1]), mask = slots - 1, most = slots / 2;
-    struct timespec a, b;
-    clock_gettime(CLOCK_MONOTONIC, &a);
-    int32_t *table = room(slots * 4), *next = room(most * ACTIONS * 4);
+    u64 last = 1ull << atoi(argv[1]), most = last / 2;
+#ifdef FINAL_SIZE
+    u64 slots = last;
+#else
+    u64 slots = 1 << 16;
+#endif
+    u64 mask = slots - 1;
+    double began = seconds_of(CLOCK_MONOTONIC);
+    int32_t *table = room(last * 4), *next = room(most * ACTIONS * 4);
     u64 *states = room(most * WORDS * 8);
     State s = start();
     u64 count = 1, ended = 0, depth = 0, last_of_level = 0;
@@ -157,6 +199,10 @@ int main(int argc, char **argv) {
     table[hash(states) & mask] = 1;
     for (u64 head = 0; head < count;) {
         int width = count - head < BATCH ? count - head : BATCH;
+        if (slots < last && count + BATCH * ACTIONS > slots / 2) {
+            slots *= 2, mask = slots - 1;
+            fill(table, slots, states, count);
+        }
         u64 keys[BATCH * ACTIONS][WORDS], slot[BATCH * ACTIONS];
         char over[BATCH];
         for (int i = 0; i < width; i++) {
@@ -188,14 +234,9 @@ int main(int argc, char **argv) {
             }
         }
     }
-    char path[4096];
-    snprintf(path, sizeof path, "%s/states.bin", argv[2]);
-    FILE *file = fopen(path, "wb");
-    if (!file || fwrite(states, WORDS * 8, count, file) != count || fclose(file)) return 4;
-    snprintf(path, sizeof path, "%s/successors.bin", argv[2]);
-    file = fopen(path, "wb");
-    if (!file || fwrite(next, ACTIONS * 4, count, file) != count || fclose(file)) return 4;
-    clock_gettime(CLOCK_MONOTONIC, &b);
-    printf("%lu %lu %lu %.6f\n", count, ended, depth, (b.tv_sec - a.tv_sec) + 1e-9 * (b.tv_nsec - a.tv_nsec));
+    write_file(argv[2], "states.bin", states, WORDS * 8, count);
+    write_file(argv[2], "successors.bin", next, ACTIONS * 4, count);
+    printf("%lu %lu %lu %.6f %.6f\n", count, ended, depth, seconds_of(CLOCK_MONOTONIC) - began,
+           seconds_of(CLOCK_PROCESS_CPUTIME_ID));
     return 0;
 }

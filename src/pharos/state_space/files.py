@@ -14,6 +14,9 @@ from pharos import storage
 from pharos.errors import DiskFull, StateSpaceCorrupted, StateSpaceLocked
 from pharos.state_space.manifest import AGAIN, CHECKSUM_BYTES, MANIFEST, digest_of
 
+# Appended bytes that are sent on to the disk together, while the search goes on.
+SENT_BYTES = 1 << 20
+
 
 class GrowingFile:
     """A file that is appended to, its length, and one checksum for every CHECKSUM_BYTES of it."""
@@ -26,6 +29,7 @@ class GrowingFile:
         self._partial_bytes = 0
         self._failure: DiskFull | None = None
         self._unsynced: DiskFull | None = None
+        self._sent = 0  # bytes that the system was asked to write out
         try:
             self._file = open(path, "r+b" if committed else "w+b", buffering=0)  # noqa: SIM115
         except OSError as error:
@@ -43,6 +47,7 @@ class GrowingFile:
         self._file.seek(0)
         while block := self._file.read(CHECKSUM_BYTES):
             self._note(memoryview(block))
+        self._sent = self.bytes
         if self.entry()["checksums"] != committed["checksums"] or self.bytes != committed["bytes"]:
             raise StateSpaceCorrupted(
                 f"{self.path}: does not match the checksums of its last checkpoint: it was changed; {AGAIN}"
@@ -61,6 +66,9 @@ class GrowingFile:
             self._failure = cannot_write(self.path, error)
             raise self._failure from error
         self._note(data)
+        if self.bytes - self._sent >= SENT_BYTES:
+            storage.write_out(self._file.fileno(), self._sent, self.bytes - self._sent)
+            self._sent = self.bytes
 
     def _note(self, data: memoryview) -> None:
         self.bytes += len(data)
