@@ -39,7 +39,7 @@ from pharos.errors import PharosError
 from pharos.hardness import kernel_spectrum
 from pharos.hardness.kernel_operator import Exact
 from pharos.hardness.kernel_regret import RAREST
-from pharos.hardness.mean_field import WORST_GREEDY, Learner, _Memory
+from pharos.hardness.mean_field import WORST_GREEDY, Learner, Memory
 from pharos.hardness.representation import Grouped
 from pharos.hardness.standard_occupancy import standard_occupancy
 from pharos.observations import Network, network_inputs, observe, representation, tangent_kernel
@@ -237,9 +237,9 @@ class Cell:
     def _uniform_values(self):
         """(C, A): of uniform play, with the learner's discount."""
         mdp, gamma = self.learner.mdp, self.schedule.gamma
-        memory = _Memory(mdp, self.learner.states)
+        memory = Memory(mdp, self.learner.states)
         policy = np.full((len(self.learner.states), mdp.num_actions), 1 / mdp.num_actions)
-        memory.play(self.learner._everywhere(policy), policy, self.learner.episode, 1)
+        memory.play(self.learner.everywhere(policy), policy, self.learner.episode, 1)
         v = np.zeros(len(policy))
         for _ in range(200):
             q, visits = memory.targets(v, gamma)
@@ -255,7 +255,7 @@ class Paced(Learner):
         vars(self).update(vars(learner))
         self.rate = hyperparameters["learning_rate"] * np.sqrt(hyperparameters["batch_size"])
 
-    def _learnt(self, apply, weights, error, vector):
+    def learnt(self, apply, weights, error, vector):
         largest = 1.05 * apply.largest_eigenvalue(weights.max(axis=1, keepdims=True), vector)
         rms = float(np.sqrt((weights * error**2).sum()))
         if not largest > 0 or not rms > 0:
@@ -281,9 +281,9 @@ class PolicyGradient:
         v, regrets = np.zeros(len(learner.states)), []
         for _ in range(0, steps, ROLLOUT):
             policy = _softmax(logits)[observations.groups]
-            memory = _Memory(learner.mdp, learner.states)
-            played, _ = memory.play(learner._everywhere(policy), policy, learner.episode, 1)
-            regrets.append(learner._regret(played if learner._is_return else learner._value(policy)))
+            memory = Memory(learner.mdp, learner.states)
+            played, _ = memory.play(learner.everywhere(policy), policy, learner.episode, 1)
+            regrets.append(learner.regret(played if learner.is_return else learner.value(policy)))
             for _ in range(60):
                 q, visits = memory.targets(v, self.gamma)
                 v = (policy * q).sum(axis=1)

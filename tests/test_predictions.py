@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 from pharos import study
 from pharos.cli import app
 from pharos.errors import FileFormatError, ParameterError, ResultCorrupted
-from pharos.study import read_predictions, specification, validation, write_predictions
+from pharos.study import POLICY_PREDICTORS, read_predictions, specification, validation, write_predictions
 
 SPEC = {
     "name": "tiny",
@@ -35,6 +35,8 @@ def test_every_cell_that_sees_observations_is_predicted(predicted):
     assert predicted["agent"].tolist() == ["dqn", "dqn", "ppo", "ppo"]
     assert predicted["network"].tolist() == ["mlp128x2, pytorch"] * 2 + ["mlp128x2+tanh, sb3"] * 2
     assert predicted[list(study.PREDICTORS)].notna().all().all()
+    of_policies = predicted[list(POLICY_PREDICTORS)].notna()
+    assert of_policies.all(axis=1).tolist() == of_policies.any(axis=1).tolist() == [False, False, True, True]
     plain, hidden = predicted.iloc[0], predicted.iloc[1]
     assert plain["aliasing_floor"] == 0 < hidden["aliasing_floor"]
     assert plain["kernel_regret"] <= hidden["kernel_regret"]

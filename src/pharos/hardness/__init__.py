@@ -22,10 +22,11 @@ from pharos.hardness.kernel_spectrum import (
     kernel_learning_time,
     kernel_sample_complexity,
 )
-from pharos.hardness.mean_field import LearningCurve, Schedule
+from pharos.hardness.mean_field import LearningCurve, Rollouts, Schedule
 from pharos.hardness.mismatch import distribution_mismatch
 from pharos.hardness.mixing_time import MixingTime, mixing_time
 from pharos.hardness.occupancy import Occupancy, discounted_visits, occupancy
+from pharos.hardness.policy_regret import kernel_policy_regret
 from pharos.hardness.registry import Measure, Problem, chosen, measures, register
 from pharos.hardness.report import Report, Result, report
 from pharos.hardness.representation import Representation
@@ -56,6 +57,7 @@ __all__ = [
     "Representation",
     "Result",
     "ReturnDistribution",
+    "Rollouts",
     "Schedule",
     "Spectral",
     "StationaryHorizon",
@@ -73,6 +75,7 @@ __all__ = [
     "gaps",
     "gorp_bound",
     "kernel_learning_time",
+    "kernel_policy_regret",
     "kernel_regret",
     "kernel_sample_complexity",
     "measures",

@@ -15,6 +15,7 @@ from pharos.hardness.kernel_regret import kernel_regret
 from pharos.hardness.kernel_spectrum import aliasing_floor, kernel_learning_time, kernel_sample_complexity
 from pharos.hardness.mismatch import distribution_mismatch
 from pharos.hardness.mixing_time import mixing_time
+from pharos.hardness.policy_regret import kernel_policy_regret
 from pharos.hardness.registry import Problem, register
 from pharos.hardness.stationary_horizon import stationary_effective_horizon
 from pharos.hardness.value_norm import certified_value_norm
@@ -201,6 +202,24 @@ register(
     definition="mean over learning of (V* - V of the greedy policy) / (V* - V of uniform play) of expected Q-learning "
     "in the tangent kernel of the agent's network; as played; and both of tabular Q-learning",
     source="pharos; after Sirignano and Spiliopoulos (2019)",
+    complexity="representation",
+    version=1,
+    depends="representation",
+    on_request=True,
+)
+register(
+    "kernel_policy_regret",
+    lambda problem: kernel_policy_regret(
+        problem.mdp,
+        problem.seen("kernel_policy_regret"),
+        schedule=problem.schedule,
+        rollouts=problem.rollouts,
+        solution=problem.solution,
+        horizon=problem.horizon,
+    ),
+    definition="mean over learning of (V* - V of the most probable actions) / (V* - V of uniform play) of an expected "
+    "actor-critic in the tangent kernel of the agent's network; as played; and both of a table",
+    source="pharos; Sutton et al. (2000), Schulman et al. (2016, 2017)",
     complexity="representation",
     version=1,
     depends="representation",

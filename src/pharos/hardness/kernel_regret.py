@@ -32,6 +32,7 @@ class KernelRegret:
         landmarks: of the approximation; None: the kernel is exact.
         estimated_error: half of the landmarks change the value by that much: an estimate, not a bound; 0 where exact.
         conventions: schedule, episode, observation and network.
+        name: of the measure.
     """
 
     curve: LearningCurve
@@ -41,6 +42,7 @@ class KernelRegret:
     landmarks: int | None
     estimated_error: float
     conventions: Mapping[str, Any] = field(default_factory=dict)
+    name: str = "kernel_regret"
 
     @property
     def value(self) -> float:
@@ -53,7 +55,7 @@ class KernelRegret:
         if self.landmarks is None:
             return ""
         return (
-            f"kernel_regret: by {self.landmarks} landmarks of {self.observations:,} observations; half of them change "
+            f"{self.name}: by {self.landmarks} landmarks of {self.observations:,} observations; half of them change "
             f"it by {self.estimated_error:.2g}, which is an estimate of its error and no bound"
         )
 
@@ -119,21 +121,42 @@ def kernel_regret(
     representation.check(mdp.num_states)
     episode = representation.episode(mdp.horizon if horizon is None else horizon, "kernel_regret")
     schedule = schedule or Schedule()
-    learner = Learner(mdp, schedule, episode, solution)
+    found = learnt_in_kernel(mdp, Learner(mdp, schedule, episode, solution), representation)
+    conventions = {
+        "schedule": asdict(schedule),
+        "episode": episode,
+        "gamma": float(mdp.gamma),
+        "horizon": mdp.horizon,
+        "step_size": f"1 / ({MARGIN} largest eigenvalue of K diag(max_a d))",
+        "clipped": {"greedy": WORST_GREEDY, "played": WORST_PLAYED},
+        **representation.conventions,
+    }
+    return KernelRegret(*found, conventions)
+
+
+def learnt_in_kernel(
+    mdp: TabularMDP, learner: Learner, representation: Representation
+) -> tuple[LearningCurve, LearningCurve, int, int, int | None, float]:
+    """What a learner does with a kernel, by landmarks where there are too many observations, and with a table.
+
+    Returns:
+        The fields of a KernelRegret, in their order.
+    """
     everything = learner.numbers[learner.states]
     observations = Grouped(representation.classes, everything)
-    landmarks = representation.landmarks
+    landmarks, error = representation.landmarks, 0.0
     if landmarks is None and len(observations) > MOST_EXACT:
         landmarks = LANDMARKS
-    observed, error = observations.representatives, 0.0
+    observed, is_adam = observations.representatives, learner.schedule.optimizer == "adam"
     is_exact = not landmarks or landmarks >= len(observations)
     operator = Exact(representation.kernel, observed) if is_exact else None  # what does not fit is said at once
     tabular = learner.curve(Grouped(np.arange(mdp.num_states), everything), Identity())
-    if not is_exact or schedule.optimizer == "adam":
-        weights = observations.sums(standard_occupancy(mdp, schedule.gamma, episode).states[everything])
+    if not is_exact or is_adam:
+        standard = standard_occupancy(mdp, learner.schedule.gamma, learner.episode)
+        weights = observations.sums(standard.states[everything])
 
     def learnt(operator: KernelOperator) -> LearningCurve:
-        if schedule.optimizer == "adam":
+        if is_adam:
             operator.preconditioned(np.maximum(weights, RAREST * weights.max()))
         return learner.curve(observations, operator)
 
@@ -147,13 +170,4 @@ def kernel_regret(
             for some in (chosen, chosen[: max(1, landmarks // 2)])
         )
         error = abs(curve.mean_greedy - half.mean_greedy)
-    conventions = {
-        "schedule": asdict(schedule),
-        "episode": episode,
-        "gamma": float(mdp.gamma),
-        "horizon": mdp.horizon,
-        "step_size": f"1 / ({MARGIN} largest eigenvalue of K diag(max_a d))",
-        "clipped": {"greedy": WORST_GREEDY, "played": WORST_PLAYED},
-        **representation.conventions,
-    }
-    return KernelRegret(curve, tabular, len(observations), len(everything), landmarks, error, conventions)
+    return curve, tabular, len(observations), len(everything), landmarks, error

@@ -67,6 +67,29 @@ class Schedule:
         return first + (last - first) * share
 
 
+@dataclass(frozen=True, kw_only=True)
+class Rollouts:
+    """How the idealised actor-critic learns.
+
+    Attributes:
+        steps: of the environment in a rollout, after which policy and values learn.
+        gradient_steps: that they learn by.
+        gae_lambda: weight of longer returns, in returns and advantages.
+    """
+
+    steps: int = 512
+    gradient_steps: int = 16
+    gae_lambda: float = 0.95
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "gradient_steps"):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
+                raise ParameterError(f"rollouts: {name} is {value!r}; expected a whole number, at least 1")
+        if not 0 <= self.gae_lambda <= 1:
+            raise ParameterError(f"rollouts: gae_lambda is {self.gae_lambda!r}; expected a number in [0, 1]")
+
+
 @dataclass(frozen=True, eq=False)
 class LearningCurve:
     """What the idealised learner does in each of its J phases; regrets are normalised: 0 optimal, 1 uniform play.
@@ -128,16 +151,16 @@ class Learner:
         """Learn from observations, the groups of states that look alike, with a kernel over them."""
         schedule, actions = self.schedule, self.mdp.num_actions
         values = np.zeros((len(observations), actions))
-        memory = _Memory(self.mdp, self.states)
+        memory = Memory(self.mdp, self.states)
         vector = np.full((len(observations), 1), len(observations) ** -0.5)
         rows = []
         for step in range(0, schedule.steps, schedule.period):
             period, epsilon = min(schedule.period, schedule.steps - step), schedule.epsilon(step)
-            greedy = _greedy(values)[observations.groups]
+            greedy = greedy_policy(values)[observations.groups]
             policy = (1 - epsilon) * greedy + epsilon / actions
-            played, length = memory.play(self._everywhere(policy), policy, self.episode, period)
-            played = played if self._is_return else self._value(policy)
-            rows.append((step, self._regret(self._value(greedy)), self._regret(played), period / length))
+            played, length = memory.play(self.everywhere(policy), policy, self.episode, period)
+            played = played if self.is_return else self.value(policy)
+            rows.append((step, self.regret(self.value(greedy)), self.regret(played), period / length))
             if step < schedule.learning_starts:
                 continue
             q = values[observations.groups]
@@ -145,48 +168,61 @@ class Learner:
             weights = observations.sums(visits / visits.sum())
             total = observations.sums(visits / visits.sum() * target)
             error = np.divide(total, weights, out=values.copy(), where=weights > 0) - values
-            values += self._learnt(apply, weights, error, vector)
+            values += self.learnt(apply, weights, error, vector)
         return LearningCurve(*(np.array(column) for column in zip(*rows, strict=True)))
 
-    def _learnt(self, apply: KernelOperator, weights: np.ndarray, error: np.ndarray, vector: np.ndarray) -> np.ndarray:
-        """(C, A): what the gradient steps of a phase add. vector (C, 1): the last phase's eigenvector, replaced."""
-        largest = apply.largest_eigenvalue(weights.max(axis=1, keepdims=True), vector)
-        before = float((weights * error**2).sum())
-        while largest > 0 and before > 0:
-            with np.errstate(over="ignore", invalid="ignore"):  # where the eigenvalue was far too small
-                added = apply.descended(weights, error, 1 / (MARGIN * largest), self.schedule.gradient_steps)
-                after = float((weights * (error - added) ** 2).sum())
-            if after <= 1.001 * before:  # no step of a stable size makes it larger
-                return added
-            largest *= 1.1
-        return np.zeros_like(error)
+    def learnt(self, apply: KernelOperator, weights: np.ndarray, error: np.ndarray, vector: np.ndarray) -> np.ndarray:
+        """(C, A): what the gradient steps of a phase add; see `descent`."""
+        return descent(apply, weights, error, vector, self.schedule.gradient_steps)
 
     @property
-    def _is_return(self) -> bool:
+    def is_return(self) -> bool:
         """Whether a value is the expected return of an episode, so that walks tell it."""
         return self.mdp.gamma == 1.0 and self.mdp.horizon == self.episode
 
-    def _regret(self, value: float) -> float:
+    def regret(self, value: float) -> float:
+        """Normalised, of a policy's value."""
         return (self.optimal - value) / self.spread
 
-    def _value(self, policy: np.ndarray) -> float:
-        if self._is_return:
-            visits = visits_of(self.mdp, self._everywhere(policy), self.episode)
+    def value(self, policy: np.ndarray) -> float:
+        """Of a policy (N, A) of the states, at the start."""
+        if self.is_return:
+            visits = visits_of(self.mdp, self.everywhere(policy), self.episode)
             return float((visits.executed * self.mdp.rewards).sum())
         if policy.max(axis=1).min() == 1.0:
             actions = np.zeros(self.mdp.num_states, np.int64)
             actions[self.states] = policy.argmax(axis=1)
             return evaluate_policy(self.mdp, actions, ACCURACY * self.spread).value_at_start
-        return evaluate_policy(self.mdp, self._everywhere(policy), ACCURACY * self.spread).value_at_start
+        return evaluate_policy(self.mdp, self.everywhere(policy), ACCURACY * self.spread).value_at_start
 
-    def _everywhere(self, policy: np.ndarray) -> np.ndarray:
+    def everywhere(self, policy: np.ndarray) -> np.ndarray:
         """(S, A), uniform where nobody acts."""
         table = np.full((self.mdp.num_states, self.mdp.num_actions), 1 / self.mdp.num_actions)
         table[self.states] = policy
         return table
 
 
-class _Memory:
+def descent(
+    apply: KernelOperator, weights: np.ndarray, error: np.ndarray, vector: np.ndarray, steps: int
+) -> np.ndarray:
+    """(C, A): what `steps` gradient steps of the largest stable size add to values whose error is (C, A).
+
+    Args:
+        weights: (C, A), of the squared errors. vector: (C, 1), the last phase's eigenvector; replaced.
+    """
+    largest = apply.largest_eigenvalue(weights.max(axis=1, keepdims=True), vector)
+    before = float((weights * error**2).sum())
+    while largest > 0 and before > 0:
+        with np.errstate(over="ignore", invalid="ignore"):  # where the eigenvalue was far too small
+            added = apply.descended(weights, error, 1 / (MARGIN * largest), steps)
+            after = float((weights * (error - added) ** 2).sum())
+        if after <= 1.001 * before:  # no step of a stable size makes it larger
+            return added
+        largest *= 1.1
+    return np.zeros_like(error)
+
+
+class Memory:
     """Expected visits so far, by state, previously executed action and chosen action: the replay buffer."""
 
     def __init__(self, mdp: TabularMDP, states: np.ndarray):
@@ -247,7 +283,7 @@ def visits_of(mdp: TabularMDP, policy: np.ndarray, episode: int) -> Visits:
     return Visits(first, later, walk.executed(first, later))
 
 
-def _greedy(values: np.ndarray) -> np.ndarray:
+def greedy_policy(values: np.ndarray) -> np.ndarray:
     """(C, A) probabilities: the best action, or all that are as good up to rounding alike."""
     best = values >= (values.max(axis=1) - TIES * np.abs(values).max(axis=1))[:, None]
     return best / best.sum(axis=1, keepdims=True)

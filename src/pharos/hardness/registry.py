@@ -9,7 +9,7 @@ from typing import Any
 from pharos.errors import ParameterError, PrecisionError, UndefinedMeasure, UnknownName
 from pharos.hardness.gaps import Gaps, resolved_gaps
 from pharos.hardness.interval import Budget, Progress
-from pharos.hardness.mean_field import Schedule
+from pharos.hardness.mean_field import Rollouts, Schedule
 from pharos.hardness.representation import Representation
 from pharos.mdp import TabularMDP
 from pharos.solvers import Solution, value_iteration
@@ -28,6 +28,7 @@ class Problem:
         progress: called with the name of the running measure and a line on how far it is.
         representation: what the agent's network makes of the states, for measures that need one; or None.
         schedule: of the idealised learner.
+        rollouts: of the idealised actor-critic; None: those of `Rollouts`.
     """
 
     mdp: TabularMDP
@@ -38,6 +39,7 @@ class Problem:
     progress: Callable[[str, str], None] | None = None
     representation: Representation | None = None
     schedule: Schedule = field(default_factory=Schedule)
+    rollouts: Rollouts | None = None
 
     @cached_property
     def solution(self) -> Solution:

@@ -10,7 +10,7 @@ import numpy as np
 from pharos.compiling import Stopwatch
 from pharos.errors import ParameterError, PrecisionError, UndefinedMeasure
 from pharos.hardness.interval import Budget, Certificate, Certified, certificate_of
-from pharos.hardness.mean_field import Schedule
+from pharos.hardness.mean_field import Rollouts, Schedule
 from pharos.hardness.registry import Measure, Problem, chosen
 from pharos.hardness.representation import Representation
 from pharos.hardness.results_file import ResultsFile
@@ -118,6 +118,7 @@ def report(
     progress: Callable[[str, str], None] | None = None,
     representation: Representation | None = None,
     schedule: Schedule | None = None,
+    rollouts: Rollouts | None = None,
 ) -> Report:
     """Measure how hard an MDP is.
 
@@ -135,7 +136,7 @@ def report(
         progress: called with the name of the running measure and a line on how far it is.
         representation: what the agent's network makes of the states, `pharos.observations.representation`; with one,
             measures of it are part of the report.
-        schedule: of the idealised learner that these have.
+        schedule: of the idealised learner that these have; rollouts: of the actor-critic.
     Returns:
         A Report. A measure that does not exist for this MDP says why; the others are there.
     Raises:
@@ -151,7 +152,7 @@ def report(
         )
     wanted = chosen(measures, representation is not None)
     schedule = schedule or Schedule()
-    problem = Problem(mdp, horizon, tolerance, restart, Budget.of(budget), progress, representation, schedule)
+    problem = Problem(mdp, horizon, tolerance, restart, Budget.of(budget), progress, representation, schedule, rollouts)
     conventions = _conventions(problem)
     file = ResultsFile(mdp, conventions) if keep else None
     results = {measure.name: _measured(measure, problem, file) for measure in wanted}
@@ -228,6 +229,8 @@ def _conventions(problem: Problem) -> dict[str, Any]:
         if representation is None
         else {"representation": dict(representation.conventions), "schedule": asdict(problem.schedule)}
     )
+    if representation is not None and problem.rollouts is not None:
+        represented["rollouts"] = asdict(problem.rollouts)
     return {
         **represented,
         "gamma": float(mdp.gamma),

@@ -21,7 +21,7 @@ FILE = "hardness.json"
 FORMAT = 2
 
 # Conventions that the results of a measure depend on, by its `depends`; else all, but for these where it is "all".
-_OF_REPRESENTATIONS = ("representation", "schedule")
+_OF_REPRESENTATIONS = ("representation", "schedule", "rollouts")
 _DEPENDS = {
     "structure": ("chance", "restart"),
     "values": ("chance", "gamma", "horizon_of_values", "tolerance"),

@@ -19,7 +19,7 @@ from pharos.study.findings import findings
 from pharos.study.forecast import Forecast
 from pharos.study.logs import LOGGERS, RunLog, log
 from pharos.study.paper import paper_regressions, paper_returns
-from pharos.study.predictions import PREDICTORS, predict, read_predictions, write_predictions
+from pharos.study.predictions import POLICY_PREDICTORS, PREDICTORS, predict, read_predictions, write_predictions
 from pharos.study.regression import Fit, aggregate_r_squared, fit, fit_models, leave_one_class_out_r_squared
 from pharos.study.report import StudyReport, report
 from pharos.study.specification import presets, specification
@@ -29,6 +29,7 @@ from pharos.study.unseen_classes import outcomes, validation
 
 __all__ = [
     "LOGGERS",
+    "POLICY_PREDICTORS",
     "PREDICTORS",
     "Comparison",
     "Estimate",

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from pharos.hardness import Schedule
+    from pharos.mdp import TabularMDP
 
 MEASURES = ("kernel_regret", "kernel_learning_time", "kernel_sample_complexity", "aliasing_floor", "exploration_time")
 PREDICTORS = (
@@ -31,6 +32,9 @@ PREDICTORS = (
     *("kernel_learning_time", "kernel_sample_complexity", "aliasing_floor", "exploration_time", "num_states"),
 )
 """Columns of predictions, numbers; the larger, the harder. `adam_regret` is kernel regret with `optimizer="adam"`."""
+POLICY_PREDICTORS = ("policy_regret", "policy_regret_played", "policy_tabular_regret")
+"""Columns beside them where an agent is an actor-critic: `kernel_policy_regret`, as played, and of a table."""
+ACTOR_CRITICS = ("ppo", "a2c")
 CURVE_POINTS = 40
 _KEY = b"pharos.predictions"
 
@@ -47,7 +51,8 @@ def predict(
         Columns `environment`, `instance`, `chance`, `agent`, `observation`; PREDICTORS; `network`; `estimated_error`,
         that of `kernel_regret` where landmarks stand for the kernel; `curve` and `adam_curve`, the learner's steps and
         greedy regrets as JSON; `notes`, why a number is missing. The idealised learner has the steps of the run, and of
-        a DQN its discount, exploration and target network.
+        a DQN its discount, exploration and target network; of actor-critics, with the rollouts, steps and discount of
+        the agent, POLICY_PREDICTORS and `policy_curve`, NaN and "" in rows of others.
     Raises:
         ParameterError: the study has no such cell.
     Cost: measures of hardness are kept beside the state spaces, so that a second call is quick.
@@ -67,7 +72,8 @@ def predict(
         rows[key] = run.cell | _predicted(run)
     if not rows:
         raise ParameterError(f"study {study.name!r}: no agent learns from observations, so there is nothing to predict")
-    return pd.DataFrame(list(rows.values()))
+    frame = pd.DataFrame(list(rows.values()))
+    return frame.fillna({"policy_curve": ""}) if "policy_curve" in frame else frame
 
 
 def _predicted(run: Run) -> dict[str, Any]:
@@ -86,6 +92,8 @@ def _predicted(run: Run) -> dict[str, Any]:
         schedule = _schedule(run.config)
         measures = report(task.mdp, MEASURES, schedule=schedule, **options)
         rescaled = report(task.mdp, ["kernel_regret"], schedule=replace(schedule, optimizer="adam"), **options)
+        if run.config["agent"] in ACTOR_CRITICS:
+            row |= _of_policy(run.config, task.mdp, options)
     except PharosError as error:
         return {**row, "notes": str(error)}
     row |= {"num_states": float(task.mdp.num_states), "network": f"{name}, {initialisation}"}
@@ -103,6 +111,26 @@ def _predicted(run: Run) -> dict[str, Any]:
             row[measure] = float(value["value"] if isinstance(value, Mapping) else value)
     notes = (result.undefined or result.certificate.note for result in measures.results.values())
     return {**row, "notes": "; ".join(note for note in notes if note)}
+
+
+def _of_policy(config: Mapping[str, Any], mdp: "TabularMDP", options: Mapping[str, Any]) -> dict[str, Any]:
+    """What the idealised actor-critic says."""
+    from pharos.hardness import Rollouts, Schedule, report
+
+    name, own = "kernel_policy_regret", config["hyperparameters"]
+    steps = int(own.get("n_steps", 2048)) * int(own.get("n_envs", 1))
+    minibatches = math.ceil(steps / int(own["batch_size"])) if own.get("batch_size") else 1
+    rollouts = Rollouts(
+        steps=steps,
+        gradient_steps=minibatches * int(own.get("n_epochs", 1)),
+        gae_lambda=own.get("gae_lambda", Rollouts.gae_lambda),
+    )
+    schedule = Schedule(steps=config["steps"], gamma=own.get("gamma", Schedule.gamma))
+    regret = report(mdp, [name], schedule=schedule, rollouts=rollouts, **options)[name].value
+    if regret is None:
+        return {**dict.fromkeys(POLICY_PREDICTORS, math.nan), "policy_curve": ""}
+    numbers = (regret["value"], regret["played"], regret["tabular"])
+    return {**dict(zip(POLICY_PREDICTORS, numbers, strict=True)), "policy_curve": _curve(regret)}
 
 
 def _curve(regret: Mapping[str, Any]) -> str:

@@ -13,7 +13,7 @@ import numpy as np
 from pharos.errors import ParameterError
 from pharos.study import held_out as _held_out
 from pharos.study.mixed_models import mixed_fit
-from pharos.study.predictions import PREDICTORS
+from pharos.study.predictions import POLICY_PREDICTORS, PREDICTORS
 from pharos.study.tables import CELL
 from pharos.study.within_mdps import Pairs
 
@@ -27,7 +27,7 @@ OUTCOMES = {
     "cumulative": "cumulative regret of the training episodes, logarithm",
 }
 ABSOLUTE = "cumulative"  # in units of reward: judged only beside what random play would lose
-LINEAR = tuple(name for name in PREDICTORS if "regret" in name or name == "aliasing_floor")
+LINEAR = tuple(name for name in (*PREDICTORS, *POLICY_PREDICTORS) if "regret" in name or name == "aliasing_floor")
 """Predictors that enter as they are; the others as logarithms."""
 TENTH = 0.1
 RESAMPLES = 1000
@@ -35,7 +35,8 @@ PERMUTATIONS = 4999
 CONTROL = "tabular_regret"
 IMAGES, VECTOR = ("simple_image", "complex_image", "recorded"), "vector"
 TABULAR, SCALE, CLASSES = "tabular measures", "random play", "class alone"
-BASELINES = (CLASSES, SCALE, TABULAR, "exploration_time", "num_states", "tabular_regret", "tabular_regret_played")
+TABLES = ("tabular_regret", "tabular_regret_played", "policy_tabular_regret")  # the learners without a kernel
+BASELINES = (CLASSES, SCALE, TABULAR, "exploration_time", "num_states", *TABLES)
 P_VALUES = ("p_rho", "p_agreement", "p_slope")
 
 
@@ -90,7 +91,9 @@ def models_of(frame: "pd.DataFrame", predictors: Sequence[str], measures: Sequen
     Args:
         measures: tabular ones; each alone too, where there are no predictions.
     """
-    models = [Model(name, (name,), name in BASELINES) for name in predictors if name in frame]
+    models = [
+        Model(name, (name,), name in BASELINES) for name in predictors if name in frame and frame[name].notna().any()
+    ]
     if not models:
         models = [Model(name, (name,), True) for name in measures]
     if measures:
@@ -104,7 +107,7 @@ def validation(
     predictions: "pd.DataFrame | None",
     cells: "pd.DataFrame",
     *,
-    predictors: Sequence[str] = PREDICTORS,
+    predictors: Sequence[str] = (*PREDICTORS, *POLICY_PREDICTORS),
     measures: "pd.DataFrame | None" = None,
     least_classes: int = 3,
     permutations: int = PERMUTATIONS,

@@ -1,0 +1,165 @@
+"""The regret of an actor-critic in the kernel of an agent's network, in expectation: the twin of `kernel_regret`.
+
+An idealised PPO. Policy and values are functions in the space of the network's tangent kernel, rollouts are exact
+expected visits, and so are the returns towards which values learn and the advantages by which the policy does. With the
+identity in the place of the kernel it is tabular softmax policy gradient (Agarwal et al., 2021) with a learnt baseline.
+"""
+
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from pharos.hardness.kernel_operator import KernelOperator
+from pharos.hardness.kernel_regret import KernelRegret, learnt_in_kernel
+from pharos.hardness.mean_field import (
+    MARGIN,
+    WORST_GREEDY,
+    WORST_PLAYED,
+    Learner,
+    LearningCurve,
+    Memory,
+    Rollouts,
+    Schedule,
+    descent,
+    greedy_policy,
+)
+from pharos.hardness.representation import Grouped, Representation
+from pharos.mdp import TabularMDP, takes_mdp
+from pharos.solvers import Solution
+
+SPAN = 30.0  # logits differ by no more
+RETURNS = 1e-6  # relative change at which expected returns are known
+MOST_BACKUPS = 2000
+
+
+@takes_mdp
+def kernel_policy_regret(
+    mdp: TabularMDP,
+    representation: Representation,
+    *,
+    schedule: Schedule | None = None,
+    rollouts: Rollouts | None = None,
+    solution: Solution | None = None,
+    horizon: int | None = None,
+) -> KernelRegret:
+    """Return the expected regret of an actor-critic whose policy and values learn in the tangent kernel of a network.
+
+    With logits z = 0 and values V = 0, for each rollout, g gradient steps and the learner's discount:
+
+        pi = softmax(z);   d = the occupancy of pi, of sum 1;   G = r + gamma E[(1 - lambda) V(s') + lambda pi G(s')]
+        A = G - V, less its mean under d, divided by its standard deviation under d
+        g times:   V += eta K diag(d) (sum_a pi G - V)
+        g times:   z(., a) += eta K diag(d) p(a) (A(., a) - sum_b p(b) A(., b)),   p = softmax(z) at the step
+
+    which goes up PPO's objective E[p / pi A] without clipping. eta is 1 / (1.05 times the largest eigenvalue of
+    K diag(d)), d of states: no learning rate, and what K learns slowly stays slow.
+    The value is the mean over rollouts of (V* - V of the most probable actions) / (V* - V of uniform play); as played,
+    that of pi.
+
+    Args:
+        representation: the kernel; of an actor-critic `initialisation="sb3"`.
+        schedule: for its steps, discount and optimizer; None: that of `Schedule`.
+        rollouts: None: those of `Rollouts`.
+        solution: the optimal values of `mdp`, where they are known.
+        horizon: steps of an episode that the learner sees; None: the MDP's, else the time limit.
+    Returns:
+        A KernelRegret; a phase is a rollout. Actions whose logits are within 1e-6 of the state's largest one are
+        chosen alike by the greedy policy. Values are in the MDP's setting (gamma, horizon). Under sticky actions
+        returns are means over previous actions, weighted by visits.
+    Raises:
+        UndefinedMeasure: there is neither a horizon nor a time limit; or uniform play is optimal.
+        ParameterError: the representation is of other states, or its kernel does not fit into memory.
+    Cost: for each rollout g products of the kernel with A columns, and 4 sqrt(g) with one; a walk of T steps, two
+        values, and up to 14 / (1 - gamma lambda) backups. Landmarks as in `kernel_regret`.
+    Source: pharos; Sutton et al. (2000) for the gradient, Schulman et al. (2016) for G, Schulman et al. (2017) for the
+        objective, Agarwal et al. (2021) for tables.
+    """
+    representation.check(mdp.num_states)
+    episode = representation.episode(mdp.horizon if horizon is None else horizon, "kernel_policy_regret")
+    schedule, rollouts = schedule or Schedule(), rollouts or Rollouts()
+    learner = PolicyLearner(mdp, schedule, episode, solution, rollouts)
+    found = learnt_in_kernel(mdp, learner, representation)
+    conventions = {
+        "schedule": {name: asdict(schedule)[name] for name in ("steps", "gamma", "optimizer")},
+        "rollouts": asdict(rollouts),
+        "episode": episode,
+        "gamma": float(mdp.gamma),
+        "horizon": mdp.horizon,
+        "step_size": f"1 / ({MARGIN} largest eigenvalue of K diag(d))",
+        "clipped": {"greedy": WORST_GREEDY, "played": WORST_PLAYED},
+        **representation.conventions,
+    }
+    return KernelRegret(*found, conventions, "kernel_policy_regret")
+
+
+class PolicyLearner(Learner):
+    """An MDP, and actor-critics on it."""
+
+    def __init__(
+        self, mdp: TabularMDP, schedule: Schedule, episode: int, solution: Solution | None, rollouts: Rollouts
+    ):
+        super().__init__(mdp, schedule, episode, solution)
+        self.rollouts = rollouts
+
+    def curve(self, observations: Grouped, apply: KernelOperator) -> LearningCurve:
+        logits, values = np.zeros((len(observations), self.mdp.num_actions)), np.zeros((len(observations), 1))
+        of_actor, of_critic = (np.full((len(observations), 1), len(observations) ** -0.5) for _ in range(2))
+        returns = np.zeros((len(self.states), self.mdp.num_actions))
+        rows, steps = [], self.rollouts.gradient_steps
+        for step in range(0, self.schedule.steps, self.rollouts.steps):
+            behaviour = softmax(logits)
+            policy, memory = behaviour[observations.groups], Memory(self.mdp, self.states)
+            played, length = memory.play(self.everywhere(policy), policy, self.episode, 1)
+            played = played if self.is_return else self.value(policy)
+            greedy = self.value(greedy_policy(logits)[observations.groups])
+            count = min(self.rollouts.steps, self.schedule.steps - step) / length
+            rows.append((step, self.regret(greedy), self.regret(played), count))
+            v = values[observations.groups, 0]
+            returns, visits = self._returns(memory, policy, v, returns)
+            visits = visits / visits.sum()
+            weights = observations.sums(visits.sum(axis=1))[:, None]
+            goal = observations.sums((visits * (policy * returns).sum(axis=1, keepdims=True)).sum(axis=1))[:, None]
+            error = np.divide(goal, weights, out=values.copy(), where=weights > 0) - values
+            values = values + descent(apply, weights, error, of_critic, steps)
+            largest = apply.largest_eigenvalue(weights, of_actor)
+            pull = observations.sums(visits * _standardised(returns - v[:, None], visits))
+            if largest > 0:
+                logits = ascended(logits, pull, apply, 1 / (MARGIN * largest), steps)
+        return LearningCurve(*(np.array(column) for column in zip(*rows, strict=True)))
+
+    def _returns(
+        self, memory: Memory, policy: np.ndarray, v: np.ndarray, begin: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """((N, A), (N, A)): expected returns G of each choice, from values v (N,); and its visits."""
+        share, returns = self.rollouts.gae_lambda, begin
+        for _ in range(MOST_BACKUPS):
+            after = (1 - share) * v + share * (policy * returns).sum(axis=1)
+            before, (returns, visits) = returns, memory.targets(after, self.schedule.gamma)
+            if np.abs(returns - before).max() <= RETURNS * np.abs(returns).max():
+                break
+        return returns, visits
+
+
+def ascended(logits: np.ndarray, pull: np.ndarray, apply: KernelOperator, rate: float, steps: int) -> np.ndarray:
+    """Logits (C, A) after gradient steps up the sum of pull(., a) p(a) / pi(a), pi their policy before the first."""
+    behaviour = np.maximum(softmax(logits), 1e-30)
+    for _ in range(steps):
+        policy = softmax(logits)
+        of_action = pull * policy / behaviour
+        logits = logits + rate * apply(of_action - policy * of_action.sum(axis=1, keepdims=True))
+        logits = np.maximum(logits - logits.max(axis=1, keepdims=True), -SPAN)
+    return logits
+
+
+def softmax(logits: np.ndarray) -> np.ndarray:
+    """(C, A) probabilities."""
+    grown = np.exp(logits - logits.max(axis=1, keepdims=True))
+    return grown / grown.sum(axis=1, keepdims=True)
+
+
+def _standardised(advantages: np.ndarray, visits: np.ndarray) -> Any:
+    """(N, A) of mean 0 and standard deviation 1 under visits of sum 1; 0 where they are all the same."""
+    centred = advantages - (visits * advantages).sum()
+    spread = float(np.sqrt((visits * centred**2).sum()))
+    return centred / spread if spread > 1e-12 else np.zeros_like(centred)
