@@ -12,6 +12,7 @@ import numpy as np
 
 from pharos.errors import ParameterError, UndefinedMeasure
 from pharos.hardness.interval import Budget, Interval, Progress, Spending, conventions_of
+from pharos.hardness.lean_sweep import lean_diameter, lean_eccentricity, needs_more_than_memory
 from pharos.hardness.stochastic_diameter import stochastic_diameter
 from pharos.hardness.stochastic_eccentricity import stochastic_start_eccentricity
 from pharos.hardness.sum_sweep import SumSweep
@@ -51,7 +52,8 @@ def diameter(
         ParameterError: an option is out of range.
     Cost:
         deterministic: usually 3 to 100 breadth-first searches, each one pass over the table in the order of discovery;
-        memory 8 bytes an edge and 32 a state. Chance: see `stochastic_diameter`.
+        memory 8 bytes an edge and 32 a state. Where there is less, some ten sweeps over the table in place of each
+        search, and 12 bytes a state, which may be mapped files. Chance: see `stochastic_diameter`.
     Source: Jaksch, Ortner and Auer (2010), definition 1; Borassi et al. (2015), "Fast diameter and radius BFS-based
         computation in (weakly connected) real-world graphs", section 4.
     """
@@ -60,6 +62,8 @@ def diameter(
     graph = Graph.of(mdp, restart)
     if graph is None:
         return stochastic_diameter(mdp, restart, tolerance, spending)
+    if needs_more_than_memory(graph):
+        return lean_diameter(graph, spending, conventions_of(mdp, restart))
     return SumSweep(graph, spending, conventions_of(mdp, restart)).interval()
 
 
@@ -104,6 +108,8 @@ def start_eccentricity_interval(
     if graph is None:
         return stochastic_start_eccentricity(mdp, restart, tolerance, spending)
     starts = mdp.start_states[mdp.start_probabilities > 0]
+    if len(starts) == 1 and needs_more_than_memory(graph):
+        return lean_eccentricity(graph, int(starts[0]), spending, conventions_of(mdp, restart))
     weights = mdp.start_probabilities[mdp.start_probabilities > 0]
     mean, distance = np.zeros(graph.num_nodes), np.empty(graph.num_nodes, np.int32)
     note, infinite, largest = "", False, 0

@@ -68,7 +68,10 @@ def _leads_to_end(table: np.ndarray, terminal: np.ndarray) -> bool:
     """Whether a row that is followed holds -1; in blocks, for tables that are larger than memory."""
     block = 1 << 20
     for low in range(0, len(table), block):
-        ending = (table[low : low + block] < 0).any(axis=1)
+        rows = table[low : low + block]
+        if rows.min(initial=0) >= 0:
+            continue
+        ending = (rows < 0).any(axis=1)
         if (ending & ~np.asarray(terminal[low : low + block])).any():
             return True
     return False

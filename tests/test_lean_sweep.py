@@ -1,0 +1,81 @@
+"""Diameters by sweeps over the table, in two bytes a state: against all pairs, and where two bytes are too few."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from naive_hardness import distances
+from pharos import TabularMDP, hardness
+from pharos.hardness import lean_sweep
+from pharos.hardness.transition_graph import Graph
+from test_diameter import deterministic_mdps
+
+pytestmark = pytest.mark.long
+
+
+@pytest.fixture
+def no_memory(monkeypatch):
+    monkeypatch.setattr(lean_sweep, "available_memory", lambda: 0)
+    monkeypatch.setattr(lean_sweep, "_RANGE", 5)
+
+
+@settings(max_examples=150, deadline=None)
+@given(deterministic_mdps(), st.booleans())
+def test_the_diameter_is_the_largest_distance_between_any_two_states(mdp, restart):
+    d = distances(mdp, restart=restart)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(lean_sweep, "available_memory", lambda: 0)
+        patch.setattr(lean_sweep, "_RANGE", 5)
+        found = hardness.diameter(mdp, restart=restart)
+        eccentricity = hardness.start_eccentricity(mdp, restart=restart)
+    assert "sweeps over the table" in found.method
+    assert found.exact and found.lower == found.upper == d.max()
+    assert eccentricity == d[mdp.initial].max()
+    if np.isinf(d).any():
+        assert 1 <= found.unreachable_pairs <= np.isinf(d).sum() and not found.counted
+
+
+@settings(max_examples=100, deadline=None)
+@given(deterministic_mdps(), st.booleans(), st.sampled_from([np.int16, np.int32]))
+def test_sweeps_give_the_distances_of_searches(mdp, restart, dtype):
+    plain = Graph.of(mdp, restart)
+    graph = lean_sweep.LeanGraph(plain, dtype)
+    d = distances(mdp, restart=restart)
+    expected = np.where(np.isinf(d), graph.far, d).astype(dtype)
+    found = np.empty(graph.num_nodes, dtype)
+    for node in range(graph.num_nodes):
+        forward = graph.search_forward(node, found)
+        assert (found == expected[node]).all()
+        inside = d[node][np.isfinite(d[node])]
+        assert forward == (len(inside), inside.max(), inside.sum())
+        graph.search_backward(node, found)
+        assert (found == expected[:, node]).all()
+
+
+@pytest.mark.parametrize("size", (32_766, 32_767, 32_768, 40_000))
+def test_distances_that_two_bytes_cannot_hold_take_four(size, no_memory, monkeypatch):
+    monkeypatch.setattr(lean_sweep, "_RANGE", 1 << 22)
+    state = np.arange(size)
+    table = np.stack([(state + 1) % size, np.zeros_like(state)], axis=1)  # one step on, or back to the start
+    mdp = TabularMDP.from_arrays(table, np.zeros(table.shape))
+    widths, lean = [], lean_sweep.LeanGraph
+
+    def made(graph, dtype):
+        widths.append(dtype)
+        return lean(graph, dtype)
+
+    monkeypatch.setattr(lean_sweep, "LeanGraph", made)
+    found = hardness.diameter(mdp)
+    assert found.exact and found.upper == size - 1
+    assert (widths == [np.int16]) == (size < 2**15 - 1)
+
+
+def test_an_interval_is_proven_within_the_budget(no_memory):
+    rng = np.random.default_rng(0)
+    order = rng.permutation(300)
+    table = rng.integers(0, 300, (300, 2))
+    table[order, 0] = np.roll(order, 1)
+    mdp = TabularMDP.from_arrays(table, np.zeros((300, 2)))
+    found = hardness.diameter(mdp, budget=hardness.Budget(searches=2))
+    assert found.lower <= distances(mdp).max() <= found.upper
