@@ -69,6 +69,11 @@ def trained(agent, tasks, sets, steps, seeds):
     return means.reshape(shape), np.array(values).reshape(shape[0], shape[2])
 
 
+def named_values(text):
+    """{"gamma": 0.99, "n_steps": 5} of "gamma=0.99,n_steps=5"."""
+    return {name: json.loads(value) for name, value in (each.split("=") for each in text.split(",") if each)}
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("instance")
@@ -79,6 +84,7 @@ def main():
     parser.add_argument("--sets", type=int, default=10)
     parser.add_argument("--seeds", type=int, nargs="+", default=[1000])
     parser.add_argument("--group", action="append", default=[], help="hyperparameters of a group: NAME=VALUE,...")
+    parser.add_argument("--set", action="append", default=[], help="a set beside those drawn: NAME=VALUE,...")
     parser.add_argument("--out", type=Path, required=True)
     arguments = parser.parse_args()
     parameters = dict(each.split("=") for each in arguments.parameters)
@@ -100,9 +106,10 @@ def main():
     for number, text in enumerate(arguments.group or [""]):
         if any(trial["group"] == text for trial in found["trials"]):
             continue
-        own = {name: json.loads(value) for name, value in (each.split("=") for each in text.split(",") if each)}
+        own = named_values(text)
         rng = np.random.default_rng(number)
-        given = [{}, *(drawn_set(rng, SPACES[arguments.agent], 3) for _ in range(arguments.sets - 1))]
+        drawn = [drawn_set(rng, SPACES[arguments.agent], 3) for _ in range(arguments.sets - 1)]
+        given = [{}, *map(named_values, arguments.set), *drawn]
         began = time.process_time()
         means, values = trained(
             arguments.agent, tasks, [{**table, **own, **each} for each in given], arguments.steps, arguments.seeds
