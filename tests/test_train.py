@@ -11,6 +11,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 
@@ -357,6 +358,7 @@ def test_tabular_agents_need_the_core_alone(tmp_path):
     """In a process in which nothing that an extra brings is installed; what it wrote is read with and without."""
     code = f"""
 import sys
+import tempfile
 for name in ("torch", "stable_baselines3", "yaml", "pyarrow", "pandas", "matplotlib", "statsmodels", "pydantic"):
     sys.modules[name] = None
 import pharos
@@ -386,3 +388,22 @@ except pharos.errors.MissingExtra as error:
         (tmp_path / "run" / "curve.csv").write_text(changed)
         with pytest.raises((ResultCorrupted, FileFormatError), match=r"curve\.csv"):
             read_curve(tmp_path / "run")
+
+
+@pytest.mark.parametrize("verbose", [0, 1])
+def test_a_model_makes_no_folder_among_the_temporary_files(verbose, tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    task = Task(pharos.make("frozen_lake/4x4"), horizon=20)
+    model = Deep("ppo", task, {"n_steps": 16, "batch_size": 16, "verbose": verbose}, 16, 0, None).model
+    model._setup_learn(16)
+    assert len(model.logger.output_formats) == verbose
+    assert list(tmp_path.glob("SB3*")) == []  # PyTorch makes one of its own, when it is loaded
+
+
+@pytest.mark.long
+def test_the_process_that_workers_are_forked_from_leaves_no_folder_among_the_temporary_files(tmp_path):
+    loaded = subprocess.run(
+        [sys.executable, "-c", "import pharos.study.warm"], env=os.environ | {"TMPDIR": str(tmp_path)}
+    )
+    assert loaded.returncode == 0
+    assert list(tmp_path.glob("SB3*")) == []

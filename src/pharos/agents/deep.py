@@ -8,6 +8,7 @@ between representations, not between networks (the pharos paper, section 4.2).
 import importlib
 import inspect
 import math
+import sys
 from collections.abc import Mapping
 from typing import Any
 
@@ -148,8 +149,9 @@ def make_model(
         )
     except (TypeError, ValueError, AssertionError) as error:
         raise ParameterError(f"agent {_title(agent)!r} cannot be made: {error}") from error
-    if tensorboard is None and not options.get("verbose"):
-        from stable_baselines3.common.logger import Logger
+    if tensorboard is None:  # the logger that it would make itself leaves a folder among the temporary files
+        from stable_baselines3.common.logger import HumanOutputFormat, Logger
 
-        model.set_logger(Logger(folder=None, output_formats=[]))  # else a folder is left among the temporary files
+        told = [HumanOutputFormat(sys.stdout)] if options.get("verbose") else []
+        model.set_logger(Logger(folder=None, output_formats=told))
     return model

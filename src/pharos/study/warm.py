@@ -27,10 +27,16 @@ def _train() -> None:
     import gymnasium
     import torch
     from stable_baselines3 import DQN, PPO
+    from stable_baselines3.common.logger import Logger
 
     torch.set_num_threads(1)
-    DQN("MlpPolicy", gymnasium.make("CartPole-v1"), device="cpu", learning_starts=20, buffer_size=100).learn(60)
-    PPO("MlpPolicy", gymnasium.make("CartPole-v1"), device="cpu", n_steps=30, batch_size=30).learn(60)
+    env = gymnasium.make("CartPole-v1")
+    for model in (
+        DQN("MlpPolicy", env, device="cpu", learning_starts=20, buffer_size=100),
+        PPO("MlpPolicy", env, device="cpu", n_steps=30, batch_size=30),
+    ):
+        model.set_logger(Logger(folder=None, output_formats=[]))  # its own makes a folder among the temporary files
+        model.learn(60)
 
 
 with warnings.catch_warnings():
