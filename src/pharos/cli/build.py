@@ -1,7 +1,5 @@
 """pharos build: enumerate a state space."""
 
-import os
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -16,7 +14,17 @@ from pharos.cli.answers import (
     print_json,
     size_text,
 )
-from pharos.cli.options import Json, MaxStates, Memory, Parameters, TargetArgument, Workers, parse_size
+from pharos.cli.options import (
+    Json,
+    MaxStates,
+    Memory,
+    Parameters,
+    Processes,
+    TargetArgument,
+    Workers,
+    parse_size,
+    ranks_of,
+)
 from pharos.cli.target import parse_environment
 from pharos.compiling import Stopwatch
 
@@ -30,25 +38,15 @@ def build(
     out: Annotated[Path | None, typer.Option("--out", help="Folder to write; the cache when not given.")] = None,
     memory: Memory = None,
     workers: Workers = None,
-    processes: Annotated[
-        str,
-        typer.Option(
-            "--processes",
-            metavar="N|mpi",
-            help="Processes that share the work and the table; under mpiexec: those that it has started.",
-        ),
-    ] = "1",
+    processes: Processes = "1",
     max_states: MaxStates = None,
     json: Json = False,
 ) -> None:
     """Enumerate every state that can be reached, and its transitions, onto disk. The same command resumes."""
     from pharos import state_space
-    from pharos.ranks import launched
     from pharos.state_space import cached_folder
 
-    rank, size = launched()
-    if rank > 0:  # the first one speaks for all
-        sys.stdout = sys.stderr = open(os.devnull, "w")  # noqa: SIM115
+    ranks = ranks_of(processes)
     env = parse_environment(environment, parameters)
     limit = parse_size(memory)
     was_there = _is_there(out or cached_folder(env))
@@ -58,7 +56,7 @@ def build(
         out,
         memory=limit,
         workers=workers,
-        processes="mpi" if size > 1 else _number_or_mpi(processes),
+        processes=ranks,
         max_states=max_states,
     )
     seconds = watch.seconds
@@ -99,15 +97,6 @@ def build(
             ("folder", space.folder),
         ],
     )
-
-
-def _number_or_mpi(text: str) -> int | str:
-    """The value of --processes."""
-    if text == "mpi":
-        return text
-    if not text.isdigit():
-        raise typer.BadParameter(f"--processes {text}: expected a number, or mpi")
-    return int(text)
 
 
 def _outcomes(space: "StateSpace") -> list[tuple[str, str]]:

@@ -3,7 +3,9 @@
 import ast
 import dataclasses
 import json
+import os
 import re
+import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -57,6 +59,14 @@ Memory = Annotated[
     str | None, typer.Option("--memory", metavar="SIZE", help="Memory to use at most, such as 2GiB or 500MB.")
 ]
 Workers = Annotated[int | None, typer.Option("--workers", min=1, help="Threads; all processors when not given.")]
+Processes = Annotated[
+    str,
+    typer.Option(
+        "--processes",
+        metavar="N|mpi",
+        help="Processes that share the work and the memory; under mpiexec: those that it has started.",
+    ),
+]
 Gamma = Annotated[
     float | None,
     typer.Option(
@@ -151,6 +161,22 @@ def discount(gamma: float | None, horizon: int | None) -> float:
 def build_options(memory: str | None, workers: int | None, max_states: int | None) -> dict[str, Any]:
     """What `build` takes, of --memory, --workers and --max-states."""
     return {"memory": parse_size(memory), "workers": workers, "max_states": max_states}
+
+
+def ranks_of(processes: str) -> int | str:
+    """The value of --processes; "mpi" in a process that a launcher has started with others. All but the first of them
+    are silent from here on.
+    """
+    from pharos.ranks import launched
+
+    rank, size = launched()
+    if rank > 0:  # the first one speaks for all
+        sys.stdout = sys.stderr = open(os.devnull, "w")  # noqa: SIM115
+    if size > 1 or processes == "mpi":
+        return "mpi"
+    if not processes.isdigit():
+        raise typer.BadParameter(f"--processes {processes}: expected a number, or mpi")
+    return int(processes)
 
 
 def check_format(path: Path, suffixes: Sequence[str], option: str = "--out") -> str:

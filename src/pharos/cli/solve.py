@@ -22,12 +22,14 @@ from pharos.cli.options import (
     MaxStates,
     Memory,
     Parameters,
+    Processes,
     Random,
     Sticky,
     TargetArgument,
     Workers,
     build_options,
     check_format,
+    ranks_of,
 )
 from pharos.cli.target import parse_target
 from pharos.wording import many
@@ -56,31 +58,44 @@ def solve(
     ] = None,
     memory: Memory = None,
     workers: Workers = None,
+    processes: Processes = "1",
+    jacobi: Annotated[
+        bool,
+        typer.Option("--jacobi", help="Many more sweeps, and values whose bits do not depend on --processes."),
+    ] = False,
     max_states: MaxStates = None,
     json: Json = False,
 ) -> None:
-    """Find the optimal values and policy, with a proven error bound."""
+    """Find the optimal values and policy, with a proven error bound. With --processes the same command resumes."""
+    ranks = ranks_of(processes)
     if out is not None:
         check_format(out, (".npz", ".npy"))
     building = build_options(memory, workers, max_states)
     chance = {"sticky": sticky, "random": random, "lazy": lazy}
-    mdp = parse_target(target, parameters).mdp(gamma=gamma, horizon=horizon, **chance, **building)
+    mdp = parse_target(target, parameters).mdp(gamma=gamma, horizon=horizon, **chance, **building, processes=ranks)
+    from pharos import paths
     from pharos.solvers import uniform_value, value_iteration
 
+    checkpoint = (values or paths.cache_directory() / "values") if ranks != 1 else None
+    sharing: dict[str, Any] = {"processes": ranks, "jacobi": jacobi, "checkpoint": checkpoint}
     with progress_line("solving") as report:
         solution = value_iteration(
             mdp,
             tolerance,
             progress=lambda sweeps, bound: report(f"sweep {sweeps}, error at most {bound:.2g}"),
-            values=None if values is None else values / "optimal.npy",
+            values=None if values is None or ranks != 1 else values / "optimal.npy",
+            **sharing,
         )
         report("value of the uniform policy")
         uniform = uniform_value(
             mdp,
             tolerance,
             progress=lambda sweeps, bound: report(f"uniform policy, sweep {sweeps}, error at most {bound:.2g}"),
-            values=None if values is None else values / "uniform.npy",
+            values=None if values is None or ranks != 1 else values / "uniform.npy",
+            **sharing,
         )
+    if solution is None:  # a rank of MPI that is not the first
+        return
     if out is not None:
         save(out, solution)
     answer = {
@@ -98,6 +113,7 @@ def solve(
         "tolerance": tolerance,
         "uniform_error_bound": uniform.error_bound,
         "uniform_seconds": uniform.seconds,
+        "processes": ranks,
         "num_states": mdp.num_states,
         "num_actions": mdp.num_actions,
         "file": None if out is None else str(out),

@@ -37,14 +37,17 @@ class Target:
         workers: int | None = None,
         max_states: int | None = None,
         out: Path | None = None,
+        processes: int | str = 1,
     ) -> "StateSpace":
         """The state space: built (or taken from the cache) for an environment, loaded from a folder."""
+        from pharos.ranks import launched
         from pharos.state_space import build, load
 
         if self.environment is not None or self.is_imported:
-            return build(self.found_environment(), out, memory=memory, workers=workers, max_states=max_states)
+            options: dict[str, Any] = {"memory": memory, "workers": workers, "max_states": max_states}
+            return build(self.found_environment(), out, processes=processes, **options)
         assert self.path is not None
-        space = load(self.path)
+        space = load(self.path, verify=launched()[0] == 0)  # of ranks, the first reads it all
         if max_states is not None and space.num_states > max_states:
             raise ParameterError(f"{self.path}: has {space.num_states} states; expected at most {max_states}")
         return space

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from pharos.mdp.lazy import Lazy
     from pharos.mdp.matrices import Matrices
     from pharos.mdp.outcome_table import OutcomeTable
+    from pharos.mdp.part import Part
     from pharos.mdp.rewards import Rewards
     from pharos.mdp.selection import BEST, WORST, Extreme, PolicyTable, Selection, chosen_mass
     from pharos.mdp.space_rewards import rewards_of_outcomes, rewards_of_space, rewards_of_staying
@@ -33,6 +34,7 @@ _FILES = {
     "Minimization": "bisimulation",
     "OutcomeTable": "outcome_table",
     "Outcomes": "dynamics",
+    "Part": "part",
     "Play": "dynamics",
     "PolicyTable": "selection",
     "Rewards": "rewards",
@@ -62,6 +64,7 @@ __all__ = [
     "Minimization",
     "OutcomeTable",
     "Outcomes",
+    "Part",
     "Play",
     "PolicyTable",
     "Rewards",

@@ -17,7 +17,13 @@ _RANGE = 1 << 22
 
 
 class CompiledDynamics(Dynamics):
-    """Transitions in arrays that kernels/outcomes.py knows how to read: each loop is written once for all of them."""
+    """Transitions in arrays that kernels/outcomes.py knows how to read: each loop is written once for all of them.
+
+    Attributes:
+        workers: threads of a backup; None for all processors.
+    """
+
+    workers: int | None = None
 
     @property
     @abstractmethod
@@ -47,7 +53,7 @@ class CompiledDynamics(Dynamics):
             else (bellman.optimal_block, chance.uniform, x[:, 0], out[:, 0])
         )
         out[-1] = 0.0
-        _shared(lambda start, stop: kernel(*tables, weights, choice, x_, out_, actions, start, stop), self.num_states)
+        _shared(lambda start, stop: kernel(*tables, weights, choice, x_, out_, actions, start, stop), self)
 
     def sweep(self, equation: BellmanEquation, x: np.ndarray) -> float:
         return swept(self.for_sweeps, self.num_actions, equation, x, None)
@@ -102,7 +108,7 @@ def swept(
     if chance.is_sticky:
         return bellman.sticky_sweep(*tables, chance.triple, choice, x, actions, scratch, order)
     change, v = 0.0, x[:, 0]
-    for start, stop in _ranges(transitions, len(x) - 1):
+    for start, stop in _ranges(transitions, rewards.shape[0]):
         part = bellman.optimal_sweep(*tables, chance.uniform, choice, v, actions, order, start, stop)
         change = float(np.maximum(change, part))
     return change
@@ -127,11 +133,12 @@ def _choice(select: Selection) -> "float | np.ndarray | None":
     return None if select.actions is None else np.ascontiguousarray(select.actions, np.int64)
 
 
-def _shared(block: Callable[[int, int], None], num_states: int) -> None:
+def _shared(block: Callable[[int, int], None], dynamics: CompiledDynamics) -> None:
     """block(start, stop) over all states, on all processors where there are enough states to share."""
     from pharos.workers import usable_workers
 
-    workers = usable_workers(None) if num_states >= 1 << 16 else 1
+    num_states = dynamics.num_states
+    workers = usable_workers(dynamics.workers) if num_states >= 1 << 16 else 1
     if workers == 1:
         return block(0, num_states)
     cuts = [num_states * i // workers for i in range(workers + 1)]

@@ -135,6 +135,19 @@ class Dynamics(ABC):
     def arrays(self) -> dict[str, np.ndarray]:
         """What it is made of, by name, as files keep it."""
 
+    def part(self, start: int, stop: int) -> "tuple[Dynamics, np.ndarray]":
+        """The states [start, stop) alone, and the states outside that they may lead to; numbers as part.py says."""
+        from pharos.mdp.outcome_table import OutcomeTable  # which derives from this class
+
+        states = np.arange(start, stop)
+        outcomes = self.outcomes(*self._all_actions(states))
+        following = np.where(outcomes.states == self.num_states, -1, outcomes.states)
+        local, halo = split(following, start, stop)
+        rows = np.bincount(outcomes.which, minlength=len(states) * self.num_actions)
+        offsets = np.concatenate([[0], np.cumsum(rows)])
+        table = OutcomeTable(local, self.num_actions, offsets=offsets, probabilities=outcomes.probabilities)
+        return table, halo
+
     def lazy(self, p: float) -> "Dynamics":
         """The same, but with probability p the state stays what it is, whatever is executed; 0 < p < 1."""
         from pharos.mdp.matrices import Matrices  # which derives from this class
@@ -158,8 +171,8 @@ class Dynamics(ABC):
     # What follows from it -------------------------------------------------------------------------------------------
 
     def backup(self, equation: BellmanEquation, x: np.ndarray, out: np.ndarray) -> None:
-        """out = T x; x and out are not the same."""
-        out[:-1] = equation.value(equation.rewards.array + equation.gamma * self.expected(x))
+        """out = T x; x and out are not the same. Between the states and the end there may be others, of a part."""
+        out[: self.num_states] = equation.value(equation.rewards.array + equation.gamma * self.expected(x))
         out[-1] = 0.0
 
     def sweep(self, equation: BellmanEquation, x: np.ndarray) -> float:
@@ -330,3 +343,15 @@ class Dynamics(ABC):
 
 def as_indices(table: np.ndarray, num_states: int) -> np.ndarray:
     return np.ascontiguousarray(table, np.int32 if num_states < 2**31 else np.int64)
+
+
+def split(successors: np.ndarray, start: int, stop: int) -> tuple[np.ndarray, np.ndarray]:
+    """(next states of a range renumbered for its part, int32 where that is enough; its halo)."""
+    inside = (successors >= start) & (successors < stop)
+    outside = ~inside & (successors >= 0)
+    halo, place = np.unique(successors[outside], return_inverse=True)
+    local = successors.astype(np.int64)
+    local -= start
+    local[successors < 0] = -1
+    local[outside] = stop - start + place.reshape(-1)
+    return as_indices(local, stop - start + len(halo) + 1), halo.astype(np.int64)

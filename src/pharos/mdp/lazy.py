@@ -98,6 +98,10 @@ class Lazy(CompiledDynamics):
     def order(self, live: np.ndarray) -> Order | None:
         return None if live.any() else self.tables.order(live)
 
+    def part(self, start: int, stop: int) -> tuple[Dynamics, np.ndarray]:
+        tables, halo = self.tables.part(start, stop)
+        return tables.lazy(self.laziness), halo
+
     def restricted_to(self, states: np.ndarray) -> Dynamics:
         return self.tables.restricted_to(states).lazy(self.laziness)
 

@@ -9,7 +9,7 @@ import numpy as np
 from pharos.errors import ParameterError
 from pharos.kernels import outcomes as kernels
 from pharos.mdp.compiled import CompiledDynamics
-from pharos.mdp.dynamics import Outcomes, as_indices
+from pharos.mdp.dynamics import Outcomes, as_indices, split
 from pharos.mdp.outcome_arrays import check_outcome_arrays, checked_outcomes, compact_outcomes
 
 if TYPE_CHECKING:
@@ -203,6 +203,19 @@ class OutcomeTable(CompiledDynamics):
         result = np.zeros((self.num_states, self.num_actions), np.bool_)
         kernels.arrive(self.for_kernels, np.asarray(states), result)
         return result
+
+    def part(self, start: int, stop: int) -> tuple["OutcomeTable", np.ndarray]:
+        rows = slice(start * self.num_actions, stop * self.num_actions)
+        where, arrays = slice(start, stop), {}
+        if self.offsets is not None:
+            offsets = self.offsets[rows.start : rows.stop + 1].astype(np.int64)
+            where, arrays["offsets"] = slice(int(offsets[0]), int(offsets[-1])), offsets - offsets[0]
+        if self.probabilities is not None:
+            arrays["probabilities"] = np.array(self.probabilities[where])
+        else:
+            arrays.update(codes=np.array(self.codes[start:stop]), palette=self.palette)  # type: ignore[index]
+        local, halo = split(np.asarray(self.successors[where]), start, stop)
+        return OutcomeTable(local, self.num_actions, **arrays), halo
 
     def restricted_to(self, states: np.ndarray) -> "OutcomeTable":
         """These states alone; what leads out of them leads back to where it came from."""

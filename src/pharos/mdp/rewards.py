@@ -58,7 +58,7 @@ class Rewards:
         """(N, A) float64, the rewards of some states."""
         return self.palette[self.table[states]] if len(self.palette) else self.table[states]
 
-    def of(self, states: np.ndarray) -> "Rewards":
+    def of(self, states: slice | np.ndarray) -> "Rewards":
         """The rewards of some states alone."""
         return Rewards(np.asarray(self.table[states]), self.palette)
 

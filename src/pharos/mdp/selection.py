@@ -149,6 +149,12 @@ class PolicyTable:
     def first_value(self, q: np.ndarray, states: Any = slice(None)) -> np.ndarray:
         return np.einsum("sba,sa...->sb...", self.first[states], q)
 
+    def of_states(self, states: slice) -> "PolicyTable":
+        """What it chooses in some states alone."""
+        if self.actions is not None:
+            return PolicyTable(self.num_actions, actions=np.ascontiguousarray(self.actions[states]))
+        return PolicyTable(self.num_actions, np.ascontiguousarray(self.probabilities[states]))
+
     def chosen(self, mass: np.ndarray) -> np.ndarray:
         """(S, A): how mass (S, W) after the first step chooses actions; the adjoint of `value`."""
         return chosen_mass(self.later, mass)

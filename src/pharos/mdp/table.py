@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from pharos.mdp.compiled import CompiledDynamics
-from pharos.mdp.dynamics import Outcomes, as_indices
+from pharos.mdp.dynamics import Outcomes, as_indices, split
 
 
 class Table(CompiledDynamics):
@@ -66,6 +66,10 @@ class Table(CompiledDynamics):
 
     def sample(self, states: np.ndarray, actions: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         return self.next_states[states, actions]
+
+    def part(self, start: int, stop: int) -> tuple["Table", np.ndarray]:
+        local, halo = split(np.asarray(self.next_states[start:stop]), start, stop)
+        return Table(local), halo
 
     def restricted_to(self, states: np.ndarray) -> "Table":
         """These states alone; what leads out of them leads back to where it came from."""

@@ -90,6 +90,7 @@ def evaluate_policy(
     *,
     horizon: int | None = None,
     observation: Any = None,
+    processes: int | str = 1,
     **seeing: Any,
 ) -> Solution:
     """The values of a policy.
@@ -106,6 +107,7 @@ def evaluate_policy(
         tolerance: every value is within this of the true one, proven.
         horizon: number of steps to go, instead of the MDP's own.
         observation: what the policy sees, a name or an Observation; of models "vector" when not given.
+        processes: that share the work, for policies over states; see `pharos.value_iteration`.
         seeing: further options of policies that see observations: `observation_options`, a dictionary;
             `previous_action`, whether they see it, under sticky actions; `deterministic`, whether the most probable
             action is taken.
@@ -121,11 +123,13 @@ def evaluate_policy(
     if isinstance(policy, TabularAgent):
         policy = policy.policy_table()
     if observation is not None or isinstance(policy, Policy | Model):
+        if processes != 1:
+            raise ParameterError("a policy that sees observations is evaluated by one process; expected processes=1")
         timed = mdp if horizon is None else mdp.with_horizon(horizon)
         return evaluate_observing(timed, policy, tolerance, observation=observation or "vector", **seeing)
     if seeing:
         raise ParameterError(f"{', '.join(seeing)} given for a policy that sees no observations; name the observation")
-    return solvers.evaluate_policy(mdp, policy, tolerance, horizon=horizon)
+    return solvers.evaluate_policy(mdp, policy, tolerance, horizon=horizon, processes=processes)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

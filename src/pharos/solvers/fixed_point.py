@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pharos.errors import DivergenceError, PrecisionError
-from pharos.mdp import BellmanEquation, Selection, TabularMDP
+from pharos.mdp import BellmanEquation, Part, Selection, TabularMDP
 from pharos.solvers.policy_iteration import PolicyIteration
 from pharos.state_space import large_zeros
 
@@ -31,7 +31,7 @@ SETTLING = 64
 # Entries of x that are looked at in one go.
 _BLOCK = 1 << 20
 # Rounding of the computation of a bound itself, and products of rounding errors.
-_MARGIN = 1 + 2.0**-40
+MARGIN = 1 + 2.0**-40
 
 
 class FixedPoint(NamedTuple):
@@ -51,7 +51,7 @@ class FixedPoint(NamedTuple):
 class Backup:
     """The backup T of an MDP and of what is chosen in its states."""
 
-    def __init__(self, mdp: TabularMDP, select: Selection):
+    def __init__(self, mdp: TabularMDP | Part, select: Selection):
         chance = mdp.chance
         self.mdp, self.select = mdp, select
         self.equation = BellmanEquation(mdp.reward_table, mdp.gamma, chance, select)
@@ -108,14 +108,14 @@ def fixed_point(
     rho = backup.factor
     least = backup.rounding(0.0) / (1 - rho) if rho < 1 else math.inf
     if not least <= tolerance:
-        raise _imprecise(mdp, least, tolerance)
+        raise imprecise(mdp, least, tolerance)
     x, sweeps = backup.zeros() if x is None else x, 0
     better, least, since = PolicyIteration(mdp, select), math.inf, 0
     while True:
         change = backup.sweep(x)
         sweeps += 1
         rounding = backup.rounding(largest_of(x) + change)
-        bound = (rho * change + rounding) / (1 - rho) * _MARGIN
+        bound = (rho * change + rounding) / (1 - rho) * MARGIN
         if progress is not None:
             progress(sweeps, bound)
         if bound <= tolerance:
@@ -124,7 +124,7 @@ def fixed_point(
             least, since = bound, sweeps
         # x is exact up to rounding, also where values are infinite; or sweeps move rounding errors about
         if not rho * change > rounding or (better.is_exact and sweeps - since > SETTLING):
-            raise _imprecise(mdp, least if better.is_exact else bound, tolerance)
+            raise imprecise(mdp, least if better.is_exact else bound, tolerance)
         if better.is_worth_it(sweeps, change, tolerance):
             better.improve(x, tolerance)
 
@@ -148,7 +148,7 @@ def backward_induction(
         largest = largest_of(x)
         if steps is not None:
             steps[t + 1] = x
-    bound *= _MARGIN
+    bound *= MARGIN
     if not math.isfinite(bound + largest):
         raise PrecisionError(
             f"{mdp}: the values of {horizon} steps pass 1.8e308, the largest 64-bit float; use smaller rewards"
@@ -170,8 +170,8 @@ def chain_bound(mdp: TabularMDP, select: Selection, x: np.ndarray, successor: np
             residual = np.abs(reward + mdp.gamma * x[successor, 0] - x[:-1, 0]).max(initial=0.0)
         bound = (float(residual) + rounding) / (1 - mdp.gamma)
     if not math.isfinite(bound):
-        raise _imprecise(mdp, bound, 0.0)
-    return bound * _MARGIN
+        raise imprecise(mdp, bound, 0.0)
+    return bound * MARGIN
 
 
 def largest_of(x: np.ndarray) -> float:
@@ -202,15 +202,15 @@ def _in_one_pass(
     with np.errstate(over="ignore", invalid="ignore"):
         mdp.dynamics.sweep_once(backup.equation, x, order)
         series = min(backups, 1 / (1 - rho)) if rho < 1 else backups * np.float64(rho) ** order.longest
-        bound = float(backup.rounding(largest_of(x)) * series * _MARGIN)
+        bound = float(backup.rounding(largest_of(x)) * series * MARGIN)
     if progress is not None:
         progress(1, bound)
     if not bound <= tolerance:
-        raise _imprecise(mdp, bound, tolerance)
+        raise imprecise(mdp, bound, tolerance)
     return FixedPoint(x, bound, 1)
 
 
-def _imprecise(mdp: TabularMDP, bound: float, tolerance: float) -> PrecisionError:
+def imprecise(mdp: TabularMDP, bound: float, tolerance: float) -> PrecisionError:
     if not math.isfinite(bound):
         return PrecisionError(
             f"{mdp}: 64-bit floats give no bound at gamma = {mdp.gamma!r}: values pass 1.8e308, or probabilities sum "

@@ -1,5 +1,6 @@
 """Values of a given policy: on its functional graph where everything is deterministic, else by iteration."""
 
+import os
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,7 @@ from pharos.errors import DivergenceError
 from pharos.mdp import PolicyTable, TabularMDP, takes_mdp
 from pharos.solvers.fixed_point import chain_bound
 from pharos.solvers.policy_iteration import chain, chain_values
+from pharos.solvers.sharing import Sharing
 from pharos.solvers.solution import Solution
 from pharos.solvers.values import check_tolerance, checked_horizon, solution_of
 
@@ -20,6 +22,9 @@ def evaluate_policy(
     tolerance: float = 1e-6,
     *,
     horizon: int | None = None,
+    processes: int | str = 1,
+    jacobi: bool = False,
+    checkpoint: str | os.PathLike | None = None,
 ) -> Solution:
     """The values of a policy over states; `pharos.evaluate_policy` also takes policies that see observations.
 
@@ -32,6 +37,7 @@ def evaluate_policy(
             function from an array of state indices to either; or an agent with such a `policy_table()`.
         tolerance: every value is within this of the true one, proven.
         horizon: number of steps to go, instead of the MDP's own.
+        processes, jacobi, checkpoint: as `value_iteration` takes them.
     Returns:
         A Solution of kind "policy". A deterministic policy on a deterministic MDP is evaluated on its functional graph,
         in O(S), exactly up to rounding, whatever the tolerance.
@@ -47,9 +53,10 @@ def evaluate_policy(
         policy = policy.policy_table()
     watch = Stopwatch()
     select = PolicyTable.of(mdp, policy)
-    if select.actions is not None and mdp.is_deterministic and horizon is None:
+    sharing = Sharing(processes, jacobi, checkpoint)
+    if select.actions is not None and mdp.is_deterministic and horizon is None and not sharing.is_wanted:
         return _on_its_graph(mdp, select, watch)
-    return solution_of(mdp, select, tolerance, horizon)
+    return solution_of(mdp, select, tolerance, horizon, sharing=sharing)
 
 
 @takes_mdp

@@ -10,6 +10,7 @@ from pharos.errors import ParameterError
 from pharos.mdp import BEST, WORST, Selection, TabularMDP, random_actions, takes_mdp
 from pharos.solvers.fixed_point import backward_induction, fixed_point
 from pharos.solvers.kept_values import kept_values
+from pharos.solvers.sharing import Sharing, shared_solution
 from pharos.solvers.solution import Solution
 
 
@@ -22,6 +23,9 @@ def value_iteration(
     keep_all: bool = False,
     progress: Callable[[int, float], None] | None = None,
     values: str | os.PathLike | None = None,
+    processes: int | str = 1,
+    jacobi: bool = False,
+    checkpoint: str | os.PathLike | None = None,
 ) -> Solution:
     """The optimal values of an MDP.
 
@@ -37,11 +41,21 @@ def value_iteration(
         values: a file (.npy) that holds the values while they are computed, in place of memory, and afterwards; what
             it holds already is where the sweeps begin, so that a solve that was killed goes on. None: memory, or
             where that has little room a file without a name.
+        jacobi: sweeps that are not in place, many times as many: their values are the same to the last bit whatever the
+            number of processes. Those of a horizon are so anyway.
+
+        Cost only:
+        processes: of this machine, each of which sweeps a range of the states; or "mpi": those that `mpiexec` has
+            started, all of which make this call; the first gets the Solution, the others None. Values depend on it
+            within the tolerance.
+        checkpoint: a folder for the values so far, once a minute, so that the same call goes on where one was killed,
+            with any number of processes.
     Returns:
         A Solution of kind "optimal".
     Raises:
         DivergenceError: gamma is 1, there is no horizon, and the value may be infinite.
         PrecisionError: 64-bit floats cannot reach the tolerance, or hold the values.
+        ParameterError: several processes, and gamma = 1 without a horizon. RankFailed: a process died.
     Cost: O(S A) a sweep, 0.5 to 2 ns for each state and action on game graphs; memory 8 bytes a state (8 A under sticky
         actions). Where gamma is so near 1 that sweeps would be many, policy iteration: on the graph of the policy where
         nothing is left to chance (56 bytes a state then); by a Krylov method whose operator is a sweep else (10 vectors
@@ -49,13 +63,22 @@ def value_iteration(
         action) times actions are up to 2 million (up to 500 MB then), or nodes are up to 3000.
     Source: Bellman (1957); in place: Puterman (1994), section 6.3.3; the sticky equation: the pharos paper, appendix A.
     """
-    return solution_of(mdp, BEST, tolerance, horizon, keep_all, progress, values)
+    sharing = Sharing(processes, jacobi, checkpoint)
+    return solution_of(mdp, BEST, tolerance, horizon, keep_all, progress, values, sharing)
 
 
 @takes_mdp
-def worst_value(mdp: TabularMDP, tolerance: float = 1e-6, *, horizon: int | None = None) -> Solution:
+def worst_value(
+    mdp: TabularMDP,
+    tolerance: float = 1e-6,
+    *,
+    horizon: int | None = None,
+    processes: int | str = 1,
+    jacobi: bool = False,
+    checkpoint: str | os.PathLike | None = None,
+) -> Solution:
     """The values of the worst policy: as `value_iteration`, minimising."""
-    return solution_of(mdp, WORST, tolerance, horizon)
+    return solution_of(mdp, WORST, tolerance, horizon, sharing=Sharing(processes, jacobi, checkpoint))
 
 
 @takes_mdp
@@ -66,12 +89,17 @@ def uniform_value(
     horizon: int | None = None,
     progress: Callable[[int, float], None] | None = None,
     values: str | os.PathLike | None = None,
+    processes: int | str = 1,
+    jacobi: bool = False,
+    checkpoint: str | os.PathLike | None = None,
 ) -> Solution:
     """The values of the uniformly random policy: every action is replaced by a uniform one, so nothing is chosen.
 
     The arguments are those of `value_iteration`.
     """
-    return solution_of(random_actions(mdp, 1.0), BEST, tolerance, horizon, progress=progress, values=values)
+    sharing = Sharing(processes, jacobi, checkpoint)
+    mdp = random_actions(mdp, 1.0)
+    return solution_of(mdp, BEST, tolerance, horizon, progress=progress, values=values, sharing=sharing)
 
 
 def solution_of(
@@ -82,10 +110,17 @@ def solution_of(
     keep_all: bool = False,
     progress: Callable[[int, float], None] | None = None,
     values: str | os.PathLike | None = None,
+    sharing: Sharing | None = None,
 ) -> Solution:
     """The values of what is chosen: a fixed point, or those of backward induction where there is a horizon."""
     check_tolerance(tolerance)
     horizon = checked_horizon(mdp, horizon)
+    if sharing is not None and sharing.is_wanted:
+        if keep_all:
+            raise ParameterError("keep_all: several processes keep the last step alone; expected processes=1")
+        if values is not None:
+            raise ParameterError("values: several processes keep theirs in a folder; expected checkpoint=FOLDER")
+        return shared_solution(mdp, select, tolerance, horizon, sharing, progress)
     watch = Stopwatch()
     steps = None
     if horizon is None:

@@ -4,16 +4,13 @@ import contextlib
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
-from pharos.errors import ParameterError
-from pharos.ranks import Rank, mpi_rank, processes
+from pharos.ranks import Rank, check_number, mpi_rank, processes
 from pharos.state_space.journal import Journal
 from pharos.state_space.plan import Plan
 from pharos.state_space.progress import Progress
 from pharos.state_space.ranked_search import RankedSearch
 from pharos.state_space.ranked_table import answer, bytes_of_exchange, end, warm
 from pharos.state_space.search import Options, Search
-
-MOST = 1024  # processes of a machine that anybody may mean
 
 
 @dataclass(frozen=True)
@@ -55,9 +52,8 @@ def crew_of(size: int | str, plan: Plan, memory: int | None) -> Iterator[Crew]:
         size: as `build` takes `processes`.
     """
     if size != "mpi":
-        if not isinstance(size, int) or isinstance(size, bool) or not 1 <= size <= MOST:
-            raise ParameterError(f"processes is {size!r}; expected a whole number from 1 to {MOST}, or 'mpi'")
-        yield Crew(size)
+        check_number(size)
+        yield Crew(int(size))
         return
     rank = mpi_rank()
     if rank.rank > 0:

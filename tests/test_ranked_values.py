@@ -1,0 +1,309 @@
+"""Values by several processes: those of one process, whatever the number, and going on after a kill."""
+
+import contextlib
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import pharos
+from pharos import ranks
+from pharos.errors import ParameterError, PrecisionError
+from pharos.mdp import BEST, WORST, Matrices, PolicyTable, TabularMDP
+from pharos.ranks import RankFailed
+from pharos.solvers import checkpoint as checkpoints
+from pharos.solvers import evaluate_policy, ranked, sharing, uniform_value, value_iteration
+from pharos.solvers.fixed_point import Backup
+from pharos.solvers.sharing import Sharing, shared_solution
+from strategies import hard_mdps, lazy_mdps, small_mdps
+
+MPIEXEC = shutil.which("mpiexec", path=Path(sys.executable).parent)
+MANY = st.one_of(small_mdps(), hard_mdps(), lazy_mdps())
+
+
+def chain(num_states=300, gamma=0.9):
+    """Walk right for a reward at the end, or jump to the start; the halo of each range is small."""
+    states = np.arange(num_states)
+    following = np.stack([np.minimum(states + 1, num_states - 1), states // 7], axis=1)
+    rewards = np.zeros((num_states, 2))
+    rewards[-2, 0], rewards[::5, 1] = 1.0, 0.01
+    following[-1], rewards[-1] = num_states - 1, 0.0
+    return TabularMDP.from_arrays(following, rewards, gamma=gamma)
+
+
+@contextlib.contextmanager
+def threads(disturb=lambda rank: None):
+    """Ranks are threads of this process."""
+
+    def together(size, program, capacity):
+        def run(rank):
+            disturb(rank)
+            return program(rank)
+
+        with ranks.loop(size, run) as rank:
+            return run(rank)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sharing, "together", together)
+        yield
+
+
+def solved(mdp, size, *, select=BEST, tolerance=1e-6, horizon=None, disturb=lambda rank: None, **options):
+    with threads(disturb):
+        return shared_solution(mdp, select, tolerance, horizon, Sharing(size, **options))
+
+
+class Killed(Exception):
+    """In place of a kill."""
+
+
+def fails_at(who, number):
+    def disturb(rank):
+        exchange, calls = rank.exchange, iter(range(10**9))
+
+        def disturbed(parts):
+            if rank.rank == who and next(calls) == number:
+                raise Killed(f"at exchange {number}")
+            return exchange(parts)
+
+        rank.exchange = disturbed
+
+    return disturb
+
+
+# The same values ------------------------------------------------------------------------------------------------------
+
+
+def test_three_ranks_find_the_values_of_one():
+    mdp = chain()
+    alone, shared = value_iteration(mdp), solved(mdp, 3)
+    assert shared.error_bound <= 1e-6
+    assert np.abs(shared.x - alone.x).max() <= alone.error_bound + shared.error_bound
+
+
+@pytest.mark.long
+@settings(max_examples=40, deadline=None)
+@given(mdp=MANY, size=st.integers(1, 5), select=st.sampled_from([BEST, WORST, None]), seed=st.integers(0, 99))
+def test_values_by_ranks_are_within_the_bounds(mdp, size, select, seed):
+    mdp = mdp.with_gamma(min(mdp.gamma, 0.8)).with_horizon(None)
+    tolerance = 1e-7 * max(1.0, np.abs(mdp.rewards).max())
+    if select is None:
+        rng = np.random.default_rng(seed)
+        select = PolicyTable.of(mdp, rng.dirichlet(np.ones(mdp.num_actions), mdp.num_states))
+    size = min(size, mdp.num_states)
+    alone = solved(mdp, 1, select=select, tolerance=tolerance, jacobi=True)
+    shared = solved(mdp, size, select=select, tolerance=tolerance)
+    assert np.abs(shared.x - alone.x).max() <= alone.error_bound + shared.error_bound
+    plain = solved(mdp, size, select=select, tolerance=tolerance, jacobi=True)
+    assert (plain.x == alone.x).all()
+    assert (plain.error_bound, plain.sweeps) == (alone.error_bound, alone.sweeps)
+
+
+@pytest.mark.long
+@settings(max_examples=30, deadline=None)
+@given(mdp=MANY, size=st.integers(2, 5), horizon=st.integers(1, 9))
+def test_values_of_a_horizon_are_the_same_bits(mdp, size, horizon):
+    alone = value_iteration(mdp, horizon=horizon)
+    shared = solved(mdp, min(size, mdp.num_states), horizon=horizon)
+    assert (shared.x == alone.x).all()
+    assert (shared.next_x == alone.next_x).all()
+    if not isinstance(mdp.dynamics, Matrices):  # whose parts are tables of outcomes, which count operations otherwise
+        assert shared.error_bound == alone.error_bound
+
+
+@pytest.mark.long
+@settings(max_examples=30, deadline=None)
+@given(mdp=MANY, size=st.integers(2, 5))
+def test_jacobi_sweeps_are_backups_of_the_whole(mdp, size):
+    """The loop of one process, written down again: x = T x until the same bound."""
+    mdp = mdp.with_gamma(min(mdp.gamma, 0.8)).with_horizon(None)
+    tolerance = 1e-4 * max(1.0, np.abs(mdp.rewards).max())
+    shared = solved(mdp, min(size, mdp.num_states), tolerance=tolerance, jacobi=True)
+    backup = Backup(mdp, BEST)
+    x = backup.zeros()
+    for _ in range(shared.sweeps):
+        x = backup(x)
+    assert (shared.x == x).all()
+
+
+def test_evaluation_and_the_uniform_policy_are_shared(monkeypatch):
+    mdp, policy = chain(), np.arange(300) % 2
+    for function in (lambda **more: evaluate_policy(mdp, policy, **more), lambda **more: uniform_value(mdp, **more)):
+        alone = function()
+        with threads():
+            shared = function(processes=3)
+        assert np.abs(shared.v - alone.v).max() <= alone.error_bound + shared.error_bound
+
+
+# What is refused ------------------------------------------------------------------------------------------------------
+
+
+def test_what_processes_cannot_do_is_said():
+    mdp = chain(5)
+    with pytest.raises(ParameterError, match=r"6 processes for 5 states; expected at most one for each state"):
+        value_iteration(mdp, processes=6)
+    with pytest.raises(ParameterError, match=r"expected a whole number from 1 to 1024, or 'mpi'"):
+        value_iteration(mdp, processes=0)
+    with pytest.raises(ParameterError, match="expected processes=1, a horizon, or gamma < 1"):
+        solved(mdp.with_gamma(1.0), 2)
+    with pytest.raises(ParameterError, match="keep the last step alone"):
+        value_iteration(mdp, processes=2, horizon=3, keep_all=True)
+    with pytest.raises(PrecisionError, match="raise the tolerance or lower gamma"):
+        solved(mdp, 2, tolerance=1e-17)
+
+
+def test_sweeps_that_gain_nothing_end(monkeypatch):
+    monkeypatch.setattr(ranked.RankedBackup, "sweep", lambda _: 1e-9)  # rounding errors that are moved about
+    with pytest.raises(PrecisionError, match="64-bit floats reach a bound of 9e-09"):
+        solved(chain(10), 2, tolerance=1e-9)
+
+
+# Checkpoints ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.long
+@settings(max_examples=30, deadline=None)
+@given(
+    size=st.integers(1, 5),
+    who=st.integers(0, 4),
+    number=st.integers(0, 60),
+    then=st.integers(1, 5),
+    horizon=st.sampled_from([None, 20]),
+    mdp=st.sampled_from([chain(40), pharos.sticky_actions(chain(40), 0.25), pharos.lazy_actions(chain(40), 0.1)]),
+)
+def test_solving_goes_on_whoever_failed_and_however_many_go_on(size, who, number, then, horizon, mdp):
+    whole = solved(mdp, 1, horizon=horizon, jacobi=True)
+    with tempfile.TemporaryDirectory() as folder:
+        options = {"horizon": horizon, "jacobi": True, "checkpoint": folder, "checkpoint_seconds": -1.0}
+        with contextlib.suppress(Killed, RankFailed), pytest.MonkeyPatch.context() as patch:
+            patch.setattr(checkpoints, "_SHARE", 0)
+            solved(mdp, size, disturb=fails_at(who % size, number), **options)
+        result = solved(mdp, then, **options)
+        assert not list(Path(folder).iterdir())
+    assert (result.x == whole.x).all()
+    assert (result.next_x == whole.next_x).all()
+    assert (result.error_bound, result.sweeps) == (whole.error_bound, whole.sweeps)
+
+
+def test_a_checkpoint_is_of_one_question(tmp_path, monkeypatch):
+    monkeypatch.setattr(checkpoints, "_SHARE", 0)
+    options = {"checkpoint": tmp_path, "checkpoint_seconds": -1.0}
+    with pytest.raises(Killed):
+        solved(chain(), 2, disturb=fails_at(0, 20), **options)
+    (file,) = tmp_path.iterdir()
+    first = []
+    paid = np.ones((300, 2)) * (np.arange(300) < 299)[:, None]
+    for mdp in (chain(), chain(gamma=0.8), chain().with_rewards(paid)):
+        done = []
+        with threads():
+            report = lambda sweeps, _, done=done: done.append(sweeps)  # noqa: E731
+            value_iteration(mdp, processes=3, checkpoint=tmp_path, progress=report)
+        first.append(done[0])
+        if len(first) == 1:
+            assert not file.exists()  # it was answered
+    assert first[0] > 1
+    assert first[1:] == [1, 1]
+
+
+@pytest.mark.parametrize("harm", ["cut", "changed", "empty"])
+def test_a_checkpoint_that_is_not_whole_is_no_checkpoint(harm, tmp_path, monkeypatch):
+    monkeypatch.setattr(checkpoints, "_SHARE", 0)
+    options = {"horizon": 60, "checkpoint": tmp_path, "checkpoint_seconds": -1.0}
+    with pytest.raises(Killed):
+        solved(chain(), 2, disturb=fails_at(0, 25), **options)
+    (file,) = tmp_path.iterdir()
+    data = bytearray(file.read_bytes())
+    data[-20] ^= 1
+    file.write_bytes({"cut": data[:-8], "changed": data, "empty": b""}[harm])
+    assert (solved(chain(), 3, **options).x == value_iteration(chain(), horizon=60).x).all()
+
+
+def test_a_full_disk_ends_no_solving(tmp_path, monkeypatch):
+    monkeypatch.setattr(checkpoints, "_SHARE", 0)
+
+    def full(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(checkpoints.storage, "replacing", full)
+    with pytest.warns(UserWarning, match=r"No space left on device; values are not kept any more, solving goes on"):
+        result = solved(chain(), 2, checkpoint=tmp_path, checkpoint_seconds=-1.0)
+    assert result.error_bound <= 1e-6
+
+
+# Processes and MPI ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.long
+def test_three_processes_solve_and_go_on_after_a_kill(tmp_path, monkeypatch):
+    mdp = chain(5000)
+    alone = value_iteration(mdp, jacobi=True)
+    monkeypatch.setattr(checkpoints, "_SHARE", 0)
+    monkeypatch.setattr(checkpoints, "SECONDS", -1.0)
+    monkeypatch.setattr(Sharing, "checkpoint_seconds", -1.0)
+    sweep, sweeps = ranked.RankedBackup.plain_sweep, []
+
+    def dies(backup):
+        sweeps.append(0)
+        if backup.rank.rank == 2 and len(sweeps) == 40:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return sweep(backup)
+
+    monkeypatch.setattr(ranked.RankedBackup, "plain_sweep", dies)
+    with pytest.raises(RankFailed, match=r"rank 2 of 3 died \(exit code -9\); the same command resumes"):
+        shared_solution(mdp, BEST, 1e-6, None, Sharing(3, True, tmp_path, -1.0))
+    assert len(list(tmp_path.iterdir())) == 1
+    monkeypatch.setattr(ranked.RankedBackup, "plain_sweep", sweep)
+    first = []
+    result = shared_solution(
+        mdp, BEST, 1e-6, None, Sharing(2, True, tmp_path, -1.0), lambda sweeps, _: first.append(sweeps)
+    )
+    assert first[0] > 10
+    assert (result.x == alone.x).all()
+
+
+WORLD = ["breakout", "height=7", "columns=5", "brick_rows=1", "--gamma", "0.5"]
+
+
+def run(tmp_path, *arguments, ranks_of_mpi=0):
+    launcher = [MPIEXEC, "-n", str(ranks_of_mpi)] if ranks_of_mpi else []
+    command = [*launcher, sys.executable, "-m", "pharos", "solve", *arguments]
+    environment = {**os.environ, "PHAROS_CACHE_DIR": str(tmp_path / "cache")}
+    return subprocess.run(command, capture_output=True, text=True, timeout=500, env=environment)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("chance", [[], ["--sticky", "0.25"], ["--random", "0.1", "--horizon", "30"]])
+@pytest.mark.parametrize("launcher", ["processes", "mpi"])
+def test_the_command_writes_the_same_file(launcher, chance, tmp_path):
+    if launcher == "mpi" and MPIEXEC is None:
+        pytest.skip("needs the extra mpi")
+    more = {"ranks_of_mpi": 3} if launcher == "mpi" else {}
+    many = ["--processes", "3"] if launcher == "processes" else []
+    alone = run(tmp_path, *WORLD, *chance, "--jacobi", "--out", tmp_path / "alone.npz", "--json")
+    shared = run(tmp_path, *WORLD, *chance, "--jacobi", *many, "--out", tmp_path / "shared.npz", "--json", **more)
+    assert shared.returncode == 0, shared.stderr
+    answers = [json.loads(each.stdout) for each in (alone, shared)]
+    for key in ("value_at_start", "uniform_value_at_start", "error_bound", "sweeps"):
+        assert answers[0][key] == answers[1][key]
+    with np.load(tmp_path / "alone.npz") as one, np.load(tmp_path / "shared.npz") as other:
+        assert set(one) == set(other)
+        assert all((one[name] == other[name]).all() for name in one)
+
+
+@pytest.mark.long
+@pytest.mark.skipif(MPIEXEC is None, reason="needs the extra mpi")
+def test_an_error_of_ranks_is_one_line(tmp_path):
+    refused = run(tmp_path, *WORLD[:-1], "1", ranks_of_mpi=3)
+    assert refused.returncode == 2
+    lines = [line for line in refused.stderr.splitlines() if line.startswith("pharos:")]
+    assert len(lines) == 1
+    assert "gamma is 1 and there is no horizon" in lines[0]
