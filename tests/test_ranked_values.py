@@ -83,6 +83,7 @@ def fails_at(who, number):
 # The same values ------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_three_ranks_find_the_values_of_one():
     mdp = chain()
     alone, shared = value_iteration(mdp), solved(mdp, 3)
@@ -135,6 +136,7 @@ def test_jacobi_sweeps_are_backups_of_the_whole(mdp, size):
     assert (shared.x == x).all()
 
 
+@pytest.mark.long
 def test_evaluation_and_the_uniform_policy_are_shared(monkeypatch):
     mdp, policy = chain(), np.arange(300) % 2
     for function in (lambda **more: evaluate_policy(mdp, policy, **more), lambda **more: uniform_value(mdp, **more)):
@@ -161,6 +163,7 @@ def test_what_processes_cannot_do_is_said():
         solved(mdp, 2, tolerance=1e-17)
 
 
+@pytest.mark.long
 def test_sweeps_that_gain_nothing_end(monkeypatch):
     monkeypatch.setattr(ranked.RankedBackup, "sweep", lambda _: 1e-9)  # rounding errors that are moved about
     with pytest.raises(PrecisionError, match="64-bit floats reach a bound of 9e-09"):
@@ -194,6 +197,7 @@ def test_solving_goes_on_whoever_failed_and_however_many_go_on(size, who, number
     assert (result.error_bound, result.sweeps) == (whole.error_bound, whole.sweeps)
 
 
+@pytest.mark.long
 def test_a_checkpoint_is_of_one_question(tmp_path, monkeypatch):
     monkeypatch.setattr(checkpoints, "_SHARE", 0)
     options = {"checkpoint": tmp_path, "checkpoint_seconds": -1.0}
@@ -214,6 +218,7 @@ def test_a_checkpoint_is_of_one_question(tmp_path, monkeypatch):
     assert first[1:] == [1, 1]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("harm", ["cut", "changed", "empty"])
 def test_a_checkpoint_that_is_not_whole_is_no_checkpoint(harm, tmp_path, monkeypatch):
     monkeypatch.setattr(checkpoints, "_SHARE", 0)
@@ -227,6 +232,7 @@ def test_a_checkpoint_that_is_not_whole_is_no_checkpoint(harm, tmp_path, monkeyp
     assert (solved(chain(), 3, **options).x == value_iteration(chain(), horizon=60).x).all()
 
 
+@pytest.mark.long
 def test_a_full_disk_ends_no_solving(tmp_path, monkeypatch):
     monkeypatch.setattr(checkpoints, "_SHARE", 0)
 
