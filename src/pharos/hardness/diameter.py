@@ -7,12 +7,14 @@ where it does not close (Then et al. 2014), and an argument of ours for spaces t
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
 from pharos.errors import ParameterError, UndefinedMeasure
 from pharos.hardness.interval import Budget, Interval, Progress, Spending, conventions_of
 from pharos.hardness.lean_sweep import lean_diameter, lean_eccentricity, needs_more_than_memory
+from pharos.hardness.ranked_search import ranked_eccentricity
 from pharos.hardness.stochastic_diameter import stochastic_diameter
 from pharos.hardness.stochastic_eccentricity import stochastic_start_eccentricity
 from pharos.hardness.sum_sweep import SumSweep
@@ -69,7 +71,12 @@ def diameter(
 
 @takes_mdp
 def start_eccentricity(
-    mdp: TabularMDP, *, restart: bool = True, tolerance: float = 1e-6, budget: Budget | float | None = None
+    mdp: TabularMDP,
+    *,
+    restart: bool = True,
+    tolerance: float = 1e-6,
+    budget: Budget | float | None = None,
+    processes: int | str = 1,
 ) -> float:
     """Return the largest least expected number of steps from the start to a state: the paper's (1), read literally.
 
@@ -79,6 +86,8 @@ def start_eccentricity(
         restart: as in `diameter`; without chance and with one start state it makes no difference.
         tolerance: relative accuracy under chance, and with several start states; else it is counted.
         budget: seconds (300 by default), or a `Budget`, under chance and with several start states.
+        processes: without chance and with one start state, as many that share the search, see `value_iteration`; under
+            MPI all get the result.
     Returns:
         Steps; infinite where some state cannot be reached from some start state. An expectation comes as its upper
         bound, proven to lie within `tolerance`.
@@ -89,7 +98,8 @@ def start_eccentricity(
         one stochastic shortest path problem for each target that bounds do not rule out.
     Source: the pharos paper, equation 1.
     """
-    interval = start_eccentricity_interval(mdp, restart=restart, tolerance=tolerance, budget=budget)
+    options: dict[str, Any] = {"restart": restart, "tolerance": tolerance, "budget": budget, "processes": processes}
+    interval = start_eccentricity_interval(mdp, **options)
     if not interval.exact:
         raise UndefinedMeasure(
             f"start_eccentricity: between {interval.lower:.6g} and {interval.upper:.6g}; {interval.note}"
@@ -99,15 +109,26 @@ def start_eccentricity(
 
 @takes_mdp
 def start_eccentricity_interval(
-    mdp: TabularMDP, *, restart: bool = True, tolerance: float = 1e-6, budget: Budget | float | None = None
+    mdp: TabularMDP,
+    *,
+    restart: bool = True,
+    tolerance: float = 1e-6,
+    budget: Budget | float | None = None,
+    processes: int | str = 1,
 ) -> Interval:
     """Return `start_eccentricity` as an `Interval`: exact, or what is proven within the budget. Arguments: the same."""
     _check_tolerance(tolerance)
     spending = Spending(Budget.of(budget), None)
     graph = Graph.of(mdp, restart)
     if graph is None:
+        if processes != 1:
+            raise ParameterError(f"{mdp}: has chance, under which one process searches; expected processes=1")
         return stochastic_start_eccentricity(mdp, restart, tolerance, spending)
     starts = mdp.start_states[mdp.start_probabilities > 0]
+    if processes != 1:
+        if len(starts) > 1:
+            raise ParameterError(f"{mdp}: has {len(starts)} start states; expected processes=1")
+        return ranked_eccentricity(graph, int(starts[0]), processes, spending, conventions_of(mdp, restart))
     if len(starts) == 1 and needs_more_than_memory(graph):
         return lean_eccentricity(graph, int(starts[0]), spending, conventions_of(mdp, restart))
     weights = mdp.start_probabilities[mdp.start_probabilities > 0]

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from pharos.mdp.arguments import takes_mdp
     from pharos.mdp.bisimulation import Minimization, minimize
     from pharos.mdp.chance import Chance, lazy_actions, random_actions, sticky_actions
-    from pharos.mdp.dynamics import BellmanEquation, Dynamics, Outcomes, Play
+    from pharos.mdp.dynamics import BellmanEquation, Dynamics, Outcomes, Play, split
     from pharos.mdp.lazy import Lazy
     from pharos.mdp.matrices import Matrices
     from pharos.mdp.outcome_table import OutcomeTable
@@ -48,6 +48,7 @@ _FILES = {
     "rewards_of_outcomes": "space_rewards",
     "rewards_of_space": "space_rewards",
     "rewards_of_staying": "space_rewards",
+    "split": "dynamics",
     "sticky_actions": "chance",
     "takes_mdp": "arguments",
 }
@@ -78,6 +79,7 @@ __all__ = [
     "rewards_of_outcomes",
     "rewards_of_space",
     "rewards_of_staying",
+    "split",
     "sticky_actions",
     "takes_mdp",
 ]

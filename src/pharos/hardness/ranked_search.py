@@ -1,0 +1,143 @@
+"""Distances by several processes: each has a range of the nodes of a graph, and exchanges its borders with the others.
+
+Distances come from sweeps over the table in order, as in lean_sweep.py: an upper bound is lowered along every edge
+until nothing is. Forward, a rank lowers the bounds of its halo, nodes of other ranks, too, and tells their owners;
+backward, it asks the owners for them. Distances are whole numbers, so they are the same whatever the number of ranks.
+"""
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from pharos.hardness.interval import Interval, Spending
+from pharos.hardness.transition_graph import Graph
+from pharos.kernels import distance_sweeps
+from pharos.mdp import split
+from pharos.ranks import Rank, check_number, together
+
+# Untyped, as starred arguments of compiled functions are not checked.
+kernels: Any = distance_sweeps
+FAR = int(np.iinfo(np.int32).max)
+
+
+class Found(NamedTuple):
+    """What a search has found.
+
+    Attributes:
+        distances: (N,) int32 at the first rank, `FAR` where there is no way; None at the others.
+        count: nodes found. largest: distance of these.
+    """
+
+    distances: np.ndarray | None
+    count: int
+    largest: int
+
+
+class RankedGraph:
+    """One rank's range of the nodes of a graph: states, and the end where there is one."""
+
+    def __init__(self, graph: Graph, rank: Rank):
+        self.rank, self.num_nodes = rank, graph.num_nodes
+        self.cuts = np.array([graph.num_nodes * i // rank.size for i in range(rank.size + 1)])
+        self.start, self.stop = map(int, self.cuts[rank.rank : rank.rank + 2])
+        self._local, self._halo = split(_edges(graph, self.start, self.stop), self.start, self.stop)
+        borders = np.searchsorted(self._halo, self.cuts)
+        self._halo_of = [slice(borders[q], borders[q + 1]) for q in range(rank.size)]
+        asked = [self._halo[part] - self.cuts[q] for q, part in enumerate(self._halo_of)]
+        self._wanted = rank.exchange(asked)  # nodes of this rank that each has in its halo
+        self._never = np.zeros(len(self), np.bool_)
+        self.distance = np.empty(len(self) + len(self._halo), np.int32)
+
+    def __len__(self) -> int:
+        return self.stop - self.start
+
+    def search(self, source: int, backward: bool) -> tuple[int, int]:
+        """Distances from a node, or, backward, to it. Returns (nodes found, largest distance)."""
+        self.distance[:] = FAR
+        numbers = np.concatenate([np.arange(self.start, self.stop), self._halo])
+        self.distance[numbers == source] = 0
+        kernel = kernels.lower_backward if backward else kernels.lower_forward
+        lowered = 1
+        while lowered:
+            own = int(kernel(self._local, self._never, -1, self.distance, FAR, 0, len(self)))
+            own += self._told() if not backward else 0
+            lowered = sum(int(each[0]) for each in self.rank.gather_all(np.array([own])))
+            if backward:
+                self._ask()
+        found, largest, _ = kernels.summary(self.distance[: len(self)], FAR)
+        every = self.rank.gather_all(np.array([found, largest]))
+        return sum(int(each[0]) for each in every), max(int(each[1]) for each in every)
+
+    def _told(self) -> int:
+        """Lower distances to what others have found; how many."""
+        halo, lowered = self.distance[len(self) :], 0
+        for rows, found in zip(self._wanted, self.rank.exchange([halo[part] for part in self._halo_of]), strict=True):
+            lower = found < self.distance[rows]
+            self.distance[rows[lower]] = found[lower]
+            lowered += int(np.count_nonzero(lower))
+        return lowered
+
+    def _ask(self) -> None:
+        """Get the distances of the halo."""
+        received = self.rank.exchange([self.distance[rows] for rows in self._wanted])
+        self.distance[len(self) :] = np.concatenate(received)
+
+    def gathered(self) -> np.ndarray | None:
+        """(N,) the distances of all nodes at the first rank; None at the others."""
+        parts = self.rank.gather(self.distance[: len(self)])
+        return np.concatenate(parts) if self.rank.rank == 0 else None
+
+
+def ranked_distances(graph: Graph, source: int, processes: int | str, *, backward: bool = False) -> Found:
+    """The distances from a node to all others, or, backward, from all others to it, by several processes."""
+    check_number(processes)
+    size = processes if isinstance(processes, int) else 1
+    _warm(backward)
+
+    def program(rank: Rank) -> Found:
+        part = RankedGraph(graph, rank)
+        count, largest = part.search(source, backward)
+        return Found(part.gathered(), count, largest)
+
+    return together(processes, program, (graph.num_nodes // size + 1) * 4 * max(size, 2) + (1 << 16))
+
+
+def ranked_eccentricity(
+    graph: Graph, source: int, processes: int | str, spending: Spending, conventions: dict[str, Any]
+) -> Interval:
+    """The largest number of steps from a state to another one."""
+    found = ranked_distances(graph, source, processes)
+    spending.searches += 1
+    is_whole = found.count == graph.num_nodes
+    value = float(found.largest) if is_whole else math.inf
+    return Interval(
+        value,
+        value,
+        True,
+        finite_part=value if is_whole else 0.0,
+        searches=1,
+        method="a breadth-first search by several processes",
+        conventions=conventions,
+        seconds=spending.seconds,
+    )
+
+
+def _edges(graph: Graph, start: int, stop: int) -> np.ndarray:
+    """(n, A) the nodes that each of a range leads to; to itself where that is nowhere."""
+    states = np.asarray(graph.next_states[start:stop]).astype(np.int64)
+    end = len(graph.next_states)
+    if stop > end:
+        states = np.concatenate([states, np.full((1, states.shape[1]), -1)])
+    own = np.arange(start, stop)[:, None]
+    states[states < 0] = end
+    stops = np.append(graph.ends, [True] * graph.has_end)[start:stop, None]
+    return np.where(stops, own if graph.start < 0 else graph.start, states)
+
+
+def _warm(backward: bool) -> None:
+    """Compile what ranks run, once, before they are forked."""
+    kernel = kernels.lower_backward if backward else kernels.lower_forward
+    local, never, distance = np.zeros((1, 1), np.int32), np.zeros(1, np.bool_), np.zeros(1, np.int32)
+    kernel(local, never, -1, distance, FAR, 0, 1)
+    kernels.summary(distance, FAR)
