@@ -14,7 +14,7 @@ from pharos import hardness
 from pharos.errors import UndefinedMeasure
 from pharos.hardness.choices import choices_of
 from pharos.hardness.hitting_times import HittingTimes
-from pharos.hardness.interval import Spending
+from pharos.hardness.interval import Budget, Spending
 from pharos.hardness.stochastic_diameter import _Diameter
 from pharos.hardness.travel import TravelBounds
 from pharos.kernels import hitting
@@ -392,3 +392,18 @@ def test_hardness_of_blackjack_takes_seconds():
     assert found.exact and found.upper == pytest.approx(38114.81866, rel=1e-6)
     found = hardness.start_eccentricity_interval(mdp, budget=30)
     assert found.exact and found.upper == pytest.approx(38112.81866, rel=1e-6)
+
+
+def test_attempts_that_fail_a_million_times_take_few_sweeps():
+    """A row of 20 cells, each step of which leads on or back to the first by a coin: 2^20 - 2 steps.
+
+    A sweep alone brings the first cell one step nearer to it.
+    """
+    cells = np.arange(20)
+    successors = np.stack([np.minimum(cells + 1, 19), np.zeros(20, int)], axis=1)[:, None, :]
+    mdp = TabularMDP.from_outcomes(successors, np.full((20, 1, 2), 0.5), np.zeros((20, 1)))
+    targets = HittingTimes(choices_of(mdp, restart=True))
+    j, count, _ = targets.open(19)
+    bounds = targets.sweep(j, count, 400, 0.0, Spending(Budget(), None))
+    assert bounds.lower <= 2**20 - 2 <= bounds.upper
+    assert bounds.apart < 1e-3

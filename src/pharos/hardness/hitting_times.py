@@ -12,6 +12,13 @@ loses at least one expected step a step, so it needs at most c J. With c = 1 / (
 way, and iterating T from c J rises to J*. It does not matter where J comes from, and the second half holds for J of any
 sign.
 
+The slow mode. Where an attempt mostly fails and begins again, sweeps bring J nearer by one failure each. What is
+missing then has one shape: W(n), how likely the target is missed for long from n. It is swept along,
+W(n) = sum_m p(m | n, a) W(m) under the best actions, beginning with 1. A sweep adds f to J and takes g from W; where f
+is nearly c g, J + c W is the solution, but for what sweeps mend. Where J is so low that the best actions never arrive,
+as each failure costs less than is missing, J is raised by itself along W first: from above, attempts are worth their
+while.
+
 Rounding. Rows sum to 1, so T J(n) - J(n) = 1 + min_a sum_m p(m | n, a) (J(m) - J(n)), and its rounding error is a few
 units in the last place of sum_m p(m | n, a) |J(m) - J(n)|; the kernels add it to `above` and `below`. What is left is
 that J itself is rounded: a float of 1e10 is known to 1e-6 steps, and each of the 1e10 visits on the way to the target
@@ -43,10 +50,18 @@ SWEEPS = 40
 WIDEST = 8_000
 # Sweeps that a linear solve takes as long as: FILL_IN times the cube of that number of nodes, by the outcomes.
 FILL_IN = 1 / 30
+# Times half of `SWEEPS` that are made in any case.
+LEAST = 6
 # They end closer than the tolerance asks for, nearly as close as a linear solve does.
 CLOSER = 1e-3
 # Nodes up to which linear solves are tried: beyond, their fill-in takes more memory than the MDP.
 SOLVABLE = 60_000
+# Sweeps before the slow mode is looked at, sweeps between two looks, and sweeps between two that raise J by itself.
+PLAIN_SWEEPS, LOOK, RAISE = 8, 4, 12
+# Cosine, squared, of the angle between what J gains and what the mode loses, from which on they are one direction.
+ALIGNED = 0.95
+# Beyond, no J proves anything in 64-bit floats, and raising it ends.
+HIGHEST = 1e15
 # Stands for infinity in the hitting times of nodes that do not surely reach the target: products with it stay finite.
 TOP = 1e300
 # The residual of a float J is some units in its last place: where that is more than the tolerance, one float is too
@@ -79,6 +94,9 @@ class HittingTimes:
         size = len(self.choices.underlying)
         self.order, self.distance = np.empty(size, np.int64), np.empty(size, np.int64)
         self.policy, self.goal = np.zeros(size, np.int64), np.zeros(size, np.bool_)
+        self.mode: np.ndarray | None = None
+        self.swept = self.raised = 0
+        self.least = 0.0
 
     def for_another_thread(self) -> "HittingTimes":
         """The same problem with arrays of its own."""
@@ -109,6 +127,7 @@ class HittingTimes:
             the distance. A guess from above proves after few sweeps that a target is not the farthest.
         """
         count = self.distances(target)
+        self.mode, self.swept, self.raised, self.least = None, 0, 0, 0.0
         j = np.maximum(self.distance, 0) * self.initial_scale
         if self.choices.is_connected:
             return j, count, None
@@ -120,15 +139,21 @@ class HittingTimes:
         return j, nodes.size, ~sure
 
     def bounds(self, j: np.ndarray, count: int) -> Bounds:
-        """Bounds by the residuals of J; the greedy policy stands in `policy` then."""
+        """Bounds by the residuals of J; the greedy policy stands in `policy` then. `least` is the best lower one."""
         above, below, largest = hitting.residuals(*self.arrays, self.goal, self.order, count, j, self.policy)
-        return certified(above, below, largest)
+        bounds = certified(above, below, largest)
+        self.least = max(self.least, bounds.lower)
+        return bounds
 
     def sweep(self, j: np.ndarray, count: int, sweeps: int, enough: float, spending: Spending) -> Bounds:
         """Sweeps in place; ends early where the upper bound is at most `enough`, the budget ends, or J does not
         move."""
         for number in range(sweeps):
-            change = hitting.sweep_in_place(*self.arrays, self.goal, self.order, count, j)
+            if self.swept < PLAIN_SWEEPS:
+                change = hitting.sweep_in_place(*self.arrays, self.goal, self.order, count, j)
+            else:
+                change = self._sweep_with_mode(j, count)
+            self.swept += 1
             if number % 4 == 3 or change < 1e-13:
                 bounds = self.bounds(j, count)
                 if change < max(1e-13, 4 * hitting.UNIT * bounds.largest):
@@ -136,6 +161,25 @@ class HittingTimes:
                 if bounds.upper <= enough or spending.is_over:
                     return bounds
         return self.bounds(j, count)
+
+    def _sweep_with_mode(self, j: np.ndarray, count: int) -> float:
+        """A sweep of J and of the slow mode, along which J is moved now and then; the largest change by the sweep."""
+        if self.mode is None:
+            self.mode = np.zeros(len(j))
+            self.mode[self.order[:count]] = ~self.goal[self.order[:count]]
+        arrays = (*self.arrays, self.goal, self.order, count, j, self.mode)
+        change, ff, fg, gg = hitting.sweep_with_mode(*arrays)
+        if self.swept % LOOK != LOOK - 1 or not (gg > 0 and math.isfinite(ff) and change > 0):
+            return float(change)
+        nodes = self.order[:count]
+        if fg * fg > ALIGNED * ff * gg:
+            j[nodes] += fg / gg * self.mode[nodes]
+        elif fg > 0 and self.swept - self.raised >= RAISE and math.isinf(self.bounds(j, count).high):
+            largest = float(j[nodes].max())
+            if largest < HIGHEST:
+                j[nodes] += largest * self.mode[nodes]
+                self.raised = self.swept
+        return float(change)
 
     def solve(self, j: np.ndarray, count: int, tolerance: float, enough: float, spending: Spending) -> Bounds:
         """Bounds within `tolerance` of each other, or an upper bound of at most `enough`, or what budget and floats
@@ -170,21 +214,28 @@ class HittingTimes:
         return bounds
 
     def _converged(self, j: np.ndarray, count: int, tolerance: float, enough: float, spending: Spending) -> Bounds:
-        """Sweeps; more than `SWEEPS` where at their rate the bounds meet sooner than a linear solve takes."""
+        """Sweeps; as long as at their rate the bounds meet sooner than a linear solve takes, or nearly as soon.
+
+        The rate is that of three times `SWEEPS` / 2 sweeps: moves along the slow mode set single ones back.
+        """
         bounds = self.sweep(j, count, SWEEPS // 2, enough, spending)
         as_long = FILL_IN * self._width(count) ** 3 / max(self.support[1].size, 1)
-        left = max(1, int(as_long / (SWEEPS // 2)) - 1)
-        unbounded = left // 4  # of these: while nothing is proven, no rate is known
-        while not (bounds.upper <= enough or bounds.limited or spending.is_over):
-            apart, bounds = bounds.apart, self.sweep(j, count, SWEEPS // 2, enough, spending)
-            left, goal = left - 1, CLOSER * tolerance
-            if math.isinf(bounds.apart) and unbounded > 0:
+        left = max(LEAST, int(as_long / (SWEEPS // 2)) - 1)
+        unbounded = max(LEAST // 2, left // 4)  # of these: while nothing is proven, no rate is known
+        apart, goal = [bounds.apart], CLOSER * tolerance
+        while left > 0 and not (bounds.upper <= enough or bounds.limited or bounds.apart <= goal or spending.is_over):
+            bounds = self.sweep(j, count, SWEEPS // 2, enough, spending)
+            left -= 1
+            apart.append(bounds.apart)
+            if math.isinf(bounds.apart):
                 unbounded -= 1
+                if unbounded < 0:
+                    break
                 continue
-            if bounds.apart <= goal or bounds.apart >= apart:
-                break
-            if math.isfinite(apart) and left * math.log(apart / bounds.apart) < math.log(bounds.apart / goal):
-                break
+            if len(apart) > 3 and math.isfinite(apart[-4]):
+                before, now = apart[-4], max(min(apart[-3:]), goal)
+                if now >= before or left * math.log(before / now) < 3 * math.log(now / goal):
+                    break
         return bounds
 
     def _width(self, count: int) -> int:

@@ -30,8 +30,9 @@ BATCH = 64
 MANY = 10**9
 # Targets that are solved before it is judged whether their bounds rule out others.
 TRIAL = 16
-# Targets that one solved target must rule out on average; else looking at the others one by one is quicker.
-RULED_OUT = 10
+# Targets that each of the last `TRIAL` ones must have ruled out on average, or all of them half of those left; else
+# looking at the others one by one is quicker.
+RULED_OUT = 40
 # `crude_upper` is a product of up to N rounded factors.
 CRUDE = 1.01
 
@@ -135,11 +136,13 @@ class _Diameter:
         """
         batch = [int(self.choices.underlying[self.choices.starts[0][0]])]
         apart = self.choices.num_targets // 64 + 1
+        trial, left_before = TRIAL, self._num_open
         while batch and not self.spending.is_over:
             yield batch
-            searches, ruled_out = self.spending.searches, np.count_nonzero(self.upper == -math.inf)
-            if not self.many and searches >= TRIAL and ruled_out < RULED_OUT * searches:
-                return
+            if not self.many and self.spending.searches >= trial:
+                if left_before - self._num_open < min(RULED_OUT * TRIAL, left_before / 2):
+                    return
+                trial, left_before = self.spending.searches + TRIAL, self._num_open
             widest = int(self.upper.argmax())
             others = self.upper.copy()
             others[max(0, widest - apart) : widest + apart] = -math.inf  # neighbours bound each other
@@ -221,7 +224,7 @@ def _look(
         times = j * bounds.high if bounding and lost is None and math.isfinite(bounds.high) else None
         limited = bounds.limited and not bounds.meets(tolerance)
         scale = targets.scale_of(j) if scaling else 1.0
-        looks.append(_Look(target, bounds.lower, bounds.upper, limited, missing, scale, times))
+        looks.append(_Look(target, max(bounds.lower, targets.least), bounds.upper, limited, missing, scale, times))
     return looks
 
 

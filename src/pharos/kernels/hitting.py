@@ -72,6 +72,50 @@ def sweep_in_place(rows, common, alike, goal, order, count, j):
 
 
 @njit(cache=True, nogil=True)
+def sweep_with_mode(rows, common, alike, goal, order, count, j, mode):
+    """As `sweep_in_place`, and mode(n) = sum p mode under the actions that are best for j, in place as well.
+
+    Returns (largest change of j, sum f f, sum f g, sum g g): f, what j has gained, g, what mode has lost in the sweep.
+    """
+    first, node, weight = rows
+    always, always_node, always_weight = common
+    num_actions = (len(first) - 1) // len(goal)
+    change, of_alike, mode_of_alike = 0.0, -1.0, 0.0
+    ff, fg, gg = 0.0, 0.0, 0.0
+    for i in range(count):
+        n = order[i]
+        if goal[n]:
+            continue
+        if alike[n] and of_alike >= 0:
+            change = max(change, abs(of_alike - j[n]))
+            j[n], mode[n] = of_alike, mode_of_alike
+            continue
+        best, choice = np.inf, n * num_actions
+        for row in range(n * num_actions, (n + 1) * num_actions):
+            total = 0.0
+            for k in range(first[row], first[row + 1]):
+                total += weight[k] * j[node[k]]
+            if total < best:
+                best, choice = total, row
+        best += 1.0
+        left = 0.0
+        for k in range(first[choice], first[choice + 1]):
+            left += weight[k] * mode[node[k]]
+        for k in range(always[n], always[n + 1]):
+            best += always_weight[k] * j[always_node[k]]
+            left += always_weight[k] * mode[always_node[k]]
+        f, g = best - j[n], mode[n] - left
+        change = max(change, abs(f))
+        ff += f * f
+        fg += f * g
+        gg += g * g
+        j[n], mode[n] = best, left
+        if alike[n]:
+            of_alike, mode_of_alike = best, left
+    return change, ff, fg, gg
+
+
+@njit(cache=True, nogil=True)
 def residuals(rows, common, alike, goal, order, count, j, policy):
     """(bound of T j - j, bound of j - T j, largest j) over nodes that are not the goal; policy[n] = the action that
     attains T j.
