@@ -35,6 +35,15 @@ CHANGES = {  # class -> version of the rules -> what changed
         2: "The paddle's edge sends the ball one column back ([why](../decisions/0004-breakout-edges.md)).",
     }
 }
+COUNTED = {  # instance -> states, and the page that tells how they were counted, where its values were never computed
+    "sliding_tiles/3x4": (239_500_800, "puzzles.md"),
+    **{f"pocket_cube/{name}": (3_674_160, "puzzles.md") for name in ("half", "quarter", "half-4", "quarter-4")},
+    "game_2048/3x3": (48_713_519, "game-2048.md"),
+    "game_2048/3x3-to-256": (7_270_259, "game-2048.md"),
+    "mini_grid/key-corridor-s5r3": (5_582_592, "mini-grid.md"),
+    "mini_grid/key-corridor-s6r3": (16_844_288, "mini-grid.md"),
+    "freeway/25x13-speed1": (3_001_973, "study.md"),
+}
 LIVE = "assets/explorer/frozen_lake.html"
 FRAME = (
     f'<iframe src="{LIVE}" title="Explorer of a slippery lake" loading="lazy" style="width: 100%; height: 52rem; '
@@ -45,9 +54,10 @@ MARK = "<!-- The site has it live here: scripts/site_pages.py, explorer. -->"
 POLICIES = ("optimal", "uniform", "worst")
 VALUES = (
     "Values at the start are those of the optimal, the uniformly random and the worst policy. *Discounted*: by 0.99, "
-    "without a limit. *Of an episode*: undiscounted, of as many steps as its limit (left out where that is long to "
-    "compute). Each is within 1e-6, rounded to six digits."
+    "without a limit. *Of an episode*: undiscounted, of as many steps as its limit; a dash where states, actions and "
+    "steps multiply to more than 10^10, so that it was not computed. Each is within 1e-6, rounded to six digits."
 )
+UNKNOWN = "–"
 VALUES_HEAD = (
     "| instance | states | limit | V\\*, discounted | uniform | worst | V\\* of an episode | uniform | worst |\n"
     "|---|--:|--:|--:|--:|--:|--:|--:|--:|"
@@ -94,19 +104,43 @@ def environments(files: Mapping[str, Path]) -> dict[str, str]:
 
 def values_of_all(stored: Mapping[str, dict]) -> str:
     """One table of every named instance."""
-    rows = [row for name, numbers in stored.items() if (row := values_row(name, numbers))]
+    known = {name: row for name, numbers in stored.items() if (row := values_row(name, numbers))}
     return "\n".join(
         [
             "# Values of every instance",
             "",
-            f"{VALUES} An instance without a row has more states than were enumerated for this page. The same in JSON: "
+            f"{VALUES} Instances that were not enumerated for this page stand below. The same in JSON: "
             "[environments.json](../environments.json).",
             "",
             VALUES_HEAD,
-            *rows,
+            *known.values(),
+            "",
+            "## Not enumerated",
+            "",
+            "Each would take minutes to hours, and gigabytes, on two cores; `pharos solve` does it, "
+            "[as far as memory and disk go](../performance.md).",
+            "",
+            "| instance | states |",
+            "|---|---|",
+            *(f"| {page_link(name)} | {states_of(name, stored[name])} |" for name in stored if name not in known),
             "",
         ]
     )
+
+
+def page_link(name: str) -> str:
+    """An instance, as a link to the page of its class."""
+    return f"[`{name}`]({name.split('/')[0]}.md)"
+
+
+def states_of(name: str, numbers: Mapping) -> str:
+    """How many states an instance has, as far as that is known."""
+    if "num_states" in numbers:
+        return f"{numbers['num_states']:,}"
+    if name in COUNTED:
+        states, page = COUNTED[name]
+        return f"{states:,} ([counted](../{page}))"
+    return f"more than {numbers['more_than']:,}, not enumerated" if numbers else "not enumerated"
 
 
 def values_row(name: str, numbers: Mapping) -> str | None:
@@ -114,9 +148,8 @@ def values_row(name: str, numbers: Mapping) -> str | None:
     if "num_states" not in numbers:
         return None
     found = [numbers.get(kind, {}).get(policy) for kind in ("discounted", "episode") for policy in POLICIES]
-    texts = ("" if value is None else f"{value + 0.0:.6g}" for value in found)
-    page = f"[`{name}`]({name.split('/')[0]}.md)"
-    return f"| {page} | {numbers['num_states']:,} | {numbers['episode_limit']:,} | {' | '.join(texts)} |"
+    texts = (UNKNOWN if value is None else f"{value + 0.0:.6g}" for value in found)
+    return f"| {page_link(name)} | {numbers['num_states']:,} | {numbers['episode_limit']:,} | {' | '.join(texts)} |"
 
 
 def sections_of(text: str) -> dict[str, str]:
@@ -140,7 +173,9 @@ def described(cls) -> dict:
 
 def card_of(cls, stored: Mapping[str, dict], section: str) -> str:
     """A cell of the list of environments, in HTML: the pages are beside it."""
-    states = [n["num_states"] for name, n in stored.items() if name.split("/")[0] == cls.name and "num_states" in n]
+    own = {name: numbers for name, numbers in stored.items() if name.split("/")[0] == cls.name}
+    states = [numbers.get("num_states", COUNTED.get(name, (0,))[0]) for name, numbers in own.items()]
+    states = [number for number in states if number]
     moving = animations(section)
     picture = f'<a href="{cls.name}.html"><img src="../{moving[0][1]}" alt="{cls.name}"></a>' if moving else ""
     span = " to ".join(f"{number:,}" for number in dict.fromkeys((min(states), max(states)))) if states else "many"
@@ -215,20 +250,29 @@ def instances(cls, stored: Mapping[str, dict]) -> list[str]:
     """The table of named instances, with counts and values at the start."""
     ids = {name: gymnasium_id for gymnasium_id, name in ids_of(cls).items()}
     counted = ["| instance | Gymnasium id | states | terminal | depth |", "|---|---|--:|--:|--:|"]
-    values = [VALUES_HEAD]
+    values, unknown = [VALUES_HEAD], []
     for instance in cls.instances:
         name = f"{cls.name}/{instance}"
         numbers = stored.get(name, {})
         start = f"| `{name}` | `{ids[name]}` |"
         if (row := values_row(name, numbers)) is None:
-            bound = f"more than {numbers['more_than']:,}" if numbers else ""
-            counted.append(f"{start} {bound} | | |")
+            counted.append(f"{start} {states_of(name, numbers)} | {UNKNOWN} | {UNKNOWN} |")
+            unknown.append(f"`{name}`")
             continue
         parts = ("num_states", "num_terminal_states", "depth")
         counted.append(f"{start} " + " | ".join(f"{numbers[part]:,}" for part in parts) + " |")
         values.append(row)
     about = f"*Depth* is how far the farthest state is from the start. {VALUES}"
-    return ["## Named instances", "", *counted, "", about, "", *values, ""]
+    absent = []
+    if unknown:
+        which = "it takes" if len(unknown) == 1 else "they take"
+        absent = [
+            f"Not computed for this page, because {which} minutes to hours on two cores: {', '.join(unknown)}.",
+            "",
+        ]
+    if len(values) > 1:
+        absent = [*values, "", *absent]
+    return ["## Named instances", "", *counted, "", about, "", *absent]
 
 
 def observations(section: str) -> str:

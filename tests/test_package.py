@@ -62,6 +62,16 @@ def test_workflows_and_templates_are_yaml(folder):
     assert files and all(isinstance(yaml.safe_load(file.read_text()), dict) for file in files)
 
 
+def test_issue_templates_have_the_keys_that_forms_know():
+    for file in (ROOT / ".github/ISSUE_TEMPLATE").glob("[!c]*.yml"):
+        form = yaml.safe_load(file.read_text())
+        assert set(form) <= {"name", "description", "title", "labels", "assignees", "body"}
+        for field in form["body"]:
+            assert set(field) <= {"type", "id", "attributes", "validations"}
+            assert set(field["attributes"]) <= {"label", "description", "placeholder", "value", "render"}, file.name
+            assert all(isinstance(value, str) for value in field["attributes"].values()), file.name
+
+
 def test_workflows_and_recipes_name_no_package_index():
     files = [*(ROOT / ".github/workflows").glob("*.yml"), ROOT / "conda/meta.yaml"]
     for file in files:

@@ -124,6 +124,24 @@ def test_every_environment_has_a_page(scripts):
 
 
 @pytest.mark.slow
+def test_no_cell_of_the_numbers_is_empty_and_what_was_not_enumerated_says_so(scripts):
+    pages = scripts("site_pages").environments({})
+    for page in pages.values():
+        for line in page.partition("## Named instances")[2].partition("\n## ")[0].splitlines():
+            assert not line.startswith("|") or all(cell.strip() for cell in line.split("|")[1:-1]), line
+    values = pages["environments/values.md"]
+    stored = json.loads((DOCS / "environments.json").read_text())
+    assert all(values.count(f"[`{name}`]") == 1 for name in stored)
+
+
+def test_counts_of_the_site_are_those_of_the_docs_and_of_what_was_enumerated(scripts):
+    stored = json.loads((DOCS / "environments.json").read_text())
+    for name, (states, page) in scripts("site_pages").COUNTED.items():
+        assert f"{states:,}" in (DOCS / page).read_text(), name
+        assert stored[name].get("num_states", states) == states, name
+        assert stored[name].get("more_than", 0) < states, name
+
+
 def test_the_reference_has_every_published_name_once(scripts):
     pages = scripts("site_pages").reference()
     text = "\n".join(pages.values())
