@@ -9,13 +9,16 @@ largest change of an entry.
 """
 
 import numpy as np
-from numba import njit, types
+from numba import njit, types, uint64
 from numba.extending import overload
 
-from pharos.kernels.outcomes import expectation, expectation_of_pair, size_of
+from pharos.kernels.outcomes import expectation, expectation_of_pair, fetch_values, size_of
 from pharos.kernels.paths import state_at
 
 UNROLLED = 128  # actions
+AHEAD = (
+    32  # states between the one whose values are fetched and the one that is backed up: memory has that long to answer
+)
 
 
 def actions_of(num_actions: int) -> "tuple[int, ...] | np.ndarray":
@@ -30,8 +33,8 @@ def reward_at(table, palette, s, a):
 @overload(reward_at)
 def _reward_at(table, palette, s, a):
     if table.dtype.name == "uint8":
-        return lambda table, palette, s, a: palette[table[s, a]]
-    return lambda table, palette, s, a: table[s, a]
+        return lambda table, palette, s, a: palette[table[uint64(s), uint64(a)]]
+    return lambda table, palette, s, a: table[uint64(s), uint64(a)]
 
 
 def _backup(transitions, table, palette, gamma, uniform, choice, v, actions, s):
@@ -44,13 +47,16 @@ def _backup_of(transitions, table, palette, gamma, uniform, choice, v, actions, 
 
         def of_extreme(transitions, table, palette, gamma, uniform, choice, v, actions, s):
             best = -np.inf
-            total = 0.0
+            if uniform > 0.0:
+                total = 0.0
+                for a in range(len(actions)):
+                    q = reward_at(table, palette, s, a) + gamma * expectation(transitions, v, s, a)
+                    best = max(best, choice * q)
+                    total += q
+                return (1.0 - uniform) * (choice * best) + uniform * total / len(actions)
             for a in range(len(actions)):
                 q = reward_at(table, palette, s, a) + gamma * expectation(transitions, v, s, a)
                 best = max(best, choice * q)
-                total += q
-            if uniform > 0.0:
-                return (1.0 - uniform) * (choice * best) + uniform * total / len(actions)
             return choice * best
 
         return of_extreme
@@ -73,10 +79,12 @@ def optimal_sweep(transitions, table, palette, gamma, uniform, choice, v, action
     """v[s] = (1 - uniform) q(s, what is chosen) + uniform mean_a q(s, a), in place, for places [start, stop)."""
     change = 0.0
     for i in range(stop - 1, start - 1, -1):
+        if i >= start + AHEAD:
+            fetch_values(transitions, v, actions, state_at(order, i - AHEAD))
         s = state_at(order, i)
         value = _backup(transitions, table, palette, gamma, uniform, choice, v, actions, s)
-        change = max(change, abs(value - v[s]))
-        v[s] = value
+        change = max(change, abs(value - v[uint64(s)]))
+        v[uint64(s)] = value
     return change
 
 
@@ -84,7 +92,9 @@ def optimal_sweep(transitions, table, palette, gamma, uniform, choice, v, action
 def optimal_block(transitions, table, palette, gamma, uniform, choice, v, out, actions, start, stop):
     """out[s] = the backup of v for s in [start, stop), not in place: what threads share, and horizons need."""
     for s in range(start, stop):
-        out[s] = _backup(transitions, table, palette, gamma, uniform, choice, v, actions, s)
+        if s + AHEAD < stop:
+            fetch_values(transitions, v, actions, s + AHEAD)
+        out[uint64(s)] = _backup(transitions, table, palette, gamma, uniform, choice, v, actions, s)
 
 
 @njit(forceinline=True)
@@ -124,13 +134,15 @@ def sticky_sweep(transitions, table, palette, gamma, weights, choice, v, actions
     chosen, previous, uniform = weights
     change = 0.0
     for i in range(size_of(transitions)[0] - 1, -1, -1):
+        if i >= AHEAD:
+            fetch_values(transitions, v, actions, state_at(order, i - AHEAD))
         s = state_at(order, i)
         best, total = _sticky_values(transitions, table, palette, gamma, choice, v, actions, q, s)
         shared = chosen * best + uniform * total / len(actions)
         for b in range(len(actions)):
             value = shared + previous * q[b]
-            change = max(change, abs(value - v[s, b]))
-            v[s, b] = value
+            change = max(change, abs(value - v[uint64(s), b]))
+            v[uint64(s), b] = value
     return change
 
 
@@ -140,10 +152,12 @@ def sticky_block(transitions, table, palette, gamma, weights, choice, v, out, ac
     chosen, previous, uniform = weights
     q = np.empty(len(actions))
     for s in range(start, stop):
+        if s + AHEAD < stop:
+            fetch_values(transitions, v, actions, s + AHEAD)
         best, total = _sticky_values(transitions, table, palette, gamma, choice, v, actions, q, s)
         shared = chosen * best + uniform * total / len(actions)
         for b in range(len(actions)):
-            out[s, b] = shared + previous * q[b]
+            out[uint64(s), b] = shared + previous * q[b]
 
 
 @njit(cache=True, nogil=True)

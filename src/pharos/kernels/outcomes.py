@@ -11,12 +11,15 @@ Kernels take `transitions`, one of three things:
 - a pair (`transitions` of the first two kinds, p): with probability p a state stays what it is, else they hold. Staying
   is the last outcome of each row.
 
-`outcomes_of` and `outcome` give them one by one, `expectation` adds up values. Loops over tables cost nothing more.
+`outcomes_of` and `outcome` give them one by one, `expectation` adds up values. Loops over tables cost nothing more:
+their indices are unsigned, as signed ones would be asked at each read whether they count from the end.
 """
 
 import numpy as np
 from numba import njit, types, uint64
 from numba.extending import overload
+
+from pharos.kernels.hash_table import prefetch
 
 # The largest K that the compiler is told.
 UNROLLED = 4
@@ -134,7 +137,7 @@ def _expectation(transitions, v, s, a):
 
         return moves_or_stays
     if isinstance(transitions, types.Array):
-        return lambda transitions, v, s, a: v[transitions[s, a]]
+        return lambda transitions, v, s, a: v[transitions[uint64(s), uint64(a)]]
 
     def several(transitions, v, s, a):
         total = 0.0
@@ -159,7 +162,7 @@ def _expectation_of_pair(transitions, v, s, a):
 
         return moves_or_stays
     if isinstance(transitions, types.Array):
-        return lambda transitions, v, s, a: v[transitions[s, a], a]
+        return lambda transitions, v, s, a: v[transitions[uint64(s), uint64(a)], uint64(a)]
 
     def several(transitions, v, s, a):
         total = 0.0
@@ -169,6 +172,24 @@ def _expectation_of_pair(transitions, v, s, a):
         return total
 
     return several
+
+
+def fetch_values(transitions, v, actions, s):
+    """Ask the processor for what `expectation` or `expectation_of_pair` will read of v for state s, where one reads a
+    table. actions: see kernels/bellman.py.
+    """
+
+
+@overload(fetch_values)
+def _fetch_values(transitions, v, actions, s):
+    if not isinstance(transitions, types.Array):
+        return lambda transitions, v, actions, s: None
+
+    def each_action(transitions, v, actions, s):
+        for a in range(len(actions)):
+            prefetch(v, np.int64(transitions[uint64(s), uint64(a)]))
+
+    return each_action
 
 
 @njit(cache=True, nogil=True)

@@ -111,10 +111,14 @@ def fixed_point(
         raise imprecise(mdp, least, tolerance)
     x, sweeps = backup.zeros() if x is None else x, 0
     better, least, since = PolicyIteration(mdp, select), math.inf, 0
+    largest = largest_of(x)
     while True:
         change = backup.sweep(x)
         sweeps += 1
-        rounding = backup.rounding(largest_of(x) + change)
+        largest += change  # at most that: the entries are read where it matters, which costs a third of a sweep
+        if better.is_exact or not rho * change > max(backup.rounding(largest + change), tolerance * (1 - rho)):
+            largest = largest_of(x)
+        rounding = backup.rounding(largest + change)
         bound = (rho * change + rounding) / (1 - rho) * MARGIN
         if progress is not None:
             progress(sweeps, bound)
@@ -127,6 +131,7 @@ def fixed_point(
             raise imprecise(mdp, least if better.is_exact else bound, tolerance)
         if better.is_worth_it(sweeps, change, tolerance):
             better.improve(x, tolerance)
+            largest = largest_of(x)
 
 
 def backward_induction(
