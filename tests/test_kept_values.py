@@ -123,3 +123,19 @@ def test_a_file_of_values_is_for_one_solve_of_one_mdp_at_a_time(tmp_path):
         value_iteration(ring(), values=tmp_path / "other.npy", horizon=3)
     with pytest.raises(ParameterError, match="cannot be used for values"):
         value_iteration(ring(), values=tmp_path)
+
+
+@pytest.mark.parametrize("threads", (2, 3))
+def test_threads_share_a_sweep_and_the_bound_holds(threads):
+    mdp = ring()
+    alone, shared = value_iteration(mdp), value_iteration(mdp, threads=threads)
+    assert shared.error_bound <= 1e-6
+    assert (abs(shared.v - alone.v) <= shared.error_bound + alone.error_bound).all()
+
+
+@pytest.mark.long
+@settings(max_examples=60, deadline=None)
+@given(small_mdps(), st.integers(2, 9))
+def test_bounds_hold_whatever_the_threads(mdp, threads):
+    solution = value_iteration(mdp, threads=threads)
+    assert naive_exact.largest_error(solution.v, naive_exact.extreme_values(mdp)) <= solution.error_bound <= 1e-6

@@ -56,6 +56,9 @@ def solve(
             help="Folder that holds the values while they are computed, in place of memory; a killed solve goes on.",
         ),
     ] = None,
+    threads: Annotated[
+        int, typer.Option("--threads", min=1, help="Of a sweep; beyond one, last digits may differ, within the error.")
+    ] = 1,
     memory: Memory = None,
     workers: Workers = None,
     processes: Processes = "1",
@@ -84,6 +87,7 @@ def solve(
             tolerance,
             progress=lambda sweeps, bound: report(f"sweep {sweeps}, error at most {bound:.2g}"),
             values=None if values is None or ranks != 1 else values / "optimal.npy",
+            threads=threads,
             **sharing,
         )
         report("value of the uniform policy")
@@ -92,6 +96,7 @@ def solve(
             tolerance,
             progress=lambda sweeps, bound: report(f"uniform policy, sweep {sweeps}, error at most {bound:.2g}"),
             values=None if values is None or ranks != 1 else values / "uniform.npy",
+            threads=threads,
             **sharing,
         )
     if solution is None:  # a rank of MPI that is not the first

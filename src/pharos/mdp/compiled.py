@@ -55,8 +55,8 @@ class CompiledDynamics(Dynamics):
         out[-1] = 0.0
         _shared(lambda start, stop: kernel(*tables, weights, choice, x_, out_, actions, start, stop), self)
 
-    def sweep(self, equation: BellmanEquation, x: np.ndarray) -> float:
-        return swept(self.for_sweeps, self.num_actions, equation, x, None)
+    def sweep(self, equation: BellmanEquation, x: np.ndarray, threads: int = 1) -> float:
+        return swept(self.for_sweeps, self.num_actions, equation, x, None, threads)
 
     def sweep_once(self, equation: BellmanEquation, x: np.ndarray, order: Order) -> None:
         swept(self.for_sweeps, self.num_actions, equation, x, order.states)
@@ -92,9 +92,17 @@ class CompiledDynamics(Dynamics):
 
 
 def swept(
-    transitions: Any, num_actions: int, equation: BellmanEquation, x: np.ndarray, order: np.ndarray | None
+    transitions: Any,
+    num_actions: int,
+    equation: BellmanEquation,
+    x: np.ndarray,
+    order: np.ndarray | None,
+    threads: int = 1,
 ) -> float:
-    """Replace each entry of x by its backup, from the last state of an order to the first; the largest change."""
+    """Replace each entry of x by its backup, from the last state of an order to the first; the largest change.
+
+    Each thread has a part of the states, where that is possible.
+    """
     rewards, gamma, chance, select = equation
     tables = (transitions, rewards.table, rewards.palette, gamma)
     actions, scratch = bellman.actions_of(num_actions), np.empty(num_actions)
@@ -107,21 +115,30 @@ def swept(
         return bellman.policy_sweep(*tables, *weights, select.later[:, 0], x[:, 0], order)
     if chance.is_sticky:
         return bellman.sticky_sweep(*tables, chance.triple, choice, x, actions, scratch, order)
-    change, v = 0.0, x[:, 0]
-    for start, stop in _ranges(transitions, rewards.shape[0]):
-        part = bellman.optimal_sweep(*tables, chance.uniform, choice, v, actions, order, start, stop)
-        change = float(np.maximum(change, part))
-    return change
+    v = x[:, 0]
+
+    def part(low: int, high: int) -> float:
+        change = 0.0
+        for start, stop in _ranges(transitions, low, high):
+            largest = bellman.optimal_sweep(*tables, chance.uniform, choice, v, actions, order, start, stop)
+            change = float(np.maximum(change, largest))
+        return change
+
+    cuts = [rewards.shape[0] * i // threads for i in range(threads + 1)]
+    if threads == 1:
+        return part(*cuts)
+    with ThreadPoolExecutor(threads) as pool:
+        return float(np.max([*pool.map(part, cuts[:-1], cuts[1:])]))
 
 
-def _ranges(transitions: Any, num_states: int) -> Iterator[tuple[int, int]]:
-    """Ranges of places, the last one first; where they are read from a mapped file, the next one is asked for."""
+def _ranges(transitions: Any, low: int, high: int) -> Iterator[tuple[int, int]]:
+    """Ranges of places [low, high), the last one first; the next one is asked for where it is read from a file."""
     if not isinstance(transitions, np.memmap):
-        yield 0, num_states
+        yield low, high
         return
-    for stop in range(num_states, 0, -_RANGE):
-        start = max(stop - _RANGE, 0)
-        read_ahead(transitions, max(start - _RANGE, 0), start)
+    for stop in range(high, low, -_RANGE):
+        start = max(stop - _RANGE, low)
+        read_ahead(transitions, max(start - _RANGE, low), start)
         yield start, stop
 
 

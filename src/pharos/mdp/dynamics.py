@@ -175,9 +175,12 @@ class Dynamics(ABC):
         out[: self.num_states] = equation.value(equation.rewards.array + equation.gamma * self.expected(x))
         out[-1] = 0.0
 
-    def sweep(self, equation: BellmanEquation, x: np.ndarray) -> float:
-        """Replace each entry of x by its backup, from entries that are old or already new.
+    def sweep(self, equation: BellmanEquation, x: np.ndarray, threads: int = 1) -> float:
+        """Replace each entry of x by its backup, from entries that are old or already new; once each.
 
+        Args:
+            threads: that may share the entries; which of two is first is theirs then, so that x is not the same to the
+                last bit in every run.
         Returns the largest change.
         """
         new = np.empty_like(x)

@@ -9,7 +9,8 @@ The bound. Let T be the backup, a contraction with factor rho, x* its fixed poin
 entries by at most d, with rounding errors of at most e an entry. Every new entry is a backup of entries that are old or
 already new, so it is within rho max(|x_old - x*|, |x_new - x*|) + e of x*. With D = |x_new - x*| in the maximum norm
 and |x_old - x*| <= D + d, D <= rho (D + d) + e, hence D <= (rho d + e) / (1 - rho). Nothing is assumed of x_old: it may
-be a guess. rho is gamma times the largest sum of probabilities, which is 1 up to the rounding of what was given.
+be a guess. Nor of the order: threads may share the states, as long as each state is swept once. rho is gamma times the
+largest sum of probabilities, which is 1 up to the rounding of what was given.
 
 Values that follow from x are as accurate: q = r + gamma E x has an error of at most rho D + e <= D.
 """
@@ -51,9 +52,9 @@ class FixedPoint(NamedTuple):
 class Backup:
     """The backup T of an MDP and of what is chosen in its states."""
 
-    def __init__(self, mdp: TabularMDP | Part, select: Selection):
+    def __init__(self, mdp: TabularMDP | Part, select: Selection, threads: int = 1):
         chance = mdp.chance
-        self.mdp, self.select = mdp, select
+        self.mdp, self.select, self.threads = mdp, select, threads
         self.equation = BellmanEquation(mdp.reward_table, mdp.gamma, chance, select)
         executed = chance.chosen * select.mass + chance.previous + chance.uniform
         is_exact = select.mass == 1.0 and mdp.dynamics.mass == 1.0 and not chance.is_sticky and not chance.is_random
@@ -79,7 +80,7 @@ class Backup:
     def sweep(self, x: np.ndarray) -> float:
         """x = T x in place, from the last state to the first where that is possible; the largest change."""
         with np.errstate(over="ignore", invalid="ignore"):  # the bound of values beyond floats is infinite
-            return self.mdp.dynamics.sweep(self.equation, x)
+            return self.mdp.dynamics.sweep(self.equation, x, self.threads)
 
     def rounding(self, largest: float) -> float:
         """A bound on the rounding error of one backup of entries up to `largest`: half a unit for each operation."""
@@ -92,17 +93,19 @@ def fixed_point(
     tolerance: float,
     progress: Callable[[int, float], None] | None = None,
     x: np.ndarray | None = None,
+    threads: int = 1,
 ) -> FixedPoint:
     """Sweep until the proven bound is at most the tolerance.
 
     Args:
         x: (S + 1, W) float64, where to sweep, from any finite values; None: from zeros.
+        threads: of a sweep.
 
     Raises:
         DivergenceError: gamma is 1, and a state can be visited again, so that the value may be infinite.
         PrecisionError: 64-bit floats cannot reach the tolerance.
     """
-    backup = Backup(mdp, select)
+    backup = Backup(mdp, select, threads)
     if mdp.gamma == 1.0 or mdp.age is not None:
         return _in_one_pass(backup, tolerance, progress, x)
     rho = backup.factor

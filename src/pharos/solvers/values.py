@@ -12,6 +12,7 @@ from pharos.solvers.fixed_point import backward_induction, fixed_point
 from pharos.solvers.kept_values import kept_values
 from pharos.solvers.sharing import Sharing, shared_solution
 from pharos.solvers.solution import Solution
+from pharos.workers import usable_workers
 
 
 @takes_mdp
@@ -26,6 +27,7 @@ def value_iteration(
     processes: int | str = 1,
     jacobi: bool = False,
     checkpoint: str | os.PathLike | None = None,
+    threads: int = 1,
 ) -> Solution:
     """The optimal values of an MDP.
 
@@ -50,6 +52,8 @@ def value_iteration(
             within the tolerance.
         checkpoint: a folder for the values so far, once a minute, so that the same call goes on where one was killed,
             with any number of processes.
+        threads: that share the states of a sweep in this process, where no action is sticky and transitions are in
+            arrays. Values depend on which is first, within the tolerance.
     Returns:
         A Solution of kind "optimal".
     Raises:
@@ -64,7 +68,7 @@ def value_iteration(
     Source: Bellman (1957); in place: Puterman (1994), section 6.3.3; the sticky equation: the pharos paper, appendix A.
     """
     sharing = Sharing(processes, jacobi, checkpoint)
-    return solution_of(mdp, BEST, tolerance, horizon, keep_all, progress, values, sharing)
+    return solution_of(mdp, BEST, tolerance, horizon, keep_all, progress, values, sharing, threads)
 
 
 @takes_mdp
@@ -92,6 +96,7 @@ def uniform_value(
     processes: int | str = 1,
     jacobi: bool = False,
     checkpoint: str | os.PathLike | None = None,
+    threads: int = 1,
 ) -> Solution:
     """The values of the uniformly random policy: every action is replaced by a uniform one, so nothing is chosen.
 
@@ -99,7 +104,9 @@ def uniform_value(
     """
     sharing = Sharing(processes, jacobi, checkpoint)
     mdp = random_actions(mdp, 1.0)
-    return solution_of(mdp, BEST, tolerance, horizon, progress=progress, values=values, sharing=sharing)
+    return solution_of(
+        mdp, BEST, tolerance, horizon, progress=progress, values=values, sharing=sharing, threads=threads
+    )
 
 
 def solution_of(
@@ -111,6 +118,7 @@ def solution_of(
     progress: Callable[[int, float], None] | None = None,
     values: str | os.PathLike | None = None,
     sharing: Sharing | None = None,
+    threads: int = 1,
 ) -> Solution:
     """The values of what is chosen: a fixed point, or those of backward induction where there is a horizon."""
     check_tolerance(tolerance)
@@ -125,7 +133,7 @@ def solution_of(
     steps = None
     if horizon is None:
         x = None if values is None else kept_values(values, (mdp.num_states + 1, mdp.width))
-        found = fixed_point(mdp, select, tolerance, progress, x)
+        found = fixed_point(mdp, select, tolerance, progress, x, usable_workers(threads))
         following = found.x
     elif values is not None:
         raise ParameterError(f"values={str(values)!r}: a file keeps values without a horizon; found {horizon} steps")
