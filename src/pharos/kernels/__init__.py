@@ -13,6 +13,7 @@ __all__ = [
     "clocks",
     "dense_search",
     "disk_table",
+    "distance_sweeps",
     "elimination",
     "gaps",
     "graph",
