@@ -8,6 +8,7 @@ the only other memory (table.py). The search (search.py) expands states and numb
 import hashlib
 import json
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,16 +17,17 @@ from pharos.environments import Environment, make
 from pharos.errors import ParameterError, StateSpaceMismatch
 from pharos.state_space import memory as machine
 from pharos.state_space.files import lock
-from pharos.state_space.manifest import ARRAYS, MANIFEST, PARTS, check_lengths, read_manifest
+from pharos.state_space.manifest import ARRAYS, MANIFEST, PARTS, read_manifest
 from pharos.state_space.plan import Plan
 from pharos.state_space.progress import Progress, reporter
+from pharos.state_space.shards import SHARDS, check_files, shard
 from pharos.state_space.store import StateSpace, load
 
 if TYPE_CHECKING:
     from pharos.state_space.crew import Crew
     from pharos.state_space.search import Options
 
-OUR_FILES = (*ARRAYS, *PARTS.values(), MANIFEST + ".tmp", storage.LOCK, storage.CLAIM)
+OUR_FILES = (*ARRAYS, *PARTS.values(), SHARDS, MANIFEST + ".tmp", storage.LOCK, storage.CLAIM)
 CHECKPOINT_SECONDS = 15.0
 
 
@@ -39,6 +41,7 @@ def build(
     processes: int | str = 1,
     progress: Progress | bool | None = None,
     checkpoint_seconds: float = CHECKPOINT_SECONDS,
+    shards: Sequence[str | os.PathLike] = (),
 ) -> StateSpace:
     """Enumerate the states of `env` that can be reached from its start states, and their transitions.
 
@@ -58,6 +61,8 @@ def build(
             (`memory` is that of each).
         progress: None for a bar on a terminal; False for silence; or a function that gets a BuildProgress now and then.
         checkpoint_seconds: at most this much work is lost when the process is killed.
+        shards: folders, on other disks for example, that the files are moved to once they are finished, each a range of
+            them; the reader maps the ranges as one file.
     Returns:
         The StateSpace, whose files are in `folder`.
     Raises:
@@ -86,6 +91,9 @@ def build(
     options = Options(max_states, memory, workers, checkpoint_seconds)
     with crew_of(processes, plan, memory) as crew:
         was_there = crew.is_first and _build(plan, path, crew, options, progress)
+        if crew.is_first and shards:
+            with lock(path):
+                shard(path, read_manifest(path) or {}, [Path(each) for each in shards])
     return load(path, verify=was_there, environment=env)
 
 
@@ -137,7 +145,7 @@ def _manifest_of(plan: Plan, path: Path) -> dict[str, Any] | None:
                 f"{path}: holds {manifest['environment']} with {key} = {_short(manifest.get(key))}; "
                 f"expected {_short(expected)} for {plan.env}; choose another folder, or delete this one"
             )
-    check_lengths(path, manifest)
+    check_files(path, manifest)
     return manifest
 
 

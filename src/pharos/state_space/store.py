@@ -1,5 +1,7 @@
 """StateSpace: the folder on disk, read through memory maps. docs/format.md specifies it to the byte."""
 
+import itertools
+import math
 import os
 from collections.abc import Sequence
 from functools import cached_property, partial
@@ -26,12 +28,12 @@ from pharos.state_space.manifest import (
     OUTCOMES_VERSION,
     STATES,
     TERMINAL,
-    check_lengths,
     read_manifest,
     successors_name,
 )
 from pharos.state_space.outcome_checks import check_outcome_rules, check_outcomes, outcomes_to_check
 from pharos.state_space.plan import Plan
+from pharos.state_space.shards import blocks_of_ranges, check_files, mapped, ranges_of
 from pharos.state_space.stored_outcomes import StoredOutcomes
 
 if TYPE_CHECKING:
@@ -252,16 +254,18 @@ class StateSpace:
     def verify(self) -> None:
         """Read every file once and compare it with its checksums; StateSpaceCorrupted where one differs."""
         for name, entry in self.manifest["arrays"].items():
-            with open(self.folder / name, "rb") as file:
-                for number, expected in enumerate(entry["checksums"]):
-                    if xxhash.xxh3_128_hexdigest(file.read(CHECKSUM_BYTES)) != expected:
-                        raise StateSpaceCorrupted(
-                            f"{self.folder / name}: block {number} (bytes {number * CHECKSUM_BYTES} on) does not match "
-                            f"its checksum: the file was changed after it was written; {AGAIN}"
-                        )
+            blocks = blocks_of_ranges(ranges_of(self.folder, self.manifest, name), CHECKSUM_BYTES)
+            for number, (expected, block) in enumerate(
+                itertools.zip_longest(entry["checksums"], blocks, fillvalue=b"")
+            ):
+                if xxhash.xxh3_128_hexdigest(block) != expected:
+                    raise StateSpaceCorrupted(
+                        f"{self.folder / name}: block {number} (bytes {number * CHECKSUM_BYTES} on) does not match "
+                        f"its checksum: the file was changed after it was written; {AGAIN}"
+                    )
 
     def _map(self, name: str, dtype: str, shape: tuple[int, ...]) -> np.ndarray:
-        return np.memmap(self.folder / name, dtype=dtype, mode="r", shape=shape)
+        return mapped(ranges_of(self.folder, self.manifest, name), dtype)[: math.prod(shape)].reshape(shape)
 
     def _check_index(self, i: int) -> None:
         if not 0 <= i < self.num_states:
@@ -294,7 +298,7 @@ def load(folder: str | os.PathLike, *, verify: bool = True, environment: Environ
         raise StateSpaceIncomplete(
             f"{folder}: the build stopped at {manifest['num_states']} states; the same build command resumes it"
         )
-    check_lengths(folder, manifest)
+    check_files(folder, manifest)
     space = StateSpace(folder, manifest, environment or _environment_of(folder, manifest))
     if verify:
         space.verify()

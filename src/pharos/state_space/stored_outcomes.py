@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pharos.state_space.manifest import CODES, OFFSETS, PALETTE, PROBABILITIES, successors_name
+from pharos.state_space.shards import mapped, ranges_of
 
 OutcomesOfState = list[tuple[np.ndarray, np.ndarray]]
 """For each action the next states and their probabilities, possible outcomes alone."""
@@ -47,7 +48,7 @@ class StoredOutcomes(NamedTuple):
         def array(name: str) -> np.ndarray | None:
             if name not in arrays:
                 return None
-            return np.memmap(folder / name, arrays[name]["dtype"], "r").reshape(shapes[name])
+            return mapped(ranges_of(folder, manifest, name), arrays[name]["dtype"]).reshape(shapes[name])
 
         successors = array(successors_name(arrays))
         assert successors is not None
