@@ -8,6 +8,7 @@ import contextlib
 import importlib
 import inspect
 import io
+import itertools
 import json
 import re
 import tempfile
@@ -16,7 +17,7 @@ from pathlib import Path
 
 import pharos
 from pharos import explorer as explorers
-from pharos.cli.list import list_
+from pharos.cli.list import list_, rules_of
 from pharos.environments import classes, make
 from pharos.interaction.registration import ids_of
 
@@ -206,7 +207,7 @@ def page_of(cls, stored: Mapping[str, dict], section: str) -> str:
         "",
         "## Rules",
         "",
-        *rules_table(facts["rules"]),
+        *rules_table(cls),
         "",
         f"**Actions**, in the order of their numbers: {', '.join(f'`{name}`' for name in facts['actions'])}.",
         "",
@@ -230,20 +231,15 @@ def cell(value) -> str:
     return text.replace("|", r"\|").replace("\n", " ")
 
 
-def rules_table(docstring: str) -> list[str]:
-    """The docstring of a class up to its attributes: paragraphs, and entries such as `State    (row, column)`."""
-    text = docstring.partition("Attributes:\n")[0].rstrip()
-    paragraphs, entries = [], []
-    for line in text.splitlines()[1:]:
-        entry = re.match(r"([A-Z][a-z]+)  *(\S.*)", line) if not line.startswith(" ") else None
-        if entry and (len(entry[0]) <= 120) and line[len(entry[1]) : 9].strip() == "":
-            entries.append([entry[1], entry[2]])
-        elif entries and line.strip():
-            entries[-1][1] += " " + line.strip()
-        elif line.strip():
-            paragraphs.append(line.strip())
-    table = ["| | |", "|---|---|", *(f"| **{title}** | {cell(text)} |" for title, text in entries)]
-    return [" ".join(paragraphs), "", *table] if paragraphs else table
+def rules_table(cls) -> list[str]:
+    """The rules of a class: paragraphs, and a table of entries such as *State* and *Reward*."""
+    lines: list[str] = []
+    for titled, group in itertools.groupby(rules_of(cls)[1:], lambda block: bool(block[0])):
+        if titled:
+            lines += ["| | |", "|---|---|", *(f"| **{title}** | {cell(text)} |" for title, text in group), ""]
+        else:
+            lines += [line for _, text in group for line in (text, "")]
+    return lines[:-1]
 
 
 def instances(cls, stored: Mapping[str, dict]) -> list[str]:

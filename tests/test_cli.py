@@ -18,6 +18,7 @@ from pharos.cli.play import Game
 from pharos.environments import classes, make
 from pharos.errors import ParameterError
 
+ENTRIES = ["State", "Start", "Actions", "Chance", "Reward", "Ends", "Limit", "Ours", "Source"]
 BUILD_KEYS = set(
     [
         "environment",
@@ -159,6 +160,21 @@ def test_list_describes_one_class_parameter_by_parameter(answer, pharos, name):
         assert each["meaning"] and each["values"] and "default" in each
     shown = pharos("list", name).stdout
     assert "values" in shown and all(parameter in shown for parameter in described["parameters"])
+
+
+def test_list_folds_rules_at_the_width_of_the_terminal(pharos, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "72")
+    lines = [line.rstrip() for line in pharos("list", "game_2048").stdout.splitlines()]
+    rules = lines[: lines.index(next(line for line in lines if line.startswith("parameter ")))]
+    assert max(map(len, rules)) <= 72
+    entries = [line for line in rules[3:-3] if line]
+    assert all(line[:9].strip() in ("", *ENTRIES) and line[9] != " " for line in entries)
+    assert [line[:9].strip() for line in entries if line[0] != " "] == ENTRIES
+    assert rules[-3:] == [
+        "Every move adds what appears to the sum of the tiles, the age of a",
+        "state: so no state is visited twice.",
+        "",
+    ]
 
 
 def test_list_says_type_range_default_and_meaning(answer):

@@ -2,6 +2,7 @@
 
 import dataclasses
 import inspect
+import itertools
 import re
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -95,6 +96,25 @@ def _meanings(cls: type["Environment"]) -> dict[str, str]:
     return meanings
 
 
+def rules_of(cls: type["Environment"]) -> list[tuple[str, str]]:
+    """(title, text) of what the docstring of a class says before its attributes; the title of a paragraph is empty.
+
+    An entry has its title in the first nine columns, `State    (row, column)`, and goes on in lines that are indented.
+    """
+    blocks: list[tuple[str, str]] = []
+    goes_on = False
+    for line in (inspect.getdoc(cls) or "").partition("Attributes:\n")[0].splitlines():
+        entry = re.match(r"([A-Z][a-z]+) +(?<=^.{9})(\S.*)", line)
+        if entry:
+            blocks.append((entry[1], entry[2]))
+        elif goes_on:
+            blocks[-1] = (blocks[-1][0], f"{blocks[-1][1]} {line.strip()}".rstrip())
+        elif line.strip():
+            blocks.append(("", line.strip()))
+        goes_on = bool(line.strip())
+    return blocks
+
+
 def _annotation(annotation: Any) -> str:
     text = annotation if isinstance(annotation, str) else getattr(annotation, "__name__", str(annotation))
     words = {"int": "integer", "float": "number", "bool": "true or false", "str": "text"}
@@ -120,8 +140,13 @@ def _print_one(cls: type["Environment"]) -> None:
     from rich.table import Table
 
     to = console()
-    rules = (inspect.getdoc(cls) or "").partition("Attributes:\n")[0].rstrip()
-    to.print(f"[bold cyan]{cls.name}[/bold cyan]  {escape(rules)}\n", highlight=False)
+    (_, first), *blocks = rules_of(cls) or [("", "")]
+    to.print(f"[bold cyan]{cls.name}[/bold cyan]  {escape(first)}\n", highlight=False)
+    for titled, group in itertools.groupby(blocks, lambda block: bool(block[0])):
+        rules = Table.grid(padding=(0, 2, 0, 0))
+        for block in group:
+            rules.add_row(*(escape(text) for text in (block if titled else block[1:])))
+        to.print(rules, "")
     table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="bold")
     for heading in ("parameter", "default", "values", "meaning"):
         table.add_column(heading, overflow="fold")
