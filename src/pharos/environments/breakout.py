@@ -26,7 +26,7 @@ INSTANCES = {
     f"{height}x{columns}x{width}": {"height": height, "columns": columns, "extra_paddle_width": (width - 1) // 2}
     for height, columns, width in (*PAPER, *DRAWN)
 }
-INSTANCES["20x10x1-3rows"] = {"height": 20, "columns": 10, "brick_rows": 3}  # a billion states
+INSTANCES["24x10x1-3rows"] = {"height": 24, "columns": 10, "brick_rows": 3}  # more than a billion states
 
 # found by a search on a court of 11 x 7 under three kinds of chance, docs/agents.md
 VECTOR = {
