@@ -131,6 +131,19 @@ def test_pairs_of_observations_of_one_mdp_are_compared():
     assert pairs.agreement(np.zeros(24)) == 0.5
 
 
+def test_the_ceiling_of_agreement_is_that_of_a_predictor_that_knows_expectations():
+    """4,000 pairs of cells; means of seeds are their expectations with normal noise."""
+    rng = np.random.default_rng(0)
+    truth, noise = rng.uniform(0, 5, 8000), rng.uniform(0.2, 1.5, 8000)
+    y = truth + rng.normal(size=8000) * np.sqrt(noise)
+    signs = np.sign(y[::2] - y[1::2])
+    some = within_mdps.Pairs(np.arange(0, 8000, 2), np.arange(1, 8000, 2), signs)
+    assert 0.7 < some.agreement(truth) < 0.9
+    assert some.ceiling(y, noise) == pytest.approx(some.agreement(truth), abs=0.04)
+    assert some.ceiling(y, np.zeros(8000)) == 1.0
+    assert np.isnan(some.ceiling(y, np.full(8000, np.nan)))
+
+
 def test_a_class_whose_instances_agree_counts_once():
     """One class, two observations: whatever the number of its instances, two names for them, so p is never small."""
     mdps = np.repeat(np.arange(20), 2)

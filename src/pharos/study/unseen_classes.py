@@ -130,7 +130,8 @@ def validation(
             R2 that noise over seeds leaves;
         within: `rho_within`, the mean over classes of the rank correlation within; `pairs`, of observations of one MDP
             whose outcomes differ by more than 0.05; `agreement`, the share of them that is ordered rightly, with
-            interval and `p_agreement`; `image_pairs`, `image_agreement`, of image against vector alone;
+            interval, `p_agreement` and `agreement_ceiling`, what noise over seeds leaves; `image_pairs`,
+            `image_agreement`, of image against vector alone;
         mixed: `slope` of the standardised predictor in a mixed model with random classes and MDPs, `slope_error`,
             `p_slope`, and the shares of the variance that it leaves to `class_share`, `mdp_share`; `given_tabular`,
             `given_tabular_regret`, partial rank correlations given the tabular measures, and given the regret of the
@@ -233,7 +234,7 @@ def _line(
         return None
     row: dict[str, float] = {"baseline": model.is_baseline, "cells": len(cells.y), "classes": count}
     row |= _left_out(cells, outcome, permutations, seed)
-    row |= _within(cells, permutations, seed)
+    row |= _within(cells, outcome, permutations, seed)
     return row | _mixed(cells, model, tabular, seed)
 
 
@@ -281,9 +282,9 @@ def _percentile(values: np.ndarray, share: float) -> float:
     return float(np.percentile(finite, share)) if len(finite) else np.nan
 
 
-def _within(cells: Cells, permutations: int, seed: int) -> dict[str, float]:
+def _within(cells: Cells, outcome: str, permutations: int, seed: int) -> dict[str, float]:
     row = {"rho_within": np.nan, "pairs": 0, "agreement": np.nan}
-    row |= dict.fromkeys(("agreement_lower", "agreement_upper", "p_agreement"), np.nan)
+    row |= dict.fromkeys(("agreement_lower", "agreement_upper", "p_agreement", "agreement_ceiling"), np.nan)
     row |= {"image_pairs": 0, "image_agreement": np.nan}
     if cells.x.shape[1] != 1:
         return row
@@ -293,6 +294,9 @@ def _within(cells: Cells, permutations: int, seed: int) -> dict[str, float]:
         row["rho_within"] = float(np.nanmean(within))
     pairs = Pairs.of(y, cells.mdps)
     row |= {"pairs": len(pairs.first), "agreement": pairs.agreement(x)}
+    noise = cells.frame.get(f"{outcome}_noise")
+    if noise is not None and outcome != ABSOLUTE:
+        row["agreement_ceiling"] = pairs.ceiling(y, noise.to_numpy(float))
     names = cells.frame["observation"].to_numpy()
     kinds = np.array([_kind(name) for name in names])
     of_both = pairs.only((kinds[pairs.first] != kinds[pairs.second]) & (np.minimum(*_both(kinds, pairs)) > 0))

@@ -18,7 +18,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MOST_PANELS = 24
-PREDICTOR = "kernel_regret"
+LEARNERS = (
+    ("policy_regret", "policy_curve"),
+    ("kernel_regret", "curve"),
+)  # predictor and curve; the first that there is
 DIAGONAL = "#888888"
 LONGEST_TITLE = 34
 
@@ -41,8 +44,9 @@ def unseen_figures(
     return drawn
 
 
-def predicted_by_class(part: "pd.DataFrame", predictor: str = PREDICTOR) -> "Figure | None":
+def predicted_by_class(part: "pd.DataFrame", predictor: str | None = None) -> "Figure | None":
     """A panel for each class: regret against what a line through the other classes predicts for it."""
+    predictor = predictor or _learner(part)[0]
     cells = Cells.of(part, [predictor], "greedy")
     if len(np.unique(cells.classes)) < 2:
         return None
@@ -65,8 +69,9 @@ def predicted_by_class(part: "pd.DataFrame", predictor: str = PREDICTOR) -> "Fig
     return figure
 
 
-def observations_of_mdps(part: "pd.DataFrame", predictor: str = PREDICTOR) -> "Figure | None":
+def observations_of_mdps(part: "pd.DataFrame", predictor: str | None = None) -> "Figure | None":
     """A panel for each MDP, up to MOST_PANELS: regret under each observation, of the agent and as predicted."""
+    predictor = predictor or _learner(part)[0]
     observations = list(dict.fromkeys(part["observation"]))
     groups = [
         (key, rows) for key, rows in part.groupby(["environment", "instance", "chance"], sort=False) if len(rows) > 1
@@ -94,7 +99,8 @@ def observations_of_mdps(part: "pd.DataFrame", predictor: str = PREDICTOR) -> "F
 
 def idealised_curves(part: "pd.DataFrame", points: "pd.DataFrame", runs: "pd.DataFrame") -> "Figure | None":
     """A panel for each MDP, up to MOST_PANELS / 2: regret by steps of the agent and of the idealised learner."""
-    if "curve" not in part:
+    curve = _learner(part)[1]
+    if curve not in part:
         return None
     observations = list(dict.fromkeys(part["observation"]))
     groups = _spread(list(part.groupby(["environment", "instance", "chance"], sort=False)), MOST_PANELS // 2)
@@ -110,14 +116,20 @@ def idealised_curves(part: "pd.DataFrame", points: "pd.DataFrame", runs: "pd.Dat
             own = points[(points[CELL] == [row[name] for name in CELL]).all(axis=1)]
             mean = own.groupby("step")["regret"].mean()
             axis.plot(mean.index, mean.to_numpy(), color=color, lw=1.5, label=row["observation"])
-            curve = json.loads(row["curve"] or "[]")
-            if curve:
-                axis.plot(*zip(*curve, strict=True), "--", color=color, lw=1.2, alpha=0.9)
+            dashed = json.loads(row[curve] or "[]")
+            if dashed:
+                axis.plot(*zip(*dashed, strict=True), "--", color=color, lw=1.2, alpha=0.9)
         axis.set_title(_short(*map(str, key)), fontsize=8)
         axis.set(ylim=(-0.05, 1.5))
     _label_edges(axes, "steps", "regret")
     legend_below(figure, axes)
     return figure
+
+
+def _learner(part: "pd.DataFrame") -> tuple[str, str]:
+    """Predictor and curve of the idealised learner that an agent is held against."""
+    has = (names for names in LEARNERS if names[0] in part and part[names[0]].notna().any())
+    return next(has, LEARNERS[-1])
 
 
 def _spread(groups: list[Any], most: int = MOST_PANELS) -> list[Any]:

@@ -44,6 +44,26 @@ class Pairs:
         """The share of pairs that x orders rightly; NaN without pairs."""
         return float(self.right(x).mean()) if len(self.first) else np.nan
 
+    def ceiling(self, y: np.ndarray, noise: np.ndarray) -> float:
+        """The agreement that a predictor has which knows each cell's expectation: noise over seeds turns pairs around.
+
+            mean over pairs of P(the expectations differ as the means y do) = Phi(|y1 - y2| / sqrt(noise1 + noise2))
+
+        Normal means, any difference of expectations alike likely beforehand; NaN where no pair has two seeds.
+
+        Args:
+            noise: (N,) of cells: the variance over seeds / seeds.
+        """
+        from scipy.special import ndtr
+
+        variance = noise[self.first] + noise[self.second]
+        known = np.isfinite(variance)
+        if not known.any():
+            return np.nan
+        difference = np.abs(y[self.first] - y[self.second])[known]
+        deviation = np.sqrt(np.maximum(variance[known], 1e-300))
+        return float(ndtr(difference / deviation).mean())
+
     def interval(self, x: np.ndarray, classes: np.ndarray, counts: np.ndarray) -> tuple[float, float]:
         """95 % interval of that over samples of classes, counts (R, C)."""
         number = counts.shape[1]
