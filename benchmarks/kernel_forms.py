@@ -1,10 +1,11 @@
 """Forms of an agent's kernel beside each other: which of them tells the better observation of an MDP?
 
-python benchmarks/kernel_forms.py RUNS.parquet [...] --out FORMS.csv [--class NAME ...]
+python benchmarks/kernel_forms.py RUNS.parquet [...] --out FORMS.csv [--class NAME ...] [--form NAME ...] [--most N]
 
 RUNS.parquet are packed studies (`pharos study pack`). Writes a row for each cell (instance, chance, agent and
-observation): its regrets, and what the idealised learner says with each form of its kernel. What is in FORMS.csv is not
-computed again. `benchmarks/kernel_forms_table.py` makes the tables.
+observation): its regrets, and what the idealised learner says with each form of its kernel, or with some of them. What
+is in FORMS.csv is not computed again, but regrets are those of the runs. `benchmarks/kernel_forms_table.py` makes the
+tables.
 
 With K the kernel in closed form, W the diagonal of the standard occupancy, J the Jacobian of NETWORKS random networks:
 
@@ -66,6 +67,8 @@ def main():
     parser.add_argument("runs", nargs="+")
     parser.add_argument("--out", required=True)
     parser.add_argument("--class", dest="classes", action="append")
+    parser.add_argument("--form", dest="forms", action="append", help="of regret_FORM alone; all forms when not given")
+    parser.add_argument("--most", type=int, default=MOST, help="observations; cells of more are left out")
     given = parser.parse_args()
     torch.set_num_threads(1)
     names = [f"regret_{form}" for form in LEARNERS["dqn"]] + [f"time_{form}" for form in TIMES]
@@ -91,7 +94,7 @@ def main():
             done.add(key)
             began = time.process_time()
             try:
-                found = Cell(run).predictions()
+                found = Cell(run, given.most).predictions(given.forms)
             except PharosError as error:
                 print(f"{', '.join(cell)}: {error}", file=sys.stderr)
                 continue
@@ -102,50 +105,66 @@ def main():
                     {name: f"{value:.6g}" if isinstance(value, float) else value for name, value in row.items()}
                 )
             print(f"{', '.join(cell)}: {row['seconds']:.0f} s", file=sys.stderr, flush=True)
+        _of_runs(out, opened.name, regrets)
+
+
+def _of_runs(out, name, regrets):
+    """Give the rows of a study the regrets of these runs."""
+    with out.open(newline="") as file:
+        reader = csv.DictReader(file)
+        columns, rows = reader.fieldnames, list(reader)
+    for row in rows:
+        cell = tuple(row[column] for column in CELL)
+        if row["study"] == name and cell in regrets.index:
+            row["greedy"] = f"{regrets[cell]:.6g}"
+    with out.open("w", newline="") as file:
+        writer = csv.DictWriter(file, columns, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
 
 
 def _cell(run):
-    config = run.config
-    if config["observation"] == "index":
-        return ()
-    return (config["environment"], run.instance, run.chance, config["agent"], config["observation"])
+    return () if run.config["observation"] == "index" else tuple(run.cell[name] for name in CELL)
 
 
 class Cell:
     """An MDP with an observation and a network: what all forms need."""
 
-    def __init__(self, run):
+    def __init__(self, run, most=MOST):
         self.config, self.agent = run.config, run.config["agent"]
         task = task_of(run.config)
         name, initialisation = _network(run.config, task)
         self.network = Network.of(name, initialisation)
-        seen = representation(task.space, task.observation, name, initialisation=initialisation)
+        options = dict(task.observation_options)
+        seen = representation(task.space, task.observation, name, initialisation=initialisation, **options)
         self.schedule = _schedule(run.config)
         episode = task.time_limit
         self.learner = Learner(task.mdp, self.schedule, episode)
         everything = self.learner.numbers[self.learner.states]
         self.observations = Grouped(seen.classes, everything)
-        if len(self.observations) > MOST:
-            raise PharosError(f"{len(self.observations)} observations; at most {MOST} are looked at")
+        if len(self.observations) > most:
+            raise PharosError(f"{len(self.observations)} observations; at most {most} are looked at")
         standard = standard_occupancy(task.mdp, self.schedule.gamma, episode)
         weights = self.observations.sums(standard.states[everything])
         self.weights = np.maximum(weights, RAREST * weights.max())
         q = self.observations.sums(standard.states[everything, None] * standard.q[everything]) / self.weights[:, None]
         self.q = q
-        observer = observe(task.env, task.observation, state_space=task.space)
+        observer = observe(task.env, task.observation, state_space=task.space, **options)
         self.inputs = network_inputs(observer, task.space.states(self.observations.representatives))
         self.closed = tangent_kernel(self.network, self.inputs)
         self._kernels = {}
 
-    def predictions(self):
+    def predictions(self, forms=None):
         """Name -> number."""
         row = {"states": len(self.learner.states)}
-        for form in LEARNERS[self.agent]:
+        for form in forms or LEARNERS[self.agent]:
             learner = self.learner
             if form == "paced":
                 learner = Paced(self.learner, self.config["hyperparameters"])
             operator = Exact(lambda *_, form=form: self.kernel("diagonal" if form == "paced" else form), self.rows)
             row[f"regret_{form}"] = learner.curve(self.observations, operator).mean_greedy
+        if forms:
+            return row
         if self.agent == "ppo":
             gamma = self.config["hyperparameters"].get("gamma", 0.99)
             for form in POLICIES:

@@ -40,7 +40,7 @@ def table(cells):
     """Print the rows of an agent."""
     forms = [name for name in cells if "_" in name and cells[name].notna().sum() > len(cells) / 2]
     pairs = _pairs(cells)
-    pictures = pairs[pairs["kind"].map(lambda kind: set(kind) == IMAGE_OR_VECTOR)]
+    pictures = pairs[pairs["kind"].map(_is_image_or_vector)]
     print("| form | image or vector | rightly said | all pairs | rightly said | R2 | rank correlation |")
     print("|---|---|---|---|---|---|---|")
     for form in forms:
@@ -69,6 +69,11 @@ def _pairs(cells):
                 about = {"environment": environment, "instance": instance, "chance": chance}
                 rows.append(about | {"kind": (one["observation"], other["observation"])} | dict(difference))
     return pd.DataFrame(rows)
+
+
+def _is_image_or_vector(kind):
+    """Whether one is the plain vector, the other an image, whatever its options."""
+    return "vector" in kind and {name.split("(")[0] for name in kind} == IMAGE_OR_VECTOR
 
 
 def _right(pairs, form):
