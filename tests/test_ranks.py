@@ -293,6 +293,24 @@ def test_numbers_of_processes_that_mean_nothing_are_refused(size, tmp_path):
         pharos.build("frozen_lake/4x4", tmp_path / "space", processes=size)
 
 
+def test_a_rank_of_mpi_that_fails_tells_the_others(monkeypatch):
+    class Second:
+        rank, size, told = 1, 2, None
+
+        def fail(self, error):
+            self.told = error
+
+    def fails(*_):
+        raise RuleError("a rule failed")
+
+    second = Second()
+    monkeypatch.setattr(crew, "mpi_rank", lambda: second)
+    monkeypatch.setattr(crew, "answer", fails)
+    with pytest.raises(RuleError), crew.crew_of("mpi", None, None):
+        pass
+    assert str(second.told) == "a rule failed"
+
+
 @pytest.mark.long
 @pytest.mark.skipif(shutil.which("mpiexec", path=Path(sys.executable).parent) is None, reason="needs the extra mpi")
 def test_ranks_of_mpi_write_the_same_files(tmp_path):

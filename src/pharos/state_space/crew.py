@@ -56,13 +56,12 @@ def crew_of(size: int | str, plan: Plan, memory: int | None) -> Iterator[Crew]:
         yield Crew(int(size))
         return
     rank = mpi_rank()
-    if rank.rank > 0:
-        answer(plan, rank, memory)
-        yield Crew(rank=rank)
-        return
     try:
+        if rank.rank > 0:
+            answer(plan, rank, memory)
         yield Crew(rank=rank)
-        end(rank)
+        if rank.rank == 0:
+            end(rank)
     except BaseException as error:
         rank.fail(error)
         raise
