@@ -22,8 +22,18 @@ def threads():
     """Ranks are threads of this process."""
 
     def together(size, program, capacity):
-        with ranks.loop(size, program) as rank:
+        def run(rank):
+            exchange = rank.exchange
+
+            def bounded(parts):
+                assert sum(-(-part.nbytes // 64) * 64 for part in parts) + 64 + 16 * size <= capacity
+                return exchange(parts)
+
+            rank.exchange = bounded
             return program(rank)
+
+        with ranks.loop(size, run) as rank:
+            return run(rank)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(ranked_search, "together", together)

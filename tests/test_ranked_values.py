@@ -46,6 +46,13 @@ def threads(disturb=lambda rank: None):
 
     def together(size, program, capacity):
         def run(rank):
+            exchange = rank.exchange
+
+            def bounded(parts):
+                assert sum(-(-part.nbytes // 64) * 64 for part in parts) + 64 + 16 * size <= capacity
+                return exchange(parts)
+
+            rank.exchange = bounded
             disturb(rank)
             return program(rank)
 
@@ -250,7 +257,7 @@ def test_a_full_disk_ends_no_solving(tmp_path, monkeypatch):
 
 @pytest.mark.long
 def test_three_processes_solve_and_go_on_after_a_kill(tmp_path, monkeypatch):
-    mdp = chain(5000)
+    mdp = chain(20_000)
     alone = value_iteration(mdp, jacobi=True)
     monkeypatch.setattr(checkpoints, "_SHARE", 0)
     monkeypatch.setattr(checkpoints, "SECONDS", -1.0)

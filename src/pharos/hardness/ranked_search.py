@@ -100,7 +100,7 @@ def ranked_distances(graph: Graph, source: int, processes: int | str, *, backwar
         count, largest = part.search(source, backward)
         return Found(part.gathered(), count, largest)
 
-    return together(processes, program, (graph.num_nodes // size + 1) * 4 * max(size, 2) + (1 << 16))
+    return together(processes, program, ((graph.num_nodes // size + 1) * 8 + 256) * size)
 
 
 def ranked_eccentricity(

@@ -30,8 +30,8 @@ _MIX = (0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB)  # of splitm
 
 
 def capacity_of(mdp: TabularMDP, ranks: int) -> int:
-    """Bytes that a rank sends in an exchange, at most: all its values to all others, and a few numbers."""
-    return (mdp.num_states // ranks + 1) * mdp.width * 8 * max(ranks - 1, 1) + 256 * ranks + (1 << 16)
+    """Bytes that a rank sends in an exchange, at most: a range of values to each, and a few numbers."""
+    return ((mdp.num_states // ranks + 1) * mdp.width * 8 + 256) * ranks
 
 
 def cuts_of(num_states: int, ranks: int) -> np.ndarray:
