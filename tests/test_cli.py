@@ -4,6 +4,7 @@ import io
 import json
 import os
 import re
+import shlex
 import subprocess
 import sys
 
@@ -15,7 +16,7 @@ from pharos import build, hardness
 from pharos.cli import answers, app
 from pharos.cli.options import parse_parameters, parse_size, parse_value
 from pharos.cli.play import Game
-from pharos.environments import classes, make
+from pharos.environments import classes, make, named_instances
 from pharos.errors import ParameterError
 
 ENTRIES = ["State", "Start", "Actions", "Chance", "Reward", "Ends", "Limit", "Ours", "Source"]
@@ -160,6 +161,14 @@ def test_list_describes_one_class_parameter_by_parameter(answer, pharos, name):
         assert each["meaning"] and each["values"] and "default" in each
     shown = pharos("list", name).stdout
     assert "values" in shown and all(parameter in shown for parameter in described["parameters"])
+
+
+@pytest.mark.parametrize("name", sorted(named_instances()))
+def test_what_names_an_environment_in_an_answer_is_how_the_command_line_is_given_it(name):
+    env = make(name)
+    called, *words = shlex.split(answers.describe(env))
+    assert make(called, **parse_parameters(words)) == env
+    assert not any(word.endswith(("=None", "=null", "=True")) for word in words)
 
 
 def test_list_folds_rules_at_the_width_of_the_terminal(pharos, monkeypatch):

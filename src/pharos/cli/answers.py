@@ -5,6 +5,8 @@ import dataclasses
 import json
 import math
 import os
+import re
+import shlex
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -18,6 +20,7 @@ if TYPE_CHECKING:
     from pharos.environments import Environment
 
 NOTABLE_SECONDS = 0.2  # of compiling, beside those of work
+SPECIAL = re.compile(r"[^\w@%+=:,./\[\]-]")  # what a shell would read as more than a character of a word
 
 
 def print_json(answer: Mapping[str, Any]) -> None:
@@ -131,13 +134,15 @@ def size_text(count: float) -> str:
 
 
 def describe(environment: "Environment") -> str:
-    """An environment in one line: `breakout height=12 columns=8`, as the command line writes it."""
-    words = (f"{name}={_written(value)}" for name, value in environment.parameters.items())
-    return " ".join((environment.name, *words))
+    """An environment in one line: `breakout height=12 columns=8`, as the command line reads it."""
+    absent = {field.name for field in dataclasses.fields(environment) if field.default is None}  # type: ignore[arg-type]
+    given = {name: value for name, value in environment.parameters.items() if value is not None or name not in absent}
+    words = (f"{name}={_written(value)}" for name, value in given.items())
+    return " ".join((environment.name, *(shlex.quote(word) if SPECIAL.search(word) else word for word in words)))
 
 
 def _written(value: Any) -> str:
-    return json.dumps(value, separators=(",", ":")) if isinstance(value, tuple | list) else str(value)
+    return str(value) if isinstance(value, str) else json.dumps(value, separators=(",", ":"))
 
 
 def compiling_fact() -> list[tuple[str, str]]:
