@@ -98,6 +98,43 @@ def test_bounds_from_a_hub_hold_for_every_target(mdp):
         assert (found[states] >= largest[hub, states] * (1 - 1e-9)).all()
 
 
+@pytest.mark.long
+@settings(max_examples=150, deadline=None)
+@given(chancy_mdps(), st.sampled_from([0.05, 0.25]))
+def test_bounds_through_the_nodes_around_a_target_hold_and_never_grow(mdp, chance):
+    mdp = random_actions(mdp, chance)
+    times, reached, state, _ = naive_hitting.hitting_times(mdp, True)
+    nodes = naive_hitting.nodes_that_count(mdp, reached, state)
+    states = np.unique(state[nodes])
+    largest = np.full((mdp.num_states + 1, mdp.num_states + 1), -math.inf)
+    for n in nodes:
+        largest[state[n]] = np.maximum(largest[state[n]], times[n])
+    if not np.isfinite(largest[np.ix_(states, states)]).all():
+        return
+    bounds = TravelBounds(mdp, True)
+    size = mdp.num_states + naive_hitting.any_end(mdp)
+    for hub in states:
+        to_hub = np.maximum(largest[:size, hub], 0.0)
+        away = bounds.times_from(hub, to_hub)
+        for around in (1, 2, 3, 100, 100):
+            shorter = bounds.shortened(to_hub, away, around, lambda: False)
+            assert (shorter <= away).all()
+            assert (shorter[states] >= largest[hub, states] * (1 - 1e-9)).all()
+            away = shorter
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("chance", [lambda mdp: random_actions(mdp, 0.1), lambda mdp: sticky_actions(mdp, 0.25)])
+def test_where_a_slip_leads_on_the_interval_is_narrow_and_few_targets_are_solved(chance):
+    mdp = chance(pharos.build(pharos.make("breakout", height=6, columns=4)).mdp())
+    little = hardness.diameter(mdp, budget=hardness.Budget(searches=40))
+    found = hardness.diameter(mdp)
+    start = hardness.start_eccentricity_interval(mdp)
+    assert found.exact and found.searches < 200  # of 4,620
+    assert little.lower <= found.upper and found.lower <= little.upper < 1.3 * little.lower
+    assert start.exact and start.upper <= found.upper * (1 + 1e-9)
+
+
 @settings(max_examples=30, deadline=None)
 @given(chancy_mdps())
 def test_spaces_too_large_for_a_look_at_each_target_have_the_same_diameter(mdp):

@@ -33,6 +33,11 @@ TRIAL = 16
 # Targets that each of the last `TRIAL` ones must have ruled out on average, or all of them half of those left; else
 # looking at the others one by one is quicker.
 RULED_OUT = 40
+# Nodes around each target through which its bounds are shortened, one size after the other while each takes off a
+# twentieth of the largest; nodes there must be for each of them, and times as long as the size before one takes.
+AROUND, TAKEN, NODES_EACH, LONGER = (64, 256, 1024), 0.95, 16, 8
+# Targets that are solved before that, where there are too many for a look at each.
+FIRST = 3
 # `crude_upper` is a product of up to N rounded factors.
 CRUDE = 1.01
 
@@ -68,6 +73,7 @@ class _Diameter:
         # States that cannot be reached at all are unreachable from all others.
         self.unreachable = int(np.count_nonzero(~has_nodes)) * (choices.num_targets - 1)
         self._travel: TravelBounds | None = None
+        self._hub: tuple[np.ndarray, np.ndarray] | None = None
 
     def interval(self, conventions: dict[str, Any]) -> Interval:
         """Look at targets until the bounds meet, or the budget ends."""
@@ -139,8 +145,11 @@ class _Diameter:
         trial, left_before = TRIAL, self._num_open
         while batch and not self.spending.is_over:
             yield batch
+            if self.many and self.spending.searches >= FIRST:
+                self._shorten()
             if not self.many and self.spending.searches >= trial:
                 if left_before - self._num_open < min(RULED_OUT * TRIAL, left_before / 2):
+                    self._shorten()
                     return
                 trial, left_before = self.spending.searches + TRIAL, self._num_open
             widest = int(self.upper.argmax())
@@ -183,8 +192,38 @@ class _Diameter:
             self._travel = TravelBounds(self.mdp, self.restart)
         by_state = np.zeros(self.choices.num_targets)
         np.maximum.at(by_state, self.choices.underlying, times)
-        bound = float(by_state.max()) + self._travel.times_from(hub, by_state)
-        np.minimum(self.upper, bound, out=self.upper)
+        away = self._travel.times_from(hub, by_state)
+        if self._hub is None:  # the start, to which all that fails comes back
+            self._hub = by_state, away
+        np.minimum(self.upper, float(by_state.max()) + away, out=self.upper)
+
+    def _shorten(self) -> None:
+        """Shorten the bounds by way of the first hub, once, as long as this narrows the interval."""
+        if self._hub is None or self._travel is None:
+            return
+        (times, away), self._hub = self._hub, None
+        for shorter in shortened(self._travel, times, away, self.spending):
+            before = self._upper()
+            np.minimum(self.upper, float(times.max()) + shorter, out=self.upper)
+            self.upper[self.upper <= self.lower] = -math.inf
+            self.spending.report(self.lower, self._upper(), self._num_open)
+            if self._upper() > TAKEN * before:
+                break
+
+
+def shortened(travel: TravelBounds, times: np.ndarray, away: np.ndarray, spending: Spending) -> Iterator[np.ndarray]:
+    """Bounds of the times from a hub to each target, ever shorter, as long as the budget allows for the next ones.
+
+    times, away: (targets,) upper bounds of the expected steps to the hub, and from it.
+    """
+    for size in AROUND:
+        began = spending.seconds
+        if size * NODES_EACH > len(away) or spending.is_over:
+            return
+        away = travel.shortened(times, away, size, lambda: spending.is_over)
+        yield away
+        if LONGER * (spending.seconds - began) > spending.budget.seconds - spending.seconds:
+            return
 
 
 @dataclass

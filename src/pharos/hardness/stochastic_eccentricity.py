@@ -11,7 +11,7 @@ import numpy as np
 from pharos.hardness.choices import Choices, choices_of
 from pharos.hardness.hitting_times import SWEEPS, HittingTimes
 from pharos.hardness.interval import Interval, Spending, conventions_of
-from pharos.hardness.stochastic_diameter import CRUDE, RULED_OUT, TRIAL
+from pharos.hardness.stochastic_diameter import CRUDE, RULED_OUT, TAKEN, TRIAL, shortened
 from pharos.hardness.travel import TravelBounds
 from pharos.kernels.hitting import UNIT
 from pharos.mdp import TabularMDP
@@ -67,6 +67,7 @@ class _Eccentricity:
         self.infinite = bool((np.diff(self.targets.edges) == 0).any())
         hubs = self.choices.is_connected and self.choices.num_targets > TRIAL
         self.travel = TravelBounds(mdp, restart) if hubs and not self.infinite else None
+        self.hub: tuple[float, np.ndarray, np.ndarray] | None = None
 
     def run(self) -> None:
         """Look at targets until none may be farther than the farthest, or the budget ends."""
@@ -79,6 +80,7 @@ class _Eccentricity:
                 self._bound_others(target, times)
                 hubs, ruled_out = hubs + 1, ruled_out + before - self._open
                 if hubs >= TRIAL and ruled_out < RULED_OUT * hubs:
+                    self._shorten()
                     self.travel = None
             target = int(self.upper.argmax())
 
@@ -113,5 +115,19 @@ class _Eccentricity:
         by_state = np.zeros(self.choices.num_targets)
         np.maximum.at(by_state, self.choices.underlying, times)
         to_hub = float(self.weights @ times[self.nodes]) * (1 + (len(self.nodes) + 8) * UNIT)
-        np.minimum(self.upper, to_hub + self.travel.times_from(hub, by_state), out=self.upper)
+        away = self.travel.times_from(hub, by_state)
+        if self.hub is None:
+            self.hub = to_hub, by_state, away
+        np.minimum(self.upper, to_hub + away, out=self.upper)
         self.upper[self.upper <= self.lower] = -math.inf
+
+    def _shorten(self) -> None:
+        """Shorten the bounds by way of the start, as long as this narrows the interval."""
+        assert self.travel is not None and self.hub is not None
+        to_hub, times, away = self.hub
+        for shorter in shortened(self.travel, times, away, self.spending):
+            before = float(self.upper.max())
+            np.minimum(self.upper, to_hub + shorter, out=self.upper)
+            self.upper[self.upper <= self.lower] = -math.inf
+            if float(self.upper.max()) > TAKEN * before:
+                break

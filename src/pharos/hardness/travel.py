@@ -18,15 +18,25 @@ y directly:
 and Dijkstra's algorithm finds the best x and a for every y: E(h, y) <= V(y). The largest expected time to target e is
 then at most the largest U(s) plus V(e). Under sticky actions sums are the largest over the previously executed action,
 and so is U.
+
+Where slips cannot be taken back, but lead on to where the way goes on as well, y need not be the next node: with the
+nodes around y, those that lead there in the fewest steps, as a problem of its own in which to leave them is to give up,
+
+    E(x, y) <= c(x) + l(x) E(h, y), where c(y) = l(y) = 0, and outside c = U, l = 1,
+
+holds for c = U, l = 1 everywhere, and goes on to hold where c(x), l(x) become 1 + sum P c and sum P l under any action,
+node by node (`shortened`). So E(h, y) <= (E(h, x) + c(x)) / (1 - l(x)) for every x around y, and what was a slip at
+each step on the way is one for as many steps as lie between x and y.
 """
 
 import itertools
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
 from pharos.hardness.choices import outcomes_of
-from pharos.kernels import travel
+from pharos.kernels import travel, vicinity
 from pharos.mdp import TabularMDP
 from pharos.workers import usable_workers
 
@@ -43,6 +53,9 @@ PASSES = 100
 ACCURACY = 1e-4
 # Outcomes below which threads are not worth their start.
 SMALL = 100_000
+# Sweeps over the nodes around a target, at most, and parts of all targets, in the order of their bounds: each part
+# knows the bounds of those before it, and threads share a part, so that results do not depend on their number.
+SWEEPS, PARTS = 30, 64
 # More than the relative rounding of sums of positive numbers along any way.
 ROUNDING = 1 + 1e-9
 
@@ -67,6 +80,8 @@ class TravelBounds:
         self._outcomes = _outcomes(mdp, restart)
         first, _, node, _ = self._outcomes
         owner = np.repeat(np.arange(len(first) - 1), np.diff(first))
+        self._num_actions = num_actions
+        self._into: tuple[np.ndarray, np.ndarray] | None = None
         self._fixed = (self._outcomes, owner, weights, num_actions if mdp.is_sticky else 0)
         self._threads = usable_workers(None) if len(node) > SMALL else 1
         with ThreadPoolExecutor(self._threads) as pool:
@@ -126,6 +141,39 @@ class TravelBounds:
         hub."""
         first, _, node, _ = self._outcomes
         return travel.times_from(hub, first, node, self._solve(1.0, times), self.leak) * ROUNDING
+
+    def shortened(self, times: np.ndarray, bound: np.ndarray, size: int, is_over: Callable[[], bool]) -> np.ndarray:
+        """(N,) `bound`, or less where the way through the nodes around a target is shorter.
+
+        Args:
+            times, bound: (N,) upper bounds of the expected steps to the hub, and from it.
+            size: nodes around each target.
+            is_over: whether to leave the rest as it is; asked between parts.
+        Cost: for each target some passes over `size` nodes.
+        """
+        outcomes, owner, weights, num_previous = self._fixed
+        num_nodes = len(outcomes[0]) - 1
+        if self._into is None:
+            self._into = travel.outcomes_into(outcomes[2], num_nodes)
+        room = [
+            (np.zeros(num_nodes, np.int32), np.empty(size, np.int64), *np.empty((2, size, num_previous + 1)))
+            for _ in range(self._threads)
+        ]
+        bound, new = bound.copy(), np.empty(num_nodes)
+        fixed = (outcomes, owner, self._into, weights, num_previous, self._num_actions, times, bound, new, SWEEPS)
+        with ThreadPoolExecutor(self._threads) as pool:
+            for part in np.array_split(np.argsort(bound, kind="stable"), min(PARTS, num_nodes)):
+                if is_over():
+                    break
+                edges = np.linspace(0, len(part), self._threads + 1).astype(np.int64)
+                tasks = [
+                    pool.submit(vicinity.shorten, part, low, high, *fixed, own)
+                    for own, low, high in zip(room, edges[:-1], edges[1:], strict=True)
+                ]
+                for task in tasks:
+                    task.result()
+                bound[part] = new[part]
+        return bound
 
 
 def _outcomes(mdp: TabularMDP, restart: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
