@@ -167,9 +167,11 @@ def ranks_of(processes: str) -> int | str:
     """The value of --processes; "mpi" in a process that a launcher has started with others. All but the first of them
     are silent from here on.
     """
-    from pharos.ranks import launched
+    from pharos.ranks import launched, mpi_rank
 
     rank, size = launched()
+    if processes == "mpi" and size == 1:  # a launcher that says nothing to its processes
+        rank = mpi_rank().rank
     if rank > 0:  # the first one speaks for all
         sys.stdout = sys.stderr = open(os.devnull, "w")  # noqa: SIM115
     if size > 1 or processes == "mpi":
