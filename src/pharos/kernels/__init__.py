@@ -11,6 +11,7 @@ __all__ = [
     "batched_worlds",
     "bellman",
     "clocks",
+    "components",
     "dense_search",
     "disk_table",
     "distance_sweeps",

@@ -126,15 +126,15 @@ def _chosen_of(choice, q, actions, s):
 
 
 @njit(cache=True, nogil=True)
-def sticky_sweep(transitions, table, palette, gamma, weights, choice, v, actions, q, order):
+def sticky_sweep(transitions, table, palette, gamma, weights, choice, v, actions, q, order, start, stop):
     """v[s, b] = chosen q(s, what is chosen) + previous q(s, b) + uniform mean_a q(s, a), in place.
 
-    v (S + 1, A); q (A,) scratch.
+    v (S + 1, A); q (A,) scratch; for places [start, stop).
     """
     chosen, previous, uniform = weights
     change = 0.0
-    for i in range(size_of(transitions)[0] - 1, -1, -1):
-        if i >= AHEAD:
+    for i in range(stop - 1, start - 1, -1):
+        if i >= start + AHEAD:
             fetch_values(transitions, v, actions, state_at(order, i - AHEAD))
         s = state_at(order, i)
         best, total = _sticky_values(transitions, table, palette, gamma, choice, v, actions, q, s)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from pharos.kernels import bellman, graph, occupancy
-from pharos.mdp.dynamics import BellmanEquation, Dynamics, Order, Play
+from pharos.mdp.dynamics import BellmanEquation, Components, Dynamics, Order, Play
 from pharos.mdp.selection import Extreme, PolicyTable, Selection
 from pharos.state_space import read_ahead
 
@@ -58,6 +58,21 @@ class CompiledDynamics(Dynamics):
     def sweep(self, equation: BellmanEquation, x: np.ndarray, threads: int = 1) -> float:
         return swept(self.for_sweeps, self.num_actions, equation, x, None, threads)
 
+    def sweep_part(self, equation: BellmanEquation, x: np.ndarray, order: np.ndarray, start: int, stop: int) -> float:
+        return swept(self.for_sweeps, self.num_actions, equation, x, order, part=(start, stop))
+
+    def components(self, live: np.ndarray, least: int) -> Components:
+        from pharos.kernels import components  # which few need
+
+        dtype = np.int32 if self.num_states < 2**31 else np.int64
+        number, path, waiting = (np.empty(self.num_states, dtype) for _ in range(3))
+        count = components.number_components(self.for_kernels, live, number, path, waiting)
+        first, is_cyclic = np.zeros(count + 1, np.int64), np.zeros(count, np.bool_)
+        order = np.empty(self.num_states, np.int64)
+        components.component_order(self.for_kernels, live, number, first, is_cyclic, order)
+        largest = int(np.diff(first).max(initial=0, where=is_cyclic))
+        return Components(order, *components.joined(first, is_cyclic, least), count, largest)
+
     def sweep_once(self, equation: BellmanEquation, x: np.ndarray, order: Order) -> None:
         swept(self.for_sweeps, self.num_actions, equation, x, order.states)
 
@@ -98,10 +113,13 @@ def swept(
     x: np.ndarray,
     order: np.ndarray | None,
     threads: int = 1,
+    part: tuple[int, int] | None = None,
 ) -> float:
     """Replace each entry of x by its backup, from the last state of an order to the first; the largest change.
 
-    Each thread has a part of the states, where that is possible.
+    Args:
+        threads: each has a part of the states, where that is possible.
+        part: the places [start, stop) of the order that are swept; None, and for a policy that draws actions: all.
     """
     rewards, gamma, chance, select = equation
     tables = (transitions, rewards.table, rewards.palette, gamma)
@@ -114,21 +132,24 @@ def swept(
         weights = (float(chance.chosen), float(chance.uniform))
         return bellman.policy_sweep(*tables, *weights, select.later[:, 0], x[:, 0], order)
     if chance.is_sticky:
-        return bellman.sticky_sweep(*tables, chance.triple, choice, x, actions, scratch, order)
+        places = part or (0, rewards.shape[0])
+        return bellman.sticky_sweep(*tables, chance.triple, choice, x, actions, scratch, order, *places)
     v = x[:, 0]
 
-    def part(low: int, high: int) -> float:
+    def change_of(low: int, high: int) -> float:
         change = 0.0
         for start, stop in _ranges(transitions, low, high):
             largest = bellman.optimal_sweep(*tables, chance.uniform, choice, v, actions, order, start, stop)
             change = float(np.maximum(change, largest))
         return change
 
+    if part:
+        return change_of(*part)
     cuts = [rewards.shape[0] * i // threads for i in range(threads + 1)]
     if threads == 1:
-        return part(*cuts)
+        return change_of(*cuts)
     with ThreadPoolExecutor(threads) as pool:
-        return float(np.max([*pool.map(part, cuts[:-1], cuts[1:])]))
+        return float(np.max([*pool.map(change_of, cuts[:-1], cuts[1:])]))
 
 
 def _ranges(transitions: Any, low: int, high: int) -> Iterator[tuple[int, int]]:

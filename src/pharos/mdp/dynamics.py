@@ -82,6 +82,23 @@ class Order(NamedTuple):
     longest: int
 
 
+class Components(NamedTuple):
+    """Strongly connected components of the states, in an order in which each stands before those that it leads to.
+
+    Attributes:
+        order: (S,) the states, component by component.
+        starts: (G + 1,) where groups of neighbouring components begin in the order.
+        has_cycle: (G,) whether a state of a group can be visited again.
+        count: how many components there are. largest: the states of the largest one that has a cycle.
+    """
+
+    order: np.ndarray
+    starts: np.ndarray
+    has_cycle: np.ndarray
+    count: int
+    largest: int
+
+
 class Dynamics(ABC):
     """What executing an action does, for S states and A actions.
 
@@ -276,6 +293,22 @@ class Dynamics(ABC):
             outcomes = self.outcomes(rows, actions)
             result[outcomes.states, actions[outcomes.which]] = True
         return result[:-1]
+
+    def components(self, live: np.ndarray, least: int) -> Components | None:
+        """The strongly connected components of the states, of which live ones (S,) bool lead on; None: not looked for.
+
+        Args:
+            least: small components with cycles are put together until a group has as many states.
+        Cost: one look at each transition, and 33 bytes a state.
+        """
+        return None
+
+    def sweep_part(self, equation: BellmanEquation, x: np.ndarray, order: np.ndarray, start: int, stop: int) -> float:
+        """`sweep` over the places [start, stop) of an order (S,) of states, the last one first.
+
+        Only where there are `components`, and not for a policy that draws its actions.
+        """
+        raise NotImplementedError
 
     def sweep_once(self, equation: BellmanEquation, x: np.ndarray, order: Order) -> None:
         """Replace each entry of x by its backup, from the last state of an order to the first: the fixed point."""

@@ -3,7 +3,8 @@
 Sweeps go in place and in reverse order of discovery: breadth-first search numbers a state before those that it leads
 to, so a sweep from the last state to the first carries values back along whole paths. 20 to 40 sweeps solve games that
 take a thousand plain ones. Where no state can be visited twice, and gamma is 1 or the states have an age, one pass is
-enough. Where sweeps are slow, because gamma is near 1, policy iteration gives a better x to go on from.
+enough. Where sweeps are slow, because gamma is near 1, solving strongly connected components one after another or
+policy iteration gives a better x to go on from.
 
 The bound. Let T be the backup, a contraction with factor rho, x* its fixed point, and let one sweep in place change
 entries by at most d, with rounding errors of at most e an entry. Every new entry is a backup of entries that are old or
@@ -23,6 +24,7 @@ import numpy as np
 
 from pharos.errors import DivergenceError, PrecisionError
 from pharos.mdp import BellmanEquation, Part, Selection, TabularMDP
+from pharos.solvers.components import ComponentSolver
 from pharos.solvers.policy_iteration import PolicyIteration
 from pharos.state_space import large_zeros
 
@@ -113,7 +115,7 @@ def fixed_point(
     if not least <= tolerance:
         raise imprecise(mdp, least, tolerance)
     x, sweeps = backup.zeros() if x is None else x, 0
-    better, least, since = PolicyIteration(mdp, select), math.inf, 0
+    components, better, least, since = ComponentSolver(mdp, select), PolicyIteration(mdp, select), math.inf, 0
     largest = largest_of(x)
     while True:
         change = backup.sweep(x)
@@ -132,7 +134,9 @@ def fixed_point(
         # x is exact up to rounding, also where values are infinite; or sweeps move rounding errors about
         if not rho * change > rounding or (better.is_exact and sweeps - since > SETTLING):
             raise imprecise(mdp, least if better.is_exact else bound, tolerance)
-        if better.is_worth_it(sweeps, change, tolerance):
+        if components.is_worth_it(sweeps, change, tolerance) and components.improve(x, tolerance):
+            largest = largest_of(x)
+        elif better.is_worth_it(sweeps, change, tolerance):
             better.improve(x, tolerance)
             largest = largest_of(x)
 

@@ -61,8 +61,9 @@ def value_iteration(
         PrecisionError: 64-bit floats cannot reach the tolerance, or hold the values.
         ParameterError: several processes, and gamma = 1 without a horizon. RankFailed: a process died.
     Cost: O(S A) a sweep, 0.5 to 2 ns for each state and action on game graphs; memory 8 bytes a state (8 A under sticky
-        actions). Where gamma is so near 1 that sweeps would be many, policy iteration: on the graph of the policy where
-        nothing is left to chance (56 bytes a state then); by a Krylov method whose operator is a sweep else (10 vectors
+        actions). Where gamma is so near 1 that sweeps would be many: strongly connected components one after another
+        where none has half of the states (48 bytes a state); policy iteration, on the graph of the policy where nothing
+        is left to chance (56 bytes a state then); by a Krylov method whose operator is a sweep else (10 vectors
         of values); and by elimination where that fails and nodes (states, under sticky actions pairs with the previous
         action) times actions are up to 2 million (up to 500 MB then), or nodes are up to 3000.
     Source: Bellman (1957); in place: Puterman (1994), section 6.3.3; the sticky equation: the pharos paper, appendix A.
