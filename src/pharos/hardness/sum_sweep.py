@@ -274,7 +274,8 @@ class SumSweep:
 
     def _search_in_step(self) -> None:
         """Where only restarts hide a clock, in(v) of all that are open, the farthest first."""
-        clock = HiddenClock.of(self.graph, self.to, self.away) if self._open()[0] else None
+        is_tried = self._open()[0] and self._fits(1)
+        clock = HiddenClock.of(self.graph, self.to, self.away) if is_tried else None
         while clock is not None and self._open()[0] and not self.spending.is_over:
             nodes = np.flatnonzero(np.greater(self.in_upper, self.best))
             words = _WORDS[-1] if self._fits(_WORDS[-1]) else 1
