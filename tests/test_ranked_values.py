@@ -153,6 +153,20 @@ def test_evaluation_and_the_uniform_policy_are_shared(monkeypatch):
         assert np.abs(shared.v - alone.v).max() <= alone.error_bound + shared.error_bound
 
 
+@pytest.mark.long
+@pytest.mark.parametrize("sticky", [0.0, 0.25])
+def test_ranks_compute_the_rewards_of_their_ranges(sticky, tmp_path):
+    space = pharos.build(pharos.make("breakout", height=7, columns=5, brick_rows=1), tmp_path, progress=False)
+    mdp = pharos.sticky_actions(space.mdp(0.5), sticky)
+    ranged = pharos.sticky_actions(space.mdp(0.5, by_range=True), sticky)
+    shared = solved(ranged, 3, jacobi=True)
+    assert ranged.reward_table.whole is None
+    alone = solved(mdp, 1, jacobi=True)
+    assert (shared.x == alone.x).all()
+    assert shared.value_at_start == alone.value_at_start
+    assert (ranged.rewards == mdp.rewards).all()
+
+
 # What is refused ------------------------------------------------------------------------------------------------------
 
 

@@ -75,7 +75,8 @@ class Target:
                 f"{self.text}: pharos does not know the class {space.manifest['class']} of this environment, "
                 f"so not its rewards; name it as module:Class instead of its folder"
             )
-        return chance.of(space.mdp(gamma=discount(gamma, horizon)).with_horizon(horizon))
+        by_range = building.get("processes") == "mpi"
+        return chance.of(space.mdp(gamma=discount(gamma, horizon), by_range=by_range).with_horizon(horizon))
 
     def found_environment(self) -> "Environment":
         """The environment, also of a folder: the one it was built from, or that of the imported MDP.

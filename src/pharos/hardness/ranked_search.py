@@ -26,11 +26,11 @@ class Found(NamedTuple):
 
     Attributes:
         distances: (N,) int32 at the first rank, `FAR` where there is no way; None at the others.
-        count: nodes found. largest: distance of these.
+        reached: how many nodes were. largest: distance of these.
     """
 
     distances: np.ndarray | None
-    count: int
+    reached: int
     largest: int
 
 
@@ -109,7 +109,7 @@ def ranked_eccentricity(
     """The largest number of steps from a state to another one."""
     found = ranked_distances(graph, source, processes)
     spending.searches += 1
-    is_whole = found.count == graph.num_nodes
+    is_whole = found.reached == graph.num_nodes
     value = float(found.largest) if is_whole else math.inf
     return Interval(
         value,

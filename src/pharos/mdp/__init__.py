@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from pharos.mdp.part import Part
     from pharos.mdp.rewards import Rewards
     from pharos.mdp.selection import BEST, WORST, Extreme, PolicyTable, Selection, chosen_mass
-    from pharos.mdp.space_rewards import rewards_of_outcomes, rewards_of_space, rewards_of_staying
+    from pharos.mdp.space_rewards import ranged_rewards, rewards_of_outcomes, rewards_of_space, rewards_of_staying
     from pharos.mdp.table import Table
     from pharos.mdp.tabular import TabularMDP
 
@@ -45,6 +45,7 @@ _FILES = {
     "lazy_actions": "chance",
     "minimize": "bisimulation",
     "random_actions": "chance",
+    "ranged_rewards": "space_rewards",
     "rewards_of_outcomes": "space_rewards",
     "rewards_of_space": "space_rewards",
     "rewards_of_staying": "space_rewards",
@@ -76,6 +77,7 @@ __all__ = [
     "lazy_actions",
     "minimize",
     "random_actions",
+    "ranged_rewards",
     "rewards_of_outcomes",
     "rewards_of_space",
     "rewards_of_staying",

@@ -5,7 +5,9 @@ float64, an eighth of the memory of (S, A) float64 and an eighth of what a sweep
 float64.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -80,6 +82,35 @@ class Rewards:
     def highest(self) -> float:
         """The largest reward."""
         return float(self.palette.max() if len(self.palette) else self.table.max())
+
+
+class RangedRewards(Rewards):
+    """Rewards of a state space of which only some ranges may be asked for: they are computed when they are.
+
+    Attributes:
+        whole: all of them, once somebody has asked for them; else None.
+    """
+
+    def __init__(self, shape: tuple[int, int], compute: Callable[[int, int], Rewards]):
+        """compute(start, stop): the rewards of the states [start, stop)."""
+        vars(self).update(_shape=shape, _compute=compute, whole=None)  # the class is frozen
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        return vars(self)["_shape"]
+
+    def __getattr__(self, name: str) -> Any:
+        if name not in ("table", "palette"):
+            raise AttributeError(name)
+        if vars(self)["whole"] is None:
+            vars(self)["whole"] = vars(self)["_compute"](0, self.shape[0])
+        return getattr(vars(self)["whole"], name)
+
+    def of(self, states: slice | np.ndarray) -> Rewards:
+        if vars(self)["whole"] is None and isinstance(states, slice) and states.step is None:
+            start, stop, _ = states.indices(self.shape[0])
+            return vars(self)["_compute"](start, stop)
+        return super().of(states)
 
 
 @dataclass

@@ -48,6 +48,19 @@ def rewards_of_space(space: "StateSpace", rewards: Any = None, *, workers: int |
     return _collected(space, env, _blocks(space, env, workers))
 
 
+def ranged_rewards(space: "StateSpace") -> "Rewards":
+    """The rewards by the rules, of which each range is computed when it is asked for."""
+    from pharos.mdp.rewards import RangedRewards
+
+    env = space.environment
+    assert env is not None
+
+    def compute(start: int, stop: int) -> "Rewards":
+        return _collected(space, env, _blocks(space, env, None, start, stop), start, stop)
+
+    return RangedRewards((space.num_states, space.num_actions), compute)
+
+
 def rewards_of_staying(space: "StateSpace", reward: Callable | None = None) -> "Rewards":
     """What the rules pay for going from a state to itself, whether an action leads there or not; 0 in terminal states.
 
@@ -78,17 +91,24 @@ def rewards_of_staying(space: "StateSpace", reward: Callable | None = None) -> "
     return _collected(space, env, blocks())
 
 
-def _collected(space: "StateSpace", env: Environment, blocks: Iterator[tuple[int, np.ndarray]]) -> "Rewards":
-    """Blocks (first state, rewards) as one; RuleError where one is not finite."""
+def _collected(
+    space: "StateSpace",
+    env: Environment,
+    blocks: Iterator[tuple[int, np.ndarray]],
+    first: int = 0,
+    last: int | None = None,
+) -> "Rewards":
+    """Blocks (first state, rewards) of the states [first, last) as one; RuleError where one is not finite."""
     from pharos.mdp.rewards import RewardsCollector
     from pharos.rules import refused_reward
 
-    collector = RewardsCollector((space.num_states, space.num_actions))
+    stop = space.num_states if last is None else last
+    collector = RewardsCollector((stop - first, space.num_actions))
     for start, block in blocks:
         if not np.isfinite(block).all():
             s, a = map(int, np.argwhere(~np.isfinite(block))[0])
             raise refused_reward(env, space.state(start + s), a, f"is {block[s, a]}; expected a finite number")
-        collector.add(start, block)
+        collector.add(start - first, block)
     return collector.finish()
 
 
@@ -118,17 +138,20 @@ def rewards_of_outcomes(space: "StateSpace") -> np.ndarray:
     return np.concatenate(blocks)
 
 
-def _blocks(space: "StateSpace", env: Environment, workers: int | None) -> Iterator[tuple[int, np.ndarray]]:
-    """(start, rewards of the states from start on), in order."""
+def _blocks(
+    space: "StateSpace", env: Environment, workers: int | None, first: int = 0, last: int | None = None
+) -> Iterator[tuple[int, np.ndarray]]:
+    """(start, rewards of the states from start on), in order, of the states [first, last)."""
     from pharos.rules import rules_of
 
     rules = rules_of(env).rewards
-    starts = range(0, space.num_states, _ROWS)
+    end = space.num_states if last is None else last
+    starts = range(first, end, _ROWS)
     states, terminal = space.packed_states, space.terminal
     successors = None if space.has_chance else space.successors
 
     def block(start: int) -> np.ndarray:
-        stop = min(start + _ROWS, space.num_states)
+        stop = min(start + _ROWS, end)
         if successors is not None:
             return rules.block(states, successors, terminal, start, stop)
         outcomes = space.outcomes.entries(start, stop, space.num_actions)

@@ -64,7 +64,7 @@ class Checkpoint:
         whole = backup.gathered(backup.x)
         if whole is not None and self._path is not None:
             header = np.array([sweeps, *numbers, *whole.shape], np.float64).tobytes()
-            values = memoryview(np.ascontiguousarray(whole)).cast("B")
+            values = np.ascontiguousarray(whole).data.cast("B")
             try:
                 self._path.parent.mkdir(parents=True, exist_ok=True)
                 with storage.replacing(self._path) as file:
@@ -101,5 +101,5 @@ class Checkpoint:
             whole = np.memmap(self._path, np.float64, "r", begin, shape)
         except OSError:
             return nothing
-        is_whole = storage.digest_of_bytes(memoryview(whole).cast("B")) == digests[_DIGEST:]
+        is_whole = storage.digest_of_bytes(whole.data.cast("B")) == digests[_DIGEST:]
         return (header.copy(), whole) if is_whole else nothing
