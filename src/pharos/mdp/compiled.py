@@ -17,13 +17,7 @@ _RANGE = 1 << 22
 
 
 class CompiledDynamics(Dynamics):
-    """Transitions in arrays that kernels/outcomes.py knows how to read: each loop is written once for all of them.
-
-    Attributes:
-        workers: threads of a backup; None for all processors.
-    """
-
-    workers: int | None = None
+    """Transitions in arrays that kernels/outcomes.py knows how to read: each loop is written once for all of them."""
 
     @property
     @abstractmethod

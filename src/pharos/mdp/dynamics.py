@@ -108,6 +108,7 @@ class Dynamics(ABC):
         is_deterministic: whether executing an action has one outcome, everywhere.
         has_ends: whether some execution ends the episode without a next state.
         laziness: probability that nothing happens, as far as `lazy` has added it.
+        workers: threads of a backup, where it has several; None for all processors.
     """
 
     num_states: int
@@ -117,6 +118,7 @@ class Dynamics(ABC):
     is_deterministic: bool
     has_ends: bool
     laziness: float = 0.0
+    workers: int | None = None
 
     # What each representation says of itself ------------------------------------------------------------------------
 

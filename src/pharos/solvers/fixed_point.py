@@ -56,7 +56,8 @@ class Backup:
 
     def __init__(self, mdp: TabularMDP | Part, select: Selection, threads: int = 1):
         chance = mdp.chance
-        self.mdp, self.select, self.threads = mdp, select, threads
+        self.mdp: Any = mdp
+        self.select, self.threads = select, threads
         self.equation = BellmanEquation(mdp.reward_table, mdp.gamma, chance, select)
         executed = chance.chosen * select.mass + chance.previous + chance.uniform
         is_exact = select.mass == 1.0 and mdp.dynamics.mass == 1.0 and not chance.is_sticky and not chance.is_random
