@@ -7,6 +7,7 @@ import sys
 import tomllib
 from pathlib import Path
 
+import jinja2
 import pytest
 import yaml
 
@@ -24,12 +25,31 @@ def test_every_file_that_says_the_version_says_the_same():
     assert f'version = "{pharos.__version__}"' in (ROOT / "conda/meta.yaml").read_text()
 
 
-def test_the_conda_recipe_has_the_dependencies_of_the_core():
-    recipe = (ROOT / "conda/meta.yaml").read_text()
-    for requirement in PROJECT["dependencies"]:
-        name, bound = re.fullmatch(r"(\w+)(.*)", requirement).groups()
-        assert re.search(rf"- (python-)?{name} {re.escape(bound)}$", recipe, re.MULTILINE), requirement
-    assert f"python {PROJECT['requires-python']}" in recipe
+@pytest.fixture(scope="module")
+def recipe():
+    """The recipe of conda, rendered as conda does: Jinja2, then YAML."""
+    text = jinja2.Template((ROOT / "conda/meta.yaml").read_text(), undefined=jinja2.StrictUndefined)
+    return yaml.safe_load(text.render(PYTHON="python"))
+
+
+def test_the_conda_recipe_has_the_dependencies_of_the_core_and_no_others(recipe):
+    required = {re.sub(r"(?<=\w)(?=[<>=])", " ", requirement, count=1) for requirement in PROJECT["dependencies"]}
+    found = {requirement.removeprefix("python-") for requirement in recipe["requirements"]["run"]}
+    assert found == required | {f"python {PROJECT['requires-python']}"}
+    optional = [r for extra in PROJECT["optional-dependencies"].values() for r in extra]
+    for requirement in recipe["requirements"]["run_constrained"]:
+        assert requirement.replace("pytorch", "torch").replace(" ", "") in optional, requirement
+
+
+def test_the_conda_recipe_builds_what_the_project_says(recipe):
+    (build,) = tomllib.loads((ROOT / "pyproject.toml").read_text())["build-system"]["requires"]
+    assert build.replace(">=", " >=") in recipe["requirements"]["host"]
+    scripts = [f"{name} = {target}" for name, target in PROJECT["scripts"].items()]
+    assert (recipe["build"]["entry_points"], recipe["build"]["noarch"]) == (scripts, "python")
+    assert recipe["package"] == {"name": PROJECT["name"], "version": pharos.__version__}
+    assert recipe["about"]["license"] == PROJECT["license"] and recipe["about"]["summary"] == PROJECT["description"]
+    assert recipe["about"]["home"] == PROJECT["urls"]["Repository"]
+    assert (ROOT / "conda" / recipe["source"]["path"]).resolve() == ROOT.resolve()
 
 
 def test_extras_name_this_distribution():
