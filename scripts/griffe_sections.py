@@ -17,6 +17,9 @@ class Sections(griffe.Extension):
         text = re.sub(
             rf"^(?!(?:{SECTIONS}):)(\S[^\n]*)\n(?=    \S)", r"\1\n\n", text, flags=re.MULTILINE
         )  # lists of ours
+        text = re.sub(
+            r"^\S+\n(?:[├│└].*\n)+", r"```text\n\g<0>```\n", text, flags=re.MULTILINE
+        )  # a tree keeps its lines
         text = re.sub(r"(?<=\b[VQ])\*", r"\\*", text)  # V*, which is no emphasis
         text = re.sub(r"^(Cost|Sources?): ", r"**\1.** ", text, flags=re.MULTILINE)
         obj.docstring.value = re.sub(r"^(Returns|Raises): *(?=\S)", r"\1:\n    ", text, flags=re.MULTILINE)

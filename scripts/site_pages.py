@@ -110,13 +110,13 @@ def values_of_all(stored: Mapping[str, dict]) -> str:
         [
             "# Values of every instance",
             "",
-            f"{VALUES} Instances that were not enumerated for this page stand below. The same in JSON: "
+            f"{VALUES} Instances whose values were not computed for this page stand below. The same in JSON: "
             "[environments.json](../environments.json).",
             "",
             VALUES_HEAD,
             *known.values(),
             "",
-            "## Not enumerated",
+            "## Without values",
             "",
             "Each would take minutes to hours, and gigabytes, on two cores; `pharos solve` does it, "
             "[as far as memory and disk go](../performance.md).",
