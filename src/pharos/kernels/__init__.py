@@ -43,6 +43,7 @@ __all__ = [
     "tangent",
     "ties",
     "travel",
+    "vicinity",
 ]
 
 compiling.listen()

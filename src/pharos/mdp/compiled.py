@@ -1,5 +1,6 @@
 """Dynamics that kernels read: the methods that are compiled, without temporary arrays."""
 
+import math
 from abc import abstractmethod
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -52,8 +53,27 @@ class CompiledDynamics(Dynamics):
     def sweep(self, equation: BellmanEquation, x: np.ndarray, threads: int = 1) -> float:
         return swept(self.for_sweeps, self.num_actions, equation, x, None, threads)
 
-    def sweep_part(self, equation: BellmanEquation, x: np.ndarray, order: np.ndarray, start: int, stop: int) -> float:
-        return swept(self.for_sweeps, self.num_actions, equation, x, order, part=(start, stop))
+    def settle_components(
+        self, equation: BellmanEquation, x: np.ndarray, parts: Components, target: float, settled: float, most: float
+    ) -> None:
+        choice = _choice(equation.select)
+        if choice is not None and not equation.chance.is_sticky:
+            from pharos.kernels import components
+
+            tables = (self.for_sweeps, equation.rewards.table, equation.rewards.palette, equation.gamma)
+            actions, chance = bellman.actions_of(self.num_actions), equation.chance.uniform
+            groups = (parts.order, parts.starts, parts.has_cycle)
+            components.settle(*tables, chance, choice, x[:, 0], actions, *groups, target, settled, most)
+            return
+        for group in range(len(parts.has_cycle) - 1, -1, -1):
+            start, stop = int(parts.starts[group]), int(parts.starts[group + 1])
+            change, largest = math.inf, 0.0
+            while change > max(target, settled * largest):
+                change = swept(self.for_sweeps, self.num_actions, equation, x, parts.order, part=(start, stop))
+                largest += change
+                most -= stop - start
+                if most < 0 or not parts.has_cycle[group]:
+                    break
 
     def components(self, live: np.ndarray, least: int) -> Components:
         from pharos.kernels import components  # which few need

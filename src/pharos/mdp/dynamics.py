@@ -305,10 +305,14 @@ class Dynamics(ABC):
         """
         return None
 
-    def sweep_part(self, equation: BellmanEquation, x: np.ndarray, order: np.ndarray, start: int, stop: int) -> float:
-        """`sweep` over the places [start, stop) of an order (S,) of states, the last one first.
+    def settle_components(
+        self, equation: BellmanEquation, x: np.ndarray, parts: Components, target: float, settled: float, most: float
+    ) -> None:
+        """Sweep x group by group of `components`, from the last to the first, until each is settled.
 
-        Only where there are `components`, and not for a policy that draws its actions.
+        Args:
+            target: a sweep of a group changes it by at most as much in the end, or by `settled` times its values.
+            most: backups, after which each group that is left is swept once.
         """
         raise NotImplementedError
 

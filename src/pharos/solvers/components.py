@@ -20,7 +20,7 @@ from pharos.state_space import available_memory
 FIRST_ATTEMPT, LEFT = 32, 100
 # Operations that must be left: fewer take less time than compiling.
 WORTH = 5e8
-# Operations that calling a sweep costs; states that are swept in one call, at least, for that reason.
+# Operations that calling a sweep costs; states under sticky actions that are swept in one call, at least.
 CALL, LEAST = 5000, 512
 # Bytes of a state that an attempt takes, at most.
 BYTES = 48
@@ -56,21 +56,12 @@ class ComponentSolver:
         An attempt may cost half of the sweeps that seem to be left; then each component that is left is swept once.
         """
         mdp, self._is_tried = self.mdp, True
-        found = mdp.dynamics.components(~np.asarray(mdp.terminal), LEAST)
+        found = mdp.dynamics.components(~np.asarray(mdp.terminal), LEAST if mdp.is_sticky else 1)
         if found is None or found.largest > mdp.num_states // 2:
             return False
         target = SHARE * tolerance * (1 - mdp.gamma)
-        budget = 0.5 * self._cost(self._left, mdp.num_states)
-        for group in range(len(found.has_cycle) - 1, -1, -1):
-            start, stop = int(found.starts[group]), int(found.starts[group + 1])
-            change, largest = math.inf, 0.0
-            while change > max(target, SETTLED * largest):
-                with np.errstate(over="ignore", invalid="ignore"):
-                    change = mdp.dynamics.sweep_part(self.equation, x, found.order, start, stop)
-                budget -= self._cost(1.0, stop - start)
-                largest += change  # at least as large as the values, but for what they were before
-                if budget < 0 or not found.has_cycle[group]:
-                    break
+        with np.errstate(over="ignore", invalid="ignore"):
+            mdp.dynamics.settle_components(self.equation, x, found, target, SETTLED, 0.5 * self._left * mdp.num_states)
         return True
 
     def _cost(self, sweeps: float, num_states: int) -> float:
