@@ -83,7 +83,7 @@ def main() -> None:
         for gamma in (0.999, 0.9999):
             mdp = make(gamma)
             found = mdp.dynamics.components(~np.asarray(mdp.terminal), 1)
-            sizes = f"{mdp.num_states:,} states, {found.count:,} components, the largest of {found.largest:,}"
+            sizes = f"{mdp.num_states:,} states, {found.total:,} components, the largest of {found.largest:,}"
             print(f"{name}: {sizes}; gamma {gamma}")
             for way, used in WAYS.items():
                 for solver, known, is_used in zip(solvers, worth, used, strict=True):

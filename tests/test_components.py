@@ -44,7 +44,7 @@ def test_components_are_those_of_scipy_in_topological_order(drawn, least):
     place = np.empty(dynamics.num_states, np.int64)
     place[found.order] = np.arange(dynamics.num_states)
     group = np.searchsorted(found.starts, place, side="right") - 1
-    assert found.count == count and sorted(found.order) == list(range(dynamics.num_states))
+    assert found.total == count and sorted(found.order) == list(range(dynamics.num_states))
     s, t = np.nonzero(leads & (label[:, None] != label))
     assert (place[s] < place[t]).all()
     sizes = [0]

@@ -16,7 +16,7 @@ from pharos.mdp import TabularMDP
 from pharos.solvers import uniform_value, value_iteration
 from strategies import small_mdps
 
-memory_map = importlib.import_module("pharos.state_space.memory_map")
+memory_map = importlib.import_module("pharos.large_arrays")
 
 
 def ring(size: int = 400, gamma: float = 0.99) -> TabularMDP:

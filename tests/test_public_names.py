@@ -28,6 +28,8 @@ ORDER = (
         "installation",
         "lazy",
         "paths",
+        "memory",
+        "large_arrays",
         "wording",
         "storage",
         "templates",

@@ -25,7 +25,7 @@ from table_worlds import TableWorld
 building = importlib.import_module("pharos.state_space.build")
 search = importlib.import_module("pharos.state_space.search")
 table = importlib.import_module("pharos.state_space.table")
-machine = importlib.import_module("pharos.state_space.memory")
+machine = importlib.import_module("pharos.memory")
 
 BREAKOUT = pharos.make("breakout", height=7, columns=5)  # 27,692 states; a frontier of hundreds
 NARROW = TableWorld(num_positions=5000, lows="-1000,0,7", sizes=f"{2**40},{2**30},1", num_starts=3, end_share=0.05)

@@ -150,8 +150,8 @@ def make_model(
     except (TypeError, ValueError, AssertionError) as error:
         raise ParameterError(f"agent {_title(agent)!r} cannot be made: {error}") from error
     if tensorboard is None:  # the logger that it would make itself leaves a folder among the temporary files
-        from stable_baselines3.common.logger import HumanOutputFormat, Logger
+        from stable_baselines3.common.logger import HumanOutputFormat, KVWriter, Logger
 
-        told = [HumanOutputFormat(sys.stdout)] if options.get("verbose") else []
-        model.set_logger(Logger(folder=None, output_formats=told))
+        formats: list[KVWriter] = [HumanOutputFormat(sys.stdout)] if options.get("verbose") else []
+        model.set_logger(Logger(folder=None, output_formats=formats))
     return model

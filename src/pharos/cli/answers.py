@@ -136,8 +136,10 @@ def size_text(count: float) -> str:
 def describe(environment: "Environment") -> str:
     """An environment in one line: `breakout height=12 columns=8`, as the command line reads it."""
     absent = {field.name for field in dataclasses.fields(environment) if field.default is None}  # type: ignore[arg-type]
-    given = {name: value for name, value in environment.parameters.items() if value is not None or name not in absent}
-    words = (f"{name}={_written(value)}" for name, value in given.items())
+    parameters = {
+        name: value for name, value in environment.parameters.items() if value is not None or name not in absent
+    }
+    words = (f"{name}={_written(value)}" for name, value in parameters.items())
     return " ".join((environment.name, *(shlex.quote(word) if SPECIAL.search(word) else word for word in words)))
 
 

@@ -18,9 +18,9 @@ from pharos.hardness.gap_blocks import weighted_gaps
 from pharos.hardness.interval import Certified
 from pharos.hardness.ties import TieProof, UnresolvedTies
 from pharos.kernels import gaps as kernels
+from pharos.large_arrays import large_zeros
 from pharos.mdp import BEST, BellmanEquation, TabularMDP, takes_mdp
 from pharos.solvers import Solution, value_iteration
-from pharos.state_space import large_zeros
 
 # Of Colosseum.
 REGULARIZER = 0.1

@@ -79,7 +79,7 @@ class HiddenClock(NamedTuple):
         words = -(-len(targets) // 64)
         widest = int(np.diff(self.layer_first).max())
         scratch = np.zeros((2, widest, words), np.uint64)
-        seen = np.zeros((len(self.order), words), np.uint64)
+        visits = np.zeros((len(self.order), words), np.uint64)
         largest = np.full(len(targets), best, np.int64)
         ordered = np.ascontiguousarray(targets[order], np.int64)
         reads = kernels.search_in_step(
@@ -95,7 +95,7 @@ class HiddenClock(NamedTuple):
             self.home,
             best,
             scratch,
-            seen,
+            visits,
             largest,
         )
         result = np.empty_like(largest)

@@ -121,7 +121,7 @@ def kernel_regret(
     representation.check(mdp.num_states)
     episode = representation.episode(mdp.horizon if horizon is None else horizon, "kernel_regret")
     schedule = schedule or Schedule()
-    found = learnt_in_kernel(mdp, Learner(mdp, schedule, episode, solution), representation)
+    outcome = learnt_in_kernel(mdp, Learner(mdp, schedule, episode, solution), representation)
     conventions = {
         "schedule": asdict(schedule),
         "episode": episode,
@@ -131,7 +131,7 @@ def kernel_regret(
         "clipped": {"greedy": WORST_GREEDY, "played": WORST_PLAYED},
         **representation.conventions,
     }
-    return KernelRegret(*found, conventions)
+    return KernelRegret(*outcome, conventions)
 
 
 def learnt_in_kernel(

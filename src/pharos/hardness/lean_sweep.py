@@ -14,7 +14,8 @@ from pharos.hardness.interval import Interval, Spending
 from pharos.hardness.sum_sweep import SumSweep
 from pharos.hardness.transition_graph import Graph
 from pharos.kernels import distance_sweeps
-from pharos.state_space import available_memory, large_zeros, read_ahead
+from pharos.large_arrays import large_zeros, read_ahead
+from pharos.memory import available_memory
 
 # Untyped, as starred arguments of compiled functions are not checked.
 kernels: Any = distance_sweeps
@@ -41,16 +42,16 @@ def lean_diameter(graph: Graph, spending: Spending, conventions: dict[str, Any])
 def lean_eccentricity(graph: Graph, source: int, spending: Spending, conventions: dict[str, Any]) -> Interval:
     """The largest number of steps from a state to another one."""
     try:
-        found, largest, _ = LeanGraph(graph, np.int16).search_forward(source, large_zeros((graph.num_nodes,), np.int16))
+        reach, largest, _ = LeanGraph(graph, np.int16).search_forward(source, large_zeros((graph.num_nodes,), np.int16))
     except OverflowError:
-        found, largest, _ = LeanGraph(graph, np.int32).search_forward(source, large_zeros((graph.num_nodes,), np.int32))
+        reach, largest, _ = LeanGraph(graph, np.int32).search_forward(source, large_zeros((graph.num_nodes,), np.int32))
     spending.searches += 1
-    value = float(largest) if found == graph.num_nodes else np.inf
+    value = float(largest) if reach == graph.num_nodes else np.inf
     return Interval(
         value,
         value,
         True,
-        finite_part=value if found == graph.num_nodes else 0.0,
+        finite_part=value if reach == graph.num_nodes else 0.0,
         searches=1,
         method="a breadth-first search, by sweeps over the table",
         conventions=conventions,
@@ -72,7 +73,7 @@ class LeanGraph:
         self.dtype, self.far = dtype, int(np.iinfo(dtype).max)
 
     def search_forward(self, source: int, distance: np.ndarray) -> tuple[int, int, int]:
-        """distance[v] = d(source, v), `far` where there is no way; (nodes found, largest distance, sum of distances).
+        """distance[v] = d(source, v), `far` where there is no way; (nodes reach, largest distance, sum of distances).
 
         OverflowError where a distance does not fit.
         """
@@ -93,8 +94,8 @@ class LeanGraph:
                 if count < 0:
                     raise OverflowError
                 lowered += count
-        found, largest, total = kernels.summary(distance, self.far)
-        return int(found), int(largest), int(total)
+        reach, largest, total = kernels.summary(distance, self.far)
+        return int(reach), int(largest), int(total)
 
     def _through_end(self, distance: np.ndarray, backward: bool) -> int:
         """The one edge that is in no row: from the end to the start; whether it lowers a distance."""

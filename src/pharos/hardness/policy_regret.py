@@ -79,7 +79,7 @@ def kernel_policy_regret(
     episode = representation.episode(mdp.horizon if horizon is None else horizon, "kernel_policy_regret")
     schedule, rollouts = schedule or Schedule(), rollouts or Rollouts()
     learner = PolicyLearner(mdp, schedule, episode, solution, rollouts)
-    found = learnt_in_kernel(mdp, learner, representation)
+    outcome = learnt_in_kernel(mdp, learner, representation)
     conventions = {
         "schedule": {name: asdict(schedule)[name] for name in ("steps", "gamma", "optimizer")},
         "rollouts": asdict(rollouts),
@@ -90,7 +90,7 @@ def kernel_policy_regret(
         "clipped": {"greedy": WORST_GREEDY, "played": WORST_PLAYED},
         **representation.conventions,
     }
-    return KernelRegret(*found, conventions, "kernel_policy_regret")
+    return KernelRegret(*outcome, conventions, "kernel_policy_regret")
 
 
 class PolicyLearner(Learner):

@@ -44,8 +44,8 @@ class RankedGraph:
         self._local, self._halo = split(_edges(graph, self.start, self.stop), self.start, self.stop)
         borders = np.searchsorted(self._halo, self.cuts)
         self._halo_of = [slice(borders[q], borders[q + 1]) for q in range(rank.size)]
-        asked = [self._halo[part] - self.cuts[q] for q, part in enumerate(self._halo_of)]
-        self._wanted = rank.exchange(asked)  # nodes of this rank that each has in its halo
+        rows = [self._halo[part] - self.cuts[q] for q, part in enumerate(self._halo_of)]
+        self._wanted = rank.exchange(rows)  # nodes of this rank that each has in its halo
         self._never = np.zeros(len(self), np.bool_)
         self.distance = np.empty(len(self) + len(self._halo), np.int32)
 
@@ -65,16 +65,18 @@ class RankedGraph:
             lowered = sum(int(each[0]) for each in self.rank.gather_all(np.array([own])))
             if backward:
                 self._ask()
-        found, largest, _ = kernels.summary(self.distance[: len(self)], FAR)
-        every = self.rank.gather_all(np.array([found, largest]))
+        reach, largest, _ = kernels.summary(self.distance[: len(self)], FAR)
+        every = self.rank.gather_all(np.array([reach, largest]))
         return sum(int(each[0]) for each in every), max(int(each[1]) for each in every)
 
     def _told(self) -> int:
         """Lower distances to what others have found; how many."""
         halo, lowered = self.distance[len(self) :], 0
-        for rows, found in zip(self._wanted, self.rank.exchange([halo[part] for part in self._halo_of]), strict=True):
-            lower = found < self.distance[rows]
-            self.distance[rows[lower]] = found[lower]
+        for rows, distances in zip(
+            self._wanted, self.rank.exchange([halo[part] for part in self._halo_of]), strict=True
+        ):
+            lower = distances < self.distance[rows]
+            self.distance[rows[lower]] = distances[lower]
             lowered += int(np.count_nonzero(lower))
         return lowered
 
@@ -107,10 +109,10 @@ def ranked_eccentricity(
     graph: Graph, source: int, processes: int | str, spending: Spending, conventions: dict[str, Any]
 ) -> Interval:
     """The largest number of steps from a state to another one."""
-    found = ranked_distances(graph, source, processes)
+    search = ranked_distances(graph, source, processes)
     spending.searches += 1
-    is_whole = found.reached == graph.num_nodes
-    value = float(found.largest) if is_whole else math.inf
+    is_whole = search.reached == graph.num_nodes
+    value = float(search.largest) if is_whole else math.inf
     return Interval(
         value,
         value,

@@ -97,7 +97,7 @@ def last_gap(next_states, ends, start, order, layer_first, position, current, co
 
 @njit(cache=True, nogil=True)
 def search_in_step(
-    next_states, ends, order, layer_first, position, targets, layer, offset, away, home, best, scratch, seen, largest
+    next_states, ends, order, layer_first, position, targets, layer, offset, away, home, best, scratch, visits, largest
 ):
     """Searches backward from many targets at once, a bit each, that stand in the same layer at the same time.
 
@@ -106,13 +106,13 @@ def search_in_step(
     there is another way to target i, of home[v] + away[i] steps.
 
     order (N,): the nodes by layer, layer_first (P + 1,), position (N,): place of a node in its layer. Target i joins at
-    tick offset[i], ascending from 0; `layer` is that of the first. scratch (2, widest layer, words) uint64; seen
+    tick offset[i], ascending from 0; `layer` is that of the first. scratch (2, widest layer, words) uint64; visits
     (N, words) uint64, zero before: by place in `order`, the targets that a node reaches.
     Returns table entries read. largest[i], `best` before, becomes the largest over all nodes of the lesser of both
     ways to target i, where that is more.
     """
     num_actions = next_states.shape[1]
-    num_layers, words, num_targets = len(layer_first) - 1, seen.shape[1], len(targets)
+    num_layers, words, num_targets = len(layer_first) - 1, visits.shape[1], len(targets)
     farthest = np.int64(home.max())
     last = np.int64(0)
     for i in range(num_targets):
@@ -136,8 +136,8 @@ def search_in_step(
             joined += 1
         for p in range(width):
             for w in range(words):
-                new = coming[p, w] & ~seen[low + p, w]
-                seen[low + p, w] |= new
+                new = coming[p, w] & ~visits[low + p, w]
+                visits[low + p, w] |= new
                 if new and tick > best:
                     for i in range(64 * w, min(64 * w + 64, num_targets)):
                         if new >> np.uint64(i % 64) & np.uint64(1):
@@ -147,7 +147,7 @@ def search_in_step(
     unseen = np.zeros((farthest + 1, words), np.uint64)
     for place in range(len(order)):
         for w in range(words):
-            unseen[home[order[place]], w] |= ~seen[place, w]
+            unseen[home[order[place]], w] |= ~visits[place, w]
     for i in range(num_targets):
         steps = farthest
         while steps > 0 and not unseen[steps, i // 64] >> np.uint64(i % 64) & np.uint64(1):

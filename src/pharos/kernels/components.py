@@ -25,7 +25,7 @@ def number_components(transitions, live, component, path, waiting):
     branch = np.empty(num_states, np.int32)
     is_root = np.empty(num_states, np.bool_)  # whether a state of the path is the first one seen of its component
     component[:] = 0
-    seen, last = 1, num_states  # numbers of states on the way go up from 1, those of finished components down from S
+    number, last = 1, num_states  # numbers of states on the way go up from 1, those of finished components down from S
     tail = 0
     for start in range(num_states):
         depth = -1
@@ -34,8 +34,8 @@ def number_components(transitions, live, component, path, waiting):
             if component[following] == 0:
                 depth += 1
                 path[depth], action[depth], branch[depth], is_root[depth] = following, 0, 0, True
-                component[following] = seen
-                seen += 1
+                component[following] = number
+                number += 1
             s = np.int64(path[depth])
             following = s
             if live[s]:
@@ -56,11 +56,11 @@ def number_components(transitions, live, component, path, waiting):
             if following != s:
                 continue
             if is_root[depth]:
-                seen -= 1
+                number -= 1
                 while tail > 0 and component[waiting[tail - 1]] >= component[s]:
                     tail -= 1
                     component[waiting[tail]] = last
-                    seen -= 1
+                    number -= 1
                 component[s] = last
                 last -= 1
             else:

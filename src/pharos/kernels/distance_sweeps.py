@@ -59,11 +59,11 @@ def lower_forward(next_states, ends, start, distance, far, first, stop):
 @njit(cache=True, nogil=True)
 def summary(distance, far):
     """(Nodes found, largest distance among them, their sum)."""
-    found, largest, total = 0, 0, 0
+    reach, largest, total = 0, 0, 0
     for v in range(len(distance)):
         d = distance[v]
         if d < far:
-            found += 1
+            reach += 1
             total += d
             largest = max(largest, d)
-    return found, largest, total
+    return reach, largest, total

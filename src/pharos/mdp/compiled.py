@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from pharos.kernels import bellman, graph, occupancy
+from pharos.large_arrays import read_ahead
 from pharos.mdp.dynamics import BellmanEquation, Components, Dynamics, Order, Play
 from pharos.mdp.selection import Extreme, PolicyTable, Selection
-from pharos.state_space import read_ahead
 
 # States of a table in a file that are swept while the next ones are read.
 _RANGE = 1 << 22
@@ -85,7 +85,8 @@ class CompiledDynamics(Dynamics):
         order = np.empty(self.num_states, np.int64)
         components.component_order(self.for_kernels, live, number, first, is_cyclic, order)
         largest = int(np.diff(first).max(initial=0, where=is_cyclic))
-        return Components(order, *components.joined(first, is_cyclic, least), count, largest)
+        starts, has_cycle = components.joined(first, is_cyclic, least)
+        return Components(order, starts, has_cycle, count, largest)
 
     def sweep_once(self, equation: BellmanEquation, x: np.ndarray, order: Order) -> None:
         swept(self.for_sweeps, self.num_actions, equation, x, order.states)

@@ -89,13 +89,13 @@ class Components(NamedTuple):
         order: (S,) the states, component by component.
         starts: (G + 1,) where groups of neighbouring components begin in the order.
         has_cycle: (G,) whether a state of a group can be visited again.
-        count: how many components there are. largest: the states of the largest one that has a cycle.
+        total: how many components there are. largest: the states of the largest one that has a cycle.
     """
 
     order: np.ndarray
     starts: np.ndarray
     has_cycle: np.ndarray
-    count: int
+    total: int
     largest: int
 
 

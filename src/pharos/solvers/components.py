@@ -14,7 +14,7 @@ import math
 import numpy as np
 
 from pharos.mdp import BellmanEquation, PolicyTable, Selection, TabularMDP
-from pharos.state_space import available_memory
+from pharos.memory import available_memory
 
 # Sweeps before the attempt, and how many must be left: finding components takes as long as some tens of them.
 FIRST_ATTEMPT, LEFT = 32, 100
@@ -56,12 +56,14 @@ class ComponentSolver:
         An attempt may cost half of the sweeps that seem to be left; then each component that is left is swept once.
         """
         mdp, self._is_tried = self.mdp, True
-        found = mdp.dynamics.components(~np.asarray(mdp.terminal), LEAST if mdp.is_sticky else 1)
-        if found is None or found.largest > mdp.num_states // 2:
+        components = mdp.dynamics.components(~np.asarray(mdp.terminal), LEAST if mdp.is_sticky else 1)
+        if components is None or components.largest > mdp.num_states // 2:
             return False
         target = SHARE * tolerance * (1 - mdp.gamma)
         with np.errstate(over="ignore", invalid="ignore"):
-            mdp.dynamics.settle_components(self.equation, x, found, target, SETTLED, 0.5 * self._left * mdp.num_states)
+            mdp.dynamics.settle_components(
+                self.equation, x, components, target, SETTLED, 0.5 * self._left * mdp.num_states
+            )
         return True
 
     def _cost(self, sweeps: float, num_states: int) -> float:

@@ -79,14 +79,14 @@ def _checked_offset(path: Path, file: BinaryIO, shape: tuple[int, int]) -> int:
     """Where the values begin."""
     try:
         np.lib.format.read_magic(file)
-        found, is_fortran, dtype = np.lib.format.read_array_header_1_0(file)
+        file_shape, is_fortran, dtype = np.lib.format.read_array_header_1_0(file)
     except ValueError as error:
         raise FileFormatError(f"{path}: is no file of values; choose another name, or delete it") from error
     offset = file.tell()
     whole = offset + 8 * shape[0] * shape[1] == os.path.getsize(path)
-    if found != shape or dtype != np.dtype("<f8") or is_fortran or not whole:
+    if file_shape != shape or dtype != np.dtype("<f8") or is_fortran or not whole:
         raise FileFormatError(
-            f"{path}: holds {dtype} of shape {found}; expected float64 of shape {shape}, the values of this MDP: "
+            f"{path}: holds {dtype} of shape {file_shape}; expected float64 of shape {shape}, the values of this MDP: "
             "choose another name, or delete it"
         )
     return offset

@@ -64,8 +64,8 @@ class RankedBackup:
         backup.factor, backup.operations, backup.largest_reward = float(factor), int(operations), float(largest)
         halo = self.part.halo
         borders = np.searchsorted(halo, self.cuts)
-        asked = [halo[borders[q] : borders[q + 1]] - self.cuts[q] for q in range(rank.size)]
-        self._wanted = rank.exchange(asked)  # rows of this part that each rank has in its halo
+        rows = [halo[borders[q] : borders[q + 1]] - self.cuts[q] for q in range(rank.size)]
+        self._wanted = rank.exchange(rows)  # rows of this part that each rank has in its halo
         self.x = self.part.zeros()
 
     def sweep(self) -> float:

@@ -134,15 +134,15 @@ def solution_of(
     steps = None
     if horizon is None:
         x = None if values is None else kept_values(values, (mdp.num_states + 1, mdp.width))
-        found = fixed_point(mdp, select, tolerance, progress, x, usable_workers(threads))
-        following = found.x
+        result = fixed_point(mdp, select, tolerance, progress, x, usable_workers(threads))
+        following = result.x
     elif values is not None:
         raise ParameterError(f"values={str(values)!r}: a file keeps values without a horizon; found {horizon} steps")
     else:
-        found, following, steps = backward_induction(mdp, select, horizon, keep_all)
+        result, following, steps = backward_induction(mdp, select, horizon, keep_all)
     if steps is not None:
         steps = steps[:, :-1] if mdp.is_sticky else steps[:, :-1, 0]
-    return Solution(mdp, found.bound, found.sweeps, watch.seconds, horizon, select, found.x, following, steps)
+    return Solution(mdp, result.bound, result.sweeps, watch.seconds, horizon, select, result.x, following, steps)
 
 
 def check_tolerance(tolerance: float) -> None:

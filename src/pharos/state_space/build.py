@@ -12,10 +12,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pharos import memory as machine
 from pharos import paths, storage
 from pharos.environments import Environment, make
 from pharos.errors import ParameterError, StateSpaceMismatch
-from pharos.state_space import memory as machine
 from pharos.state_space.files import lock
 from pharos.state_space.manifest import ARRAYS, MANIFEST, PARTS, read_manifest
 from pharos.state_space.plan import Plan

@@ -19,9 +19,9 @@ import numpy as np
 from pharos.environments import Environment
 from pharos.errors import StateSpaceError
 from pharos.kernels import key_owner
+from pharos.large_arrays import huge_pages
 from pharos.ranks import Rank, loop
 from pharos.rules import rules_of
-from pharos.state_space.memory_map import huge_pages
 from pharos.state_space.plan import Plan
 from pharos.state_space.table import Block, MemoryTable
 

@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 
+from pharos import memory as machine
 from pharos.environments import Environment
 from pharos.errors import StateSpaceTooLarge
 from pharos.rules import rules_of
-from pharos.state_space import memory as machine
 from pharos.state_space.journal import Journal, Position
 from pharos.state_space.outcome_journal import OutcomeJournal
 from pharos.state_space.plan import Plan

@@ -57,11 +57,11 @@ class Pairs:
         from scipy.special import ndtr
 
         variance = noise[self.first] + noise[self.second]
-        known = np.isfinite(variance)
-        if not known.any():
+        is_known = np.isfinite(variance)
+        if not is_known.any():
             return np.nan
-        difference = np.abs(y[self.first] - y[self.second])[known]
-        deviation = np.sqrt(np.maximum(variance[known], 1e-300))
+        difference = np.abs(y[self.first] - y[self.second])[is_known]
+        deviation = np.sqrt(np.maximum(variance[is_known], 1e-300))
         return float(ndtr(difference / deviation).mean())
 
     def interval(self, x: np.ndarray, classes: np.ndarray, counts: np.ndarray) -> tuple[float, float]:

@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
+from pharos import memory as machine
 from pharos import paths
 from pharos.errors import DiskFull
-from pharos.state_space import memory as machine
 
 # Bytes that are always taken from memory; beyond them, the share of what is free that one array may take.
 SMALL, SHARE = 1 << 26, 4
