@@ -124,19 +124,34 @@ def joined(first, is_cyclic, least):
 
 @njit(cache=True, nogil=True)
 def settle(
-    transitions, table, palette, gamma, uniform, choice, v, actions, order, starts, has_cycle, target, settled, most
+    transitions,
+    table,
+    palette,
+    gamma,
+    uniform,
+    choice,
+    v,
+    actions,
+    order,
+    starts,
+    has_cycle,
+    target,
+    settled,
+    most,
+    before,
 ):
     """Sweep group by group, from the last to the first, each until it changes by at most `target`, or by its rounding.
 
     starts, has_cycle: as `joined` makes them; settled: a change that is no more than rounding, relative to the values.
-    most: backups, after which each group that is left is swept once. See kernels/bellman.py for the rest.
+    most: backups, after which each group that is left is swept once. before: the largest absolute value so
+    far. See kernels/bellman.py for the rest.
     """
     for group in range(len(has_cycle) - 1, -1, -1):
-        change, largest = np.inf, 0.0
+        change, largest = np.inf, before
         while change > max(target, settled * largest):
             start, stop = starts[group], starts[group + 1]
             change = optimal_sweep(transitions, table, palette, gamma, uniform, choice, v, actions, order, start, stop)
-            largest += change  # at least as large as the values, but for what they were before
+            largest += change  # at least as large as the values
             most -= stop - start
             if most < 0 or not has_cycle[group]:
                 break

@@ -56,18 +56,18 @@ class CompiledDynamics(Dynamics):
     def settle_components(
         self, equation: BellmanEquation, x: np.ndarray, parts: Components, target: float, settled: float, most: float
     ) -> None:
-        choice = _choice(equation.select)
+        choice, before = _choice(equation.select), float(max(x.max(), -x.min()))
         if choice is not None and not equation.chance.is_sticky:
             from pharos.kernels import components
 
             tables = (self.for_sweeps, equation.rewards.table, equation.rewards.palette, equation.gamma)
             actions, chance = bellman.actions_of(self.num_actions), equation.chance.uniform
             groups = (parts.order, parts.starts, parts.has_cycle)
-            components.settle(*tables, chance, choice, x[:, 0], actions, *groups, target, settled, most)
+            components.settle(*tables, chance, choice, x[:, 0], actions, *groups, target, settled, most, before)
             return
         for group in range(len(parts.has_cycle) - 1, -1, -1):
             start, stop = int(parts.starts[group]), int(parts.starts[group + 1])
-            change, largest = math.inf, 0.0
+            change, largest = math.inf, before
             while change > max(target, settled * largest):
                 change = swept(self.for_sweeps, self.num_actions, equation, x, parts.order, part=(start, stop))
                 largest += change

@@ -22,6 +22,8 @@ FIRST_ATTEMPT, LEFT = 32, 100
 WORTH = 5e8
 # Operations that calling a sweep costs; states under sticky actions that are swept in one call, at least.
 CALL, LEAST = 5000, 512
+# Sweeps over all states that an attempt may cost, at most: near gamma = 1 those that are left are without number.
+MOST = 4096
 # Bytes of a state that an attempt takes, at most.
 BYTES = 48
 # The share of the change that the tolerance allows which a component may have left, and the relative change by a sweep
@@ -53,7 +55,8 @@ class ComponentSolver:
     def improve(self, x: np.ndarray, tolerance: float) -> bool:
         """Settle the components of x (S + 1, W) one after another; whether that was tried.
 
-        An attempt may cost half of the sweeps that seem to be left; then each component that is left is swept once.
+        An attempt may cost half of the sweeps that seem to be left, and `MOST`; then each component that is left is
+        swept once.
         """
         mdp, self._is_tried = self.mdp, True
         components = mdp.dynamics.components(~np.asarray(mdp.terminal), LEAST if mdp.is_sticky else 1)
@@ -61,9 +64,8 @@ class ComponentSolver:
             return False
         target = SHARE * tolerance * (1 - mdp.gamma)
         with np.errstate(over="ignore", invalid="ignore"):
-            mdp.dynamics.settle_components(
-                self.equation, x, components, target, SETTLED, 0.5 * self._left * mdp.num_states
-            )
+            most = min(0.5 * self._left, MOST) * mdp.num_states
+            mdp.dynamics.settle_components(self.equation, x, components, target, SETTLED, most)
         return True
 
     def _cost(self, sweeps: float, num_states: int) -> float:
