@@ -53,7 +53,7 @@ IDS = [(STICKY, "16c6e3a1ce9b5baf"), (GRID, "62d6ef94bab09fc7"), (DEEP, "1a6fa55
 PRESETS = {
     "quick": ("f61401af6050c7c5", "108e7e8c2348f12e", "7816e81b463bd2d3c9702dae1f64e789f66d5a7ce44cf43dbdfdee20456940b3"),  # noqa: E501
     "small": ("c40d4509c7f775c3", "79bd57c5fcfb019b", "15693fe60ba09179d4a40544027a6fd35dc6d19189a46f75539ba98216fe15c1"),  # noqa: E501
-    "paper": ("c40d4509c7f775c3", "4c62fffca280b32d", "a2866aa2c66a4724b6fe79a7500acf80e44e52cce7f5cc61e0dbbd127d140a54"),  # noqa: E501
+    "paper": ("c40d4509c7f775c3", "4c62fffca280b32d", "403d34b1d5fcc767ed8a133d8d9867d42bd2ab64788bcf79e55e45ec66847e83"),  # noqa: E501
 }  # fmt: skip
 
 

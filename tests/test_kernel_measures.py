@@ -438,7 +438,7 @@ def test_a_kernel_that_does_not_fit_is_told_before_anything_is_learnt(grid, monk
 
     monkeypatch.setattr("pharos.hardness.mean_field.Learner.curve", learnt)
     seen = representation(grid, "vector", "mlp16", landmarks=0)
-    monkeypatch.setattr("pharos.state_space.available_memory", lambda: 800)
+    monkeypatch.setattr("pharos.memory.available_memory", lambda: 800)
     with pytest.raises(ParameterError, match=r"10 states fit into memory.*landmarks"):
         kernel_regret(grid.mdp(), seen)
 
