@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from naive_hardness import distances
-from pharos import TabularMDP, hardness
+from pharos import TabularMDP, hardness, large_arrays
 from pharos.hardness import lean_sweep
 from pharos.hardness.transition_graph import Graph
 from test_diameter import deterministic_mdps
@@ -17,7 +17,6 @@ pytestmark = pytest.mark.long
 @pytest.fixture
 def no_memory(monkeypatch):
     monkeypatch.setattr(lean_sweep, "available_memory", lambda: 0)
-    monkeypatch.setattr(lean_sweep, "_RANGE", 5)
 
 
 @settings(max_examples=150, deadline=None)
@@ -26,7 +25,6 @@ def test_the_diameter_is_the_largest_distance_between_any_two_states(mdp, restar
     d = distances(mdp, restart=restart)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(lean_sweep, "available_memory", lambda: 0)
-        patch.setattr(lean_sweep, "_RANGE", 5)
         found = hardness.diameter(mdp, restart=restart)
         eccentricity = hardness.start_eccentricity(mdp, restart=restart)
     assert "sweeps over the table" in found.method
@@ -37,25 +35,28 @@ def test_the_diameter_is_the_largest_distance_between_any_two_states(mdp, restar
 
 
 @settings(max_examples=100, deadline=None)
-@given(deterministic_mdps(), st.booleans(), st.sampled_from([np.int16, np.int32]))
-def test_sweeps_give_the_distances_of_searches(mdp, restart, dtype):
+@given(deterministic_mdps(), st.booleans(), st.sampled_from([np.int16, np.int32]), st.booleans())
+def test_sweeps_give_the_distances_of_searches(mdp, restart, dtype, is_mapped):
     plain = Graph.of(mdp, restart)
     graph = lean_sweep.LeanGraph(plain, dtype)
+    if is_mapped:
+        graph.next_states = graph.next_states.view(np.memmap)
     d = distances(mdp, restart=restart)
     expected = np.where(np.isinf(d), graph.far, d).astype(dtype)
     found = np.empty(graph.num_nodes, dtype)
-    for node in range(graph.num_nodes):
-        forward = graph.search_forward(node, found)
-        assert (found == expected[node]).all()
-        inside = d[node][np.isfinite(d[node])]
-        assert forward == (len(inside), inside.max(), inside.sum())
-        graph.search_backward(node, found)
-        assert (found == expected[:, node]).all()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(large_arrays, "RANGE", 5)
+        for node in range(graph.num_nodes):
+            forward = graph.search_forward(node, found)
+            assert (found == expected[node]).all()
+            inside = d[node][np.isfinite(d[node])]
+            assert forward == (len(inside), inside.max(), inside.sum())
+            graph.search_backward(node, found)
+            assert (found == expected[:, node]).all()
 
 
 @pytest.mark.parametrize("size", (32_766, 32_767, 32_768, 40_000))
 def test_distances_that_two_bytes_cannot_hold_take_four(size, no_memory, monkeypatch):
-    monkeypatch.setattr(lean_sweep, "_RANGE", 1 << 22)
     state = np.arange(size)
     table = np.stack([(state + 1) % size, np.zeros_like(state)], axis=1)  # one step on, or back to the start
     mdp = TabularMDP.from_arrays(table, np.zeros(table.shape))

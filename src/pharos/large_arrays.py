@@ -9,6 +9,7 @@ import mmap
 import os
 import sys
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,8 @@ from pharos.errors import DiskFull
 # Bytes that are always taken from memory; beyond them, the share of what is free that one array may take.
 SMALL, SHARE = 1 << 26, 4
 _BLOCK = 1 << 24
+# Rows of a mapped array that are swept while the next ones are read.
+RANGE = 1 << 22
 
 
 def reserved_states(num_words: int) -> np.ndarray:
@@ -92,11 +95,23 @@ def mapped_file(folder: Path, size: int) -> mmap.mmap:
         return mmap.mmap(file.fileno(), size)
 
 
-def read_ahead(array: np.memmap, start: int, stop: int) -> None:
-    """Ask the system for rows of a mapped array, which will be read soon; it does so while this process works.
+def ranges_from_the_end(rows: Any, low: int, high: int) -> Iterator[tuple[int, int]]:
+    """Ranges [start, stop) that make up [low, high), the last one first: how rows are swept from the last to the first.
 
-    It finds out by itself what is read from the first byte to the last, but not what is read the other way round.
+    Rows in memory are one range. Of a mapped array, `RANGE` rows are swept while the system reads those before them: it
+    finds out by itself what is read from the first byte to the last, but not what is read the other way round.
     """
+    if not isinstance(rows, np.memmap):
+        yield low, high
+        return
+    for stop in range(high, low, -RANGE):
+        start = max(stop - RANGE, low)
+        _read_ahead(rows, max(start - RANGE, low), start)
+        yield start, stop
+
+
+def _read_ahead(array: np.memmap, start: int, stop: int) -> None:
+    """Ask the system for rows of a mapped array, which will be read soon; it does so while this process works."""
     mapping = getattr(array, "_mmap", None)
     if start < stop and isinstance(mapping, mmap.mmap) and hasattr(mmap, "MADV_WILLNEED"):
         row = array.strides[0]

@@ -5,22 +5,21 @@ The algorithm is that of sum_sweep.py, without what needs room for more. Distanc
 that memory has no room for are mapped files.
 """
 
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Callable
+from typing import Any, TypeVar
 
 import numpy as np
 
-from pharos.hardness.interval import Interval, Spending
+from pharos.hardness.interval import Interval, Spending, interval_of_search
 from pharos.hardness.sum_sweep import SumSweep
 from pharos.hardness.transition_graph import Graph
 from pharos.kernels import distance_sweeps
-from pharos.large_arrays import large_zeros, read_ahead
+from pharos.large_arrays import large_zeros, ranges_from_the_end
 from pharos.memory import available_memory
 
 # Untyped, as starred arguments of compiled functions are not checked.
 kernels: Any = distance_sweeps
-# Rows that are swept while the next ones are read.
-_RANGE = 1 << 22
+Result = TypeVar("Result")
 
 
 def needs_more_than_memory(graph: Graph) -> bool:
@@ -33,30 +32,25 @@ def needs_more_than_memory(graph: Graph) -> bool:
 
 def lean_diameter(graph: Graph, spending: Spending, conventions: dict[str, Any]) -> Interval:
     """The diameter, or the interval proven within the budget."""
-    try:
-        return LeanSweep(LeanGraph(graph, np.int16), spending, conventions).interval()
-    except OverflowError:
-        return LeanSweep(LeanGraph(graph, np.int32), spending, conventions).interval()
+    return _in_two_bytes_or_four(lambda dtype: LeanSweep(LeanGraph(graph, dtype), spending, conventions).interval())
 
 
 def lean_eccentricity(graph: Graph, source: int, spending: Spending, conventions: dict[str, Any]) -> Interval:
     """The largest number of steps from a state to another one."""
-    try:
-        reach, largest, _ = LeanGraph(graph, np.int16).search_forward(source, large_zeros((graph.num_nodes,), np.int16))
-    except OverflowError:
-        reach, largest, _ = LeanGraph(graph, np.int32).search_forward(source, large_zeros((graph.num_nodes,), np.int32))
-    spending.searches += 1
-    value = float(largest) if reach == graph.num_nodes else np.inf
-    return Interval(
-        value,
-        value,
-        True,
-        finite_part=value if reach == graph.num_nodes else 0.0,
-        searches=1,
-        method="a breadth-first search, by sweeps over the table",
-        conventions=conventions,
-        seconds=spending.seconds,
+    reach, largest, _ = _in_two_bytes_or_four(
+        lambda dtype: LeanGraph(graph, dtype).search_forward(source, large_zeros((graph.num_nodes,), dtype))
     )
+    spending.searches += 1
+    method = "a breadth-first search, by sweeps over the table"
+    return interval_of_search(largest, reach == graph.num_nodes, method, spending, conventions)
+
+
+def _in_two_bytes_or_four(result: Callable[[Any], Result]) -> Result:
+    """result(dtype) with distances of two bytes; of four where one does not fit into two."""
+    try:
+        return result(np.int16)
+    except OverflowError:
+        return result(np.int32)
 
 
 class LeanGraph:
@@ -73,23 +67,23 @@ class LeanGraph:
         self.dtype, self.far = dtype, int(np.iinfo(dtype).max)
 
     def search_forward(self, source: int, distance: np.ndarray) -> tuple[int, int, int]:
-        """distance[v] = d(source, v), `far` where there is no way; (nodes reach, largest distance, sum of distances).
+        """distance[v] = d(source, v), `far` where there is no way; (nodes found, largest distance, sum of distances).
 
         OverflowError where a distance does not fit.
         """
         return self._swept(kernels.lower_forward, source, distance, False)
 
     def search_backward(self, source: int, distance: np.ndarray) -> tuple[int, int, int]:
-        """distance[v] = d(v, source); as above."""
+        """distance[v] = d(v, source); returns and raises as `search_forward`."""
         return self._swept(kernels.lower_backward, source, distance, True)
 
     def _swept(self, kernel: Any, source: int, distance: np.ndarray, backward: bool) -> tuple[int, int, int]:
         distance[:] = self.far
         distance[source] = 0
-        lowered = 1
+        size, lowered = len(self.next_states), 1
         while lowered:
             lowered = self._through_end(distance, backward)
-            for first, stop in self._ranges(backward):
+            for first, stop in ranges_from_the_end(self.next_states, 0, size) if backward else [(0, size)]:
                 count = int(kernel(self.next_states, self.ends, self.start, distance, self.far, first, stop))
                 if count < 0:
                     raise OverflowError
@@ -106,14 +100,6 @@ class LeanGraph:
             distance[there] = distance[here] + 1
             return 1
         return 0
-
-    def _ranges(self, backward: bool) -> Iterator[tuple[int, int]]:
-        size = len(self.next_states)
-        starts = range(0, size, _RANGE)
-        for first in reversed(starts) if backward else starts:
-            if backward and isinstance(self.next_states, np.memmap):
-                read_ahead(self.next_states, max(first - _RANGE, 0), first)
-            yield first, min(first + _RANGE, size)
 
 
 class LeanSweep(SumSweep):

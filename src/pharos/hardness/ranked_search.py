@@ -5,12 +5,11 @@ until nothing is. Forward, a rank lowers the bounds of its halo, nodes of other 
 backward, it asks the owners for them. Distances are whole numbers, so they are the same whatever the number of ranks.
 """
 
-import math
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from pharos.hardness.interval import Interval, Spending
+from pharos.hardness.interval import Interval, Spending, interval_of_search
 from pharos.hardness.transition_graph import Graph
 from pharos.kernels import distance_sweeps
 from pharos.mdp import split
@@ -111,18 +110,8 @@ def ranked_eccentricity(
     """The largest number of steps from a state to another one."""
     search = ranked_distances(graph, source, processes)
     spending.searches += 1
-    is_whole = search.reached == graph.num_nodes
-    value = float(search.largest) if is_whole else math.inf
-    return Interval(
-        value,
-        value,
-        True,
-        finite_part=value if is_whole else 0.0,
-        searches=1,
-        method="a breadth-first search by several processes",
-        conventions=conventions,
-        seconds=spending.seconds,
-    )
+    is_whole, method = search.reached == graph.num_nodes, "a breadth-first search by several processes"
+    return interval_of_search(search.largest, is_whole, method, spending, conventions)
 
 
 def _edges(graph: Graph, start: int, stop: int) -> np.ndarray:

@@ -2,19 +2,16 @@
 
 import math
 from abc import abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
 
 from pharos.kernels import bellman, graph, occupancy
-from pharos.large_arrays import read_ahead
+from pharos.large_arrays import ranges_from_the_end
 from pharos.mdp.dynamics import BellmanEquation, Components, Dynamics, Order, Play
 from pharos.mdp.selection import Extreme, PolicyTable, Selection
-
-# States of a table in a file that are swept while the next ones are read.
-_RANGE = 1 << 22
 
 
 class CompiledDynamics(Dynamics):
@@ -153,7 +150,7 @@ def swept(
 
     def change_of(low: int, high: int) -> float:
         change = 0.0
-        for start, stop in _ranges(transitions, low, high):
+        for start, stop in ranges_from_the_end(transitions, low, high):
             largest = bellman.optimal_sweep(*tables, chance.uniform, choice, v, actions, order, start, stop)
             change = float(np.maximum(change, largest))
         return change
@@ -165,17 +162,6 @@ def swept(
         return change_of(*cuts)
     with ThreadPoolExecutor(threads) as pool:
         return float(np.max([*pool.map(change_of, cuts[:-1], cuts[1:])]))
-
-
-def _ranges(transitions: Any, low: int, high: int) -> Iterator[tuple[int, int]]:
-    """Ranges of places [low, high), the last one first; the next one is asked for where it is read from a file."""
-    if not isinstance(transitions, np.memmap):
-        yield low, high
-        return
-    for stop in range(high, low, -_RANGE):
-        start = max(stop - _RANGE, low)
-        read_ahead(transitions, max(start - _RANGE, low), start)
-        yield start, stop
 
 
 def _choice(select: Selection) -> "float | np.ndarray | None":
