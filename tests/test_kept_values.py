@@ -1,6 +1,7 @@
 """Values in files: the same as in memory, to the last bit, with bounds that hold from whatever a file holds."""
 
 import importlib
+import io
 import multiprocessing
 import os
 import signal
@@ -41,6 +42,27 @@ def test_large_zeros_are_a_file_without_a_name_where_memory_has_no_room(tmp_path
     assert array.shape == (3, 5) and not array.any() and not array.flags.owndata
     array[:] = np.arange(15).reshape(3, 5)
     assert array.sum() == 105 and list((tmp_path / "cache").iterdir()) == []
+
+
+class RecordingFile(io.BytesIO):
+    """A file in memory that keeps the sizes of what is written."""
+
+    def __init__(self):
+        super().__init__()
+        self.sizes = []
+
+    def write(self, data):
+        self.sizes.append(len(data))
+        return super().write(data)
+
+
+def test_zeros_are_written_in_blocks_where_the_system_cannot_take_their_room(monkeypatch):
+    monkeypatch.delattr(os, "posix_fallocate", raising=False)
+    monkeypatch.setattr(memory_map, "_BLOCK", 64)
+    file = RecordingFile()
+    file.write(b"header")
+    memory_map.append_zeros(file, 150)
+    assert file.getvalue() == b"header" + bytes(150) and file.sizes == [6, 64, 64, 22]
 
 
 def test_values_in_files_are_those_in_memory_to_the_last_bit(tmp_path, monkeypatch):

@@ -11,7 +11,7 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -83,16 +83,22 @@ def large_zeros(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
 
 def mapped_file(folder: Path, size: int) -> mmap.mmap:
     """A file of zeros without a name, its room on the disk taken: a mapped file that finds the disk full when it is
-    written kills the process. OSError where it cannot be.
+    written kills the process. OSError where that room is missing.
     """
     with tempfile.TemporaryFile(dir=folder) as file:
-        if hasattr(os, "posix_fallocate"):
-            os.posix_fallocate(file.fileno(), 0, size)
-        else:
-            for start in range(0, size, _BLOCK):
-                file.write(bytes(min(_BLOCK, size - start)))
-            file.flush()
+        append_zeros(file, size)
         return mmap.mmap(file.fileno(), size)
+
+
+def append_zeros(file: BinaryIO, size: int) -> None:
+    """Append so many zero bytes to what was written, their room on the disk taken. OSError where it cannot be."""
+    file.flush()
+    if hasattr(os, "posix_fallocate"):
+        os.posix_fallocate(file.fileno(), file.tell(), size)
+    else:
+        for start in range(0, size, _BLOCK):
+            file.write(bytes(min(_BLOCK, size - start)))
+        file.flush()
 
 
 def ranges_from_the_end(rows: Any, low: int, high: int) -> Iterator[tuple[int, int]]:

@@ -14,12 +14,14 @@ import numpy as np
 
 from pharos import storage
 from pharos.errors import FileFormatError, FolderLocked, ParameterError
+from pharos.large_arrays import append_zeros
 
 try:
     import fcntl
 except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
+# Rows that are read in one go.
 _BLOCK = 1 << 22
 
 
@@ -56,14 +58,7 @@ def _make(path: Path, shape: tuple[int, int]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with storage.replacing(path, durable=False) as file:
         np.lib.format.write_array_header_1_0(file, {"descr": "<f8", "fortran_order": False, "shape": shape})
-        start, size = file.tell(), 8 * shape[0] * shape[1]
-        file.flush()
-        if hasattr(os, "posix_fallocate"):
-            os.posix_fallocate(file.fileno(), start, size)
-        else:
-            for _ in range(0, size, _BLOCK):
-                file.write(bytes(min(_BLOCK, size)))
-            file.truncate(start + size)
+        append_zeros(file, 8 * shape[0] * shape[1])
 
 
 def _lock(path: Path, file: BinaryIO) -> None:
