@@ -89,6 +89,10 @@ class Backup:
         """A bound on the rounding error of one backup of entries up to `largest`: half a unit for each operation."""
         return self.operations * (_UNIT * (self.largest_reward + largest) + 2.0**-1074)
 
+    def bound(self, change: float, rounding: float) -> float:
+        """The largest error of values that a sweep has changed by at most `change`: (rho d + e) / (1 - rho)."""
+        return (self.factor * change + rounding) / (1 - self.factor) * MARGIN
+
 
 def fixed_point(
     mdp: TabularMDP,
@@ -112,9 +116,7 @@ def fixed_point(
     if mdp.gamma == 1.0 or mdp.age is not None:
         return _in_one_pass(backup, tolerance, progress, x)
     rho = backup.factor
-    least = backup.rounding(0.0) / (1 - rho) if rho < 1 else math.inf
-    if not least <= tolerance:
-        raise imprecise(mdp, least, tolerance)
+    check_tolerance(mdp, backup, tolerance)
     x, sweeps = backup.zeros() if x is None else x, 0
     components, better, least, since = ComponentSolver(mdp, select), PolicyIteration(mdp, select), math.inf, 0
     largest = largest_of(x)
@@ -125,7 +127,7 @@ def fixed_point(
         if better.is_exact or not rho * change > max(backup.rounding(largest + change), tolerance * (1 - rho)):
             largest = largest_of(x)
         rounding = backup.rounding(largest + change)
-        bound = (rho * change + rounding) / (1 - rho) * MARGIN
+        bound = backup.bound(change, rounding)
         if progress is not None:
             progress(sweeps, bound)
         if bound <= tolerance:
@@ -161,12 +163,7 @@ def backward_induction(
         largest = largest_of(x)
         if steps is not None:
             steps[t + 1] = x
-    bound *= MARGIN
-    if not math.isfinite(bound + largest):
-        raise PrecisionError(
-            f"{mdp}: the values of {horizon} steps pass 1.8e308, the largest 64-bit float; use smaller rewards"
-        )
-    return FixedPoint(x, bound, horizon), before, steps
+    return FixedPoint(x, bound_of_steps(mdp, horizon, bound, largest), horizon), before, steps
 
 
 def chain_bound(mdp: TabularMDP, select: Selection, x: np.ndarray, successor: np.ndarray, reward: np.ndarray) -> float:
@@ -221,6 +218,29 @@ def _in_one_pass(
     if not bound <= tolerance:
         raise imprecise(mdp, bound, tolerance)
     return FixedPoint(x, bound, 1)
+
+
+def bound_of_steps(mdp: TabularMDP, horizon: int, bound: float, largest: float) -> float:
+    """The error bound of the values of a horizon, with what rounding adds to it.
+
+    Args:
+        bound: that was added up, step by step. largest: of the values.
+
+    Raises:
+        PrecisionError: values are too large for 64-bit floats.
+    """
+    if not math.isfinite(bound * MARGIN + largest):
+        raise PrecisionError(
+            f"{mdp}: the values of {horizon} steps pass 1.8e308, the largest 64-bit float; use smaller rewards"
+        )
+    return bound * MARGIN
+
+
+def check_tolerance(mdp: TabularMDP, backup: Backup, tolerance: float) -> None:
+    """Raise PrecisionError where rounding errors alone are beyond the tolerance."""
+    least = backup.rounding(0.0) / (1 - backup.factor) if backup.factor < 1 else math.inf
+    if not least <= tolerance:
+        raise imprecise(mdp, least, tolerance)
 
 
 def imprecise(mdp: TabularMDP, bound: float, tolerance: float) -> PrecisionError:

@@ -17,11 +17,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from pharos.errors import ParameterError, PrecisionError
+from pharos.errors import ParameterError
 from pharos.mdp import Part, Selection, TabularMDP
 from pharos.ranks import Rank
 from pharos.solvers.checkpoint import Checkpoint
-from pharos.solvers.fixed_point import MARGIN, SETTLING, Backup, imprecise, largest_of
+from pharos.solvers.fixed_point import SETTLING, Backup, bound_of_steps, check_tolerance, imprecise, largest_of
 from pharos.workers import usable_workers
 
 _ROWS = 1 << 20  # of values that a rank sends to the first in one exchange
@@ -162,9 +162,7 @@ def ranked_fixed_point(
             f"{mdp}: gamma is 1 and there is no horizon, which several processes cannot solve; "
             "expected processes=1, a horizon, or gamma < 1"
         )
-    least = backup.backup.rounding(0.0) / (1 - rho) if rho < 1 else math.inf
-    if not least <= tolerance:
-        raise imprecise(mdp, least, tolerance)
+    check_tolerance(mdp, backup.backup, tolerance)
     sweeps = checkpoint.start(backup)
     patience = SETTLING + math.ceil(math.log(0.5) / math.log(rho)) if rho > 0 else SETTLING
     least, since = math.inf, sweeps
@@ -174,7 +172,7 @@ def ranked_fixed_point(
         numbers = backup.share(change, largest_of(backup.x[: len(backup.part)]), checkpoint.is_due(backup))
         change, largest, is_due = map(float, numbers.max(axis=0))
         rounding = backup.backup.rounding(largest + change)
-        bound = (rho * change + rounding) / (1 - rho) * MARGIN
+        bound = backup.backup.bound(change, rounding)
         if progress is not None and backup.rank.rank == 0:
             progress(sweeps, bound)
         if bound <= tolerance:
@@ -208,9 +206,4 @@ def ranked_induction(
             progress(step, bound)
         if is_due:
             checkpoint.keep(backup, step, (bound, largest))
-    bound *= MARGIN
-    if not math.isfinite(bound + largest):
-        raise PrecisionError(
-            f"{backup.mdp}: the values of {horizon} steps pass 1.8e308, the largest 64-bit float; use smaller rewards"
-        )
-    return bound, before
+    return bound_of_steps(backup.mdp, horizon, bound, largest), before
