@@ -15,20 +15,20 @@ import numpy as np
 
 from pharos.mdp import BellmanEquation, PolicyTable, Selection, TabularMDP
 from pharos.memory import available_memory
+from pharos.solvers.sweeps_left import SETTLED, operations, shrinking, sweeps_left
 
 # Sweeps before the attempt, and how many must be left: finding components takes as long as some tens of them.
 FIRST_ATTEMPT, LEFT = 32, 100
 # Operations that must be left: fewer take less time than compiling.
 WORTH = 5e8
-# Operations that calling a sweep costs; states under sticky actions that are swept in one call, at least.
-CALL, LEAST = 5000, 512
+# States under sticky actions that are swept in one call, at least.
+LEAST = 512
 # Sweeps over all states that an attempt may cost, at most: near gamma = 1 those that are left are without number.
 MOST = 4096
 # Bytes of a state that an attempt takes, at most.
 BYTES = 48
-# The share of the change that the tolerance allows which a component may have left, and the relative change by a sweep
-# that is no more than rounding.
-SHARE, SETTLED = 0.25, 2.0**-47
+# The share of the change that the tolerance allows which a component may have left.
+SHARE = 0.25
 
 
 class ComponentSolver:
@@ -41,16 +41,15 @@ class ComponentSolver:
         self._is_tried = False
 
     def is_worth_it(self, sweeps: int, change: float, tolerance: float) -> bool:
-        """Whether the sweeps that are left, as the last half of them tells, cost more than an attempt."""
+        """Whether the sweeps that are left cost more than an attempt."""
         if self._is_tried or sweeps & (sweeps - 1) or not 0 < change < math.inf:
             return False
         before, self._change = self._change, change
-        mdp, gamma = self.mdp, self.mdp.gamma
+        gamma = self.mdp.gamma
         if sweeps < FIRST_ATTEMPT or gamma == 0.0 or not self._is_known:
             return False
-        rate = min(gamma, max(change / before, 1e-300) ** (2 / sweeps))
-        self._left = math.log(max(change / (tolerance * (1 - gamma)), 1.0)) / -math.log(rate)
-        return self._left > LEFT and self._cost(self._left, mdp.num_states) > WORTH and self._fits
+        self._left = sweeps_left(change, shrinking(change, before, sweeps, gamma), tolerance, gamma)
+        return self._left > LEFT and operations(self.mdp, self._left) > WORTH and self._fits
 
     def improve(self, x: np.ndarray, tolerance: float) -> bool:
         """Settle the components of x (S + 1, W) one after another; whether that was tried.
@@ -67,10 +66,6 @@ class ComponentSolver:
             most = min(0.5 * self._left, MOST) * mdp.num_states
             mdp.dynamics.settle_components(self.equation, x, components, target, SETTLED, most)
         return True
-
-    def _cost(self, sweeps: float, num_states: int) -> float:
-        """Operations of some sweeps over as many states."""
-        return sweeps * (CALL + 4.0 * num_states * self.mdp.width * self.mdp.num_actions)
 
     @property
     def _is_known(self) -> bool:

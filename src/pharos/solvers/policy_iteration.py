@@ -16,6 +16,7 @@ from pharos.kernels import bellman, krylov
 from pharos.mdp import BellmanEquation, PolicyTable, Rewards, Selection, TabularMDP
 from pharos.memory import available_memory
 from pharos.solvers.linear_systems import bicgstab, solution_of_system
+from pharos.solvers.sweeps_left import SETTLED, operations, shrinking, sweeps_left
 
 # Sweeps before the first attempt, and before that of the inexact way, which gains less: most games are solved by then.
 # Later attempts come after twice as many sweeps each, four times where they failed.
@@ -25,16 +26,15 @@ FIRST_ATTEMPT, FIRST_INEXACT = 64, 256
 MOST_ENTRIES, DIRECTLY = 2_000_000, 3000
 # States whose greedy actions are worked out in one go.
 BLOCK = 1 << 16
-# Improvements of one attempt, and the relative change by a sweep that is no more than rounding.
-MOST_IMPROVEMENTS, SETTLED = 60, 2.0**-47
+# Improvements of one attempt.
+MOST_IMPROVEMENTS = 60
 # Inexact: improvements of one attempt, sweeps after each, by how much each shrinks the residual of its policy, and in
 # how many steps at most.
 MOST_INEXACT, SWEEPS_AFTER, FORCING, STEPS = 500, 20, 0.1, 100
 # Bytes of a node that an attempt takes, at most, and bytes that there always are.
 BYTES, SMALL = 80, 1 << 28
-# Operations that calling a sweep costs, however few states there are; and those of policy iteration by sparse systems,
-# for each node.
-CALL, SPARSE = 5000, 50_000.0
+# Operations of policy iteration by sparse systems, for each node.
+SPARSE = 50_000.0
 
 
 class PolicyIteration:
@@ -51,10 +51,7 @@ class PolicyIteration:
         self._left = 0.0
 
     def is_worth_it(self, sweeps: int, change: float, tolerance: float) -> bool:
-        """Whether the sweeps that are left cost more than an attempt.
-
-        How many are left, the last half of the sweeps tells: changes often shrink by much more than gamma in each.
-        """
+        """Whether the sweeps that are left cost more than an attempt."""
         if sweeps & (sweeps - 1) or self.mdp.gamma == 0.0 or not self._fits:
             return False
         change = max(change, 1e-300)
@@ -62,10 +59,9 @@ class PolicyIteration:
         if sweeps < self._next:
             return False
         gamma = self.mdp.gamma
-        self._rate = min(gamma, max(change / before, 1e-300) ** (2 / sweeps))
-        left = math.log(max(change / (tolerance * (1 - gamma)), 1.0)) / -math.log(self._rate)
-        self._left = left
-        of_sweeps = left * (CALL + 4.0 * self.nodes * self.mdp.num_actions)
+        self._rate = shrinking(change, before, sweeps, gamma)
+        self._left = left = sweeps_left(change, self._rate, tolerance, gamma)
+        of_sweeps = operations(self.mdp, left)
         if self.is_chain:
             return of_sweeps > 1000.0 * self.nodes and not self.is_exact
         if self.is_direct:
