@@ -16,9 +16,8 @@ from pharos.kernels.outcomes import expectation, expectation_of_pair, fetch_valu
 from pharos.kernels.paths import state_at
 
 UNROLLED = 128  # actions
-AHEAD = (
-    32  # states between the one whose values are fetched and the one that is backed up: memory has that long to answer
-)
+# States between the one whose values are fetched and the one that is backed up: memory has that long to answer.
+AHEAD = 32
 
 
 def actions_of(num_actions: int) -> "tuple[int, ...] | np.ndarray":
