@@ -88,7 +88,8 @@ def test_a_run_is_the_same_in_lanes_of_every_width(grid, agent):
 def test_a_lane_has_at_most_three_idle_runs():
     assert [lane_widths(number, False) for number in (1, 5, 10, 32, 37)] == [[4], [6], [10], [32], [32, 6]]
     assert lane_widths(9, True) == [8, 4]
-    assert lane_widths(9, False, "cuda") == [lane_width(False, "cuda")]
+    assert [lane_widths(number, False, "cuda") for number in (9, 33, 300)] == [[32], [64], [256, 64]]
+    assert lane_width(True, "cuda") == 256
 
 
 def test_a_policy_asked_about_few_observations_answers_as_about_many(grid):
@@ -134,7 +135,7 @@ def test_tensor_operations_compute_what_the_compiled_loops_do(grid, agent):
     """What runs on other devices, here on the processor."""
     runs = runs_of(grid, AGENTS[agent])
     compiled, tensors = (make_batch(agent, runs) for _ in range(2))
-    tensors.lanes[0].arithmetic = TensorArithmetic("cpu")
+    tensors.lanes[0].arithmetic = TensorArithmetic("cpu", tensors.lanes[0].width)
     for batch in (compiled, tensors):
         batch.learn([60], lambda point: None)
     for i in range(3):

@@ -91,10 +91,10 @@ def check_updates_of_dqn(task, hyperparameters, number):
 
     def minibatch(size, env=None):
         drawn = lane.replay
-        seen, following = (as_stored(source.at(states[i])) for states in (drawn.states, drawn.next_states))
-        parts = (seen, drawn.actions[i][:, None], following)
-        ends = (drawn.discounts[i] == 0).astype(np.float32)
-        return ReplayBufferSamples(*map(torch.from_numpy, (*parts, ends[:, None], drawn.rewards[i][:, None])))
+        seen, following = (as_stored(source.at(states[i])) for states in (drawn.states.array, drawn.next_states.array))
+        parts = (seen, drawn.actions.array[i][:, None], following)
+        ends = (drawn.discounts.array[i] == 0).astype(np.float32)
+        return ReplayBufferSamples(*map(torch.from_numpy, (*parts, ends[:, None], drawn.rewards.array[i][:, None])))
 
     model.replay_buffer.sample = minibatch
     for update in range(number):

@@ -51,7 +51,7 @@ def train_configs(
     """
     _check_device(device)
     made = [config if isinstance(config, RunConfig) else RunConfig.from_dict(config) for config in configs]
-    work = _Work(made, folders, checkpoints, progress, members or Members(), device, lane)
+    work = _Work(made, folders, checkpoints, progress, members or Members(device=device), device, lane)
     work.run()
     return [work.results[place] for place in range(len(made))]
 

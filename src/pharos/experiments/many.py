@@ -89,7 +89,7 @@ def train_many(
         for seed in numbers
     ]
     folder = None if out is None else Path(out)
-    if folder is not None and len(parts := parts_of(configs, workers)) > 1:
+    if folder is not None and len(parts := parts_of(configs, workers, device)) > 1:
         return train_parts(
             configs,
             [folder / f"seed-{seed}" for seed in numbers],
@@ -98,7 +98,7 @@ def train_many(
             device=device,
             progress=progress,
         )
-    members = Members()
+    members = Members(device=device)
     members.adopt(configs[0], task)
     return train_configs(
         configs,

@@ -78,6 +78,7 @@ class Members:
     Args:
         values: config -> values at the start of its task, where they are known.
         trust, strict: as for `RunConfig.task`.
+        device: where networks are trained, which decides about what fits together.
     """
 
     def __init__(
@@ -86,8 +87,9 @@ class Members:
         *,
         trust: bool = False,
         strict: bool = False,
+        device: str = "cpu",
     ):
-        self.values, self.trust, self.strict = values, trust, strict
+        self.values, self.trust, self.strict, self.device = values, trust, strict, device
         self.made: dict[str, Any] = {}
 
     def task(self, config: RunConfig) -> Task:
@@ -141,7 +143,7 @@ class Members:
             reward_noise=chance.reward_noise,
             reward_delay=chance.reward_delay,
         )
-        key = (config.agent, config.steps, config.evaluation_interval, group_key(config.agent, run))
+        key = (config.agent, config.steps, config.evaluation_interval, group_key(config.agent, run, self.device))
         return Member(place, config, folder, task, chosen, run, key)
 
     def _once(self, what: str, config: RunConfig, names: Sequence[str], make: Callable[[], Any]) -> Any:

@@ -21,9 +21,9 @@ from pharos.experiments.members import FailedRun, Members
 from pharos.experiments.run_folder import TrainingResult, finished_result
 
 
-def parts_of(configs: Sequence[RunConfig], workers: int) -> list[list[int]]:
+def parts_of(configs: Sequence[RunConfig], workers: int, device: str = "cpu") -> list[list[int]]:
     """Places of the runs by process: whole lanes, dealt out in turn; one list where there is nothing to share."""
-    width = lane_width(any("image" in config.observation for config in configs))
+    width = lane_width(any("image" in config.observation for config in configs), device)
     lanes = [list(range(first, min(first + width, len(configs)))) for first in range(0, len(configs), width)]
     number = min(workers, len(lanes))
     if number < 2 or any(config.engine != "batched" for config in configs):
@@ -87,7 +87,7 @@ def _train(entries: Sequence[tuple[dict[str, Any], Path]], checkpoints: Path | N
             sys.exit(1)
 
     configs, folders = zip(*entries, strict=True)
-    members = Members(trust=True)  # of code that the process which started this one has imported
+    members = Members(trust=True, device=device)  # of code that the process which started this one has imported
     train_configs(configs, folders, checkpoints=checkpoints, progress=tell, members=members, device=device)
 
 

@@ -44,7 +44,7 @@ def train_batch(
         stored = _values.stored_values(config.to_dict())
         return None if stored is None else TaskValues.from_dict(stored)
 
-    members = Members(values, trust=True, strict=True)
+    members = Members(values, trust=True, strict=True, device=device)
     ends = train_configs(configs, folders, checkpoints=checkpoints, members=members, device=device)
     return [end.error if isinstance(end, FailedRun) else None for end in ends]
 
@@ -58,7 +58,7 @@ class Batches:
     """
 
     def __init__(self, folder: Path, device: str = "cpu"):
-        self.on_processor = device == "cpu"
+        self.device = device
         self.folder = folder / BATCHES
         self.most: dict[str, int] = {}  # of runs whose batch was too large for memory: how many may be together
         self.shapes: dict[str, Hashable] = {}
@@ -99,8 +99,7 @@ class Batches:
     def width(self, run: Run) -> int:
         """How many runs may be in a batch of this one."""
         is_image = not run.configuration.is_tabular and len(self._shape(run)[0]) == 3
-        device = "cpu" if self.on_processor else "cuda"
-        usual = TABLES if run.configuration.is_tabular else lane_width(is_image, device)
+        usual = TABLES if run.configuration.is_tabular else lane_width(is_image, self.device)
         return min(usual, self.most.get(run.id, usual))
 
     def key(self, run: Run) -> Hashable:
@@ -123,7 +122,7 @@ class Batches:
             run_in_short: Any = SimpleNamespace(
                 observe=observation, mdp=mdp, hyperparameters=config.hyperparameters, steps=config.steps
             )
-            key = group_key(config.agent, run_in_short)
+            key = group_key(config.agent, run_in_short, self.device)
         except Exception:  # what is wrong with it, the run will say
             return run.id
         return (config.agent, config.steps, config.evaluation_interval, key)

@@ -6,6 +6,7 @@ import numpy as np
 import torch
 
 from pharos.agents.batched.dqn import DQNLane
+from pharos.agents.batched.handover import is_gpu
 from pharos.agents.batched.lane import Lane, RunPolicy
 from pharos.agents.batched.ppo import PPOLane
 from pharos.agents.batched.runs import BatchRun, group_key, lane_width, lane_widths
@@ -26,7 +27,7 @@ class Batch:
     def __init__(self, agent: str, runs: Sequence[BatchRun], device: str = "cpu"):
         if not runs:
             raise ParameterError("a batch has no runs; expected at least one")
-        keys = {group_key(agent, run) for run in runs}
+        keys = {group_key(agent, run, device) for run in runs}
         if len(keys) > 1:
             raise ParameterError(f"{len(runs)} runs are of {len(keys)} groups; expected one batch a group (group_key)")
         self.runs = list(runs)
@@ -104,4 +105,6 @@ def make_batch(agent: str, runs: Sequence[BatchRun], *, device: str = "cpu", thr
         ParameterError: the engine lacks a hyperparameter, or the runs are of several groups.
     """
     torch.set_num_threads(threads or 1)
+    if is_gpu(device):  # products in whole single precision, as elsewhere
+        torch.backends.cudnn.allow_tf32 = False
     return Batch(agent, runs, device)

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from pharos.agents.batched.handover import Mirror, Program, wait
 from pharos.agents.batched.lane import Lane
 from pharos.agents.batched.networks import QNetworks
 from pharos.agents.batched.replay import Replay
@@ -27,22 +28,23 @@ class DQNLane(Lane):
         super().__init__(runs, width, device)
         self._rows = torch.arange(width, device=device)[:, None]
         self.target = self.parameters.clone()
-        self.target_values = self.network.parameters.views(self.target)
-        self.replay = Replay(self.keys, int(self.shared["buffer_size"]), self.copies, int(self.shared["batch_size"]))
+        self.target_values = self.views(self.target)
+        size, rows = int(self.shared["batch_size"]), int(self.shared["buffer_size"])
+        self.replay = Replay(self.keys, self.number, rows, self.copies, size, device)
+        self._dq = torch.zeros((width, size, self.num_actions), device=device)
+        self._descend = Program(self.descend, device)
         self.epsilon = np.zeros(width)
         names = ("initial_eps", "final_eps", "fraction")
         self._exploration = tuple(self.own[f"exploration_{name}"] for name in names)
         self._explores = np.zeros(width, np.bool_)
         self._no_scores = np.zeros((width, self.copies, self.num_actions), np.float32)
-        self._remembers = all(remembers_targets(run) for run in self.runs)
+        self._remembers = device == "cpu" and all(remembers_targets(run) for run in self.runs)
         self._known: torch.Tensor | None = None  # (W, S, A) values of the target networks, where they are remembered
         self._target_calls = np.maximum(self.own["target_update_interval"].astype(np.int64) // self.copies, 1)
 
-    def network_of_lane(self) -> QNetworks:
+    def network_seeing(self, shape: tuple[int, ...]) -> QNetworks:
         """As `Lane` says."""
-        observations = self.seen
-        self.network = QNetworks(observations.shape, observations.is_image, self.shared["net_arch"], self.num_actions)
-        return self.network
+        return QNetworks(shape, self.seen.is_image, self.shared["net_arch"], self.num_actions)
 
     def probabilities(self, scores: np.ndarray) -> np.ndarray:
         """One for the best action."""
@@ -54,7 +56,7 @@ class DQNLane(Lane):
         is_warming = self.steps < self.own["learning_starts"]
         kernels.exploring(self.keys, self.calls, self.epsilon, is_warming, self._explores)
         if not self._explores[: self.number].all():
-            scores = self.network.scores(self.values, self.observed(worlds.state)).cpu().numpy()
+            scores = self.scores_of(worlds.state)
         kernels.choose(self.keys, self.calls, self._explores, scores, self.actions)
         before = worlds.state.copy()
         self.move()
@@ -91,36 +93,44 @@ class DQNLane(Lane):
         if number < 0:
             number = int(self.shared["train_freq"]) * self.copies
         for draw in range(number):
+            wait(self.device)
             self.replay.sample(self.calls, draw, self.own["gamma"], int(self.shared["n_steps"]))
             self.learn_minibatch()
 
     def learn_minibatch(self) -> None:
         """One step of gradient descent on the minibatch that the replay memory has drawn."""
+        self.plan(self._learns())
+        self._descend()
+
+    def descend(self) -> None:
+        """The step; a GPU records this."""
         batch = self.replay
+        for part in batch.drawn:
+            part.send()
         q_next = q_choice = self._target_scores(batch.next_states)
         if self.shared["double"]:
             q_choice = self.network.scores(self.values, self.observed(batch.next_states)).clone()
         q = self.network.scores(self.values, self.observed(batch.states))
-        dq = torch.empty(q.shape, device=self.device)
-        minibatch = (batch.actions, batch.rewards, batch.discounts)
-        self.arithmetic.huber(q, q_next, q_choice, minibatch, dq, self.losses)
-        self.network.backward(self.values, self.gradient_views, dq)
-        self.adam(self._learns())
+        minibatch = (batch.actions.tensor, batch.rewards.tensor, batch.discounts.tensor)
+        self.arithmetic.huber(q, q_next, q_choice, minibatch, self._dq, self.loss)
+        self.network.backward(self.values, self.gradient_views, self._dq)
+        self.adam()
 
-    def _target_scores(self, states: np.ndarray) -> torch.Tensor:
+    def _target_scores(self, states: Mirror) -> torch.Tensor:
         """(W, B, A) values of states (W, B) by the target networks."""
         if not self._remembers:
             return self.network.scores(self.target_values, self.observed(states)).clone()
         if self._known is None:
-            self._known = self._all_target_scores(states.shape[1])
-        return self._known[self._rows, torch.from_numpy(states).to(self.device)]
+            self._known = self._all_target_scores(states.array.shape[1])
+        return self._known[self._rows, states.tensor]
 
     def _all_target_scores(self, size: int) -> torch.Tensor:
         """(W, S, A) of all states, `size` of each run at a time; runs with fewer states repeat their last one."""
         numbers = np.array([run.mdp.num_states for run in self.runs])
         scores = torch.empty((self.width, int(numbers.max()), self.num_actions), device=self.device)
+        states = Mirror((self.width, size), torch.int64, self.device)
         for first in range(0, scores.shape[1], size):
-            states = np.minimum(np.arange(first, first + size), numbers[:, None] - 1)
+            states.array[:] = np.minimum(np.arange(first, first + size), numbers[:, None] - 1)
             part = scores[:, first : first + size]
             part[:] = self.network.scores(self.target_values, self.observed(states))[:, : part.shape[1]]
         return scores

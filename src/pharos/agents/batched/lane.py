@@ -7,9 +7,10 @@ import numpy as np
 import torch
 
 from pharos.agents.batched.arithmetic import CompiledArithmetic, TensorArithmetic
-from pharos.agents.batched.layers import Shape, Values, room
-from pharos.agents.batched.networks import names_of
-from pharos.agents.batched.observed import Seen
+from pharos.agents.batched.handover import Mirror, Program, wait
+from pharos.agents.batched.layers import MASK, Shape, Values, room
+from pharos.agents.batched.networks import names_of, spread
+from pharos.agents.batched.observed import Seen, SeenOnDevice
 from pharos.agents.batched.runs import BatchRun, resolved
 from pharos.agents.batched.worlds import Worlds
 from pharos.kernels import batched_worlds as kernels
@@ -32,13 +33,11 @@ class Lane:
     """
 
     agent: str
-    network: Any
-
     tensors: tuple[str, ...] = ("parameters", "means", "squares")  # those that have to be remembered
 
     def __init__(self, runs: Sequence[BatchRun], width: int, device: str = "cpu"):
         self.number, self.width, self.device = len(runs), width, device
-        self.arithmetic = (CompiledArithmetic if device == "cpu" else TensorArithmetic)(device)
+        self.arithmetic = (CompiledArithmetic if device == "cpu" else TensorArithmetic)(device, width)
         self.runs = [*runs, *[runs[0]] * (width - len(runs))]
         every = [resolved(self.agent, run.hyperparameters) for run in self.runs]
         self.shared = every[0]
@@ -50,23 +49,36 @@ class Lane:
         self.is_idle = np.arange(width) >= len(runs)
         self.worlds = Worlds(self.runs, self.keys, self.copies)
         self.actions = np.zeros((width, self.copies), np.int64)
-        self.seen = Seen(self.runs, device)
+        self.seen = (Seen if device == "cpu" else SeenOnDevice)(self.runs, device)
         self._rooms: dict[int, torch.Tensor] = {}
-        self.parameters = torch.from_numpy(self.network_of_lane().initial(self._draws)).to(device)
+        self.network = self.network_seeing(self.seen.shape)
+        self._own_networks = [
+            self.network if sight.shape == self.seen.shape else self.network_seeing(sight.shape)
+            for sight in self.seen.sights
+        ]
+        self.parameters = torch.from_numpy(self._initial()).to(device)
         self.gradients = torch.zeros_like(self.parameters)
         self.means, self.squares = torch.zeros_like(self.parameters), torch.zeros_like(self.parameters)
         self.updates = np.zeros(width, np.int64)
-        self.losses = np.zeros(width)
-        self.values: Values = self.network.parameters.views(self.parameters)
+        self.loss = Mirror((width,), torch.float64, device)
+        self.values: Values = self.views(self.parameters)
         self.gradient_views: Values = self.network.parameters.views(self.gradients)
+        self._asked = Mirror((width, self.copies), torch.int64, device)
+        self._scores = Mirror((width, self.copies, self.num_actions), torch.float32, device)
+        self._answer = Program(self.answer, device)
         self.steps = self.calls = self.collected = 0
         self.is_due = False
 
     # What an agent says of itself -----------------------------------------------------------------------------------
 
-    def network_of_lane(self) -> Any:
-        """Make `network`."""
+    def network_seeing(self, shape: tuple[int, ...]) -> Any:
+        """The network for observations of a shape."""
         raise NotImplementedError
+
+    def evaluate(self, x: torch.Tensor) -> torch.Tensor:
+        """(W, E, A) scores of actions in what is seen, by the networks as they are."""
+        scores: torch.Tensor = self.network.scores(self.values, x)
+        return scores
 
     def step(self) -> None:
         """One step of each copy; sets `is_due` at the end of a rollout."""
@@ -100,34 +112,77 @@ class Lane:
             self.update()
             self.is_due = False
 
-    def observed(self, states: np.ndarray) -> torch.Tensor:
+    def views(self, rows: torch.Tensor) -> Values:
+        """name -> (W, ...) view of parameters (W, P), with the mask of what is seen, where there is one."""
+        views: Values = self.network.parameters.views(rows)
+        return views if self.seen.mask is None else {**views, MASK: self.seen.mask}
+
+    def observed(self, states: Mirror) -> torch.Tensor:
         """(W, B, size) float32 observations of states (W, B); they stay until the next call with as many."""
-        if states.shape[1] not in self._rooms:
-            self._rooms[states.shape[1]] = room(self.width, states.shape[1], self.seen.size, device=self.device)
-        return self.seen.at(states, self._rooms[states.shape[1]])
+        number = states.array.shape[1]
+        if number not in self._rooms:
+            self._rooms[number] = room(self.width, number, self.seen.size, device=self.device)
+        return self.seen.at(states, self._rooms[number])
+
+    def answer(self) -> None:
+        """Write the scores of the states that were asked about; a GPU records this."""
+        self._asked.send()
+        self._scores.tensor.copy_(self.evaluate(self.observed(self._asked)))
+        self._scores.fetch()
+
+    def scores_of(self, states: np.ndarray) -> np.ndarray:
+        """(W, E, A) scores of states (W, E), which stay until the next call."""
+        wait(self.device)
+        self._asked.array[:] = states
+        self._answer()
+        wait(self.device)
+        return self._scores.array
 
     def best_actions(self, states: np.ndarray) -> np.ndarray:
         """(number,) the action with the highest score in the state (number,) of each run."""
-        rows = np.zeros((self.width, 1), np.int64)
+        rows = np.zeros((self.width, self.copies), np.int64)
         rows[: self.number, 0] = states
-        scores: np.ndarray = self.network.scores(self.values, self.observed(rows))[: self.number, 0].cpu().numpy()
-        return scores.argmax(axis=1)
+        best: np.ndarray = self.scores_of(rows)[: self.number, 0].argmax(axis=1)
+        return best
 
     def move(self) -> None:
         """Execute `actions`; episodes that end after the last step of the training do not count."""
         self.worlds.step(self.calls, self.actions, counts=self.steps + self.copies <= self.total)
 
-    def adam(self, is_active: np.ndarray) -> None:
-        """A step down the clipped gradients, for the runs that are active."""
-        state = (self.parameters, self.gradients, self.means, self.squares)
-        rates, max_norms = self.own["learning_rate"], self.own["max_grad_norm"]
-        self.arithmetic.adam(state, self.updates, is_active, rates, max_norms, self.network.eps)
+    @property
+    def losses(self) -> np.ndarray:
+        """(W,) the losses of the last minibatch."""
+        wait(self.device)
+        return self.loss.array
 
-    def _draws(self, number: int) -> np.ndarray:
-        """(W, number) uniform in (0, 1), for the first parameters."""
-        words = np.empty((self.width, -(-number // 4), 4), np.uint32)
-        philox.words(self.keys, kernels.WEIGHTS, 0, words)
-        return (words.reshape(self.width, -1)[:, :number] + 0.5) * 2.0**-32
+    def plan(self, is_active: np.ndarray) -> None:
+        """Say that the next step down the gradients is for the runs (W,) that are active."""
+        rates, max_norms = self.own["learning_rate"], self.own["max_grad_norm"]
+        self.arithmetic.plan(self.updates, is_active, rates, max_norms, self.network.eps)
+
+    def adam(self) -> None:
+        """The step that was planned, down the clipped gradients."""
+        self.arithmetic.adam((self.parameters, self.gradients, self.means, self.squares))
+
+    def _initial(self) -> np.ndarray:
+        """(W, P) the first parameters; each run draws those of its own network."""
+        if all(network is self.network for network in self._own_networks):
+            rows: np.ndarray = self.network.initial(lambda number: self._draws(self.keys, number))
+            return rows
+        rows = np.zeros((self.width, self.network.parameters.length), np.float32)
+        for i, network in enumerate(self._own_networks):
+            members = np.flatnonzero(self.seen.which == i)
+            keys = self.keys[members]
+            drawn = network.initial(lambda number, keys=keys: self._draws(keys, number))
+            rows[members] = spread(network.parameters, drawn, self.network.parameters)
+        return rows
+
+    @staticmethod
+    def _draws(keys: np.ndarray, number: int) -> np.ndarray:
+        """(N, number) uniform in (0, 1) for keys (N,), for the first parameters."""
+        words = np.empty((len(keys), -(-number // 4), 4), np.uint32)
+        philox.words(keys, kernels.WEIGHTS, 0, words)
+        return (words.reshape(len(keys), -1)[:, :number] + 0.5) * 2.0**-32
 
     # What is kept ---------------------------------------------------------------------------------------------------
 
@@ -152,8 +207,11 @@ class Lane:
 
     def as_stored(self, views: Values, i: int) -> dict[str, np.ndarray]:
         """name -> one run's part of some views of parameters or gradients, in Stable-Baselines3's shapes."""
-        shapes: list[Shape] = self.network.parameters.shapes
-        arrays = {each.name: np.array(each.stored(views[each.name][i].cpu().numpy()), order="C") for each in shapes}
+        shapes: list[Shape] = self._own_networks[self.seen.which[i]].parameters.shapes
+        arrays = {}
+        for each in shapes:
+            own = views[each.name][i].cpu().numpy()[tuple(slice(n) for n in each.shape)]
+            arrays[each.name] = np.array(each.stored(own), order="C")
         return {name: value for own_name, value in arrays.items() for name in names_of(own_name)}
 
 
@@ -166,11 +224,12 @@ class RunPolicy:
     def action_probabilities(self, observations: np.ndarray) -> np.ndarray:
         """(M, A) float64 for observations (M, ...) as the environment gives them."""
         lane = self.lane
+        wait(lane.device)
         values = {name: view[self.i : self.i + 1] for name, view in lane.values.items()}
         answers, first = [], 0
         while first < len(observations):
             size = next((size for size in ASKED if size >= len(observations) - first), ASKED[-1])
-            rows = lane.seen.encoded(observations[first : first + size])
+            rows = lane.seen.encoded(observations[first : first + size], self.i)
             block = torch.zeros((1, size, lane.seen.size), device=lane.device)
             block[0, : len(rows)] = rows  # of one of two sizes, as layers keep room for each size
             answers.append(lane.probabilities(lane.network.scores(values, block)[0, : len(rows)].cpu().numpy()))

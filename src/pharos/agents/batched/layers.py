@@ -18,6 +18,7 @@ from pharos.kernels import batched_learning
 ALIGNED = 16  # floats: each parameter of each run begins at a multiple of 64 bytes
 RELU, TANH, NONE = "relu", "tanh", "none"
 ROWS = "all parameters"
+MASK = "which pixels there are"
 KERNEL = 3  # of the small convolution
 
 linear_row: Any = batched_learning.linear_row
@@ -184,7 +185,8 @@ class PatchConvolution(Layer):
     """A convolution of 3 x 3 with padding as one product: x holds the 9 C neighbours of each pixel, from 0 to 255.
 
     They come out of a table, so that nothing is unfolded here; 1 / 255 is a factor of the weights. y is (W, B, pixels
-    x filters).
+    x filters). Runs whose pictures are smaller than those of others in their lane have a mask (W, pixels) among the
+    values, which keeps what is no pixel of theirs at 0.
     """
 
     def __init__(self, parameters: Parameters, name: str, shape: tuple[int, ...], filters: int):
@@ -207,6 +209,8 @@ class PatchConvolution(Layer):
         weights = values[f"{self.name}.weight"] * (1 / 255)
         torch.baddbmm(values[f"{self.name}.bias"], self._rows(x), weights, out=self._rows(y))
         self._activate(y)
+        if MASK in values:
+            y.view(*y.shape[:2], self.pixels, self.filters).mul_(values[MASK][:, None, :, None])
         return y
 
     def backward(self, values: Values, gradients: Values, x: Tensor, dy: Tensor, *, onward: bool) -> None:
@@ -250,9 +254,14 @@ class Convolution(Layer):
         """The outputs."""
         y, _ = self._room(x)
         weights, bias = values[f"{self.name}.weight"] * self.scale, values[f"{self.name}.bias"]
-        for i in range(len(x)):
-            images = x[i].view(-1, *self.shape_in)
-            y[i] = torch.nn.functional.conv2d(images, weights[i], bias[i, 0], self.stride).flatten(1)
+        if is_one_by_one(x):
+            for i in range(len(x)):
+                images = x[i].view(-1, *self.shape_in)
+                y[i] = torch.nn.functional.conv2d(images, weights[i], bias[i, 0], self.stride).flatten(1)
+        else:
+            images = self._side_by_side(x, self.shape_in)
+            out = torch.nn.functional.conv2d(images, weights.flatten(0, 1), bias.flatten(), self.stride, groups=len(x))
+            y.copy_(self._apart(out, y))
         self._activate(y)
         return y
 
@@ -260,17 +269,44 @@ class Convolution(Layer):
         """As `Layer` says."""
         y, dx = self._room(x, onward=onward)
         dy = self._before_activation(dy, y)
-        for i in range(len(x)):
-            images, out = x[i].view(-1, *self.shape_in), dy[i].view(-1, *self.shape_out)
-            weights, steps = values[f"{self.name}.weight"][i], [self.stride] * 2
-            of_x, of_weights, of_bias = torch.ops.aten.convolution_backward(
-                out, images, weights, [len(weights)], steps, [0, 0], [1, 1], False, [0, 0], 1, [onward, True, True]
-            )
-            torch.mul(of_weights, self.scale, out=gradients[f"{self.name}.weight"][i])
-            gradients[f"{self.name}.bias"][i, 0] = of_bias
-            if onward:
-                dx[i] = of_x.flatten(1)
+        if is_one_by_one(x):
+            for i in range(len(x)):
+                images, out = x[i].view(-1, *self.shape_in), dy[i].view(-1, *self.shape_out)
+                self._gradients(values, gradients, slice(i, i + 1), images, out, dx[i : i + 1] if onward else None)
+        else:
+            images, out = self._side_by_side(x, self.shape_in), self._side_by_side(dy, self.shape_out)
+            self._gradients(values, gradients, slice(None), images, out, dx if onward else None)
         return dx if onward else None
+
+    def _gradients(
+        self, values: Values, gradients: Values, runs: slice, images: Tensor, out: Tensor, dx: Tensor | None
+    ) -> None:
+        """Write those of some runs, whose images (B, runs x C, H, W) and gradients of outputs are side by side."""
+        own = values[f"{self.name}.weight"][runs]
+        weights, steps = own.flatten(0, 1), [self.stride] * 2
+        of_x, of_weights, of_bias = torch.ops.aten.convolution_backward(
+            out, images, weights, [len(weights)], steps, [0, 0], [1, 1], False, [0, 0], len(own),
+            [dx is not None, True, True],
+        )  # fmt: skip
+        torch.mul(of_weights.view(own.shape), self.scale, out=gradients[f"{self.name}.weight"][runs])
+        gradients[f"{self.name}.bias"][runs, 0] = of_bias.view(len(own), -1)
+        if dx is not None:
+            dx.copy_(self._apart(of_x, dx))
+
+    @staticmethod
+    def _side_by_side(x: Tensor, shape: tuple[int, ...]) -> Tensor:
+        """(B, W C, H, W') of (W, B, C H W')."""
+        return x.view(*x.shape[:2], *shape).transpose(0, 1).flatten(1, 2)
+
+    @staticmethod
+    def _apart(x: Tensor, like: Tensor) -> Tensor:
+        """The reverse, as a view: (W, B, C H W')."""
+        return x.reshape(like.shape[1], like.shape[0], -1).transpose(0, 1)
+
+
+def is_one_by_one(x: Tensor) -> bool:
+    """Whether convolutions go run by run, which is faster on the processor."""
+    return x.device.type == "cpu"
 
 
 class Stack:

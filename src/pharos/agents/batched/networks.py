@@ -19,18 +19,13 @@ from pharos.agents.batched.layers import (
     Stack,
     Values,
 )
+from pharos.agents.batched.runs import is_small
 
 FEATURES = 128
 FILTERS = 16
-NATURE = 36  # pixels from which the three convolutions of Mnih et al. (2015) take the place of one, as in networks.py
 
 Draws = Callable[[int], np.ndarray]
 """number of draws -> (W, number) uniform in (0, 1)."""
-
-
-def is_small(shape: tuple[int, ...], is_image: bool) -> bool:
-    """Whether an observation is an image of the small convolution, which sees the neighbours of each pixel."""
-    return is_image and min(shape[1:]) < NATURE
 
 
 def extractor(parameters: Parameters, name: str, shape: tuple[int, ...], is_image: bool) -> list[Layer]:
@@ -47,6 +42,20 @@ def extractor(parameters: Parameters, name: str, shape: tuple[int, ...], is_imag
         convolutions.append(made)
         shape = made.shape_out
     return [*convolutions, Linear(parameters, f"{name}.layers.1", math.prod(shape), FEATURES, RELU)]
+
+
+def spread(own: Parameters, rows: np.ndarray, common: Parameters) -> np.ndarray:
+    """(N, P) parameters of networks in the places that a larger network of the same layers has for them; 0 elsewhere.
+
+    The larger one has more inputs in its first layers, which follow those that both have.
+    """
+    result = np.zeros((len(rows), common.length), np.float32)
+    for each, place in zip(own.shapes, common.shapes, strict=True):
+        part = result[:, place.offset : place.offset + place.size].reshape(-1, *place.shape)
+        part[:, *(slice(n) for n in each.shape)] = rows[:, each.offset : each.offset + each.size].reshape(
+            -1, *each.shape
+        )
+    return result
 
 
 def hidden(parameters: Parameters, name: str, sizes: Sequence[int], activation: str) -> list[Layer]:

@@ -6,13 +6,50 @@ from typing import Any
 import numpy as np
 import torch
 
+from pharos.agents.batched.handover import Mirror, is_gpu
 from pharos.agents.batched.layers import KERNEL, whole
-from pharos.agents.batched.networks import is_small
-from pharos.agents.batched.runs import BLOCK, BatchRun
+from pharos.agents.batched.runs import BLOCK, BatchRun, ObservationSource, as_networks_see, is_small
 from pharos.kernels import batched_worlds
 
 kernels: Any = batched_worlds  # compiled functions, whose types are hidden
-LARGEST_TABLE = 1 << 28  # bytes of observations as networks take them
+LARGEST_TABLE = 1 << 28  # bytes of observations as networks take them, on the processor
+SHARE_OF_DEVICE = 0.5  # of a GPU's free memory that a table may take
+
+
+class Sight:
+    """What the states of one source look like to a network.
+
+    Attributes:
+        shape: of an observation as Stable-Baselines3's networks take it, images with their channels first.
+        size: numbers that the first layer takes.
+        places: (size,) where each of them is in a `raw` observation; beyond the border of an image in its 0.
+    """
+
+    def __init__(self, source: ObservationSource):
+        self.source = source
+        self.shape, self._turns = as_networks_see(tuple(source.shape), source.is_image)
+        self.is_small = is_small(self.shape, source.is_image)
+        self.places = np.arange(int(np.prod(self.shape)))
+        if self.is_small:  # the small convolution takes the 9 C neighbours of each pixel
+            inside = self.places.reshape(self.shape)
+            padded = np.pad(inside, ((0, 0), (1, 1), (1, 1)), constant_values=inside.size)
+            windows = np.lib.stride_tricks.sliding_window_view(padded, (KERNEL, KERNEL), axis=(1, 2))  # type: ignore[call-overload]
+            self.places = np.ascontiguousarray(windows.transpose(1, 2, 0, 3, 4)).ravel()
+        self.size = len(self.places)
+
+    def raw(self, observations: np.ndarray) -> np.ndarray:
+        """(N, M + 1) observations with their channels first, and a 0."""
+        turned = np.moveaxis(observations, -1, 1) if self._turns else observations
+        return np.pad(turned.reshape(len(turned), -1), ((0, 0), (0, 1)))
+
+    def encoded(self, observations: np.ndarray) -> np.ndarray:
+        """(N, size) of observations as the environment gives them."""
+        return self.raw(observations)[:, self.places]
+
+    def in_blocks(self) -> Any:
+        """(first state, observations) of all states, a block at a time."""
+        for first in range(0, self.source.num_states, BLOCK):
+            yield first, self.source.at(np.arange(first, min(first + BLOCK, self.source.num_states)))
 
 
 class Seen:
@@ -23,77 +60,95 @@ class Seen:
     as much again for each ten pixels to copy their neighbours.
 
     Attributes:
-        shape: of an observation as Stable-Baselines3's networks take it, images with their channels first.
-        size: numbers that the first layer takes.
+        sights: of the distinct sources; which: (W,) the number of each run's.
+        shape: of an observation as the lane's network takes it.
+        size: numbers that its first layer takes.
         is_image: whether it is one.
+        mask: None, as all have the same shape.
+    """
+
+    mask: torch.Tensor | None = None
+
+    def __init__(self, runs: Sequence[BatchRun], device: Any = None):
+        self.device, self.is_image = device, runs[0].observe.is_image
+        sources = list({id(run.observe): run.observe for run in runs}.values())
+        place = {id(source): i for i, source in enumerate(sources)}
+        self.sights = [Sight(source) for source in sources]
+        self.which = np.array([place[id(run.observe)] for run in runs])
+        self._ends = np.cumsum([0, *(source.num_states for source in sources)])
+        self._begins = self._ends[self.which]
+        self.shape, self.size = self.sights[0].shape, self.sights[0].size
+        self._take_room()
+
+    def _take_room(self) -> None:
+        kind = torch.uint8 if self.is_image else torch.float32
+        self._table: torch.Tensor | None = None
+        if self._ends[-1] * self.size * kind.itemsize > LARGEST_TABLE:
+            return
+        self._table = torch.empty((int(self._ends[-1]), self.size), dtype=kind)
+        for sight, begin in zip(self.sights, self._ends, strict=False):
+            for first, block in sight.in_blocks():
+                self._table[begin + first : begin + first + len(block)] = torch.from_numpy(sight.encoded(block))
+
+    def at(self, states: Mirror, out: torch.Tensor) -> torch.Tensor:
+        """Write what is seen in states (W, B) into out (W, B, size) float32; images from 0 to 255."""
+        if self._table is not None:
+            kernels.look_up(self._table.numpy(), self._begins, states.array, whole(out).numpy())
+            return out
+        for i, sight in enumerate(self.sights):
+            members = np.flatnonzero(self.which == i)
+            raw = sight.raw(sight.source.at(states.array[members].ravel()))
+            kernels.write_drawn(raw, sight.places, members, whole(out).numpy())
+        return out
+
+    def encoded(self, observations: np.ndarray, i: int) -> torch.Tensor:
+        """(N, size) float32 of observations (N, ...) as the environment of run i gives them."""
+        rows = torch.from_numpy(self.sights[self.which[i]].encoded(observations)).float()
+        return torch.nn.functional.pad(rows, (0, self.size - rows.shape[1])).to(self.device)
+
+
+class SeenOnDevice(Seen):
+    """The same on another device than the processor, for runs that see alike but for the size of what they see.
+
+    A table of all observations lies there. Smaller observations are filled up with zeros, and a mask says which pixels
+    of the small convolution there are.
+
+    Raises:
+        MemoryError: the table takes more than its share of the device's memory.
     """
 
     def __init__(self, runs: Sequence[BatchRun], device: Any = None):
-        first = runs[0].observe
-        self.is_image, self.device = first.is_image, device
-        self.shape, self._turns = as_networks_see(tuple(first.shape), first.is_image)
-        self._is_small = is_small(self.shape, self.is_image)
-        self.size = int(np.prod(self.shape)) * (KERNEL**2 if self._is_small else 1)
-        self.sources = list({id(run.observe): run.observe for run in runs}.values())
-        place = {id(source): i for i, source in enumerate(self.sources)}
-        self._which = np.array([place[id(run.observe)] for run in runs])
-        begins = np.cumsum([0, *(source.num_states for source in self.sources)])
-        self._begins = begins[self._which]
-        self._places = self._places_of_inputs()
-        kind = torch.uint8 if self.is_image else torch.float32
-        self._table: torch.Tensor | None = None
-        if begins[-1] * self.size * kind.itemsize <= LARGEST_TABLE:
-            table = torch.empty((int(begins[-1]), self.size), dtype=kind)
-            for source, begin in zip(self.sources, begins, strict=False):
-                for row in range(0, source.num_states, BLOCK):
-                    rows = np.arange(row, min(row + BLOCK, source.num_states))
-                    block = torch.from_numpy(self._encoded(source.at(rows)))
-                    table[begin + row : begin + row + len(rows)] = block
-            self._table = table.to(device)
+        super().__init__(runs, device)
+        if len({sight.shape for sight in self.sights}) == 1:
+            return
+        self.size = max(sight.size for sight in self.sights)
+        channels = self.shape[0] * KERNEL**2
+        self.shape = (self.shape[0], 1, self.size // channels) if self.is_image else (self.size,)
+        if self.is_image:
+            pixels = np.array([sight.size // channels for sight in self.sights])[self.which]
+            is_there = np.arange(self.size // channels) < pixels[:, None]
+            self.mask = torch.from_numpy(is_there.astype(np.float32)).to(device)
 
-    def at(self, states: np.ndarray, out: torch.Tensor) -> torch.Tensor:
-        """Write what is seen in states (W, B) into out (W, B, size) float32; images from 0 to 255."""
-        if self._table is None:
-            drawn = whole(out) if out.device.type == "cpu" else whole(torch.empty_like(out, device="cpu"))
-            for i, source in enumerate(self.sources):
-                members = np.flatnonzero(self._which == i)
-                raw = self._raw(source.at(states[members].ravel()))
-                kernels.write_drawn(raw, self._places, members, drawn.numpy())
-            return out if out.device.type == "cpu" else out.copy_(drawn[:, : out[0].numel()].view(out.shape))
-        if self._table.device.type == "cpu":
-            kernels.look_up(self._table.numpy(), self._begins, states, whole(out).numpy())
-            return out
-        rows = torch.from_numpy((states + self._begins[:, None]).ravel()).to(self.device)
-        return out.copy_(self._table.index_select(0, rows).view(out.shape))
+    def _take_room(self) -> None:
+        kind, total = torch.uint8 if self.is_image else torch.float32, int(self._ends[-1])
+        length = max(int(np.prod(sight.shape)) for sight in self.sights) + 1
+        needed = total * length * kind.itemsize
+        if is_gpu(self.device) and needed > SHARE_OF_DEVICE * torch.cuda.mem_get_info()[0]:
+            raise MemoryError(f"out of memory: observations of {total:,} states take {needed >> 20:,} MiB there")
+        table = torch.zeros((total, length), dtype=kind)
+        places = np.full((len(self.sights), max(sight.size for sight in self.sights)), length - 1)
+        for sight, row, begin in zip(self.sights, places, self._ends, strict=False):
+            row[: sight.size] = np.where(sight.places < int(np.prod(sight.shape)), sight.places, length - 1)
+            for first, block in sight.in_blocks():
+                raw = sight.raw(block)[:, :-1]
+                table[begin + first : begin + first + len(raw), : raw.shape[1]] = torch.from_numpy(raw)
+        self._table = table.to(self.device)
+        self._offsets = torch.from_numpy(self._begins[:, None]).to(self.device)
+        self._places = torch.from_numpy(places[self.which][:, None]).to(self.device)
 
-    def encoded(self, observations: np.ndarray) -> torch.Tensor:
-        """(N, size) float32 of observations (N, ...) as the environment gives them."""
-        return torch.from_numpy(self._encoded(observations)).to(self.device).float()
-
-    def _raw(self, observations: np.ndarray) -> np.ndarray:
-        """(N, M + 1) observations with their channels first, and a 0."""
-        turned = np.moveaxis(observations, -1, 1) if self._turns else observations
-        return np.pad(turned.reshape(len(turned), -1), ((0, 0), (0, 1)))
-
-    def _encoded(self, observations: np.ndarray) -> np.ndarray:
-        """(N, size) of observations."""
-        return self._raw(observations)[:, self._places]
-
-    def _places_of_inputs(self) -> np.ndarray:
-        """(size,): where each input of the first layer is in a `_raw` observation; beyond the border in its 0."""
-        inside = np.arange(int(np.prod(self.shape)))
-        if not self._is_small:
-            return inside
-        padded = np.pad(inside.reshape(self.shape), ((0, 0), (1, 1), (1, 1)), constant_values=len(inside))
-        windows = np.lib.stride_tricks.sliding_window_view(padded, (KERNEL, KERNEL), axis=(1, 2))  # type: ignore[call-overload]
-        return np.ascontiguousarray(windows.transpose(1, 2, 0, 3, 4)).ravel()
-
-
-def as_networks_see(shape: tuple[int, ...], is_image: bool) -> tuple[tuple[int, ...], bool]:
-    """(shape as networks take it, whether images are turned): their channels come first.
-
-    Stable-Baselines3 takes the smallest side of an image for its channels, and turns it unless that comes first.
-    """
-    if not is_image or int(np.argmin(shape)) == 0:
-        return shape, False
-    return (shape[2], *shape[:2]), True
+    def at(self, states: Mirror, out: torch.Tensor) -> torch.Tensor:
+        """As `Seen` says; a GPU can record it."""
+        assert self._table is not None
+        rows = (states.tensor + self._offsets).view(-1)
+        raw = self._table.index_select(0, rows).view(*states.tensor.shape, -1)
+        return out.copy_(raw.gather(2, self._places.expand(-1, raw.shape[1], -1)))

@@ -5,10 +5,13 @@ from typing import Any
 import numpy as np
 import torch
 
+from pharos.agents.batched.handover import Mirror, Program, wait
 from pharos.agents.batched.lane import Lane
 from pharos.agents.batched.networks import ActorCritics
 from pharos.kernels import batched_rollouts as rollouts
 from pharos.kernels import batched_worlds as kernels
+
+WEIGHTS = ("clip_range", "ent_coef", "vf_coef")
 
 
 class PPOLane(Lane):
@@ -19,6 +22,8 @@ class PPOLane(Lane):
             (W, T, E) float32: the rollout that goes on; begins is 1 where a step is the first of its episode.
         timeouts: (W, T, E) bool, whether a step was cut off by the time limit.
         begin: (W, E) float32, whether the next step is the first of its episode.
+        weights: (W,) float64 each: the clip range, and what entropy and value weigh in the loss.
+        divergence: (W,) float64, from the policy that acted, on the last minibatch.
     """
 
     agent = "ppo"
@@ -34,15 +39,24 @@ class PPOLane(Lane):
         self.begin = np.ones((width, self.copies), np.float32)
         self._log_p = np.zeros((width, self.copies), np.float32)
         self._order = np.zeros((width, shape[1] * shape[2]), np.int64)
-        self.divergences = np.zeros(width)
+        self._valued = Mirror((width, self.copies, 1), torch.float32, device)
+        self.divergence = Mirror((width,), torch.float64, device)
+        self.weights = tuple(Mirror((width,), torch.float64, device) for _ in WEIGHTS)
+        for mirror, name in zip(self.weights, WEIGHTS, strict=True):
+            mirror.array[:] = self.own[name]
+            mirror.send()
+        self._lessons: dict[int, Lesson] = {}
 
-    def network_of_lane(self) -> ActorCritics:
+    def network_seeing(self, shape: tuple[int, ...]) -> ActorCritics:
         """As `Lane` says."""
-        observations = self.seen
-        self.network = ActorCritics(
-            observations.shape, observations.is_image, self.shared["net_arch"], self.num_actions
-        )
-        return self.network
+        return ActorCritics(shape, self.seen.is_image, self.shared["net_arch"], self.num_actions)
+
+    def evaluate(self, x: torch.Tensor) -> torch.Tensor:
+        """As `Lane` says; the values of the states are written, too."""
+        scores, values = self.network.both(self.values, x)
+        self._valued.tensor.copy_(values)
+        self._valued.fetch()
+        return scores
 
     def probabilities(self, scores: np.ndarray) -> np.ndarray:
         """The softmax of the scores."""
@@ -52,12 +66,12 @@ class PPOLane(Lane):
     def step(self) -> None:
         """As `Lane` says."""
         worlds, t = self.worlds, self.collected
-        scores, values = self.network.both(self.values, self.observed(worlds.state))
-        kernels.act(self.keys, self.calls, scores.cpu().numpy(), self.actions, self._log_p)
+        scores = self.scores_of(worlds.state)
+        kernels.act(self.keys, self.calls, scores, self.actions, self._log_p)
         self.states[:, t] = worlds.state
         self.move()
         self.next_states[:, t], self.actions_taken[:, t] = worlds.next_state, self.actions
-        self.log_probabilities[:, t], self.kept_values[:, t] = self._log_p, values[..., 0].cpu().numpy()
+        self.log_probabilities[:, t], self.kept_values[:, t] = self._log_p, self._valued.array[..., 0]
         self.rewards[:, t], self.begins[:, t] = worlds.reward, self.begin
         self.timeouts[:, t] = worlds.flags & kernels.TIMEOUT
         self.begin[:] = worlds.flags & kernels.DONE
@@ -106,7 +120,8 @@ class PPOLane(Lane):
 
     def values_of(self, states: np.ndarray) -> np.ndarray:
         """(W, E) float32 values of states (W, E)."""
-        return self.network.values(self.values, self.observed(states))[..., 0].cpu().numpy().copy()
+        self.scores_of(states)
+        return self._valued.array[..., 0].copy()
 
     def learn_minibatch(self, minibatch: tuple[np.ndarray, ...], is_active: np.ndarray) -> np.ndarray:
         """One step of gradient descent for the active runs, unless the policy has moved too far; (W,) those that did.
@@ -114,24 +129,54 @@ class PPOLane(Lane):
         Args:
             minibatch: (states, actions, logarithms of probabilities, advantages, returns), (W, B) each.
         """
-        states, actions, old, advantages, returns = minibatch
-        if self.shared["normalize_advantage"] and states.shape[1] > 1:
-            rollouts.normalize(advantages)
-        scores, values = self.network.both(self.values, self.observed(states))
-        dscores, dvalues = (torch.empty(part.shape, device=self.device) for part in (scores, values))
-        weights = tuple(self.own[name] for name in ("clip_range", "ent_coef", "vf_coef"))
-        self.arithmetic.clipped_loss(
-            scores, values, (actions, old, advantages, returns), weights, (dscores, dvalues), self.losses,
-            self.divergences,
-        )  # fmt: skip
-        target = self.shared["target_kl"]
-        if target is not None:
-            is_active = is_active & ~(self.divergences > 1.5 * float(target))
-        self.network.backward(self.values, self.gradient_views, dscores, dvalues)
-        self.adam(is_active)
+        size = minibatch[0].shape[1]
+        if size not in self._lessons:
+            self._lessons[size] = Lesson(self, size)
+        lesson = self._lessons[size]
+        wait(self.device)
+        for mirror, part in zip(lesson.minibatch, minibatch, strict=True):
+            mirror.array[:] = part
+        if self.shared["normalize_advantage"] and size > 1:
+            rollouts.normalize(lesson.minibatch[3].array)
+        lesson.assess()
+        if self.shared["target_kl"] is not None:
+            wait(self.device)
+            is_active = is_active & ~(self.divergence.array > 1.5 * float(self.shared["target_kl"]))
+        self.plan(is_active)
+        lesson.descend()
         return is_active
 
     def own_arrays(self) -> dict[str, np.ndarray]:
         """As `Lane` says."""
         names = ("states", "next_states", "actions_taken", "log_probabilities", "kept_values", "rewards", "begins")
         return {f"rollout_{name}": getattr(self, name) for name in (*names, "timeouts")} | {"begin": self.begin}
+
+
+class Lesson:
+    """What PPO learns from minibatches of one size: forwards with the loss, backwards with Adam; a GPU records both.
+
+    Attributes:
+        minibatch: states, actions (W, B) int64, old logarithms of probabilities, advantages, returns (W, B) float32.
+    """
+
+    def __init__(self, lane: PPOLane, size: int):
+        device, shape = lane.device, (lane.width, size)
+        kinds = [torch.int64] * 2 + [torch.float32] * 3
+        self.minibatch = tuple(Mirror(shape, kind, device) for kind in kinds)
+        self._lane = lane
+        self._gradients = tuple(torch.zeros((*shape, last), device=device) for last in (lane.num_actions, 1))
+        self.assess, self.descend = Program(self._assess, device), Program(self._descend, device)
+
+    def _assess(self) -> None:
+        lane = self._lane
+        for part in self.minibatch:
+            part.send()
+        states, *others = self.minibatch
+        scores, values = lane.network.both(lane.values, lane.observed(states))
+        parts, weights = tuple(part.tensor for part in others), tuple(part.tensor for part in lane.weights)
+        lane.arithmetic.clipped_loss(scores, values, parts, weights, self._gradients, lane.loss, lane.divergence)
+
+    def _descend(self) -> None:
+        lane = self._lane
+        lane.network.backward(lane.values, lane.gradient_views, *self._gradients)
+        lane.adam()

@@ -1,7 +1,9 @@
 """Replay memory of W runs: numbers of states instead of what they look like, 14 bytes a transition."""
 
 import numpy as np
+import torch
 
+from pharos.agents.batched.handover import Mirror
 from pharos.kernels import batched_learning as kernels
 
 
@@ -9,10 +11,15 @@ class Replay:
     """The last transitions of W runs with E copies each; a row is one step of all copies.
 
     As in Stable-Baselines3 there are max(buffer_size // E, 1) rows, and the oldest is overwritten.
+
+    Attributes:
+        states, next_states, actions (W, B) int64, rewards, discounts (W, B) float32: the minibatch that was drawn.
     """
 
-    def __init__(self, keys: np.ndarray, buffer_size: int, copies: int, batch_size: int):
-        width, self.keys = len(keys), keys
+    def __init__(
+        self, keys: np.ndarray, number: int, buffer_size: int, copies: int, batch_size: int, device: str = "cpu"
+    ):
+        width, self.keys, self.number = len(keys), keys, number
         self.size = max(buffer_size // copies, 1)
         shape = (width, self.size, copies)
         self.memory: tuple[np.ndarray, ...] = (
@@ -22,10 +29,9 @@ class Replay:
             np.zeros(shape, np.float32),
             np.zeros(shape, np.uint8),
         )
-        batch = (width, batch_size)
-        self.states, self.next_states = np.zeros(batch, np.int64), np.zeros(batch, np.int64)
-        self.actions = np.zeros(batch, np.int64)
-        self.rewards, self.discounts = np.zeros(batch, np.float32), np.zeros(batch, np.float32)
+        kinds = [torch.int64] * 3 + [torch.float32] * 2
+        self.drawn = tuple(Mirror((width, batch_size), kind, device) for kind in kinds)
+        self.states, self.next_states, self.actions, self.rewards, self.discounts = self.drawn
 
     def add(
         self,
@@ -42,10 +48,11 @@ class Replay:
             array[:, place] = new
 
     def sample(self, calls: int, draw: int, gammas: np.ndarray, num_steps: int) -> None:
-        """Draw a minibatch for each run, after `calls` steps; see `kernels.sample`."""
-        batch = (self.states, self.next_states, self.actions, self.rewards, self.discounts)
+        """Draw a minibatch for each run that is not idle, after `calls` steps; see `kernels.sample`."""
+        batch = tuple(part.array[: self.number] for part in self.drawn)
         filled = min(calls, self.size)
-        kernels.sample(self.keys, calls, draw, calls % self.size, filled, gammas, num_steps, self.memory, batch)
+        keys = self.keys[: self.number]
+        kernels.sample(keys, calls, draw, calls % self.size, filled, gammas, num_steps, self.memory, batch)
 
     def arrays(self, calls: int) -> dict[str, np.ndarray]:
         """The rows that are filled, by name."""

@@ -1,5 +1,6 @@
 """What a run is before it exists: its MDP, what it sees of the states, its hyperparameters; and which share a batch."""
 
+import math
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -13,8 +14,9 @@ if TYPE_CHECKING:
     from pharos.observations import ObservationInContext
     from pharos.state_space import StateSpace
 
-WIDTH_OF_VECTORS, WIDTH_OF_IMAGES, WIDTH_ELSEWHERE = 32, 8, 256  # most runs of a lane; the last: not on the processor
+WIDTH_OF_VECTORS, WIDTH_OF_IMAGES = 32, 8  # most runs of a lane
 NARROWEST = 4
+WIDTHS_ELSEWHERE = (32, 64, 128, 256)  # of lanes on other devices than the processor
 
 # What Stable-Baselines3 takes where nothing is given. The first part may differ among the runs of a batch.
 OF_A_RUN: dict[str, dict[str, Any]] = {
@@ -73,6 +75,7 @@ ONLY: dict[str, Any] = {
     "sde_sample_freq": -1,
     "clip_range_vf": None,
 }
+NATURE = 36  # pixels from which the three convolutions of Mnih et al. (2015) take the place of one, as in networks.py
 MOST_REMEMBERED = 1 << 14  # states whose target values are kept
 BLOCK = 4096  # states that are observed at once
 
@@ -186,13 +189,44 @@ def resolved(agent: str, hyperparameters: Mapping[str, Any]) -> dict[str, Any]:
     return result
 
 
-def group_key(agent: str, run: BatchRun) -> Hashable:
-    """Runs with equal keys can share a batch."""
+def group_key(agent: str, run: BatchRun, device: str = "cpu") -> Hashable:
+    """Runs with equal keys can share a batch.
+
+    On the processor they see observations of one shape. Elsewhere, where a wide lane costs hardly more than a narrow
+    one, vectors share a batch with others of about their length, and small images with those of as many channels and
+    about as many pixels (see `_scale`).
+    """
     options = resolved(agent, run.hyperparameters)
     shared = tuple((name, repr(options[name])) for name in OF_A_BATCH[agent])
-    observation = (tuple(run.observe.shape), str(run.observe.dtype), run.observe.is_image)
-    remembers = agent == "dqn" and remembers_targets(run)
+    observation: tuple[Any, ...] = (tuple(run.observe.shape), str(run.observe.dtype), run.observe.is_image)
+    remembers = device == "cpu" and agent == "dqn" and remembers_targets(run)
+    if device != "cpu":
+        shape, _ = as_networks_see(tuple(run.observe.shape), run.observe.is_image)
+        if is_small(shape, run.observe.is_image):
+            observation = ("small image", shape[0], _scale(shape[1] * shape[2]))
+        elif not run.observe.is_image:
+            observation = ("vector", _scale(math.prod(shape)))
     return agent, run.steps, run.mdp.num_actions, observation, shared, remembers
+
+
+def _scale(number: int) -> int:
+    """The same for 1 to 64, 65 to 512, 513 to 4,096, ..."""
+    return max(2, ((number - 1).bit_length() + 2) // 3)
+
+
+def is_small(shape: tuple[int, ...], is_image: bool) -> bool:
+    """Whether an observation is an image of the small convolution, which sees the neighbours of each pixel."""
+    return is_image and min(shape[1:]) < NATURE
+
+
+def as_networks_see(shape: tuple[int, ...], is_image: bool) -> tuple[tuple[int, ...], bool]:
+    """(shape as networks take it, whether images are turned): their channels come first.
+
+    Stable-Baselines3 takes the smallest side of an image for its channels, and turns it unless that comes first.
+    """
+    if not is_image or int(np.argmin(shape)) == 0:
+        return shape, False
+    return (shape[2], *shape[:2]), True
 
 
 def remembers_targets(run: BatchRun) -> bool:
@@ -216,16 +250,19 @@ def _is_in_steps(value: Any) -> bool:
 def lane_width(is_image: bool, device: str = "cpu") -> int:
     """The most runs of a lane, chosen by measurement on the processor (docs/decisions/0013-batched-training.md)."""
     if device != "cpu":
-        return WIDTH_ELSEWHERE
+        return WIDTHS_ELSEWHERE[-1]
     return WIDTH_OF_IMAGES if is_image else WIDTH_OF_VECTORS
 
 
 def lane_widths(number: int, is_image: bool, device: str = "cpu") -> list[int]:
-    """The widths of the lanes of a batch: on the processor the last one has as few idle runs as may be.
+    """The widths of the lanes of a batch: the last one has few idle runs.
 
-    A width is even and at least NARROWEST there, as products of single runs add up in another order.
+    On the processor a width is even and at least NARROWEST, as products of single runs add up in another order;
+    elsewhere it is one of a few.
     """
     most = lane_width(is_image, device)
     full, rest = divmod(number, most)
-    last = most if device != "cpu" else max(rest + rest % 2, NARROWEST)
+    last = max(rest + rest % 2, NARROWEST)
+    if device != "cpu":
+        last = next(width for width in WIDTHS_ELSEWHERE if width >= rest)
     return [most] * full + ([last] if rest else [])

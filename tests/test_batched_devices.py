@@ -1,0 +1,151 @@
+"""What runs on other devices than the processor, here on the processor by another name, and Triton's interpreter."""
+
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+from pharos.agents.batched import BatchRun, ObservationSource, group_key, layers, make_batch
+from pharos.agents.batched.handover import Mirror, Program
+from pharos.environments import make
+from pharos.errors import ParameterError
+from pharos.experiments import Task
+
+ELSEWHERE = "cpu:0"
+DQN = {"learning_rate": 0.01, "buffer_size": 60, "learning_starts": 20, "batch_size": 8, "train_freq": 4,
+       "target_update_interval": 10, "net_arch": [12]}  # fmt: skip
+PPO = {"n_envs": 2, "n_steps": 8, "batch_size": 12, "n_epochs": 2, "net_arch": [7]}
+AGENTS = {"dqn": DQN, "ppo": PPO}
+
+
+def runs_of(agent, observation, sizes, number=2):
+    runs = []
+    for size in sizes:
+        task = Task.of(make("simple_grid", height=size, width=size), observation=observation)
+        source = ObservationSource.of(task.space, task.sight.observe)
+        runs += [
+            BatchRun(task.mdp, source, task.time_limit, AGENTS[agent], 120, i, 2**40 + 977 * i + size)
+            for i in range(number)
+        ]
+    return runs
+
+
+def learned(agent, runs, device=ELSEWHERE):
+    batch = make_batch(agent, runs, device=device)
+    batch.learn([60, 120], lambda point: None)
+    return batch
+
+
+@pytest.mark.parametrize("observation", ["one_hot", "simple_image"])
+@pytest.mark.parametrize("agent", AGENTS)
+def test_runs_that_see_more_or_less_share_a_lane_and_learn_what_they_learn_alone(agent, observation):
+    runs = runs_of(agent, observation, (4, 6))
+    batch = learned(agent, runs)
+    (lane,) = batch.lanes
+    assert len({sight.shape for sight in lane.seen.sights}) == 2
+    for first in (0, 2):
+        alone = learned(agent, runs[first : first + 2], "cpu")
+        for i in (0, 1):
+            mine, theirs = batch.parameters(first + i), alone.parameters(i)
+            assert {name: each.shape for name, each in mine.items()} == {name: x.shape for name, x in theirs.items()}
+            assert max(np.abs(mine[name] - theirs[name]).max() for name in mine) <= 1e-4
+            assert (batch.episodes[first + i], batch.returns[first + i]) == (alone.episodes[i], alone.returns[i])
+            seen = runs[first].observe.at(np.arange(16))
+            answers = (each.action_probabilities(seen) for each in (batch.policy(first + i), alone.policy(i)))
+            assert np.abs(np.subtract(*answers)).max() <= 1e-4
+
+
+def test_what_a_run_has_not_stays_zero():
+    """Weights of inputs that only the others of a lane have."""
+    batch = learned("dqn", runs_of("dqn", "simple_image", (4, 6)))
+    (lane,) = batch.lanes
+    weights = lane.values["q_net.features_extractor.layers.1.weight"]
+    assert weights.shape[1] == 36 * 16
+    assert not weights[:2, 16 * 16 :].any() and weights[2:4, 16 * 16 :].any()
+
+
+def test_shapes_share_a_lane_elsewhere_and_not_on_the_processor():
+    near, far = runs_of("dqn", "simple_image", (4, 6), 1), runs_of("dqn", "simple_image", (4, 9), 1)
+    assert len({group_key("dqn", run, "cuda") for run in near}) == 1
+    assert len({group_key("dqn", run, "cuda") for run in far}) == len({group_key("dqn", run) for run in near}) == 2
+    with pytest.raises(ParameterError, match="2 groups"):
+        make_batch("dqn", near)
+
+
+@pytest.mark.parametrize("agent", AGENTS)
+def test_a_batch_elsewhere_goes_on_from_its_state_bit_for_bit(agent):
+    runs = runs_of(agent, "one_hot", (4, 5))
+    whole, first, second = learned(agent, runs), *(make_batch(agent, runs, device=ELSEWHERE) for _ in range(2))
+    first.learn([60], lambda point: None)
+    second.restore(first.state())
+    second.learn([120], lambda point: None)
+    for i in range(len(runs)):
+        mine, theirs = whole.parameters(i), second.parameters(i)
+        assert all(mine[name].tobytes() == theirs[name].tobytes() for name in mine)
+
+
+def test_convolutions_side_by_side_are_those_run_by_run(monkeypatch):
+    generator = torch.Generator().manual_seed(0)
+    parameters = layers.Parameters()
+    layer = layers.Convolution(parameters, "c", (2, 12, 12), 5, 4, 2, 1 / 255)
+    rows = torch.randn(3, parameters.length, generator=generator)
+    values, x = parameters.views(rows), 255 * torch.rand(3, 4, layer.inputs, generator=generator)
+    dy, answers = torch.randn(3, 4, layer.outputs, generator=generator), []
+    for one_by_one in (True, False):
+        monkeypatch.setattr(layers, "is_one_by_one", lambda x, answer=one_by_one: answer)
+        gradients = torch.zeros_like(rows)
+        y = layer.forward(values, x).clone()
+        dx = layer.backward(values, parameters.views(gradients), x, dy.clone(), onward=True)
+        answers.append((y, dx.clone(), gradients))
+    for one, other in zip(*answers, strict=True):
+        assert (one - other).abs().max() <= 1e-4 * one.abs().max()
+
+
+def test_mirrors_are_one_array_on_the_processor_and_two_elsewhere():
+    here, there = (Mirror((3,), torch.float32, device) for device in ("cpu", ELSEWHERE))
+    for mirror, alike in ((here, True), (there, False)):
+        mirror.array[:] = (1, 2, 3)
+        assert mirror.tensor.tolist() == ([1, 2, 3] if alike else [0, 0, 0])
+        mirror.send()
+        mirror.tensor.mul_(2)
+        assert mirror.array.tolist() == ([2, 4, 6] if alike else [1, 2, 3])
+        mirror.fetch()
+        assert mirror.array.tolist() == [2, 4, 6]
+
+
+def test_a_program_runs_each_time_it_is_called():
+    calls = []
+    program = Program(lambda: calls.append(0), ELSEWHERE)
+    for _ in range(3):
+        program()
+    assert len(calls) == 3
+
+
+CODE = """
+import numpy as np, torch
+from pharos.agents.batched.arithmetic import TensorArithmetic
+from pharos.agents.batched.fused import adam
+torch.manual_seed(0)
+states = [[torch.randn(3, 1500), torch.randn(3, 1500), torch.randn(3, 1500), torch.rand(3, 1500)]]
+states.append([each.clone() for each in states[0]])
+for fused, state in zip((adam, None), states):
+    arithmetic = TensorArithmetic("cpu:0", 3)
+    arithmetic._fused = fused
+    counts = np.array([0, 5, 7])
+    for is_active in ([True, True, False], [False, True, False]):
+        arithmetic.plan(counts, np.array(is_active), np.full(3, 0.01), np.array([0.5, 1e9, 1.0]), 1e-8)
+        arithmetic.adam(state)
+for one, other in zip(*states):
+    assert (one - other).abs().max() <= 1e-6, (one - other).abs().max()
+assert not torch.equal(states[0][0][0], states[0][0][1])
+"""
+
+
+def test_fused_adam_computes_what_tensor_operations_do():
+    pytest.importorskip("triton")  # torch for CUDA brings it along
+    environment = {**os.environ, "TRITON_INTERPRET": "1"}
+    done = subprocess.run([sys.executable, "-c", CODE], env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
