@@ -62,9 +62,14 @@ def check(agent: str, task: Task, options: dict) -> None:
         batches[name] = make_batch(agent, runs_of(task, few, number, steps), device=device)
         batches[name].learn([steps], lambda point: None)
     for name in ("cpu", "again", "40", "100", "200"):
-        pairs = [(a, b) for i in range(8) for a, b in zip(outcome(batches["8"], i), outcome(batches[name], i), strict=True)]
+        pairs = [
+            (a, b) for i in range(8) for a, b in zip(outcome(batches["8"], i), outcome(batches[name], i), strict=True)
+        ]
         furthest = max(float(np.abs(a - b).max()) for a, b in pairs)
-        print(f"  {agent}: 8 runs on the device and {name}: equal {all(np.array_equal(a, b) for a, b in pairs)}, furthest apart {furthest:.1e}", flush=True)
+        print(
+            f"  {agent}: 8 runs on the device and {name}: equal {all(np.array_equal(a, b) for a, b in pairs)}, furthest apart {furthest:.1e}",
+            flush=True,
+        )
 
 
 def main() -> None:
@@ -79,7 +84,9 @@ def main() -> None:
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     most = peak()
-    print(f"{arguments.instance}, torch {torch.__version__}, {torch.cuda.get_device_name()}, a product: {most / 1e12:.1f} TFLOP/s")
+    print(
+        f"{arguments.instance}, torch {torch.__version__}, {torch.cuda.get_device_name()}, a product: {most / 1e12:.1f} TFLOP/s"
+    )
     for agent in arguments.agents:
         for observation in arguments.observations:
             task = Task.of(arguments.instance, observation=observation)
