@@ -13,8 +13,8 @@ import time
 
 import numpy as np
 import torch
-from batched import work
 
+from batched import work
 from pharos.agents import hyperparameters
 from pharos.agents.batched import BatchRun, ObservationSource, make_batch
 from pharos.experiments import Task
@@ -66,10 +66,8 @@ def check(agent: str, task: Task, options: dict) -> None:
             (a, b) for i in range(8) for a, b in zip(outcome(batches["8"], i), outcome(batches[name], i), strict=True)
         ]
         furthest = max(float(np.abs(a - b).max()) for a, b in pairs)
-        print(
-            f"  {agent}: 8 runs on the device and {name}: equal {all(np.array_equal(a, b) for a, b in pairs)}, furthest apart {furthest:.1e}",
-            flush=True,
-        )
+        equal = all(np.array_equal(a, b) for a, b in pairs)
+        print(f"  {agent}: 8 runs there and {name}: equal {equal}, furthest apart {furthest:.1e}", flush=True)
 
 
 def main() -> None:
@@ -84,9 +82,8 @@ def main() -> None:
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     most = peak()
-    print(
-        f"{arguments.instance}, torch {torch.__version__}, {torch.cuda.get_device_name()}, a product: {most / 1e12:.1f} TFLOP/s"
-    )
+    device = f"torch {torch.__version__}, {torch.cuda.get_device_name()}"
+    print(f"{arguments.instance}, {device}, a product: {most / 1e12:.1f} TFLOP/s", flush=True)
     for agent in arguments.agents:
         for observation in arguments.observations:
             task = Task.of(arguments.instance, observation=observation)
@@ -108,8 +105,8 @@ def main() -> None:
                     done += unit
                 speed = done * number / (time.perf_counter() - began)
                 print(
-                    f"{agent} {observation:14}{number:6} runs: {speed:12,.0f} agent-steps/s, {speed * flop / 1e12:6.2f} TFLOP/s, "
-                    f"{speed * flop / most:5.1%} of peak (warm-up {warmed:.1f} s, "
+                    f"{agent} {observation:14}{number:6} runs: {speed:12,.0f} agent-steps/s, "
+                    f"{speed * flop / 1e12:6.2f} TFLOP/s, {speed * flop / most:5.1%} of peak (warm-up {warmed:.1f} s, "
                     f"{torch.cuda.max_memory_allocated() / 2**30:.1f} GiB)",
                     flush=True,
                 )
