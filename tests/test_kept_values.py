@@ -2,6 +2,7 @@
 
 import importlib
 import io
+import itertools
 import multiprocessing
 import os
 import signal
@@ -12,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import naive_exact
+from pharos import hardness
 from pharos.errors import FileFormatError, FolderLocked, ParameterError
 from pharos.mdp import TabularMDP
 from pharos.solvers import uniform_value, value_iteration
@@ -74,6 +76,33 @@ def test_values_in_files_are_those_in_memory_to_the_last_bit(tmp_path, monkeypat
     monkeypatch.setattr(memory_map, "SMALL", 0)
     monkeypatch.setattr(memory_map.machine, "available_memory", lambda: 0)
     assert (value_iteration(mdp).x == expected.x).all()
+
+
+@pytest.mark.long
+def test_gaps_with_values_in_files_are_those_in_memory_to_the_last_bit(tmp_path, monkeypatch):
+    mdp = ring()
+    expected = hardness.gaps(mdp)
+    monkeypatch.setattr(memory_map, "SMALL", 0)
+    monkeypatch.setattr(memory_map.machine, "available_memory", lambda: 0)
+    assert hardness.gaps(mdp).to_dict() == expected.to_dict()
+    names = ["sum_of_reciprocal_gaps", "minimal_gap"]
+    kept = hardness.report(mdp, names, folder=tmp_path)
+    assert kept[names[0]].value == expected.sum_of_reciprocals and kept[names[1]].value == expected.minimal
+    assert kept[names[0]].certificate.lower == expected.lower and kept[names[0]].certificate.upper == expected.upper
+
+
+@pytest.mark.long
+@settings(max_examples=40, deadline=None)
+@given(small_mdps())
+def test_values_settled_in_their_file_have_the_gaps_of_a_copy(tmp_path_factory, mdp):
+    names = ["sum_of_reciprocal_gaps", "sum_of_reciprocal_gaps_regularized", "minimal_gap"]
+    alone, folder = hardness.report(mdp, names), tmp_path_factory.mktemp("values")
+    kept = hardness.report(mdp, names, folder=folder)
+    again = hardness.report(mdp, names, folder=folder)  # from values that are settled
+    for name in names:
+        assert kept[name].value == alone[name].value and kept[name].certificate == alone[name].certificate
+        for ours, other in itertools.permutations((alone[name].certificate, again[name].certificate)):
+            assert ours.lower is None or other.upper is None or ours.lower <= other.upper
 
 
 def test_a_solve_goes_on_from_the_values_of_one_that_stopped(tmp_path):

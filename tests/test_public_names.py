@@ -32,6 +32,7 @@ ORDER = (
         "large_arrays",
         "wording",
         "storage",
+        "kept_arrays",
         "templates",
         "compiling",
         "mdp_files",

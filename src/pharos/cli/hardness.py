@@ -1,6 +1,7 @@
 """pharos hardness: all measures of one instance in a table, with exactness and sources."""
 
 import math
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -98,6 +99,13 @@ def hardness(
     ] = None,
     definitions: Annotated[bool, typer.Option("--definitions", help="Show definitions and sources.")] = False,
     latex: Annotated[bool, typer.Option("--latex", help="Print a LaTeX table.")] = False,
+    values: Annotated[
+        Path | None,
+        typer.Option(
+            "--values",
+            help="Folder for values and bounds while they are computed, in place of memory; what was killed goes on.",
+        ),
+    ] = None,
     fresh: Annotated[bool, typer.Option("--fresh", help="Compute anew what is kept beside the state space.")] = False,
     memory: Memory = None,
     workers: Workers = None,
@@ -106,10 +114,12 @@ def hardness(
 ) -> None:
     """Measure how hard an instance is: visitation, estimation and planning complexity."""
     building = build_options(memory, workers, max_states)
+    needs_rewards = True
     if measures is not None:
         from pharos.hardness import chosen
 
-        chosen(measures)  # an unknown name is told before anything is built
+        wanted = chosen(measures)  # an unknown name is told before anything is built
+        needs_rewards = any(each.depends != "structure" for each in wanted)
     if observation is None and (option or network or landmarks is not None):
         raise ParameterError("--option, --network and --landmarks go with --observation NAME")
     goal = parse_target(target, parameters)
@@ -120,6 +130,7 @@ def hardness(
         sticky=sticky,
         random=random,
         lazy=lazy,
+        by_range=not needs_rewards,
         **building,
     )
     representation = None
@@ -142,6 +153,7 @@ def hardness(
             progress=lambda what, line: tell(f"{what}  {line}"),
             representation=representation,
             schedule=None if representation is None else Schedule(optimizer=optimizer),
+            folder=values,
         )
     if json:
         print_json({**report.to_dict(), "compiling_seconds": compiling.seconds()})

@@ -60,9 +60,13 @@ class Target:
         sticky: float = 0.0,
         random: float = 0.0,
         lazy: float = 0.0,
+        by_range: bool = False,
         **building: Any,
     ) -> "TabularMDP":
-        """The tabular MDP, with chance; `gamma` None is 0.99, or 1 with a horizon. `building` as for `space`."""
+        """The tabular MDP, with chance; `gamma` None is 0.99, or 1 with a horizon. `building` as for `space`.
+
+        by_range: whether rewards may wait until they are asked for; they do under MPI.
+        """
         from pharos.experiments import ChanceSetting
 
         chance = ChanceSetting(sticky, random, lazy)
@@ -75,7 +79,7 @@ class Target:
                 f"{self.text}: pharos does not know the class {space.manifest['class']} of this environment, "
                 f"so not its rewards; name it as module:Class instead of its folder"
             )
-        by_range = building.get("processes") == "mpi"
+        by_range = by_range or building.get("processes") == "mpi"
         return chance.of(space.mdp(gamma=discount(gamma, horizon), by_range=by_range).with_horizon(horizon))
 
     def found_environment(self) -> "Environment":

@@ -23,7 +23,8 @@ from pharos.hardness.value_norm import certified_value_norm
 
 def _diameter(problem: Problem) -> Any:
     reporter = problem.interval_reporter("diameter")
-    return diameter(problem.mdp, restart=problem.restart, budget=problem.budget, progress=reporter)
+    options: dict[str, Any] = {"restart": problem.restart, "budget": problem.budget, "bounds": problem.folder}
+    return diameter(problem.mdp, progress=reporter, **options)
 
 
 def _start_eccentricity(problem: Problem) -> Certified:

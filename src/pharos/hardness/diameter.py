@@ -6,6 +6,7 @@ where it does not close (Then et al. 2014), and an argument of ours for spaces t
 """
 
 import math
+import os
 from collections.abc import Callable
 from typing import Any
 
@@ -31,6 +32,7 @@ def diameter(
     tolerance: float = 1e-6,
     budget: Budget | float | None = None,
     progress: Callable[[Progress], None] | None = None,
+    bounds: str | os.PathLike | None = None,
 ) -> Interval:
     """Return D, the maximum over ordered pairs of states s != s' of the least expected number of steps from s to s'.
 
@@ -46,12 +48,15 @@ def diameter(
         tolerance: relative width of the interval from which on it counts as exact. Counted steps are exact anyway.
         budget: seconds (300 by default), or a `Budget`; a value out of reach comes as the interval proven by then.
         progress: called with a `Progress` now and then.
+        bounds: a folder for the bounds on all states, 8 bytes each, where memory has no room for searches of a
+            deterministic MDP: the same call goes on from them where one was killed, or its budget spent. They are
+            removed once the diameter is known.
     Returns:
         An `Interval`, in steps. The implicit end of an episode (-1 in a row of `next_states`) counts as one more state,
         the only one beside the S states. Under sticky actions s' is a state reached with any previous action, and s
         stands for every reachable (state, previously executed action) and the start states without a previous action.
     Raises:
-        ParameterError: an option is out of range.
+        ParameterError: an option is out of range. FileFormatError: `bounds` are of another MDP. FolderLocked: in use.
     Cost:
         deterministic: usually 3 to 100 breadth-first searches, each one pass over the table in the order of discovery;
         memory 8 bytes an edge and 32 a state. Where there is less, some ten sweeps over the table in place of each
@@ -65,7 +70,7 @@ def diameter(
     if graph is None:
         return stochastic_diameter(mdp, restart, tolerance, spending)
     if needs_more_than_memory(graph):
-        return lean_diameter(graph, spending, conventions_of(mdp, restart))
+        return lean_diameter(graph, spending, conventions_of(mdp, restart), bounds)
     return SumSweep(graph, spending, conventions_of(mdp, restart)).interval()
 
 

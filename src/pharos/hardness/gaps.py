@@ -162,23 +162,29 @@ def gaps(mdp: TabularMDP, solution: Solution | None = None, *, tie_tolerance: fl
     return _summed(mdp, optimal_solution(mdp, solution), tie_tolerance)
 
 
-def resolved_gaps(mdp: TabularMDP, solution: Solution) -> Gaps:
-    """The gaps of a solution; of a more accurate one where ties are unresolved, or the sum is wide."""
+def resolved_gaps(mdp: TabularMDP, solution: Solution, in_place: bool = False) -> Gaps:
+    """The gaps of a solution; of a more accurate one where ties are unresolved, or the sum is wide.
+
+    in_place: whether the values of the solution may become the more accurate ones; its bound holds for these, too.
+    """
     if solution.horizon is not None or mdp.gamma == 1.0:
         return _summed(mdp, solution, None)
-    settled = _settled(mdp, solution) if TieProof(mdp).holds else solution  # else ties cannot be proven that way
+    settled = solution
+    if TieProof(mdp).holds:  # else ties cannot be proven that way
+        settled = _settled(mdp, solution, in_place)
     result = _summed(mdp, settled, None)
     if result.is_resolved or settled is not solution:
         return result
-    settled = _settled(mdp, solution)
+    settled = _settled(mdp, solution, in_place)
     return _summed(mdp, settled, None) if settled.error_bound < solution.error_bound else result
 
 
-def _settled(mdp: TabularMDP, solution: Solution) -> Solution:
+def _settled(mdp: TabularMDP, solution: Solution, in_place: bool) -> Solution:
     """The solution after more sweeps, until values do not change, or by no more than rounding.
 
     The bound is that of `pharos.solvers`: (rho change + rounding) / (1 - rho). Values that do not change at all make
-    proofs of ties possible, as equal states then have equal floats.
+    proofs of ties possible, as equal states then have equal floats. A sweep keeps every bound D of that form: new
+    entries are within rho D + rounding <= D of the fixed point.
     """
     equation = BellmanEquation(mdp.reward_table, mdp.gamma, mdp.chance, BEST)
     operations = 2 * mdp.num_actions + mdp.dynamics.operations + 16
@@ -186,8 +192,10 @@ def _settled(mdp: TabularMDP, solution: Solution) -> Solution:
     if rho >= 1:
         return solution
     largest_reward = max(abs(mdp.reward_table.lowest), abs(mdp.reward_table.highest))
-    x, bound, at_rest = large_zeros(solution.x.shape, np.float64), solution.error_bound, 0
-    x[:] = solution.x
+    x, bound, at_rest = solution.x, solution.error_bound, 0
+    if not in_place:
+        x = large_zeros(solution.x.shape, np.float64)
+        x[:] = solution.x
     largest = max(float(x.max(initial=0.0)), -float(x.min(initial=0.0)))
     sweeps = 0
     while sweeps < _SWEEPS:

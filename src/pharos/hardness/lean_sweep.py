@@ -2,15 +2,19 @@
 
 The algorithm is that of sum_sweep.py, without what needs room for more. Distances come from sweeps over the table
 (kernels/distance_sweeps.py) in place of searches with a queue and a reversed graph, which takes 8 bytes an edge. Arrays
-that memory has no room for are mapped files.
+that memory has no room for are mapped files; bounds may be in files that outlive the process (kept_bounds.py), of which
+the search in progress is all that is lost.
 """
 
+import os
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
 from pharos.hardness.interval import Interval, Spending, interval_of_search
+from pharos.hardness.kept_bounds import KeptBounds
 from pharos.hardness.sum_sweep import SumSweep
 from pharos.hardness.transition_graph import Graph
 from pharos.kernels import distance_sweeps
@@ -30,9 +34,22 @@ def needs_more_than_memory(graph: Graph) -> bool:
     return 7 * entry * graph.num_nodes + first + graph.next_states.dtype.itemsize * edges > available_memory()
 
 
-def lean_diameter(graph: Graph, spending: Spending, conventions: dict[str, Any]) -> Interval:
-    """The diameter, or the interval proven within the budget."""
-    return _in_two_bytes_or_four(lambda dtype: LeanSweep(LeanGraph(graph, dtype), spending, conventions).interval())
+def lean_diameter(
+    graph: Graph, spending: Spending, conventions: dict[str, Any], folder: str | os.PathLike | None = None
+) -> Interval:
+    """The diameter, or the interval proven within the budget.
+
+    folder: where bounds are kept while they are tightened, and gone on from; None: in memory.
+    """
+    kept = None if folder is None else KeptBounds(Path(folder), graph)
+
+    def interval(dtype: Any) -> Interval:
+        return LeanSweep(LeanGraph(graph, dtype), spending, conventions, kept).interval()
+
+    result = interval(np.int32) if kept and kept.dtype == np.int32 else _in_two_bytes_or_four(interval)
+    if kept and result.exact:
+        kept.remove()
+    return result
 
 
 def lean_eccentricity(graph: Graph, source: int, spending: Spending, conventions: dict[str, Any]) -> Interval:
@@ -105,21 +122,29 @@ class LeanGraph:
 class LeanSweep(SumSweep):
     """`SumSweep` on a graph that is searched by sweeps, in little memory."""
 
-    def __init__(self, graph: LeanGraph, spending: Spending, conventions: dict[str, Any]):
+    def __init__(
+        self, graph: LeanGraph, spending: Spending, conventions: dict[str, Any], kept: KeptBounds | None = None
+    ):
+        """kept: where the bounds are; None: in memory."""
         self.graph: Any = graph
         self.spending, self.conventions = spending, conventions
         size, dtype = graph.num_nodes, graph.dtype
+        if kept is None:
+            bounds = [large_zeros((size,), dtype) for _ in range(4)]
+            for upper in bounds[2:]:
+                upper[:] = graph.far
+        else:
+            bounds = [*kept.arrays(np.dtype(dtype))]
+        self.out_lower, self.in_lower, self.out_upper, self.in_upper = bounds
         self.away = large_zeros((size,), dtype)
         self.to = large_zeros((size,), dtype)
-        self.out_lower, self.in_lower, self.out_upper, self.in_upper = (large_zeros((size,), dtype) for _ in range(4))
-        self.out_upper[:] = self.in_upper[:] = graph.far
-        self.best = 0
+        self.best = max(int(self.out_lower.max()), int(self.in_lower.max()))  # what is at most an out(v) is at most D
         self.method = "directed ExactSumSweep, by sweeps over the table"
 
     def interval(self) -> Interval:
         """The diameter, or what is proven of it. OverflowError where bounds do not fit."""
         graph = self.graph
-        if not self._pivot(graph.pivot):
+        if not self._is_bounded() and not self._pivot(graph.pivot):
             return Interval(
                 np.inf,
                 np.inf,
@@ -133,12 +158,16 @@ class LeanSweep(SumSweep):
                 note="some states cannot be reached from others; how many pairs was not counted, for want of memory",
                 seconds=self.spending.seconds,
             )
-        if int(self.out_upper.max()) >= graph.far or int(self.in_upper.max()) >= graph.far:
+        if not self._is_bounded():
             raise OverflowError  # a bound was cut
         self._sweep()
         upper = self._upper()
         note = f"budget spent: {self._open()[0]} states may have a larger eccentricity than {self.best}"
         return self._result(self.best, upper, note if upper > self.best else "")
+
+    def _is_bounded(self) -> bool:
+        """Whether every node has upper bounds, as after a search from one in both directions that found all."""
+        return int(self.out_upper.max()) < self.graph.far and int(self.in_upper.max()) < self.graph.far
 
     def _fits(self, words: int) -> bool:
         return False  # for searches from many nodes at once

@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 from pharos.errors import ParameterError, PrecisionError, UndefinedMeasure, UnknownName
@@ -29,6 +30,7 @@ class Problem:
         representation: what the agent's network makes of the states, for measures that need one; or None.
         schedule: of the idealised learner.
         rollouts: of the idealised actor-critic; None: those of `Rollouts`.
+        folder: where optimal values and bounds of searches are kept while they are computed; None: in memory.
     """
 
     mdp: TabularMDP
@@ -40,12 +42,14 @@ class Problem:
     representation: Representation | None = None
     schedule: Schedule = field(default_factory=Schedule)
     rollouts: Rollouts | None = None
+    folder: Path | None = None
 
     @cached_property
     def solution(self) -> Solution:
         """Optimal values."""
         tolerance, rewards = self.tolerance, self.mdp.reward_table
         largest = max(abs(rewards.lowest), abs(rewards.highest)) / max(1 - self.mdp.gamma, 2.0**-53)
+        values = None if self.folder is None or self.mdp.horizon is not None else self.folder / "optimal.npy"
         while True:
             try:
                 return value_iteration(
@@ -53,6 +57,7 @@ class Problem:
                     tolerance,
                     keep_all=self.mdp.horizon is not None and self._is_small,
                     progress=lambda sweeps, bound: self.report("values", f"sweep {sweeps}, error at most {bound:.2g}"),
+                    values=values,
                 )
             except PrecisionError:
                 if tolerance > largest or not math.isfinite(largest):
@@ -62,7 +67,7 @@ class Problem:
     @cached_property
     def gaps(self) -> Gaps:
         """Suboptimality gaps."""
-        return resolved_gaps(self.mdp, self.solution)
+        return resolved_gaps(self.mdp, self.solution, in_place=self.folder is not None)
 
     def episode(self, measure: str) -> int:
         """The horizon; UndefinedMeasure where there is none."""

@@ -1,8 +1,10 @@
 """All measures of an MDP in one table, with definitions and sources; kept beside the state space."""
 
 import math
+import os
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -119,6 +121,7 @@ def report(
     representation: Representation | None = None,
     schedule: Schedule | None = None,
     rollouts: Rollouts | None = None,
+    folder: str | os.PathLike | None = None,
 ) -> Report:
     """Measure how hard an MDP is.
 
@@ -137,6 +140,9 @@ def report(
         representation: what the agent's network makes of the states, `pharos.observations.representation`; with one,
             measures of it are part of the report.
         schedule: of the idealised learner that these have; rollouts: of the actor-critic.
+        folder: for optimal values (`optimal.npy`, which `value_iteration(..., values=)` knows as well) and for the
+            bounds of a diameter while they are computed, in place of memory: the same call goes on from them where one
+            was killed, or a budget spent. None: memory, or where that has little room files without a name.
     Returns:
         A Report. A measure that does not exist for this MDP says why; the others are there.
     Raises:
@@ -152,7 +158,8 @@ def report(
         )
     wanted = chosen(measures, representation is not None)
     schedule = schedule or Schedule()
-    problem = Problem(mdp, horizon, tolerance, restart, Budget.of(budget), progress, representation, schedule, rollouts)
+    options = (representation, schedule, rollouts, None if folder is None else Path(folder))
+    problem = Problem(mdp, horizon, tolerance, restart, Budget.of(budget), progress, *options)
     conventions = _conventions(problem)
     file = ResultsFile(mdp, conventions) if keep else None
     results = {measure.name: _measured(measure, problem, file) for measure in wanted}
@@ -165,7 +172,8 @@ def report(
 def _measured(measure: Measure, problem: Problem, file: ResultsFile | None) -> Result:
     empty = Result(measure.name, measure.definition, measure.source, measure.complexity)
     entry = None if file is None else file.get(measure, problem.budget)
-    if entry is not None:
+    # what is kept of a budget that was spent may go on from what the folder holds
+    if entry is not None and (problem.folder is None or entry["certificate"].kind != "interval"):
         return replace(empty, **entry, kept=True)
     watch = Stopwatch()
     problem.report(measure.name, "")
