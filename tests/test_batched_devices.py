@@ -1,5 +1,6 @@
 """What runs on other devices than the processor, here on the processor by another name, and Triton's interpreter."""
 
+import contextlib
 import os
 import subprocess
 import sys
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from pharos.agents.batched import BatchRun, ObservationSource, group_key, layers, make_batch
+from pharos.agents.batched import BatchRun, ObservationSource, group_key, handover, layers, make_batch, observed
 from pharos.agents.batched.handover import Mirror, Program
 from pharos.environments import make
 from pharos.errors import ParameterError
@@ -122,6 +123,54 @@ def test_a_program_runs_each_time_it_is_called():
     for _ in range(3):
         program()
     assert len(calls) == 3
+
+
+@pytest.fixture
+def recorder(monkeypatch):
+    """A GPU that writes down what it is told."""
+    told = []
+
+    class Graph:
+        def replay(self):
+            told.append("replay")
+
+    @contextlib.contextmanager
+    def recording(graph, **options):
+        told.append("record")
+        yield
+
+    monkeypatch.setattr(handover, "is_gpu", lambda device: True)
+    monkeypatch.setattr(torch.cuda, "CUDAGraph", Graph)
+    monkeypatch.setattr(torch.cuda, "graph", recording)
+    return told
+
+
+def test_a_program_is_recorded_by_its_second_call_and_then_replayed(recorder):
+    program = Program(lambda: recorder.append("run"), "cuda")
+    for _ in range(3):
+        program()
+    assert recorder == ["run", "record", "run", "replay", "replay"]
+
+
+def test_a_program_that_cannot_be_recorded_is_run_as_it_is(recorder):
+    def operations():
+        recorder.append("run")
+        if recorder[-2:] == ["record", "run"]:
+            raise RuntimeError("operation not permitted when stream is capturing")
+
+    program = Program(operations, "cuda")
+    program()
+    with pytest.warns(UserWarning, match="does not record the updates, which are slower so: operation not permitted"):
+        program()
+    program()
+    assert recorder == ["run", "record", "run", "run", "run"]
+
+
+def test_observations_that_do_not_fit_on_the_device_are_counted(monkeypatch):
+    monkeypatch.setattr(observed, "is_gpu", lambda device: True)
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda: (1 << 12, 1 << 30))
+    with pytest.raises(MemoryError, match="out of memory: observations of 52 states take 0 MiB on cpu:0, more than 50%"):
+        make_batch("dqn", runs_of("dqn", "simple_image", (4, 6), 1), device=ELSEWHERE)
 
 
 CODE = """

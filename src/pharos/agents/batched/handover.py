@@ -1,5 +1,6 @@
 """What the processor and a device hand each other: arrays that stay in their places, and programs that are recorded."""
 
+import warnings
 from collections.abc import Callable
 
 import numpy as np
@@ -37,6 +38,7 @@ class Program:
     """Operations on tensors that stay in their places. A GPU records them, and runs them as one launch.
 
     The first call runs them one by one, which also takes all the room that they need; the second one records them.
+    Where that fails they are run one by one, with a warning, as recording changes no result.
     """
 
     def __init__(self, operations: Callable[[], None], device: str):
@@ -47,15 +49,24 @@ class Program:
     def __call__(self) -> None:
         if self._graph is not None:
             self._graph.replay()
-        elif self._is_recorded and self._has_run:
-            graph = torch.cuda.CUDAGraph()
-            with torch.cuda.graph(graph, capture_error_mode="thread_local"):
-                self._operations()
-            self._graph = graph
-            graph.replay()
+        elif self._is_recorded and self._has_run and self._record():
+            self()
         else:
             self._operations()
             self._has_run = True
+
+    def _record(self) -> bool:
+        graph = torch.cuda.CUDAGraph()
+        try:
+            with torch.cuda.graph(graph, capture_error_mode="thread_local"):
+                self._operations()
+        except RuntimeError as error:
+            self._is_recorded = False
+            reason = (str(error).splitlines() or [""])[0]
+            warnings.warn(f"the GPU does not record the updates, which are slower so: {reason}", stacklevel=2)
+            return False
+        self._graph = graph
+        return True
 
 
 def is_gpu(device: str) -> bool:

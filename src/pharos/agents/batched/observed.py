@@ -134,7 +134,10 @@ class SeenOnDevice(Seen):
         length = max(int(np.prod(sight.shape)) for sight in self.sights) + 1
         needed = total * length * kind.itemsize
         if is_gpu(self.device) and needed > SHARE_OF_DEVICE * torch.cuda.mem_get_info()[0]:
-            raise MemoryError(f"out of memory: observations of {total:,} states take {needed >> 20:,} MiB there")
+            raise MemoryError(
+                f"out of memory: observations of {total:,} states take {needed >> 20:,} MiB on {self.device}, "
+                f"more than {SHARE_OF_DEVICE:.0%} of what is free; a run alone that is too large trains on cpu"
+            )
         table = torch.zeros((total, length), dtype=kind)
         places = np.full((len(self.sights), max(sight.size for sight in self.sights)), length - 1)
         for sight, row, begin in zip(self.sights, places, self._ends, strict=False):
