@@ -169,7 +169,7 @@ def test_a_program_that_cannot_be_recorded_is_run_as_it_is(recorder):
 def test_observations_that_do_not_fit_on_the_device_are_counted(monkeypatch):
     monkeypatch.setattr(observed, "is_gpu", lambda device: True)
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda: (1 << 12, 1 << 30))
-    with pytest.raises(MemoryError, match="out of memory: observations of 52 states take 0 MiB on cpu:0, more than 50%"):
+    with pytest.raises(MemoryError, match="of 52 states take 0 MiB on cpu:0, more than 50%"):
         make_batch("dqn", runs_of("dqn", "simple_image", (4, 6), 1), device=ELSEWHERE)
 
 
