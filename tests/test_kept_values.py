@@ -6,6 +6,7 @@ import itertools
 import multiprocessing
 import os
 import signal
+import tempfile
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from hypothesis import strategies as st
 
 import naive_exact
 from pharos import hardness
-from pharos.errors import FileFormatError, FolderLocked, ParameterError
+from pharos.errors import FileFormatError, FolderLocked, ParameterError, PrecisionError
 from pharos.mdp import TabularMDP
 from pharos.solvers import uniform_value, value_iteration
 from strategies import small_mdps
@@ -190,3 +191,41 @@ def test_threads_share_a_sweep_and_the_bound_holds(threads):
 def test_bounds_hold_whatever_the_threads(mdp, threads):
     solution = value_iteration(mdp, threads=threads)
     assert naive_exact.largest_error(solution.v, naive_exact.extreme_values(mdp)) <= solution.error_bound <= 1e-6
+
+
+@pytest.mark.long
+@settings(max_examples=100, deadline=None)
+@given(small_mdps(), st.sampled_from((1.0, -3e4, 1e-12, 0.1)), st.booleans())
+def test_bounds_of_values_of_32_bits_count_what_is_lost(mdp, scale, is_kept):
+    mdp = mdp.with_rewards(mdp.rewards * scale)
+    tolerance = 4e-7 * abs(scale) / (1 - mdp.gamma) ** 2 + 1e-40
+    with tempfile.TemporaryDirectory() as folder:
+        path = os.path.join(folder, "values.npy") if is_kept else None
+        solution = value_iteration(mdp, tolerance, values=path, dtype="float32")
+        assert solution.x.dtype == np.float32
+        truth = naive_exact.extreme_values(mdp)
+        assert naive_exact.largest_error(solution.v, truth) <= solution.error_bound <= tolerance
+        del solution
+
+
+@pytest.mark.long
+def test_values_of_32_bits_take_half_of_the_file_and_refuse_what_they_cannot_reach(tmp_path):
+    mdp, path = ring(), tmp_path / "values.npy"
+    double = value_iteration(mdp)
+    single = value_iteration(mdp, 1e-3, values=path, dtype="float32")
+    assert np.abs(single.v - double.v).max() <= single.error_bound + double.error_bound
+    assert path.stat().st_size - 128 == single.x.nbytes == double.x.nbytes // 2 and single.q.dtype == np.float64
+    del single
+    with pytest.raises(PrecisionError, match=r"32-bit floats reach a bound of .*use float64"):
+        value_iteration(mdp, 1e-9, dtype="float32")
+    with pytest.raises(FileFormatError, match="holds float32 of shape"):
+        value_iteration(mdp, values=path)
+
+
+def test_values_of_32_bits_are_for_one_process_and_no_horizon():
+    mdp = ring()
+    for wrong in ({"horizon": 3}, {"processes": 2}, {"jacobi": True}):
+        with pytest.raises(ParameterError, match="one process and no horizon"):
+            value_iteration(mdp, dtype="float32", **wrong)
+    with pytest.raises(ParameterError, match="expected 'float64' or 'float32'"):
+        value_iteration(mdp, dtype="float16")

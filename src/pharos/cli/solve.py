@@ -59,6 +59,10 @@ def solve(
     threads: Annotated[
         int, typer.Option("--threads", min=1, help="Of a sweep; beyond one, last digits may differ, within the error.")
     ] = 1,
+    dtype: Annotated[
+        str,
+        typer.Option("--dtype", help="Of values: float64; or float32, half the memory, and a bound that counts it."),
+    ] = "float64",
     memory: Memory = None,
     workers: Workers = None,
     processes: Processes = "1",
@@ -80,13 +84,14 @@ def solve(
     from pharos.solvers import uniform_value, value_iteration
 
     checkpoint = (values or paths.cache_directory() / "values") if ranks != 1 else None
-    sharing: dict[str, Any] = {"processes": ranks, "jacobi": jacobi, "checkpoint": checkpoint}
+    sharing: dict[str, Any] = {"processes": ranks, "jacobi": jacobi, "checkpoint": checkpoint, "dtype": dtype}
+    suffix = ".npy" if dtype == "float64" else f"-{dtype}.npy"
     with progress_line("solving") as report:
         solution = value_iteration(
             mdp,
             tolerance,
             progress=lambda sweeps, bound: report(f"sweep {sweeps}, error at most {bound:.2g}"),
-            values=None if values is None or ranks != 1 else values / "optimal.npy",
+            values=None if values is None or ranks != 1 else values / f"optimal{suffix}",
             threads=threads,
             **sharing,
         )
@@ -95,7 +100,7 @@ def solve(
             mdp,
             tolerance,
             progress=lambda sweeps, bound: report(f"uniform policy, sweep {sweeps}, error at most {bound:.2g}"),
-            values=None if values is None or ranks != 1 else values / "uniform.npy",
+            values=None if values is None or ranks != 1 else values / f"uniform{suffix}",
             threads=threads,
             **sharing,
         )
@@ -116,6 +121,7 @@ def solve(
         "random": random,
         "lazy": lazy,
         "tolerance": tolerance,
+        "dtype": dtype,
         "uniform_error_bound": uniform.error_bound,
         "uniform_seconds": uniform.seconds,
         "processes": ranks,

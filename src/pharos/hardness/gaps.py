@@ -254,6 +254,9 @@ def optimal_solution(mdp: TabularMDP, solution: Solution | None) -> Solution:
         raise ParameterError(
             f"solution is of kind {solution.kind!r} for {solution.mdp}; expected the optimal one of {mdp}"
         )
+    if solution.x.dtype != np.float64:
+        x = solution.x.astype(np.float64)  # the same numbers, whose bound holds
+        return replace(solution, x=x, next_x=x)
     return solution
 
 

@@ -14,6 +14,10 @@ be a guess. Nor of the order: threads may share the states, as long as each stat
 largest sum of probabilities, which is 1 up to the rounding of what was given.
 
 Values that follow from x are as accurate: q = r + gamma E x has an error of at most rho D + e <= D.
+
+Values of 32 bits. Backups are computed in 64 bits, and what is stored is the nearest float of 32: with |v| the largest
+backup it is off by at most s = 2^-24 |v| + 2^-150. That is one more rounding of a new entry, so e becomes e + s; and d,
+which sweeps tell of the backups before they are stored, becomes d + s: D <= (rho (d + s) + e + s) / (1 - rho).
 """
 
 import math
@@ -31,6 +35,8 @@ from pharos.solvers.policy_iteration import PolicyIteration
 _UNIT = 2.0**-53
 # Sweeps that gain nothing, after values of the best policy were found, until it is clear that rounding stops them.
 SETTLING = 64
+# Half a unit in the last place of 32 bits, for numbers from 1 to 2, and for the smallest ones.
+_UNIT32, _LEAST32 = 2.0**-24, 2.0**-150
 # Entries of x that are looked at in one go.
 _BLOCK = 1 << 20
 # Rounding of the computation of a bound itself, and products of rounding errors.
@@ -41,7 +47,7 @@ class FixedPoint(NamedTuple):
     """The fixed point of a backup.
 
     Attributes:
-        x: (S + 1, W) float64: V(s, b), row S the end; W previous actions under sticky actions, else 1.
+        x: (S + 1, W) float64 or float32: V(s, b), row S the end; W previous actions under sticky actions, else 1.
         bound: every entry is within this of the true one.
         sweeps: what it took.
     """
@@ -52,10 +58,17 @@ class FixedPoint(NamedTuple):
 
 
 class Backup:
-    """The backup T of an MDP and of what is chosen in its states."""
+    """The backup T of an MDP and of what is chosen in its states.
 
-    def __init__(self, mdp: TabularMDP | Part, select: Selection, threads: int = 1):
+    Attributes:
+        dtype: that values are stored in; backups are computed in 64 bits.
+        is_single: whether that is float32.
+    """
+
+    def __init__(self, mdp: TabularMDP | Part, select: Selection, threads: int = 1, dtype: Any = np.float64):
         chance = mdp.chance
+        self.dtype = np.dtype(dtype)
+        self.is_single = self.dtype == np.float32
         self.mdp: Any = mdp
         self.select, self.threads = select, threads
         self.equation = BellmanEquation(mdp.reward_table, mdp.gamma, chance, select)
@@ -71,7 +84,7 @@ class Backup:
 
     def zeros(self) -> np.ndarray:
         """(S + 1, W); mapped from a file where memory has little room for it."""
-        return large_zeros((self.mdp.num_states + 1, self.mdp.width), np.float64)
+        return large_zeros((self.mdp.num_states + 1, self.mdp.width), self.dtype)
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
         """T x, not in place."""
@@ -86,8 +99,14 @@ class Backup:
             return self.mdp.dynamics.sweep(self.equation, x, self.threads)
 
     def rounding(self, largest: float) -> float:
-        """A bound on the rounding error of one backup of entries up to `largest`: half a unit for each operation."""
-        return self.operations * (_UNIT * (self.largest_reward + largest) + 2.0**-1074)
+        """A bound on the rounding error of one backup of entries up to `largest`: half a unit for each operation, and
+        what storing it costs.
+        """
+        return self.operations * (_UNIT * (self.largest_reward + largest) + 2.0**-1074) + self.stored(largest)
+
+    def stored(self, largest: float) -> float:
+        """A bound on the error of storing a backup, where the result is at most `largest`: 0 in 64 bits."""
+        return _UNIT32 * (1 + 4 * _UNIT32) * largest + 2 * _LEAST32 if self.is_single else 0.0
 
     def bound(self, change: float, rounding: float) -> float:
         """The largest error of values that a sweep has changed by at most `change`: (rho d + e) / (1 - rho)."""
@@ -101,22 +120,26 @@ def fixed_point(
     progress: Callable[[int, float], None] | None = None,
     x: np.ndarray | None = None,
     threads: int = 1,
+    dtype: Any = np.float64,
 ) -> FixedPoint:
     """Sweep until the proven bound is at most the tolerance.
 
     Args:
-        x: (S + 1, W) float64, where to sweep, from any finite values; None: from zeros.
+        x: (S + 1, W) of `dtype`, where to sweep, from any finite values; None: from zeros.
         threads: of a sweep.
+        dtype: float64; or float32, values that are swept and nothing else.
 
     Raises:
         DivergenceError: gamma is 1, and a state can be visited again, so that the value may be infinite.
-        PrecisionError: 64-bit floats cannot reach the tolerance.
+        PrecisionError: floats cannot reach the tolerance.
     """
-    backup = Backup(mdp, select, threads)
+    backup = Backup(mdp, select, threads, dtype)
     if mdp.gamma == 1.0 or mdp.age is not None:
         return _in_one_pass(backup, tolerance, progress, x)
     rho = backup.factor
     check_tolerance(mdp, backup, tolerance)
+    if backup.is_single:
+        return _in_single(backup, tolerance, progress, backup.zeros() if x is None else x)
     x, sweeps = backup.zeros() if x is None else x, 0
     components, better, least, since = ComponentSolver(mdp, select), PolicyIteration(mdp, select), math.inf, 0
     largest = largest_of(x)
@@ -142,6 +165,27 @@ def fixed_point(
         elif better.is_worth_it(sweeps, change, tolerance):
             better.improve(x, tolerance)
             largest = largest_of(x)
+
+
+def _in_single(
+    backup: Backup, tolerance: float, progress: Callable[[int, float], None] | None, x: np.ndarray
+) -> FixedPoint:
+    """The same for values of 32 bits, by sweeps alone."""
+    mdp, rho, sweeps, least, since = backup.mdp, backup.factor, 0, math.inf, 0
+    patience = SETTLING + math.ceil(1 / (1 - rho))  # sweeps that gain a factor of 2.7, but for rounding
+    while True:
+        change = backup.sweep(x) * (1 + 4 * _UNIT32)  # which some dynamics compute in 32 bits
+        sweeps += 1
+        size = (largest_of(x) + change) * (1 + 4 * _UNIT32) + 4 * _LEAST32  # of old entries, and of backups
+        bound = backup.bound(change + backup.stored(size), backup.rounding(size))
+        if progress is not None:
+            progress(sweeps, bound)
+        if bound <= tolerance:
+            return FixedPoint(x, bound, sweeps)
+        if bound < 0.9 * least:
+            least, since = bound, sweeps
+        if change == 0.0 or sweeps - since > patience or not math.isfinite(bound):
+            raise imprecise(mdp, min(least, bound), tolerance, is_single=True)
 
 
 def backward_induction(
@@ -212,11 +256,12 @@ def _in_one_pass(
     with np.errstate(over="ignore", invalid="ignore"):
         mdp.dynamics.sweep_once(backup.equation, x, order)
         series = min(backups, 1 / (1 - rho)) if rho < 1 else backups * np.float64(rho) ** order.longest
-        bound = float(backup.rounding(largest_of(x)) * series * MARGIN)
+        largest = largest_of(x) * (1 + 4 * _UNIT32 if backup.is_single else 1)  # of backups
+        bound = float(backup.rounding(largest) * series * MARGIN)
     if progress is not None:
         progress(1, bound)
     if not bound <= tolerance:
-        raise imprecise(mdp, bound, tolerance)
+        raise imprecise(mdp, bound, tolerance, backup.is_single)
     return FixedPoint(x, bound, 1)
 
 
@@ -240,16 +285,18 @@ def check_tolerance(mdp: TabularMDP, backup: Backup, tolerance: float) -> None:
     """Raise PrecisionError where rounding errors alone are beyond the tolerance."""
     least = backup.rounding(0.0) / (1 - backup.factor) if backup.factor < 1 else math.inf
     if not least <= tolerance:
-        raise imprecise(mdp, least, tolerance)
+        raise imprecise(mdp, least, tolerance, backup.is_single)
 
 
-def imprecise(mdp: TabularMDP, bound: float, tolerance: float) -> PrecisionError:
+def imprecise(mdp: TabularMDP, bound: float, tolerance: float, is_single: bool = False) -> PrecisionError:
+    """The error where floats of 64 bits, or of 32 where values are stored in these, do not reach the tolerance."""
+    bits, end, advice = (32, "3.4e38", "use float64, ") if is_single else (64, "1.8e308", "")
     if not math.isfinite(bound):
         return PrecisionError(
-            f"{mdp}: 64-bit floats give no bound at gamma = {mdp.gamma!r}: values pass 1.8e308, or probabilities sum "
+            f"{mdp}: {bits}-bit floats give no bound at gamma = {mdp.gamma!r}: values pass {end}, or probabilities sum "
             "to 1 / gamma or more; lower gamma or the rewards"
         )
     return PrecisionError(
-        f"{mdp}: 64-bit floats reach a bound of {bound:.2g} at gamma = {mdp.gamma!r}; asked for {tolerance:.2g}: "
-        f"raise the tolerance or lower gamma"
+        f"{mdp}: {bits}-bit floats reach a bound of {bound:.2g} at gamma = {mdp.gamma!r}; asked for {tolerance:.2g}: "
+        f"{advice}raise the tolerance or lower gamma"
     )

@@ -22,8 +22,8 @@ class Solution:
         sweeps, seconds: what it took; compiling is not among the seconds.
         horizon: of the values: those of the first step, with all steps to go; or None.
         select: what is chosen: the best action, the worst one, or what a policy says.
-        x: (S + 1, W) float64, values of (state, previously executed action), W = A under sticky actions, else 1; row S,
-            the end, is 0.
+        x: (S + 1, W) float64, or float32 where it was asked for: values of (state, previously executed action), W = A
+            under sticky actions, else 1; row S, the end, is 0.
         next_x: the values of next states: x, or with a horizon those with one step less to go.
         all_steps: with a horizon, where they were kept: (T + 1, S), or (T + 1, S, A), row t with t steps to go.
     Under sticky actions values belong to pairs: `v` is (S, A), the value of (state, previously executed action), and
@@ -64,7 +64,7 @@ class Solution:
 
     def q_of(self, states: Any) -> np.ndarray:
         """(N, A), the values of executing each action in some states (indices or a slice)."""
-        following = self.mdp.dynamics.expected(self.next_x, states)
+        following = self.mdp.dynamics.expected(self.next_x, states).astype(np.float64, copy=False)
         return self.mdp.reward_table.rows(states) + self.mdp.gamma * following
 
     @cached_property

@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -28,6 +29,7 @@ def value_iteration(
     jacobi: bool = False,
     checkpoint: str | os.PathLike | None = None,
     threads: int = 1,
+    dtype: Any = "float64",
 ) -> Solution:
     """The optimal values of an MDP.
 
@@ -45,6 +47,8 @@ def value_iteration(
             where that has little room a file without a name.
         jacobi: sweeps that are not in place, many times as many: their values are the same to the last bit whatever the
             number of processes. Those of a horizon are so anyway.
+        dtype: "float32" stores values in half of the memory; the bound counts what that costs, so that a tolerance
+            below 1.2e-7 max |V| / (1 - gamma) is out of reach. For one process, and no horizon.
 
         Cost only:
         processes: of this machine, each of which sweeps a range of the states; or "mpi": those that `mpiexec` has
@@ -69,7 +73,7 @@ def value_iteration(
     Source: Bellman (1957); in place: Puterman (1994), section 6.3.3; the sticky equation: the pharos paper, appendix A.
     """
     sharing = Sharing(processes, jacobi, checkpoint)
-    return solution_of(mdp, BEST, tolerance, horizon, keep_all, progress, values, sharing, threads)
+    return solution_of(mdp, BEST, tolerance, horizon, keep_all, progress, values, sharing, threads, dtype)
 
 
 @takes_mdp
@@ -98,6 +102,7 @@ def uniform_value(
     jacobi: bool = False,
     checkpoint: str | os.PathLike | None = None,
     threads: int = 1,
+    dtype: Any = "float64",
 ) -> Solution:
     """The values of the uniformly random policy: every action is replaced by a uniform one, so nothing is chosen.
 
@@ -105,9 +110,8 @@ def uniform_value(
     """
     sharing = Sharing(processes, jacobi, checkpoint)
     mdp = random_actions(mdp, 1.0)
-    return solution_of(
-        mdp, BEST, tolerance, horizon, progress=progress, values=values, sharing=sharing, threads=threads
-    )
+    storage: dict[str, Any] = {"values": values, "threads": threads, "dtype": dtype}
+    return solution_of(mdp, BEST, tolerance, horizon, progress=progress, sharing=sharing, **storage)
 
 
 def solution_of(
@@ -120,10 +124,13 @@ def solution_of(
     values: str | os.PathLike | None = None,
     sharing: Sharing | None = None,
     threads: int = 1,
+    dtype: Any = "float64",
 ) -> Solution:
     """The values of what is chosen: a fixed point, or those of backward induction where there is a horizon."""
     check_tolerance(tolerance)
-    horizon = checked_horizon(mdp, horizon)
+    horizon, dtype = checked_horizon(mdp, horizon), checked_dtype(dtype)
+    if dtype == np.float32 and (horizon is not None or (sharing is not None and sharing.is_wanted)):
+        raise ParameterError("dtype='float32' is for one process and no horizon; expected 'float64' here")
     if sharing is not None and sharing.is_wanted:
         if keep_all:
             raise ParameterError("keep_all: several processes keep the last step alone; expected processes=1")
@@ -133,8 +140,8 @@ def solution_of(
     watch = Stopwatch()
     steps = None
     if horizon is None:
-        x = None if values is None else kept_values(values, (mdp.num_states + 1, mdp.width))
-        result = fixed_point(mdp, select, tolerance, progress, x, usable_workers(threads))
+        x = None if values is None else kept_values(values, (mdp.num_states + 1, mdp.width), dtype)
+        result = fixed_point(mdp, select, tolerance, progress, x, usable_workers(threads), dtype)
         following = result.x
     elif values is not None:
         raise ParameterError(f"values={str(values)!r}: a file keeps values without a horizon; found {horizon} steps")
@@ -149,6 +156,17 @@ def check_tolerance(tolerance: float) -> None:
     """ParameterError where a tolerance is not a positive number."""
     if not (isinstance(tolerance, int | float | np.floating) and np.isfinite(tolerance) and tolerance > 0):
         raise ParameterError(f"tolerance is {tolerance!r}; expected a positive number, in units of return")
+
+
+def checked_dtype(dtype: Any) -> np.dtype:
+    """float64 or float32."""
+    try:
+        found = np.dtype(dtype)
+    except TypeError:
+        found = np.dtype(object)
+    if found not in (np.float64, np.float32):
+        raise ParameterError(f"dtype is {dtype!r}; expected 'float64' or 'float32'")
+    return found
 
 
 def checked_horizon(mdp: TabularMDP, horizon: int | None) -> int | None:
