@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from pharos.mdp.outcome_table import OutcomeTable
     from pharos.mdp.part import Part
     from pharos.mdp.rewards import Rewards
-    from pharos.mdp.selection import BEST, WORST, Extreme, PolicyTable, Selection, chosen_mass
+    from pharos.mdp.selection import BEST, WORST, Extreme, PolicyTable, Selection, chosen_mass, mass_of
     from pharos.mdp.space_rewards import ranged_rewards, rewards_of_outcomes, rewards_of_space, rewards_of_staying
     from pharos.mdp.table import Table
     from pharos.mdp.tabular import TabularMDP
@@ -42,6 +42,7 @@ _FILES = {
     "Table": "table",
     "TabularMDP": "tabular",
     "chosen_mass": "selection",
+    "mass_of": "selection",
     "lazy_actions": "chance",
     "minimize": "bisimulation",
     "random_actions": "chance",
@@ -75,6 +76,7 @@ __all__ = [
     "TabularMDP",
     "chosen_mass",
     "lazy_actions",
+    "mass_of",
     "minimize",
     "random_actions",
     "ranged_rewards",

@@ -138,7 +138,7 @@ class PolicyTable:
         if self.actions is not None:
             return 1.0
         largest = float(self.probabilities.sum(axis=2).max(initial=0.0))
-        return max(1.0, largest * (1 + self.num_actions * 2.0**-53))
+        return mass_of(largest, self.num_actions)
 
     def operations(self, num_actions: int) -> int:
         return num_actions + 1
@@ -161,6 +161,11 @@ class PolicyTable:
 
     def policy(self, q: np.ndarray) -> "PolicyTable":
         return self
+
+
+def mass_of(largest: float, num_actions: int) -> float:
+    """A bound on the sums of probabilities of choosing, from the largest one as floats add it up; at least 1."""
+    return max(1.0, largest * (1 + num_actions * 2.0**-53))
 
 
 def chosen_mass(policy: np.ndarray, mass: np.ndarray) -> np.ndarray:

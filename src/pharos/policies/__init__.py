@@ -1,6 +1,7 @@
 """Policies: tables, and functions of observations; asked in the states that they reach, and evaluated."""
 
 from pharos.policies.asking import Answers, PolicyAnswers, Sight, TableAnswers
+from pharos.policies.copies import is_small_table, table_values
 from pharos.policies.evaluation import (
     Evaluation,
     ReachedSolution,
@@ -26,7 +27,9 @@ __all__ = [
     "evaluate_observing",
     "evaluate_policy",
     "evaluate_seeing",
+    "is_small_table",
     "is_walk",
     "policy_function",
+    "table_values",
     "walk_values",
 ]

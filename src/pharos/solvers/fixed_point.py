@@ -72,15 +72,19 @@ class Backup:
         self.mdp: Any = mdp
         self.select, self.threads = select, threads
         self.equation = BellmanEquation(mdp.reward_table, mdp.gamma, chance, select)
-        executed = chance.chosen * select.mass + chance.previous + chance.uniform
-        is_exact = select.mass == 1.0 and mdp.dynamics.mass == 1.0 and not chance.is_sticky and not chance.is_random
-        mass = 1.0 if is_exact else max(1.0, executed * mdp.dynamics.mass) * (1 + 8 * _UNIT)
-        self.factor = mdp.gamma * mass
+        self.factor = self.factor_of(select.mass)
         # q: a product and a sum, each of two half units; with chance of choosing the mean over actions, too, and a
         # product and a sum for each of three weights, and their rounding
         chosen = 4 if chance.is_none else mdp.num_actions + 12
         self.operations = chosen + select.operations(mdp.num_actions) + mdp.dynamics.operations
         self.largest_reward = max(abs(mdp.reward_table.lowest), abs(mdp.reward_table.highest))
+
+    def factor_of(self, mass: float) -> float:
+        """Of the contraction, where probabilities of choosing sum to at most `mass`."""
+        chance, dynamics = self.mdp.chance, self.mdp.dynamics
+        executed = chance.chosen * mass + chance.previous + chance.uniform
+        is_exact = mass == 1.0 and dynamics.mass == 1.0 and not chance.is_sticky and not chance.is_random
+        return self.mdp.gamma * (1.0 if is_exact else max(1.0, executed * dynamics.mass) * (1 + 8 * _UNIT))
 
     def zeros(self) -> np.ndarray:
         """(S + 1, W); mapped from a file where memory has little room for it."""
@@ -102,7 +106,11 @@ class Backup:
         """A bound on the rounding error of one backup of entries up to `largest`: half a unit for each operation, and
         what storing it costs.
         """
-        return self.operations * (_UNIT * (self.largest_reward + largest) + 2.0**-1074) + self.stored(largest)
+        return float(self.rounding_of(self.largest_reward, largest)) + self.stored(largest)
+
+    def rounding_of(self, rewards: Any, largest: Any) -> Any:
+        """The same for rewards up to `rewards`, in 64 bits."""
+        return self.operations * (_UNIT * (rewards + largest) + 2.0**-1074)
 
     def stored(self, largest: float) -> float:
         """A bound on the error of storing a backup, where the result is at most `largest`: 0 in 64 bits."""

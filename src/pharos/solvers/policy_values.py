@@ -7,8 +7,8 @@ import numpy as np
 
 from pharos.compiling import Stopwatch
 from pharos.errors import DivergenceError
-from pharos.mdp import PolicyTable, TabularMDP, takes_mdp
-from pharos.solvers.fixed_point import chain_bound
+from pharos.mdp import PolicyTable, TabularMDP, mass_of, takes_mdp
+from pharos.solvers.fixed_point import MARGIN, Backup, chain_bound
 from pharos.solvers.policy_iteration import chain, chain_values
 from pharos.solvers.sharing import Sharing
 from pharos.solvers.solution import Solution
@@ -57,6 +57,42 @@ def evaluate_policy(
     if select.actions is not None and mdp.is_deterministic and horizon is None and not sharing.is_wanted:
         return _on_its_graph(mdp, select, watch)
     return solution_of(mdp, select, tolerance, horizon, sharing=sharing)
+
+
+def evaluate_apart(
+    mdp: TabularMDP, policy: np.ndarray, part: np.ndarray, start_probabilities: np.ndarray
+) -> list[tuple[float, float]]:
+    """(value at the start, its error bound) of each part of an MDP with a horizon, to the bits that it has alone.
+
+    Args:
+        mdp: of parts that never meet, such as copies of one MDP.
+        policy: as `evaluate_policy` takes probabilities.
+        part: (S,) the part of each state, 0 to P - 1; each has states, and as many starts.
+        start_probabilities: (N,) of the starts of each part.
+    Cost: one backward induction of all of them, instead of P.
+    """
+    select = PolicyTable.of(mdp, policy)
+    backup = Backup(mdp, select)
+    order = np.argsort(part, kind="stable")
+    begins = np.searchsorted(part[order], np.arange(part.max() + 1))
+
+    def largest(entries: np.ndarray) -> np.ndarray:
+        """(P,) of the entries (S, ...) of its states."""
+        of_states: np.ndarray = entries.reshape(len(part), -1).max(axis=1)
+        return np.maximum.reduceat(of_states[order], begins)
+
+    rewards, sums = largest(np.abs(mdp.reward_table.array)), largest(select.probabilities.sum(axis=2))
+    factors = np.array([backup.factor_of(mass_of(each, mdp.num_actions)) for each in sums.tolist()])
+    x = before = backup.zeros()
+    bounds, sizes = np.zeros(len(begins)), np.zeros(len(begins))
+    for _ in range(checked_horizon(mdp, None) or 0):
+        before, x = x, backup(x)
+        bounds = factors * bounds + backup.rounding_of(rewards, sizes)
+        sizes = largest(np.abs(x[:-1]))
+    starts = mdp.start_states[np.argsort(part[mdp.start_states], kind="stable")].reshape(len(begins), -1)
+    solution = Solution(mdp, 0.0, 0, 0.0, mdp.horizon, select, x, before)
+    values = [solution.value_from(states, start_probabilities) for states in starts]
+    return list(zip(values, (bounds * MARGIN).tolist(), strict=True))
 
 
 @takes_mdp

@@ -92,7 +92,10 @@ class Solution:
     @property
     def value_at_start(self) -> float:
         """The expected value of an episode's first state."""
-        starts, probabilities = self.mdp.start_states, self.mdp.start_probabilities
+        return self.value_from(self.mdp.start_states, self.mdp.start_probabilities)
+
+    def value_from(self, starts: np.ndarray, probabilities: np.ndarray) -> float:
+        """The expected value of an episode's first state, drawn from other states or probabilities (N,)."""
         if not self.mdp.is_sticky:
             return float(probabilities @ self.v[starts])
         q = self.q_of(starts)
