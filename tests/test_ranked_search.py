@@ -1,43 +1,18 @@
 """Distances by several processes: those of one search, whatever the number."""
 
-import contextlib
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import pharos
-from pharos import ranks
 from pharos.errors import ParameterError
 from pharos.hardness import ranked_search, start_eccentricity
 from pharos.hardness.ranked_search import FAR, ranked_distances
 from pharos.hardness.transition_graph import Graph
 from pharos.mdp import TabularMDP, sticky_actions
+from rank_threads import threads
 from strategies import deterministic_mdps
-
-
-@contextlib.contextmanager
-def threads():
-    """Ranks are threads of this process."""
-
-    def together(size, program, capacity):
-        def run(rank):
-            exchange = rank.exchange
-
-            def bounded(parts):
-                assert sum(-(-part.nbytes // 64) * 64 for part in parts) + 64 + 16 * size <= capacity
-                return exchange(parts)
-
-            rank.exchange = bounded
-            return program(rank)
-
-        with ranks.loop(size, run) as rank:
-            return run(rank)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(ranked_search, "together", together)
-        yield
 
 
 def ring(num_states=60):
@@ -70,7 +45,7 @@ def test_distances_do_not_depend_on_ranks(mdp, size, restart, backward, data):
         return
     source = data.draw(st.integers(0, graph.num_nodes - 1))
     expected, count, largest = searched(graph, source, backward)
-    with threads():
+    with threads(ranked_search):
         found = ranked_distances(graph, source, size, backward=backward)
     assert (found.distances == expected).all()
     assert (found.reached, found.largest) == (count, largest)

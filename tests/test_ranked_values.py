@@ -16,7 +16,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import pharos
-from pharos import ranks
 from pharos.errors import ParameterError, PrecisionError
 from pharos.mdp import BEST, WORST, Matrices, PolicyTable, TabularMDP
 from pharos.ranks import RankFailed
@@ -24,6 +23,7 @@ from pharos.solvers import checkpoint as checkpoints
 from pharos.solvers import evaluate_policy, ranked, sharing, uniform_value, value_iteration
 from pharos.solvers.fixed_point import Backup
 from pharos.solvers.sharing import Sharing, shared_solution
+from rank_threads import Killed, fails_at, threads
 from strategies import hard_mdps, lazy_mdps, small_mdps
 
 MPIEXEC = shutil.which("mpiexec", path=Path(sys.executable).parent)
@@ -40,51 +40,9 @@ def chain(num_states=300, gamma=0.9):
     return TabularMDP.from_arrays(following, rewards, gamma=gamma)
 
 
-@contextlib.contextmanager
-def threads(disturb=lambda rank: None):
-    """Ranks are threads of this process."""
-
-    def together(size, program, capacity):
-        def run(rank):
-            exchange = rank.exchange
-
-            def bounded(parts):
-                assert sum(-(-part.nbytes // 64) * 64 for part in parts) + 64 + 16 * size <= capacity
-                return exchange(parts)
-
-            rank.exchange = bounded
-            disturb(rank)
-            return program(rank)
-
-        with ranks.loop(size, run) as rank:
-            return run(rank)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sharing, "together", together)
-        yield
-
-
 def solved(mdp, size, *, select=BEST, tolerance=1e-6, horizon=None, disturb=lambda rank: None, **options):
-    with threads(disturb):
+    with threads(sharing, disturb):
         return shared_solution(mdp, select, tolerance, horizon, Sharing(size, **options))
-
-
-class Killed(Exception):
-    """In place of a kill."""
-
-
-def fails_at(who, number):
-    def disturb(rank):
-        exchange, calls = rank.exchange, iter(range(10**9))
-
-        def disturbed(parts):
-            if rank.rank == who and next(calls) == number:
-                raise Killed(f"at exchange {number}")
-            return exchange(parts)
-
-        rank.exchange = disturbed
-
-    return disturb
 
 
 # The same values ------------------------------------------------------------------------------------------------------
@@ -148,7 +106,7 @@ def test_evaluation_and_the_uniform_policy_are_shared(monkeypatch):
     mdp, policy = chain(), np.arange(300) % 2
     for function in (lambda **more: evaluate_policy(mdp, policy, **more), lambda **more: uniform_value(mdp, **more)):
         alone = function()
-        with threads():
+        with threads(sharing):
             shared = function(processes=3)
         assert np.abs(shared.v - alone.v).max() <= alone.error_bound + shared.error_bound
 
@@ -229,7 +187,7 @@ def test_a_checkpoint_is_of_one_question(tmp_path, monkeypatch):
     paid = np.ones((300, 2)) * (np.arange(300) < 299)[:, None]
     for mdp in (chain(), chain(gamma=0.8), chain().with_rewards(paid)):
         done = []
-        with threads():
+        with threads(sharing):
             report = lambda sweeps, _, done=done: done.append(sweeps)  # noqa: E731
             value_iteration(mdp, processes=3, checkpoint=tmp_path, progress=report)
         first.append(done[0])

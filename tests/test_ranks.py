@@ -26,6 +26,7 @@ from pharos.state_space.files import lock
 from pharos.state_space.plan import Plan
 from pharos.state_space.progress import reporter
 from pharos.state_space.search import Options, journal_of
+from rank_threads import Killed, fails_at
 from test_resuming import build, files_of
 
 WORLDS = {
@@ -62,26 +63,6 @@ def build_by_threads(env, folder, size, *, wide=0, rows=64, disturb=lambda rank:
             ranked_search.RankedSearch(plan, journal_of(folder, plan), options, report, rank, wide).run(manifest)
             ranked_table.end(rank)
     return folder
-
-
-class Killed(Exception):
-    """In place of a kill."""
-
-
-def fails_at(who, number):
-    """One rank fails at one of its exchanges."""
-
-    def disturb(rank):
-        exchange, calls = rank.exchange, iter(range(10**9))
-
-        def disturbed(parts):
-            if rank.rank == who and next(calls) == number:
-                raise Killed(f"at exchange {number}")
-            return exchange(parts)
-
-        rank.exchange = disturbed
-
-    return disturb
 
 
 @pytest.mark.parametrize("world", ["breakout", pytest.param("chance", marks=pytest.mark.long)])
@@ -329,3 +310,20 @@ def test_ranks_of_mpi_write_the_same_files(tmp_path):
     assert finished.returncode == 0, finished.stderr
     assert finished.stdout.count("states/s") == 1
     assert files_of(tmp_path / "space") == expected("breakout")
+
+
+def test_each_rank_knows_which_of_its_rows_the_others_read():
+    cuts = ranks.cuts_of(20, 3)
+    assert cuts.tolist() == [0, 6, 13, 20]
+    rows = [np.array([6, 7, 19]), np.array([0, 13]), np.array([5])]  # outside of each range
+    halos = {}
+
+    def make(rank):
+        halos[rank.rank] = ranks.Halo(rank, rows[rank.rank], cuts)
+
+    with ranks.loop(3, make) as rank:
+        make(rank)
+    for reader, owner in np.ndindex(3, 3):
+        read = rows[reader][halos[reader].of_rank[owner]]
+        assert ((cuts[owner] <= read) & (read < cuts[owner + 1])).all()
+        assert (halos[owner].wanted[reader] + cuts[owner]).tolist() == read.tolist()

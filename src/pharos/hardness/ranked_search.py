@@ -13,7 +13,7 @@ from pharos.hardness.interval import Interval, Spending, interval_of_search
 from pharos.hardness.transition_graph import Graph
 from pharos.kernels import distance_sweeps
 from pharos.mdp import split
-from pharos.ranks import Rank, check_number, together
+from pharos.ranks import Halo, Rank, check_number, cuts_of, together
 
 # Untyped, as starred arguments of compiled functions are not checked.
 kernels: Any = distance_sweeps
@@ -38,13 +38,10 @@ class RankedGraph:
 
     def __init__(self, graph: Graph, rank: Rank):
         self.rank, self.num_nodes = rank, graph.num_nodes
-        self.cuts = np.array([graph.num_nodes * i // rank.size for i in range(rank.size + 1)])
-        self.start, self.stop = map(int, self.cuts[rank.rank : rank.rank + 2])
-        self._local, self._halo = split(_edges(graph, self.start, self.stop), self.start, self.stop)
-        borders = np.searchsorted(self._halo, self.cuts)
-        self._halo_of = [slice(borders[q], borders[q + 1]) for q in range(rank.size)]
-        rows = [self._halo[part] - self.cuts[q] for q, part in enumerate(self._halo_of)]
-        self._wanted = rank.exchange(rows)  # nodes of this rank that each has in its halo
+        cuts = cuts_of(graph.num_nodes, rank.size)
+        self.start, self.stop = map(int, cuts[rank.rank : rank.rank + 2])
+        self._local, halo = split(_edges(graph, self.start, self.stop), self.start, self.stop)
+        self._halo = Halo(rank, halo, cuts)
         self._never = np.zeros(len(self), np.bool_)
         self.distance = np.empty(len(self) + len(self._halo), np.int32)
 
@@ -54,7 +51,7 @@ class RankedGraph:
     def search(self, source: int, backward: bool) -> tuple[int, int]:
         """Distances from a node, or, backward, to it. Returns (nodes found, largest distance)."""
         self.distance[:] = FAR
-        numbers = np.concatenate([np.arange(self.start, self.stop), self._halo])
+        numbers = np.concatenate([np.arange(self.start, self.stop), self._halo.rows])
         self.distance[numbers == source] = 0
         kernel = kernels.lower_backward if backward else kernels.lower_forward
         lowered = 1
@@ -71,9 +68,8 @@ class RankedGraph:
     def _told(self) -> int:
         """Lower distances to what others have found; how many."""
         halo, lowered = self.distance[len(self) :], 0
-        for rows, distances in zip(
-            self._wanted, self.rank.exchange([halo[part] for part in self._halo_of]), strict=True
-        ):
+        received = self.rank.exchange([halo[part] for part in self._halo.of_rank])
+        for rows, distances in zip(self._halo.wanted, received, strict=True):
             lower = distances < self.distance[rows]
             self.distance[rows[lower]] = distances[lower]
             lowered += int(np.count_nonzero(lower))
@@ -81,7 +77,7 @@ class RankedGraph:
 
     def _ask(self) -> None:
         """Get the distances of the halo."""
-        received = self.rank.exchange([self.distance[rows] for rows in self._wanted])
+        received = self.rank.exchange([self.distance[rows] for rows in self._halo.wanted])
         self.distance[len(self) :] = np.concatenate(received)
 
     def gathered(self) -> np.ndarray | None:

@@ -19,7 +19,7 @@ import numpy as np
 
 from pharos.errors import ParameterError
 from pharos.mdp import Part, Selection, TabularMDP
-from pharos.ranks import Rank
+from pharos.ranks import Halo, Rank, cuts_of
 from pharos.solvers.checkpoint import Checkpoint
 from pharos.solvers.fixed_point import SETTLING, Backup, bound_of_steps, check_tolerance, imprecise, largest_of
 from pharos.workers import usable_workers
@@ -34,15 +34,10 @@ def capacity_of(mdp: TabularMDP, ranks: int) -> int:
     return ((mdp.num_states // ranks + 1) * mdp.width * 8 + 256) * ranks
 
 
-def cuts_of(num_states: int, ranks: int) -> np.ndarray:
-    """(P + 1,) where the ranges of ranks begin and end.
-
-    Raises:
-        ParameterError: there are more ranks than states.
-    """
+def check_ranks(num_states: int, ranks: int) -> None:
+    """Raise ParameterError where there are more ranks than states."""
     if ranks > max(num_states, 1):
         raise ParameterError(f"{ranks} processes for {num_states} states; expected at most one for each state")
-    return np.array([num_states * i // ranks for i in range(ranks + 1)])
 
 
 class RankedBackup:
@@ -54,6 +49,7 @@ class RankedBackup:
     """
 
     def __init__(self, mdp: TabularMDP, select: Selection, rank: Rank):
+        check_ranks(mdp.num_states, rank.size)
         self.mdp, self.rank = mdp, rank
         self.cuts = cuts_of(mdp.num_states, rank.size)
         self.part = Part.of(mdp, *map(int, self.cuts[rank.rank : rank.rank + 2]))
@@ -62,10 +58,7 @@ class RankedBackup:
         numbers = np.array([backup.factor, backup.operations, backup.largest_reward])
         factor, operations, largest = np.max(rank.gather_all(numbers), axis=0)
         backup.factor, backup.operations, backup.largest_reward = float(factor), int(operations), float(largest)
-        halo = self.part.halo
-        borders = np.searchsorted(halo, self.cuts)
-        rows = [halo[borders[q] : borders[q + 1]] - self.cuts[q] for q in range(rank.size)]
-        self._wanted = rank.exchange(rows)  # rows of this part that each rank has in its halo
+        self._halo = Halo(rank, self.part.halo, self.cuts)
         self.x = self.part.zeros()
 
     def sweep(self) -> float:
@@ -84,7 +77,7 @@ class RankedBackup:
     def share(self, *numbers: float) -> np.ndarray:
         """Get the values of the halo. Returns (P, K), the numbers of each rank."""
         width, own = self.x.shape[1], len(self.part)
-        messages = [np.concatenate([self.x[rows].reshape(-1), numbers]) for rows in self._wanted]
+        messages = [np.concatenate([self.x[rows].reshape(-1), numbers]) for rows in self._halo.wanted]
         received = self.rank.exchange(messages)
         count = len(numbers)
         self.x[own:-1] = np.concatenate([each[: len(each) - count] for each in received]).reshape(-1, width)

@@ -14,7 +14,7 @@ from pharos.mdp import Part, Selection, TabularMDP
 from pharos.ranks import Rank, check_number, together
 from pharos.solvers.checkpoint import SECONDS, Checkpoint
 from pharos.solvers.fixed_point import Backup
-from pharos.solvers.ranked import RankedBackup, capacity_of, cuts_of, ranked_fixed_point, ranked_induction
+from pharos.solvers.ranked import RankedBackup, capacity_of, check_ranks, ranked_fixed_point, ranked_induction
 from pharos.solvers.solution import Solution
 
 
@@ -55,7 +55,7 @@ def shared_solution(
     watch = Stopwatch()
     processes = sharing.processes
     if processes != "mpi":
-        cuts_of(mdp.num_states, int(processes))  # which refuses too many
+        check_ranks(mdp.num_states, int(processes))
     _warm(mdp, select, sharing.jacobi or horizon is not None)
     folder = None if sharing.checkpoint is None else Path(sharing.checkpoint)
     if folder is not None and folder.exists() and not folder.is_dir():
