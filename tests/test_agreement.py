@@ -1,23 +1,17 @@
 """The statistics of benchmarks/agreement.py, beside SciPy's and statsmodels' own."""
 
-import importlib.util
-from pathlib import Path
-
 import numpy as np
 import pandas as pd
 import pytest
 from statsmodels.stats.multitest import multipletests
 from statsmodels.stats.weightstats import CompareMeans, DescrStatsW
 
-FILE = Path(__file__).parent.parent / "benchmarks" / "agreement.py"
+from benchmark_modules import benchmark
 
 
 @pytest.fixture(scope="module")
 def agreement():
-    specification = importlib.util.spec_from_file_location("agreement", FILE)
-    module = importlib.util.module_from_spec(specification)
-    specification.loader.exec_module(module)
-    return module
+    return benchmark("agreement")
 
 
 def runs(values, instance):

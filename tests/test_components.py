@@ -6,7 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.sparse import csgraph, csr_matrix
 
-from pharos.mdp import Table, TabularMDP
+from benchmark_modules import benchmark
+from pharos.mdp import Table
 from pharos.solvers import components, value_iteration, worst_value
 from pharos.solvers.components import ComponentSolver
 from strategies import small_mdps
@@ -85,21 +86,11 @@ def test_values_by_components_and_by_sweeps_alone_are_within_both_bounds(mdp, ga
     assert (np.abs(together.v - alone.v) <= together.error_bound + alone.error_bound).all()
 
 
-def walk(length, gamma):
-    """Forward succeeds half of the time; states have random numbers."""
-    number = np.random.default_rng(0).permutation(length)
-    following = np.empty(length, np.int64)
-    following[number[:-1]], following[number[-1]] = number[1:], number[-1]
-    successors = np.stack([following, np.arange(length)], axis=1)[:, None]
-    rewards = np.full((length, 1), -0.01)
-    rewards[number[-1]] = 0.0
-    return TabularMDP.from_outcomes(successors, np.full(successors.shape, 0.5), rewards, gamma=gamma), number
-
-
 def test_a_chain_in_no_order_takes_its_states_once_each():
     """A state n steps before the end is worth -0.01 (1 - f^n) / (1 - gamma), f = 0.5 gamma / (1 - 0.5 gamma)."""
     gamma, length = 0.999, 2000
-    mdp, number = walk(length, gamma)
+    number = np.random.default_rng(0).permutation(length)
+    mdp = benchmark("components").chain(number, gamma)
     with pytest.MonkeyPatch.context() as patched:
         done = always(patched)
         solution = value_iteration(mdp, 1e-9)

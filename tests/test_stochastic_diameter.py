@@ -79,16 +79,21 @@ def test_the_interval_holds_the_value_for_every_budget(mdp, searches):
         assert "budget" in found.note
 
 
+def largest_times(mdp):
+    """(states that count, (S + 1, S + 1) largest expected time from s to e over previous actions; -inf elsewhere)."""
+    times, reached, state, _ = naive_hitting.hitting_times(mdp, True)
+    nodes = naive_hitting.nodes_that_count(mdp, reached, state)
+    largest = np.full((mdp.num_states + 1, mdp.num_states + 1), -math.inf)
+    for n in nodes:
+        largest[state[n]] = np.maximum(largest[state[n]], times[n])
+    return np.unique(state[nodes]), largest
+
+
 @settings(max_examples=30, deadline=None)
 @given(chancy_mdps())
 def test_bounds_from_a_hub_hold_for_every_target(mdp):
     mdp = random_actions(mdp, 0.25)
-    times, reached, state, _ = naive_hitting.hitting_times(mdp, True)
-    nodes = naive_hitting.nodes_that_count(mdp, reached, state)
-    states = np.unique(state[nodes])
-    largest = np.full((mdp.num_states + 1, mdp.num_states + 1), -math.inf)
-    for n in nodes:
-        largest[state[n]] = np.maximum(largest[state[n]], times[n])
+    states, largest = largest_times(mdp)
     if not np.isfinite(largest[np.ix_(states, states)]).all():
         return  # such an MDP is not bounded from hubs
     bounds = TravelBounds(mdp, True)
@@ -103,12 +108,7 @@ def test_bounds_from_a_hub_hold_for_every_target(mdp):
 @given(chancy_mdps(), st.sampled_from([0.05, 0.25]))
 def test_bounds_through_the_nodes_around_a_target_hold_and_never_grow(mdp, chance):
     mdp = random_actions(mdp, chance)
-    times, reached, state, _ = naive_hitting.hitting_times(mdp, True)
-    nodes = naive_hitting.nodes_that_count(mdp, reached, state)
-    states = np.unique(state[nodes])
-    largest = np.full((mdp.num_states + 1, mdp.num_states + 1), -math.inf)
-    for n in nodes:
-        largest[state[n]] = np.maximum(largest[state[n]], times[n])
+    states, largest = largest_times(mdp)
     if not np.isfinite(largest[np.ix_(states, states)]).all():
         return
     bounds = TravelBounds(mdp, True)

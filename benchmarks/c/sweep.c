@@ -4,8 +4,9 @@
  */
 #include <stdint.h>
 
-void sweep(const int32_t *next_states, const float *rewards, double gamma, const double *v, double *out,
-           int64_t start, int64_t stop, int64_t num_actions)
+static inline __attribute__((always_inline))
+void sweep_of(const int32_t *next_states, const float *rewards, double gamma, const double *v, double *out,
+              int64_t start, int64_t stop, int64_t num_actions)
 {
     for (int64_t s = start; s < stop; s++) {
         double best = -1e300;
@@ -17,18 +18,17 @@ void sweep(const int32_t *next_states, const float *rewards, double gamma, const
     }
 }
 
+void sweep(const int32_t *next_states, const float *rewards, double gamma, const double *v, double *out,
+           int64_t start, int64_t stop, int64_t num_actions)
+{
+    sweep_of(next_states, rewards, gamma, v, out, start, stop, num_actions);
+}
+
 /* The same where the compiler knows the number of actions, and that arrays do not overlap. */
 void sweep_unrolled(const int32_t *restrict next_states, const float *restrict rewards, double gamma,
                     const double *restrict v, double *restrict out, int64_t start, int64_t stop)
 {
-    for (int64_t s = start; s < stop; s++) {
-        double best = -1e300;
-        for (int a = 0; a < ACTIONS; a++) {
-            double q = rewards[s * ACTIONS + a] + gamma * v[next_states[s * ACTIONS + a]];
-            best = q > best ? q : best;
-        }
-        out[s] = best;
-    }
+    sweep_of(next_states, rewards, gamma, v, out, start, stop, ACTIONS);
 }
 
 /* Under sticky actions: values (S, ACTIONS) by the action executed before, which is repeated with probability p. */
