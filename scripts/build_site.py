@@ -28,6 +28,9 @@ GENERATED_LISTS = ("docs/decisions", "docs/tutorials")
 CONVERTED = (".ipynb",)
 FOREIGN_WORKER = "https://unpkg.com/iframe-worker/shim"  # what the theme would load instead of assets/search-worker.js
 LINK = re.compile(r"(\]\()([^)\s]+)(\))")
+LIST = re.compile(r"(?<=\n)(?![-#|\s])([^\n]*\n)(?=- )")  # a paragraph's last line, and a list that begins below it
+UNREAD = re.compile(r"\n\s*[-*] |[├└]")  # in a paragraph: a list or a drawing that was run together
+STRESSED = re.compile(r"<em>[(),']")  # the text between the stars of V* and Q*
 
 
 def stage() -> Path:
@@ -104,7 +107,12 @@ def relinked(text: str, source: Path, name: str) -> str:
         return f"{match[1]}{os.path.relpath(staged, Path(name).parent)}{hash}{anchor}{match[3]}"
 
     parts = re.split(r"(^```.*?^```$)", text, flags=re.MULTILINE | re.DOTALL)  # code stays as it is
-    return "".join(part if i % 2 else LINK.sub(target, part) for i, part in enumerate(parts))
+    return "".join(part if i % 2 else separated(LINK.sub(target, part)) for i, part in enumerate(parts))
+
+
+def separated(text: str) -> str:
+    """Text with an empty line above each list: GitHub needs none below a paragraph, Python-Markdown does."""
+    return LIST.sub(r"\1\n", f"\n{text}")[1:]
 
 
 def with_sections(nav: list, sections: dict[str, dict]) -> list:
@@ -126,17 +134,29 @@ def with_sections(nav: list, sections: dict[str, dict]) -> list:
 
 
 class _Page(html.parser.HTMLParser):
-    """Links, anchors and what the browser loads by itself."""
+    """Links, anchors, what the browser loads by itself, and paragraphs."""
 
     def __init__(self, text: str):
         super().__init__()
         self.links: list[str] = []
         self.loaded: list[str] = []
         self.anchors: set[str] = set()
+        self.paragraphs: list[str] = []
+        self.in_paragraph = False
         self.feed(text)
+
+    def handle_data(self, data):
+        if self.in_paragraph:
+            self.paragraphs[-1] += data
+
+    def handle_endtag(self, tag):
+        self.in_paragraph = self.in_paragraph and tag != "p"
 
     def handle_starttag(self, tag, attributes):
         given = dict(attributes)
+        if tag in ("p", "div", "pre", "ul", "ol", "table"):  # which end a paragraph
+            self.in_paragraph = tag == "p"
+            self.paragraphs += [""] * self.in_paragraph
         self.anchors |= {given[name] for name in ("id", "name") if given.get(name)}
         if tag == "a" and given.get("href"):
             self.links.append(given["href"])
@@ -147,12 +167,15 @@ class _Page(html.parser.HTMLParser):
 
 
 def faults(site: Path) -> list[str]:
-    """What is wrong with a built site, a line each: links and pictures that lead nowhere, things from elsewhere."""
-    pages = {path: _Page(path.read_text(encoding="utf-8")) for path in sorted(site.rglob("*.html"))}
-    found = []
+    """What is wrong with a built site, a line each: links and pictures that lead nowhere, things from elsewhere, lists
+    that were run together."""
+    texts = {path: path.read_text(encoding="utf-8") for path in sorted(site.rglob("*.html"))}
+    pages = {path: _Page(text) for path, text in texts.items()}
+    found = [f"{path.relative_to(site)}: V* without a backslash" for path in pages if STRESSED.search(texts[path])]
     for path, page in pages.items():
         here = path.relative_to(site)
         found += [f"{here}: loads {url}" for url in page.loaded if urlsplit(url).scheme not in ("", "data")]
+        found += [f"{here}: has a list in a paragraph: {text[:60]}" for text in page.paragraphs if UNREAD.search(text)]
         for link in {*page.links, *page.loaded}:
             parts = urlsplit(link)
             if parts.scheme or parts.netloc or here.name == "404.html":

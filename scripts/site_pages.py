@@ -324,7 +324,7 @@ def reference() -> dict[str, str]:
                 worlds.append(f"[`{name}`](../environments/{value.name}.md)")
                 continue
             if home in shown:
-                entries.append(f"## `{title}.{name}`\n\nThe same as [`{shown[home]}`][{home}].\n")
+                entries.append(f"## {title}.{name} {{ .doc-heading }}\n\nThe same as [`{shown[home]}`][{home}].\n")
                 continue
             shown[home] = f"{title}.{name}"
             options = f"    options:\n      heading: {title}.{name}\n      toc_label: {name}\n"
@@ -370,8 +370,8 @@ def tutorials(folder: Path) -> dict[str, str | bytes]:
         text, pictures = notebook(json.loads(path.read_text(encoding="utf-8")), path.stem)
         pages[f"tutorials/{path.stem}.md"] = text
         pages |= {f"tutorials/{name}": data for name, data in pictures.items()}
-        title, about = re.match(r"# (.*)\n+(.*)", text).groups()
-        lines.append(f"- [{title}]({path.stem}.md): {about}")
+        title, about = re.match(r"# (.*)\n+((?:.+\n)+)", text).groups()  # the first paragraph
+        lines.append(f"- [{title}]({path.stem}.md): {' '.join(about.split())}")
     return {"tutorials/index.md": "\n".join(lines) + "\n", **pages}
 
 

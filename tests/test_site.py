@@ -156,6 +156,14 @@ def test_faults_of_a_built_site_are_found(scripts, tmp_path):
     page.write_text('<a href="there.html#top"></a><img src="data:,x"><a href="https://elsewhere.org"></a>')
     faults = scripts("build_site").faults
     assert faults(tmp_path) == []
-    for wrong in ('<a href="gone.html">', '<a href="there.html#gone">', '<script src="https://elsewhere.org/x.js">'):
+    wrongs = ('<a href="gone.html">', '<a href="there.html#gone">', '<script src="https://elsewhere.org/x.js">')
+    run_together = ("<p>one of\n- <code>this</code>;\n- that</p>", "<p>Error ├── Lost</p>", "V<em>(s) - Q</em>(s)")
+    for wrong in (*wrongs, *run_together):
         page.write_text(wrong)
         assert len(faults(tmp_path)) == 1, wrong
+
+
+def test_a_list_right_below_a_paragraph_is_one_on_the_site(scripts):
+    text = "One of\n- this;\n  and more\n- that.\n\n```\na\n- b\n```\n\n- c\n"
+    staged = scripts("build_site").relinked(text, Path("docs/a.md"), "a.md")
+    assert staged == text.replace("of\n-", "of\n\n-")

@@ -1,24 +1,24 @@
 """Every exception that pharos raises on purpose.
 
-PharosError
-├── ParameterError (ValueError)     a parameter, name or option is wrong: nothing was computed  (exit code 2)
-│   ├── UnknownName                 no such environment, measure, observation, agent ...: nearest match suggested
-│   └── UntrustedCode               a file names code of somebody else, which is executed only where it is trusted
-├── RuleError                       an environment's rules broke their contract, for a named state and action
-├── StateSpaceError                 something is wrong with a folder that holds a state space
-│   ├── StateSpaceTooLarge          more states than `max_states`
-│   ├── StateSpaceIncomplete        the build has not finished; the same command resumes it
-│   ├── StateSpaceCorrupted         truncated or tampered files
-│   ├── StateSpaceMismatch          the folder holds another environment, parameters or version of its rules
-│   ├── StateSpaceLocked            another process is building there (a FolderLocked as well)
-│   └── DiskFull                    no room; finished work is kept
-├── FolderLocked                    another process is at work in a folder
-├── FileFormatError (ValueError)    a file lacks something or holds nonsense
-│   └── ResultCorrupted             a result was cut short, or changed after it was written
-├── PrecisionError                  the requested precision is finer than the error bound allows
-├── DivergenceError (ValueError)    the value asked for may be infinite
-├── UndefinedMeasure                the measure does not exist for this MDP; the message says what would define it
-└── MissingExtra (ImportError)      an optional dependency is needed; the message names the extra
+    PharosError
+    ├── ParameterError (ValueError)     a parameter, name or option is wrong: nothing was computed  (exit code 2)
+    │   ├── UnknownName                 no such environment, measure, observation, agent ...: nearest match suggested
+    │   └── UntrustedCode               a file names code of somebody else, which is executed only where it is trusted
+    ├── RuleError                       an environment's rules broke their contract, for a named state and action
+    ├── StateSpaceError                 something is wrong with a folder that holds a state space
+    │   ├── StateSpaceTooLarge          more states than `max_states`
+    │   ├── StateSpaceIncomplete        the build has not finished; the same command resumes it
+    │   ├── StateSpaceCorrupted         truncated or tampered files
+    │   ├── StateSpaceMismatch          the folder holds another environment, parameters or version of its rules
+    │   ├── StateSpaceLocked            another process is building there (a FolderLocked as well)
+    │   └── DiskFull                    no room; finished work is kept
+    ├── FolderLocked                    another process is at work in a folder
+    ├── FileFormatError (ValueError)    a file lacks something or holds nonsense
+    │   └── ResultCorrupted             a result was cut short, or changed after it was written
+    ├── PrecisionError                  the requested precision is finer than the error bound allows
+    ├── DivergenceError (ValueError)    the value asked for may be infinite
+    ├── UndefinedMeasure                the measure does not exist for this MDP; the message says what would define it
+    └── MissingExtra (ImportError)      an optional dependency is needed; the message names the extra
 
 A message says whose, expected, found, and what to try, in one line.
 """
