@@ -21,7 +21,7 @@ class Curve:
         """Evaluate the policy after `step` steps and `episodes` finished episodes, whose returns sum to `returns`;
         unless its `evaluation` is there.
         """
-        evaluation = evaluation or evaluate_agent(agent, self.task)
+        evaluation = evaluation or evaluate_agent(agent, self.task, again=True)
         best, uniform = self.task.reference.optimal, self.task.reference.uniform
         last = self.rows[-1] if self.rows else None
         finished = episodes - (last["episodes"] if last else 0)

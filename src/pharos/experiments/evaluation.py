@@ -14,6 +14,7 @@ def evaluate_agent(
     max_states: int = 100_000,
     episodes: int = 2_000,
     seed: int = 0,
+    again: bool = False,
 ) -> Evaluation:
     """Return the value of an agent's current policy on a task.
 
@@ -24,6 +25,7 @@ def evaluate_agent(
         deterministic: whether the most probable action is taken (the first among equals) instead of one at random.
         max_states: how many states (pairs, where previous actions matter) the policy may reach for an exact value.
         episodes, seed: of the estimate beyond that.
+        again: whether more policies of the task will be evaluated: what they share is remembered. Changes no value.
     Raises:
         ParameterError: the agent is none of these, or its answers are no probabilities.
     Cost: one answer of the policy for each state reached, then horizon x states reached.
@@ -39,4 +41,5 @@ def evaluate_agent(
         max_states=max_states,
         episodes=episodes,
         seed=seed,
+        reach=task.reach if again else None,
     )

@@ -1,6 +1,6 @@
 """Policies: tables, and functions of observations; asked in the states that they reach, and evaluated."""
 
-from pharos.policies.asking import Answers, PolicyAnswers, Sight, TableAnswers
+from pharos.policies.asking import Answers, PolicyAnswers, Reach, Sight, TableAnswers, reach_of_any
 from pharos.policies.copies import is_small_table, table_values
 from pharos.policies.evaluation import (
     Evaluation,
@@ -20,6 +20,7 @@ __all__ = [
     "Policy",
     "PolicyAnswers",
     "PolicyLike",
+    "Reach",
     "ReachedSolution",
     "Sight",
     "TableAnswers",
@@ -30,6 +31,7 @@ __all__ = [
     "is_small_table",
     "is_walk",
     "policy_function",
+    "reach_of_any",
     "table_values",
     "walk_values",
 ]

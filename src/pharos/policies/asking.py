@@ -6,13 +6,13 @@ Two kinds of policy are asked in the same way: functions of observations (`Polic
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from pharos.environments import Environment
 from pharos.errors import ParameterError
-from pharos.mdp import TabularMDP
+from pharos.mdp import Rewards, TabularMDP
 from pharos.observations import ObservationInContext, observe
 from pharos.policies.policy import PolicyLike, policy_function
 from pharos.state_space import StateSpace
@@ -52,6 +52,18 @@ class Sight:
     def frames(self) -> int:
         """How many states are seen at once, the last ones of the episode."""
         return self.observe.observation.frames
+
+
+class Reach(NamedTuple):
+    """What every policy reaches that gives each action a chance.
+
+    Attributes:
+        rows: (N,) in the order in which `Answers.reach` meets them.
+        is_whole: whether that is all of it; False: it is more than `reach` was to look at.
+    """
+
+    rows: np.ndarray
+    is_whole: bool
 
 
 class Answers:
@@ -139,6 +151,23 @@ class Answers:
             frontier = rows[self.index(rows) < 0]
         return True
 
+    def take(self, reach: Callable[[], Reach]) -> bool | None:
+        """As `reach`, but the policy is asked in all rows at once; None, and nothing is remembered, where it gives an
+        action no chance, so that it may reach less.
+        """
+        chance = self.mdp.chance
+        always = chance.uniform > 0 and chance.first_uniform > 0
+        if not always and not (self._ask(self.start_rows()) > 0).all():
+            return None
+        rows, is_whole = reach()
+        blocks = [self._ask(rows[start : start + BATCH]) for start in range(0, len(rows), BATCH)]
+        probabilities = np.concatenate(blocks)
+        if not always and not (probabilities > 0).all():
+            return None
+        self._rows, self._answers, self._count = rows.copy(), probabilities, len(rows)
+        self._place[rows] = np.arange(1, self._count + 1)
+        return is_whole
+
     def _arrivals(self, states: np.ndarray, actions: np.ndarray) -> np.ndarray:
         """(N,) the rows of states that were reached by executing these actions."""
         return states * self.width + (actions if self.by_pairs else 0)
@@ -190,7 +219,23 @@ class Answers:
             reached = TabularMDP.from_matrices(
                 sparse.csr_matrix(entries, (count * num_actions, count)), rewards, **setting
             )
+        if mdp.horizon is not None:  # every step reads them
+            reached = replace(reached, reward_table=Rewards(np.asarray(rewards, np.float64), np.empty(0)))
         return replace(reached, chance=mdp.chance)
+
+
+class AnyAnswers(Answers):
+    """Those of a policy that gives each action a chance."""
+
+    def _ask(self, rows: np.ndarray) -> np.ndarray:
+        return np.full((len(rows), self.num_actions), 1 / self.num_actions)
+
+
+def reach_of_any(mdp: TabularMDP, max_rows: int, steps: int | None, *, sees_previous_action: bool = False) -> Reach:
+    """What every policy reaches in so many steps that gives each action a chance."""
+    answers = AnyAnswers(mdp, sees_previous_action=sees_previous_action)
+    is_whole = answers.reach(max_rows, steps)
+    return Reach(answers.rows.copy(), is_whole)
 
 
 class PolicyAnswers(Answers):

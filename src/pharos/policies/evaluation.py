@@ -14,7 +14,7 @@ import numpy as np
 from pharos import solvers
 from pharos.errors import DivergenceError, ParameterError
 from pharos.mdp import PolicyTable, TabularMDP, takes_mdp
-from pharos.policies.asking import Answers, PolicyAnswers, Sight, TableAnswers
+from pharos.policies.asking import Answers, PolicyAnswers, Reach, Sight, TableAnswers
 from pharos.policies.estimation import estimate
 from pharos.policies.histories import answers_of
 from pharos.policies.policy import Model, Policy, PolicyLike, TabularAgent
@@ -55,6 +55,7 @@ def evaluate_seeing(
     max_states: int = 100_000,
     episodes: int = 2_000,
     seed: int = 0,
+    reach: Callable[[int, int], Reach] | None = None,
 ) -> Evaluation:
     """Return the value of a policy from the start: exact where it reaches few states, else estimated with a bound.
 
@@ -62,6 +63,8 @@ def evaluate_seeing(
         sight: gives what the policy sees; called for policies over observations alone.
         return_range: gives the lowest and the highest return of an episode; called where the value is estimated.
         deterministic, max_states, episodes, seed: as for `experiments.evaluate_agent`.
+        reach: (rows at most, steps) -> what every policy reaches that gives each action a chance, where more than one
+            policy is evaluated: those that do are asked at once. Changes no value.
     """
     if isinstance(policy, TabularAgent):
         policy = policy.policy_table()
@@ -75,7 +78,8 @@ def evaluate_seeing(
     else:
         answers = answers_of(policy, mdp, sight(), deterministic=deterministic)
     steps, error = steps_that_matter(mdp)
-    if answers.reach(max_states, steps):
+    is_whole = None if reach is None else answers.take(lambda: reach(max_states, steps))
+    if answers.reach(max_states, steps) if is_whole is None else is_whole:
         solution = solvers.evaluate_policy(*answers.reached_mdp())
         return Evaluation(solution.value_at_start, True, solution.error_bound + error, len(answers.rows))
     value, width = estimate(answers, return_range(), episodes, np.random.default_rng(seed))

@@ -1,12 +1,13 @@
 """Policies that see the last k frames: they are asked in histories of k states, as far as they reach some."""
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from pharos.errors import ParameterError
 from pharos.mdp import TabularMDP
-from pharos.policies.asking import PolicyAnswers, Sight
+from pharos.policies.asking import PolicyAnswers, Reach, Sight
 from pharos.policies.policy import PolicyLike
 
 # Histories whose frames are drawn at once
@@ -36,6 +37,10 @@ class HistoryAnswers(PolicyAnswers):
         pairs, inverse = np.unique(np.stack([rows, following], axis=1), axis=0, return_inverse=True)
         numbers = self._numbers([(*self._histories[row][1:], t) for row, t in pairs.tolist()])
         return numbers[inverse.reshape(-1)]
+
+    def take(self, reach: Callable[[], Reach]) -> bool | None:
+        """Never: rows are histories."""
+        return None
 
     def states_of(self, rows: np.ndarray) -> np.ndarray:
         return np.array([self._histories[row][-1] for row in rows], np.int64)
