@@ -60,23 +60,23 @@ def read(words):
     return [{name: value_of(value) for name, value in (part.split("=") for part in each.split(","))} for each in words]
 
 
-def compare(agent, env, candidates, seeds, steps, observation, members=None):
-    """For each candidate: normalised regrets (seeds, evaluations) and final values (seeds,)."""
+def compare(agent, tasks, candidates, seeds, steps):
+    """For each candidate: normalised regrets (runs, evaluations) and final values (runs,) of all tasks and seeds."""
     configs = []
     for given in candidates:
-        for seed in seeds:
-            task = experiments.Task(env, observation=observation)
-            configs.append(
-                experiments.RunConfig.of_task(
-                    task,
-                    agent,
-                    steps=steps,
-                    seed=seed,
-                    evaluation_interval=steps // EVALUATIONS,
-                    hyperparameters=given,
-                    engine="batched",
+        for task in tasks:
+            for seed in seeds:
+                configs.append(
+                    experiments.RunConfig.of_task(
+                        task,
+                        agent,
+                        steps=steps,
+                        seed=seed,
+                        evaluation_interval=steps // EVALUATIONS,
+                        hyperparameters=given,
+                        engine="batched",
+                    )
                 )
-            )
     ends = experiments.train_configs(configs)
     regrets, finals = [], []
     for end in ends:
@@ -84,7 +84,7 @@ def compare(agent, env, candidates, seeds, steps, observation, members=None):
             raise end.exception
         regrets.append([row["normalized_regret"] for row in end.curve[1:]])
         finals.append(end.result["final_value"])
-    shape = (len(candidates), len(seeds))
+    shape = (len(candidates), len(tasks) * len(seeds))
     return np.array(regrets).reshape(*shape, -1), np.array(finals).reshape(shape), ends[0].result
 
 
@@ -98,7 +98,8 @@ def value_of(text):
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("environment", help="name of a class")
-    parser.add_argument("--instance", help="default: the class with its defaults")
+    parser.add_argument("--instance", action="append", help="its name, or {name: value, ...}; default: the class's own")
+    parser.add_argument("--chance", action="append", help="plain, or random=P or sticky=P; default: plain")
     parser.add_argument("--agent", default="dqn", choices=SPACES)
     parser.add_argument("--observation", default="vector")
     parser.add_argument("--steps", type=int, default=20000)
@@ -119,7 +120,10 @@ def main():
         SPACES[given.agent][name] = tuple(
             value_of(choice.replace("one of", '"one of"')) for choice in choices.split(",")
         )
-    env = pharos.make(given.instance or given.environment)
+    named = [value_of(each) for each in given.instance or [given.environment]]
+    envs = [pharos.make(given.environment, **each) if isinstance(each, dict) else pharos.make(each) for each in named]
+    chances = [{} if each == "plain" else read([each])[0] for each in given.chance or ["plain"]]
+    tasks = [experiments.Task(env, observation=given.observation, **chance) for env in envs for chance in chances]
     table = hyperparameters_of(given.agent, given.environment, given.observation)
     if given.check:
         candidates, seeds = [table, *({**table, **each} for each in read(given.check))], list(range(5))
@@ -130,11 +134,11 @@ def main():
         )
         seeds = list(range(1000, 1000 + given.seeds))
     began, processor = time.perf_counter(), time.process_time()
-    regrets, finals, one = compare(given.agent, env, candidates, seeds, given.steps, given.observation)
+    regrets, finals, one = compare(given.agent, tasks, candidates, seeds, given.steps)
     took, used = time.perf_counter() - began, time.process_time() - processor
     scores, last = regrets.mean((1, 2)), regrets[:, :, -1].mean(1)
     values = f"V* {one['value_optimal']:.4g}, uniform {one['value_uniform']:.4g}"
-    print(f"{env}, {given.agent}: {values}; {took:.0f} s, {used:.0f} s of processor time")
+    print(f"{', '.join(map(str, envs))}, {given.agent}: {values}; {took:.0f} s, {used:.0f} s of processor time")
     for i in [0, *[int(i) for i in np.argsort(scores) if i][:5]]:
         changed = (
             {name: value for name, value in candidates[i].items() if table.get(name) != value}
@@ -153,11 +157,11 @@ def main():
         "format": 1,
         "config": {
             "agent": given.agent,
-            "instances": [{"environment": env.name, "parameters": env.parameters}],
+            "instances": [{"environment": env.name, "parameters": env.parameters} for env in envs],
             "observation": given.observation,
             "steps": given.steps,
             "seeds": seeds,
-            "chance": {"sticky": 0.0, "random": 0.0},
+            "chance": chances,
             "space": {name: list(choices) for name, choices in SPACES[given.agent].items()},
             "shapes": shapes,
             "search_seed": given.search_seed,

@@ -44,7 +44,7 @@ def supports(agent, hyperparameters):
     return "it has no hyperparameter 'optimize_memory_usage'" if "optimize_memory_usage" in hyperparameters else None
 
 
-def group_key(agent, run):
+def group_key(agent, run, device="cpu"):
     return (run.observe.shape, run.hyperparameters["batch_size"])
 
 

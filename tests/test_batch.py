@@ -192,6 +192,32 @@ def test_tables_of_many_seeds_are_those_of_single_runs(tmp_path):
     assert read_record(tmp_path / "alone")["id"] == read_record(tmp_path / "seed-1")["id"]
 
 
+def test_tables_that_were_killed_go_on_together_to_the_same_bytes(tmp_path, monkeypatch):
+    monkeypatch.setattr(run_folder, "CHECKPOINT_SECONDS", 0.0)
+    options = {"agent": "q_learning", "steps": 4000, "evaluation_interval": 1000, "sticky": 0.25}
+    many(tmp_path / "whole", **options)
+    with pytest.raises(Killed):
+        many(tmp_path / "killed", progress=kill_at(2000 * 3), **options)
+    assert list((tmp_path / "killed" / "checkpoints").glob("*/checkpoint/batch.npz"))
+    results = many(tmp_path / "killed", **options)
+    assert not (tmp_path / "killed" / "checkpoints").exists() and len(results) == 3
+    for name in ("curve.parquet", "policy.npy"):
+        assert (tmp_path / "whole" / "seed-2" / name).read_bytes() == (
+            tmp_path / "killed" / "seed-2" / name
+        ).read_bytes()
+
+
+def test_a_table_that_cannot_be_learnt_fails_by_itself(tmp_path):
+    task = Task.of("simple_grid/4x4-plain")
+    good, bad = (
+        [RunConfig.of_task(task, "q_learning", steps=40, seed=seed, evaluation_interval=10, hyperparameters=given)]
+        for seed, given in ((0, {}), (1, {"learning_rate": 2.0}))
+    )
+    first, second, third = train_configs([*good, *bad, *good], [tmp_path / name for name in "abc"])
+    assert isinstance(second, FailedRun) and "learning_rate is 2.0" in second.error
+    assert first.result["final_value"] == third.result["final_value"]
+
+
 def test_the_engine_belongs_to_the_id_only_where_it_is_another():
     usual = config(engine="sb3")
     assert "engine" not in usual.to_dict()
@@ -280,7 +306,7 @@ def test_whole_lanes_are_dealt_out_to_processes():
 
 @pytest.mark.long
 def test_processes_leave_what_one_leaves(tmp_path, monkeypatch):
-    monkeypatch.setattr(importlib.import_module("pharos.experiments.parts"), "lane_width", lambda _: 2)
+    monkeypatch.setattr(importlib.import_module("pharos.experiments.parts"), "lane_width", lambda *_: 2)
     small = {"learning_starts": 50, "buffer_size": 500, "optimize_memory_usage": False}
     options = {"seeds": (0, 1, 2), "steps": 200, "evaluation_interval": 100, "hyperparameters": small}
     done = []

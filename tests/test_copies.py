@@ -10,7 +10,7 @@ from pharos.agents.batched import make_batch
 from pharos.experiments import ChanceSetting, Members, RunConfig, evaluate_agent
 from pharos.experiments.side_by_side import values_together
 from pharos.mdp import TabularMDP, lazy_actions, random_actions, sticky_actions
-from pharos.policies import Evaluation, TableAnswers, is_small_table, table_values
+from pharos.policies import Evaluation, TableAnswers, is_small_table, table_values, whole_values
 
 SETTING = {"steps": 300, "horizon": 16, "evaluation_interval": 100, "engine": "batched"}
 
@@ -60,6 +60,18 @@ def test_policies_are_worth_among_copies_what_they_are_worth_alone(chance, start
         assert together == [alone(mdp, policy) for policy in policies]
         assert len({each.value for each in together}) == 6
     assert len({each.error_bound for each in together}) > 1
+
+
+@pytest.mark.parametrize("chance", [lambda mdp: mdp, lambda mdp: random_actions(sticky_actions(mdp, 0.25), 0.1)])
+def test_tables_are_worth_together_what_they_are_worth_alone(chance, monkeypatch):
+    mdp = chance(mdp_of(17, 3))
+    tables = list(np.random.default_rng(2).integers(mdp.num_actions, size=(5, mdp.num_states)))
+    solutions = [solvers.evaluate_policy(mdp, table) for table in tables]
+    wanted = [Evaluation(each.value_at_start, True, each.error_bound, mdp.num_states) for each in solutions]
+    assert whole_values(mdp, tables) == wanted
+    monkeypatch.setattr("pharos.policies.copies.MOST_TOGETHER", 2 * 9 * mdp.width)
+    assert whole_values(mdp, tables) == wanted
+    assert len({each.value for each in wanted}) == 5
 
 
 def test_many_copies_are_taken_in_groups(monkeypatch):

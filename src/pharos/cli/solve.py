@@ -78,7 +78,7 @@ def solve(
     if out is not None:
         check_format(out, (".npz", ".npy"))
     building = build_options(memory, workers, max_states)
-    chance = {"sticky": sticky, "random": random, "lazy": lazy}
+    chance: dict[str, Any] = {"sticky": sticky, "random": random, "lazy": lazy}
     mdp = parse_target(target, parameters).mdp(gamma=gamma, horizon=horizon, **chance, **building, processes=ranks)
     from pharos import paths
     from pharos.solvers import uniform_value, value_iteration

@@ -20,6 +20,7 @@ from pharos.experiments.ledger import Ledger, Stopped, Tell
 from pharos.experiments.members import FailedRun, Member, Members
 from pharos.experiments.one_batch import Batch
 from pharos.experiments.run_folder import TrainingResult, finished_result
+from pharos.policies import is_small_table
 
 
 def train_configs(
@@ -77,7 +78,7 @@ class _Work(Ledger):
         for place, config in enumerate(self.configs):
             if self._is_finished(place, config):
                 self.done += config.steps
-            elif config.engine == "batched":
+            elif config.engine == "batched" or self._is_table(place, config):
                 waiting[place] = config
             else:
                 alone.append(place)
@@ -88,6 +89,16 @@ class _Work(Ledger):
                 Batch(self, group).train()
             if self.checkpoints is not None and self.checkpoints.is_dir() and not any(self.checkpoints.iterdir()):
                 self.checkpoints.rmdir()
+
+    def _is_table(self, place: int, config: RunConfig) -> bool:
+        """Whether it learns a table that is evaluated with others: of few states, and not half learnt alone."""
+        if not config.is_tabular or len(self.configs) == 1:
+            return False
+        folder = self.folder(place)
+        try:
+            return is_small_table(self.members.task(config).mdp) and not (folder and (folder / "checkpoint").exists())
+        except Exception:  # what is wrong with it, it is told alone
+            return False
 
     def _is_finished(self, place: int, config: RunConfig) -> bool:
         folder = self.folder(place)

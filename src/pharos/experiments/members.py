@@ -11,6 +11,7 @@ from pharos.agents import hyperparameters as hyperparameters_of
 from pharos.errors import ParameterError, PharosError
 from pharos.experiments.config import RunConfig
 from pharos.experiments.curve import Curve
+from pharos.experiments.learners import Tabular
 from pharos.experiments.run_folder import Record
 from pharos.experiments.task import Task, TaskValues
 
@@ -120,6 +121,8 @@ class Members:
         Raises:
             ParameterError: a hyperparameter is wrong, or the engine lacks it.
         """
+        if config.is_tabular:
+            return self._table(place, config, folder)
         from pharos.agents.batched import BatchRun, ObservationSource, group_key, supports
 
         chosen = hyperparameters_of(config.agent, config.environment, config.observation, config.hyperparameters)
@@ -145,6 +148,19 @@ class Members:
         )
         key = (config.agent, config.steps, config.evaluation_interval, group_key(config.agent, run, self.device))
         return Member(place, config, folder, task, chosen, run, key)
+
+    def _table(self, place: int | None, config: RunConfig, folder: Path | None) -> Member:
+        """A run of Q-learning, which a batch makes; that it can be made is seen before."""
+        chosen = hyperparameters_of(config.agent, config.environment, config.observation, config.hyperparameters)
+        task = self.task(config)
+
+        def make() -> Any:
+            return Tabular(task, chosen, config.steps, config.seed).agent
+
+        make()
+        return Member(
+            place, config, folder, task, chosen, make, (config.agent, config.steps, config.evaluation_interval)
+        )
 
     def _once(self, what: str, config: RunConfig, names: Sequence[str], make: Callable[[], Any]) -> Any:
         entry = config.to_dict()

@@ -16,6 +16,7 @@ from pharos.experiments.ledger import Ledger, Stopped
 from pharos.experiments.members import FailedRun, Member, in_one_line
 from pharos.experiments.run_folder import Checkpoint, TrainingResult
 from pharos.experiments.side_by_side import values_together
+from pharos.experiments.tables import Tables
 from pharos.storage import digest_of_json, lock, replace_json
 from pharos.wording import many
 
@@ -70,10 +71,14 @@ class Batch:
             return
 
     def _train(self) -> None:
-        from pharos.agents.batched import make_batch
-
         began = time.perf_counter()
-        self.batch = make_batch(self.config.agent, [member.run for member in self.group], device=self.ledger.device)
+        runs = [member.run for member in self.group]
+        if self.config.is_tabular:
+            self.batch = Tables(runs)
+        else:
+            from pharos.agents.batched import make_batch
+
+            self.batch = make_batch(self.config.agent, runs, device=self.ledger.device)
         checkpoint = None
         if self._place is not None and self._claim(self._place):
             members = [member.config for member in self.group]
@@ -169,9 +174,7 @@ class Batch:
                 continue
             curve, result = member.curve.rows, member.curve.result()
             if member.folder is not None:
-                counters = {"num_timesteps": int(self.batch.steps), "episodes": int(self.batch.episodes[i])}
-                returns = float(self.batch.returns[i])
-                publish_network(member.folder, self.batch.parameters(i), counters, returns)
+                self._publish_agent(i, member.folder)
                 _results.write_curve(member.folder, curve)
                 size = {"runs": len(self.group), "seconds": seconds, "device": self.ledger.device}
                 member.record.write("finished", seconds=share, batch=size, result=result)
@@ -180,6 +183,14 @@ class Batch:
                 member.config.to_dict(), result, rows, self.batch.policy(i), member.folder, share
             )
         self._remove_checkpoint()
+
+    def _publish_agent(self, i: int, folder: Path) -> None:
+        """What run i has learnt: the greedy policy of a table, or a network."""
+        if self.config.is_tabular:
+            _results.write_policy(folder, self.batch.policy(i).policy_table())
+            return
+        counters = {"num_timesteps": int(self.batch.steps), "episodes": int(self.batch.episodes[i])}
+        publish_network(folder, self.batch.parameters(i), counters, float(self.batch.returns[i]))
 
     def _end_with(self, error: Exception) -> None:
         """The only run of a batch has failed."""

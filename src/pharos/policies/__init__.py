@@ -1,7 +1,7 @@
 """Policies: tables, and functions of observations; asked in the states that they reach, and evaluated."""
 
 from pharos.policies.asking import Answers, PolicyAnswers, Reach, Sight, TableAnswers, reach_of_any
-from pharos.policies.copies import is_small_table, table_values
+from pharos.policies.copies import is_small_table, table_values, whole_values
 from pharos.policies.evaluation import (
     Evaluation,
     ReachedSolution,
@@ -34,4 +34,5 @@ __all__ = [
     "reach_of_any",
     "table_values",
     "walk_values",
+    "whole_values",
 ]

@@ -46,6 +46,18 @@ def _values(mdp: TabularMDP, policies: Sequence[np.ndarray]) -> list[Evaluation]
     return [Evaluation(value, True, bound, count) for (value, bound), count in zip(values, counts, strict=True)]
 
 
+def whole_values(mdp: TabularMDP, policies: Sequence[np.ndarray]) -> list[Evaluation]:
+    """The same for policies (S,) of actions, which are evaluated in all states, as tables are."""
+    size = max(1, MOST_TOGETHER // (mdp.num_states * mdp.width))
+    evaluations = []
+    for first in range(0, len(policies), size):
+        group = policies[first : first + size]
+        part = np.repeat(np.arange(len(group)), mdp.num_states)
+        values = solvers.evaluate_apart(_copies(mdp, len(group)), np.concatenate(group), part, mdp.start_probabilities)
+        evaluations += [Evaluation(value, True, bound, mdp.num_states) for value, bound in values]
+    return evaluations
+
+
 def _copies(mdp: TabularMDP, number: int) -> TabularMDP:
     """The MDP beside itself: state s of copy i has the number i S + s."""
     table, rewards = np.asarray(mdp.dynamics.deterministic_table(), np.int64), mdp.reward_table

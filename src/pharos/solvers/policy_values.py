@@ -66,7 +66,7 @@ def evaluate_apart(
 
     Args:
         mdp: of parts that never meet, such as copies of one MDP.
-        policy: as `evaluate_policy` takes probabilities.
+        policy: as `evaluate_policy` takes actions, or probabilities.
         part: (S,) the part of each state, 0 to P - 1; each has states, and as many starts.
         start_probabilities: (N,) of the starts of each part.
     Cost: one backward induction of all of them, instead of P.
@@ -81,8 +81,10 @@ def evaluate_apart(
         of_states: np.ndarray = entries.reshape(len(part), -1).max(axis=1)
         return np.maximum.reduceat(of_states[order], begins)
 
-    rewards, sums = largest(np.abs(mdp.reward_table.array)), largest(select.probabilities.sum(axis=2))
-    factors = np.array([backup.factor_of(mass_of(each, mdp.num_actions)) for each in sums.tolist()])
+    rewards, factors = largest(np.abs(mdp.reward_table.array)), np.full(len(begins), backup.factor)
+    if select.actions is None:
+        sums = largest(select.probabilities.sum(axis=2)).tolist()
+        factors = np.array([backup.factor_of(mass_of(each, mdp.num_actions)) for each in sums])
     x = before = backup.zeros()
     bounds, sizes = np.zeros(len(begins)), np.zeros(len(begins))
     for _ in range(checked_horizon(mdp, None) or 0):

@@ -28,7 +28,7 @@ from pharos.study import worker as _worker
 from pharos.study.blocks import Run
 
 BATCHES = "batches"
-TABLES = 16  # runs of one program that learn tables, one after the other
+TABLES = 16  # runs of one program that learn tables
 
 BatchRunner = Callable[[Sequence[Mapping[str, Any]], Sequence[Path], Path], Sequence[str | None]]
 """runner(configs, folders, folder for checkpoints) -> for each run None, or why it failed."""
