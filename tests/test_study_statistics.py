@@ -89,6 +89,16 @@ def test_aggregate_r_squared_of_one_fit_is_its_own():
     assert aggregate_r_squared([single]) == pytest.approx(single.r_squared)
 
 
+def test_regrets_that_are_all_the_same_leave_nothing_to_explain():
+    table = study_table(noise=0.5)
+    table.loc[table["environment"] == "lake", "regret"] = 0.25
+    assert [each.subset for each in fit_models(table)] == ["all", "image", "vector", "grid"]
+    same = table.assign(regret=0.25)
+    with pytest.raises(ParameterError, match=r"single model of all has nothing to explain: the regret is 0\.25 in all"):
+        fit_models(same)
+    assert np.isnan(leave_one_class_out_r_squared(same))
+
+
 def test_models_fitted_per_class_explain_at_least_as_much_together_as_one_for_all_without_class_effects():
     table = study_table(noise=1.0)
     one = fit(table, "single", "all", ["observation", "effective_horizon", "sum_of_reciprocal_gaps", "diameter"])

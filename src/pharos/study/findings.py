@@ -10,7 +10,7 @@ from scipy.linalg import helmert
 
 from pharos.experiments import bootstrap_interval
 from pharos.study.analysis import IMAGE, VECTOR, Models, agreement, paper_agreement
-from pharos.study.regression import Fit
+from pharos.study.regression import Fit, r_squared
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -283,9 +283,8 @@ def _power_of_error(effect: float, error: float) -> float:
 def _r_squared(fit: Fit, rows: np.ndarray) -> float:
     """R2 of the same model fitted to some of the rows; NaN where they are all alike."""
     design, actual = fit.design[rows], fit.actual[rows]
-    total = float(((actual - actual.mean()) ** 2).sum())
     coefficients, *_ = np.linalg.lstsq(design, actual, rcond=None)
-    return 1 - float(((actual - design @ coefficients) ** 2).sum()) / total if total > 0 else math.nan
+    return r_squared(actual, actual - design @ coefficients)
 
 
 def _agreement(cells: "pd.DataFrame") -> dict[str, Any]:

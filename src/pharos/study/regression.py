@@ -68,21 +68,30 @@ class Fit:
 def fit_models(data: "pd.DataFrame", *, measures: Sequence[str] = MEASURES) -> list[Fit]:
     """The single model (equation 7), one model a representation (8), one model a class (9).
 
+    A representation or class whose regrets are all the same has no model.
+
     Raises:
-        ParameterError: a column is missing, a measure is not positive (its logarithm is needed), or there are too few
-            rows.
+        ParameterError: a column is missing, a measure is not positive (its logarithm is needed), there are too few
+            rows, or all regrets are the same.
     """
     checked = _checked(data, measures)
     fits = [fit(checked, "single", "all", ["observation", "environment", *measures])]
-    for observation, rows in checked.groupby("observation", sort=True):
-        fits.append(fit(rows, "representation", str(observation), ["environment", *measures]))
-    for environment, rows in checked.groupby("environment", sort=True):
-        fits.append(fit(rows, "class", str(environment), ["observation", *measures]))
+    for model, column, other in (
+        ("representation", "observation", "environment"),
+        ("class", "environment", "observation"),
+    ):
+        for name, rows in checked.groupby(column, sort=True):
+            if np.ptp(rows["regret"]) > 0:
+                fits.append(fit(rows, model, str(name), [other, *measures]))
     return fits
 
 
 def fit(rows: "pd.DataFrame", model: str, subset: str, predictors: Sequence[str]) -> Fit:
-    """One fit; predictors that are constant or collinear in these rows are dropped and named."""
+    """One fit; predictors that are constant or collinear in these rows are dropped and named.
+
+    Raises:
+        ParameterError: there are too few rows for the coefficients, or all regrets are the same.
+    """
     import statsmodels.formula.api as smf
 
     terms, columns, dropped = _independent(rows, predictors)
@@ -92,12 +101,16 @@ def fit(rows: "pd.DataFrame", model: str, subset: str, predictors: Sequence[str]
             f"the {model} model of {subset} has {many(len(rows), 'row')}; needs at least {needed} for its "
             f"{many(columns - 1, 'predictor')}: run more instances or fewer predictors"
         )
+    if np.ptp(rows["regret"]) == 0:
+        raise ParameterError(
+            f"the {model} model of {subset} has nothing to explain: the regret is {rows['regret'].iloc[0]:g} in all of "
+            f"its {many(len(rows), 'row')}"
+        )
     formula = "regret ~ " + (" + ".join(terms) if terms else "1")
     result = smf.ols(formula, rows).fit()
     influence = result.get_influence()
     actual = rows["regret"].to_numpy(float)
     tasks = _tasks(rows)
-    total = float(((actual - actual.mean()) ** 2).sum())
     errors = _errors_without_the_task(np.asarray(result.model.exog, float), np.asarray(result.resid), tasks)
     return Fit(
         model=model,
@@ -106,7 +119,7 @@ def fit(rows: "pd.DataFrame", model: str, subset: str, predictors: Sequence[str]
         num_rows=len(rows),
         r_squared=float(result.rsquared),
         adjusted_r_squared=float(result.rsquared_adj),
-        cross_validated_r_squared=1 - float((errors**2).sum()) / total if total > 0 else float("nan"),
+        cross_validated_r_squared=r_squared(actual, errors),
         coefficients=_coefficients(result, rows, tasks),
         dropped=tuple(dropped),
         condition_number=_condition_number(result.model.exog),
@@ -128,8 +141,9 @@ def _tasks(rows: "pd.DataFrame") -> tuple[str, ...]:
 
 
 def _errors_without_the_task(design: np.ndarray, residuals: np.ndarray, tasks: Sequence[str]) -> np.ndarray:
-    """The error of each row under the model fitted without its task: (I - H)^-1 residuals, for the task's block of
-    H."""
+    """(N,) the error of each row under the model fitted without its task: (I - H)^-1 residuals, H the task's block of
+    the hat matrix; the shortest such vector where the task alone determines a coefficient.
+    """
     basis, _ = np.linalg.qr(design)
     errors = np.empty(len(residuals))
     places: dict[Any, list[int]] = {}
@@ -137,21 +151,32 @@ def _errors_without_the_task(design: np.ndarray, residuals: np.ndarray, tasks: S
         places.setdefault(task, []).append(row)
     for rows in places.values():
         remainder = np.eye(len(rows)) - basis[rows] @ basis[rows].T
-        errors[rows] = np.linalg.lstsq(np.maximum(remainder, 1e-12) if len(rows) == 1 else remainder, residuals[rows])[
-            0
-        ]
+        if len(rows) == 1:
+            remainder = np.maximum(remainder, 1e-12)
+        errors[rows] = np.linalg.lstsq(remainder, residuals[rows])[0]
     return errors
 
 
+def r_squared(actual: np.ndarray, errors: np.ndarray) -> float:
+    """1 - sum of squared errors / sum of squares about the mean; NaN where all values are the same."""
+    total = float(((actual - actual.mean()) ** 2).sum())
+    return 1 - float((errors**2).sum()) / total if total > 0 else float("nan")
+
+
 def aggregate_r_squared(fits: Sequence[Fit]) -> float:
-    """R2 of several fits together: 1 - residual over total sum of squares, all rows pooled, one overall mean."""
+    """R2 of several fits together: all rows pooled, one overall mean."""
     actual = np.concatenate([fit.actual for fit in fits])
-    residual = actual - np.concatenate([fit.fitted for fit in fits])
-    return 1 - float((residual**2).sum()) / float(((actual - actual.mean()) ** 2).sum())
+    return r_squared(actual, actual - np.concatenate([fit.fitted for fit in fits]))
 
 
 def leave_one_class_out_r_squared(data: "pd.DataFrame", *, measures: Sequence[str] = MEASURES) -> float:
-    """R2 of predictions for each class by a model fitted on the others (representation and measures only)."""
+    """R2 of predictions for each class by a model fitted on the others (representation and measures only).
+
+    Returns:
+        NaN where all regrets are the same.
+    Raises:
+        ParameterError: a column is missing, a measure is not positive, or there is one class alone.
+    """
     import statsmodels.formula.api as smf
 
     checked = _checked(data, measures)
@@ -164,7 +189,7 @@ def leave_one_class_out_r_squared(data: "pd.DataFrame", *, measures: Sequence[st
         result = smf.ols("regret ~ " + (" + ".join(terms) or "1"), checked[~inside]).fit()
         predicted[inside] = result.predict(checked[inside])
     actual = checked["regret"].to_numpy(float)
-    return 1 - float(((actual - predicted) ** 2).sum()) / float(((actual - actual.mean()) ** 2).sum())
+    return r_squared(actual, actual - predicted)
 
 
 def _checked(data: "pd.DataFrame", measures: Sequence[str]) -> "pd.DataFrame":
