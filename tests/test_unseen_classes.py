@@ -205,6 +205,17 @@ def test_outcomes_are_means_over_evaluations_with_their_noise_over_seeds():
     assert (cell["cumulative"], cell["random_scale"]) == (5, 15)
 
 
+def test_seeds_without_an_outcome_do_not_count_for_its_noise():
+    of = {"environment": "a", "instance": "a/1", "chance": "plain", "agent": "dqn", "observation": "vector"}
+    regrets, ends = (0.3, 0.5, np.nan), {"value_optimal": 1.0, "value_uniform": 0.0, "episodes": 1}
+    runs = pd.DataFrame(
+        [{**of, **ends, "id": str(i), "cumulative_realised_regret": each} for i, each in enumerate(regrets)]
+    )
+    points = pd.DataFrame({"id": ["0", "1", "2"], "step": [0, 0, 0], "value": [0.5, 0.5, 0.5]})
+    cell = study.outcomes(runs, points).iloc[0]
+    assert cell["played"] == pytest.approx(0.4) and cell["played_noise"] == pytest.approx(0.02 / 2)
+
+
 def test_runs_that_had_begun_are_told():
     runs = pd.DataFrame({"id": [*"abc"], "began": ["2026-01-01T00:00:00Z", "2026-01-02T00:00:01Z", ""]})
     assert unseen_classes.late(runs, {"date": "2026-01-02T00:00:00Z"}) == (1, 1)

@@ -46,13 +46,11 @@ def outcomes(runs: "pd.DataFrame", points: "pd.DataFrame") -> "pd.DataFrame":
     Args:
         runs, points: of `table` and `curves`.
     Returns:
-        CELL; OUTCOMES, `cumulative` before its logarithm; for each the column NAME_noise, its variance over seeds
-        divided by their number (NaN of one seed); `random_scale`, what random play would lose in as many episodes.
+        CELL; OUTCOMES, `cumulative` before its logarithm; for each the column NAME_noise, its variance over the seeds
+        that have it, divided by their number (NaN of one seed); `random_scale`, what random play would lose in as many
+        episodes.
     """
-    of_run = runs.set_index("id")
-    spread = of_run["value_optimal"] - of_run["value_uniform"]
-    optimal = points["id"].map(of_run["value_optimal"])
-    regret = ((optimal - points["value"]) / points["id"].map(spread)).replace([np.inf, -np.inf], np.nan)
+    regret = normalized_regrets(points, runs)
     cells = runs[[*CELL, "id"]].copy()
     cells["greedy"] = cells["id"].map(regret.groupby(points["id"]).mean())
     reached = points["step"].where(regret <= TENTH).groupby(points["id"]).min()
@@ -66,8 +64,20 @@ def outcomes(runs: "pd.DataFrame", points: "pd.DataFrame") -> "pd.DataFrame":
         cells["played"] = (cells["cumulative"] / cells["random_scale"]).replace([np.inf, -np.inf], np.nan)
     groups = cells.groupby(CELL, sort=False)
     table = groups[[*OUTCOMES, "random_scale"]].mean()
-    noise = groups[list(OUTCOMES)].var(ddof=1).div(groups.size(), axis=0)
-    return table.join(noise.add_suffix("_noise")).reset_index()
+    of_seeds = groups[list(OUTCOMES)]
+    return table.join((of_seeds.var(ddof=1) / of_seeds.count()).add_suffix("_noise")).reset_index()
+
+
+def normalized_regrets(points: "pd.DataFrame", runs: "pd.DataFrame") -> "pd.Series":
+    """Of each evaluation the regret of the greedy policy, (V* - V) / (V* - V of uniform play); NaN where that is 0.
+
+    Args:
+        points, runs: of `curves` and `table`.
+    """
+    of_run = runs.set_index("id")
+    spread = of_run["value_optimal"] - of_run["value_uniform"]
+    lost = points["id"].map(of_run["value_optimal"]) - points["value"]
+    return (lost / points["id"].map(spread)).replace([np.inf, -np.inf], np.nan)
 
 
 @dataclass(frozen=True)
@@ -181,7 +191,12 @@ def _corrected(table: "pd.DataFrame") -> "pd.DataFrame":
 
 @dataclass(frozen=True, eq=False)
 class Cells:
-    """Cells of one agent as arrays; `frame` has the rows that are left, `x` (N, P), `y` (N,)."""
+    """Cells of one agent as arrays.
+
+    Attributes:
+        frame: the N rows. x: (N, P) predictors, as they enter. y: (N,) the outcome.
+        classes, instances, mdps: (N,) numbers from 0.
+    """
 
     frame: "pd.DataFrame"
     x: np.ndarray
@@ -239,6 +254,7 @@ def _line(
 
 
 def _left_out(cells: Cells, outcome: str, permutations: int, seed: int) -> dict[str, float]:
+    """Statistics of classes and MDPs left out; rank correlations are NaN where there is no predictor."""
     x, y, classes = cells.x, cells.y, cells.classes
     count = classes.max() + 1
     scores, rho = _held_out.held_out(x, y, classes, np.ones((1, count), int))
@@ -252,7 +268,7 @@ def _left_out(cells: Cells, outcome: str, permutations: int, seed: int) -> dict[
     dummies = np.eye(count)[classes][:, 1:] if not x.shape[1] else x
     by_mdp = _held_out.predictions(dummies, y, cells.instances, classes)
     slope, offset = _held_out.calibration(y, predicted, classes)
-    noise = cells.frame.get(f"{outcome}_noise")
+    noise = _noise(cells, outcome)
     floors, p = [np.nan, np.nan], np.nan
     if permutations and x.shape[1] and count >= 3:
         shuffled = _held_out.permuted_classes(x, y, classes, cells.places, permutations, seed)
@@ -271,10 +287,15 @@ def _left_out(cells: Cells, outcome: str, permutations: int, seed: int) -> dict[
         "r_squared_mdp": _held_out.r_squared(y, by_mdp, classes) if cells.instances.max() else np.nan,
         "calibration": slope if x.shape[1] else np.nan,
         "calibration_offset": offset if x.shape[1] else np.nan,
-        "ceiling": np.nan
-        if noise is None or outcome == ABSOLUTE
-        else _held_out.ceiling(y, noise.to_numpy(float), classes),
+        "ceiling": np.nan if noise is None else _held_out.ceiling(y, noise, classes),
     }
+
+
+def _noise(cells: Cells, outcome: str) -> np.ndarray | None:
+    """(N,) the variance of the mean over seeds; None where it is not known, or is not that of the logarithm."""
+    if outcome == ABSOLUTE or f"{outcome}_noise" not in cells.frame:
+        return None
+    return cells.frame[f"{outcome}_noise"].to_numpy(float)
 
 
 def _percentile(values: np.ndarray, share: float) -> float:
@@ -283,6 +304,7 @@ def _percentile(values: np.ndarray, share: float) -> float:
 
 
 def _within(cells: Cells, outcome: str, permutations: int, seed: int) -> dict[str, float]:
+    """Statistics within classes and MDPs; NaN of several predictors together, and of none."""
     row = {"rho_within": np.nan, "pairs": 0, "agreement": np.nan}
     row |= dict.fromkeys(("agreement_lower", "agreement_upper", "p_agreement", "agreement_ceiling"), np.nan)
     row |= {"image_pairs": 0, "image_agreement": np.nan}
@@ -294,12 +316,14 @@ def _within(cells: Cells, outcome: str, permutations: int, seed: int) -> dict[st
         row["rho_within"] = float(np.nanmean(within))
     pairs = Pairs.of(y, cells.mdps)
     row |= {"pairs": len(pairs.first), "agreement": pairs.agreement(x)}
-    noise = cells.frame.get(f"{outcome}_noise")
-    if noise is not None and outcome != ABSOLUTE:
-        row["agreement_ceiling"] = pairs.ceiling(y, noise.to_numpy(float))
+    noise = _noise(cells, outcome)
+    if noise is not None:
+        row["agreement_ceiling"] = pairs.ceiling(y, noise)
     names = cells.frame["observation"].to_numpy()
-    kinds = np.array([_kind(name) for name in names])
-    of_both = pairs.only((kinds[pairs.first] != kinds[pairs.second]) & (np.minimum(*_both(kinds, pairs)) > 0))
+    is_vector = names == VECTOR
+    is_image = np.array([name.split("(")[0] in IMAGES for name in names])
+    first, second = pairs.first, pairs.second
+    of_both = pairs.only((is_image[first] & is_vector[second]) | (is_vector[first] & is_image[second]))
     row |= {"image_pairs": len(of_both.first), "image_agreement": of_both.agreement(x)}
     if (x[pairs.first] == x[pairs.second]).all():
         return row
@@ -311,16 +335,8 @@ def _within(cells: Cells, outcome: str, permutations: int, seed: int) -> dict[st
     return row
 
 
-def _both(kinds: np.ndarray, pairs: Pairs) -> tuple[np.ndarray, np.ndarray]:
-    return kinds[pairs.first], kinds[pairs.second]
-
-
-def _kind(observation: str) -> int:
-    """1 of the plain vector, 2 of images, 0 of others."""
-    return 1 if observation == VECTOR else 2 if observation.split("(")[0] in IMAGES else 0
-
-
 def _mixed(cells: Cells, model: Model, tabular: Sequence[str], seed: int) -> dict[str, float]:
+    """The mixed model and partial correlations; NaN of several predictors together, and of none."""
     names = ("slope", "slope_error", "p_slope", "class_share", "mdp_share")
     row: dict[str, float] = dict.fromkeys(names, np.nan)
     for name in ("given_tabular", "given_tabular_regret"):
@@ -353,6 +369,6 @@ def _mixed(cells: Cells, model: Model, tabular: Sequence[str], seed: int) -> dic
 
 
 def late(runs: "pd.DataFrame", about: Mapping[str, str]) -> tuple[int, int]:
-    """(how many runs had begun when the predictions were written, how many runs do not say when they were made)."""
+    """(runs that had begun when the predictions were written, runs that do not say when they began): numbers."""
     began = runs["began"] if "began" in runs else runs["id"].map(lambda _: "")
     return int(((began != "") & (began <= about["date"])).sum()), int((began == "").sum())

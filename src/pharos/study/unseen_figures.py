@@ -11,17 +11,15 @@ from pharos.study import held_out
 from pharos.study.curves import agent_name, observation_color, slug, title
 from pharos.study.figures import legend_below, panels
 from pharos.study.tables import CELL
-from pharos.study.unseen_classes import Cells
+from pharos.study.unseen_classes import Cells, normalized_regrets
 
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
 MOST_PANELS = 24
-LEARNERS = (
-    ("policy_regret", "policy_curve"),
-    ("kernel_regret", "curve"),
-)  # predictor and curve; the first that there is
+# Predictor and curve of each idealised learner; the first that there is counts.
+LEARNERS = (("policy_regret", "policy_curve"), ("kernel_regret", "curve"))
 DIAGONAL = "#888888"
 LONGEST_TITLE = 34
 
@@ -104,11 +102,7 @@ def idealised_curves(part: "pd.DataFrame", points: "pd.DataFrame", runs: "pd.Dat
         return None
     observations = list(dict.fromkeys(part["observation"]))
     groups = _spread(list(part.groupby(["environment", "instance", "chance"], sort=False)), MOST_PANELS // 2)
-    of_run = runs.set_index("id")
-    spread = of_run["value_optimal"] - of_run["value_uniform"]
-    points = points.assign(
-        regret=(points["id"].map(of_run["value_optimal"]) - points["value"]) / points["id"].map(spread)
-    )
+    points = points.assign(regret=normalized_regrets(points, runs))
     figure, axes = panels(len(groups), 3.0, 2.2)
     for axis, (key, rows) in zip(axes, groups, strict=True):
         for row in rows.to_dict("records"):

@@ -45,14 +45,16 @@ class Pairs:
         return float(self.right(x).mean()) if len(self.first) else np.nan
 
     def ceiling(self, y: np.ndarray, noise: np.ndarray) -> float:
-        """The agreement that a predictor has which knows each cell's expectation: noise over seeds turns pairs around.
+        """The agreement of a predictor that knows the expectation of each cell: noise over seeds turns pairs around.
 
             mean over pairs of P(the expectations differ as the means y do) = Phi(|y1 - y2| / sqrt(noise1 + noise2))
 
-        Normal means, any difference of expectations alike likely beforehand; NaN where no pair has two seeds.
+        for means that are normal about their expectations, under a flat prior on the difference of two expectations.
 
         Args:
-            noise: (N,) of cells: the variance over seeds / seeds.
+            y, noise: (N,) of cells: the mean over seeds, and the variance over seeds / seeds; NaN of a single seed.
+        Returns:
+            NaN where no pair has two seeds in both of its cells.
         """
         from scipy.special import ndtr
 
@@ -65,7 +67,11 @@ class Pairs:
         return float(ndtr(difference / deviation).mean())
 
     def interval(self, x: np.ndarray, classes: np.ndarray, counts: np.ndarray) -> tuple[float, float]:
-        """95 % interval of that over samples of classes, counts (R, C)."""
+        """95 % interval of the agreement over samples of classes; (NaN, NaN) without pairs.
+
+        Args:
+            x, classes: (N,) of cells. counts: (R, C), how often each class counts in each sample.
+        """
         number = counts.shape[1]
         right = np.bincount(classes[self.first], self.right(x), minlength=number)
         pairs = np.bincount(classes[self.first], minlength=number)
@@ -86,7 +92,11 @@ class Pairs:
     ) -> np.ndarray:
         """(R,) agreement where observations change names, in all MDPs of a class alike, but in each class otherwise.
 
-        So a class whose instances all prefer the same observation counts once.
+        So a class whose instances all prefer the same observation counts once. NaN where no pair is left.
+
+        Args:
+            x, classes, mdps, observations: (N,) of cells; classes and MDPs are numbers from 0.
+            permutations: R.
         """
         names = {name: i for i, name in enumerate(dict.fromkeys(observations))}
         columns = np.array([names[each] for each in observations])

@@ -66,7 +66,7 @@ def _text(judgement: "pd.DataFrame") -> list[str]:
     return [
         "Does a number that is known before training predict regret on classes that it has not met? Each class is "
         "predicted by a line through the others, classes weighing alike; baselines stand first, and a measure that "
-        "does not beat them says nothing that is new. R² below 0 is worse than the mean of the other classes.",
+        "does not beat them says nothing that is new. R² below 0 is worse than the mean of all classes.",
         f"{many(number, 'test')} in all; p-values are corrected for that number (Holm). Intervals are over classes "
         "drawn anew, and permutations exchange whole classes: instances and observations of a class are not "
         "independent. The floor is what 95 % of such permutations stay below; the ceiling is what noise over "
