@@ -51,3 +51,7 @@ def test_names_stand_for_environments(space):
         pharos.build("frozen_lak/4x4")
     with pytest.raises(ParameterError, match=r"expected an Environment: write pharos\.make"):
         pharos.build(3)
+    with pytest.raises(ParameterError, match=r"expected a name, such as 'frozen_lake/4x4': write FrozenLake\(\)"):
+        pharos.make(type(ENV))
+    with pytest.raises(ParameterError, match="expected a name, such as"):
+        pharos.make(ENV)

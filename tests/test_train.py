@@ -369,13 +369,20 @@ try:
     pharos.train("q_learning", "frozen_lake/4x4", steps=200, hyperparameters="own.yaml")
 except pharos.errors.MissingExtra as error:
     print(error)
+from pharos import leaderboard
+file = leaderboard.submit({str(tmp_path / "run")!r}, {str(tmp_path / "entry.safetensors")!r})
+print(leaderboard.verify(file).holds)
+try:
+    leaderboard.submit({str(tmp_path / "here")!r}, {str(tmp_path / "other.safetensors")!r})
+except pharos.errors.MissingExtra as error:
+    print(error)
 """
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300)
-    first, second, refused = done.stdout.splitlines()
-    assert first == second and first.startswith("101 200 "), done.stderr
-    assert re.search(r"pip install 'pharos-rl\[study\]'", refused)
-
     here = train("q_learning", "frozen_lake/4x4", steps=200, out=tmp_path / "here")
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300)
+    first, second, refused, holds, unread = done.stdout.splitlines() or [done.stderr] * 5
+    assert first == second and first.startswith("101 200 "), done.stderr
+    assert holds == "True"
+    assert all(re.search(r"pip install 'pharos-rl\[study\]'", hint) for hint in (refused, unread))
     assert sorted(path.name for path in (tmp_path / "run").iterdir()) == ["curve.csv", "policy.npy", "run.json"]
     pd.testing.assert_frame_equal(read_curve(tmp_path / "run"), read_curve(tmp_path / "here"), check_exact=True)
     digests = [read_record(tmp_path / name)["checksums"] for name in ("run", "here")]

@@ -35,8 +35,11 @@ def make(name: str, **parameters: Any) -> Environment:
         parameters: of the class; those of a named instance may be overridden.
     Raises:
         UnknownName: no such environment or parameter; the nearest name is suggested.
-        ParameterError: a parameter is out of range, or there is no such module or class.
+        ParameterError: a parameter is out of range, there is no such module or class, or `name` is no text.
     """
+    if not isinstance(name, str):
+        written = f"{name.__name__}()" if isinstance(name, type) else "it as it is"
+        raise ParameterError(f"make: found {name!r:.60}; expected a name, such as 'frozen_lake/4x4': write {written}")
     class_name, slash, instance = name.partition("/")
     cls = class_called(class_name)
     if (cls is None or (slash and instance not in cls.instances)) and mdp_files.is_folder(Path(name).expanduser()):

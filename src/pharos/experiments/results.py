@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pharos import storage
-from pharos.errors import FileFormatError, ResultCorrupted
+from pharos.errors import FileFormatError, MissingExtra, ResultCorrupted
 from pharos.experiments.config import run_id
 
 if TYPE_CHECKING:
@@ -241,7 +241,10 @@ def read_table(path: Path, advice: str = AGAIN) -> "pa.Table":
 
     Raises:
         FileFormatError: there is no such file. ResultCorrupted: it cannot be read; the message ends with the advice.
+        MissingExtra: pyarrow is not installed.
     """
+    if not _has_pyarrow():
+        raise MissingExtra(f"reading {path}", "pyarrow", "study")
     import pyarrow as pa
     import pyarrow.parquet as pq
 

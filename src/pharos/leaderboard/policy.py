@@ -10,7 +10,6 @@ import numpy as np
 from pharos.agents import AGENTS, algorithm, make_model
 from pharos.errors import FileFormatError, ParameterError, UntrustedCode
 from pharos.experiments import Task
-from pharos.interaction import make_sb3_vec
 from pharos.leaderboard.entry import POLICY, Entry
 from pharos.observations import observe
 from pharos.policies import DeepPolicy
@@ -52,15 +51,17 @@ def _table(entry: Entry, task: Task) -> np.ndarray:
 
 
 def _network(entry: Entry, task: Task, trust: bool) -> DeepPolicy:
-    import torch
-
     config = entry.config
     if trust:
         agent, hyperparameters = config.algorithm(trust=True, strict=True), dict(entry.hyperparameters)
     else:
         agent, hyperparameters = _known_agent(config.agent), _network_options(entry)
         _check_sizes(entry, task, hyperparameters)
-    parameters = inspect.signature(algorithm(agent)).parameters
+    parameters = inspect.signature(algorithm(agent)).parameters  # or what is missing for it is told
+    import torch
+
+    from pharos.interaction import make_sb3_vec
+
     smallest = next((options for options in SMALLEST if set(options) <= set(parameters)), {})
     env = make_sb3_vec(task.env, 1, seed=0, **task.interaction)
     try:
