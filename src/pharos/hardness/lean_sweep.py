@@ -41,14 +41,14 @@ def lean_diameter(
 
     folder: where bounds are kept while they are tightened, and gone on from; None: in memory.
     """
-    kept = None if folder is None else KeptBounds(Path(folder), graph)
+    store = None if folder is None else KeptBounds(Path(folder), graph)
 
     def interval(dtype: Any) -> Interval:
-        return LeanSweep(LeanGraph(graph, dtype), spending, conventions, kept).interval()
+        return LeanSweep(LeanGraph(graph, dtype), spending, conventions, store).interval()
 
-    result = interval(np.int32) if kept and kept.dtype == np.int32 else _in_two_bytes_or_four(interval)
-    if kept and result.exact:
-        kept.remove()
+    result = interval(np.int32) if store and store.dtype == np.int32 else _in_two_bytes_or_four(interval)
+    if store and result.exact:
+        store.remove()
     return result
 
 
@@ -123,18 +123,18 @@ class LeanSweep(SumSweep):
     """`SumSweep` on a graph that is searched by sweeps, in little memory."""
 
     def __init__(
-        self, graph: LeanGraph, spending: Spending, conventions: dict[str, Any], kept: KeptBounds | None = None
+        self, graph: LeanGraph, spending: Spending, conventions: dict[str, Any], store: KeptBounds | None = None
     ):
-        """kept: where the bounds are; None: in memory."""
+        """store: where the bounds are; None: in memory."""
         self.graph: Any = graph
         self.spending, self.conventions = spending, conventions
         size, dtype = graph.num_nodes, graph.dtype
-        if kept is None:
+        if store is None:
             bounds = [large_zeros((size,), dtype) for _ in range(4)]
             for upper in bounds[2:]:
                 upper[:] = graph.far
         else:
-            bounds = [*kept.arrays(np.dtype(dtype))]
+            bounds = [*store.arrays(np.dtype(dtype))]
         self.out_lower, self.in_lower, self.out_upper, self.in_upper = bounds
         self.away = large_zeros((size,), dtype)
         self.to = large_zeros((size,), dtype)

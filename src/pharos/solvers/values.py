@@ -161,12 +161,12 @@ def check_tolerance(tolerance: float) -> None:
 def checked_dtype(dtype: Any) -> np.dtype:
     """float64 or float32."""
     try:
-        found = np.dtype(dtype)
+        kind = np.dtype(dtype)
     except TypeError:
-        found = np.dtype(object)
-    if found not in (np.float64, np.float32):
+        kind = np.dtype(object)
+    if kind not in (np.float64, np.float32):
         raise ParameterError(f"dtype is {dtype!r}; expected 'float64' or 'float32'")
-    return found
+    return kind
 
 
 def checked_horizon(mdp: TabularMDP, horizon: int | None) -> int | None:

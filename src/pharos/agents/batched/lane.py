@@ -16,7 +16,7 @@ from pharos.agents.batched.worlds import Worlds
 from pharos.kernels import batched_worlds as kernels
 from pharos.kernels import philox
 
-ASKED = (16, 256)  # rows of the blocks in which a policy is asked: few observations, many
+ASKED = (16, 64, 256)  # rows of the blocks in which a policy is asked
 
 
 class Lane:
