@@ -45,6 +45,7 @@ COUNTED = {  # instance -> states, and the page that tells how they were counted
     "mini_grid/key-corridor-s6r3": (16_844_288, "mini-grid.md"),
     "freeway/25x13-speed1": (3_001_973, "study.md"),
     "breakout/20x10x1-3rows": (923_305_259, "performance.md"),
+    "breakout/30x10x1-3rows": (1_083_934_871, "performance.md"),
 }
 LIVE = "assets/explorer/frozen_lake.html"
 FRAME = (

@@ -229,3 +229,34 @@ def test_values_of_32_bits_are_for_one_process_and_no_horizon():
             value_iteration(mdp, dtype="float32", **wrong)
     with pytest.raises(ParameterError, match="expected 'float64' or 'float32'"):
         value_iteration(mdp, dtype="float16")
+
+
+@pytest.mark.long
+@settings(max_examples=150, deadline=None)
+@given(small_mdps(), st.integers(2, 7), st.sampled_from(("float64", "float32")), st.integers(1, 3))
+def test_bounds_hold_whatever_the_blocks(mdp, blocks, dtype, threads):
+    tolerance = 1e-6 if dtype == "float64" else 1e-6 / (1 - mdp.gamma) ** 2
+    solution = value_iteration(mdp, tolerance, blocks=blocks, dtype=dtype, threads=threads)
+    truth = naive_exact.extreme_values(mdp)
+    assert naive_exact.largest_error(solution.v, truth) <= solution.error_bound <= tolerance
+
+
+@pytest.mark.long
+def test_the_largest_residual_proves_the_bound_of_blocks(tmp_path):
+    mdp, bounds = ring(3000, 0.999), []
+
+    def look(rounds, bound):
+        bounds.append(bound)
+
+    solution = value_iteration(mdp, 1e-3, blocks=5, progress=look, values=tmp_path / "values.npy")
+    x = solution.x[:, 0].copy()
+    residual = np.abs((mdp.rewards + mdp.gamma * x[mdp.next_states]).max(axis=1) - x[:-1]).max()
+    assert residual / (1 - mdp.gamma) <= solution.error_bound == bounds[-1] <= 1e-3 < bounds[-2]
+    del solution
+    assert value_iteration(mdp, 1e-3, blocks=5, values=tmp_path / "values.npy").sweeps == 1
+
+
+def test_a_number_of_blocks_that_cannot_be_is_one_line():
+    for wrong in (0, -1, 1.5, 5000, None):
+        with pytest.raises(ParameterError, match="expected a whole number from 1 to 4096"):
+            value_iteration(ring(), blocks=wrong)

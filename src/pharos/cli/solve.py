@@ -63,6 +63,12 @@ def solve(
         str,
         typer.Option("--dtype", help="Of values: float64; or float32, half the memory, and a bound that counts it."),
     ] = "float64",
+    blocks: Annotated[
+        int,
+        typer.Option(
+            "--blocks", min=1, help="Ranges of states that are swept one after another: fewer reads of a disk."
+        ),
+    ] = 1,
     memory: Memory = None,
     workers: Workers = None,
     processes: Processes = "1",
@@ -84,7 +90,8 @@ def solve(
     from pharos.solvers import uniform_value, value_iteration
 
     checkpoint = (values or paths.cache_directory() / "values") if ranks != 1 else None
-    sharing: dict[str, Any] = {"processes": ranks, "jacobi": jacobi, "checkpoint": checkpoint, "dtype": dtype}
+    sharing: dict[str, Any] = {"processes": ranks, "jacobi": jacobi, "checkpoint": checkpoint}
+    sharing |= {"dtype": dtype, "blocks": blocks}
     suffix = ".npy" if dtype == "float64" else f"-{dtype}.npy"
     with progress_line("solving") as report:
         solution = value_iteration(

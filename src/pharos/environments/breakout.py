@@ -26,7 +26,9 @@ INSTANCES = {
     f"{height}x{columns}x{width}": {"height": height, "columns": columns, "extra_paddle_width": (width - 1) // 2}
     for height, columns, width in (*PAPER, *DRAWN)
 }
-INSTANCES["20x10x1-3rows"] = {"height": 20, "columns": 10, "brick_rows": 3}  # 923,305,259 states
+INSTANCES |= {  # 923,305,259 and 1,083,934,871 states
+    f"{height}x10x1-3rows": {"height": height, "columns": 10, "brick_rows": 3} for height in (20, 30)
+}
 
 # found by searches on courts of 11 x 7 and 10 x 8 under three kinds of chance, docs/agents.md
 VECTOR = {

@@ -45,7 +45,7 @@ BUILT_IN = (  # in the order in which they are listed
         "breakout",
         "Breakout",
         "12x10x1 12x8x1 16x8x1 20x8x1 24x8x1 12x10x3 12x8x3 16x8x3 20x8x3 24x8x3 14x8x1 14x10x3 20x10x1 20x10x3 "
-        "24x10x3 20x10x1-3rows",
+        "24x10x3 20x10x1-3rows 30x10x1-3rows",
     ),
     BuiltIn("sliding_tiles", "SlidingTiles", "2x2 2x3 3x3 3x3-hardest 2x4 2x5 3x4"),
     BuiltIn("pocket_cube", "PocketCube", "half quarter half-4 quarter-4"),

@@ -17,6 +17,8 @@ from pharos.mdp.selection import Extreme, PolicyTable, Selection
 class CompiledDynamics(Dynamics):
     """Transitions in arrays that kernels/outcomes.py knows how to read: each loop is written once for all of them."""
 
+    sweeps_ranges = True
+
     @property
     @abstractmethod
     def for_kernels(self) -> Any:
@@ -47,8 +49,11 @@ class CompiledDynamics(Dynamics):
         out[-1] = 0.0
         _shared(lambda start, stop: kernel(*tables, weights, choice, x_, out_, actions, start, stop), self)
 
-    def sweep(self, equation: BellmanEquation, x: np.ndarray, threads: int = 1) -> float:
-        return swept(self.for_sweeps, self.num_actions, equation, x, None, threads)
+    def sweep(
+        self, equation: BellmanEquation, x: np.ndarray, threads: int = 1, part: tuple[int, int] | None = None
+    ) -> float:
+        """part: the states [start, stop) alone."""
+        return swept(self.for_sweeps, self.num_actions, equation, x, None, threads, part)
 
     def settle_components(
         self, equation: BellmanEquation, x: np.ndarray, parts: Components, target: float, settled: float, most: float
@@ -155,9 +160,8 @@ def swept(
             change = float(np.maximum(change, largest))
         return change
 
-    if part:
-        return change_of(*part)
-    cuts = [rewards.shape[0] * i // threads for i in range(threads + 1)]
+    low, high = part or (0, rewards.shape[0])
+    cuts = [low + (high - low) * i // threads for i in range(threads + 1)]
     if threads == 1:
         return change_of(*cuts)
     with ThreadPoolExecutor(threads) as pool:

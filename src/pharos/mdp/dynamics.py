@@ -109,6 +109,7 @@ class Dynamics(ABC):
         has_ends: whether some execution ends the episode without a next state.
         laziness: probability that nothing happens, as far as `lazy` has added it.
         workers: threads of a backup, where it has several; None for all processors.
+        sweeps_ranges: whether `sweep` takes a range of the states, `part=(start, stop)`.
     """
 
     num_states: int
@@ -119,6 +120,7 @@ class Dynamics(ABC):
     has_ends: bool
     laziness: float = 0.0
     workers: int | None = None
+    sweeps_ranges: bool = False
 
     # What each representation says of itself ------------------------------------------------------------------------
 

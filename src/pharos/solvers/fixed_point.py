@@ -97,10 +97,14 @@ class Backup:
             self.mdp.dynamics.backup(self.equation, x, out)
         return out
 
-    def sweep(self, x: np.ndarray) -> float:
-        """x = T x in place, from the last state to the first where that is possible; the largest change."""
+    def sweep(self, x: np.ndarray, part: tuple[int, int] | None = None) -> float:
+        """x = T x in place, from the last state to the first where that is possible; the largest change.
+
+        part: the range of states [start, stop) alone, where transitions are in arrays.
+        """
+        options = {} if part is None else {"part": part}
         with np.errstate(over="ignore", invalid="ignore"):  # the bound of values beyond floats is infinite
-            return self.mdp.dynamics.sweep(self.equation, x, self.threads)
+            return self.mdp.dynamics.sweep(self.equation, x, self.threads, **options)
 
     def rounding(self, largest: float) -> float:
         """A bound on the rounding error of one backup of entries up to `largest`: half a unit for each operation, and
@@ -115,6 +119,19 @@ class Backup:
     def stored(self, largest: float) -> float:
         """A bound on the error of storing a backup, where the result is at most `largest`: 0 in 64 bits."""
         return _UNIT32 * (1 + 4 * _UNIT32) * largest + 2 * _LEAST32 if self.is_single else 0.0
+
+    def size(self, largest: float) -> float:
+        """How large backups may be of which the largest was stored as `largest`."""
+        return largest * (1 + 4 * _UNIT32) + 4 * _LEAST32 if self.is_single else largest
+
+    def changed(self, change: float, largest: float) -> float:
+        """By how much stored entries have changed, at most, that were at most `largest`; `change` is what a sweep says:
+        of backups before they were stored, computed in 32 bits by some dynamics.
+        """
+        if not self.is_single:
+            return change
+        change *= 1 + 4 * _UNIT32
+        return change + self.stored(self.size(largest + change))
 
     def bound(self, change: float, rounding: float) -> float:
         """The largest error of values that a sweep has changed by at most `change`: (rho d + e) / (1 - rho)."""
@@ -182,17 +199,17 @@ def _in_single(
     mdp, rho, sweeps, least, since = backup.mdp, backup.factor, 0, math.inf, 0
     patience = SETTLING + math.ceil(1 / (1 - rho))  # sweeps that gain a factor of 2.7, but for rounding
     while True:
-        change = backup.sweep(x) * (1 + 4 * _UNIT32)  # which some dynamics compute in 32 bits
-        sweeps += 1
-        size = (largest_of(x) + change) * (1 + 4 * _UNIT32) + 4 * _LEAST32  # of old entries, and of backups
-        bound = backup.bound(change + backup.stored(size), backup.rounding(size))
+        told, sweeps = backup.sweep(x), sweeps + 1
+        largest = largest_of(x)
+        change = backup.changed(told, largest)
+        bound = backup.bound(change, backup.rounding(backup.size(largest + change)))
         if progress is not None:
             progress(sweeps, bound)
         if bound <= tolerance:
             return FixedPoint(x, bound, sweeps)
         if bound < 0.9 * least:
             least, since = bound, sweeps
-        if change == 0.0 or sweeps - since > patience or not math.isfinite(bound):
+        if told == 0.0 or sweeps - since > patience or not math.isfinite(bound):
             raise imprecise(mdp, min(least, bound), tolerance, is_single=True)
 
 
@@ -264,8 +281,7 @@ def _in_one_pass(
     with np.errstate(over="ignore", invalid="ignore"):
         mdp.dynamics.sweep_once(backup.equation, x, order)
         series = min(backups, 1 / (1 - rho)) if rho < 1 else backups * np.float64(rho) ** order.longest
-        largest = largest_of(x) * (1 + 4 * _UNIT32 if backup.is_single else 1)  # of backups
-        bound = float(backup.rounding(largest) * series * MARGIN)
+        bound = float(backup.rounding(backup.size(largest_of(x))) * series * MARGIN)
     if progress is not None:
         progress(1, bound)
     if not bound <= tolerance:

@@ -9,7 +9,8 @@ import numpy as np
 from pharos.compiling import Stopwatch
 from pharos.errors import ParameterError
 from pharos.mdp import BEST, WORST, Selection, TabularMDP, random_actions, takes_mdp
-from pharos.solvers.fixed_point import backward_induction, fixed_point
+from pharos.solvers.blocks import MOST_BLOCKS, blocked_fixed_point, can_be_swept_by_blocks
+from pharos.solvers.fixed_point import Backup, backward_induction, fixed_point
 from pharos.solvers.kept_values import kept_values
 from pharos.solvers.sharing import Sharing, shared_solution
 from pharos.solvers.solution import Solution
@@ -30,6 +31,7 @@ def value_iteration(
     checkpoint: str | os.PathLike | None = None,
     threads: int = 1,
     dtype: Any = "float64",
+    blocks: int = 1,
 ) -> Solution:
     """The optimal values of an MDP.
 
@@ -49,6 +51,9 @@ def value_iteration(
             number of processes. Those of a horizon are so anyway.
         dtype: "float32" stores values in half of the memory; the bound counts what that costs, so that a tolerance
             below 1.2e-7 max |V| / (1 - gamma) is out of reach. For one process, and no horizon.
+        blocks: ranges of states that are swept one after another, each some times in a row and as long as its own bound
+            is not met: values and transitions are read fewer times, for more backups, which pays where memory holds a
+            range at a time. Where gamma is below 1 and transitions are in arrays; else it does not matter.
 
         Cost only:
         processes: of this machine, each of which sweeps a range of the states; or "mpi": those that `mpiexec` has
@@ -73,7 +78,8 @@ def value_iteration(
     Source: Bellman (1957); in place: Puterman (1994), section 6.3.3; the sticky equation: the pharos paper, appendix A.
     """
     sharing = Sharing(processes, jacobi, checkpoint)
-    return solution_of(mdp, BEST, tolerance, horizon, keep_all, progress, values, sharing, threads, dtype)
+    storage: dict[str, Any] = {"values": values, "threads": threads, "dtype": dtype, "blocks": blocks}
+    return solution_of(mdp, BEST, tolerance, horizon, keep_all, progress, sharing=sharing, **storage)
 
 
 @takes_mdp
@@ -103,6 +109,7 @@ def uniform_value(
     checkpoint: str | os.PathLike | None = None,
     threads: int = 1,
     dtype: Any = "float64",
+    blocks: int = 1,
 ) -> Solution:
     """The values of the uniformly random policy: every action is replaced by a uniform one, so nothing is chosen.
 
@@ -110,7 +117,7 @@ def uniform_value(
     """
     sharing = Sharing(processes, jacobi, checkpoint)
     mdp = random_actions(mdp, 1.0)
-    storage: dict[str, Any] = {"values": values, "threads": threads, "dtype": dtype}
+    storage: dict[str, Any] = {"values": values, "threads": threads, "dtype": dtype, "blocks": blocks}
     return solution_of(mdp, BEST, tolerance, horizon, progress=progress, sharing=sharing, **storage)
 
 
@@ -125,12 +132,15 @@ def solution_of(
     sharing: Sharing | None = None,
     threads: int = 1,
     dtype: Any = "float64",
+    blocks: int = 1,
 ) -> Solution:
     """The values of what is chosen: a fixed point, or those of backward induction where there is a horizon."""
     check_tolerance(tolerance)
     horizon, dtype = checked_horizon(mdp, horizon), checked_dtype(dtype)
     if dtype == np.float32 and (horizon is not None or (sharing is not None and sharing.is_wanted)):
         raise ParameterError("dtype='float32' is for one process and no horizon; expected 'float64' here")
+    if not (isinstance(blocks, int | np.integer) and 1 <= blocks <= MOST_BLOCKS):
+        raise ParameterError(f"blocks is {blocks!r}; expected a whole number from 1 to {MOST_BLOCKS}")
     if sharing is not None and sharing.is_wanted:
         if keep_all:
             raise ParameterError("keep_all: several processes keep the last step alone; expected processes=1")
@@ -141,7 +151,12 @@ def solution_of(
     steps = None
     if horizon is None:
         x = None if values is None else kept_values(values, (mdp.num_states + 1, mdp.width), dtype)
-        result = fixed_point(mdp, select, tolerance, progress, x, usable_workers(threads), dtype)
+        if blocks > 1 and can_be_swept_by_blocks(mdp):
+            result = blocked_fixed_point(
+                Backup(mdp, select, usable_workers(threads), dtype), tolerance, blocks, progress, x
+            )
+        else:
+            result = fixed_point(mdp, select, tolerance, progress, x, usable_workers(threads), dtype)
         following = result.x
     elif values is not None:
         raise ParameterError(f"values={str(values)!r}: a file keeps values without a horizon; found {horizon} steps")
