@@ -260,3 +260,13 @@ def test_a_number_of_blocks_that_cannot_be_is_one_line():
     for wrong in (0, -1, 1.5, 5000, None):
         with pytest.raises(ParameterError, match="expected a whole number from 1 to 4096"):
             value_iteration(ring(), blocks=wrong)
+
+
+def test_rows_that_fill_memory_are_all_swept_and_stay_what_they_are(tmp_path, monkeypatch, no_memory):
+    monkeypatch.setattr(memory_map, "RANGE", 1000)
+    rows = np.arange(30_000, dtype=np.int32).reshape(-1, 3)
+    rows.tofile(tmp_path / "rows.bin")
+    mapped = np.memmap(tmp_path / "rows.bin", np.int32, "r", shape=rows.shape)
+    ranges = list(memory_map.ranges_from_the_end(mapped, 100, len(rows)))
+    assert ranges[0] == (9000, 10_000) and ranges[-1] == (100, 1000)
+    assert all(start == stop for (start, _), (_, stop) in itertools.pairwise(ranges)) and (mapped == rows).all()

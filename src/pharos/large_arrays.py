@@ -24,6 +24,8 @@ SMALL, SHARE = 1 << 26, 4
 _BLOCK = 1 << 24
 # Rows of a mapped array that are swept while the next ones are read.
 RANGE = 1 << 22
+# Advice of Linux 5.4 that Python has no name for: these pages may go first.
+_COLD = 20
 
 
 def reserved_states(num_words: int) -> np.ndarray:
@@ -105,22 +107,29 @@ def ranges_from_the_end(rows: Any, low: int, high: int) -> Iterator[tuple[int, i
     """Ranges [start, stop) that make up [low, high), the last one first: how rows are swept from the last to the first.
 
     Rows in memory are one range. Of a mapped array, `RANGE` rows are swept while the system reads those before them: it
-    finds out by itself what is read from the first byte to the last, but not what is read the other way round.
+    finds out by itself what is read from the first byte to the last, but not what is read the other way round. Where
+    the rows fill memory, those that were swept go before anything else: values, which may be mapped as well, are needed
+    all the time.
     """
     if not isinstance(rows, np.memmap):
         yield low, high
         return
+    fills_memory = 2 * rows.nbytes > machine.available_memory()
     for stop in range(high, low, -RANGE):
         start = max(stop - RANGE, low)
-        _read_ahead(rows, max(start - RANGE, low), start)
+        _advise(rows, max(start - RANGE, low), start, getattr(mmap, "MADV_WILLNEED", None))
         yield start, stop
+        if fills_memory and sys.platform == "linux":
+            _advise(rows, start, stop, _COLD)
 
 
-def _read_ahead(array: np.memmap, start: int, stop: int) -> None:
-    """Ask the system for rows of a mapped array, which will be read soon; it does so while this process works."""
+def _advise(array: np.memmap, start: int, stop: int, advice: int | None) -> None:
+    """Tell the system what becomes of rows of a mapped array: that they will be read soon, which it does while this
+    process works; or that they will not.
+    """
     mapping = getattr(array, "_mmap", None)
-    if start < stop and isinstance(mapping, mmap.mmap) and hasattr(mmap, "MADV_WILLNEED"):
+    if start < stop and isinstance(mapping, mmap.mmap) and advice is not None:
         row = array.strides[0]
         first = start * row // mmap.PAGESIZE * mmap.PAGESIZE
         with contextlib.suppress(OSError, ValueError):
-            mapping.madvise(mmap.MADV_WILLNEED, first, stop * row - first)
+            mapping.madvise(advice, first, stop * row - first)
