@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from pharos.hardness.layers import WIDE, Layers
 from pharos.hardness.transition_graph import Graph
 from pharos.kernels import clocks
 
@@ -25,8 +26,8 @@ from pharos.kernels import clocks
 kernels: Any = clocks
 # Cycles shorter than this leave layers so wide that searches by levels read as little.
 _SHORTEST = 64
-# Times that searches may go round, and nodes of a layer, which must stay in a core's cache.
-_ROUNDS, _WIDE = 4, 1024
+# Times that searches may go round.
+_ROUNDS = 4
 
 
 class HiddenClock(NamedTuple):
@@ -34,14 +35,12 @@ class HiddenClock(NamedTuple):
 
     Attributes:
         home: (N,) steps to the start; away: (N,) steps from it.
-        order: (N,) nodes by layer; layer_first: (P + 1,); position: (N,) int32, the place of a node in its layer.
+        layers: of the nodes, by `away` modulo P.
     """
 
     home: np.ndarray
     away: np.ndarray
-    order: np.ndarray
-    layer_first: np.ndarray
-    position: np.ndarray
+    layers: Layers
 
     @staticmethod
     def of(graph: Graph, home: np.ndarray, away: np.ndarray) -> "HiddenClock | None":
@@ -58,36 +57,29 @@ class HiddenClock(NamedTuple):
             return None
         layer = away % cycle
         widths = np.bincount(layer, minlength=cycle)
-        if int(widths.max()) > _WIDE:
+        if int(widths.max()) > WIDE:
             return None
-        layer_first = np.concatenate([[0], np.cumsum(widths)])
-        order = np.argsort(layer, kind="stable").astype(graph.dtype)
-        position = np.empty(graph.num_nodes, np.int32)
-        position[order] = np.arange(graph.num_nodes) - np.repeat(layer_first[:-1], widths)
-        return HiddenClock(home.copy(), away.copy(), order, layer_first, position)
+        return HiddenClock(home.copy(), away.copy(), Layers.of(layer, widths, graph.dtype))
 
     def largest_to(self, graph: Graph, targets: np.ndarray, best: int) -> tuple[np.ndarray, int]:
         """((targets,) max over u of d(u, target), or `best` where that is larger; table entries read)."""
-        cycle = len(self.layer_first) - 1
-        layers = self.away[targets] % cycle
-        order = np.argsort(-layers, kind="stable")
+        cycle = self.layers.number
+        of_target = self.away[targets] % cycle
+        order = np.argsort(-of_target, kind="stable")
         # The first is the one after the longest stretch of layers without a target.
-        gaps = (np.roll(layers[order], 1) - layers[order]) % cycle
+        gaps = (np.roll(of_target[order], 1) - of_target[order]) % cycle
         order = np.roll(order, -int(gaps.argmax()))
-        first = int(layers[order[0]])
-        offset = (first - layers[order]) % cycle
+        first = int(of_target[order[0]])
+        offset = (first - of_target[order]) % cycle
         words = -(-len(targets) // 64)
-        widest = int(np.diff(self.layer_first).max())
-        scratch = np.zeros((2, widest, words), np.uint64)
-        visits = np.zeros((len(self.order), words), np.uint64)
+        scratch = np.zeros((2, self.layers.widest, words), np.uint64)
+        visits = np.zeros((len(self.away), words), np.uint64)
         largest = np.full(len(targets), best, np.int64)
         ordered = np.ascontiguousarray(targets[order], np.int64)
         reads = kernels.search_in_step(
             graph.next_states,
             graph.ends,
-            self.order,
-            self.layer_first,
-            self.position,
+            *self.layers,
             ordered,
             first,
             offset.astype(np.int64),

@@ -10,6 +10,7 @@ import numpy as np
 
 from pharos.hardness.hidden_clock import HiddenClock
 from pharos.hardness.interval import Interval, Spending
+from pharos.hardness.layers import WIDE, Layers
 from pharos.hardness.orbits import orbits
 from pharos.hardness.restored import largest_distances, restored
 from pharos.hardness.transition_graph import Graph
@@ -21,8 +22,6 @@ kernels: Any = graph
 clock: Any = clocks
 dense: Any = dense_search
 searches: Any = many_searches
-# Nodes of a layer beyond which layers are not narrow: a set of them no longer fits into a core's cache.
-_WIDE = 1024
 # Widths of searches from many nodes, in words of 64 sources: eight words are a cache line.
 _WORDS = (1, 8)
 # Levels up to which every node is asked on every level. Breakout has six times as many, puzzles half of them.
@@ -285,7 +284,7 @@ class SumSweep:
             self.in_upper[targets] = largest
             self.best = max(self.best, int(largest.max()))
             self.spending.searches += len(targets)
-            self.method = f"searches in step with {len(clock.layer_first) - 1} layers of a clock that restarts hide"
+            self.method = f"searches in step with {clock.layers.number} layers of a clock that restarts hide"
             self.spending.report(self.best, self._upper(), self._open()[0])
 
     def _from_clock(self) -> "Interval | str":
@@ -313,17 +312,12 @@ class SumSweep:
         layer = self.away % cycle
         widths = np.bincount(layer, minlength=cycle)
         widest = int(widths.max())
-        if widest > _WIDE:
+        if widest > WIDE:
             return f"all cycles have multiples of {cycle} steps, but a layer of {widest} states is too wide to follow"
-        layer_first = np.concatenate([[0], np.cumsum(widths)])
-        order = np.argsort(layer, kind="stable").astype(graph.dtype)
-        position = np.empty(graph.num_nodes, np.int32)
-        position[order] = np.arange(graph.num_nodes) - np.repeat(layer_first[:-1], widths)
+        layers = Layers.of(layer, widths, graph.dtype)
         scratch = [np.empty((widest, -(-widest // 64)), np.uint64) for _ in range(2)]
         max_reads = 200 * graph.num_nodes * graph.next_states.shape[1] + 10**8
-        gap, _ = clock.last_gap(
-            graph.next_states, graph.ends, graph.start, order, layer_first, position, *scratch, max_reads
-        )
+        gap, _ = clock.last_gap(graph.next_states, graph.ends, graph.start, *layers, *scratch, max_reads)
         if gap == -2:
             return f"all cycles have multiples of {cycle} steps, but some state needs more to reach its whole layer"
         if gap == -3:
