@@ -420,8 +420,9 @@ def test_what_does_not_exist_says_so():
         hardness.exploration_time(endless)
     with pytest.raises(UndefinedMeasure, match="no reward is positive"):
         hardness.exploration_time(chain().with_rewards(np.zeros((4, 2))))
-    with pytest.raises(UndefinedMeasure, match="uniform play is optimal"):
-        kernel_regret(chain().with_rewards(np.zeros((4, 2))), seen)
+    for name in ("kernel_regret", "kernel_policy_regret"):
+        with pytest.raises(UndefinedMeasure, match=f"{name}: uniform play is optimal"):
+            getattr(hardness, name)(chain().with_rewards(np.zeros((4, 2))), seen)
     with pytest.raises(ParameterError, match="of 4 states; expected 5"):
         kernel_regret(chain(5), seen)
     with pytest.raises(ParameterError, match="not symmetric"):

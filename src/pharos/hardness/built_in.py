@@ -191,15 +191,15 @@ def _of_representation(function: Any) -> Any:
     return measure
 
 
+def _of_learner(function: Any, problem: Problem, **options: Any) -> Any:
+    """A measure of an idealised learner."""
+    options |= {"schedule": problem.schedule, "solution": problem.solution, "horizon": problem.horizon}
+    return function(problem.mdp, problem.seen(function.__name__), **options)
+
+
 register(
     "kernel_regret",
-    lambda problem: kernel_regret(
-        problem.mdp,
-        problem.seen("kernel_regret"),
-        schedule=problem.schedule,
-        solution=problem.solution,
-        horizon=problem.horizon,
-    ),
+    lambda problem: _of_learner(kernel_regret, problem),
     definition="mean over learning of (V* - V of the greedy policy) / (V* - V of uniform play) of expected Q-learning "
     "in the tangent kernel of the agent's network; as played; and both of tabular Q-learning",
     source="pharos; after Sirignano and Spiliopoulos (2019)",
@@ -210,14 +210,7 @@ register(
 )
 register(
     "kernel_policy_regret",
-    lambda problem: kernel_policy_regret(
-        problem.mdp,
-        problem.seen("kernel_policy_regret"),
-        schedule=problem.schedule,
-        rollouts=problem.rollouts,
-        solution=problem.solution,
-        horizon=problem.horizon,
-    ),
+    lambda problem: _of_learner(kernel_policy_regret, problem, rollouts=problem.rollouts),
     definition="mean over learning of (V* - V of the most probable actions) / (V* - V of uniform play) of an expected "
     "actor-critic in the tangent kernel of the agent's network; as played; and both of a table",
     source="pharos; Sutton et al. (2000), Schulman et al. (2016, 2017)",

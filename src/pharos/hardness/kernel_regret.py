@@ -121,26 +121,23 @@ def kernel_regret(
     representation.check(mdp.num_states)
     episode = representation.episode(mdp.horizon if horizon is None else horizon, "kernel_regret")
     schedule = schedule or Schedule()
-    outcome = learnt_in_kernel(mdp, Learner(mdp, schedule, episode, solution), representation)
-    conventions = {
-        "schedule": asdict(schedule),
-        "episode": episode,
-        "gamma": float(mdp.gamma),
-        "horizon": mdp.horizon,
-        "step_size": f"1 / ({MARGIN} largest eigenvalue of K diag(max_a d))",
-        "clipped": {"greedy": WORST_GREEDY, "played": WORST_PLAYED},
-        **representation.conventions,
-    }
-    return KernelRegret(*outcome, conventions)
+    learner = Learner(mdp, schedule, episode, solution)
+    return regret_in_kernel(mdp, learner, representation, {"schedule": asdict(schedule)}, "max_a d")
 
 
-def learnt_in_kernel(
-    mdp: TabularMDP, learner: Learner, representation: Representation
-) -> tuple[LearningCurve, LearningCurve, int, int, int | None, float]:
-    """What a learner does with a kernel, by landmarks where there are too many observations, and with a table.
+def regret_in_kernel(
+    mdp: TabularMDP,
+    learner: Learner,
+    representation: Representation,
+    settings: Mapping[str, Any],
+    weights_of_steps: str,
+) -> KernelRegret:
+    """The regret of a learner with a kernel, by landmarks where there are too many observations, and with a table.
 
-    Returns:
-        The fields of a KernelRegret, in their order.
+    Args:
+        mdp: all of it, also where the learner has the states alone that an episode can meet.
+        settings: of the learner, the first of the conventions.
+        weights_of_steps: how d weighs the kernel in the step size.
     """
     everything = learner.numbers[learner.states]
     observations = Grouped(representation.classes, everything)
@@ -170,4 +167,15 @@ def learnt_in_kernel(
             for some in (chosen, chosen[: max(1, landmarks // 2)])
         )
         error = abs(curve.mean_greedy - half.mean_greedy)
-    return curve, tabular, len(observations), len(everything), landmarks, error
+    conventions = {
+        **settings,
+        "episode": learner.episode,
+        "gamma": float(mdp.gamma),
+        "horizon": mdp.horizon,
+        "step_size": f"1 / ({MARGIN} largest eigenvalue of K diag({weights_of_steps}))",
+        "clipped": {"greedy": WORST_GREEDY, "played": WORST_PLAYED},
+        **representation.conventions,
+    }
+    return KernelRegret(
+        curve, tabular, len(observations), len(everything), landmarks, error, conventions, learner.measure
+    )

@@ -125,6 +125,7 @@ class Learner:
     """An MDP, and what learners on it have in common.
 
     Attributes:
+        measure: what is said to be undefined, or estimated.
         mdp: as given, without states that its horizon keeps out of reach.
         numbers: (S,) of its states in the MDP as it was given.
         states: (N,) those that an episode can meet and that are not terminal.
@@ -132,12 +133,14 @@ class Learner:
         UndefinedMeasure: uniform play is optimal, so that regret has no scale.
     """
 
+    measure = "kernel_regret"
+
     def __init__(self, mdp: TabularMDP, schedule: Schedule, episode: int, solution: Solution | None = None):
         solution = solution or value_iteration(mdp)
         uniform = uniform_value(mdp)
         self.optimal, self.spread = solution.value_at_start, solution.value_at_start - uniform.value_at_start
         if not self.spread > max(1e-12, 2 * (solution.error_bound + uniform.error_bound)):
-            raise UndefinedMeasure("kernel_regret: uniform play is optimal, so that there is no regret to speak of")
+            raise UndefinedMeasure(f"{self.measure}: uniform play is optimal, so that there is no regret to speak of")
         self.schedule, self.episode = schedule, episode
         self.mdp, self.numbers = mdp, np.arange(mdp.num_states)
         met = mdp.states_within(episode)

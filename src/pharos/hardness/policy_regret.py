@@ -6,16 +6,13 @@ identity in the place of the kernel it is tabular softmax policy gradient (Agarw
 """
 
 from dataclasses import asdict
-from typing import Any
 
 import numpy as np
 
 from pharos.hardness.kernel_operator import KernelOperator
-from pharos.hardness.kernel_regret import KernelRegret, learnt_in_kernel
+from pharos.hardness.kernel_regret import KernelRegret, regret_in_kernel
 from pharos.hardness.mean_field import (
     MARGIN,
-    WORST_GREEDY,
-    WORST_PLAYED,
     Learner,
     LearningCurve,
     Memory,
@@ -79,22 +76,15 @@ def kernel_policy_regret(
     episode = representation.episode(mdp.horizon if horizon is None else horizon, "kernel_policy_regret")
     schedule, rollouts = schedule or Schedule(), rollouts or Rollouts()
     learner = PolicyLearner(mdp, schedule, episode, solution, rollouts)
-    outcome = learnt_in_kernel(mdp, learner, representation)
-    conventions = {
-        "schedule": {name: asdict(schedule)[name] for name in ("steps", "gamma", "optimizer")},
-        "rollouts": asdict(rollouts),
-        "episode": episode,
-        "gamma": float(mdp.gamma),
-        "horizon": mdp.horizon,
-        "step_size": f"1 / ({MARGIN} largest eigenvalue of K diag(d))",
-        "clipped": {"greedy": WORST_GREEDY, "played": WORST_PLAYED},
-        **representation.conventions,
-    }
-    return KernelRegret(*outcome, conventions, "kernel_policy_regret")
+    of_schedule = {name: asdict(schedule)[name] for name in ("steps", "gamma", "optimizer")}
+    settings = {"schedule": of_schedule, "rollouts": asdict(rollouts)}
+    return regret_in_kernel(mdp, learner, representation, settings, "d")
 
 
 class PolicyLearner(Learner):
     """An MDP, and actor-critics on it."""
+
+    measure = "kernel_policy_regret"
 
     def __init__(
         self, mdp: TabularMDP, schedule: Schedule, episode: int, solution: Solution | None, rollouts: Rollouts
@@ -158,8 +148,9 @@ def softmax(logits: np.ndarray) -> np.ndarray:
     return grown / grown.sum(axis=1, keepdims=True)
 
 
-def _standardised(advantages: np.ndarray, visits: np.ndarray) -> Any:
+def _standardised(advantages: np.ndarray, visits: np.ndarray) -> np.ndarray:
     """(N, A) of mean 0 and standard deviation 1 under visits of sum 1; 0 where they are all the same."""
     centred = advantages - (visits * advantages).sum()
     spread = float(np.sqrt((visits * centred**2).sum()))
-    return centred / spread if spread > 1e-12 else np.zeros_like(centred)
+    standardised: np.ndarray = centred / spread if spread > 1e-12 else np.zeros_like(centred)
+    return standardised
