@@ -1,16 +1,18 @@
 """Predictions of a study: written before its runs, hashed and dated; and what is said of them afterwards."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
 import pytest
 from typer.testing import CliRunner
 
-from pharos import study
+from pharos import hardness, study
+from pharos.agents import hyperparameters
 from pharos.cli import app
 from pharos.errors import FileFormatError, ParameterError, ResultCorrupted
-from pharos.study import POLICY_PREDICTORS, read_predictions, specification, validation, write_predictions
+from pharos.study import POLICY_PREDICTORS, predictions, read_predictions, specification, validation, write_predictions
 
 SPEC = {
     "name": "tiny",
@@ -41,6 +43,23 @@ def test_every_cell_that_sees_observations_is_predicted(predicted):
     assert plain["aliasing_floor"] == 0 < hidden["aliasing_floor"]
     assert plain["kernel_regret"] <= hidden["kernel_regret"]
     assert plain["tabular_regret"] == hidden["tabular_regret"]
+
+
+def test_an_actor_critic_is_idealised_with_the_rollouts_and_the_lambda_of_its_agent(monkeypatch):
+    rollouts = []
+
+    def report(mdp, names, **options):
+        rollouts.append(options["rollouts"])
+        return {names[0]: SimpleNamespace(value=None)}
+
+    monkeypatch.setattr(hardness, "report", report)
+    for agent in ("ppo", "a2c"):  # A2C of Stable-Baselines3 has a lambda of 1
+        own = hyperparameters(agent, "simple_grid", "vector")
+        predictions._of_policy({"agent": agent, "steps": 1000, "hyperparameters": own}, None, {})
+    assert rollouts == [
+        hardness.Rollouts(steps=512, gradient_steps=16, gae_lambda=0.95),
+        hardness.Rollouts(steps=40, gradient_steps=1, gae_lambda=1.0),
+    ]
 
 
 def test_a_file_of_predictions_has_its_hash_and_its_date(predicted, tmp_path):

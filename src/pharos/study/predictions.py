@@ -34,7 +34,8 @@ PREDICTORS = (
 """Columns of predictions, numbers; the larger, the harder. `adam_regret` is kernel regret with `optimizer="adam"`."""
 POLICY_PREDICTORS = ("policy_regret", "policy_regret_played", "policy_tabular_regret")
 """Columns beside them where an agent is an actor-critic: `kernel_policy_regret`, as played, and of a table."""
-ACTOR_CRITICS = ("ppo", "a2c")
+ACTOR_CRITICS = {"ppo": 0.95, "a2c": 1.0}
+"""Agents that learn as actor-critics, and the lambda of their advantages where hyperparameters do not say it."""
 CURVE_POINTS = 40
 _KEY = b"pharos.predictions"
 
@@ -114,16 +115,16 @@ def _predicted(run: Run) -> dict[str, Any]:
 
 
 def _of_policy(config: Mapping[str, Any], mdp: "TabularMDP", options: Mapping[str, Any]) -> dict[str, Any]:
-    """What the idealised actor-critic says."""
+    """POLICY_PREDICTORS and `policy_curve`, of the idealised actor-critic with the rollouts and steps of the agent."""
     from pharos.hardness import Rollouts, Schedule, report
 
     name, own = "kernel_policy_regret", config["hyperparameters"]
-    steps = int(own.get("n_steps", 2048)) * int(own.get("n_envs", 1))
+    steps = int(own["n_steps"]) * int(own.get("n_envs", 1))
     minibatches = math.ceil(steps / int(own["batch_size"])) if own.get("batch_size") else 1
     rollouts = Rollouts(
         steps=steps,
         gradient_steps=minibatches * int(own.get("n_epochs", 1)),
-        gae_lambda=own.get("gae_lambda", Rollouts.gae_lambda),
+        gae_lambda=own.get("gae_lambda", ACTOR_CRITICS[config["agent"]]),
     )
     schedule = Schedule(steps=config["steps"], gamma=own.get("gamma", Schedule.gamma))
     regret = report(mdp, [name], schedule=schedule, rollouts=rollouts, **options)[name].value
