@@ -120,13 +120,13 @@ def enlarged(picture, height):
 
 
 def beside(panels, gap=12, height=260):
-    """Pictures beside each other on white, tops aligned, each with its label below."""
+    """Pictures beside each other, tops aligned, each with its label below; nothing between them, on any ground."""
     pictures = [np.asarray(drawing.image(enlarged(picture, height), label)) for label, picture in panels.items()]
     rows = max(map(len, pictures))
     parts = []
     for picture in pictures:
-        framed = np.full((rows, picture.shape[1] + gap, 3), 255, np.uint8)
-        framed[: len(picture), : picture.shape[1]] = picture
+        framed = np.zeros((rows, picture.shape[1] + gap, 4), np.uint8)  # the fourth: how opaque
+        framed[: len(picture), : picture.shape[1]] = np.dstack([picture, np.full(picture.shape[:2], 255, np.uint8)])
         parts.append(framed)
     return np.concatenate(parts, axis=1)[:, :-gap]
 

@@ -47,6 +47,20 @@ COUNTED = {  # instance -> states, and the page that tells how they were counted
     "breakout/20x10x1-3rows": (923_305_259, "performance.md"),
     "breakout/30x10x1-3rows": (1_083_934_871, "performance.md"),
 }
+NOT_COMPUTED = {  # instance -> why its values are not there
+    "breakout/20x10x1-3rows": "V\\* is 3.580966, within 2.2e-8: 1,328 s, and 10.4 GiB of memory beside mapped files "
+    "([performance](../performance.md)); the uniform and the worst policy were not solved",
+    "breakout/30x10x1-3rows": "V\\* is 2.212515, within 4.5e-9 ([performance](../performance.md)); the uniform and the "
+    "worst policy were not solved",
+    "sliding_tiles/3x4": "enumerated once ([302 s of a processor, 5.8 GB of files](../large-runs.md)); not solved",
+    "game_2048/3x3": "541,821,326 possible outcomes, 33 minutes to enumerate; undiscounted the optimum is worth "
+    "5,468.49 ([2048](../game-2048.md)); the uniform and the worst policy were not solved",
+    **{
+        f"game_2048/3x3-to-{target}": f"tens of millions of states with up to 16 outcomes; the optimum wins "
+        f"with probability {chance} ([2048](../game-2048.md)); the uniform and the worst policy were not solved"
+        for target, chance in ((512, 0.736774), (1024, 0.011338))
+    },
+}
 LIVE = "assets/explorer/frozen_lake.html"
 FRAME = (
     f'<iframe src="{LIVE}" title="Explorer of a slippery lake" loading="lazy" style="width: 100%; height: 52rem; '
@@ -120,12 +134,15 @@ def values_of_all(stored: Mapping[str, dict]) -> str:
             "",
             "## Without values",
             "",
-            "Each would take minutes to hours, and gigabytes, on two cores; `pharos solve` does it, "
-            "[as far as memory and disk go](../performance.md).",
+            "`pharos solve` computes them, [as far as memory and disk go](../performance.md).",
             "",
-            "| instance | states |",
-            "|---|---|",
-            *(f"| {page_link(name)} | {states_of(name, stored[name])} |" for name in stored if name not in known),
+            "| instance | states | why |",
+            "|---|---|---|",
+            *(
+                f"| {page_link(name)} | {states_of(name, stored[name])} | {NOT_COMPUTED[name]} |"
+                for name in stored
+                if name not in known
+            ),
             "",
         ]
     )
@@ -255,7 +272,7 @@ def instances(cls, stored: Mapping[str, dict]) -> list[str]:
         start = f"| `{name}` | `{ids[name]}` |"
         if (row := values_row(name, numbers)) is None:
             counted.append(f"{start} {states_of(name, numbers)} | {UNKNOWN} | {UNKNOWN} |")
-            unknown.append(f"`{name}`")
+            unknown.append(f"- `{name}`: {NOT_COMPUTED[name]}.")
             continue
         parts = ("num_states", "num_terminal_states", "depth")
         counted.append(f"{start} " + " | ".join(f"{numbers[part]:,}" for part in parts) + " |")
@@ -263,11 +280,7 @@ def instances(cls, stored: Mapping[str, dict]) -> list[str]:
     about = f"*Depth* is how far the farthest state is from the start. {VALUES}"
     absent = []
     if unknown:
-        which = "it takes" if len(unknown) == 1 else "they take"
-        absent = [
-            f"Not computed for this page, because {which} minutes to hours on two cores: {', '.join(unknown)}.",
-            "",
-        ]
+        absent = ["Not computed for this page:", "", *unknown, ""]
     if len(values) > 1:
         absent = [*values, "", *absent]
     return ["## Named instances", "", *counted, "", about, "", *absent]

@@ -102,6 +102,13 @@ def test_stored_numbers_of_environments_are_of_todays_rules(scripts):
         assert numbers.numbers_of(name, 1000) == stored[name]
 
 
+def test_every_named_instance_has_values_or_a_reason_why_not(scripts):
+    stored = json.loads((DOCS / "environments.json").read_text())
+    without = {name for name in named_instances() if "discounted" not in stored.get(name, {})}
+    assert without == set(scripts("site_pages").NOT_COMPUTED)
+    assert all(stored[name]["more_than"] for name in without)
+
+
 def test_stored_values_are_in_order():
     for name, entry in json.loads((DOCS / "environments.json").read_text()).items():
         for kind in ("discounted", "episode"):
