@@ -1,5 +1,6 @@
 """pharos solve: optimal values, beside those of the uniformly random policy."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -94,23 +95,20 @@ def solve(
     sharing |= {"dtype": dtype, "blocks": blocks}
     suffix = ".npy" if dtype == "float64" else f"-{dtype}.npy"
     with progress_line("solving") as report:
-        solution = value_iteration(
-            mdp,
-            tolerance,
-            progress=lambda sweeps, bound: report(f"sweep {sweeps}, error at most {bound:.2g}"),
-            values=None if values is None or ranks != 1 else values / f"optimal{suffix}",
-            threads=threads,
-            **sharing,
-        )
+
+        def solution_by(solver: Callable[..., Any], name: str, policy: str) -> Any:
+            return solver(
+                mdp,
+                tolerance,
+                progress=lambda sweeps, bound: report(f"{policy}sweep {sweeps}, error at most {bound:.2g}"),
+                values=None if values is None or ranks != 1 else values / f"{name}{suffix}",
+                threads=threads,
+                **sharing,
+            )
+
+        solution = solution_by(value_iteration, "optimal", "")
         report("value of the uniform policy")
-        uniform = uniform_value(
-            mdp,
-            tolerance,
-            progress=lambda sweeps, bound: report(f"uniform policy, sweep {sweeps}, error at most {bound:.2g}"),
-            values=None if values is None or ranks != 1 else values / f"uniform{suffix}",
-            threads=threads,
-            **sharing,
-        )
+        uniform = solution_by(uniform_value, "uniform", "uniform policy, ")
     if solution is None:  # a rank of MPI that is not the first
         return
     if out is not None:
