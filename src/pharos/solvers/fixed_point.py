@@ -199,9 +199,9 @@ def _in_single(
     mdp, rho, sweeps, least, since = backup.mdp, backup.factor, 0, math.inf, 0
     patience = SETTLING + math.ceil(1 / (1 - rho))  # sweeps that gain a factor of 2.7, but for rounding
     while True:
-        told, sweeps = backup.sweep(x), sweeps + 1
+        shift, sweeps = backup.sweep(x), sweeps + 1
         largest = largest_of(x)
-        change = backup.changed(told, largest)
+        change = backup.changed(shift, largest)
         bound = backup.bound(change, backup.rounding(backup.size(largest + change)))
         if progress is not None:
             progress(sweeps, bound)
@@ -209,7 +209,7 @@ def _in_single(
             return FixedPoint(x, bound, sweeps)
         if bound < 0.9 * least:
             least, since = bound, sweeps
-        if told == 0.0 or sweeps - since > patience or not math.isfinite(bound):
+        if shift == 0.0 or sweeps - since > patience or not math.isfinite(bound):
             raise imprecise(mdp, min(least, bound), tolerance, is_single=True)
 
 
