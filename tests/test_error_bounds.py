@@ -289,7 +289,7 @@ def test_large_deterministic_mdps_near_gamma_1_are_solved_on_their_functional_gr
     assert (sign * (attained.v - solution.v)).max() <= solution.error_bound + attained.error_bound
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("neighbours", ["copies apart", "copies mixed at random"])
 def test_large_mdps_with_chance_near_gamma_1_are_solved_by_sparse_systems(neighbours):
     # copies of each state: whichever copy an action leads to, the values are those of six states

@@ -313,7 +313,7 @@ def survive_imported(folder, mutations):
     print(right, wrong)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_mutants_of_an_imported_mdp_never_end_the_process(tmp_path):
     code = f"import sys, pathlib; sys.path.insert(0, {str(Path(__file__).parent)!r}); import test_hostile_spaces as t\n"
     code += f"t.survive_imported(pathlib.Path({str(tmp_path)!r}), 400)"

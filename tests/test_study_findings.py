@@ -148,7 +148,7 @@ def test_a_task_seen_twice_is_one_piece_of_evidence(finding):
     assert verdicts(twice)[finding, "all"].p == pytest.approx(verdicts(vectors)[finding, "all"].p, rel=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_tests_without_effect_are_significant_as_often_as_the_level_says(without_effect):
     """2.5 of 50 expected."""
     names = ("one model explains next to nothing", "models by class explain more than one")

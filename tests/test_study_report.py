@@ -233,7 +233,7 @@ def report_of(tmp_path, name="own", change=None, **block):
     return report, read(report.html.read_text())
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_study_without_dqn_says_nothing_false_and_has_no_empty_section(tmp_path):
     report, page = report_of(tmp_path, agents=["ppo", "q_learning"], chance=["plain", {"sticky": 0.25}])
     text = " ".join(page.text)
@@ -261,7 +261,7 @@ def test_a_study_without_dqn_says_nothing_false_and_has_no_empty_section(tmp_pat
     assert "simple image & vector & index" in latex and "DQN" not in latex and "--" not in latex
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_each_agent_that_sees_observations_has_models(tmp_path):
     report, page = report_of(tmp_path, agents=["ppo", "a2c"], environments=["frozen_lake/4x4"])
     text = " ".join(page.text)
