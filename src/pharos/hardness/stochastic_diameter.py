@@ -33,11 +33,17 @@ TRIAL = 16
 # Targets that each of the last `TRIAL` ones must have ruled out on average, or all of them half of those left; else
 # looking at the others one by one is quicker.
 RULED_OUT = 40
-# Nodes around each target through which its bounds are shortened, one size after the other while each takes off a
-# twentieth of the largest; nodes there must be for each of them, and times as long as the size before one takes.
-AROUND, TAKEN, NODES_EACH, LONGER = (64, 256, 1024), 0.95, 16, 8
-# Targets that are solved before that, where there are too many for a look at each.
-FIRST = 3
+# Nodes on the way to a target through which its bound is shortened, and one in how many targets, drawn by their
+# numbers: a few are bounded by long ways, and the others from these by short ones. 0: those of the largest bounds, as
+# many as of the long ways.
+WAYS = ((64, 1), (4096, 64), (1024, 16), (256, 1), (4096, 0))
+# Nodes there must be for each node on a way; the share that is left of the median and of the largest of the bounds
+# beyond which no more is tried; and times as long as the ways before take the next ones.
+NODES_EACH, TAKEN, LONGER = 8, 0.95, 5
+# Mixes the numbers of targets, neighbours among which are alike.
+_MIX = np.uint64(0x9E3779B97F4A7C15)
+# Targets that are solved before that, where there are too many for a look at each, or bounds are so many times apart.
+FIRST, APART = 3, 2.0
 # `crude_upper` is a product of up to N rounded factors.
 CRUDE = 1.01
 
@@ -73,7 +79,7 @@ class _Diameter:
         # States that cannot be reached at all are unreachable from all others.
         self.unreachable = int(np.count_nonzero(~has_nodes)) * (choices.num_targets - 1)
         self._travel: TravelBounds | None = None
-        self._hub: tuple[np.ndarray, np.ndarray] | None = None
+        self._start: tuple[np.ndarray, np.ndarray] | None = None
 
     def interval(self, conventions: dict[str, Any]) -> Interval:
         """Look at targets until the bounds meet, or the budget ends."""
@@ -145,7 +151,7 @@ class _Diameter:
         trial, left_before = TRIAL, self._num_open
         while batch and not self.spending.is_over:
             yield batch
-            if self.many and self.spending.searches >= FIRST:
+            if self.spending.searches >= FIRST and (self.many or self._upper() > APART * self.lower):
                 self._shorten()
             if not self.many and self.spending.searches >= trial:
                 if left_before - self._num_open < min(RULED_OUT * TRIAL, left_before / 2):
@@ -188,41 +194,44 @@ class _Diameter:
 
     def _bound_others(self, hub: int, times: np.ndarray) -> None:
         """Bound all targets by upper bounds (nodes,) of the hitting times of a solved one."""
+        is_first = self._travel is None  # of the start, to which all that fails comes back
         if self._travel is None:
             self._travel = TravelBounds(self.mdp, self.restart)
         by_state = np.zeros(self.choices.num_targets)
         np.maximum.at(by_state, self.choices.underlying, times)
         away = self._travel.times_from(hub, by_state)
-        if self._hub is None:  # the start, to which all that fails comes back
-            self._hub = by_state, away
+        if is_first:
+            self._start = by_state, away
         np.minimum(self.upper, float(by_state.max()) + away, out=self.upper)
 
     def _shorten(self) -> None:
-        """Shorten the bounds by way of the first hub, once, as long as this narrows the interval."""
-        if self._hub is None or self._travel is None:
+        """Shorten the bounds by way of the start, once, as long as this narrows them."""
+        if self._start is None or self._travel is None:
             return
-        (times, away), self._hub = self._hub, None
+        (times, away), self._start = self._start, None
         for shorter in shortened(self._travel, times, away, self.spending):
-            before = self._upper()
             np.minimum(self.upper, float(times.max()) + shorter, out=self.upper)
             self.upper[self.upper <= self.lower] = -math.inf
             self.spending.report(self.lower, self._upper(), self._num_open)
-            if self._upper() > TAKEN * before:
-                break
 
 
 def shortened(travel: TravelBounds, times: np.ndarray, away: np.ndarray, spending: Spending) -> Iterator[np.ndarray]:
-    """Bounds of the times from a hub to each target, ever shorter, as long as the budget allows for the next ones.
+    """Bounds of the times from a hub to each target, ever shorter, while this helps and the budget allows for more.
 
     times, away: (targets,) upper bounds of the expected steps to the hub, and from it.
     """
-    for size in AROUND:
-        began = spending.seconds
-        if size * NODES_EACH > len(away) or spending.is_over:
-            return
-        away = travel.shortened(times, away, size, lambda: spending.is_over)
+    count = len(away)
+    drawn = np.argsort(np.arange(count, dtype=np.uint64) * _MIX, kind="stable")
+    for size, every in WAYS:
+        if size * NODES_EACH > count:
+            continue
+        began, long = spending.seconds, count // WAYS[1][1]
+        targets = np.sort(drawn[: count // every]) if every else np.argpartition(away, count - long)[count - long :]
+        before, away = away, travel.shortened(times, away, targets, size, lambda: spending.is_over)
         yield away
-        if LONGER * (spending.seconds - began) > spending.budget.seconds - spending.seconds:
+        if spending.is_over or LONGER * (spending.seconds - began) > spending.budget.seconds - spending.seconds:
+            return
+        if size > WAYS[0][0] and all(f(away[targets]) > TAKEN * f(before[targets]) for f in (np.median, np.max)):
             return
 
 

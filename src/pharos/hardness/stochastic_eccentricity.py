@@ -11,7 +11,7 @@ import numpy as np
 from pharos.hardness.choices import Choices, choices_of
 from pharos.hardness.hitting_times import SWEEPS, HittingTimes
 from pharos.hardness.interval import Interval, Spending, conventions_of
-from pharos.hardness.stochastic_diameter import CRUDE, RULED_OUT, TAKEN, TRIAL, shortened
+from pharos.hardness.stochastic_diameter import CRUDE, RULED_OUT, TRIAL, shortened
 from pharos.hardness.travel import TravelBounds
 from pharos.kernels.hitting import UNIT
 from pharos.mdp import TabularMDP
@@ -126,8 +126,5 @@ class _Eccentricity:
         assert self.travel is not None and self.hub is not None
         to_hub, times, away = self.hub
         for shorter in shortened(self.travel, times, away, self.spending):
-            before = float(self.upper.max())
             np.minimum(self.upper, to_hub + shorter, out=self.upper)
             self.upper[self.upper <= self.lower] = -math.inf
-            if float(self.upper.max()) > TAKEN * before:
-                break

@@ -20,13 +20,16 @@ then at most the largest U(s) plus V(e). Under sticky actions sums are the large
 and so is U.
 
 Where slips cannot be taken back, but lead on to where the way goes on as well, y need not be the next node: with the
-nodes around y, those that lead there in the fewest steps, as a problem of its own in which to leave them is to give up,
+nodes around y, those on short ways from h to y, the nearest to y first, as a problem of its own in which to leave them
+is to give up,
 
     E(x, y) <= c(x) + l(x) E(h, y), where c(y) = l(y) = 0, and outside c = U, l = 1,
 
 holds for c = U, l = 1 everywhere, and goes on to hold where c(x), l(x) become 1 + sum P c and sum P l under any action,
 node by node (`shortened`). So E(h, y) <= (E(h, x) + c(x)) / (1 - l(x)) for every x around y, and what was a slip at
-each step on the way is one for as many steps as lie between x and y.
+each step on the way is one for as many steps as lie between x and y. Each x on the way still has to be met exactly, at
+a factor of 1 / (1 - l(x)) each time. So a few targets, drawn at random, are bounded by long ways of thousands of nodes
+from each other, and every target by a short way from one of them: a few factors instead of hundreds.
 """
 
 import itertools
@@ -142,27 +145,39 @@ class TravelBounds:
         first, _, node, _ = self._outcomes
         return travel.times_from(hub, first, node, self._solve(1.0, times), self.leak) * ROUNDING
 
-    def shortened(self, times: np.ndarray, bound: np.ndarray, size: int, is_over: Callable[[], bool]) -> np.ndarray:
+    def shortened(
+        self, times: np.ndarray, bound: np.ndarray, targets: np.ndarray, size: int, is_over: Callable[[], bool]
+    ) -> np.ndarray:
         """(N,) `bound`, or less where the way through the nodes around a target is shorter.
 
         Args:
             times, bound: (N,) upper bounds of the expected steps to the hub, and from it.
-            size: nodes around each target.
+            targets: those whose bounds are to be shortened.
+            size: nodes around each of them.
             is_over: whether to leave the rest as it is; asked between parts.
-        Cost: for each target some passes over `size` nodes.
+        Cost: for each of the targets some passes over `size` nodes.
         """
         outcomes, owner, weights, num_previous = self._fixed
         num_nodes = len(outcomes[0]) - 1
         if self._into is None:
             self._into = travel.outcomes_into(outcomes[2], num_nodes)
         room = [
-            (np.zeros(num_nodes, np.int32), np.empty(size, np.int64), *np.empty((2, size, num_previous + 1)))
+            (
+                np.zeros(num_nodes, np.int32),
+                np.empty(size, np.int64),
+                np.empty((4 * size, 2), np.int64),
+                np.empty(vicinity.TURNS, np.int64),
+                *np.empty((2, size, num_previous + 1)),
+            )
             for _ in range(self._threads)
         ]
         bound, new = bound.copy(), np.empty(num_nodes)
-        fixed = (outcomes, owner, self._into, weights, num_previous, self._num_actions, times, bound, new, SWEEPS)
+        steps = vicinity.steps_from(int(np.argmin(bound)), outcomes[0], outcomes[2])
+        graph, chance = (outcomes, owner, self._into, steps), (weights, num_previous, self._num_actions)
+        fixed = (graph, chance, times, bound, new, SWEEPS)
         with ThreadPoolExecutor(self._threads) as pool:
-            for part in np.array_split(np.argsort(bound, kind="stable"), min(PARTS, num_nodes)):
+            order = targets[np.argsort(bound[targets], kind="stable")]
+            for part in np.array_split(order, min(PARTS, max(len(order), 1))):
                 if is_over():
                     break
                 edges = np.linspace(0, len(part), self._threads + 1).astype(np.int64)
