@@ -15,7 +15,7 @@ import pharos
 from chance_worlds import ChanceWorld
 
 PAGE = (Path(__file__).parents[1] / "docs" / "format.md").read_text()
-CODE, CODE_WITH_CHANCE = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
+CODE, CODE_WITH_CHANCE, CODE_OF_40_BITS = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
 
 
 @pytest.mark.parametrize("name", ["simple_grid/6x6-decoy", "frozen_lake/8x8", "freeway", "breakout"])

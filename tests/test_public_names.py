@@ -29,6 +29,7 @@ ORDER = (
         "lazy",
         "paths",
         "memory",
+        "packed_indices",
         "large_arrays",
         "wording",
         "storage",

@@ -124,7 +124,7 @@ def test_limits_end_in_the_same_line(tmp_path):
 def test_indices_widen_while_ranks_search(tmp_path, monkeypatch):
     monkeypatch.setattr(search, "INT32_STATES", 2000)
     build(WORLDS["breakout"], tmp_path / "alone", workers=1)
-    assert "successors64.bin" in files_of(tmp_path / "alone")
+    assert "successors40.bin" in files_of(tmp_path / "alone")
     build_by_threads(WORLDS["breakout"], tmp_path / "space", 3)
     assert files_of(tmp_path / "space") == files_of(tmp_path / "alone")
 

@@ -18,6 +18,7 @@ import numpy as np
 from pharos import memory as machine
 from pharos import paths
 from pharos.errors import DiskFull
+from pharos.packed_indices import PackedIndices
 
 # Bytes that are always taken from memory; beyond them, the share of what is free that one array may take.
 SMALL, SHARE = 1 << 26, 4
@@ -111,6 +112,7 @@ def ranges_from_the_end(rows: Any, low: int, high: int) -> Iterator[tuple[int, i
     the rows fill memory, those that were swept go before anything else: values, which may be mapped as well, are needed
     all the time.
     """
+    rows = rows.packed if isinstance(rows, PackedIndices) else rows
     if not isinstance(rows, np.memmap):
         yield low, high
         return

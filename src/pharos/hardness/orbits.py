@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from pharos.kernels import symmetry
+from pharos.packed_indices import Indices
 
 # Untyped, as starred arguments of compiled functions are not checked.
 kernels: Any = symmetry
@@ -14,7 +15,7 @@ _CANDIDATES, _IN_VAIN = 200, 3
 
 
 def orbits(
-    next_states: np.ndarray, ends: np.ndarray, start: int, pivot: int, is_over: Callable[[], bool]
+    next_states: Indices, ends: np.ndarray, start: int, pivot: int, is_over: Callable[[], bool]
 ) -> np.ndarray | None:
     """Return (S,) integers: for each state the smallest one of its orbit; None where no symmetry was found.
 

@@ -5,6 +5,8 @@ until nothing is. Forward, a rank lowers the bounds of its halo, nodes of other 
 backward, it asks the owners for them. Distances are whole numbers, so they are the same whatever the number of ranks.
 """
 
+from collections.abc import Iterator
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,6 +19,8 @@ from pharos.ranks import Halo, Rank, check_number, cuts_of, together
 
 # Untyped, as starred arguments of compiled functions are not checked.
 kernels: Any = distance_sweeps
+# Nodes whose edges are looked at in one go.
+_BLOCK = 1 << 18
 FAR = int(np.iinfo(np.int32).max)
 
 
@@ -40,7 +44,12 @@ class RankedGraph:
         self.rank, self.num_nodes = rank, graph.num_nodes
         cuts = cuts_of(graph.num_nodes, rank.size)
         self.start, self.stop = map(int, cuts[rank.rank : rank.rank + 2])
-        self._local, halo = split(_edges(graph, self.start, self.stop), self.start, self.stop)
+        self._local, halo = split(
+            partial(_edges, graph, self.start, self.stop),
+            (len(self), graph.next_states.shape[1]),
+            self.start,
+            self.stop,
+        )
         self._halo = Halo(rank, halo, cuts)
         self._never = np.zeros(len(self), np.bool_)
         self.distance = np.empty(len(self) + len(self._halo), np.int32)
@@ -110,15 +119,21 @@ def ranked_eccentricity(
     return interval_of_search(search.largest, is_whole, method, spending, conventions)
 
 
-def _edges(graph: Graph, start: int, stop: int) -> np.ndarray:
-    """(n, A) the nodes that each of a range leads to; to itself where that is nowhere."""
+def _edges(graph: Graph, start: int, stop: int) -> Iterator[tuple[int, np.ndarray]]:
+    """The nodes that each of a range leads to, A each; to itself where that is nowhere. In blocks (first, rows)."""
+    for first in range(start, stop, _BLOCK):
+        yield first - start, _edges_of(graph, first, min(first + _BLOCK, stop))
+
+
+def _edges_of(graph: Graph, start: int, stop: int) -> np.ndarray:
+    """(n, A) of nodes [start, stop)."""
     states = np.asarray(graph.next_states[start:stop]).astype(np.int64)
     end = len(graph.next_states)
     if stop > end:
         states = np.concatenate([states, np.full((1, states.shape[1]), -1)])
     own = np.arange(start, stop)[:, None]
     states[states < 0] = end
-    stops = np.append(graph.ends, [True] * graph.has_end)[start:stop, None]
+    stops = np.append(graph.ends[start:stop], [True] * (stop > end))[:, None]
     return np.where(stops, own if graph.start < 0 else graph.start, states)
 
 

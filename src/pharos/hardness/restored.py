@@ -19,6 +19,7 @@ import numpy as np
 
 from pharos.hardness.orbits import orbits
 from pharos.kernels import graph, replacement, symmetry
+from pharos.packed_indices import Indices, copy_of
 
 # Untyped, as starred arguments of compiled functions are not checked.
 searches: Any = graph
@@ -37,12 +38,12 @@ class Restored(NamedTuple):
         orbit: (S,) for each state the smallest one that looks the same.
     """
 
-    table: np.ndarray
+    table: Indices
     end: int
     orbit: np.ndarray
 
 
-def restored(next_states: np.ndarray, ends: np.ndarray, pivot: int, is_over: Callable[[], bool]) -> Restored | None:
+def restored(next_states: Indices, ends: np.ndarray, pivot: int, is_over: Callable[[], bool]) -> Restored | None:
     """Return the graph without its only end; None where that has no symmetries, or there are other ends.
 
     Args:
@@ -54,7 +55,7 @@ def restored(next_states: np.ndarray, ends: np.ndarray, pivot: int, is_over: Cal
     if len(where) != 1 or len(next_states) < 3:
         return None
     end, size = int(where[0]), len(next_states)
-    table = np.array(next_states)
+    table = copy_of(next_states)
     table[end] = symmetry.UNKNOWN
     going_on = np.zeros(size, np.bool_)
     dtype = np.int32 if size < 2**31 else np.int64

@@ -6,6 +6,7 @@ import numpy as np
 
 from pharos.kernels import graph
 from pharos.mdp import TabularMDP
+from pharos.packed_indices import Indices
 
 # Untyped, as starred arguments of compiled functions are not checked.
 kernels: Any = graph
@@ -20,7 +21,7 @@ class Graph:
         pivot: a start state, where searches begin.
     """
 
-    def __init__(self, next_states: np.ndarray, terminal: np.ndarray, start: int, pivot: int):
+    def __init__(self, next_states: Indices, terminal: np.ndarray, start: int, pivot: int):
         self.next_states = next_states
         self.ends = np.ascontiguousarray(terminal, np.bool_)
         self.start, self.pivot = start, pivot
@@ -64,7 +65,7 @@ class Graph:
         return kernels.search_backward(*self.backward, self.start, source, distance, self.queue)
 
 
-def _leads_to_end(table: np.ndarray, terminal: np.ndarray) -> bool:
+def _leads_to_end(table: Indices, terminal: np.ndarray) -> bool:
     """Whether a row that is followed holds -1; in blocks, for tables that are larger than memory."""
     block = 1 << 20
     for low in range(0, len(table), block):

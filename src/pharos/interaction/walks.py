@@ -12,6 +12,7 @@ from pharos.interaction.simulator import Simulator
 from pharos.kernels import stepping
 from pharos.mdp import rewards_of_outcomes, rewards_of_staying
 from pharos.observations import Index, in_blocks
+from pharos.packed_indices import as_array
 
 if TYPE_CHECKING:
     from pharos.state_space import StateSpace
@@ -164,7 +165,7 @@ class TableWalk:
 def _tables(space: "StateSpace") -> tuple[Any, Any]:
     """What executing an action leads to, and what that pays, as `stepping.walk_table` takes them."""
     if not space.has_chance:
-        return np.asarray(space.successors), np.ascontiguousarray(space.mdp().rewards, np.float64)
+        return as_array(space.successors), np.ascontiguousarray(space.mdp().rewards, np.float64)
     dynamics: Any = space.dynamics
     return dynamics.for_kernels, dynamics.for_kernels_with(rewards_of_outcomes(space))
 

@@ -4,6 +4,7 @@ The package announces its files; each is loaded where it is used, and loads Numb
 """
 
 from pharos import compiling
+from pharos.kernels import packed_indices
 
 __all__ = [
     "batched_learning",
@@ -29,6 +30,7 @@ __all__ = [
     "observation_kernels",
     "occupancy",
     "outcomes",
+    "packed_indices",
     "packing",
     "palettes",
     "partition",

@@ -7,11 +7,11 @@ a block of its own, as one draw holds for all copies of a run.
 """
 
 import numpy as np
-from numba import njit, types
+from numba import njit
 from numba.extending import overload
 
 from pharos.kernels.bellman import reward_at
-from pharos.kernels.outcomes import outcome, outcomes_of, size_of
+from pharos.kernels.outcomes import is_table, outcome, outcomes_of, size_of
 from pharos.kernels.philox import below, philox, unit
 from pharos.kernels.stepping import executed_by_number
 
@@ -84,7 +84,7 @@ def drawn_outcome(transitions, s, a, u):
 
 @overload(drawn_outcome)
 def _drawn_outcome(transitions, s, a, u):
-    if isinstance(transitions, types.Array):
+    if is_table(transitions):
         return lambda transitions, s, a, u: (np.int64(transitions[s, a]), 0)
 
     def drawn(transitions, s, a, u):

@@ -5,11 +5,11 @@ restored.
 """
 
 import numpy as np
-from numba import njit, types, uint64
+from numba import njit, uint64
 from numba.extending import overload
 
 from pharos.kernels.bellman import reward_at
-from pharos.kernels.outcomes import drawn, size_of
+from pharos.kernels.outcomes import drawn, is_table, size_of
 from pharos.kernels.stepping import normal_number
 
 
@@ -35,7 +35,7 @@ def _following(transitions, s, a, word):
 
 @overload(_following)
 def _following_of(transitions, s, a, word):
-    if isinstance(transitions, types.Array):
+    if is_table(transitions):
         return lambda transitions, s, a, word: np.int64(transitions[s, a])
     return lambda transitions, s, a, word: drawn(transitions, s, a, _random(word))
 

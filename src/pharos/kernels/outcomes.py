@@ -2,7 +2,7 @@
 
 Kernels take `transitions`, one of three things:
 
-- a table (S, A) of next states, -1 where the episode ends;
+- a table (S, A) of next states, -1 where the episode ends: an array, or `PackedIndices`;
 - several outcomes, as a tuple (successors (N,), offsets, codes, weights, (S, A), each). The outcomes of (s, a), row =
   s A + a, are successors[row K : (row + 1) K], or successors[offsets[row] : offsets[row + 1]] where there are offsets.
   Their probabilities are weights[codes[row]], or, without codes, weights at the same places as the successors. Without
@@ -20,6 +20,7 @@ from numba import njit, types, uint64
 from numba.extending import overload
 
 from pharos.kernels.hash_table import prefetch
+from pharos.kernels.packed_indices import PackedIndicesType
 
 # The largest K that the compiler is told.
 UNROLLED = 4
@@ -35,6 +36,11 @@ def _is_lazy(transitions):
     return isinstance(transitions, types.BaseTuple) and len(transitions) == 2
 
 
+def is_table(transitions):
+    """Whether the type is that of a table of next states."""
+    return isinstance(transitions, types.Array | PackedIndicesType)
+
+
 def size_of(transitions):
     """(S, A)."""
 
@@ -43,7 +49,7 @@ def size_of(transitions):
 def _size_of(transitions):
     if _is_lazy(transitions):
         return lambda transitions: size_of(transitions[0])
-    if isinstance(transitions, types.Array):
+    if is_table(transitions):
         return lambda transitions: transitions.shape
     return lambda transitions: transitions[4]
 
@@ -56,7 +62,7 @@ def outcomes_of(transitions, s, a):
 def _outcomes_of(transitions, s, a):
     if _is_lazy(transitions):
         return lambda transitions, s, a: range(len(outcomes_of(transitions[0], s, a)) + 1)
-    if isinstance(transitions, types.Array):
+    if is_table(transitions):
         return lambda transitions, s, a: range(1)
     if isinstance(transitions[5], types.BaseTuple):
         return lambda transitions, s, a: range(len(transitions[5]))
@@ -85,7 +91,7 @@ def _outcome(transitions, s, a, k):
             return np.int64(t), (1.0 - transitions[1]) * p
 
         return moves_or_stays
-    if isinstance(transitions, types.Array):
+    if is_table(transitions):
         return lambda transitions, s, a, k: (transitions[s, a], 1.0)
     if isinstance(transitions[2], types.NoneType):
 
@@ -136,7 +142,7 @@ def _expectation(transitions, v, s, a):
             return (1.0 - transitions[1]) * expectation(transitions[0], v, s, a) + transitions[1] * v[s]
 
         return moves_or_stays
-    if isinstance(transitions, types.Array):
+    if is_table(transitions):
         return lambda transitions, v, s, a: v[transitions[uint64(s), uint64(a)]]
 
     def several(transitions, v, s, a):
@@ -161,7 +167,7 @@ def _expectation_of_pair(transitions, v, s, a):
             return (1.0 - transitions[1]) * expectation_of_pair(transitions[0], v, s, a) + transitions[1] * v[s, a]
 
         return moves_or_stays
-    if isinstance(transitions, types.Array):
+    if is_table(transitions):
         return lambda transitions, v, s, a: v[transitions[uint64(s), uint64(a)], uint64(a)]
 
     def several(transitions, v, s, a):
@@ -182,7 +188,7 @@ def fetch_values(transitions, v, actions, s):
 
 @overload(fetch_values)
 def _fetch_values(transitions, v, actions, s):
-    if not isinstance(transitions, types.Array):
+    if not is_table(transitions):
         return lambda transitions, v, actions, s: None
 
     def each_action(transitions, v, actions, s):

@@ -3,10 +3,10 @@
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import float64, njit, types, uint64
+from numba import float64, njit, uint64
 from numba.extending import overload
 
-from pharos.kernels.outcomes import outcome, outcomes_of, size_of
+from pharos.kernels.outcomes import is_table, outcome, outcomes_of, size_of
 
 NEXT_STEP, SAME_STEP, DISABLED = range(3)  # when an environment that has ended is reset
 
@@ -191,7 +191,7 @@ def outcome_on_table(transitions, rewards, s, a, rng, i):
 
 @overload(outcome_on_table)
 def _outcome_on_table(transitions, rewards, s, a, rng, i):
-    if isinstance(transitions, types.Array):
+    if is_table(transitions):
         return lambda transitions, rewards, s, a, rng, i: (transitions[s, a], rewards[s, a], 1.0)
 
     def drawn(transitions, rewards, s, a, rng, i):  # as the rules draw it, see rules/interaction.py

@@ -14,6 +14,7 @@ from pharos.errors import ParameterError
 from pharos.mdp.arguments import takes_mdp
 from pharos.mdp.rewards import Rewards
 from pharos.mdp.tabular import TabularMDP
+from pharos.packed_indices import Indices
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +83,7 @@ def _numbered(rows: np.ndarray, before: np.ndarray) -> np.ndarray:
     return partition.numbered_rows(rows, before)[0]
 
 
-def _refined(table: np.ndarray, classes: np.ndarray) -> tuple[np.ndarray, int]:
+def _refined(table: Indices, classes: np.ndarray) -> tuple[np.ndarray, int]:
     """(coarsest stable partition, rounds) of a table of next states."""
     from pharos.kernels import partition
 

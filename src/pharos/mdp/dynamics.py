@@ -12,6 +12,8 @@ States are numbered 0 .. S - 1; S stands for the end of an episode, which has no
 """
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -21,9 +23,12 @@ from pharos.kernels import paths
 from pharos.mdp.chance import Chance
 from pharos.mdp.rewards import Rewards
 from pharos.mdp.selection import Selection, chosen_mass
+from pharos.packed_indices import Indices, blocks_of, room_for_indices
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
+
+Blocks = Callable[[], Iterator[tuple[int, np.ndarray]]]
 
 # Rows of a table that are looked at in one go.
 _BLOCK = 1 << 16
@@ -163,7 +168,7 @@ class Dynamics(ABC):
         states = np.arange(start, stop)
         outcomes = self.outcomes(*self._all_actions(states))
         following = np.where(outcomes.states == self.num_states, -1, outcomes.states)
-        local, halo = split(following, start, stop)
+        local, halo = split(partial(blocks_of, following), following.shape, start, stop)
         rows = np.bincount(outcomes.which, minlength=len(states) * self.num_actions)
         offsets = np.concatenate([[0], np.cumsum(rows)])
         table = OutcomeTable(local, self.num_actions, offsets=offsets, probabilities=outcomes.probabilities)
@@ -175,7 +180,7 @@ class Dynamics(ABC):
 
         return Matrices(self.matrix()[:, : self.num_states], self.num_actions).lazy(p)
 
-    def deterministic_table(self) -> np.ndarray | None:
+    def deterministic_table(self) -> Indices | None:
         """(S, A) next states, -1 for the end, where each execution has one outcome; else None."""
         return None
 
@@ -389,13 +394,22 @@ def as_indices(table: np.ndarray, num_states: int) -> np.ndarray:
     return np.ascontiguousarray(table, np.int32 if num_states < 2**31 else np.int64)
 
 
-def split(successors: np.ndarray, start: int, stop: int) -> tuple[np.ndarray, np.ndarray]:
-    """(next states of a range renumbered for its part, int32 where that is enough; its halo)."""
-    inside = (successors >= start) & (successors < stop)
-    outside = ~inside & (successors >= 0)
-    halo, place = np.unique(successors[outside], return_inverse=True)
-    local = successors.astype(np.int64)
-    local -= start
-    local[successors < 0] = -1
-    local[outside] = stop - start + place.reshape(-1)
-    return as_indices(local, stop - start + len(halo) + 1), halo.astype(np.int64)
+def split(blocks: Blocks, shape: tuple[int, ...], start: int, stop: int) -> tuple[Indices, np.ndarray]:
+    """(next states of a range renumbered for its part, int32 where that is enough; its halo).
+
+    Args:
+        blocks: () -> (first row, some rows) of the next states of the states [start, stop), from the first row on;
+            asked twice, so that no more than a block is there in 64 bits.
+        shape: of all of them.
+    """
+    outside = [np.unique(rows[(rows >= 0) & ((rows < start) | (rows >= stop))]) for _, rows in blocks()]
+    halo = np.unique(np.concatenate([np.empty(0, np.int64), *outside]))
+    local = room_for_indices(shape, stop - start + len(halo) + 1)
+    for first, rows in blocks():
+        numbers = rows.astype(np.int64)
+        inside, ends = (numbers >= start) & (numbers < stop), numbers < 0
+        numbers[~inside] = np.searchsorted(halo, numbers[~inside]) + stop
+        numbers -= start
+        numbers[ends] = -1
+        local[first : first + len(rows)] = numbers
+    return local, halo

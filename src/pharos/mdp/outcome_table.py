@@ -1,7 +1,7 @@
 """Dynamics with several outcomes for each state and action: games whose rules have chance."""
 
 import math
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,6 +11,7 @@ from pharos.kernels import outcomes as kernels
 from pharos.mdp.compiled import CompiledDynamics
 from pharos.mdp.dynamics import Outcomes, as_indices, split
 from pharos.mdp.outcome_arrays import check_outcome_arrays, checked_outcomes, compact_outcomes
+from pharos.packed_indices import Indices, PackedIndices, as_array, blocks_of, holds_end, rows_of
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
@@ -22,7 +23,8 @@ class OutcomeTable(CompiledDynamics):
     """Several next states for each state and action, and their probabilities, as tables.
 
     Attributes:
-        successors: (S, A, K) int32 or int64, -1 where the episode ends; or (N,), the rows s A + a one after another.
+        successors: (S, A, K) int32, int64 or `PackedIndices`, -1 where the episode ends; or (N,), the rows s A + a one
+            after another.
         offsets: (S A + 1,) where the rows begin; None where successors are (S, A, K).
         codes: (S, A) uint8 or uint16, which vector of the palette has the probabilities; None without a palette.
         palette: (P, K) float64, the probabilities of the outcomes in their order, then zeros; None without one.
@@ -33,7 +35,7 @@ class OutcomeTable(CompiledDynamics):
 
     def __init__(
         self,
-        successors: np.ndarray,
+        successors: Indices,
         num_actions: int,
         *,
         offsets: np.ndarray | None = None,
@@ -48,13 +50,13 @@ class OutcomeTable(CompiledDynamics):
         """
         if (palette is None) != (codes is None) or (palette is None) == (probabilities is None):
             raise ParameterError("an OutcomeTable takes codes with a palette, or probabilities; found both or neither")
-        self.successors, self.offsets = np.asarray(successors), None if offsets is None else np.asarray(offsets)
+        self.successors, self.offsets = as_array(successors), None if offsets is None else np.asarray(offsets)
         self.codes, self.palette, self.probabilities = (
             None if array is None else np.asarray(array) for array in (codes, palette, probabilities)
         )
         self.num_actions = num_actions
         if offsets is None:
-            self.num_states, _, self.num_outcomes = successors.shape
+            self.num_states, self.num_outcomes = successors.shape[0], successors.shape[2]
         else:
             self.num_states = (len(offsets) - 1) // num_actions
             self.num_outcomes = int(np.diff(offsets).max()) if palette is None else palette.shape[1]
@@ -117,18 +119,20 @@ class OutcomeTable(CompiledDynamics):
 
     @cached_property
     def has_ends(self) -> bool:  # type: ignore[override]
-        return bool((self.successors == -1).any())
+        return holds_end(self.successors)
 
     @cached_property
     def is_deterministic(self) -> bool:  # type: ignore[override]
         return bool(kernels.have_one_outcome(self.for_kernels))
 
     @cached_property
-    def _table(self) -> np.ndarray:
+    def _table(self) -> Indices:
+        if isinstance(self.successors, PackedIndices) and self.successors.size == self.num_states * self.num_actions:
+            return self.successors.reshape(self.num_states, self.num_actions)
         first = self.successors if self.offsets is not None else self.successors[..., 0]
         return np.ascontiguousarray(first.reshape(self.num_states, self.num_actions))
 
-    def deterministic_table(self) -> np.ndarray | None:
+    def deterministic_table(self) -> Indices | None:
         return self._table if self.is_deterministic else None
 
     def arrays(self) -> dict[str, np.ndarray]:
@@ -214,7 +218,8 @@ class OutcomeTable(CompiledDynamics):
             arrays["probabilities"] = np.array(self.probabilities[where])
         else:
             arrays.update(codes=np.array(self.codes[start:stop]), palette=self.palette)  # type: ignore[index]
-        local, halo = split(np.asarray(self.successors[where]), start, stop)
+        entries = rows_of(self.successors, where.start, where.stop)
+        local, halo = split(partial(blocks_of, entries), entries.shape, start, stop)
         return OutcomeTable(local, self.num_actions, **arrays), halo
 
     def restricted_to(self, states: np.ndarray) -> "OutcomeTable":
@@ -228,14 +233,15 @@ class OutcomeTable(CompiledDynamics):
 
     def ends_and_stays(self) -> tuple[np.ndarray, np.ndarray]:
         """(S,) bool each: whether all that a state leads to is the end; and whether it is the end or the state."""
-        own = np.arange(self.num_states, dtype=self.successors.dtype)
+        successors = np.asarray(self.successors)
+        own = np.arange(self.num_states, dtype=successors.dtype)
         if self.offsets is None:
-            ends = self.successors == -1
-            stays = ends | (self.successors == own[:, None, None])
+            ends = successors == -1
+            stays = ends | (successors == own[:, None, None])
             return ends.all(axis=(1, 2)), stays.all(axis=(1, 2))
         first = self.offsets[:: self.num_actions]
-        ends = self.successors == -1
-        stays = ends | (self.successors == np.repeat(own, np.diff(first)))
+        ends = successors == -1
+        stays = ends | (successors == np.repeat(own, np.diff(first)))
         return np.logical_and.reduceat(ends, first[:-1]), np.logical_and.reduceat(stays, first[:-1])
 
     # Parts of it ----------------------------------------------------------------------------------------------------

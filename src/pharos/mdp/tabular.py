@@ -25,6 +25,7 @@ from pharos.mdp.tabular_arrays import (
     start_of,
     terminal_states,
 )
+from pharos.packed_indices import Indices
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
@@ -216,8 +217,8 @@ class TabularMDP:
         return self.reward_table.shape[1]
 
     @property
-    def next_states(self) -> np.ndarray | None:
-        """(S, A) int32 or int64, where each action leads; -1: the episode ends.
+    def next_states(self) -> Indices | None:
+        """(S, A) int32, int64 or `PackedIndices`, where each action leads; -1: the episode ends.
 
         None where that is not how they are stored.
         """

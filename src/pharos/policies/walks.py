@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from pharos.mdp import TabularMDP
+from pharos.packed_indices import as_array
 from pharos.policies.evaluation import Evaluation, steps_that_matter
 
 _UNIT = 2.0**-53
@@ -29,7 +30,7 @@ def walk_values(mdps: Sequence[TabularMDP], act: Callable[[np.ndarray], np.ndarr
     Cost: the longest episode times a call of `act`.
     """
     worlds = {
-        id(mdp): (np.asarray(mdp.dynamics.deterministic_table()), np.asarray(mdp.terminal), mdp.reward_table)
+        id(mdp): (as_array(mdp.dynamics.deterministic_table()), np.asarray(mdp.terminal), mdp.reward_table)
         for mdp in mdps
     }
     members = {key: np.array([i for i, mdp in enumerate(mdps) if id(mdp) == key]) for key in worlds}

@@ -11,6 +11,7 @@ import numpy as np
 
 from pharos.environments import Environment
 from pharos.errors import RuleError
+from pharos.packed_indices import PackedIndices
 from pharos.rules.compiler import exploration_kernels, interaction_kernels, numeric_attributes, type_text
 from pharos.rules.layout import Layout
 
@@ -164,8 +165,10 @@ class CompiledAges(_Compiled):
         return out
 
 
-def _read_only(array: np.ndarray) -> np.ndarray:
+def _read_only(array: Any) -> Any:
     """A view that is not to be written to, as arrays of a StateSpace are: the kernel is compiled for these alone."""
+    if isinstance(array, PackedIndices):  # which kernels never write to
+        return array
     view = array.view()
     view.flags.writeable = False
     return view

@@ -19,6 +19,7 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 
 from pharos.environments import Environment
+from pharos.packed_indices import Indices
 from pharos.rules.compiled import (
     COUNTED,
     CompiledAges,
@@ -94,9 +95,7 @@ class Rewards(Protocol):
     def threads(self, workers: int) -> int:
         """How many threads may call `block` at a time, of `workers`."""
 
-    def block(
-        self, states: np.ndarray, successors: np.ndarray, terminal: np.ndarray, start: int, stop: int
-    ) -> np.ndarray:
+    def block(self, states: np.ndarray, successors: Indices, terminal: np.ndarray, start: int, stop: int) -> np.ndarray:
         """(stop - start, A) float64, of states [start, stop); 0 in terminal states.
 
         Raises:

@@ -8,6 +8,7 @@ import numpy as np
 
 from pharos.environments import Environment
 from pharos.errors import StateSpaceCorrupted, StateSpaceMismatch
+from pharos.packed_indices import Indices
 from pharos.rules import Layout, unpack
 from pharos.state_space.manifest import AGAIN, STATES, SUCCESSORS, TERMINAL
 
@@ -37,7 +38,7 @@ def states_to_check(num_states: int) -> np.ndarray:
 
 
 def check_rules(
-    folder: Path, env: Environment, layout: Layout, states: np.ndarray, successors: np.ndarray, bits: np.ndarray
+    folder: Path, env: Environment, layout: Layout, states: np.ndarray, successors: Indices, bits: np.ndarray
 ) -> None:
     """StateSpaceMismatch where the rules of `env` disagree with the stored transitions of 64 states."""
     chosen = states_to_check(len(successors))
@@ -63,7 +64,7 @@ def check_rules(
             )
 
 
-def check_successors(path: Path, successors: np.ndarray, terminal_bits: np.ndarray, num_terminal: int) -> None:
+def check_successors(path: Path, successors: Indices, terminal_bits: np.ndarray, num_terminal: int) -> None:
     """StateSpaceCorrupted where an index is no state, or a terminal state does not lead to itself.
 
     Cost: one pass over the successors, in blocks that fit into a processor's cache.

@@ -16,16 +16,19 @@ from typing import Any
 import numpy as np
 
 from pharos.errors import DiskFull
+from pharos.packed_indices import as_stored, dtype_of, from_stored
 from pharos.rules import pack
 from pharos.state_space.checks import check_rules
 from pharos.state_space.files import GrowingFile, write_manifest
 from pharos.state_space.manifest import (
     ARRAYS,
+    INDEX_TYPES,
+    INT40_VERSION,
     PARTS,
     STATES,
     SUCCESSORS,
+    SUCCESSORS40,
     TERMINAL,
-    WIDE_SUCCESSORS,
     successors_name,
 )
 from pharos.state_space.plan import Plan
@@ -79,17 +82,16 @@ class Journal:
     """The files of one build.
 
     Attributes:
-        path: the folder. index_dtype: of the successors.
+        path: the folder.
         appended: states handed over to the files.
         last_checkpoint: time of the last commit, `time.perf_counter()`.
     """
 
     def __init__(self, path: Path, plan: Plan):
         self.path, self.plan = path, plan
-        self.index_dtype: np.dtype = np.dtype("<i4")
         self.appended = 0
         self.last_checkpoint = time.perf_counter()
-        self._successors_name, self._wide_name = SUCCESSORS, WIDE_SUCCESSORS
+        self._indices = SUCCESSORS  # of INDEX_TYPES
         self._files: dict[str, GrowingFile] = {}
         self._writes: list[Future] = []
         self._written: dict[str, Any] | None = None  # what a checkpoint commits: counts and files that belong together
@@ -99,8 +101,6 @@ class Journal:
         """Open the files, at the start states or at the last checkpoint; returns where the search stands."""
         arrays = manifest["arrays"] if manifest else {}
         names = self._names(arrays)
-        if manifest:
-            self.index_dtype = np.dtype(arrays[self._successors_name]["dtype"])
         for name in {*ARRAYS, *PARTS.values()} - set(names):
             (self.path / name).unlink(missing_ok=True)  # left by a process killed while it made other files of some
         for name in names:
@@ -118,8 +118,18 @@ class Journal:
 
     def _names(self, arrays: dict[str, Any]) -> tuple[str, ...]:
         """The files of a build, at the start or where it stopped with these arrays."""
-        self._successors_name = successors_name(arrays)
+        self._indices = successors_name(arrays)
         return STATES, self._successors_name, TERMINAL
+
+    @property
+    def index_dtype(self) -> np.dtype:
+        """Of the successors while they are in memory."""
+        return np.dtype(np.int32 if self._indices == SUCCESSORS else np.int64)
+
+    @property
+    def _successors_name(self) -> str:
+        """Their file."""
+        return self._indices
 
     def stored_states(self, count: int) -> np.ndarray:
         """(count, W) uint64, a memory map."""
@@ -151,9 +161,12 @@ class Journal:
 
     def _write(self, states: np.ndarray, block: Block, at: Position) -> None:
         self._files[STATES].append(states)
-        self._files[self._successors_name].append(block.successors)
+        self._append_successors(block.successors)
         self._files[TERMINAL].append(np.packbits(block.terminal, bitorder="little"))
         self._written = self._entries(at)
+
+    def _append_successors(self, successors: np.ndarray) -> None:
+        self._files[self._successors_name].append(as_stored(successors, INDEX_TYPES[self._indices]))
 
     def finish_writes(self) -> None:
         """Wait until everything appended is in the files."""
@@ -161,15 +174,13 @@ class Journal:
             self._writes.pop(0).result()
 
     def widen(self, position: Position) -> None:
-        """From int32 to int64 indices: a new file of successors; the old file goes once this is committed."""
+        """From indices of 32 to those of 40 bits: a new file; the old one goes once this is committed."""
         self.finish_writes()
-        narrow, name = self._successors_name, self._wide_name
+        narrow, self._indices = self._successors_name, SUCCESSORS40
         old = self._files[narrow]
-        wide = GrowingFile(self.path / name)
+        self._files[self._successors_name] = GrowingFile(self.path / self._successors_name)
         for _, entries in blocks_of(old, np.dtype("<i4")):
-            wide.append(entries.astype("<i8"))
-        self._files[name] = wide
-        self._successors_name, self.index_dtype = name, np.dtype("<i8")
+            self._append_successors(entries)
         self._written = self._entries(position)
         self.commit(complete=False)
         self._drop(narrow)
@@ -200,7 +211,7 @@ class Journal:
             file.sync()
         manifest = {
             "format": "pharos state space",
-            "format_version": self.plan.format_version,
+            "format_version": INT40_VERSION if self._indices == SUCCESSORS40 else self.plan.format_version,
             "complete": complete,
             **self.plan.identity,
             "num_actions": self.plan.env.num_actions,
@@ -223,7 +234,7 @@ class Journal:
 
     def _dtypes(self) -> dict[str, str]:
         """The types of the arrays, by the names of their files."""
-        return {STATES: "<u8", self._successors_name: self.index_dtype.str, TERMINAL: "|u1"}
+        return {STATES: "<u8", self._successors_name: INDEX_TYPES[self._indices], TERMINAL: "|u1"}
 
     def _entries(self, position: Position) -> dict[str, Any]:
         arrays = {name: {"dtype": dtype, **self._files[name].entry()} for name, dtype in self._dtypes().items()}
@@ -234,7 +245,8 @@ class Journal:
         if position.first == 0:
             return
         shape = (position.first, self.plan.env.num_actions)
-        successors = np.memmap(self.path / self._successors_name, self.index_dtype, "r", shape=shape)
+        dtype = dtype_of(INDEX_TYPES[self._indices])
+        successors = from_stored(np.memmap(self.path / self._successors_name, dtype, "r", shape=shape))
         bits = np.memmap(self.path / TERMINAL, "|u1", "r")
         check_rules(self.path, self.plan.env, self.plan.layout, self.stored_states(position.count), successors, bits)
 

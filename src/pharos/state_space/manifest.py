@@ -8,26 +8,33 @@ from typing import Any
 
 from pharos import storage
 from pharos.errors import StateSpaceCorrupted, StateSpaceError, StateSpaceMismatch
+from pharos.packed_indices import INT40
 
 FORMAT, FORMAT_VERSION = "pharos state space", 1
 OUTCOMES_VERSION = 2
 """Of folders of environments with chance."""
+
+INT40_VERSION = 3
+"""Of folders whose successors have 40 bits, with chance and without."""
 
 IMPORTED_FORMAT = "pharos mdp"
 """What `pharos import` writes in place of it."""
 
 MANIFEST = "manifest.json"
 STATES, SUCCESSORS, TERMINAL = "states.bin", "successors.bin", "terminal.bin"
-WIDE_SUCCESSORS = "successors64.bin"
-"""In place of successors.bin beyond 2^31 states."""
+SUCCESSORS40, SUCCESSORS64 = "successors40.bin", "successors64.bin"
+"""In place of successors.bin beyond 2^31 states; of 64 bits only in folders that an earlier pharos began."""
+
+INDEX_TYPES = {SUCCESSORS: "<i4", SUCCESSORS40: INT40, SUCCESSORS64: "<i8"}
+"""The type of the indices in each of these files."""
 
 OFFSETS, CODES, PALETTE, PROBABILITIES = "offsets.bin", "codes.bin", "palette.bin", "probabilities.bin"
 """Only with chance."""
 
-ARRAYS = (STATES, SUCCESSORS, WIDE_SUCCESSORS, TERMINAL, OFFSETS, CODES, PALETTE, PROBABILITIES)
+ARRAYS = (STATES, *INDEX_TYPES, TERMINAL, OFFSETS, CODES, PALETTE, PROBABILITIES)
 """The files of arrays that a folder may hold."""
 
-PARTS = {name: f"building-{name}" for name in (SUCCESSORS, WIDE_SUCCESSORS, OFFSETS, CODES, PALETTE, PROBABILITIES)}
+PARTS = {name: f"building-{name}" for name in (*INDEX_TYPES, OFFSETS, CODES, PALETTE, PROBABILITIES)}
 """With chance: what a build writes until it ends."""
 
 MOST_CODES = 1 << 16
@@ -60,10 +67,10 @@ def read_manifest(folder: Path) -> dict[str, Any] | None:
     try:
         if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
             raise ValueError("it is not the manifest of a pharos state space")
-        if manifest["format_version"] not in (FORMAT_VERSION, OUTCOMES_VERSION):
+        if manifest["format_version"] not in (FORMAT_VERSION, OUTCOMES_VERSION, INT40_VERSION):
             raise StateSpaceMismatch(
                 f"{folder}: format version {manifest['format_version']}; this pharos reads versions {FORMAT_VERSION} "
-                f"and {OUTCOMES_VERSION}: build again"
+                f"to {INT40_VERSION}: build again"
             )
         if digest_of(manifest) != manifest["digest"]:
             raise ValueError("it was changed after it was written")
@@ -80,8 +87,14 @@ def successors_name(arrays: dict[str, Any], parts: dict[str, str] | None = None)
     Args:
         parts: PARTS, where the arrays are those of a build with chance that goes on.
     """
-    wide = parts[WIDE_SUCCESSORS] if parts else WIDE_SUCCESSORS
-    return WIDE_SUCCESSORS if wide in arrays else SUCCESSORS
+    names = parts or {name: name for name in INDEX_TYPES}
+    return next((name for name in (SUCCESSORS40, SUCCESSORS64) if names[name] in arrays), SUCCESSORS)
+
+
+def has_chance(manifest: dict[str, Any]) -> bool:
+    """Whether actions have several outcomes."""
+    version = manifest["format_version"]
+    return version == OUTCOMES_VERSION or (version == INT40_VERSION and "outcomes" in manifest)
 
 
 def digest_of(manifest: dict[str, Any]) -> str:
@@ -158,15 +171,18 @@ def _check_start(manifest: dict[str, Any]) -> None:
 def _check_arrays(manifest: dict[str, Any]) -> None:
     """Each array has the length and the type that follow from the numbers of states, actions and outcomes."""
     arrays, states = manifest["arrays"], manifest["num_states"]
-    if manifest["format_version"] == OUTCOMES_VERSION:
+    has_40_bits = bool({SUCCESSORS40, PARTS[SUCCESSORS40]} & set(arrays))
+    if has_40_bits != (manifest["format_version"] == INT40_VERSION):
+        raise ValueError(f"arrays are {', '.join(arrays)}, which are not those of version {manifest['format_version']}")
+    if has_chance(manifest):
         _whole(manifest["outcomes"], "outcomes", 1)
         if not manifest["complete"]:
             _check_parts(arrays)
             return
         expected = _expected_outcomes(manifest)
     else:
-        width = 8 if successors_name(arrays) == WIDE_SUCCESSORS else 4
-        expected = {successors_name(arrays): (f"<i{width}", width * states * manifest["num_actions"])}
+        name = successors_name(arrays)
+        expected = {name: (INDEX_TYPES[name], _width(INDEX_TYPES[name]) * states * manifest["num_actions"])}
     expected = {
         STATES: ("<u8", 8 * states * manifest["layout"]["num_words"]),
         **expected,
@@ -192,9 +208,8 @@ def _expected_outcomes(manifest: dict[str, Any]) -> dict[str, tuple[str, int]]:
     if most > manifest["outcomes"] or transitions > rows * most:
         raise ValueError(f"{transitions} transitions of at most {most} outcomes, for {manifest['outcomes']} declared")
     name = successors_name(arrays)
-    width = 8 if name == WIDE_SUCCESSORS else 4
     stored = transitions if OFFSETS in arrays else rows * most
-    expected = {name: (f"<i{width}", width * stored)}
+    expected = {name: (INDEX_TYPES[name], _width(INDEX_TYPES[name]) * stored)}
     if OFFSETS in arrays:
         expected[OFFSETS] = ("<i8", 8 * (rows + 1))
     if PROBABILITIES in arrays:
@@ -213,12 +228,17 @@ def _check_parts(arrays: dict[str, Any]) -> None:
     spelled_out = {PARTS[OFFSETS], PARTS[PROBABILITIES]}
     if {STATES, TERMINAL} - set(arrays) or names - {successors} not in ({PARTS[CODES], PARTS[PALETTE]}, spelled_out):
         raise ValueError(f"arrays are {', '.join(arrays)}, which are not those of a build that goes on")
-    dtypes = {STATES: "<u8", TERMINAL: "|u1", PARTS[SUCCESSORS]: "<i4", PARTS[WIDE_SUCCESSORS]: "<i8"}
+    dtypes = {STATES: "<u8", TERMINAL: "|u1", **{PARTS[name]: dtype for name, dtype in INDEX_TYPES.items()}}
     dtypes |= {PARTS[OFFSETS]: "<i8", PARTS[CODES]: "<u2", PARTS[PALETTE]: "<f8", PARTS[PROBABILITIES]: "<f8"}
     for name, entry in arrays.items():
         size = _checked_size(name, entry)
-        if entry["dtype"] != dtypes[name] or size % int(dtypes[name][-1]):
+        if entry["dtype"] != dtypes[name] or size % _width(dtypes[name]):
             raise ValueError(f"{name}: {size} bytes of type {entry['dtype']}; expected whole numbers of {dtypes[name]}")
+
+
+def _width(dtype: str) -> int:
+    """Bytes of a number of a type."""
+    return int(dtype[-1])
 
 
 def _checked_size(name: str, entry: dict[str, Any]) -> int:

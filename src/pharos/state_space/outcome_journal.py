@@ -12,21 +12,21 @@ from typing import Any
 import numpy as np
 
 from pharos.kernels import palettes
+from pharos.packed_indices import dtype_of
 from pharos.state_space.checks import states_to_check
 from pharos.state_space.files import GrowingFile
 from pharos.state_space.journal import Journal, Position
 from pharos.state_space.manifest import (
     ARRAYS,
     CODES,
+    INDEX_TYPES,
     MOST_CODES,
     OFFSETS,
     PALETTE,
     PARTS,
     PROBABILITIES,
     STATES,
-    SUCCESSORS,
     TERMINAL,
-    WIDE_SUCCESSORS,
     successors_name,
 )
 from pharos.state_space.outcome_checks import check_outcome_rules
@@ -46,7 +46,6 @@ class OutcomeJournal(Journal):
 
     def __init__(self, path: Path, plan: Plan):
         super().__init__(path, plan)
-        self._successors_name, self._wide_name = PARTS[SUCCESSORS], PARTS[WIDE_SUCCESSORS]
         self._num_actions, self._most = plan.env.num_actions, int(plan.env.outcomes)
         self.palette: np.ndarray | None = np.zeros((min(256, MOST_CODES), self._most), np.uint64)
         self._vectors = 0
@@ -54,13 +53,17 @@ class OutcomeJournal(Journal):
         self._failure: BaseException | None = None
 
     def _names(self, arrays: dict[str, Any]) -> tuple[str, ...]:
-        self._successors_name = PARTS[successors_name(arrays, PARTS)]
+        self._indices = successors_name(arrays, PARTS)
         if PARTS[PROBABILITIES] in arrays:
             self.palette = None
         return tuple(self._dtypes())
 
+    @property
+    def _successors_name(self) -> str:
+        return PARTS[self._indices]
+
     def _dtypes(self) -> dict[str, str]:
-        dtypes = {STATES: "<u8", self._successors_name: self.index_dtype.str}
+        dtypes = {STATES: "<u8", self._successors_name: INDEX_TYPES[self._indices]}
         if self.palette is None:
             return {**dtypes, PARTS[OFFSETS]: "<i8", PARTS[PROBABILITIES]: "<f8", TERMINAL: "|u1"}
         return {**dtypes, PARTS[CODES]: "<u2", PARTS[PALETTE]: "<f8", TERMINAL: "|u1"}
@@ -83,7 +86,7 @@ class OutcomeJournal(Journal):
         """What the files hold of the first `states` states."""
         palette = None if self.palette is None else self.palette[: self._vectors]
         rows = states * self._num_actions
-        return OutcomeParts(self.path, rows, self._num_actions, self._most, self.index_dtype, palette)
+        return OutcomeParts(self.path, rows, self._num_actions, self._most, self._indices, palette)
 
     # Appending -------------------------------------------------------------------------------------------------------
 
@@ -115,7 +118,7 @@ class OutcomeJournal(Journal):
             assert self.palette is not None
             files[PARTS[CODES]].append(codes)
             files[PARTS[PALETTE]].append(self.palette[num_vectors : self._vectors])
-        files[self._successors_name].append(following[:size])
+        self._append_successors(following[:size])
         files[TERMINAL].append(np.packbits(block.terminal, bitorder="little"))
         self._written = self._entries(at)
 
@@ -170,7 +173,7 @@ class OutcomeJournal(Journal):
         written = {
             **self._written,
             "num_outcomes": most,
-            "num_transitions": arrays[self._successors_name]["bytes"] // self.index_dtype.itemsize,
+            "num_transitions": arrays[self._successors_name]["bytes"] // dtype_of(INDEX_TYPES[self._indices]).itemsize,
             "arrays": {STATES: arrays[STATES], **finished, TERMINAL: arrays[TERMINAL]},
         }
         self.commit(complete=True, written=written)

@@ -14,8 +14,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pharos.kernels import palettes
+from pharos.packed_indices import as_stored, dtype_of, from_stored
 from pharos.state_space.files import GrowingFile, cannot_write
-from pharos.state_space.manifest import CODES, OFFSETS, PALETTE, PARTS, PROBABILITIES, SUCCESSORS, WIDE_SUCCESSORS
+from pharos.state_space.manifest import CODES, INDEX_TYPES, OFFSETS, PALETTE, PARTS, PROBABILITIES
 from pharos.state_space.stored_outcomes import OutcomesOfState
 
 MOST_PADDING = (3, 10)
@@ -43,7 +44,7 @@ class OutcomeParts:
 
     Attributes:
         folder: where they are. rows: how many, A for each state. most_declared: the most outcomes that a row may have.
-        index_dtype: of the successors.
+        indices: the file of the finished build that its successors will be in, of INDEX_TYPES.
         palette: (P, K) uint64, bits of the vectors; None where probabilities are spelled out.
     """
 
@@ -51,7 +52,7 @@ class OutcomeParts:
     rows: int
     num_actions: int
     most_declared: int
-    index_dtype: np.dtype
+    indices: str
     palette: np.ndarray | None
 
     def parts(self) -> Iterator[Part]:
@@ -76,9 +77,10 @@ class OutcomeParts:
 
     def _part(self, row: int, first: int, codes: np.ndarray | None, counts: np.ndarray) -> Part:
         entries = int(counts.sum())
-        name = WIDE_SUCCESSORS if self.index_dtype.itemsize == 8 else SUCCESSORS
-        place = first * self.index_dtype.itemsize
-        successors = np.fromfile(self.folder / PARTS[name], self.index_dtype, entries, offset=place)
+        dtype = dtype_of(INDEX_TYPES[self.indices])
+        place = first * dtype.itemsize
+        stored = np.fromfile(self.folder / PARTS[self.indices], dtype, entries, offset=place)
+        successors = np.asarray(from_stored(stored))
         return Part(row, first, counts, codes, successors)
 
     def likely(self, part: Part) -> np.ndarray:
@@ -103,10 +105,10 @@ class OutcomeParts:
             written: the same of the files that there are.
         """
         most = self.most()
-        successors = WIDE_SUCCESSORS if self.index_dtype.itemsize == 8 else SUCCESSORS
-        num_entries = written[PARTS[successors]]["bytes"] // self.index_dtype.itemsize
+        successors, index_type = self.indices, INDEX_TYPES[self.indices]
+        num_entries = written[PARTS[successors]]["bytes"] // dtype_of(index_type).itemsize
         is_dense = MOST_PADDING[1] * (self.rows * most - num_entries) <= MOST_PADDING[0] * self.rows * most
-        dtypes = {successors: self.index_dtype.str}
+        dtypes = {successors: index_type}
         if not is_dense:
             dtypes[OFFSETS] = "<i8"
         if self.palette is None:
@@ -141,7 +143,8 @@ class OutcomeParts:
         successors = next(iter(dtypes))
         for part in self.parts():
             if is_dense:
-                files[successors].append(_padded(part.successors, part.counts, most, fill_with_first=True))
+                rows = _padded(part.successors, part.counts, most, fill_with_first=True)
+                files[successors].append(as_stored(rows, dtypes[successors]))
             if OFFSETS in files:
                 files[OFFSETS].append(part.first + np.cumsum(part.counts))
             if PROBABILITIES in files:

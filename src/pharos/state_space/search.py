@@ -17,12 +17,13 @@ import numpy as np
 from pharos import memory as machine
 from pharos.environments import Environment
 from pharos.errors import StateSpaceTooLarge
+from pharos.packed_indices import INT32_STATES, INT40_STATES
 from pharos.rules import rules_of
 from pharos.state_space.journal import Journal, Position
 from pharos.state_space.outcome_journal import OutcomeJournal
 from pharos.state_space.plan import Plan
 from pharos.state_space.progress import BuildProgress, Progress
-from pharos.state_space.table import INT32_STATES, Block, MemoryTable, SpilledTable
+from pharos.state_space.table import Block, MemoryTable, SpilledTable
 from pharos.workers import usable_workers
 
 # States expanded between two looks at the clock; a multiple of 8, so that terminal bits fill whole bytes.
@@ -260,7 +261,7 @@ class Search:
         return self.journal.index_dtype.itemsize == 4 and self.position.count + successors + starts > INT32_STATES
 
     def _widen_indices(self, pool: ThreadPoolExecutor) -> None:
-        """From int32 to int64 indices, in the file and in the table."""
+        """From indices of 32 bits to those of 40 in the file, of 64 in the table."""
         self.journal.finish_writes()
         if self._ahead:  # its slots are those of the old table: it is expanded again
             wait(self._ahead.futures)
@@ -357,6 +358,8 @@ def journal_of(path: Path, plan: Plan) -> Journal:
 
 def check_size(env: Environment, count: int, left: int, max_states: int | None) -> None:
     """StateSpaceTooLarge where there are more than `max_states` states, of which `left` are not expanded."""
+    if count > INT40_STATES:
+        raise StateSpaceTooLarge(f"{env} has more than {INT40_STATES} states, which indices of 40 bits cannot number")
     if max_states is None or count <= max_states:
         return
     if left == 0:

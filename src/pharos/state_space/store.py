@@ -19,15 +19,16 @@ from pharos.errors import (
     StateSpaceIncomplete,
     StateSpaceMismatch,
 )
+from pharos.packed_indices import Indices, dtype_of, from_stored
 from pharos.rules import Layout, pack, rules_of, unpack
 from pharos.state_space.checks import check_environment, check_rules, check_states, check_successors, states_to_check
 from pharos.state_space.manifest import (
     AGAIN,
     CHECKSUM_BYTES,
     MANIFEST,
-    OUTCOMES_VERSION,
     STATES,
     TERMINAL,
+    has_chance,
     read_manifest,
     successors_name,
 )
@@ -53,8 +54,8 @@ class StateSpace:
         num_states, num_actions, num_terminal_states, depth: S, A, terminal states, largest distance from the start
             states.
         has_chance: whether actions have several outcomes, which `outcomes` has in place of `successors`.
-        successors: (S, A) int32 (int64 beyond 2^31 states), index of the next state; terminal states lead to
-            themselves.
+        successors: (S, A) int32 (`PackedIndices` beyond 2^31 states), index of the next state; terminal states lead
+            to themselves.
         packed_states: (S, W) uint64, see docs/format.md.
         start_states, start_probabilities: indices and probabilities of the start states.
     """
@@ -67,7 +68,7 @@ class StateSpace:
         self.num_actions: int = manifest["num_actions"]
         self.num_terminal_states: int = manifest["num_terminal_states"]
         self.depth: int = manifest["depth"]
-        self.has_chance: bool = manifest["format_version"] == OUTCOMES_VERSION
+        self.has_chance: bool = has_chance(manifest)
         self.parameters: dict[str, Any] = manifest["parameters"]
         self.start_states = np.array([index for index, _ in manifest["initial"]], np.int64)
         self.start_probabilities = np.array([probability for _, probability in manifest["initial"]], np.float64)
@@ -83,8 +84,8 @@ class StateSpace:
         return self._stored_states
 
     @cached_property
-    def successors(self) -> np.ndarray:
-        """(S, A) int32 or int64, read-only memory map.
+    def successors(self) -> Indices:
+        """(S, A) int32, or, beyond 2^31 states, `PackedIndices` of five bytes each; a read-only memory map.
 
         Raises:
             StateSpaceCorrupted: one is no state, or a terminal state does not lead to itself. The first access looks at
@@ -145,11 +146,12 @@ class StateSpace:
         return self._map(STATES, "<u8", (self.num_states, self.layout.num_words))
 
     @cached_property
-    def _stored_successors(self) -> np.ndarray:
+    def _stored_successors(self) -> Indices:
         if self.has_chance:
             raise StateSpaceError(f"{self}: actions have several outcomes, in `outcomes`; there are no `successors`")
         name = successors_name(self.manifest["arrays"])
-        return self._map(name, self.manifest["arrays"][name]["dtype"], (self.num_states, self.num_actions))
+        shape = (self.num_states, self.num_actions)
+        return from_stored(self._map(name, dtype_of(self.manifest["arrays"][name]["dtype"]), shape))
 
     @cached_property
     def terminal_bits(self) -> np.ndarray:
@@ -268,7 +270,7 @@ class StateSpace:
                         f"its checksum: the file was changed after it was written; {AGAIN}"
                     )
 
-    def _map(self, name: str, dtype: str, shape: tuple[int, ...]) -> np.ndarray:
+    def _map(self, name: str, dtype: str | np.dtype, shape: tuple[int, ...]) -> np.ndarray:
         return mapped(ranges_of(self.folder, self.manifest, name), dtype)[: math.prod(shape)].reshape(shape)
 
     def _check_index(self, i: int) -> None:

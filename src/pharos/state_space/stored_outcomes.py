@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from pharos.packed_indices import Indices, dtype_of, from_stored
 from pharos.state_space.manifest import CODES, OFFSETS, PALETTE, PROBABILITIES, successors_name
 from pharos.state_space.shards import mapped, ranges_of
 
@@ -24,7 +25,7 @@ class StoredOutcomes(NamedTuple):
         probabilities: float64 in the shape of successors; None where there is a palette.
     """
 
-    successors: np.ndarray
+    successors: Indices
     offsets: np.ndarray | None
     codes: np.ndarray | None
     palette: np.ndarray | None
@@ -48,11 +49,12 @@ class StoredOutcomes(NamedTuple):
         def array(name: str) -> np.ndarray | None:
             if name not in arrays:
                 return None
-            return mapped(ranges_of(folder, manifest, name), arrays[name]["dtype"]).reshape(shapes[name])
+            return mapped(ranges_of(folder, manifest, name), dtype_of(arrays[name]["dtype"])).reshape(shapes[name])
 
         successors = array(successors_name(arrays))
         assert successors is not None
-        return StoredOutcomes(successors, array(OFFSETS), array(CODES), array(PALETTE), array(PROBABILITIES))
+        others = (array(name) for name in (OFFSETS, CODES, PALETTE, PROBABILITIES))
+        return StoredOutcomes(from_stored(successors), *others)
 
     def entries(self, start: int, stop: int, num_actions: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """All possible outcomes of states [start, stop), N of them.

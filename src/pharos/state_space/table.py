@@ -9,13 +9,13 @@ import numpy as np
 from pharos import memory as machine
 from pharos.kernels.hash_table import fill, fill_more, fill_range, insert_missing
 from pharos.large_arrays import huge_pages, reserved_states, reserved_table
+from pharos.packed_indices import INT32_STATES
 
 LOAD = 0.5  # the table in memory grows beyond this share of used slots
 FULLEST = 0.8  # the same, where memory has no room for a table of twice the size
 SLOTS = 1 << 16  # a table has a multiple of them
 PARALLEL_FILL = 1 << 16  # states that are worth sharing between threads when the table grows
 LEFT_OVER = 1 << 12  # states that may pass the end of a part of the table, which are a handful
-INT32_STATES = 2**31 - 1
 
 
 class Block(NamedTuple):
