@@ -11,7 +11,7 @@ from pharos.hardness import ranked_search, start_eccentricity
 from pharos.hardness.ranked_search import FAR, ranked_distances
 from pharos.hardness.transition_graph import Graph
 from pharos.mdp import TabularMDP, sticky_actions
-from rank_threads import threads
+from rank_threads import out_of_order, threads
 from strategies import deterministic_mdps
 
 
@@ -37,15 +37,16 @@ def searched(graph, source, backward):
     size=st.integers(1, 5),
     restart=st.booleans(),
     backward=st.booleans(),
+    seed=st.integers(0, 2**32),
     data=st.data(),
 )
-def test_distances_do_not_depend_on_ranks(mdp, size, restart, backward, data):
+def test_distances_do_not_depend_on_ranks(mdp, size, restart, backward, seed, data):
     graph = Graph.of(mdp, restart)
     if graph is None:
         return
     source = data.draw(st.integers(0, graph.num_nodes - 1))
     expected, count, largest = searched(graph, source, backward)
-    with threads(ranked_search):
+    with threads(ranked_search, out_of_order(seed)):
         found = ranked_distances(graph, source, size, backward=backward)
     assert (found.distances == expected).all()
     assert (found.reached, found.largest) == (count, largest)

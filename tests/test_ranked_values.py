@@ -1,6 +1,7 @@
 """Values by several processes: those of one process, whatever the number, and going on after a kill."""
 
 import contextlib
+import itertools
 import json
 import os
 import shutil
@@ -23,8 +24,8 @@ from pharos.solvers import checkpoint as checkpoints
 from pharos.solvers import evaluate_policy, ranked, sharing, uniform_value, value_iteration
 from pharos.solvers.fixed_point import Backup
 from pharos.solvers.sharing import Sharing, shared_solution
-from rank_threads import Killed, fails_at, threads
-from strategies import hard_mdps, lazy_mdps, small_mdps
+from rank_threads import Killed, fails_at, out_of_order, threads
+from strategies import FEW, deterministic_mdps, hard_mdps, lazy_mdps, outcome_mdps, small_mdps
 
 MPIEXEC = shutil.which("mpiexec", path=Path(sys.executable).parent)
 MANY = st.one_of(small_mdps(), hard_mdps(), lazy_mdps())
@@ -40,8 +41,10 @@ def chain(num_states=300, gamma=0.9):
     return TabularMDP.from_arrays(following, rewards, gamma=gamma)
 
 
-def solved(mdp, size, *, select=BEST, tolerance=1e-6, horizon=None, disturb=lambda rank: None, **options):
-    with threads(sharing, disturb):
+def solved(mdp, size, *, select=BEST, tolerance=1e-6, horizon=None, disturb=lambda rank: None, cuts=None, **options):
+    with threads(sharing, disturb), pytest.MonkeyPatch.context() as patch:
+        if cuts is not None:
+            patch.setattr(ranked, "cuts_of", lambda num_rows, ranks: np.array(cuts))
         return shared_solution(mdp, select, tolerance, horizon, Sharing(size, **options))
 
 
@@ -125,6 +128,68 @@ def test_ranks_compute_the_rewards_of_their_ranges(sticky, tmp_path):
     assert (ranged.rewards == mdp.rewards).all()
 
 
+# Messages that travel while ranks sweep -------------------------------------------------------------------------------
+
+
+CHAINS = [chain(40), pharos.sticky_actions(chain(40), 0.25), pharos.lazy_actions(chain(40), 0.1)]
+
+
+@st.composite
+def ranges(draw, num_states):
+    """(P + 1,) where up to five ranges begin and end, uneven."""
+    inner = draw(st.sets(st.integers(1, num_states - 1), max_size=4)) if num_states > 1 else ()
+    return [0, *sorted(inner), num_states]
+
+
+@pytest.mark.long
+@settings(max_examples=60, deadline=None)
+@given(
+    mdp=st.one_of(deterministic_mdps(9), outcome_mdps(FEW), st.sampled_from(CHAINS)),
+    seed=st.integers(0, 2**32),
+    draws=st.booleans(),
+    gap=st.sampled_from([1, 2, 64]),
+    data=st.data(),
+)
+def test_neither_ranges_nor_the_order_of_arrival_change_a_bit(mdp, seed, draws, gap, data):
+    cuts, late = data.draw(ranges(mdp.num_states)), out_of_order(seed)
+    size, select = len(cuts) - 1, PolicyTable.of(mdp) if draws else BEST
+    mdp = mdp.with_gamma(min(mdp.gamma, 0.8)).with_horizon(None)
+    options = {"select": select, "tolerance": 1e-6 * max(1.0, np.abs(mdp.rewards).max())}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ranked, "_GAP", gap)
+        for more in ({"jacobi": True}, {"horizon": 7}):
+            alone = solved(mdp, 1, **options, **more)
+            shared = solved(mdp, size, cuts=cuts, disturb=late, **options, **more)
+            assert (shared.x == alone.x).all() and (shared.next_x == alone.next_x).all()
+            assert (shared.error_bound, shared.sweeps) == (alone.error_bound, alone.sweeps)
+        soon, shared = (solved(mdp, size, cuts=cuts, disturb=each, **options) for each in (lambda rank: None, late))
+        assert (shared.x == soon.x).all() and shared.sweeps == soon.sweeps
+
+
+def swept_by_ranges(mdp, cuts, sweeps):
+    """(S,) values after sweeps in place of each range, with what the others were before: written down from the text."""
+    table, x = mdp.dynamics.deterministic_table(), np.zeros(mdp.num_states + 1)
+    for _ in range(sweeps):
+        after = x.copy()
+        for start, stop in itertools.pairwise(cuts):
+            seen = x.copy()
+            for s in reversed(range(start, stop)):
+                seen[s] = max(mdp.rewards[s, a] + mdp.gamma * seen[table[s, a]] for a in range(mdp.num_actions))
+            after[start:stop] = seen[start:stop]
+        x = after
+    return x[:-1]
+
+
+@pytest.mark.long
+@settings(max_examples=40, deadline=None)
+@given(mdp=st.one_of(deterministic_mdps(max_states=9), st.just(chain(40))), seed=st.integers(0, 2**32), data=st.data())
+def test_sweeps_in_place_keep_the_order_of_the_states(mdp, seed, data):
+    mdp = mdp.with_gamma(min(mdp.gamma, 0.8))
+    cuts = data.draw(ranges(mdp.num_states))
+    shared = solved(mdp, len(cuts) - 1, cuts=cuts, disturb=out_of_order(seed))
+    assert (shared.x[:-1, 0] == swept_by_ranges(mdp, cuts, shared.sweeps)).all()
+
+
 # What is refused ------------------------------------------------------------------------------------------------------
 
 
@@ -157,18 +222,20 @@ def test_sweeps_that_gain_nothing_end(monkeypatch):
 @given(
     size=st.integers(1, 5),
     who=st.integers(0, 4),
-    number=st.integers(0, 60),
+    number=st.integers(0, 120),
     then=st.integers(1, 5),
     horizon=st.sampled_from([None, 20]),
-    mdp=st.sampled_from([chain(40), pharos.sticky_actions(chain(40), 0.25), pharos.lazy_actions(chain(40), 0.1)]),
+    mdp=st.sampled_from(CHAINS),
+    seed=st.integers(0, 2**32),
 )
-def test_solving_goes_on_whoever_failed_and_however_many_go_on(size, who, number, then, horizon, mdp):
+def test_solving_goes_on_whoever_failed_and_however_many_go_on(size, who, number, then, horizon, mdp, seed):
     whole = solved(mdp, 1, horizon=horizon, jacobi=True)
     with tempfile.TemporaryDirectory() as folder:
         options = {"horizon": horizon, "jacobi": True, "checkpoint": folder, "checkpoint_seconds": -1.0}
         with contextlib.suppress(Killed, RankFailed), pytest.MonkeyPatch.context() as patch:
             patch.setattr(checkpoints, "_SHARE", 0)
-            solved(mdp, size, disturb=fails_at(who % size, number), **options)
+            late, fails = out_of_order(seed), fails_at(who % size, number)
+            solved(mdp, size, disturb=lambda rank: (fails(rank), late(rank)), **options)
         result = solved(mdp, then, **options)
         assert not list(Path(folder).iterdir())
     assert (result.x == whole.x).all()
@@ -281,6 +348,17 @@ def test_the_command_writes_the_same_file(launcher, chance, tmp_path):
         assert answers[0][key] == answers[1][key]
     with np.load(tmp_path / "alone.npz") as one, np.load(tmp_path / "shared.npz") as other:
         assert set(one) == set(other)
+        assert all((one[name] == other[name]).all() for name in one)
+
+
+@pytest.mark.long
+@pytest.mark.skipif(MPIEXEC is None, reason="needs the extra mpi")
+def test_ranks_of_mpi_sweep_in_place_as_processes_do(tmp_path):
+    by_mpi = run(tmp_path, *WORLD, "--out", tmp_path / "mpi.npz", "--json", ranks_of_mpi=3)
+    forked = run(tmp_path, *WORLD, "--processes", "3", "--out", tmp_path / "forked.npz", "--json")
+    assert by_mpi.returncode == 0, by_mpi.stderr
+    assert json.loads(by_mpi.stdout)["sweeps"] == json.loads(forked.stdout)["sweeps"]
+    with np.load(tmp_path / "mpi.npz") as one, np.load(tmp_path / "forked.npz") as other:
         assert all((one[name] == other[name]).all() for name in one)
 
 

@@ -2,6 +2,7 @@
 
 import contextlib
 import functools
+import itertools
 import os
 import shutil
 import signal
@@ -196,6 +197,27 @@ def echo(rank):
     assert gathered == [[each] if rank.rank == 0 else [] for each in range(rank.size)]
 
 
+def tell(rank):
+    """Messages to some of the others, in rounds; the sizes say who sends how much to whom."""
+    for turn in range(40):
+        rng = np.random.default_rng(turn)
+        sizes = rng.integers(0, 4, (rank.size, rank.size, 2))
+        places = {
+            (q, i): np.full((n, 2), -1.0) for q in range(rank.size) for i, n in enumerate(sizes[q, rank.rank]) if n
+        }
+        for (source, _), into in places.items():
+            rank.receive(source, into)
+        for i, to in itertools.product(range(2), rng.permutation(rank.size)):
+            if sizes[rank.rank, to, i]:
+                rank.send(int(to), np.full((sizes[rank.rank, to, i], 2), 100.0 * turn + 10 * rank.rank + i))
+                rank.progress()
+        rank.finish()
+        for (source, i), into in places.items():
+            assert (into == 100 * turn + 10 * source + i).all()
+        if turn % 3 == 0:
+            assert rank.numbers_of_all(turn, rank.rank).tolist() == [[turn, each] for each in range(rank.size)]
+
+
 def by_processes(size, answer):
     return ranks.processes(size, answer, 1 << 12)
 
@@ -205,6 +227,69 @@ def by_processes(size, answer):
 def test_what_is_sent_arrives(among, size):
     with among(size, echo) as rank:
         echo(rank)
+
+
+@pytest.mark.parametrize("among", [ranks.loop, by_processes])
+@pytest.mark.parametrize("size", [1, 3])
+def test_messages_arrive_in_their_order(among, size):
+    with among(size, tell) as rank:
+        tell(rank)
+
+
+def fail_while_others_wait(rank):
+    into = np.zeros(1)
+    rank.receive((rank.rank + 1) % rank.size, into)
+    if rank.rank == 1:
+        raise RuleError("a rule failed")
+    rank.send((rank.rank - 1) % rank.size, np.ones(1))
+    rank.finish()
+    rank.numbers_of_all(1.0)
+
+
+@pytest.mark.parametrize("among", [ranks.loop, by_processes])
+def test_who_waits_for_a_message_is_told_of_a_failure(among):
+    with pytest.raises(RuleError, match=r"^a rule failed$"), among(3, fail_while_others_wait) as rank:
+        fail_while_others_wait(rank)
+
+
+PROGRAM = """
+import sys
+from pharos.ranks import together
+from test_ranks import fail_while_others_wait, tell
+program = {"tell": tell, "fail": fail_while_others_wait}[sys.argv[1]]
+try:
+    together("mpi", program, 0)
+    print("told")
+except Exception as error:
+    print(f"{type(error).__name__}: {error}")
+"""
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("what, line", [("tell", "told"), ("fail", "RuleError: a rule failed")])
+@pytest.mark.skipif(shutil.which("mpiexec", path=Path(sys.executable).parent) is None, reason="needs the extra mpi")
+def test_ranks_of_mpi_send_messages(what, line):
+    command = [Path(sys.executable).parent / "mpiexec", "-n", "3", sys.executable, "-c", PROGRAM, what]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([*sys.path, str(Path(__file__).parent)])}
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, env=environment)
+    assert done.stdout.splitlines() == [line] * 3, done.stderr
+
+
+def die_while_others_wait(rank):
+    rank.receive((rank.rank + 1) % rank.size, np.zeros(1))
+    if rank.rank == 2:
+        os.kill(os.getpid(), signal.SIGKILL)
+    rank.send((rank.rank - 1) % rank.size, np.ones(1))
+    rank.finish()
+    rank.numbers_of_all(1.0)
+
+
+def test_a_process_killed_before_it_sent_is_one_line():
+    with (
+        pytest.raises(RankFailed, match=r"rank 2 of 3 died \(exit code -9\); the same command resumes"),
+        by_processes(3, die_while_others_wait) as rank,
+    ):
+        die_while_others_wait(rank)
 
 
 def fail_on_purpose(rank):

@@ -2,7 +2,10 @@
 
 Distances come from sweeps over the table in order, as in lean_sweep.py: an upper bound is lowered along every edge
 until nothing is. Forward, a rank lowers the bounds of its halo, nodes of other ranks, too, and tells their owners;
-backward, it asks the owners for them. Distances are whole numbers, so they are the same whatever the number of ranks.
+backward, it gets them from the owners, those of high nodes while the low ones are swept. Sweeps follow ways in the
+order of the nodes, and would be more in another one, so no more travels meanwhile; and forward a bound in a halo may be
+lowered until the last node, so all messages wait for the end. Distances are whole numbers, so they are the same
+whatever the number of ranks.
 """
 
 from collections.abc import Iterator
@@ -62,32 +65,35 @@ class RankedGraph:
         self.distance[:] = FAR
         numbers = np.concatenate([np.arange(self.start, self.stop), self._halo.rows])
         self.distance[numbers == source] = 0
-        kernel = kernels.lower_backward if backward else kernels.lower_forward
         lowered = 1
         while lowered:
-            own = int(kernel(self._local, self._never, -1, self.distance, FAR, 0, len(self)))
-            own += self._told() if not backward else 0
-            lowered = sum(int(each[0]) for each in self.rank.gather_all(np.array([own])))
-            if backward:
-                self._ask()
+            own = self._lowered_backward() if backward else self._lowered_forward()
+            lowered = int(self.rank.numbers_of_all(own).sum())
         reach, largest, _ = kernels.summary(self.distance[: len(self)], FAR)
-        every = self.rank.gather_all(np.array([reach, largest]))
-        return sum(int(each[0]) for each in every), max(int(each[1]) for each in every)
+        every = self.rank.numbers_of_all(reach, largest)
+        return int(every[:, 0].sum()), int(every[:, 1].max())
 
-    def _told(self) -> int:
-        """Lower distances to what others have found; how many."""
-        halo, lowered = self.distance[len(self) :], 0
-        received = self.rank.exchange([halo[part] for part in self._halo.of_rank])
-        for rows, distances in zip(self._halo.wanted, received, strict=True):
-            lower = distances < self.distance[rows]
-            self.distance[rows[lower]] = distances[lower]
+    def _lowered_backward(self) -> int:
+        """Sweep, and get the distances of the halo; how many nodes have a smaller one."""
+        halo, distance = self._halo, self.distance
+        edges = (self._local, self._never, -1, distance, FAR)
+        halo.receive(distance, in_two=True)
+        lowered = kernels.lower_backward(*edges, halo.low, len(self))
+        halo.send_high(distance)
+        lowered += kernels.lower_backward(*edges, 0, halo.low)
+        halo.send_low(distance)
+        halo.finish(distance[len(self) :])
+        return int(lowered)
+
+    def _lowered_forward(self) -> int:
+        """Sweep, and lower distances to what others have found; how many."""
+        distance = self.distance
+        lowered = int(kernels.lower_forward(self._local, self._never, -1, distance, FAR, 0, len(self)))
+        for rows, distances in self._halo.give_back(distance[len(self) :]):
+            lower = distances < distance[rows]
+            distance[rows[lower]] = distances[lower]
             lowered += int(np.count_nonzero(lower))
         return lowered
-
-    def _ask(self) -> None:
-        """Get the distances of the halo."""
-        received = self.rank.exchange([self.distance[rows] for rows in self._halo.wanted])
-        self.distance[len(self) :] = np.concatenate(received)
 
     def gathered(self) -> np.ndarray | None:
         """(N,) the distances of all nodes at the first rank; None at the others."""

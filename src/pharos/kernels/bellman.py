@@ -96,6 +96,13 @@ def optimal_block(transitions, table, palette, gamma, uniform, choice, v, out, a
         out[uint64(s)] = _backup(transitions, table, palette, gamma, uniform, choice, v, actions, s)
 
 
+@njit(cache=True, nogil=True)
+def optimal_runs(transitions, table, palette, gamma, uniform, choice, v, out, actions, runs):
+    """The same for the states of some runs (R, 2) of them, ascending."""
+    for i in range(len(runs)):
+        optimal_block(transitions, table, palette, gamma, uniform, choice, v, out, actions, runs[i, 0], runs[i, 1])
+
+
 @njit(forceinline=True)
 def _sticky_values(transitions, table, palette, gamma, choice, v, actions, q, s):
     """q[a] = r(s, a) + gamma v(next, a). Returns (that of what is chosen, their sum)."""
@@ -160,12 +167,19 @@ def sticky_block(transitions, table, palette, gamma, weights, choice, v, out, ac
 
 
 @njit(cache=True, nogil=True)
-def policy_sweep(transitions, table, palette, gamma, chosen, uniform, policy, v, order):
+def sticky_runs(transitions, table, palette, gamma, weights, choice, v, out, actions, runs):
+    """The same for the states of some runs (R, 2) of them, ascending."""
+    for i in range(len(runs)):
+        sticky_block(transitions, table, palette, gamma, weights, choice, v, out, actions, runs[i, 0], runs[i, 1])
+
+
+@njit(cache=True, nogil=True)
+def policy_sweep(transitions, table, palette, gamma, chosen, uniform, policy, v, order, start, stop):
     """v[s] = sum_a (chosen policy[s, a] + uniform / A) q(s, a), in place; policy (S, A): probabilities of choosing."""
-    num_states, num_actions = size_of(transitions)
+    _, num_actions = size_of(transitions)
     each = uniform / num_actions
     change = 0.0
-    for i in range(num_states - 1, -1, -1):
+    for i in range(stop - 1, start - 1, -1):
         s = state_at(order, i)
         value = 0.0
         for a in range(num_actions):
@@ -177,17 +191,17 @@ def policy_sweep(transitions, table, palette, gamma, chosen, uniform, policy, v,
 
 
 @njit(cache=True, nogil=True)
-def sticky_policy_sweep(transitions, table, palette, gamma, weights, policy, v, q, order):
+def sticky_policy_sweep(transitions, table, palette, gamma, weights, policy, v, q, order, start, stop):
     """v[s, b] = sum_a (chosen policy[s, b, a] + uniform / A) q(s, a) + previous q(s, b), in place.
 
     v (S + 1, A). policy (S, B, A): B is A, or 1 where the previous action does not matter. q (A,) scratch.
     """
-    num_states, num_actions = size_of(transitions)
+    _, num_actions = size_of(transitions)
     chosen, previous, uniform = weights
     each = uniform / num_actions
     looks_back = policy.shape[1] > 1
     change = 0.0
-    for i in range(num_states - 1, -1, -1):
+    for i in range(stop - 1, start - 1, -1):
         s = state_at(order, i)
         for a in range(num_actions):
             q[a] = reward_at(table, palette, s, a) + gamma * expectation_of_pair(transitions, v, s, a)

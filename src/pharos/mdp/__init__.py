@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from pharos.mdp.outcome_table import OutcomeTable
     from pharos.mdp.part import Part
     from pharos.mdp.rewards import Rewards
+    from pharos.mdp.runs import count_of, runs_between, runs_of, shares_of
     from pharos.mdp.selection import BEST, WORST, Extreme, PolicyTable, Selection, chosen_mass, mass_of
     from pharos.mdp.space_rewards import ranged_rewards, rewards_of_outcomes, rewards_of_space, rewards_of_staying
     from pharos.mdp.table import Table
@@ -42,6 +43,7 @@ _FILES = {
     "Table": "table",
     "TabularMDP": "tabular",
     "chosen_mass": "selection",
+    "count_of": "runs",
     "mass_of": "selection",
     "lazy_actions": "chance",
     "minimize": "bisimulation",
@@ -50,6 +52,9 @@ _FILES = {
     "rewards_of_outcomes": "space_rewards",
     "rewards_of_space": "space_rewards",
     "rewards_of_staying": "space_rewards",
+    "runs_between": "runs",
+    "runs_of": "runs",
+    "shares_of": "runs",
     "split": "dynamics",
     "sticky_actions": "chance",
     "takes_mdp": "arguments",
@@ -75,6 +80,7 @@ __all__ = [
     "Table",
     "TabularMDP",
     "chosen_mass",
+    "count_of",
     "lazy_actions",
     "mass_of",
     "minimize",
@@ -83,6 +89,9 @@ __all__ = [
     "rewards_of_outcomes",
     "rewards_of_space",
     "rewards_of_staying",
+    "runs_between",
+    "runs_of",
+    "shares_of",
     "split",
     "sticky_actions",
     "takes_mdp",

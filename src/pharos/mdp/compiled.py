@@ -11,6 +11,7 @@ import numpy as np
 from pharos.kernels import bellman, graph, occupancy
 from pharos.large_arrays import ranges_from_the_end
 from pharos.mdp.dynamics import BellmanEquation, Components, Dynamics, Order, Play
+from pharos.mdp.runs import count_of, shares_of
 from pharos.mdp.selection import Extreme, PolicyTable, Selection
 
 
@@ -34,20 +35,25 @@ class CompiledDynamics(Dynamics):
 
         return Lazy(self, p)
 
-    def backup(self, equation: BellmanEquation, x: np.ndarray, out: np.ndarray) -> None:
+    def backup(self, equation: BellmanEquation, x: np.ndarray, out: np.ndarray, runs: np.ndarray | None = None) -> None:
         rewards, gamma, chance, select = equation
         choice = _choice(select)
         if choice is None:
-            return super().backup(equation, x, out)
+            return super().backup(equation, x, out, runs)
         tables = (self.for_sweeps, rewards.table, rewards.palette, gamma)
         actions = bellman.actions_of(self.num_actions)
-        kernel, weights, x_, out_ = (
-            (bellman.sticky_block, chance.triple, x, out)
+        kernel, of_runs, weights, x_, out_ = (
+            (bellman.sticky_block, bellman.sticky_runs, chance.triple, x, out)
             if chance.is_sticky
-            else (bellman.optimal_block, chance.uniform, x[:, 0], out[:, 0])
+            else (bellman.optimal_block, bellman.optimal_runs, chance.uniform, x[:, 0], out[:, 0])
         )
         out[-1] = 0.0
-        _shared(lambda start, stop: kernel(*tables, weights, choice, x_, out_, actions, start, stop), self)
+        arrays = (*tables, weights, choice, x_, out_, actions)
+        if runs is None:
+            whole = np.array([[0, self.num_states]])
+            _shared(lambda part: kernel(*arrays, int(part[0, 0]), int(part[0, 1])), self, whole)
+        else:
+            _shared(lambda part: of_runs(*arrays, part), self, runs)
 
     def sweep(
         self, equation: BellmanEquation, x: np.ndarray, threads: int = 1, part: tuple[int, int] | None = None
@@ -136,20 +142,19 @@ def swept(
 
     Args:
         threads: each has a part of the states, where that is possible.
-        part: the places [start, stop) of the order that are swept; None, and for a policy that draws actions: all.
+        part: the places [start, stop) of the order that are swept; None: all.
     """
     rewards, gamma, chance, select = equation
     tables = (transitions, rewards.table, rewards.palette, gamma)
     actions, scratch = bellman.actions_of(num_actions), np.empty(num_actions)
-    choice = _choice(select)
+    choice, places = _choice(select), part or (0, rewards.shape[0])
     if choice is None:
         assert isinstance(select, PolicyTable)
         if chance.is_sticky:
-            return bellman.sticky_policy_sweep(*tables, chance.triple, select.later, x, scratch, order)
+            return bellman.sticky_policy_sweep(*tables, chance.triple, select.later, x, scratch, order, *places)
         weights = (float(chance.chosen), float(chance.uniform))
-        return bellman.policy_sweep(*tables, *weights, select.later[:, 0], x[:, 0], order)
+        return bellman.policy_sweep(*tables, *weights, select.later[:, 0], x[:, 0], order, *places)
     if chance.is_sticky:
-        places = part or (0, rewards.shape[0])
         return bellman.sticky_sweep(*tables, chance.triple, choice, x, actions, scratch, order, *places)
     v = x[:, 0]
 
@@ -160,7 +165,7 @@ def swept(
             change = float(np.maximum(change, largest))
         return change
 
-    low, high = part or (0, rewards.shape[0])
+    low, high = places
     cuts = [low + (high - low) * i // threads for i in range(threads + 1)]
     if threads == 1:
         return change_of(*cuts)
@@ -176,14 +181,12 @@ def _choice(select: Selection) -> "float | np.ndarray | None":
     return None if select.actions is None else np.ascontiguousarray(select.actions, np.int64)
 
 
-def _shared(block: Callable[[int, int], None], dynamics: CompiledDynamics) -> None:
-    """block(start, stop) over all states, on all processors where there are enough states to share."""
+def _shared(block: Callable[[np.ndarray], None], dynamics: CompiledDynamics, runs: np.ndarray) -> None:
+    """block(part) over the states of runs (R, 2), on all processors where there are enough states to share."""
     from pharos.workers import usable_workers
 
-    num_states = dynamics.num_states
-    workers = usable_workers(dynamics.workers) if num_states >= 1 << 16 else 1
+    workers = usable_workers(dynamics.workers) if count_of(runs) >= 1 << 16 else 1
     if workers == 1:
-        return block(0, num_states)
-    cuts = [num_states * i // workers for i in range(workers + 1)]
+        return block(runs)
     with ThreadPoolExecutor(workers) as pool:
-        list(pool.map(block, cuts[:-1], cuts[1:]))
+        list(pool.map(block, shares_of(runs, workers)))

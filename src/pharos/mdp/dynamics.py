@@ -22,6 +22,7 @@ from pharos.errors import ParameterError
 from pharos.kernels import paths
 from pharos.mdp.chance import Chance
 from pharos.mdp.rewards import Rewards
+from pharos.mdp.runs import rows_of
 from pharos.mdp.selection import Selection, chosen_mass
 from pharos.packed_indices import Indices, blocks_of, room_for_indices
 
@@ -196,9 +197,14 @@ class Dynamics(ABC):
 
     # What follows from it -------------------------------------------------------------------------------------------
 
-    def backup(self, equation: BellmanEquation, x: np.ndarray, out: np.ndarray) -> None:
-        """out = T x; x and out are not the same. Between the states and the end there may be others, of a part."""
-        out[: self.num_states] = equation.value(equation.rewards.array + equation.gamma * self.expected(x))
+    def backup(self, equation: BellmanEquation, x: np.ndarray, out: np.ndarray, runs: np.ndarray | None = None) -> None:
+        """out = T x; x and out are not the same. Between the states and the end there may be others, of a part.
+
+        runs: the states of some runs (R, 2) alone, see runs.py; None: all.
+        """
+        states = slice(None) if runs is None else slice(*runs[0]) if len(runs) == 1 else rows_of(runs)
+        q = equation.rewards.rows(states) + equation.gamma * self.expected(x, states)
+        out[: self.num_states][states] = equation.value(q, states)
         out[-1] = 0.0
 
     def sweep(self, equation: BellmanEquation, x: np.ndarray, threads: int = 1) -> float:

@@ -1,13 +1,14 @@
 """Ranks that `mpiexec` has started (extra `mpi`: mpi4py)."""
 
 import os
+import time
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from pharos.errors import MissingExtra, ParameterError
-from pharos.ranks.rank import Rank, error_of, text_of
+from pharos.ranks.rank import NUMBERS, Rank, error_of, text_of
 
 # (rank, size) as launchers tell their processes: MPICH's and Intel's, Open MPI's, MVAPICH's.
 _LAUNCHERS = (
@@ -16,6 +17,8 @@ _LAUNCHERS = (
     ("MV2_COMM_WORLD_RANK", "MV2_COMM_WORLD_SIZE"),
 )
 _FAILED = -1
+_VALUES, _NOTICE = 0, 1  # tags of messages
+_LOOKS = 100  # at messages that have not come before others get the processor
 
 
 def launched() -> tuple[int, int]:
@@ -53,6 +56,8 @@ class _Mpi(Rank):
         self.rank, self.size = self._world.Get_rank(), self._world.Get_size()
         self.neighbors = self._world.Split_type(library.COMM_TYPE_SHARED).Get_size()
         self._is_over = False  # somebody failed: nobody waits for this rank any more
+        self._requests: list[Any] = []
+        self._kept: list[np.ndarray] = []  # what is on its way
         size = launched()[1]
         if size > 1 and size != self.size:
             raise ParameterError(
@@ -69,21 +74,59 @@ class _Mpi(Rank):
         self._world.Alltoallv([sent, rows * width], [into, received * width])
         return np.split(into, np.cumsum(received)[:-1])
 
-    def _counts(self, rows: np.ndarray) -> np.ndarray:
-        """How many rows each rank sends here."""
-        received = np.empty(self.size, np.int64)
-        self._world.Alltoall(rows, received)
+    def numbers_of_all(self, *numbers: float) -> np.ndarray:
+        self._counts(np.zeros(self.size, np.int64), numbers)
+        return self._numbers[:, : len(numbers)]
+
+    def _counts(self, rows: np.ndarray, numbers: Sequence[float] = ()) -> np.ndarray:
+        """How many rows each rank sends here. All that ranks do together begins with it, so that all learn who failed.
+
+        numbers: to be told to all; theirs are `_numbers` (P, NUMBERS) then.
+        """
+        received = self._headers(rows, numbers)
         failed = np.flatnonzero(received == _FAILED)
         if len(failed):
             self._is_over = True
             raise error_of(self._world.bcast(None, root=int(failed[0])), int(failed[0]))
         return received
 
+    def _headers(self, rows: np.ndarray, numbers: Sequence[float] = ()) -> np.ndarray:
+        sent, received = np.zeros((2, self.size, 1 + NUMBERS), np.int64)
+        sent[:, 0] = rows
+        sent[:, 1 : 1 + len(numbers)] = np.array(numbers, np.float64).view(np.int64)
+        self._world.Alltoall(sent, received)
+        self._numbers = received[:, 1:].copy().view(np.float64)
+        return received[:, 0].copy()
+
+    def send(self, to: int, array: np.ndarray) -> None:
+        self._kept.append(np.ascontiguousarray(array))
+        self._requests.append(self._world.Isend(self._kept[-1], to, _VALUES))
+
+    def receive(self, source: int, into: np.ndarray) -> None:
+        self._kept.append(into)
+        self._requests.append(self._world.Irecv(into, source, _VALUES))
+
+    def progress(self) -> None:
+        self._library.Request.Testall(self._requests)
+
+    def finish(self) -> None:
+        looks = 0
+        while not self._library.Request.Testall(self._requests):
+            looks += 1
+            if looks % _LOOKS == 0:
+                time.sleep(0)
+                if self._world.Iprobe(self._library.ANY_SOURCE, _NOTICE):
+                    self._counts(np.zeros(self.size, np.int64))  # raises: who failed comes to it, and so do the others
+        self._requests.clear()
+        self._kept.clear()
+
     def fail(self, error: BaseException) -> None:
         if self._is_over:
             return
         self._is_over = True
-        received = np.empty(self.size, np.int64)
-        self._world.Alltoall(np.full(self.size, _FAILED, np.int64), received)
+        for rank in range(self.size):  # those who wait for a message of this one
+            if rank != self.rank:
+                self._requests.append(self._world.Isend(np.zeros(0), rank, _NOTICE))
+        received = self._headers(np.full(self.size, _FAILED))
         first = min([*np.flatnonzero(received == _FAILED), self.rank])
         self._world.bcast(text_of(error) if first == self.rank else None, root=first)

@@ -2,7 +2,9 @@
 
 No locks: each rank counts its exchanges in a place of its own and waits for the counts of the others, so one that is
 killed blocks nobody. Arrays go through the outbox of who sends them. An outbox has two halves, used in turn: nobody
-writes into one before everybody has read what was there, as two exchanges ago all have gone on from it.
+writes into one before everybody has read what was there, as two exchanges ago all have gone on from it. Messages from
+one to one lie in a third part of it, which is used anew once all of them were taken; so who waits, waits for those
+alone that send to it.
 """
 
 import contextlib
@@ -23,6 +25,7 @@ _TEXT = 1 << 12  # bytes of the text of a failure
 _PATIENCE = 200  # looks at the counts before a process sleeps between them
 _NAP, _LONG_NAP = 2e-5, 1e-3
 _ALIGNMENT = 64
+_SLOTS = 4  # messages from one rank to another that may wait to be taken
 
 
 class _Memory:
@@ -30,7 +33,9 @@ class _Memory:
 
     Attributes:
         counts: (size * _LINE,) int64, exchanges of each rank. failure: (1 + _TEXT,) bytes: 0, or 1 + rank, and text.
-        outboxes: (size, 2, capacity) bytes.
+        sent, taken: (size, size) int64, messages of one rank to another, and how many of them that one has taken.
+        places: (size, size, _SLOTS) int64, where the last of them lie.
+        outboxes: (size, 3, capacity) bytes.
     """
 
     def __init__(self, size: int, capacity: int):
@@ -39,14 +44,20 @@ class _Memory:
         self.capacity = -(-capacity // mmap.PAGESIZE) * mmap.PAGESIZE
         no_reserve = 0x4000 if sys.platform == "linux" else 0  # MAP_NORESERVE, which Python names from 3.13 on
         flags = mmap.MAP_SHARED | mmap.MAP_ANONYMOUS | no_reserve
-        memory = mmap.mmap(-1, size * 2 * self.capacity, flags=flags)
-        self.outboxes = np.frombuffer(memory, np.uint8).reshape(size, 2, self.capacity)
+        memory = mmap.mmap(-1, size * 3 * self.capacity, flags=flags)
+        self.outboxes = np.frombuffer(memory, np.uint8).reshape(size, 3, self.capacity)
+        mail = np.frombuffer(mmap.mmap(-1, size * size * (2 + _SLOTS) * 8), np.int64)
+        self.sent, self.taken, places = np.split(mail, [size**2, 2 * size**2])
+        self.sent, self.taken = self.sent.reshape(size, size), self.taken.reshape(size, size)
+        self.places = places.reshape(size, size, _SLOTS)
 
 
 class _Process(Rank):
     def __init__(self, rank: int, size: int, memory: _Memory, dead: Callable[[], str | None]):
         self.rank, self.size, self.neighbors, self._memory, self._dead = rank, size, size, memory, dead
         self._exchanges = 0
+        self._expected: list[tuple[int, np.ndarray]] = []
+        self._mail = 0  # bytes that messages to others have taken since the last `finish`
 
     def exchange(self, parts: Sequence[np.ndarray]) -> list[np.ndarray]:
         half = self._exchanges % 2
@@ -54,7 +65,8 @@ class _Process(Rank):
         self._put(parts, outbox)
         self._exchanges += 1
         self._memory.counts[self.rank * _LINE] = self._exchanges
-        self._wait()
+        counts = self._memory.counts[::_LINE]
+        self._wait(lambda: bool((counts >= self._exchanges).all()))
         return [self._take(self._memory.outboxes[rank, half], parts[rank]) for rank in range(self.size)]
 
     def _put(self, parts: Sequence[np.ndarray], outbox: np.ndarray) -> None:
@@ -78,10 +90,40 @@ class _Process(Rank):
             part.reshape(-1).view(np.uint8)[:] = outbox[place : place + part.nbytes]
         return part
 
-    def _wait(self) -> None:
-        """Until all have come as far as this rank."""
-        counts, looks, next_look = self._memory.counts[::_LINE], 0, 0.0
-        while (counts < self._exchanges).any():
+    def send(self, to: int, array: np.ndarray) -> None:
+        memory, me = self._memory, self.rank
+        if not self._mail:
+            self._wait(lambda: bool((memory.taken[me] == memory.sent[me]).all()))
+        place, number = self._mail, int(memory.sent[me, to])
+        self._mail += max(1, -(-array.nbytes // _ALIGNMENT)) * _ALIGNMENT
+        if self._mail > memory.capacity:
+            raise ParameterError(f"messages of {self._mail} bytes; expected at most {memory.capacity}")
+        assert number - memory.taken[me, to] < _SLOTS
+        into = memory.outboxes[me, 2, place : place + array.nbytes]
+        into[:] = np.ascontiguousarray(array).reshape(-1).view(np.uint8)
+        memory.places[me, to, number % _SLOTS] = place
+        memory.sent[me, to] = number + 1
+
+    def receive(self, source: int, into: np.ndarray) -> None:
+        assert into.flags.c_contiguous
+        self._expected.append((source, into))
+
+    def finish(self) -> None:
+        memory, me = self._memory, self.rank
+        for source, into in self._expected:
+            number = int(memory.taken[source, me])
+            sent = memory.sent[source, me : me + 1]
+            self._wait(lambda sent=sent, number=number: bool(sent[0] > number))  # type: ignore[misc]
+            place = int(memory.places[source, me, number % _SLOTS])
+            into.reshape(-1).view(np.uint8)[:] = memory.outboxes[source, 2, place : place + into.nbytes]
+            memory.taken[source, me] = number + 1
+        self._expected.clear()
+        self._mail = 0
+
+    def _wait(self, is_over: Callable[[], bool]) -> None:
+        """Until the others have come so far."""
+        looks, next_look = 0, 0.0
+        while not is_over():
             looks += 1
             if looks < _PATIENCE:
                 time.sleep(0)
@@ -90,7 +132,7 @@ class _Process(Rank):
             if time.monotonic() > next_look:  # whether they live is a question to the system
                 next_look = time.monotonic() + 0.05
                 reason = self._dead()
-                if reason and (counts < self._exchanges).any():
+                if reason and not is_over():
                     self._raise_failure()
                     raise RankFailed(reason)
             time.sleep(_NAP if looks < 10 * _PATIENCE else _LONG_NAP)

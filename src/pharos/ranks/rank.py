@@ -1,7 +1,7 @@
 """Rank: one of several processes that run the same program, and exchange arrays.
 
 Rank 0 is the one that the user sees: it alone reads and writes files, reports and raises the errors of all. The others
-run a function that answers it. Three ways of running them differ in `exchange` alone:
+run a function that answers it. Three ways of running them differ in `exchange` and in how messages go from one to one:
 
     loop        threads of one process, for tests
     processes   forked processes of one machine, through shared memory
@@ -15,6 +15,8 @@ import numpy as np
 
 from pharos import errors
 from pharos.errors import PharosError
+
+NUMBERS = 3  # that a rank tells all others in one go, at most
 
 
 class RankFailed(PharosError):
@@ -42,9 +44,35 @@ class Rank(ABC):
             RankFailed: a rank failed or died, in place of answering.
         """
 
+    # From one to one: arrays that move while the ranks compute -------------------------------------------------------
+
+    @abstractmethod
+    def send(self, to: int, array: np.ndarray) -> None:
+        """Begin to send an array to a rank, which begins to receive one of this shape and dtype, now or later.
+
+        Nobody changes the array before `finish`. What one rank sends to another arrives in that order.
+        """
+
+    @abstractmethod
+    def receive(self, source: int, into: np.ndarray) -> None:
+        """Begin to receive an array, C-contiguous: until `finish` nobody knows what is in it."""
+
+    def progress(self) -> None:  # noqa: B027
+        """Let what was begun move on, where this process has to: to be called now and then while it computes."""
+
+    @abstractmethod
+    def finish(self) -> None:
+        """Wait until this rank has received all that it began to, and may change what it sent.
+
+        No exchange may stand between the first `send` or `receive` and this.
+
+        Raises:
+            RankFailed: a rank failed or died, in place of sending.
+        """
+
     @abstractmethod
     def fail(self, error: BaseException) -> None:
-        """Tell the others, who wait in an exchange or come to one, that this rank gives up."""
+        """Tell the others, who wait in an exchange or for a message, or come to one, that this rank gives up."""
 
     def scatter(self, parts: Sequence[np.ndarray] | None, like: np.ndarray) -> np.ndarray:
         """Rank 0 sends parts[q] to each rank q, which gets it; `like` is an array of that type for the others."""
@@ -61,6 +89,10 @@ class Rank(ABC):
     def gather_all(self, array: np.ndarray) -> list[np.ndarray]:
         """What each rank gave, in their order, at all of them."""
         return self.exchange([array] * self.size)
+
+    def numbers_of_all(self, *numbers: float) -> np.ndarray:
+        """(P, K) float64: a few numbers (at most `NUMBERS`) of each rank, at all of them."""
+        return np.array(self.gather_all(np.array(numbers, np.float64)))
 
 
 def text_of(error: BaseException) -> str:

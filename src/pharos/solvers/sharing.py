@@ -87,6 +87,6 @@ def _warm(mdp: TabularMDP, select: Selection, is_plain: bool) -> None:
     part = Part.of(mdp, 0, min(mdp.num_states, 2))
     backup, x = Backup(part, part.selection(select)), part.zeros()
     if is_plain:
-        part.dynamics.backup(backup.equation, x, np.empty_like(x))
+        part.dynamics.backup(backup.equation, x, np.empty_like(x), np.array([[0, len(part)]]))
     else:
         backup.sweep(x)
