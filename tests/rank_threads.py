@@ -23,7 +23,7 @@ def fails_at(who, number):
         def failing(call):
             def disturbed(*arguments):
                 if rank.rank == who and next(calls) == number:
-                    raise Killed(f"at call {number}")
+                    raise Killed(f"at exchange {number}")
                 return call(*arguments)
 
             return disturbed
