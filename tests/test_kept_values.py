@@ -16,8 +16,10 @@ from hypothesis import strategies as st
 import naive_exact
 from pharos import hardness
 from pharos.errors import FileFormatError, FolderLocked, ParameterError, PrecisionError
-from pharos.mdp import TabularMDP
+from pharos.mdp import BEST, TabularMDP
 from pharos.solvers import uniform_value, value_iteration
+from pharos.solvers.blocks import blocked_fixed_point
+from pharos.solvers.fixed_point import Backup, largest_of
 from strategies import small_mdps
 
 memory_map = importlib.import_module("pharos.large_arrays")
@@ -254,6 +256,26 @@ def test_the_largest_residual_proves_the_bound_of_blocks(tmp_path):
     assert residual / (1 - mdp.gamma) <= solution.error_bound == bounds[-1] <= 1e-3 < bounds[-2]
     del solution
     assert value_iteration(mdp, 1e-3, blocks=5, values=tmp_path / "values.npy").sweeps == 1
+
+
+class Recorded(Backup):
+    """A backup that knows how much its sweeps have changed."""
+
+    changes: tuple = ()
+
+    def sweep(self, x, part=None):
+        self.changes = (*self.changes, super().sweep(x, part))
+        return self.changes[-1]
+
+
+@pytest.mark.long
+def test_the_bound_of_one_block_is_that_of_its_last_sweep():
+    """(rho d + e) / (1 - rho), with one margin for rounding, and not two."""
+    backup = Recorded(ring(), BEST)
+    x, bound, _ = blocked_fixed_point(backup, 1e-3, 1)
+    change = backup.changes[-1]
+    assert bound == backup.bound(change, backup.rounding(largest_of(x) + change))
+    assert bound <= (0.99 * change + backup.rounding(largest_of(x) + change)) / 0.01 * (1 + 2.0**-39)
 
 
 def test_a_number_of_blocks_that_cannot_be_is_one_line():

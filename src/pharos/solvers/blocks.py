@@ -8,7 +8,8 @@ The bound. Let state s of a range have been backed up last at some time. If no e
 (its own range in that sweep, others afterwards), then |T x - x|(s) <= rho p + e, with e the rounding of a backup: that
 is the residual of the range. The error of all values is at most the largest residual / (1 - rho), as |x - x*| <=
 |T x - x| + rho |x - x*|. So a range whose (rho p + e) / (1 - rho) is within the tolerance need not be swept again
-before others have changed by more.
+before others have changed by more. Sums of changes are rounded up, so that p is no less than what it stands for; the
+margin of the bound is for the rounding of its own computation.
 """
 
 import math
@@ -17,7 +18,7 @@ from collections.abc import Callable
 import numpy as np
 
 from pharos.mdp import TabularMDP
-from pharos.solvers.fixed_point import MARGIN, SETTLING, Backup, FixedPoint, check_tolerance, imprecise, largest_of
+from pharos.solvers.fixed_point import SETTLING, Backup, FixedPoint, check_tolerance, imprecise, largest_of
 
 MOST_BLOCKS = 4096
 # Sweeps of a range at most before the next one; fewer once they change it by a tenth of what the first one did.
@@ -59,7 +60,7 @@ def blocked_fixed_point(
             total, last, count = _swept(backup, x, (cuts[c], cuts[c + 1]), largest, tolerance)
             sweeps += count / blocks
             largest += total
-            moved[:, c] += total
+            moved[:, c] = np.nextafter(moved[:, c] + total, math.inf)
             moved[c] = 0.0
             moved[c, c] = last
         rounds += 1
@@ -84,7 +85,7 @@ def _swept(
     while count < _REPEATS:
         count += 1
         change = backup.changed(backup.sweep(x, part), largest + total)
-        total += change
+        total = math.nextafter(total + change, math.inf)
         first = first or change
         if change <= _ENOUGH * first or _bound(backup, np.array([change]), largest + total) <= tolerance:
             break
@@ -94,4 +95,4 @@ def _swept(
 def _bound(backup: Backup, moved: np.ndarray, largest: float) -> float:
     """The largest residual of a range whose inputs have changed so much, over 1 - rho."""
     change = float(moved.max())
-    return backup.bound(change, backup.rounding(backup.size(largest + change))) * MARGIN
+    return backup.bound(change, backup.rounding(backup.size(largest + change)))
