@@ -69,12 +69,14 @@ class RankedGraph:
         while lowered:
             own = self._lowered_backward() if backward else self._lowered_forward()
             lowered = int(self.rank.numbers_of_all(own).sum())
+            if backward:
+                self._halo.finish(self.distance[len(self) :])
         reach, largest, _ = kernels.summary(self.distance[: len(self)], FAR)
         every = self.rank.numbers_of_all(reach, largest)
         return int(every[:, 0].sum()), int(every[:, 1].max())
 
     def _lowered_backward(self) -> int:
-        """Sweep, and get the distances of the halo; how many nodes have a smaller one."""
+        """Sweep, and begin to get the distances of the halo; how many nodes have a smaller one."""
         halo, distance = self._halo, self.distance
         edges = (self._local, self._never, -1, distance, FAR)
         halo.receive(distance, in_two=True)
@@ -82,7 +84,6 @@ class RankedGraph:
         halo.send_high(distance)
         lowered += kernels.lower_backward(*edges, 0, halo.low)
         halo.send_low(distance)
-        halo.finish(distance[len(self) :])
         return int(lowered)
 
     def _lowered_forward(self) -> int:

@@ -74,9 +74,10 @@ class Halo:
         self._send(values, 0, self.low)
 
     def finish(self, into: np.ndarray) -> None:
-        """Wait for the values of the halo (H, ...)."""
+        """Wait for the values of the halo (H, ...), where some were to be received."""
         self._rank.finish()
-        into[...] = self._received
+        if self._received is not None:
+            into[...] = self._received
 
     def give_back(self, values: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
         """Send values of the halo (H, ...) to the ranks that have the rows. Returns (rows, values) from each that reads

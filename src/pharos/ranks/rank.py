@@ -64,7 +64,7 @@ class Rank(ABC):
     def finish(self) -> None:
         """Wait until this rank has received all that it began to, and may change what it sent.
 
-        No exchange may stand between the first `send` or `receive` and this.
+        Exchanges may stand before it: after one, the others have begun to send what they began before it.
 
         Raises:
             RankFailed: a rank failed or died, in place of sending.

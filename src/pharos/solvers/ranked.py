@@ -81,9 +81,9 @@ class RankedBackup:
         return self.part.zeros()
 
     def sweep(self) -> float:
-        """Replace the values of this rank's states by their backups, in place, and get those of the halo.
+        """Replace the values of this rank's states by their backups, in place; the largest change.
 
-        Returns the largest change of this rank's.
+        Messages are on their way then, until `share`.
         """
         halo, x, own = self._halo, self.x, len(self.part)
         cuts, change = [own - (own - halo.low) * i // self._looks for i in range(self._looks + 1)], 0.0
@@ -94,7 +94,6 @@ class RankedBackup:
         halo.send_high(x)
         change = _larger(change, self.backup.sweep(x, (0, halo.low)))
         halo.send_low(x)
-        halo.finish(x[own:-1])
         return change
 
     def plain_sweep(self) -> float:
@@ -111,9 +110,14 @@ class RankedBackup:
             for start in range(0, own, _ROWS):
                 rows = slice(start, min(start + _ROWS, own))
                 change = _larger(change, np.abs(new[rows] - x[rows]).max(initial=0.0))
-        halo.finish(new[own:-1])
         self.x, self.previous = new, x
         return change
+
+    def share(self, *numbers: float) -> np.ndarray:
+        """Get the values of the halo after a sweep. Returns (P, K), the numbers of each rank."""
+        every = self.rank.numbers_of_all(*numbers)  # while messages travel
+        self._halo.finish(self.x[len(self.part) : -1])
+        return every
 
     # Values of all ranks, at the first ------------------------------------------------------------------------------
 
@@ -202,7 +206,7 @@ def ranked_fixed_point(
         change = backup.plain_sweep() if jacobi else backup.sweep()
         sweeps += 1
         largest = largest_of(backup.x[: len(backup.part)])
-        numbers = backup.rank.numbers_of_all(change, largest, checkpoint.is_due(backup))
+        numbers = backup.share(change, largest, checkpoint.is_due(backup))
         change, largest, is_due = map(float, numbers.max(axis=0))
         rounding = backup.backup.rounding(largest + change)
         bound = backup.backup.bound(change, rounding)
@@ -233,7 +237,7 @@ def ranked_induction(
         before, step = backup.previous, step + 1
         bound = backup.backup.factor * bound + backup.backup.rounding(largest)
         wants = checkpoint.is_due(backup) and step < horizon
-        numbers = backup.rank.numbers_of_all(largest_of(backup.x[: len(backup.part)]), wants)
+        numbers = backup.share(largest_of(backup.x[: len(backup.part)]), wants)
         largest, is_due = map(float, numbers.max(axis=0))
         if progress is not None and backup.rank.rank == 0:
             progress(step, bound)
