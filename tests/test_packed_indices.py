@@ -1,7 +1,12 @@
 """Indices of 40 bits: what they hold, what loops and tables read of them, and the folders that hold them."""
 
+import contextlib
 import json
+import os
 import shutil
+import tempfile
+from dataclasses import replace
+from pathlib import Path
 
 import numba
 import numpy as np
@@ -12,16 +17,22 @@ from hypothesis.extra import numpy as hnp
 
 import pharos
 from chance_worlds import ChanceWorld
-from pharos import packed_indices
+from pharos import hardness, large_arrays, packed_indices
 from pharos.errors import StateSpaceCorrupted, StateSpaceMismatch, StateSpaceTooLarge
-from pharos.mdp import Table
+from pharos.hardness import lean_sweep, ranked_search
+from pharos.hardness.transition_graph import Graph
+from pharos.interaction import GymEnv, make_vec
+from pharos.mdp import OutcomeTable, Table, lazy_actions, random_actions, sticky_actions
 from pharos.packed_indices import INT40, PACKED, PackedIndices, blocks_of, holds_end
+from pharos.solvers import evaluate_policy, uniform_value, value_iteration, worst_value
 from pharos.state_space import files as writing
 from pharos.state_space import manifest as manifests
-from pharos.state_space import search
+from pharos.state_space import search, shards
+from strategies import deterministic_mdps, outcome_mdps
 from test_format_page import CODE_OF_40_BITS
 from test_hostile_spaces import sealed
-from test_resuming import build, files_of
+from test_ranks import build_by_threads
+from test_resuming import _build_and_die_at, build, files_of, in_a_child
 
 EDGES = (0, 1, -1, 2**31 - 1, 2**31, 2**32 - 1, 2**32, 2**39 - 1, -(2**31), -(2**39))
 numbers = st.one_of(st.sampled_from(EDGES), st.integers(-(2**39), 2**39 - 1))
@@ -220,3 +231,217 @@ def test_a_part_has_the_same_next_states_whatever_the_width_and_the_blocks(state
     numbers = {-1: -1} | {t: t - start for t in range(start, stop)} | {t: stop - start + i for i, t in enumerate(halo)}
     expected = [[numbers[t] for t in row] for row in plain[start:stop].tolist()]
     assert np.asarray(local.next_states).tolist() == expected
+
+
+# Builds ---------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.long
+@settings(max_examples=40, deadline=None)
+@given(
+    world=st.sampled_from(sorted(WORLDS)),
+    limit=st.sampled_from([0, 60, 300, 2000, 10**6]),
+    stops=st.lists(st.integers(20, 6000), max_size=2),
+    ranks=st.integers(0, 3),
+)
+def test_files_depend_on_nothing_but_the_width(spaces, world, limit, stops, ranks):
+    """Widened at the start, in between or never; stopped and gone on with, by one process or by ranks."""
+    narrow, wide = spaces(world)
+    with tempfile.TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
+        path = Path(folder) / "space"
+        for most in stops:
+            with contextlib.suppress(StateSpaceTooLarge):
+                built(world, path, limit, max_states=most)
+        if ranks and not (stops and manifests.read_manifest(path)["complete"]):
+            patch.setattr(search, "INT32_STATES", limit)
+            build_by_threads(WORLDS[world], path, ranks)
+        else:
+            built(world, path, limit, workers=2)
+        is_wide = "successors40.bin" in files_of(path)
+        assert is_wide if limit < 60 else limit < 10**6 or not is_wide
+        assert files_of(path) == files_of((wide if is_wide else narrow).folder)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("world", ("breakout", "ragged"))
+def test_a_build_that_dies_ends_in_the_same_files(world, spaces, tmp_path, monkeypatch):
+    monkeypatch.setattr(search, "INT32_STATES", 200)
+    monkeypatch.setattr(search, "CHUNK", 512)
+    for call in range(1, 60, 4):
+        process = in_a_child(_build_and_die_at, call, WORLDS[world], tmp_path / f"space{call}")
+        process.join()
+        build(WORLDS[world], tmp_path / f"space{call}")
+        found = {**files_of(tmp_path / f"space{call}"), "lock": b""}
+        assert found == files_of(spaces(world)[1].folder)
+
+
+# What is computed -----------------------------------------------------------------------------------------------------
+
+CHANCES = {
+    "none": lambda mdp: mdp,
+    "sticky": lambda mdp: sticky_actions(mdp, 0.25),
+    "random": lambda mdp: random_actions(mdp, 0.2),
+    "lazy": lambda mdp: lazy_actions(mdp, 0.3),
+}
+
+
+def packed(mdp):
+    """The same MDP, its successors in five bytes each."""
+    dynamics = mdp.dynamics
+    if isinstance(dynamics, Table):
+        return replace(mdp, dynamics=Table(PackedIndices.of(dynamics.next_states)))
+    arrays = {**dynamics.arrays(), "successors": PackedIndices.of(dynamics.successors)}
+    return replace(mdp, dynamics=OutcomeTable(num_actions=mdp.num_actions, **arrays))
+
+
+@pytest.fixture
+def nothing_is_widened(monkeypatch):
+    """Whoever makes one array of all successors is found out."""
+
+    def refused(self, *_, **__):
+        raise AssertionError("all of the successors were unpacked")
+
+    def some(self, where):
+        assert where != slice(None) if isinstance(where, slice) else True, "all of the successors were unpacked"
+        return packed_indices.unpacked(self.packed[where])
+
+    monkeypatch.setattr(PackedIndices, "__array__", refused)
+    monkeypatch.setattr(PackedIndices, "__getitem__", some)
+
+
+def same(one, other):
+    return np.array_equal(one, other, equal_nan=True)
+
+
+@pytest.mark.long
+@settings(max_examples=60, deadline=None)
+@given(
+    st.one_of(deterministic_mdps(), outcome_mdps(("dense, palette", "ragged, one by one"))),
+    st.sampled_from(sorted(CHANCES)),
+    st.integers(0, 2**32),
+)
+def test_values_are_the_same_to_the_last_bit(mdp, chance, seed):
+    one, other = (CHANCES[chance](each) for each in (mdp, packed(mdp)))
+    rng = np.random.default_rng(seed)
+    for solve in (value_iteration, worst_value, uniform_value):
+        found, expected = solve(other), solve(one)
+        assert same(found.v, expected.v) and same(found.q, expected.q) and found.error_bound == expected.error_bound
+    actions = rng.integers(0, mdp.num_actions, mdp.num_states)
+    assert same(evaluate_policy(other, actions).v, evaluate_policy(one, actions).v)
+    drawn = rng.dirichlet(np.ones(mdp.num_actions), mdp.num_states)
+    assert same(evaluate_policy(other, drawn).v, evaluate_policy(one, drawn).v)
+
+
+@pytest.mark.long
+@settings(max_examples=60, deadline=None)
+@given(st.one_of(deterministic_mdps(), outcome_mdps(("dense, palette", "ragged, one by one"))), st.integers(0, 2**32))
+def test_dynamics_answer_the_same(mdp, seed):
+    one, other, rng = mdp.dynamics, packed(mdp).dynamics, np.random.default_rng(seed)
+    size, actions = mdp.num_states, mdp.num_actions
+    assert (one.has_ends, one.is_deterministic) == (other.has_ends, other.is_deterministic)
+    x, mass = rng.random((size + 1, actions)), rng.random((size, actions))
+    some, chosen = rng.integers(0, size, 5), rng.integers(0, actions, 5)
+    for ask in (
+        lambda d: d.expected(x),
+        lambda d: d.expected(x[:, 0], some),
+        lambda d: d.pushed(mass, actions),
+        lambda d: d.largest(x[:, 0]),
+        lambda d: d.successors_of(some),
+        lambda d: d.arrivals(some),
+        lambda d: d.reachable(some[:1]),
+        lambda d: d.matrix().toarray(),
+        lambda d: d.restricted_to(np.unique(some)).matrix().toarray(),
+        lambda d: d.sample(some, chosen, np.random.default_rng(seed)),
+        lambda d: d.longest_path(~np.asarray(mdp.terminal)),
+        lambda d: d.components(~np.asarray(mdp.terminal), 1).order,
+        lambda d: np.concatenate([np.asarray(each, float) for each in d.outcomes(some, chosen)]),
+        lambda d: d.part(0, (size + 1) // 2)[0].matrix().toarray() if size > 1 else 0,
+    ):
+        assert same(ask(one), ask(other))
+    table = one.deterministic_table()
+    assert table is None or same(table, other.deterministic_table())
+
+
+@pytest.mark.long
+@settings(max_examples=40, deadline=None)
+@given(deterministic_mdps(), st.booleans(), st.booleans())
+def test_distances_and_gaps_are_the_same(mdp, restart, is_lean):
+    wide = packed(mdp)
+    with pytest.MonkeyPatch.context() as patch:
+        if is_lean:
+            patch.setattr(lean_sweep, "available_memory", lambda: 0)
+        one, other = (hardness.diameter(each, restart=restart) for each in (mdp, wide))
+        assert (one.lower, one.upper, one.method, one.searches) == (
+            other.lower,
+            other.upper,
+            other.method,
+            other.searches,
+        )
+        assert hardness.start_eccentricity(mdp, restart=restart) == hardness.start_eccentricity(wide, restart=restart)
+    for measure in (hardness.sum_of_reciprocal_gaps, hardness.minimal_gap):
+        assert measure(mdp) == measure(wide)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("world", sorted(WORLDS))
+def test_spaces_are_solved_and_searched_where_they_lie(world, spaces, tmp_path, nothing_is_widened):
+    narrow, wide = spaces(world)
+    assert wide.num_states == narrow.num_states
+    one, other = (pharos.load(each.folder, environment=WORLDS[world]).mdp(0.95) for each in (narrow, wide))
+    assert same(one.rewards, other.rewards)
+    for options in ({}, {"blocks": 2}, {"dtype": "float32", "tolerance": 1e-3}, {"processes": 2}):
+        found, expected = value_iteration(other, **options), value_iteration(one, **options)
+        assert same(found.v, expected.v) and same(found.q, expected.q), options
+    kept = [value_iteration(each, values=tmp_path / f"{i}") for i, each in enumerate((one, other))]
+    assert same(kept[0].v, kept[1].v)
+    assert hardness.sum_of_reciprocal_gaps(other) == hardness.sum_of_reciprocal_gaps(one)
+    if not narrow.has_chance:
+        assert replace(hardness.diameter(other), seconds=0.0) == replace(hardness.diameter(one), seconds=0.0)
+        graphs = [Graph.of(each, True) for each in (one, other)]
+        searches = [ranked_search.ranked_distances(graph, 3, 2, backward=True) for graph in graphs]
+        assert same(searches[0].distances, searches[1].distances)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("world", sorted(WORLDS))
+def test_steps_through_a_space_are_the_same(world, spaces):
+    walks = []
+    for space in spaces(world):
+        rng = np.random.default_rng(0)
+        vec = make_vec(space.environment, 5, space=space)
+        walk = [vec.reset(seed=3)[0], *(vec.step(rng.integers(0, space.num_actions, 5))[0] for _ in range(50))]
+        one = GymEnv(space.environment, space=space, time_limit=1000)
+        walk.append(one.reset(seed=4)[0])
+        for _ in range(20):
+            *seen, info = one.step(int(rng.integers(space.num_actions)))
+            walk += [seen[0], np.array([info["index"]])]
+            if seen[2]:
+                one.reset()
+        walks.append(np.concatenate([np.ravel(each) for each in walk]))
+    assert same(*walks)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("world", ("breakout", "ragged"))
+def test_shards_may_part_an_index(world, spaces, tmp_path, monkeypatch):
+    monkeypatch.setattr(shards, "BORDER", os.sysconf("SC_PAGESIZE"))
+    whole = spaces(world)[1]
+    folder = shutil.copytree(whole.folder, tmp_path / "space")
+    space = build(WORLDS[world], folder, shards=[tmp_path / f"disk-{k}" for k in range(3)])
+    sizes = [(tmp_path / f"disk-{k}" / "successors40.bin").stat().st_size for k in range(3)]
+    assert sizes[0] % 5 and min(sizes)
+    assert same(
+        space.mdp(0.9).dynamics.arrays()["successors" if space.has_chance else "next_states"],
+        whole.mdp(0.9).dynamics.arrays()["successors" if space.has_chance else "next_states"],
+    )
+    assert same(value_iteration(space.mdp(0.9)).v, value_iteration(whole.mdp(0.9)).v)
+
+
+@pytest.mark.long
+def test_mapped_files_are_read_ahead(spaces, monkeypatch):
+    asked = []
+    monkeypatch.setattr(large_arrays, "RANGE", 1000)
+    monkeypatch.setattr(large_arrays, "_advise", lambda array, *place: asked.append((array.dtype, *place[:2])))
+    successors = pharos.load(spaces("breakout")[1].folder).successors
+    ranges = [*large_arrays.ranges_from_the_end(successors, 0, 5439)]
+    assert ranges[0] == (4439, 5439) and asked[0] == (PACKED, 3439, 4439)

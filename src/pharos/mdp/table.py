@@ -41,7 +41,7 @@ class Table(CompiledDynamics):
         return {"next_states": np.asarray(self.next_states)}
 
     def expected(self, x: np.ndarray, states: Any = slice(None)) -> np.ndarray:
-        if isinstance(self.next_states, PackedIndices) and states == slice(None):
+        if isinstance(self.next_states, PackedIndices) and isinstance(states, slice) and states == slice(None):
             rows = self.next_states
             out = np.empty((*rows.shape, *x.shape[2:]), x.dtype)
             for first, table in blocks_of(rows):  # no more of them is unpacked at a time
