@@ -23,7 +23,7 @@ class Halo:
         rows: (H,) int64, ascending.
         of_rank: for each rank, the slice of `rows` that lies in its range.
         wanted: for each rank, the rows of this one that it reads, int64, counted from the first row of this one.
-        low: this rank's rows before that are its low ones, counted from its first.
+        low: this rank's rows before that are its low ones, counted from its first; all where nobody reads high ones.
     """
 
     def __init__(self, rank: Rank, rows: np.ndarray, cuts: np.ndarray):
@@ -35,6 +35,8 @@ class Halo:
         self._rank = rank
         lows = np.diff(cuts) // _LOW
         self.low = int(lows[rank.rank])
+        if not any((rows >= self.low).any() for rows in self.wanted):
+            self.low = int(cuts[rank.rank + 1] - cuts[rank.rank])
         self._low_borders = np.searchsorted(rows, cuts[:-1] + lows)  # where the high rows of each rank begin in `rows`
         self._received: np.ndarray | None = None
 

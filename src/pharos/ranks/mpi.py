@@ -50,6 +50,8 @@ def mpi_rank() -> Rank:
 
 
 class _Mpi(Rank):
+    needs_progress = True
+
     def __init__(self, library: Any):
         self._library = library
         self._world = library.COMM_WORLD.Dup()

@@ -3,8 +3,8 @@
 No locks: each rank counts its exchanges in a place of its own and waits for the counts of the others, so one that is
 killed blocks nobody. Arrays go through the outbox of who sends them. An outbox has two halves, used in turn: nobody
 writes into one before everybody has read what was there, as two exchanges ago all have gone on from it. Messages from
-one to one lie in a third part of it, which is used anew once all of them were taken; so who waits, waits for those
-alone that send to it.
+one to one lie in two more halves, also used in turn, each anew once all that was in it has been taken; so who waits for
+messages, waits for those alone that send to it.
 """
 
 import contextlib
@@ -25,7 +25,7 @@ _TEXT = 1 << 12  # bytes of the text of a failure
 _PATIENCE = 200  # looks at the counts before a process sleeps between them
 _NAP, _LONG_NAP = 2e-5, 1e-3
 _ALIGNMENT = 64
-_SLOTS = 4  # messages from one rank to another that may wait to be taken
+_SLOTS = 8  # messages from one rank to another that may wait to be taken
 
 
 class _Memory:
@@ -35,7 +35,7 @@ class _Memory:
         counts: (size * _LINE,) int64, exchanges of each rank. failure: (1 + _TEXT,) bytes: 0, or 1 + rank, and text.
         sent, taken: (size, size) int64, messages of one rank to another, and how many of them that one has taken.
         places: (size, size, _SLOTS) int64, where the last of them lie.
-        outboxes: (size, 3, capacity) bytes.
+        outboxes: (size, 4, capacity) bytes: two halves for exchanges, two for messages.
     """
 
     def __init__(self, size: int, capacity: int):
@@ -44,8 +44,8 @@ class _Memory:
         self.capacity = -(-capacity // mmap.PAGESIZE) * mmap.PAGESIZE
         no_reserve = 0x4000 if sys.platform == "linux" else 0  # MAP_NORESERVE, which Python names from 3.13 on
         flags = mmap.MAP_SHARED | mmap.MAP_ANONYMOUS | no_reserve
-        memory = mmap.mmap(-1, size * 3 * self.capacity, flags=flags)
-        self.outboxes = np.frombuffer(memory, np.uint8).reshape(size, 3, self.capacity)
+        memory = mmap.mmap(-1, size * 4 * self.capacity, flags=flags)
+        self.outboxes = np.frombuffer(memory, np.uint8).reshape(size, 4, self.capacity)
         mail = np.frombuffer(mmap.mmap(-1, size * size * (2 + _SLOTS) * 8), np.int64)
         self.sent, self.taken, places = np.split(mail, [size**2, 2 * size**2])
         self.sent, self.taken = self.sent.reshape(size, size), self.taken.reshape(size, size)
@@ -58,6 +58,9 @@ class _Process(Rank):
         self._exchanges = 0
         self._expected: list[tuple[int, np.ndarray]] = []
         self._mail = 0  # bytes that messages to others have taken since the last `finish`
+        self._finished = 0  # how often `finish` was called
+        # messages to each rank until the last `finish` but one, and until the last
+        self._until = np.zeros((2, size), np.int64)
 
     def exchange(self, parts: Sequence[np.ndarray]) -> list[np.ndarray]:
         half = self._exchanges % 2
@@ -93,15 +96,15 @@ class _Process(Rank):
     def send(self, to: int, array: np.ndarray) -> None:
         memory, me = self._memory, self.rank
         if not self._mail:
-            self._wait(lambda: bool((memory.taken[me] == memory.sent[me]).all()))
+            self._wait(lambda: bool((memory.taken[me] >= self._until[0]).all()))
         place, number = self._mail, int(memory.sent[me, to])
         self._mail += max(1, -(-array.nbytes // _ALIGNMENT)) * _ALIGNMENT
         if self._mail > memory.capacity:
             raise ParameterError(f"messages of {self._mail} bytes; expected at most {memory.capacity}")
         assert number - memory.taken[me, to] < _SLOTS
-        into = memory.outboxes[me, 2, place : place + array.nbytes]
+        into = memory.outboxes[me, 2 + self._finished % 2, place : place + array.nbytes]
         into[:] = np.ascontiguousarray(array).reshape(-1).view(np.uint8)
-        memory.places[me, to, number % _SLOTS] = place
+        memory.places[me, to, number % _SLOTS] = place + self._finished % 2 * memory.capacity
         memory.sent[me, to] = number + 1
 
     def receive(self, source: int, into: np.ndarray) -> None:
@@ -115,10 +118,13 @@ class _Process(Rank):
             sent = memory.sent[source, me : me + 1]
             self._wait(lambda sent=sent, number=number: bool(sent[0] > number))  # type: ignore[misc]
             place = int(memory.places[source, me, number % _SLOTS])
-            into.reshape(-1).view(np.uint8)[:] = memory.outboxes[source, 2, place : place + into.nbytes]
+            mail = memory.outboxes[source, 2:].reshape(-1)
+            into.reshape(-1).view(np.uint8)[:] = mail[place : place + into.nbytes]
             memory.taken[source, me] = number + 1
         self._expected.clear()
         self._mail = 0
+        self._finished += 1
+        self._until = np.stack([self._until[1], memory.sent[me]])
 
     def _wait(self, is_over: Callable[[], bool]) -> None:
         """Until the others have come so far."""

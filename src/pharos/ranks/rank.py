@@ -28,11 +28,13 @@ class Rank(ABC):
 
     Attributes:
         rank: its number. size: how many there are. neighbors: how many of them are on this machine.
+        needs_progress: whether messages move on only while this process calls `progress`, or waits.
     """
 
     rank: int
     size: int
     neighbors: int
+    needs_progress: bool = False
 
     @abstractmethod
     def exchange(self, parts: Sequence[np.ndarray]) -> list[np.ndarray]:
@@ -58,7 +60,7 @@ class Rank(ABC):
         """Begin to receive an array, C-contiguous: until `finish` nobody knows what is in it."""
 
     def progress(self) -> None:  # noqa: B027
-        """Let what was begun move on, where this process has to: to be called now and then while it computes."""
+        """Let what was begun move on: to be called now and then while this process computes."""
 
     @abstractmethod
     def finish(self) -> None:

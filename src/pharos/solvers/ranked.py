@@ -19,7 +19,6 @@ that others read before the rest 240, 231 and 284, and a halo that is one sweep 
 All ranks run the same loop and see the same numbers, so they need nobody who tells them when to stop.
 """
 
-import itertools
 import math
 from collections.abc import Callable
 from functools import cached_property
@@ -72,8 +71,9 @@ class RankedBackup:
         backup.factor, backup.operations, backup.largest_reward = float(factor), int(operations), float(largest)
         self._halo = Halo(rank, self.part.halo, self.cuts)
         self.first = runs_of(self._halo.is_wanted(len(self.part)), _GAP)
-        self._looks = min(_LOOKS, 1 + (len(self.part) >> 16))
-        self._rest = shares_of(runs_between(self.first, len(self.part)), self._looks)
+        pieces = min(_LOOKS, 1 + (len(self.part) >> 16)) if rank.needs_progress else 1
+        self._rest = shares_of(runs_between(self.first, len(self.part)), pieces)
+        self._high = shares_of(np.array([[self._halo.low, len(self.part)]]), pieces)[::-1]
         self.x = self.part.zeros()
 
     @cached_property
@@ -85,11 +85,10 @@ class RankedBackup:
 
         Messages are on their way then, until `share`.
         """
-        halo, x, own = self._halo, self.x, len(self.part)
-        cuts, change = [own - (own - halo.low) * i // self._looks for i in range(self._looks + 1)], 0.0
+        halo, x, change = self._halo, self.x, 0.0
         halo.receive(x, in_two=True)
-        for stop, start in itertools.pairwise(cuts):
-            change = _larger(change, self.backup.sweep(x, (start, stop)))
+        for ((start, stop),) in self._high:
+            change = _larger(change, self.backup.sweep(x, (int(start), int(stop))))
             self.rank.progress()
         halo.send_high(x)
         change = _larger(change, self.backup.sweep(x, (0, halo.low)))
