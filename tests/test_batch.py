@@ -13,6 +13,7 @@ from pharos.agents import hyperparameters
 from pharos.errors import ParameterError, PharosError, UnknownName
 from pharos.experiments import (
     FailedRun,
+    Members,
     RunConfig,
     Task,
     evaluate_agent,
@@ -232,6 +233,12 @@ def test_the_engine_belongs_to_the_id_only_where_it_is_another():
 def test_a_device_that_is_not_there_is_named_before_anything_is_trained(engine):
     with pytest.raises(ParameterError, match="device is 'tpu', which torch does not have here"):
         many(device="tpu")
+    assert engine.made == []
+
+
+def test_members_know_the_device_and_nobody_contradicts_them(engine):
+    with pytest.raises(ParameterError, match="device is 'cuda', and the members are for 'cpu'; expected one device"):
+        train_configs([], members=Members(), device="cuda")
     assert engine.made == []
 
 

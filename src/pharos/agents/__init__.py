@@ -8,6 +8,7 @@ from pharos.agents.hyperparameters import hyperparameters
 from pharos.agents.kinds import AGENTS, BATCHED, TABULAR_OBSERVATION, AgentKind, agent_kind, agent_source, is_known
 from pharos.agents.q_learning import DEFAULTS as Q_LEARNING_DEFAULTS
 from pharos.agents.q_learning import QLearning
+from pharos.agents.states import joined_states, state_of
 
 __all__ = [
     "AGENTS",
@@ -23,5 +24,7 @@ __all__ = [
     "check_hyperparameters",
     "hyperparameters",
     "is_known",
+    "joined_states",
     "make_model",
+    "state_of",
 ]

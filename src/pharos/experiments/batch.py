@@ -30,7 +30,7 @@ def train_configs(
     checkpoints: Path | None = None,
     progress: Tell | None = None,
     members: Members | None = None,
-    device: str = "cpu",
+    device: str | None = None,
     lane: int | None = None,
 ) -> list[TrainingResult | FailedRun]:
     """Train as each configuration says; those of the batched engine that fit together as one program.
@@ -42,17 +42,21 @@ def train_configs(
         progress: called after each evaluation; what it raises ends the training and is raised here.
         members: makes tasks, with values that are known already, and code of the user's own where it is trusted; None:
             from scratch, trusting none.
-        device: "cpu" or "cuda".
+        device: "cpu" or "cuda"; None: that of the members, and "cpu" where there are none.
         lane: the most runs in a batch; None: all that fit together. Changes no result.
     Returns:
         The result of each run, or why it has none.
     Raises:
-        FileFormatError: not the configuration of a run. ParameterError: there is no such device.
+        FileFormatError: not the configuration of a run. ParameterError: there is no such device, or the members are
+            for another one.
         MissingExtra: PyTorch is not installed.
     """
-    _check_device(device)
+    members = Members(device=device or "cpu") if members is None else members
+    if device not in (None, members.device):
+        raise ParameterError(f"device is {device!r}, and the members are for {members.device!r}; expected one device")
+    _check_device(members.device)
     made = [config if isinstance(config, RunConfig) else RunConfig.from_dict(config) for config in configs]
-    work = _Work(made, folders, checkpoints, progress, members or Members(device=device), device, lane)
+    work = _Work(made, folders, checkpoints, progress, members, lane)
     work.run()
     return [work.results[place] for place in range(len(made))]
 

@@ -51,11 +51,10 @@ class Ledger:
         checkpoints: Path | None,
         progress: Tell | None,
         members: Members,
-        device: str,
         lane: int | None,
     ):
         self.configs, self.folders, self.checkpoints = configs, folders, checkpoints
-        self.tell, self.members, self.device, self.lane = progress, members, device, lane
+        self.tell, self.members, self.lane = progress, members, lane
         self.results: dict[int, TrainingResult | FailedRun] = {}
         self.total, self.done = sum(config.steps for config in configs), 0
         self.reasons: set[str] = set()

@@ -106,5 +106,4 @@ def train_many(
         checkpoints=None if folder is None else folder / "checkpoints",
         progress=progress,
         members=members,
-        device=device,
     )

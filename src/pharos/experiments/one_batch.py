@@ -78,7 +78,7 @@ class Batch:
         else:
             from pharos.agents.batched import make_batch
 
-            self.batch = make_batch(self.config.agent, runs, device=self.ledger.device)
+            self.batch = make_batch(self.config.agent, runs, device=self.ledger.members.device)
         checkpoint = None
         if self._place is not None and self._claim(self._place):
             members = [member.config for member in self.group]
@@ -176,7 +176,7 @@ class Batch:
             if member.folder is not None:
                 self._publish_agent(i, member.folder)
                 _results.write_curve(member.folder, curve)
-                size = {"runs": len(self.group), "seconds": seconds, "device": self.ledger.device}
+                size = {"runs": len(self.group), "seconds": seconds, "device": self.ledger.members.device}
                 member.record.write("finished", seconds=share, batch=size, result=result)
             rows = [{name: row[name] for name in _results.COLUMNS} for row in curve]
             self.ledger.results[member.place] = TrainingResult(

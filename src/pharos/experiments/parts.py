@@ -88,7 +88,7 @@ def _train(entries: Sequence[tuple[dict[str, Any], Path]], checkpoints: Path | N
 
     configs, folders = zip(*entries, strict=True)
     members = Members(trust=True, device=device)  # of code that the process which started this one has imported
-    train_configs(configs, folders, checkpoints=checkpoints, progress=tell, members=members, device=device)
+    train_configs(configs, folders, checkpoints=checkpoints, progress=tell, members=members)
 
 
 def _end(config: RunConfig, folder: Path) -> TrainingResult | FailedRun:

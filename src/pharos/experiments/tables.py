@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from pharos.agents import QLearning
+from pharos.agents import QLearning, joined_states, state_of
 
 MakeTable = Callable[[], QLearning]
 
@@ -52,10 +52,9 @@ class Tables:
 
     def state(self) -> dict[str, np.ndarray]:
         """Everything that `restore` needs to go on, bit for bit."""
-        return {f"{i}/{name}": array for i, table in enumerate(self._tables) for name, array in table.state().items()}
+        return joined_states(table.state() for table in self._tables)
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
         """Go on from what `state` gave, in a batch of the same runs."""
         for i, table in enumerate(self._tables):
-            prefix = f"{i}/"
-            table.restore({name[len(prefix) :]: array for name, array in state.items() if name.startswith(prefix)})
+            table.restore(state_of(state, i))

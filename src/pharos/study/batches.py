@@ -45,7 +45,7 @@ def train_batch(
         return None if stored is None else TaskValues.from_dict(stored)
 
     members = Members(values, trust=True, strict=True, device=device)
-    ends = train_configs(configs, folders, checkpoints=checkpoints, members=members, device=device)
+    ends = train_configs(configs, folders, checkpoints=checkpoints, members=members)
     return [end.error if isinstance(end, FailedRun) else None for end in ends]
 
 

@@ -10,6 +10,7 @@ from pharos.agents.batched.handover import is_gpu
 from pharos.agents.batched.lane import Lane, RunPolicy
 from pharos.agents.batched.ppo import PPOLane
 from pharos.agents.batched.runs import BatchRun, group_key, lane_width, lane_widths
+from pharos.agents.states import joined_states, state_of
 from pharos.errors import ParameterError
 
 LANES: dict[str, type[Lane]] = {"dqn": DQNLane, "ppo": PPOLane}
@@ -84,15 +85,12 @@ class Batch:
 
     def state(self) -> dict[str, np.ndarray]:
         """Everything that `restore` needs to go on, bit for bit; the arrays are copies."""
-        return {
-            f"{k}/{name}": array.copy() for k, lane in enumerate(self.lanes) for name, array in lane.arrays().items()
-        }
+        return joined_states({name: array.copy() for name, array in lane.arrays().items()} for lane in self.lanes)
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
         """Go on from what `state` gave, in a batch of the same runs."""
         for k, lane in enumerate(self.lanes):
-            prefix = f"{k}/"
-            lane.restore({name[len(prefix) :]: array for name, array in state.items() if name.startswith(prefix)})
+            lane.restore(state_of(state, k))
 
 
 def make_batch(agent: str, runs: Sequence[BatchRun], *, device: str = "cpu", threads: int | None = None) -> Batch:
