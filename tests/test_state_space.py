@@ -294,8 +294,8 @@ def test_a_manifest_that_is_no_text_is_found(folder):
 def test_a_folder_of_another_format_version_is_refused(folder):
     build(GRID, folder)
     text = (folder / "manifest.json").read_text()
-    (folder / "manifest.json").write_text(text.replace('"format_version": 1', '"format_version": 3'))
-    with pytest.raises(StateSpaceMismatch, match="format version 3; this pharos reads versions 1 and 2"):
+    (folder / "manifest.json").write_text(text.replace('"format_version": 1', '"format_version": 4'))
+    with pytest.raises(StateSpaceMismatch, match="format version 4; this pharos reads versions 1 to 3"):
         pharos.load(folder)
 
 
