@@ -9,21 +9,22 @@ size, and its reciprocal anything.
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
 from pharos.errors import ParameterError, PrecisionError
 from pharos.hardness.gap_blocks import weighted_gaps
+from pharos.hardness.gap_sums import REGULARIZER, GapSums
 from pharos.hardness.interval import Certified
+from pharos.hardness.ranked_gaps import RankedGaps, TieRule, capacity_of, warm
 from pharos.hardness.ties import TieProof, UnresolvedTies
 from pharos.kernels import gaps as kernels
 from pharos.large_arrays import large_zeros
 from pharos.mdp import BEST, BellmanEquation, TabularMDP, takes_mdp
+from pharos.ranks import Rank, check_number, together
 from pharos.solvers import Solution, value_iteration
 
-# Of Colosseum.
-REGULARIZER = 0.1
 # Relative width up to which an interval counts as the value.
 NARROW = 1e-6
 # The default tie tolerance is this times the error bound of the values; more than 2, as a gap is known to twice the
@@ -135,7 +136,13 @@ class Gaps:
 
 
 @takes_mdp
-def gaps(mdp: TabularMDP, solution: Solution | None = None, *, tie_tolerance: float | None = None) -> Gaps:
+def gaps(
+    mdp: TabularMDP,
+    solution: Solution | None = None,
+    *,
+    tie_tolerance: float | None = None,
+    processes: int | str = 1,
+) -> Gaps:
     """Return the suboptimality gaps of an MDP, summed up.
 
         gap(s, a) = V*(s) - Q*(s, a)
@@ -149,34 +156,46 @@ def gaps(mdp: TabularMDP, solution: Solution | None = None, *, tie_tolerance: fl
         solution: the optimal solution of `mdp`; None: solved here to an error of 1e-9, and where that leaves ties
             unresolved to what 64-bit floats can reach.
         tie_tolerance: gaps up to it count as ties. None: 2.5 times the error bound of the solution.
+        processes: of this machine, each of which adds up the gaps of a range of the states; or "mpi": those that
+            `mpiexec` has started, all of which make this call: the first with the solution, if there is one, the others
+            with None or anything, and the first gets the Gaps, the others None. Of one solution they find the gaps,
+            counts, ties and histogram that one process finds, to the last bit, and sums of floats within the relative
+            rounding of 1e-12 that `lower` and `upper` count. Without `solution` they solve as `value_iteration` does;
+            sweeps that settle ties after it are the first process's alone, and so is the proof that equal values come
+            from equal rewards for ever.
     Raises:
-        ParameterError: `solution` belongs to another MDP or is not optimal.
+        ParameterError: `solution` belongs to another MDP or is not optimal; several processes, and a horizon.
+        RankFailed: a process died.
         PrecisionError: tie_tolerance is not larger than twice the error bound, so that a tie could be counted as a gap.
     Cost: one pass over the table, 50 to 100 ns a state with its proofs of ties, and 1 to 40 sweeps before it; with a
         horizon T passes and 8 T S bytes.
     Source: Simchowitz and Jamieson (2019), "Non-asymptotic gap-dependent regret bounds for tabular MDPs", section 2;
         the pharos paper, equation 2; regularized: Colosseum (Conserva and Rauber, 2022).
     """
+    check_number(processes)
+    if processes != 1:
+        return _gaps_by_ranks(mdp, solution, tie_tolerance, processes)
     if solution is None and tie_tolerance is None:
         return resolved_gaps(mdp, optimal_solution(mdp, None))
     return _summed(mdp, optimal_solution(mdp, solution), tie_tolerance)
 
 
-def resolved_gaps(mdp: TabularMDP, solution: Solution, in_place: bool = False) -> Gaps:
+def resolved_gaps(mdp: TabularMDP, solution: Solution, in_place: bool = False, ranks: RankedGaps | None = None) -> Gaps:
     """The gaps of a solution; of a more accurate one where ties are unresolved, or the sum is wide.
 
     in_place: whether the values of the solution may become the more accurate ones; its bound holds for these, too.
+    ranks: who adds up; None for this process.
     """
     if solution.horizon is not None or mdp.gamma == 1.0:
-        return _summed(mdp, solution, None)
+        return _summed(mdp, solution, None, ranks)
     settled = solution
     if TieProof(mdp).holds:  # else ties cannot be proven that way
         settled = _settled(mdp, solution, in_place)
-    result = _summed(mdp, settled, None)
+    result = _summed(mdp, settled, None, ranks)
     if result.is_resolved or settled is not solution:
         return result
     settled = _settled(mdp, solution, in_place)
-    return _summed(mdp, settled, None) if settled.error_bound < solution.error_bound else result
+    return _summed(mdp, settled, None, ranks) if settled.error_bound < solution.error_bound else result
 
 
 def _settled(mdp: TabularMDP, solution: Solution, in_place: bool) -> Solution:
@@ -212,21 +231,39 @@ def _settled(mdp: TabularMDP, solution: Solution, in_place: bool) -> Solution:
 
 @takes_mdp
 def sum_of_reciprocal_gaps(
-    mdp: TabularMDP, solution: Solution | None = None, *, tie_tolerance: float | None = None, regularized: bool = False
+    mdp: TabularMDP,
+    solution: Solution | None = None,
+    *,
+    tie_tolerance: float | None = None,
+    regularized: bool = False,
+    processes: int | str = 1,
 ) -> float:
     """Return the sum of 1 / gap(s, a) over reachable, non-terminal states s and actions a with a gap; as `gaps` says.
 
     Args:
         regularized: instead, the sum of 1 / (gap + 0.1) over all states and actions.
+        processes: as `gaps` takes them; under "mpi" the first gets the sum, the others None.
     """
-    result = gaps(mdp, solution, tie_tolerance=tie_tolerance)
+    result = gaps(mdp, solution, tie_tolerance=tie_tolerance, processes=processes)
+    if result is None:  # another one of MPI's
+        return cast(Any, None)
     return result.regularized if regularized else result.sum_of_reciprocals
 
 
 @takes_mdp
-def minimal_gap(mdp: TabularMDP, solution: Solution | None = None, *, tie_tolerance: float | None = None) -> float:
-    """Return the smallest gap(s, a) that is no tie; infinite where there is none. As `gaps` says."""
-    return gaps(mdp, solution, tie_tolerance=tie_tolerance).minimal
+def minimal_gap(
+    mdp: TabularMDP,
+    solution: Solution | None = None,
+    *,
+    tie_tolerance: float | None = None,
+    processes: int | str = 1,
+) -> float:
+    """Return the smallest gap(s, a) that is no tie; infinite where there is none. As `gaps` says.
+
+    processes: as `gaps` takes them; under "mpi" the first gets the gap, the others None.
+    """
+    result = gaps(mdp, solution, tie_tolerance=tie_tolerance, processes=processes)
+    return cast(Any, None) if result is None else result.minimal
 
 
 def gaps_of_states(
@@ -293,37 +330,78 @@ def _conventions(mdp: TabularMDP, solution: Solution, tolerance: float) -> dict[
     }
 
 
-def _summed(mdp: TabularMDP, solution: Solution, tie_tolerance: float | None) -> Gaps:
+def _gaps_by_ranks(
+    mdp: TabularMDP, solution: Solution | None, tie_tolerance: float | None, processes: int | str
+) -> Gaps:
+    """The gaps by several processes. Under MPI the first gets them, and the others None."""
+    size = processes if isinstance(processes, int) else 1
+    if size > max(mdp.num_states, 1):
+        raise ParameterError(f"{size} processes for {mdp.num_states} states; expected at most one for each state")
+    has_solution, capacity = solution is not None, capacity_of(mdp, size)
+    if processes == "mpi":
+        has_solution = together(processes, lambda rank: _told_by_first(rank, has_solution), capacity)
+    if not has_solution:
+        _check_plain(mdp.horizon)
+        solution = value_iteration(mdp, 1e-9, processes=processes)
+    warm(mdp)
+
+    def program(rank: Rank) -> Gaps | None:
+        ranks = RankedGaps(mdp, rank)
+        if rank.rank:
+            ranks.follow()
+            return None
+        optimal = optimal_solution(mdp, solution)
+        _check_plain(optimal.horizon)
+        is_plain = has_solution or tie_tolerance is not None
+        result = _summed(mdp, optimal, tie_tolerance, ranks) if is_plain else resolved_gaps(mdp, optimal, ranks=ranks)
+        ranks.end()
+        return result
+
+    return cast(Any, together(processes, program, capacity))
+
+
+def _check_plain(horizon: int | None) -> None:
+    if horizon is not None:
+        raise ParameterError(f"gaps: the horizon is {horizon}; several processes take none: expected processes=1")
+
+
+def _told_by_first(rank: Rank, value: bool) -> bool:
+    return bool(rank.broadcast(np.array([value]) if rank.rank == 0 else None, np.zeros(0, np.bool_))[0])
+
+
+def _summed(mdp: TabularMDP, solution: Solution, tie_tolerance: float | None, ranks: RankedGaps | None = None) -> Gaps:
     error = _error(mdp, solution)
     tolerance = _tolerance(solution, tie_tolerance, error)
-    sums, counts, histogram = kernels.empty_sums(), kernels.empty_counts(), kernels.empty_histogram()
-    proof = UnresolvedTies(mdp, tolerance, error, tie_tolerance is not None)
-    minimal, num_rows = math.inf, 0
-    for part in weighted_gaps(mdp, solution):
-        previous = counts.copy()
-        arguments = (tolerance, error, REGULARIZER, sums, counts, histogram)
-        minimal = kernels.add_up(part.gap, part.weight, part.counted, minimal, *arguments)
-        num_rows += int(part.counted.sum())
-        proof.look_at(part, *(counts - previous)[1:].tolist())
-    total, low, high, regularized = sums[0].tolist()
-    count = int(counts[0])
-    num_ties = num_rows * mdp.num_actions - count
-    bins = np.flatnonzero(histogram)
-    unresolved = proof.unresolved(weighted_gaps(mdp, solution))
+    rule = TieRule(tolerance, error, tie_tolerance is not None)
+    ties = UnresolvedTies(mdp, *rule)
+    if ranks is None:
+        added = GapSums()
+        for part in weighted_gaps(mdp, solution):
+            ties.look_at(part, *added.add(part, tolerance, error))
+        unresolved = ties.unresolved(weighted_gaps(mdp, solution))
+    else:
+        added, small, equal, alike = ranks.totals(solution, rule)
+        unresolved = ties.unresolved_of_ranges(small, equal, alike, weighted_gaps(mdp, solution))
+    return _gaps_of(mdp, solution, rule, added, ties.small, unresolved)
+
+
+def _gaps_of(mdp: TabularMDP, solution: Solution, rule: TieRule, added: GapSums, small: int, unresolved: int) -> Gaps:
+    total, low, high, regularized = added.sums[0].tolist()
+    count, bins = int(added.counts[0]), np.flatnonzero(added.histogram)
     first, last = (int(bins[0]), int(bins[-1])) if bins.size else (0, -1)
     return Gaps(
         sum_of_reciprocals=total,
         lower=low * (1 - _ROUNDING),
         upper=high * (1 + _ROUNDING) if not unresolved else math.inf,
         regularized=regularized,
-        minimal=minimal,
+        minimal=added.minimal,
         count=count,
-        ties=num_ties,
+        ties=added.num_rows * mdp.num_actions - count,
         unresolved=unresolved,
-        small=proof.small,
-        histogram=histogram[first : last + 1].copy(),
+        small=small,
+        histogram=added.histogram[first : last + 1].copy(),
         edges=10.0 ** ((np.arange(first, last + 2) - kernels.BIN_OF_ONE) / 4),
-        tie_tolerance=tolerance,
-        error=error,
-        conventions=_conventions(mdp, solution, tolerance),
+        tie_tolerance=rule.tolerance,
+        error=rule.error,
+        conventions=_conventions(mdp, solution, rule.tolerance),
     )

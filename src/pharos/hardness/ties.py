@@ -109,10 +109,12 @@ class UnresolvedTies:
         equal: gaps that are computed as 0, beyond the first of a state.
     """
 
-    def __init__(self, mdp: TabularMDP, tolerance: float, error: float, is_definition: bool):
+    def __init__(self, mdp: TabularMDP, tolerance: float, error: float, is_definition: bool, is_part: bool = False):
+        """is_part: whether blocks are some of the MDP's, which the second proof says nothing about."""
         self.mdp, self.tolerance, self.error, self.is_definition = mdp, tolerance, error, is_definition
         self.small = self.equal = 0
         self.proof = TieProof(mdp)
+        self.proof.holds &= not is_part
 
     def look_at(self, part: GapBlock, small: int, equal: int) -> None:
         """Take up the ties of a block: how many are small, and how many equal."""
@@ -134,9 +136,21 @@ class UnresolvedTies:
             return self.small
         if self.small or not self.equal:
             return self.small + self.equal
-        return self.equal - sum(self._alike(part) for part in parts)
+        return self.equal - sum(self.alike(part) for part in parts)
 
-    def _alike(self, part: GapBlock) -> int:
+    def unresolved_of_ranges(self, small: int, equal: int, alike: int, parts: Iterator[GapBlock]) -> int:
+        """The same, where ranges have counted: small ones, equal ones, and how many of these are proven in them."""
+        self.small, self.equal = small, equal
+        if self.is_definition:
+            return small
+        if small or equal == alike:
+            return small + equal if small else 0
+        if self.proof.holds:
+            for part in parts:
+                self.look_at(part, 0, 0)
+        return 0 if self.proof.holds else equal - alike
+
+    def alike(self, part: GapBlock) -> int:
         """Equal gaps of a block between actions that have the same outcomes."""
         if part.scale == 0.0:
             return 0

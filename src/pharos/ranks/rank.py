@@ -17,6 +17,7 @@ from pharos import errors
 from pharos.errors import PharosError
 
 NUMBERS = 3  # that a rank tells all others in one go, at most
+_ROWS = 1 << 20  # that rank 0 sends to each in one exchange
 
 
 class RankFailed(PharosError):
@@ -79,6 +80,16 @@ class Rank(ABC):
     def scatter(self, parts: Sequence[np.ndarray] | None, like: np.ndarray) -> np.ndarray:
         """Rank 0 sends parts[q] to each rank q, which gets it; `like` is an array of that type for the others."""
         return self.exchange(parts or [like[:0]] * self.size)[0]
+
+    def scatter_rows(self, whole: np.ndarray | None, cuts: np.ndarray, into: np.ndarray) -> None:
+        """Rank 0 sends rank q the rows [cuts[q], cuts[q + 1]) of an array that it alone has, into its first rows."""
+        for first in range(0, int(np.diff(cuts).max()), _ROWS):
+            parts = None
+            if whole is not None:
+                stops = np.minimum(cuts[:-1] + first + _ROWS, cuts[1:])
+                parts = [np.array(whole[cuts[q] + first : max(stops[q], 0)]) for q in range(self.size)]
+            rows = self.scatter(parts, into)
+            into[first : first + len(rows)] = rows
 
     def broadcast(self, array: np.ndarray | None, like: np.ndarray) -> np.ndarray:
         """What rank 0 has sent."""

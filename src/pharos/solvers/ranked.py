@@ -133,13 +133,7 @@ class RankedBackup:
 
     def scatter(self, whole: np.ndarray | None) -> None:
         """Start from values (S + 1, W) that the first rank has."""
-        for first in range(0, int(np.diff(self.cuts).max()), _ROWS):
-            parts = None
-            if whole is not None:
-                stops = np.minimum(self.cuts[:-1] + first + _ROWS, self.cuts[1:])
-                parts = [np.array(whole[self.cuts[q] + first : max(stops[q], 0)]) for q in range(self.rank.size)]
-            rows = self.rank.scatter(parts, self.x)
-            self.x[first : first + len(rows)] = rows
+        self.rank.scatter_rows(whole, self.cuts, self.x)
         self._halo.receive(self.x)
         self._halo.send(self.x)
         self._halo.finish(self.x[len(self.part) : -1])
