@@ -22,7 +22,7 @@ from pharos.hardness.ties import TieProof, UnresolvedTies
 from pharos.kernels import gaps as kernels
 from pharos.large_arrays import large_zeros
 from pharos.mdp import BEST, BellmanEquation, TabularMDP, takes_mdp
-from pharos.ranks import Rank, check_number, together
+from pharos.ranks import Rank, check_number, check_ranks, together
 from pharos.solvers import Solution, value_iteration
 
 # Relative width up to which an interval counts as the value.
@@ -335,8 +335,7 @@ def _gaps_by_ranks(
 ) -> Gaps:
     """The gaps by several processes. Under MPI the first gets them, and the others None."""
     size = processes if isinstance(processes, int) else 1
-    if size > max(mdp.num_states, 1):
-        raise ParameterError(f"{size} processes for {mdp.num_states} states; expected at most one for each state")
+    check_ranks(mdp.num_states, size)
     has_solution, capacity = solution is not None, capacity_of(mdp, size)
     if processes == "mpi":
         has_solution = together(processes, lambda rank: _told_by_first(rank, has_solution), capacity)

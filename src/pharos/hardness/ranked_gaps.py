@@ -17,7 +17,7 @@ from pharos.hardness.gap_blocks import Step, gaps_of_step, steps_of
 from pharos.hardness.gap_sums import GapSums
 from pharos.hardness.ties import UnresolvedTies
 from pharos.mdp import Part, TabularMDP
-from pharos.ranks import Halo, Rank, cuts_of
+from pharos.ranks import Halo, Rank, check_ranks, cuts_of
 from pharos.solvers import Solution
 from pharos.workers import usable_workers
 
@@ -43,6 +43,7 @@ class RankedGaps:
     """One rank's range of the states. The first calls `totals` as often as it likes, then `end`; others `follow`."""
 
     def __init__(self, mdp: TabularMDP, rank: Rank):
+        check_ranks(mdp.num_states, rank.size)
         self.mdp, self.rank = mdp, rank
         self._cuts = cuts_of(mdp.num_states, rank.size)
         self._part = Part.of(mdp, *map(int, self._cuts[rank.rank : rank.rank + 2]))

@@ -5,13 +5,14 @@ from pharos.ranks.loop import loop
 from pharos.ranks.mpi import launched, mpi_rank
 from pharos.ranks.processes import processes
 from pharos.ranks.rank import Rank, RankFailed
-from pharos.ranks.together import check_number, together
+from pharos.ranks.together import check_number, check_ranks, together
 
 __all__ = [
     "Halo",
     "Rank",
     "RankFailed",
     "check_number",
+    "check_ranks",
     "cuts_of",
     "launched",
     "loop",

@@ -20,6 +20,12 @@ def check_number(size: int | str) -> None:
         raise ParameterError(f"processes is {size!r}; expected a whole number from 1 to {MOST}, or 'mpi'")
 
 
+def check_ranks(num_states: int, ranks: int) -> None:
+    """Raise ParameterError where there are more ranks than states."""
+    if ranks > max(num_states, 1):
+        raise ParameterError(f"{ranks} processes for {num_states} states; expected at most one for each state")
+
+
 def together(size: int | str, program: Callable[[Rank], T], capacity: int) -> T:
     """What `program(rank)` returns, at this rank, while the others run it, too.
 

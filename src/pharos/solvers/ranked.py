@@ -27,7 +27,7 @@ import numpy as np
 
 from pharos.errors import ParameterError
 from pharos.mdp import Part, Selection, TabularMDP, runs_between, runs_of, shares_of
-from pharos.ranks import Halo, Rank, cuts_of
+from pharos.ranks import Halo, Rank, check_ranks, cuts_of
 from pharos.solvers.checkpoint import Checkpoint
 from pharos.solvers.fixed_point import SETTLING, Backup, bound_of_steps, check_tolerance, imprecise, largest_of
 from pharos.workers import usable_workers
@@ -42,12 +42,6 @@ _MIX = (0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB)  # of splitm
 def capacity_of(mdp: TabularMDP, ranks: int) -> int:
     """Bytes that a rank sends in an exchange, at most: a range of values to each, and a few numbers."""
     return ((mdp.num_states // ranks + 1) * mdp.width * 8 + 256) * ranks
-
-
-def check_ranks(num_states: int, ranks: int) -> None:
-    """Raise ParameterError where there are more ranks than states."""
-    if ranks > max(num_states, 1):
-        raise ParameterError(f"{ranks} processes for {num_states} states; expected at most one for each state")
 
 
 class RankedBackup:

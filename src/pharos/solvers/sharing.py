@@ -11,10 +11,10 @@ import numpy as np
 from pharos.compiling import Stopwatch
 from pharos.errors import ParameterError
 from pharos.mdp import Part, Selection, TabularMDP
-from pharos.ranks import Rank, check_number, together
+from pharos.ranks import Rank, check_number, check_ranks, together
 from pharos.solvers.checkpoint import SECONDS, Checkpoint
 from pharos.solvers.fixed_point import Backup
-from pharos.solvers.ranked import RankedBackup, capacity_of, check_ranks, ranked_fixed_point, ranked_induction
+from pharos.solvers.ranked import RankedBackup, capacity_of, ranked_fixed_point, ranked_induction
 from pharos.solvers.solution import Solution
 
 
