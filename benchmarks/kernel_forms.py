@@ -258,7 +258,7 @@ class Cell:
         mdp, gamma = self.learner.mdp, self.schedule.gamma
         memory = Memory(mdp, self.learner.states)
         policy = np.full((len(self.learner.states), mdp.num_actions), 1 / mdp.num_actions)
-        memory.play(self.learner.everywhere(policy), policy, self.learner.episode, 1)
+        memory.play(self.learner.visits(policy), policy, 1)
         v = np.zeros(len(policy))
         for _ in range(200):
             q, visits = memory.targets(v, gamma)
@@ -301,7 +301,7 @@ class PolicyGradient:
         for _ in range(0, steps, ROLLOUT):
             policy = _softmax(logits)[observations.groups]
             memory = Memory(learner.mdp, learner.states)
-            played, _ = memory.play(learner.everywhere(policy), policy, learner.episode, 1)
+            played, _ = memory.play(learner.visits(policy), policy, 1)
             regrets.append(learner.regret(played if learner.is_return else learner.value(policy)))
             for _ in range(60):
                 q, visits = memory.targets(v, self.gamma)

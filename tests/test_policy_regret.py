@@ -6,7 +6,7 @@ import pytest
 import pharos
 from pharos import hardness
 from pharos.errors import ParameterError, UndefinedMeasure
-from pharos.hardness import Representation, Rollouts, Schedule, kernel_policy_regret
+from pharos.hardness import Representation, Rollouts, Schedule, kernel_policy_regret, kernel_regret, mean_field
 from pharos.mdp import TabularMDP, lazy_actions
 from pharos.observations import Network, tangent_kernel
 from test_kernel_measures import chain, kernel_of, random_mdp
@@ -188,3 +188,14 @@ def test_wide_networks_trained_by_exact_gradients_have_the_curve():
     assert np.ptp(played) > 0.3
     np.testing.assert_allclose(found.greedy, greedy, atol=5e-3)
     np.testing.assert_allclose(found.played, played, atol=5e-3)
+
+
+def test_a_learner_walks_once_for_a_policy_that_has_settled(monkeypatch):
+    asked, visits_of = [], mean_field.visits_of
+    monkeypatch.setattr(
+        mean_field, "visits_of", lambda mdp, policy, *of: asked.append(policy) or visits_of(mdp, policy, *of)
+    )
+    long = Schedule(steps=20_000, learning_starts=0, exploration_fraction=0.1)
+    found = kernel_regret(chain(4), Representation.of_matrix(np.eye(4)), schedule=long).curve
+    assert len(found.steps) == 80
+    assert 2 * 8 <= len(asked) < 80, "two learners, whose exploration falls for 8 phases, then policies that settle"

@@ -1,7 +1,9 @@
 """Q-learning of a network in expectation: the learner behind `kernel_regret`."""
 
+from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -149,6 +151,8 @@ class Learner:
             self.mdp, self.numbers = mdp.within(episode), np.flatnonzero(met)
             met = np.ones(len(self.numbers), np.bool_)
         self.states = np.flatnonzero(met & ~np.asarray(self.mdp.terminal))
+        self.visits = OfPolicies(lambda policy: visits_of(self.mdp, self.everywhere(policy), self.episode))
+        self.value = OfPolicies(self._value)
 
     def curve(self, observations: Grouped, apply: KernelOperator) -> LearningCurve:
         """Learn from observations, the groups of states that look alike, with a kernel over them."""
@@ -161,7 +165,7 @@ class Learner:
             period, epsilon = min(schedule.period, schedule.steps - step), schedule.epsilon(step)
             greedy = greedy_policy(values)[observations.groups]
             policy = (1 - epsilon) * greedy + epsilon / actions
-            played, length = memory.play(self.everywhere(policy), policy, self.episode, period)
+            played, length = memory.play(self.visits(policy), policy, period)
             played = played if self.is_return else self.value(policy)
             rows.append((step, self.regret(self.value(greedy)), self.regret(played), period / length))
             if step < schedule.learning_starts:
@@ -187,11 +191,10 @@ class Learner:
         """Normalised, of a policy's value."""
         return (self.optimal - value) / self.spread
 
-    def value(self, policy: np.ndarray) -> float:
+    def _value(self, policy: np.ndarray) -> float:
         """Of a policy (N, A) of the states, at the start."""
         if self.is_return:
-            visits = visits_of(self.mdp, self.everywhere(policy), self.episode)
-            return float((visits.executed * self.mdp.rewards).sum())
+            return float((self.visits(policy).executed * self.mdp.rewards).sum())
         if policy.max(axis=1).min() == 1.0:
             actions = np.zeros(self.mdp.num_states, np.int64)
             actions[self.states] = policy.argmax(axis=1)
@@ -235,9 +238,9 @@ class Memory:
         self.later = np.zeros((shape[0], mdp.width, shape[1]))
         self.rewards = np.asarray(mdp.reward_table.rows(states), np.float64)
 
-    def play(self, table: np.ndarray, policy: np.ndarray, episode: int, period: int) -> tuple[float, float]:
-        """Add the visits of `period` steps. Returns (expected return, expected steps) of an episode."""
-        visits = visits_of(self.mdp, table, episode)
+    def play(self, visits: "Visits", policy: np.ndarray, period: int) -> tuple[float, float]:
+        """Add `period` steps of a policy (N, A), by its visits. Returns (expected return, expected steps) of an
+        episode."""
         length = float(visits.executed.sum())
         scale, later = period / length, visits.later[self.states]
         if self.mdp.is_sticky:
@@ -269,6 +272,24 @@ class Visits(NamedTuple):
     first: np.ndarray
     later: np.ndarray
     executed: np.ndarray
+
+
+Answer = TypeVar("Answer")
+
+
+class OfPolicies(Generic[Answer]):
+    """A function of policies that knows its last answers: what is learnt settles, and is asked about again."""
+
+    def __init__(self, function: Callable[[np.ndarray], Answer], last: int = 4):
+        self.function, self.known = function, deque[tuple[np.ndarray, Answer]](maxlen=last)
+
+    def __call__(self, policy: np.ndarray) -> Answer:
+        place = next((i for i, (asked, _) in enumerate(self.known) if np.array_equal(asked, policy)), None)
+        answer = self.function(policy) if place is None else self.known[place][1]
+        if place is not None:
+            del self.known[place]
+        self.known.append((policy, answer))
+        return answer
 
 
 def visits_of(mdp: TabularMDP, policy: np.ndarray, episode: int) -> Visits:

@@ -100,7 +100,7 @@ class PolicyLearner(Learner):
         for step in range(0, self.schedule.steps, self.rollouts.steps):
             behaviour = softmax(logits)
             policy, memory = behaviour[observations.groups], Memory(self.mdp, self.states)
-            played, length = memory.play(self.everywhere(policy), policy, self.episode, 1)
+            played, length = memory.play(self.visits(policy), policy, 1)
             played = played if self.is_return else self.value(policy)
             greedy = self.value(greedy_policy(logits)[observations.groups])
             count = min(self.rollouts.steps, self.schedule.steps - step) / length
