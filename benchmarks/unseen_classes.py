@@ -1,18 +1,22 @@
 """What came true of predictions on classes left out, without the rest of a report: the tables of representation.md.
 
 python benchmarks/unseen_classes.py STUDY.yaml RUNS.parquet PREDICTIONS.parquet --out TABLE.csv [--figures FOLDER]
-    [--permutations N] [--hardness FOLDER]
+    [--permutations N] [--hardness FOLDER] [--and STUDY.yaml RUNS.parquet PREDICTIONS.parquet]
 
-RUNS.parquet is a packed study (`pharos study pack`). Writes all columns of `study.validation`, prints the primary
-outcome and the regret of training episodes, and draws predicted against observed regret and the learners' curves.
+RUNS.parquet is a packed study (`pharos study pack`); --and adds another one, with predictions of its own. Writes all
+columns of `study.validation`, prints the primary outcome and the regret of training episodes, and draws predicted
+against observed regret and the learners' curves.
 """
 
 import argparse
 import tempfile
 from pathlib import Path
 
+import pandas as pd
+
 from pharos import study
 from pharos.study.figures import save
+from pharos.study.predictions import Foretold
 from pharos.study.unseen_classes import PERMUTATIONS
 from pharos.study.unseen_figures import unseen_figures
 
@@ -27,18 +31,23 @@ def main():
     parser.add_argument("--figures")
     parser.add_argument("--permutations", type=int, default=PERMUTATIONS)
     parser.add_argument("--hardness", help="folder of a study whose measures of hardness are taken as they are")
+    parser.add_argument("--and", dest="more", nargs=3, action="append", default=[], metavar="FILE")
     given = parser.parse_args()
-    predictions, said = study.read_predictions(given.predictions)
-    with tempfile.TemporaryDirectory() as folder:
-        place, number = study.unpack(given.runs, Path(folder) / "study")
-        runs, points = study.table(place), study.curves(place)
-        tasks = set(zip(runs["instance"], runs["chance"], strict=True))
-        measures = study.hardness_table(study.specification(given.spec), given.hardness or place, tasks=tasks)
+    studies = [(given.spec, given.runs, given.predictions), *given.more]
+    foretold = Foretold.of([study.read_predictions(file) for _, _, file in studies])
+    predictions = foretold.cells
+    each = [_finished(spec, runs, given.hardness) for spec, runs, _ in studies]
+    runs, points, measures = (pd.concat(parts, ignore_index=True) for parts in zip(*each, strict=True))
+    measures = measures.drop_duplicates(["environment", "instance", "chance"])  # studies may share tasks
     cells = study.outcomes(runs, points)
     judged = study.validation(predictions, cells, measures=measures, permutations=given.permutations)
     judged.to_csv(given.out, index=False)
-    seeds = runs.groupby(["instance", "agent", "observation"]).size().value_counts().to_dict()
-    print(f"{number} runs; cells by number of seeds: {seeds}; predictions {said['sha256']}, {said['date']}")
+    seeds = runs.groupby(["instance", "chance", "agent", "observation"]).size().value_counts().to_dict()
+    begun, unknown = foretold.late(runs)
+    print(f"{len(runs)} runs; cells by number of seeds: {seeds}")
+    print(f"{begun} began before they were predicted, {unknown} do not say when; predictions:")
+    for _, said in foretold.parts:
+        print(f"    {said['sha256']}, {said['date']}")
     for outcome in OUTCOMES:
         rows = judged[judged["outcome"] == outcome]
         print(f"\n{outcome}: ceiling {rows['ceiling'].max():.2f}, of agreement {rows['agreement_ceiling'].max():.2f}")
@@ -54,6 +63,19 @@ def main():
         folder.mkdir(parents=True, exist_ok=True)
         for name, draw in unseen_figures(predictions, cells, points, runs).items():
             save(draw, folder / name)
+
+
+def _finished(spec, packed, hardness):
+    """(runs, points of their curves, measures of hardness of their tasks) of a packed study."""
+    with tempfile.TemporaryDirectory() as folder:
+        place, _ = study.unpack(packed, Path(folder) / "study")
+        runs = study.table(place)
+        tasks = set(zip(runs["instance"], runs["chance"], strict=True))
+        return (
+            runs,
+            study.curves(place),
+            study.hardness_table(study.specification(spec), hardness or place, tasks=tasks),
+        )
 
 
 def _interval(row, name):

@@ -164,3 +164,17 @@ def test_the_command_line_predicts_and_reports(tmp_path):
     assert done.exit_code == 0, done.output
     assert "sha256" in (tmp_path / "results" / "report" / "report.html").read_text()
     assert (tmp_path / "results" / "report" / "tables" / "predictions.csv").exists()
+    first = tmp_path / "first.yaml"  # the same in two parts
+    first.write_text(yaml.safe_dump({**spec, "blocks": blocks[:1]}))
+    rest = tmp_path / "rest.yaml"
+    rest.write_text(yaml.safe_dump({**spec, "blocks": blocks[1:]}))
+    for part in (first, rest):
+        assert CliRunner().invoke(app, ["study", "predict", str(part), "--out", f"{part}.parquet"]).exit_code == 0
+    both = [word for part in (first, rest) for word in ("--predictions", f"{part}.parquet")]
+    together = CliRunner().invoke(app, ["study", "report", str(file), *where, "--to", str(tmp_path / "both"), *both])
+    assert together.exit_code == 0, together.output
+    assert "3 of 3 runs had begun" in together.stderr
+    name = "report/tables/predictions.csv"
+    assert (tmp_path / "both" / "tables" / "predictions.csv").read_text() == (tmp_path / "results" / name).read_text()
+    twice = CliRunner().invoke(app, ["study", "report", str(file), *where, *both, "--predictions", f"{first}.parquet"])
+    assert twice.exit_code == 2 and "1 cell predicted twice" in twice.stderr

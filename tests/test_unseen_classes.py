@@ -5,8 +5,11 @@ import pandas as pd
 import pytest
 
 from pharos import study
-from pharos.study import held_out, mixed_models, unseen_classes, within_mdps
+from pharos.errors import ParameterError
+from pharos.study import held_out, mixed_models, predictions, within_mdps
+from pharos.study.predictions import Foretold
 from pharos.study.specification import specification
+from pharos.study.tables import CELL
 
 
 def design(classes=5, instances=3, predictors=2, seed=0):
@@ -218,7 +221,7 @@ def test_seeds_without_an_outcome_do_not_count_for_its_noise():
 
 def test_runs_that_had_begun_are_told():
     runs = pd.DataFrame({"id": [*"abc"], "began": ["2026-01-01T00:00:00Z", "2026-01-02T00:00:01Z", ""]})
-    assert unseen_classes.late(runs, {"date": "2026-01-02T00:00:00Z"}) == (1, 1)
+    assert predictions.late(runs, {"date": "2026-01-02T00:00:00Z"}) == (1, 1)
 
 
 def test_predictions_that_came_after_runs_are_no_predictions():
@@ -226,11 +229,25 @@ def test_predictions_that_came_after_runs_are_no_predictions():
 
     from pharos.study.report.unseen_section import doubts
 
-    about = {"date": "2026-01-02T00:00:00Z"}
+    about = Foretold([(pd.DataFrame(columns=CELL), {"date": "2026-01-02T00:00:00Z"})])
     results = SimpleNamespace(runs=pd.DataFrame({"id": ["a"], "began": ["2026-01-02T00:00:01Z"]}))
     assert doubts(results, about) == []
     results.runs["began"] = "2026-01-01T00:00:00Z"
     assert doubts(results, about) == ["not a prediction: 1 of 1 run had begun when the predictions were written"]
+
+
+def test_each_run_is_held_to_the_date_of_its_own_prediction():
+    cells = pd.DataFrame([["grid", "4x4", chance, "dqn", "vector"] for chance in ("plain", "random 0.1")], columns=CELL)
+    runs = cells.assign(id=["a", "b"], began="2026-01-02T00:00:00Z")
+    dates = ({"date": "2026-01-01T00:00:00Z"}, {"date": "2026-01-03T00:00:00Z"})
+    parts = [(cells.iloc[[i]], about) for i, about in enumerate(dates)]
+    assert Foretold.of(parts).late(runs) == (1, 0)
+    assert Foretold.of(parts).cells.equals(cells)
+    assert Foretold.of(parts[0]).parts == parts[:1]
+    assert Foretold.of(None) is Foretold.of([]) is None
+    assert Foretold.of(parts).late(runs.assign(began=["", "2026-01-04T00:00:00Z"])) == (0, 1)
+    with pytest.raises(ParameterError, match="1 cell predicted twice, such as grid, 4x4, plain, dqn, vector; expected"):
+        Foretold.of([*parts, parts[0]])
 
 
 def test_settings_and_families_make_cells_of_their_own():

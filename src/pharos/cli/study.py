@@ -219,8 +219,12 @@ def report(
         Path | None, typer.Option("--to", metavar="DIR", help="Where to write; DIR/report of the study when not given.")
     ] = None,
     predictions: Annotated[
-        Path | None,
-        typer.Option("--predictions", metavar="FILE", help="Of `pharos study predict`: what came true of them."),
+        list[Path] | None,
+        typer.Option(
+            "--predictions",
+            metavar="FILE",
+            help="Of `pharos study predict`: what came true of them; again for a study predicted in parts.",
+        ),
     ] = None,
     environments: Environments = None,
     trust: Trust = False,
@@ -229,7 +233,7 @@ def report(
     """Make the figures and tables of the finished runs: one HTML file, PNG, PDF, CSV and LaTeX."""
     from pharos import study
 
-    foretold = None if predictions is None else study.read_predictions(predictions)
+    foretold = [study.read_predictions(each) for each in predictions or ()]
     with progress_line("report") as tell:
         opened, place = study.opened(spec, out, trust=trust or None, environments=environments)
         written = study.report(opened, place, out=to, progress=tell, predictions=foretold)

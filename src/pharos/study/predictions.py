@@ -4,11 +4,11 @@ import hashlib
 import json
 import math
 import os
-from collections.abc import Callable, Mapping
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from pharos import experiments
 from pharos.agents import agent_kind
@@ -17,7 +17,9 @@ from pharos.storage import plain
 from pharos.study.blocks import Run, Specification
 from pharos.study.specification import Source
 from pharos.study.status import opened
+from pharos.study.tables import CELL
 from pharos.study.values import task_of
+from pharos.wording import many
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -38,6 +40,9 @@ ACTOR_CRITICS = {"ppo": 0.95, "a2c": 1.0}
 """Agents that learn as actor-critics, and the lambda of their advantages where hyperparameters do not say it."""
 CURVE_POINTS = 40
 _KEY = b"pharos.predictions"
+
+Predictions: TypeAlias = "tuple[pd.DataFrame, Mapping[str, str]]"
+"""Rows, and what their file says of itself."""
 
 
 def predict(
@@ -214,3 +219,52 @@ def _hash(frame: "pd.DataFrame") -> str:
     columns = {name: frame[name].tolist() for name in sorted(frame.columns)}
     text = json.dumps(plain(columns), sort_keys=True, separators=(",", ":"), allow_nan=False)
     return hashlib.sha256(text.encode()).hexdigest()
+
+
+@dataclass(frozen=True, eq=False)
+class Foretold:
+    """What was predicted of the cells of a study, at once or in parts.
+
+    Attributes:
+        parts: as `read_predictions` returns them, of different cells.
+        cells: the rows of all.
+    Raises:
+        ParameterError: a cell is predicted in two parts.
+    """
+
+    parts: "Sequence[Predictions]"
+    cells: "pd.DataFrame" = field(init=False)
+
+    def __post_init__(self) -> None:
+        import pandas as pd
+
+        cells = pd.concat([frame for frame, _ in self.parts], ignore_index=True)
+        twice = cells[cells.duplicated(CELL)][CELL]
+        if len(twice):
+            raise ParameterError(
+                f"{many(len(twice), 'cell')} predicted twice, such as {', '.join(twice.iloc[0])}; "
+                "expected files of different cells"
+            )
+        object.__setattr__(self, "cells", cells.fillna({"policy_curve": ""}) if "policy_curve" in cells else cells)
+
+    @staticmethod
+    def of(predictions: "Predictions | Sequence[Predictions] | None") -> "Foretold | None":
+        """Of one file, of several, or of none."""
+        parts = [predictions] if isinstance(predictions, tuple) else list(predictions or ())
+        return Foretold(parts) if parts else None
+
+    def late(self, runs: "pd.DataFrame") -> tuple[int, int]:
+        """(runs that had begun when the predictions were written, runs that do not say when they began): numbers.
+
+        Where there are several parts, of the runs that they are about, each.
+        """
+        if len(self.parts) == 1:
+            return late(runs, self.parts[0][1])
+        each = [late(runs.merge(frame[CELL], on=CELL), about) for frame, about in self.parts]
+        return sum(before for before, _ in each), sum(unknown for _, unknown in each)
+
+
+def late(runs: "pd.DataFrame", about: Mapping[str, str]) -> tuple[int, int]:
+    """(runs that had begun when predictions were written, runs that do not say when they began): numbers."""
+    began = runs["began"] if "began" in runs else runs["id"].map(lambda _: "")
+    return int(((began != "") & (began <= about["date"])).sum()), int((began == "").sum())

@@ -4,7 +4,7 @@ Cells of one class share more than any measure tells, so a class is held out as 
 four classes of the paper tell nothing here: with four points every measure can be ordered well by luck.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -366,9 +366,3 @@ def _mixed(cells: Cells, model: Model, tabular: Sequence[str], seed: int) -> dic
             f"{name}_upper": _percentile(values[1:], 97.5),
         }
     return row
-
-
-def late(runs: "pd.DataFrame", about: Mapping[str, str]) -> tuple[int, int]:
-    """(runs that had begun when the predictions were written, runs that do not say when they began): numbers."""
-    began = runs["began"] if "began" in runs else runs["id"].map(lambda _: "")
-    return int(((began != "") & (began <= about["date"])).sum()), int((began == "").sum())

@@ -10,6 +10,7 @@ from pharos.storage import replace_file
 from pharos.study.curves import all_curves
 from pharos.study.figures import all_figures, save
 from pharos.study.latex import tables_of
+from pharos.study.predictions import Foretold, Predictions
 from pharos.study.report.page import render
 from pharos.study.report.results import Results, coefficients, results_of
 from pharos.study.report.sections import sections_of
@@ -48,7 +49,7 @@ def report(
     out: str | os.PathLike | None = None,
     progress: Callable[[str], None] | None = None,
     trust: bool | None = None,
-    predictions: "tuple[pd.DataFrame, Mapping[str, str]] | None" = None,
+    predictions: "Predictions | Sequence[Predictions] | None" = None,
 ) -> StudyReport:
     """Make the paper's figures and tables of the runs that are finished.
 
@@ -58,13 +59,15 @@ def report(
         out: folder to write to; None for `report` in the folder of the study.
         progress: called with what is being done.
         trust: whether code that the study names may be imported; as for `specification`.
-        predictions: of `read_predictions`; figures, a section and a table say what came true of them, and how many runs
-            had begun before they were written.
+        predictions: of `read_predictions`, or several of them, of different cells; figures, a section and a table say
+            what came true of them, and how many runs had begun before they were written.
     Raises:
-        ParameterError: no run is finished; or none of those that were predicted, or of fewer than three classes.
+        ParameterError: no run is finished; or none of those that were predicted, or of fewer than three classes; or a
+            cell was predicted twice.
     Cost: the measures of hardness of what has finished runs, once, each at most its budget; then seconds.
     """
     tell = progress or (lambda _: None)
+    foretold = Foretold.of(predictions)
     study, place = opened(source, folder, trust=trust)
     results = results_of(study, place, tell)
     target = Path(out) if out is not None else place / "report"
@@ -77,26 +80,26 @@ def report(
         if images and name in curves:
             images["curves"] = curves[name].to_json().encode()
     tell("leaving out classes")
-    judgement, outcomes = judged(results, predictions)
+    judgement, outcomes = judged(results, foretold)
     more = {"outcomes": outcomes}
-    if predictions is not None:
-        more["predicted"] = predictions[0]
-        for name, draw in unseen_figures(predictions[0], outcomes, results.points, results.runs).items():
+    if foretold is not None:
+        more["predicted"] = foretold.cells
+        for name, draw in unseen_figures(foretold.cells, outcomes, results.points, results.runs).items():
             figures[name] = save(draw, target / "figures" / name)
     if judgement is not None:
-        more["predictions" if predictions is not None else "unseen_classes"] = judgement
+        more["predictions" if foretold is not None else "unseen_classes"] = judgement
     tables = _write_tables(target / "tables", results, more)
     tell("drawing instances")
     sections = sections_of(results, figures)
     if judgement is not None:
         models = next((i for i, each in enumerate(sections) if each.title == MODELS), len(sections) - 2)
-        sections.insert(models + 1, unseen_section(judgement, results, predictions, figures))
+        sections.insert(models + 1, unseen_section(judgement, results, foretold, figures))
     page = render(f"Study {study.name}", study.description, sections)
     replace_file(target / "report.html", page)
     drawn = [
         target / "figures" / f"{name}.{kind}" for name, images in figures.items() if images for kind in ("png", "pdf")
     ]
-    notes = [*results.notes, *(doubts(results, predictions[1]) if predictions is not None else ())]
+    notes = [*results.notes, *(doubts(results, foretold) if foretold is not None else ())]
     return StudyReport(target / "report.html", drawn, tables, notes)
 
 

@@ -7,10 +7,11 @@ import numpy as np
 
 from pharos.errors import ParameterError
 from pharos.study.curves import agent_name, slug
+from pharos.study.predictions import Foretold
 from pharos.study.report.page import Figures, image, table
 from pharos.study.report.results import Results
 from pharos.study.report.section import Section
-from pharos.study.unseen_classes import OUTCOMES, late, outcomes, validation
+from pharos.study.unseen_classes import OUTCOMES, outcomes, validation
 from pharos.wording import many
 
 if TYPE_CHECKING:
@@ -19,9 +20,7 @@ if TYPE_CHECKING:
 FEW_PERMUTATIONS = 499
 
 
-def judged(
-    results: Results, predictions: "tuple[pd.DataFrame, Mapping[str, str]] | None"
-) -> "tuple[pd.DataFrame | None, pd.DataFrame]":
+def judged(results: Results, predictions: Foretold | None) -> "tuple[pd.DataFrame | None, pd.DataFrame]":
     """(statistics of predictors, or None where there are fewer than two classes; cells with outcomes).
 
     Raises:
@@ -29,7 +28,7 @@ def judged(
     """
     cells = outcomes(results.runs, results.points)
     if predictions is not None:
-        return validation(predictions[0], cells, measures=results.hardness), cells
+        return validation(predictions.cells, cells, measures=results.hardness), cells
     own = cells[cells["agent"].isin(results.agents)]
     try:
         judgement = validation(None, own, measures=results.hardness, least_classes=2, permutations=FEW_PERMUTATIONS)
@@ -41,7 +40,7 @@ def judged(
 def unseen_section(
     judgement: "pd.DataFrame",
     results: Results,
-    predictions: "tuple[pd.DataFrame, Mapping[str, str]] | None",
+    predictions: Foretold | None,
     figures: Figures,
 ) -> Section:
     """What came true of predictors on classes, MDPs and observations; baselines beside."""
@@ -74,18 +73,20 @@ def _text(judgement: "pd.DataFrame") -> list[str]:
     ]
 
 
-def _said(results: Results, predictions: "tuple[pd.DataFrame, Mapping[str, str]] | None") -> list[str]:
-    """What the file of predictions says of itself, and whether it came first."""
+def _said(results: Results, predictions: Foretold | None) -> list[str]:
+    """What files of predictions say of themselves, and whether they came first."""
     if predictions is None:
         return ["Without predictions (pharos study predict), of tabular measures alone."]
-    about = predictions[1]
-    lines = [f"Predictions written {about['date']} by pharos {about['version']}, sha256 {about['sha256']}."]
-    return [*lines, *(doubts(results, about) or ["All runs began after that."])]
+    lines = [
+        f"Predictions written {about['date']} by pharos {about['version']}, sha256 {about['sha256']}."
+        for _, about in predictions.parts
+    ]
+    return [*lines, *(doubts(results, predictions) or ["All runs began after that."])]
 
 
-def doubts(results: Results, about: Mapping[str, str]) -> list[str]:
+def doubts(results: Results, predictions: Foretold) -> list[str]:
     """Why predictions may be none: runs that had begun when they were written, or that do not say when they were."""
-    before, unknown = late(results.runs, about)
+    before, unknown = predictions.late(results.runs)
     total, reasons = f"of {many(len(results.runs), 'run')}", []
     if before:
         reasons.append(f"not a prediction: {before:,} {total} had begun when the predictions were written")
