@@ -456,3 +456,14 @@ def test_attempts_that_fail_a_million_times_take_few_sweeps():
     bounds = targets.sweep(j, count, 400, 0.0, Spending(Budget(), None))
     assert bounds.lower <= 2**20 - 2 <= bounds.upper
     assert bounds.apart < 1e-3
+
+
+@pytest.mark.parametrize("next_states", [[[0, 0]], [[1, 1], [0, 0]]])
+@pytest.mark.parametrize("many", [0, 10**9])
+def test_actions_that_are_repeated_for_ever_may_all_lead_everywhere(next_states, many, monkeypatch):
+    monkeypatch.setattr("pharos.hardness.stochastic_diameter.MANY", many)
+    mdp = TabularMDP.from_arrays(np.array(next_states), np.zeros((len(next_states), 2)))
+    found = hardness.diameter(sticky_actions(mdp, 1.0), restart=False)
+    assert found.exact
+    assert found.lower <= len(next_states) - 1 <= found.upper < math.inf
+    assert found.unreachable_pairs == 0

@@ -48,38 +48,38 @@ class Choices:
         return graph.indptr, graph.indices
 
     @cached_property
-    def home(self) -> int:
-        """A node of the only set of nodes that is never left, where each target has a node in it; else -1.
-
-        So from every node every target can be reached, and surely is, by whoever chooses at random.
-        """
+    def _recurrent_class(self) -> np.ndarray:
+        """(N,) its recurrent class, nodes that lead to each other and to no others, from 0 on; -1: none."""
         first, previous = self.reversed
         size = len(self.underlying)
         graph = sparse.csr_matrix((np.ones(len(previous), np.int8), previous, first), shape=(size, size))
         number, component = csgraph.connected_components(graph, connection="strong")
         into = np.repeat(np.arange(size), np.diff(first))
         leaves = component[previous] != component[into]
-        final = np.ones(number, np.bool_)
-        final[component[previous[leaves]]] = False
-        if final.sum() != 1:
-            return -1
-        inside = final[component]
-        targets = np.unique(self.underlying)
-        return int(np.flatnonzero(inside)[0]) if np.unique(self.underlying[inside]).size == targets.size else -1
+        is_recurrent = np.ones(number, np.bool_)
+        is_recurrent[component[previous[leaves]]] = False
+        return np.asarray(np.where(is_recurrent, np.cumsum(is_recurrent) - 1, -1)[component])
 
-    @property
+    @cached_property
     def is_connected(self) -> bool:
-        """Whether every target that is met at all can be reached from every node."""
-        return self.home >= 0
+        """Whether every target that is met at all can be reached from every node: each recurrent class has all.
+
+        So from every node every target is surely reached, by whoever chooses at random.
+        """
+        inside = np.flatnonzero(self._recurrent_class >= 0)
+        pairs = np.unique(self._recurrent_class[inside] * np.int64(self.num_targets) + self.underlying[inside])
+        return bool(pairs.size == np.unique(self.underlying).size * (self._recurrent_class.max() + 1))
 
     @cached_property
     def crude_upper(self) -> float:
         """Proven, and far too large: a shortest path of at most H edges succeeds with probability q^H or more.
 
-        So the expected time is at most H / q^H.
+        So the expected time is at most H / q^H. H is that by way of one node, which all others lead to; infinite where
+        there is none.
         """
-        if not self.is_connected:
+        if not self.is_connected or self._recurrent_class.max() > 0:
             return math.inf
+        home = int(self._recurrent_class.argmax())
         size = len(self.underlying)
         coo = self.matrix.tocoo()
         best = sparse.coo_matrix((coo.data, (coo.row // self.num_actions, coo.col)), shape=(size, size))
@@ -90,7 +90,7 @@ class Choices:
         graph = sparse.csr_matrix((np.ones(int(first.sum())), (row[first], col[first])), shape=(size, size))
         steps = 0
         for each in (graph, graph.T.tocsr()):
-            distances = csgraph.dijkstra(each, indices=self.home, unweighted=True)
+            distances = csgraph.dijkstra(each, indices=home, unweighted=True)
             steps += int(distances[np.isfinite(distances)].max())
         exponent = -steps * math.log(float(data[first].min()))
         return steps * math.exp(exponent) if exponent < 690 else math.inf
