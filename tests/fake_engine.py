@@ -76,6 +76,9 @@ class Batch:
     def policy(self, i):
         return Policy(self.runs[i].mdp.num_actions, int(abs(self.walk[i, 0]) * 100))
 
+    def greedy_actions(self, places):
+        return None  # they are asked about observations
+
     def best_actions(self, states):
         actions = []
         for i, source in enumerate(run.observe for run in self.runs):

@@ -8,7 +8,6 @@ import numpy as np
 
 from pharos.errors import PharosError
 from pharos.experiments.members import Member
-from pharos.experiments.tables import Tables
 from pharos.experiments.task import Task
 from pharos.policies import Evaluation, PolicyAnswers, is_small_table, is_walk, table_values, walk_values, whole_values
 
@@ -52,10 +51,9 @@ def _values_of_walks(batch: Any, members: Sequence[Member], places: Sequence[int
 
 def _values_of_tables(batch: Any, task: Task, places: Sequence[int]) -> dict[int, Evaluation]:
     """Each policy is asked once about every state. One that gives no probabilities is left out."""
-    if isinstance(batch, Tables):
-        tables_of = {i: batch.policy(i).policy_table() for i in places}
-        chosen = {i: table for i, table in tables_of.items() if table.ndim == 1}
-        return dict(zip(chosen, whole_values(task.mdp, list(chosen.values())), strict=True)) if chosen else {}
+    actions = batch.greedy_actions(places)
+    if actions is not None:
+        return dict(zip(actions, whole_values(task.mdp, list(actions.values())), strict=True))
     mdp, sight = task.mdp, task.sight
     answers = {i: PolicyAnswers(batch.policy(i), mdp, sight) for i in places}
     tables: dict[int, list[np.ndarray]] = {i: [] for i in places}

@@ -50,6 +50,11 @@ class Tables:
         """The agent of run i."""
         return self._tables[i]
 
+    def greedy_actions(self, places: Sequence[int]) -> dict[int, np.ndarray]:
+        """(S,) actions of each of some runs, by its place; runs that look back at the previous action are left out."""
+        tables = {i: self._tables[i].policy_table() for i in places}
+        return {i: table for i, table in tables.items() if table.ndim == 1}
+
     def state(self) -> dict[str, np.ndarray]:
         """Everything that `restore` needs to go on, bit for bit."""
         return joined_states(table.state() for table in self._tables)

@@ -75,6 +75,9 @@ class Batch:
             [lane.best_actions(states[k * self.width : (k + 1) * self.width]) for k, lane in enumerate(self.lanes)]
         )
 
+    def greedy_actions(self, places: Sequence[int]) -> None:
+        """None: these policies are no tables of states, and are asked about observations."""
+
     def policy(self, i: int) -> RunPolicy:
         """The policy of run i, as it is when it is asked: greedy for DQN, probabilities for PPO."""
         return RunPolicy(self.lanes[i // self.width], i % self.width)
