@@ -284,7 +284,7 @@ class OfPolicies(Generic[Answer]):
         self.function, self.known = function, deque[tuple[np.ndarray, Answer]](maxlen=last)
 
     def __call__(self, policy: np.ndarray) -> Answer:
-        place = next((i for i, (asked, _) in enumerate(self.known) if np.array_equal(asked, policy)), None)
+        place = next((i for i, (other, _) in enumerate(self.known) if np.array_equal(other, policy)), None)
         answer = self.function(policy) if place is None else self.known[place][1]
         if place is not None:
             del self.known[place]
