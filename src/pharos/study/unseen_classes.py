@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     import pandas as pd
 
 OUTCOMES = {
-    "greedy": "mean normalised regret of the greedy policies",
+    "greedy": "mean normalised regret of the learnt policies",  # greedy; of actor-critics the distribution over actions
     "played": "that of the training episodes",
-    "steps_to_tenth": "share of the steps until the greedy policy's regret is 0.1; 1: never",
+    "steps_to_tenth": "share of the steps until that regret is 0.1; 1: never",
     "cumulative": "cumulative regret of the training episodes, logarithm",
 }
 ABSOLUTE = "cumulative"  # in units of reward: judged only beside what random play would lose
@@ -69,7 +69,9 @@ def outcomes(runs: "pd.DataFrame", points: "pd.DataFrame") -> "pd.DataFrame":
 
 
 def normalized_regrets(points: "pd.DataFrame", runs: "pd.DataFrame") -> "pd.Series":
-    """Of each evaluation the regret of the greedy policy, (V* - V) / (V* - V of uniform play); NaN where that is 0.
+    """Of each evaluation the regret of the learnt policy, (V* - V) / (V* - V of uniform play); NaN where that is 0.
+
+    The policy is the greedy one, of actor-critics the distribution over actions: what `evaluate_agent` evaluates.
 
     Args:
         points, runs: of `curves` and `table`.

@@ -103,8 +103,9 @@ def _part(agent: str, outcome: str, rows: "pd.DataFrame", figures: Figures) -> d
             "cell. On the dotted line the prediction was right.",
             "observations_of_mdps": "The same MDP under its observations: regret of the agent (full) and as predicted "
             "(hollow).",
-            "idealised_curves": "Regret of the greedy policy while learning: of the agent (full line, the mean over "
-            "seeds) and of the idealised learner (dashed), which was never trained.",
+            "idealised_curves": "Regret of the learnt policy while learning: of the agent (full line, the mean over "
+            "seeds; of actor-critics the distribution over actions) and of the greedy policy of the idealised learner "
+            "(dashed), which was never trained.",
         }
         drawn = [image(figures, f"{name}_{slug(agent)}", text) for name, text in texts.items()]
     return {
