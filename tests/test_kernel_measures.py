@@ -477,7 +477,10 @@ def test_the_command_line_has_them(grid):
     done = CliRunner().invoke(app, [*target, "--observation", "vector", "--network", "mlp128", "--landmarks", "4"])
     assert "no bound" in " ".join(done.stdout.split())
     for words, line in (
-        (["--network", "mlp128"], "go with --observation NAME"),
+        (["--network", "mlp128"], "--network goes with --observation NAME"),
+        (["--initialisation", "sb3"], "--initialisation goes with --observation NAME"),
+        (["--optimizer", "adam"], "--optimizer goes with --observation NAME"),
+        (["--observation", "vector", "--network", "mlp-1"], "no closed form"),
         (["--observation", "vector", "--network", "lstm"], "no closed form"),
         (["--observation", "vector", "--network", "cnn16"], "has convolutions"),
         (["--observation", "vectors"], "did you mean 'vector'?"),
@@ -497,8 +500,27 @@ def small(shape):
 def conv(shape):
     return nn.Conv3d(1, 1, 9)
 
+def flat(shape):
+    return nn.Sequential(nn.Flatten(), nn.Linear(shape[0], 1), nn.Flatten(0))
+
+def endless(shape):
+    layers = nn.Sequential(nn.Linear(shape[0], 4), nn.ReLU(), nn.Linear(4, 1))
+    nn.init.constant_(layers[2].weight, float("nan"))
+    return layers
+
+def none(shape):
+    return 3
+
 count = 3
 """
+OWN_ERRORS = {
+    "conv": "network 'own.py:conv' on inputs of shape",
+    "flat": "network 'own.py:flat' on inputs of shape (7,): outputs of one input have shape (1,); expected (1, A)",
+    "endless": "network 'own.py:endless' on inputs of shape (7,): gradients of the network are not finite",
+    "none": "network 'own.py:none' on inputs of shape (7,): make returned 3; expected a torch.nn.Module",
+    "count": "found 3; expected a function",
+    "absent": "network 'own.py:absent': there is no such name",
+}
 
 
 @pytest.mark.slow
@@ -518,7 +540,7 @@ def test_a_network_of_ones_own_has_its_empirical_kernel(grid, tmp_path):
     whole = seen.kernel(states, states)
     assert (whole == whole.T).all()
     np.testing.assert_allclose(seen.kernel(states[:5], states[3:]), whole[:5, 3:], rtol=1e-4)
-    for name, line in (("conv", "network 'own.py:conv' on inputs of shape"), ("count", "found 3; expected a function")):
+    for name, line in OWN_ERRORS.items():
         done = CliRunner().invoke(app, [*words[:-3], f"{file}:{name}"])
         assert done.exit_code == 2
         assert line in done.stderr

@@ -86,11 +86,18 @@ def hardness(
         ),
     ] = None,
     initialisation: Annotated[
-        str, typer.Option("--initialisation", help="Of the network: pytorch (as DQN has), or sb3 (as PPO and A2C).")
-    ] = "pytorch",
+        str | None,
+        typer.Option(
+            "--initialisation", help="Of the network: pytorch (as DQN has; when not given), or sb3 (as PPO and A2C)."
+        ),
+    ] = None,
     optimizer: Annotated[
-        str, typer.Option("--optimizer", help="Of the idealised learner: gradient, or adam, which rescales gradients.")
-    ] = "gradient",
+        str | None,
+        typer.Option(
+            "--optimizer",
+            help="Of the idealised learner: gradient (when not given), or adam, which rescales gradients.",
+        ),
+    ] = None,
     landmarks: Annotated[
         int | None,
         typer.Option(
@@ -120,8 +127,11 @@ def hardness(
 
         wanted = chosen(measures)  # an unknown name is told before anything is built
         needs_rewards = any(each.depends != "structure" for each in wanted)
-    if observation is None and (option or network or landmarks is not None):
-        raise ParameterError("--option, --network and --landmarks go with --observation NAME")
+    of_observations = {"option": option, "network": network, "initialisation": initialisation}
+    of_observations |= {"optimizer": optimizer, "landmarks": landmarks}
+    useless = [f"--{name}" for name, value in of_observations.items() if value not in (None, [])]
+    if observation is None and useless:
+        raise ParameterError(f"{useless[0]} goes with --observation NAME, what the agent sees")
     goal = parse_target(target, parameters)
     own = goal.is_imported  # an imported MDP has a discount and a horizon of its own
     mdp = goal.mdp(
@@ -136,7 +146,7 @@ def hardness(
     representation = None
     if observation is not None:
         words = parse_parameters(option)
-        named = {"network": network, "initialisation": initialisation, "landmarks": landmarks}
+        named = {"network": network, "initialisation": initialisation or "pytorch", "landmarks": landmarks}
         mdp, representation = _represented(goal, mdp, observation, building, {**words, **named})
     from pharos.hardness import Schedule
     from pharos.hardness import report as measure
@@ -152,7 +162,7 @@ def hardness(
             keep=not fresh,
             progress=lambda what, line: tell(f"{what}  {line}"),
             representation=representation,
-            schedule=None if representation is None else Schedule(optimizer=optimizer),
+            schedule=None if representation is None else Schedule(optimizer=optimizer or "gradient"),
             folder=values,
         )
     if json:

@@ -22,7 +22,8 @@ def empirical_ntk(
     Returns:
         (N, M) float32; symmetric where `others` is None.
     Raises:
-        MissingExtra: PyTorch is not installed. ParameterError: no network, or none was asked for.
+        MissingExtra: PyTorch is not installed. ParameterError: no network, or none was asked for; its outputs are not
+            (N, A), or its gradients are not finite.
     Cost: `networks` times N + M gradients, which lie in memory one network at a time.
     Source: Jacot, Gabriel and Hongler (2018).
     """
@@ -44,6 +45,8 @@ def empirical_ntk(
             rows = _gradients(torch, network, inputs)
             facing = rows if columns is None else _gradients(torch, network, columns)
             total += (rows @ facing.T).double().numpy()
+    if not np.isfinite(total).all():
+        raise ParameterError("gradients of the network are not finite; expected finite parameters and inputs")
     return (total / networks).astype(np.float32)
 
 
@@ -52,7 +55,10 @@ def _gradients(torch: Any, network: Any, inputs: Any) -> Any:
     parameters = {name: value.detach() for name, value in network.named_parameters()}
 
     def output(values: Any, one: Any) -> Any:
-        return torch.func.functional_call(network, values, (one[None],))[0, 0]
+        outputs = torch.func.functional_call(network, values, (one[None],))
+        if outputs.ndim != 2:
+            raise ParameterError(f"outputs of one input have shape {tuple(outputs.shape)}; expected (1, A)")
+        return outputs[0, 0]
 
     gradients = torch.func.vmap(torch.func.grad(output), in_dims=(None, 0))(parameters, inputs)
     return torch.cat([each.flatten(1) for each in gradients.values()], dim=1)

@@ -69,7 +69,7 @@ class Network:
         if initialisation not in INITIALISATIONS:
             raise ParameterError(f"initialisation is {initialisation!r}; expected one of {', '.join(INITIALISATIONS)}")
         match = _FORM.fullmatch(network) if isinstance(network, str) else None
-        layers = () if match is None else _layers(match["layers"].removeprefix("-"))
+        layers = () if match is None else _layers(match["layers"])
         if match is None or layers is None or (match["mlp"] and not layers):
             raise ParameterError(
                 f"network {network!r} has no closed form that is known; expected {_EXPECTED}; for any network of "

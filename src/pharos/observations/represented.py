@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pharos import sources
-from pharos.errors import ParameterError, PharosError
+from pharos.errors import MissingExtra, ParameterError, PharosError
 from pharos.hardness import Representation
 from pharos.observations.empirical import empirical_ntk
 from pharos.observations.look_alikes import observation_classes
@@ -90,16 +90,19 @@ def _own_network(network: Any, shape: tuple[int, ...]) -> tuple[Callable[..., np
     source = sources.find(network) if isinstance(network, str) else sources.source_of(network)
     function = sources.load(source) if isinstance(network, str) and source is not None else network
     name = source.name if source is not None else str(getattr(network, "__name__", network))
+    if function is None:
+        raise ParameterError(f"network {name!r}: there is no such name in the file")
     if not callable(function):
         raise ParameterError(f"network {name!r}: found {function!r}; expected a function of the shape of an input")
 
     def kernel(x: np.ndarray, y: np.ndarray | None = None) -> np.ndarray:
         try:
             return empirical_ntk(partial(function, shape), x, others=y, networks=NETWORKS)
-        except PharosError:
+        except MissingExtra:
             raise
         except Exception as error:
-            words = f"{type(error).__name__}: {' '.join(str(error).split())}"
+            kind = "" if isinstance(error, PharosError) else f"{type(error).__name__}: "
+            words = kind + " ".join(str(error).split())
             raise ParameterError(f"network {name!r} on inputs of shape {shape}: {words}") from error
 
     checksum = None if source is None else source.checksum
