@@ -24,7 +24,7 @@ STATES, ACTIONS, RUN = 9, 3, 1
 class OneHots:
     """The observations of a table: a one for the state."""
 
-    shape, dtype, is_image, num_states = (STATES,), np.dtype(np.float32), False, STATES
+    shape, dtype, is_image, num_states, frames = (STATES,), np.dtype(np.float32), False, STATES, 1
 
     def at(self, indices):
         return np.eye(STATES, dtype=np.float32)[indices]

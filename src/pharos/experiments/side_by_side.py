@@ -17,13 +17,13 @@ BLOCK = 4096  # observations that policies are asked about at once
 def values_together(batch: Any, members: Sequence[Member]) -> dict[int, Evaluation]:
     """place in the batch -> value of the run's policy, where that is had for less than one by one; others are left out.
 
-    These are DQN where nothing is random, and runs that share a task of few states.
+    These are DQN where nothing is random, and runs that share a task of few states and see one frame.
     """
     walks = [i for i, each in enumerate(members) if each.error is None and _walks(each)]
     values = _values_of_walks(batch, members, walks)
     tasks = defaultdict(list)
     for i, member in enumerate(members):
-        if member.error is None and i not in values and is_small_table(member.task.mdp):
+        if member.error is None and i not in values and is_small_table(member.task.mdp) and _frames(member) == 1:
             tasks[id(member.task)].append(i)
     for places in tasks.values():
         if len(places) > 1:
@@ -35,18 +35,25 @@ def _walks(member: Member) -> bool:
     return member.config.agent == "dqn" and is_walk(member.task.mdp)
 
 
+def _frames(member: Member) -> int:
+    """How many states the agent sees."""
+    return 1 if member.config.is_tabular else member.task.sight.frames
+
+
 def _values_of_walks(batch: Any, members: Sequence[Member], places: Sequence[int]) -> dict[int, Evaluation]:
     """An episode of a thousand steps costs a thousand calls of the networks of all runs, not of each."""
     if not places:
         return {}
-    states = np.zeros(len(members), np.int64)
+    frames = _frames(members[places[0]])
+    states = np.zeros((len(members), frames) if frames > 1 else len(members), np.int64)
 
     def act(now: np.ndarray) -> np.ndarray:
         states[places] = now
         actions: np.ndarray = batch.best_actions(states)
         return actions[places]
 
-    return dict(zip(places, walk_values([members[i].task.mdp for i in places], act), strict=True))
+    mdps = [members[i].task.mdp for i in places]
+    return dict(zip(places, walk_values(mdps, act, frames=frames), strict=True))
 
 
 def _values_of_tables(batch: Any, task: Task, places: Sequence[int]) -> dict[int, Evaluation]:

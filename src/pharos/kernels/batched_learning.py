@@ -29,17 +29,58 @@ def sample(keys, step, draw, place, filled, gammas, num_steps, memory, batch):
         for b in range(states.shape[1]):
             w = philox(b, draw, step, SAMPLE, keys[i])
             row, e = below(w[0], filled), below(w[1], copies)
-            states[i, b], actions[i, b] = state[i, row, e], action[i, row, e]
-            total, factor, at = 0.0, 1.0, row
-            for n in range(num_steps):
-                at = (row + n) % size
-                total += factor * reward[i, at, e]
-                factor *= gammas[i]
-                if flags[i, at, e] & DONE or at == last:
-                    break
-            nexts[i, b], rewards[i, b] = following[i, at, e], float32(total)
-            ended = flags[i, at, e] & DONE and not flags[i, at, e] & TIMEOUT
-            discounts[i, b] = float32(0.0) if ended else float32(factor)
+            at, rewards[i, b], discounts[i, b] = _steps_from(i, row, e, last, gammas[i], num_steps, reward, flags)
+            states[i, b], actions[i, b], nexts[i, b] = state[i, row, e], action[i, row, e], following[i, at, e]
+
+
+@njit(cache=True, nogil=True)
+def sample_histories(keys, step, draw, place, filled, gammas, num_steps, memory, batch):
+    """As `sample`, of the `filled` newest rows, with states and next states (W, B, k): the last k of the episode.
+
+    They are read from the rows before; the first state of an episode stands for those before it. Rows that were never
+    written have the flag DONE.
+    """
+    state, following, action, reward, flags = memory
+    states, nexts, actions, rewards, discounts = batch
+    size, copies, frames = state.shape[1], state.shape[2], states.shape[2]
+    first, last = (place - filled) % size, (place - 1) % size
+    for i in range(states.shape[0]):
+        for b in range(states.shape[1]):
+            w = philox(b, draw, step, SAMPLE, keys[i])
+            row, e = (first + below(w[0], filled)) % size, below(w[1], copies)
+            at, rewards[i, b], discounts[i, b] = _steps_from(i, row, e, last, gammas[i], num_steps, reward, flags)
+            actions[i, b] = action[i, row, e]
+            _last_states(i, row, e, state, flags, states[i, b])
+            _last_states(i, at, e, state, flags, nexts[i, b])
+            for f in range(1, frames):
+                nexts[i, b, f - 1] = nexts[i, b, f]
+            nexts[i, b, frames - 1] = following[i, at, e]
+
+
+@njit(cache=True, nogil=True)
+def _steps_from(i, row, e, last, gamma, num_steps, reward, flags):
+    """(the row where they end, return, discount of what follows) of at most `num_steps` steps from a row."""
+    size = reward.shape[1]
+    total, factor, at = 0.0, 1.0, row
+    for n in range(num_steps):
+        at = (row + n) % size
+        total += factor * reward[i, at, e]
+        factor *= gamma
+        if flags[i, at, e] & DONE or at == last:
+            break
+    ended = flags[i, at, e] & DONE and not flags[i, at, e] & TIMEOUT
+    return at, float32(total), float32(0.0) if ended else float32(factor)
+
+
+@njit(cache=True, nogil=True)
+def _last_states(i, row, e, state, flags, out):
+    """out (k,) = the state of a row and those of the k - 1 before it, the oldest first."""
+    size = state.shape[1]
+    for f in range(len(out) - 1, -1, -1):
+        out[f] = state[i, row, e]
+        before = row - 1 if row > 0 else size - 1
+        if not flags[i, before, e] & DONE:
+            row = before
 
 
 @njit(cache=True, nogil=True)

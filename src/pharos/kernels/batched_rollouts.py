@@ -47,7 +47,7 @@ def shuffle(keys, step, draw, order):
 def gather(order, first, sources, targets):
     """targets (W, B) of five arrays = the entries order[:, first : first + B] of sources (W, M).
 
-    The arrays: states, actions, logarithms of probabilities, advantages, returns.
+    The arrays: states, or histories with one more axis, actions, logarithms of probabilities, advantages, returns.
     """
     for i in range(targets[0].shape[0]):
         for b in range(targets[0].shape[1]):

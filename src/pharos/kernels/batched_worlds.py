@@ -51,6 +51,25 @@ def look_up(table, begins, states, out):
 
 
 @njit(cache=True, nogil=True)
+def look_up_frames(table, begins, histories, piece, out):
+    """out (W, pitch): `piece` entries of each frame in turn, the oldest first, of the histories (W, B, k) of each run.
+
+    table (R, length): a row for each frame, of which `piece` is a part; begins (W,): the row of each run's first state.
+    """
+    length, frames = table.shape[1], histories.shape[2]
+    for i in range(histories.shape[0]):
+        for b in range(histories.shape[1]):
+            for f in range(frames):
+                row = table[begins[i] + histories[i, b, f]]
+                at = b * length * frames + f * piece
+                for first in range(0, length, piece):
+                    target = out[i, at : at + piece]
+                    for j in range(piece):
+                        target[j] = row[first + j]
+                    at += frames * piece
+
+
+@njit(cache=True, nogil=True)
 def write_drawn(raw, places, members, out):
     """out (W, pitch): the entries `places` (size,) of observations, B of each of the runs `members`, one run after
     another in raw (len(members) B, M).

@@ -26,7 +26,8 @@ class ObservationInContext:
         space: Gymnasium space of what the agent gets.
         names: of the entries of a vector; None for others.
         has_more: whether frames or coins are wanted.
-        is_plain: whether that, the previous action and the remaining time are not.
+        is_alone: whether neither the previous action nor the remaining time is wanted.
+        is_plain: whether nothing at all is: a function of the state.
     Raises:
         ParameterError: the remaining time is wanted where there is no time limit.
     """
@@ -40,15 +41,15 @@ class ObservationInContext:
         self.observation = observation
         self.names = observation.names
         self.has_more = observation.frames > 1 or observation.irrelevant > 0
-        self.is_plain = not previous_action and not remaining_time and not self.has_more
+        self.is_alone = not previous_action and not remaining_time
+        self.is_plain = self.is_alone and not self.has_more
         self.is_vector = isinstance(observation, Vector)
         self._previous_action = previous_action
         self._remaining_time = remaining_time
         self._limit = limit
         self._num_actions = env.num_actions
         self.space: Space = observation.space
-        self._is_alone = not previous_action and not remaining_time
-        if self._is_alone:
+        if self.is_alone:
             return
         if self.is_vector:
             self.names = (
@@ -94,7 +95,7 @@ class ObservationInContext:
             self._write_context(out, column + self.observation.irrelevant, previous, elapsed)
             return out
         seen = self.observation(states) if seen is None else seen
-        if self._is_alone:
+        if self.is_alone:
             return seen
         batch: dict[str, Any] = {"observation": seen}
         if self._previous_action:
@@ -108,7 +109,7 @@ class ObservationInContext:
         if self.is_plain:
             return self.observation.one(state)
         batch = self(state[None], np.array([previous]), np.array([elapsed]))
-        return batch[0] if self.is_vector or self._is_alone else {name: values[0] for name, values in batch.items()}
+        return batch[0] if self.is_vector or self.is_alone else {name: values[0] for name, values in batch.items()}
 
     def _write_context(self, out: np.ndarray, column: int, previous: np.ndarray, elapsed: np.ndarray) -> None:
         if self._previous_action:

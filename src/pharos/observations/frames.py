@@ -21,6 +21,7 @@ class Frames(Observation):
 
     Attributes:
         frames: k.
+        channel_axis: of an observation, on which frames lie one after another.
     """
 
     def _stack(self, frames: Any, channels: int) -> None:
@@ -33,7 +34,7 @@ class Frames(Observation):
 
         if isinstance(frames, bool) or not isinstance(frames, int) or not 1 <= frames <= MOST:
             raise ParameterError(f"{self.name} of {self.env}: frames is {frames!r}; expected 1 to {MOST}")
-        self.frames, self._channels = frames, channels
+        self.frames, self.channel_axis = frames, channels
         if frames > 1:
             shape: Any = list(self.space.shape or ())
             shape[channels] *= frames
@@ -51,7 +52,7 @@ class Frames(Observation):
     def stacked(self, frames: np.ndarray) -> np.ndarray:
         """(N, *space.shape) of N histories of k frames (N, k, ...), the oldest first; a fresh array."""
         parts = [frames[:, i] for i in range(self.frames)]
-        return np.concatenate(parts, axis=1 + self._channels)
+        return np.concatenate(parts, axis=1 + self.channel_axis)
 
     def of_histories(self, histories: np.ndarray) -> np.ndarray:
         """(N, *space.shape) of N times k states (N, k, D), the oldest first."""

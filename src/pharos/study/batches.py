@@ -61,7 +61,7 @@ class Batches:
         self.device = device
         self.folder = folder / BATCHES
         self.most: dict[str, int] = {}  # of runs whose batch was too large for memory: how many may be together
-        self.shapes: dict[str, Hashable] = {}
+        self.seen: dict[str, SimpleNamespace] = {}
         self.keys: dict[str, Hashable] = {}  # by id
         self.stored: dict[str, frozenset[str]] = {}
         self.look()
@@ -98,7 +98,7 @@ class Batches:
 
     def width(self, run: Run) -> int:
         """How many runs may be in a batch of this one."""
-        is_image = not run.configuration.is_tabular and len(self._shape(run)[0]) == 3
+        is_image = not run.configuration.is_tabular and len(self._seen(run).shape) == 3
         usual = TABLES if run.configuration.is_tabular else lane_width(is_image, self.device)
         return min(usual, self.most.get(run.id, usual))
 
@@ -114,36 +114,35 @@ class Batches:
         config = run.configuration
         if config.is_tabular:
             return (config.agent, config.environment)
-        shape, dtype, is_image = self._shape(run)
         try:
             env = config.make_environment(trust=True)
             mdp = SimpleNamespace(num_actions=env.num_actions, num_states=most_states(env))
-            observation = SimpleNamespace(shape=shape, dtype=dtype, is_image=is_image)
             run_in_short: Any = SimpleNamespace(
-                observe=observation, mdp=mdp, hyperparameters=config.hyperparameters, steps=config.steps
+                observe=self._seen(run), mdp=mdp, hyperparameters=config.hyperparameters, steps=config.steps
             )
             key = group_key(config.agent, run_in_short, self.device)
         except Exception:  # what is wrong with it, the run will say
             return run.id
         return (config.agent, config.steps, config.evaluation_interval, key)
 
-    def _shape(self, run: Run) -> Any:
-        """(shape, type, whether it is an image) of what the agent sees, told without the states."""
+    def _seen(self, run: Run) -> Any:
+        """Shape, type and frames of what the agent sees, and whether it is an image; told without the states."""
         config = run.configuration
         entry = run.config
         names = ("environment", "parameters", "observation", "observation_options")
         key = json.dumps([entry[name] for name in names], sort_keys=True)
-        if key not in self.shapes:
+        if key not in self.seen:
             from pharos.observations import observe
 
             try:
                 task = config.task(trust=True)
-                space = observe(task.env, task.observation, **dict(task.observation_options)).space
-                shape = tuple(space.shape or ())
-                self.shapes[key] = (shape, str(space.dtype), len(shape) == 3 and str(space.dtype) == "uint8")
+                observation = observe(task.env, task.observation, **dict(task.observation_options))
+                shape, dtype = tuple(observation.space.shape or ()), str(observation.space.dtype)
+                is_image, frames = len(shape) == 3 and dtype == "uint8", observation.frames
             except Exception:
-                self.shapes[key] = ((), key, False)
-        return self.shapes[key]
+                shape, dtype, is_image, frames = (), key, False, 1
+            self.seen[key] = SimpleNamespace(shape=shape, dtype=dtype, is_image=is_image, frames=frames)
+        return self.seen[key]
 
     def halve(self, unit: Sequence[Run]) -> None:
         """The process of this batch was killed too often: its runs go on in halves, from the beginning."""

@@ -70,7 +70,7 @@ class Batch:
             at_point(point)
 
     def best_actions(self, states: np.ndarray) -> np.ndarray:
-        """(N,) the action that each run likes best in its own state (N,)."""
+        """(N,) the action that each run likes best in its own state (N,), or history (N, k) where it sees k frames."""
         return np.concatenate(
             [lane.best_actions(states[k * self.width : (k + 1) * self.width]) for k, lane in enumerate(self.lanes)]
         )

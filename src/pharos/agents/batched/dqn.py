@@ -30,7 +30,7 @@ class DQNLane(Lane):
         self.target = self.parameters.clone()
         self.target_values = self.views(self.target)
         size, rows = int(self.shared["batch_size"]), int(self.shared["buffer_size"])
-        self.replay = Replay(self.keys, self.number, rows, self.copies, size, device)
+        self.replay = Replay(self.keys, self.number, rows, self.copies, size, device, runs[0].observe.frames)
         self._dq = torch.zeros((width, size, self.num_actions), device=device)
         self._descend = Program(self.descend, device)
         self.epsilon = np.zeros(width)
@@ -56,7 +56,7 @@ class DQNLane(Lane):
         is_warming = self.steps < self.own["learning_starts"]
         kernels.exploring(self.keys, self.calls, self.epsilon, is_warming, self._explores)
         if not self._explores[: self.number].all():
-            scores = self.scores_of(worlds.state)
+            scores = self.scores_of(worlds.seen)
         kernels.choose(self.keys, self.calls, self._explores, scores, self.actions)
         before = worlds.state.copy()
         self.move()

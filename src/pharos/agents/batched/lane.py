@@ -29,6 +29,7 @@ class Lane:
         shared: hyperparameters of all of them; own: name -> (W,) those that are numbers.
         steps: of each run so far; calls: of all copies together; collected: calls of the rollout that goes on.
         total: steps of the whole training.
+        depth: (k,) where k frames are seen, so that what is seen is k numbers of states; else ().
         is_due: whether an update waits.
     """
 
@@ -47,7 +48,8 @@ class Lane:
         self.num_actions = runs[0].mdp.num_actions
         self.keys = np.array([run.key % 2**64 for run in self.runs], np.uint64)
         self.is_idle = np.arange(width) >= len(runs)
-        self.worlds = Worlds(self.runs, self.keys, self.copies)
+        self.worlds = Worlds(self.runs, self.keys, self.copies, runs[0].observe.frames)
+        self.depth = self.worlds.depth
         self.actions = np.zeros((width, self.copies), np.int64)
         self.seen = (Seen if device == "cpu" else SeenOnDevice)(self.runs, device)
         self._rooms: dict[int, torch.Tensor] = {}
@@ -63,7 +65,7 @@ class Lane:
         self.loss = Mirror((width,), torch.float64, device)
         self.values: Values = self.views(self.parameters)
         self.gradient_views: Values = self.network.parameters.views(self.gradients)
-        self._asked = Mirror((width, self.copies), torch.int64, device)
+        self._asked = Mirror((width, self.copies, *self.depth), torch.int64, device)
         self._scores = Mirror((width, self.copies, self.num_actions), torch.float32, device)
         self._answer = Program(self.answer, device)
         self.steps = self.calls = self.collected = 0
@@ -118,7 +120,7 @@ class Lane:
         return views if self.seen.mask is None else {**views, MASK: self.seen.mask}
 
     def observed(self, states: Mirror) -> torch.Tensor:
-        """(W, B, size) float32 observations of states (W, B); they stay until the next call with as many."""
+        """(W, B, size) float32 observations of states (W, B, *depth); they stay until the next call with as many."""
         number = states.array.shape[1]
         if number not in self._rooms:
             self._rooms[number] = room(self.width, number, self.seen.size, device=self.device)
@@ -131,7 +133,7 @@ class Lane:
         self._scores.fetch()
 
     def scores_of(self, states: np.ndarray) -> np.ndarray:
-        """(W, E, A) scores of states (W, E), which stay until the next call."""
+        """(W, E, A) scores of states (W, E, *depth), which stay until the next call."""
         wait(self.device)
         self._asked.array[:] = states
         self._answer()
@@ -139,8 +141,8 @@ class Lane:
         return self._scores.array
 
     def best_actions(self, states: np.ndarray) -> np.ndarray:
-        """(number,) the action with the highest score in the state (number,) of each run."""
-        rows = np.zeros((self.width, self.copies), np.int64)
+        """(number,) the action with the highest score in what each run sees, states (number, *depth)."""
+        rows = np.zeros((self.width, self.copies, *self.depth), np.int64)
         rows[: self.number, 0] = states
         best: np.ndarray = self.scores_of(rows)[: self.number, 0].argmax(axis=1)
         return best

@@ -18,8 +18,9 @@ class PPOLane(Lane):
     """W runs of PPO.
 
     Attributes:
-        states, next_states, actions_taken (W, T, E) int64, log_probabilities, kept_values, rewards, begins, advantages
-            (W, T, E) float32: the rollout that goes on; begins is 1 where a step is the first of its episode.
+        states, next_states (W, T, E, *depth), actions_taken (W, T, E) int64, log_probabilities, kept_values, rewards,
+            begins, advantages (W, T, E) float32: the rollout that goes on; begins is 1 where a step is the first of its
+            episode.
         timeouts: (W, T, E) bool, whether a step was cut off by the time limit.
         begin: (W, E) float32, whether the next step is the first of its episode.
         weights: (W,) float64 each: the clip range, and what entropy and value weigh in the loss.
@@ -31,7 +32,8 @@ class PPOLane(Lane):
     def __init__(self, runs: Any, width: int, device: str = "cpu"):
         super().__init__(runs, width, device)
         shape = (width, int(self.shared["n_steps"]), self.copies)
-        self.states, self.next_states, self.actions_taken = (np.zeros(shape, np.int64) for _ in range(3))
+        self.states, self.next_states = (np.zeros((*shape, *self.depth), np.int64) for _ in range(2))
+        self.actions_taken = np.zeros(shape, np.int64)
         self.log_probabilities, self.kept_values, self.rewards, self.begins, self.advantages = (
             np.zeros(shape, np.float32) for _ in range(5)
         )
@@ -66,11 +68,11 @@ class PPOLane(Lane):
     def step(self) -> None:
         """As `Lane` says."""
         worlds, t = self.worlds, self.collected
-        scores = self.scores_of(worlds.state)
+        scores = self.scores_of(worlds.seen)
         kernels.act(self.keys, self.calls, scores, self.actions, self._log_p)
-        self.states[:, t] = worlds.state
+        self.states[:, t] = worlds.seen
         self.move()
-        self.next_states[:, t], self.actions_taken[:, t] = worlds.next_state, self.actions
+        self.next_states[:, t], self.actions_taken[:, t] = worlds.next_seen, self.actions
         self.log_probabilities[:, t], self.kept_values[:, t] = self._log_p, self._valued.array[..., 0]
         self.rewards[:, t], self.begins[:, t] = worlds.reward, self.begin
         self.timeouts[:, t] = worlds.flags & kernels.TIMEOUT
@@ -83,21 +85,21 @@ class PPOLane(Lane):
     def update(self) -> None:
         """As `Lane` says."""
         self.add_values_of_cut_episodes()
-        last = self.values_of(self.worlds.state)
+        last = self.values_of(self.worlds.seen)
         rollouts.advantages(
             self.rewards, self.kept_values, self.begins, last, self.begin > 0, self.own["gamma"],
             self.own["gae_lambda"], self.advantages,
         )  # fmt: skip
         returns = self.advantages + self.kept_values
         parts = (self.states, self.actions_taken, self.log_probabilities, self.advantages, returns)
-        sources = tuple(part.reshape(self.width, -1) for part in parts)
+        sources = tuple(part.reshape(self.width, -1, *part.shape[3:]) for part in parts)
         number, size = self._order.shape[1], int(self.shared["batch_size"])
         is_active = ~self.is_idle
         for epoch in range(int(self.shared["n_epochs"])):
             rollouts.shuffle(self.keys, self.calls, epoch, self._order)
             for first in range(0, number, size):
                 shape = (self.width, min(size, number - first))
-                minibatch = tuple(np.empty(shape, part.dtype) for part in sources)
+                minibatch = tuple(np.empty((*shape, *part.shape[2:]), part.dtype) for part in sources)
                 rollouts.gather(self._order, first, sources, minibatch)
                 is_active &= self.learn_minibatch(minibatch, is_active)
                 if not is_active.any():
@@ -109,17 +111,19 @@ class PPOLane(Lane):
         if not len(runs):
             return
         rank = np.arange(len(runs)) - np.searchsorted(runs, runs)  # of each among those of its run
-        rewards, following = (part.reshape(self.width, -1) for part in (self.rewards, self.next_states))
+        rewards, following = (
+            part.reshape(self.width, -1, *part.shape[3:]) for part in (self.rewards, self.next_states)
+        )
         for block in range(int(rank.max()) // self.copies + 1):
             now = rank // self.copies == block
             i, place, column = runs[now], places[now], rank[now] % self.copies
-            states = self.worlds.state.copy()
+            states = self.worlds.seen.copy()
             states[i, column] = following[i, place]
             value = self.own["gamma"][i] * self.values_of(states)[i, column].astype(np.float64)
             rewards[i, place] = (rewards[i, place] + value).astype(np.float32)
 
     def values_of(self, states: np.ndarray) -> np.ndarray:
-        """(W, E) float32 values of states (W, E)."""
+        """(W, E) float32 values of states (W, E, *depth)."""
         self.scores_of(states)
         return self._valued.array[..., 0].copy()
 
@@ -127,7 +131,8 @@ class PPOLane(Lane):
         """One step of gradient descent for the active runs, unless the policy has moved too far; (W,) those that did.
 
         Args:
-            minibatch: (states, actions, logarithms of probabilities, advantages, returns), (W, B) each.
+            minibatch: (states, actions, logarithms of probabilities, advantages, returns), (W, B) each, states
+                (W, B, *depth).
         """
         size = minibatch[0].shape[1]
         if size not in self._lessons:
@@ -156,13 +161,15 @@ class Lesson:
     """What PPO learns from minibatches of one size: forwards with the loss, backwards with Adam; a GPU records both.
 
     Attributes:
-        minibatch: states, actions (W, B) int64, old logarithms of probabilities, advantages, returns (W, B) float32.
+        minibatch: states (W, B, *depth), actions (W, B) int64, old logarithms of probabilities, advantages, returns
+            (W, B) float32.
     """
 
     def __init__(self, lane: PPOLane, size: int):
         device, shape = lane.device, (lane.width, size)
         kinds = [torch.int64] * 2 + [torch.float32] * 3
-        self.minibatch = tuple(Mirror(shape, kind, device) for kind in kinds)
+        shapes = [(*shape, *lane.depth), *[shape] * 4]
+        self.minibatch = tuple(Mirror(each, kind, device) for each, kind in zip(shapes, kinds, strict=True))
         self._lane = lane
         self._gradients = tuple(torch.zeros((*shape, last), device=device) for last in (lane.num_actions, 1))
         self.assess, self.descend = Program(self._assess, device), Program(self._descend, device)

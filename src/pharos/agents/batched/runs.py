@@ -3,7 +3,7 @@
 import math
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -84,20 +84,23 @@ class ObservationSource:
     """What the states of a space look like, by their numbers.
 
     Attributes:
+        frames: k, how many states an observation shows, the last ones of the episode.
         shape, dtype: of one observation.
         is_image: whether Stable-Baselines3 takes it for an image: (C, H, W) or (H, W, C) uint8 from 0 to 255.
         num_states: S.
     Raises:
-        ParameterError: the observation is more than a function of the state.
+        ParameterError: the observation is more than a function of the last k states.
     """
 
     def __init__(self, space: "StateSpace", observe: "ObservationInContext"):
-        if not observe.is_plain:
+        if not observe.is_alone or observe.observation.irrelevant:
             raise ParameterError(
-                "the batched engine sees functions of the state; expected neither previous_action nor remaining_time, "
-                "frames or irrelevant entries; the engine sb3 has them"
+                "the batched engine sees functions of the last states; expected neither previous_action nor "
+                "remaining_time or irrelevant entries; the engine sb3 has them"
             )
-        self.space, self.observe, self.num_states = space, observe.observation, space.num_states
+        self.space, self.num_states = space, space.num_states
+        self.observe = cast(Any, observe.observation)
+        self.frames: int = self.observe.frames
         box = observe.space
         self.shape, self.dtype = tuple(box.shape or ()), np.dtype(box.dtype)  # type: ignore[arg-type]
         if not self.shape:
@@ -106,6 +109,11 @@ class ObservationSource:
         if len(self.shape) == 3 and self.dtype == np.uint8:
             low, high = np.asarray(getattr(box, "low", 1)), np.asarray(getattr(box, "high", 1))
             self.is_image = bool((low == 0).all() and (high == 255).all())
+        if self.frames > 1 and self.observe.channel_axis != (2 if as_networks_see(self.shape, True)[1] else 0):
+            raise ParameterError(
+                f"the batched engine: {self.frames} frames have as many channels as rows, {self.shape}, and networks "
+                f"would take the rows for channels; expected fewer frames, or a larger size; the engine sb3 has it"
+            )
 
     @staticmethod
     def of(space: "StateSpace", observe: "ObservationInContext") -> "ObservationSource":
@@ -113,8 +121,15 @@ class ObservationSource:
         return ObservationSource(space, observe)
 
     def at(self, indices: np.ndarray) -> np.ndarray:
-        """(N, ...): the observations of states (N,)."""
-        return self.observe(self.space.states(indices))
+        """(N, ...): the observations of states (N,); of histories (N, k), the oldest first, where k frames are seen."""
+        states = self.space.states(indices.ravel())
+        if self.frames == 1:
+            return np.asarray(self.observe(states))
+        return np.asarray(self.observe.of_histories(states.reshape(*indices.shape, -1)))
+
+    def frame(self, indices: np.ndarray) -> np.ndarray:
+        """(N, ...): one frame of each of the states (N,)."""
+        return np.asarray(self.observe.frame(self.space.states(indices)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,6 +214,7 @@ def group_key(agent: str, run: BatchRun, device: str = "cpu") -> Hashable:
     options = resolved(agent, run.hyperparameters)
     shared = tuple((name, repr(options[name])) for name in OF_A_BATCH[agent])
     observation: tuple[Any, ...] = (tuple(run.observe.shape), str(run.observe.dtype), run.observe.is_image)
+    frames = run.observe.frames
     remembers = device == "cpu" and agent == "dqn" and remembers_targets(run)
     if device != "cpu":
         shape, _ = as_networks_see(tuple(run.observe.shape), run.observe.is_image)
@@ -206,7 +222,7 @@ def group_key(agent: str, run: BatchRun, device: str = "cpu") -> Hashable:
             observation = ("small image", shape[0], _scale(shape[1] * shape[2]))
         elif not run.observe.is_image:
             observation = ("vector", _scale(math.prod(shape)))
-    return agent, run.steps, run.mdp.num_actions, observation, shared, remembers
+    return agent, run.steps, run.mdp.num_actions, observation, frames, shared, remembers
 
 
 def _scale(number: int) -> int:
@@ -230,7 +246,12 @@ def as_networks_see(shape: tuple[int, ...], is_image: bool) -> tuple[tuple[int, 
 
 
 def remembers_targets(run: BatchRun) -> bool:
-    """Whether DQN asks its target network about every state once a copy, as that is less than all minibatches ask."""
+    """Whether DQN asks its target network about every state once a copy, as that is less than all minibatches ask.
+
+    Never where several frames are seen: there are more histories than states.
+    """
+    if run.observe.frames > 1:
+        return False
     options = resolved("dqn", run.hyperparameters)
     rollout = options["train_freq"] * options["n_envs"]
     updates = options["gradient_steps"] if options["gradient_steps"] >= 0 else rollout

@@ -37,11 +37,14 @@ class Worlds:
 
     Attributes:
         state: (W, E) int64, where each is.
+        depth: () where an agent sees the state alone, (k,) where it sees the last k states of the episode.
+        history: (W, E, k), those states, the oldest first; the first one of an episode stands for those before it.
         episodes, returns: (W,) finished episodes, and the sums of their returns.
         next_state, reward, flags: (W, E) of the last step; the reward is what was paid, late or with noise.
+        next_history: (W, E, k), what is seen after the last step, before a new episode begins.
     """
 
-    def __init__(self, runs: Sequence[BatchRun], keys: np.ndarray, copies: int):
+    def __init__(self, runs: Sequence[BatchRun], keys: np.ndarray, copies: int, frames: int = 1):
         width = len(runs)
         by_table: dict[Any, list[int]] = {}
         for i, run in enumerate(runs):
@@ -63,6 +66,19 @@ class Worlds:
         self.reward, self.flags = np.zeros((width, copies)), np.zeros((width, copies), np.uint8)
         for world in self.worlds:
             kernels.start(keys, world.members, world.starts, world.cumulative, self.state)
+        self.depth = (frames,) if frames > 1 else ()
+        self.history = np.repeat(self.state[..., None], frames, axis=2)
+        self.next_history = self.history.copy()
+
+    @property
+    def seen(self) -> np.ndarray:
+        """(W, E, *depth): the numbers of the states that agents see now."""
+        return self.history if self.depth else self.state
+
+    @property
+    def next_seen(self) -> np.ndarray:
+        """(W, E, *depth): of those that the last step led to, before a new episode begins."""
+        return self.next_history if self.depth else self.next_state
 
     def step(self, step: int, actions: np.ndarray, *, counts: bool) -> None:
         """Execute actions (W, E); finished episodes are added up where `counts` is true."""
@@ -74,8 +90,13 @@ class Worlds:
                 world.transitions, world.rewards, world.staying, world.terminal, world.starts, world.cumulative,
                 world.members, setting, self._knobs, actions, episodes, self.pending, transition, counts,
             )  # fmt: skip
+        if self.depth:
+            self.next_history[..., :-1], self.next_history[..., -1] = self.history[..., 1:], self.next_state
+            ended = (self.flags & kernels.DONE) > 0
+            self.history[:] = np.where(ended[..., None], self.state[..., None], self.next_history)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """All that changes."""
         names = ["state", "previous", "elapsed", "running", "discount", "episodes", "returns"]
-        return {name: getattr(self, name) for name in [*names, *(["pending"] if self.pending.size else [])]}
+        more = [*(["pending"] if self.pending.size else []), *(["history"] if self.depth else [])]
+        return {name: getattr(self, name) for name in [*names, *more]}

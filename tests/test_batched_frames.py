@@ -1,0 +1,316 @@
+"""Stacked frames in the batched engine: agents see what Stable-Baselines3 shows them, step by step."""
+
+import importlib
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from stable_baselines3 import DQN, PPO
+from stable_baselines3.common.vec_env import VecEnvWrapper
+
+import pharos
+from pharos.agents import make_model
+from pharos.agents.batched import BatchRun, ObservationSource, group_key, make_batch, observed
+from pharos.errors import ParameterError
+from pharos.experiments import Task, evaluate_agent, load_agent, train_many
+from pharos.interaction import make_sb3_vec
+from pharos.kernels import batched_learning as learning
+from pharos.kernels import batched_worlds as worlds
+from pharos.kernels import philox
+from pharos.policies import walk_values
+
+BREAKOUT = pharos.make("breakout", height=6, columns=3, brick_rows=1)
+SIGHTS = {
+    "small": ("simple_image", {"frames": 3, "grey": True}),
+    "planes": ("simple_image", {"frames": 2, "motion": True}),
+    "large": ("complex_image", {"frames": 2, "size": (40, 44)}),
+    "channels first": ("complex_image", {"frames": 3, "size": (20, 24), "grey": True, "channels_first": True}),
+}
+DQN_OPTIONS = {"learning_rate": 0.01, "buffer_size": 60, "learning_starts": 20, "batch_size": 8, "train_freq": 4,
+               "n_envs": 2, "target_update_interval": 10, "net_arch": [12], "n_steps": 2}  # fmt: skip
+PPO_OPTIONS = {"n_envs": 3, "n_steps": 16, "batch_size": 24, "n_epochs": 2, "net_arch": [6], "gamma": 0.9}
+AGENTS = {"dqn": DQN_OPTIONS, "ppo": PPO_OPTIONS}
+RUN, LIMIT = 1, 9
+
+
+def task_of(sight="small", **options):
+    name, seen = SIGHTS[sight]
+    return Task(BREAKOUT, observation=name, observation_options=seen, horizon=LIMIT, **options)
+
+
+def runs_of(task, hyperparameters, number=3, steps=120):
+    source = ObservationSource.of(task.space, task.sight.observe)
+    return [
+        BatchRun(task.mdp, source, task.time_limit, hyperparameters, steps, i, 2**40 + 977 * i) for i in range(number)
+    ]
+
+
+class Scripted(VecEnvWrapper):
+    """An environment in which the actions of a script are executed, whatever those that are chosen."""
+
+    def __init__(self, env, script):
+        super().__init__(env)
+        self.script, self.at = script, 0
+
+    def reset(self):
+        return self.venv.reset()
+
+    def step_async(self, actions):
+        self.venv.step_async(self.script[self.at])
+        self.at += 1
+
+    def step_wait(self):
+        return self.venv.step_wait()
+
+
+def recorded(agent, task, hyperparameters, steps):
+    """A lane that has taken its steps, without updates; and the environment in which Stable-Baselines3 takes them."""
+    (lane,) = make_batch(agent, runs_of(task, hyperparameters, steps=steps)).lanes
+    script, flags, move = [], set(), lane.move
+
+    def record():
+        move()
+        script.append(lane.actions[RUN].copy())
+        flags.update(lane.worlds.flags[RUN].tolist())
+
+    lane.move = record
+    env = make_sb3_vec(task.env, lane.copies, seed=0, **task.interaction)
+    return lane, Scripted(env, script), flags
+
+
+def channels_first(observations, shape):
+    """Images (N, ...) as Stable-Baselines3 keeps them, in this shape."""
+    return observations if observations.shape[1:] == tuple(shape) else np.moveaxis(observations, -1, 1)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("n_steps", [1, 3])
+@pytest.mark.parametrize("sight", SIGHTS)
+def test_dqn_learns_from_the_frames_that_stable_baselines3_keeps(sight, n_steps, monkeypatch):
+    """From a memory that has gone round, with episodes that end and that are cut off."""
+    hyperparameters = {**DQN_OPTIONS, "n_steps": n_steps, "buffer_size": 63, "n_envs": 3, "exploration_final_eps": 1.0}
+    task, total = task_of(sight), 600
+    lane, env, flags = recorded("dqn", task, hyperparameters, total)
+    monkeypatch.setattr(lane, "learn_minibatch", lambda: None)
+    lane.advance(total)
+    assert flags == {0, worlds.DONE, worlds.DONE | worlds.TIMEOUT}
+    model = make_model(DQN, env, hyperparameters, seed=0)
+    monkeypatch.setattr(model, "train", lambda **_: None)
+    model.learn(total)
+    buffer, memory, frames = model.replay_buffer, lane.replay, task.observation_options["frames"]
+    assert buffer.full and buffer.buffer_size == memory.size == 21
+    assert memory.memory[0].shape[1] == memory.rows == memory.size + frames - 1
+    assert set(memory.memory[4][RUN].ravel().tolist()) == flags
+
+    size, place = 400, lane.calls % memory.rows
+    states, nexts = (np.zeros((lane.width, size, frames), np.int64) for _ in range(2))
+    actions = np.zeros((lane.width, size), np.int64)
+    rewards, factors = (np.zeros((lane.width, size), np.float32) for _ in range(2))
+    batch = (states, nexts, actions, rewards, factors)
+    gammas = lane.own["gamma"]
+    learning.sample_histories(lane.keys, 7, 0, place, memory.size, gammas, n_steps, memory.memory, batch)
+    words = np.zeros((lane.width, size, 4), np.uint32)
+    philox.words(lane.keys, worlds.SAMPLE, 7, words)
+    drawn = (((words[RUN, :, k].astype(np.uint64) * n) >> 32) for k, n in ((0, memory.size), (1, lane.copies)))
+    rows, copies = (each.astype(np.int64) for each in drawn)
+    assert set(rows.tolist()) == set(range(memory.size)), "all of the memory is among them"
+    monkeypatch.setattr(np.random, "randint", lambda *_, **__: copies)
+    theirs = buffer._get_samples((lane.calls - memory.size + rows) % memory.size)
+    source = lane.runs[RUN].observe
+    for mine, their in ((states, theirs.observations), (nexts, theirs.next_observations)):
+        assert (channels_first(source.at(mine[RUN]), their.shape[1:]) == their.numpy()).all()
+    assert np.abs(rewards[RUN] - theirs.rewards.numpy()[:, 0]).max() <= 1e-6
+    assert len(np.unique(states[RUN], axis=0)) > len(np.unique(states[RUN, :, -1])), "frames tell more than one"
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("sight", SIGHTS)
+def test_ppo_gathers_the_frames_and_values_that_stable_baselines3_gathers(sight, monkeypatch):
+    """Its values are those of the same network: of each observation, and of the last one before a time limit."""
+    task, total = task_of(sight), 4 * 48
+    lane, env, flags = recorded("ppo", task, PPO_OPTIONS, total)
+    monkeypatch.setattr(lane, "learn_minibatch", lambda minibatch, is_active: is_active)
+    names, ours, theirs = ("states", "rewards", "kept_values", "begins", "advantages"), [], []
+    update = lane.update
+
+    def keep():
+        update()
+        ours.append({name: getattr(lane, name)[RUN].copy() for name in names})
+
+    monkeypatch.setattr(lane, "update", keep)
+    lane.advance(total)
+    assert flags == {0, worlds.DONE, worlds.DONE | worlds.TIMEOUT}
+    model = make_model(PPO, env, PPO_OPTIONS, seed=0)
+    model.policy.load_state_dict({name: torch.from_numpy(array) for name, array in lane.stored(RUN).items()})
+    buffer = model.rollout_buffer
+    kept = ("observations", "rewards", "values", "episode_starts", "advantages")
+    monkeypatch.setattr(model, "train", lambda: theirs.append({name: getattr(buffer, name).copy() for name in kept}))
+    model.learn(total)
+    assert len(ours) == len(theirs) == 4
+    source = lane.runs[RUN].observe
+    for mine, their in zip(ours, theirs, strict=True):
+        steps, copies, *shape = their["observations"].shape
+        seen = source.at(mine["states"].reshape(steps * copies, -1))
+        assert (channels_first(seen, tuple(shape)).reshape(their["observations"].shape) == their["observations"]).all()
+        assert (their["episode_starts"] == mine["begins"]).all()
+        for name, counterpart in (("rewards", "rewards"), ("values", "kept_values"), ("advantages", "advantages")):
+            assert np.abs(their[name] - mine[counterpart]).max() <= 1e-6, name
+
+
+def outcome(batch, i):
+    """All that a run leaves behind, as bytes."""
+    parts = [value.tobytes() for value in batch.parameters(i).values()]
+    return b"".join([*parts, batch.episodes[i].tobytes(), batch.returns[i].tobytes()])
+
+
+def learned(agent, runs, points=(60, 120), **options):
+    batch = make_batch(agent, runs, **options)
+    batch.learn(points, lambda point: None)
+    return batch
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("agent", AGENTS)
+def test_a_run_with_frames_is_the_same_alone_among_others_and_drawn(agent, monkeypatch):
+    """`drawn`: where pictures fit no table."""
+    runs = runs_of(task_of(sticky=0.1), AGENTS[agent], 11)
+    runs[5] = replace(runs[5], reward_noise=0.1, reward_delay=3)
+    together, backwards = learned(agent, runs), learned(agent, runs[::-1])
+    alone = outcome(learned(agent, runs[5:6]), 0)
+    assert outcome(together, 5) == alone
+    assert all(outcome(together, i) == outcome(backwards, 10 - i) for i in range(11))
+    assert len({outcome(together, i) for i in range(11)}) == 11
+    monkeypatch.setattr(observed, "LARGEST_TABLE", 0)
+    assert outcome(learned(agent, runs[5:6]), 0) == alone
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("agent", AGENTS)
+def test_a_batch_with_frames_goes_on_from_its_state_bit_for_bit(agent):
+    runs, kept = runs_of(task_of(), {**AGENTS[agent], "n_envs": 3}, steps=240), {}
+    batch = make_batch(agent, runs)
+    batch.learn([99, 150, 240], lambda point: kept.setdefault(point, batch.state()))
+    for point in (99, 150):  # before and after the memory has gone round
+        resumed = make_batch(agent, runs)
+        resumed.restore(kept[point])
+        resumed.learn([240], lambda point: None)
+        assert all((resumed.state()[name] == array).all() for name, array in batch.state().items())
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("agent", AGENTS)
+def test_frames_elsewhere_are_those_of_the_processor(agent):
+    """On other devices a table of single pictures lies there; sizes share a lane."""
+    courts = (BREAKOUT, pharos.make("breakout", height=5, columns=4, brick_rows=1))
+    tasks = [Task(env, observation="simple_image", observation_options={"frames": 2, "grey": True}) for env in courts]
+    runs = [run for i, task in enumerate(tasks) for run in runs_of(task, AGENTS[agent], 2 + i)]
+    elsewhere = learned(agent, runs, device="cpu:0")
+    assert len(elsewhere.lanes) == 1
+    for first, last in ((0, 2), (2, 5)):
+        usual = learned(agent, runs[first:last])
+        for i in range(last - first):
+            mine, theirs = elsewhere.parameters(first + i), usual.parameters(i)
+            assert max(np.abs(mine[name] - theirs[name]).max() for name in mine) <= 1e-4
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("sight", SIGHTS)
+def test_what_is_looked_up_is_what_is_drawn(sight, monkeypatch):
+    task = task_of(sight)
+    runs = runs_of(task, DQN_OPTIONS, 1)
+    in_table, drawn = make_batch("dqn", runs).lanes[0], None
+    monkeypatch.setattr(observed, "LARGEST_TABLE", 0)
+    drawn = make_batch("dqn", runs).lanes[0]
+    assert in_table.seen._table is not None and drawn.seen._table is None
+    histories = np.random.default_rng(0).integers(0, task.space.num_states, (in_table.width, 7, *in_table.depth))
+    states = SimpleNamespace(array=histories)
+    assert torch.equal(in_table.observed(states), drawn.observed(states))
+    seen = drawn.seen.encoded(runs[0].observe.at(histories[0]), 0)
+    assert torch.equal(in_table.observed(states)[0], seen)
+
+
+# What policies are worth, and runs ------------------------------------------------------------------------------------
+
+
+def test_frames_are_of_a_group_of_their_own_and_what_the_engine_lacks_is_named():
+    seen = {
+        frames: Task(BREAKOUT, observation="simple_image", observation_options={"frames": frames, "scale": 4})
+        for frames in (1, 2)
+    }
+    one, two = (runs_of(task, DQN_OPTIONS, 1)[0] for task in seen.values())
+    wide = replace(one, observe=SimpleNamespace(**{**vars(one.observe), "shape": two.observe.shape}))
+    assert group_key("dqn", wide) != group_key("dqn", two)
+    assert two.observe.at(np.zeros((5, 2), np.int64)).shape == (5, *two.observe.shape)
+    options = {"observation": "complex_image", "observation_options": {"frames": 4, "size": (12, 12)}}
+    with pytest.raises(ParameterError, match=r"4 frames have as many channels as rows, \(12, 12, 12\), .* sb3 has it"):
+        runs_of(Task(BREAKOUT, **options), DQN_OPTIONS, 1)
+    for more in ({"previous_action": True}, {"observation_options": {"irrelevant": 2}}):
+        with pytest.raises(ParameterError, match="the batched engine sees functions of the last states"):
+            runs_of(Task(BREAKOUT, **more), DQN_OPTIONS, 1)
+
+
+def test_policies_of_frames_that_walk_together_are_worth_what_they_are_alone():
+    """Policies of the bytes that are seen, so that nothing is compiled."""
+    task = task_of()
+    source = ObservationSource.of(task.space, task.sight.observe)
+
+    def policy(seed):
+        def answer(observations):
+            words = [np.frombuffer(each.tobytes(), np.uint8).astype(np.uint32) for each in observations]
+            return np.array([np.random.default_rng([seed, *each]).integers(3) for each in words])
+
+        return answer
+
+    def act(histories):
+        assert histories.shape == (6, 3)
+        return np.array([policy(seed)(source.at(each[None]))[0] for seed, each in enumerate(histories)])
+
+    together = walk_values([task.mdp] * 6, act, frames=3)
+    for seed, found in enumerate(together):
+        alone = evaluate_agent(policy(seed), task)
+        assert abs(found.value - alone.value) <= found.error_bound + alone.error_bound
+        assert (found.exact, found.states) == (alone.exact, alone.states)
+    assert len({(each.value, each.states) for each in together}) > 1
+
+
+class Killed(BaseException):
+    pass
+
+
+def bytes_of(folder):
+    return [(folder / name).read_bytes() for name in ("curve.parquet", "agent/parameters.pt", "agent/model.json")]
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("agent", "chance"), [("dqn", {}), ("dqn", {"random": 0.1}), ("ppo", {})])
+def test_runs_with_frames_are_measured_exactly_kept_and_resumed(agent, chance, tmp_path, monkeypatch):
+    monkeypatch.setattr(importlib.import_module("pharos.experiments.run_folder"), "CHECKPOINT_SECONDS", 0.0)
+    small = (
+        {"learning_starts": 50, "buffer_size": 100}
+        if agent == "dqn"
+        else {"n_steps": 32, "n_envs": 2, "batch_size": 32}
+    )
+    name, seen = SIGHTS["small"]
+    options = {"steps": 400, "evaluation_interval": 100, "hyperparameters": small, "horizon": LIMIT,
+               "observation": name, "observation_options": seen, **chance}  # fmt: skip
+
+    def many(out, seeds, **more):
+        return train_many(agent, BREAKOUT, seeds=seeds, out=tmp_path / out, **options, **more)
+
+    def kill(now):
+        if now.done >= 2 * 200:
+            raise Killed
+
+    whole = many("whole", (0, 1, 2))
+    with pytest.raises(Killed):
+        many("killed", (0, 1), progress=kill)
+    ends = many("killed", (0, 1))
+    for seed, end in enumerate(ends):
+        folder = tmp_path / "killed" / f"seed-{seed}"
+        assert bytes_of(folder) == bytes_of(tmp_path / "whole" / f"seed-{seed}")
+        assert end.result["exact"] and end.result == whole[seed].result
+        task, kept = load_agent(folder)
+        alone = evaluate_agent(kept, task)
+        assert alone.exact and alone.value == pytest.approx(end.result["final_value"], abs=1e-6)
