@@ -127,7 +127,7 @@ def hardness(
 
         wanted = chosen(measures)  # an unknown name is told before anything is built
         needs_rewards = any(each.depends != "structure" for each in wanted)
-    of_observations = {"option": option, "network": network, "initialisation": initialisation}
+    of_observations: dict[str, object] = {"option": option, "network": network, "initialisation": initialisation}
     of_observations |= {"optimizer": optimizer, "landmarks": landmarks}
     useless = [f"--{name}" for name, value in of_observations.items() if value not in (None, [])]
     if observation is None and useless:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from pharos.kernels import bellman, graph, occupancy
+from pharos.kernels import bellman, graph, occupancy, outcomes
 from pharos.large_arrays import ranges_from_the_end
 from pharos.mdp.dynamics import BellmanEquation, Components, Dynamics, Order, Play
 from pharos.mdp.runs import count_of, shares_of
@@ -103,6 +103,11 @@ class CompiledDynamics(Dynamics):
         if now.shape[1] != after.shape[1]:  # the first step of sticky actions
             return super().move(play, now, after)
         return occupancy.push(self.for_kernels, play.live, play.policy, play.chance.triple, now, after)
+
+    def pushed(self, mass: np.ndarray, width: int = 1) -> np.ndarray:
+        after = np.zeros((self.num_states, width))
+        outcomes.pushed(self.for_kernels, np.ascontiguousarray(mass, np.float64), after)
+        return after
 
     def settle(self, play: Play, gamma: float, least: float, waiting: np.ndarray, visits: np.ndarray) -> float:
         weights = play.chance.triple

@@ -148,11 +148,6 @@ class OutcomeTable(CompiledDynamics):
         kernels.expected(self.for_kernels, flat, rows, out)
         return out.reshape(len(rows), self.num_actions, *x.shape[2:])
 
-    def pushed(self, mass: np.ndarray, width: int = 1) -> np.ndarray:
-        after = np.zeros((self.num_states, width))
-        kernels.pushed(self.for_kernels, np.ascontiguousarray(mass, np.float64), after)
-        return after
-
     def outcomes(self, states: np.ndarray, actions: np.ndarray) -> Outcomes:
         """Ascending by next state; outcomes that lead to the same one are one."""
         rows = np.asarray(states) * self.num_actions + np.asarray(actions)

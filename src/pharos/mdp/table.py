@@ -54,15 +54,6 @@ class Table(CompiledDynamics):
             return x[table]
         return x[table, np.arange(self.num_actions)] if x.shape[1] > 1 else x[table, 0]
 
-    def pushed(self, mass: np.ndarray, width: int = 1) -> np.ndarray:
-        after = np.zeros((self.num_states, width))
-        s, a = np.nonzero(mass)
-        t = self.next_states[s, a]
-        inside = t >= 0
-        column = a[inside] if width > 1 else np.zeros_like(a[inside])
-        np.add.at(after, (t[inside], column), mass[s, a][inside])
-        return after
-
     def successors_of(self, states: np.ndarray) -> np.ndarray:
         following = np.unique(self.next_states[states])
         if len(following) and following[0] == -1:
