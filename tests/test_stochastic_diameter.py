@@ -1,6 +1,7 @@
 """Diameter under chance: against value iteration on explicit matrices, theory, and published values."""
 
 import math
+from dataclasses import replace
 from fractions import Fraction
 
 import numpy as np
@@ -13,6 +14,7 @@ import pharos
 from pharos import hardness
 from pharos.errors import UndefinedMeasure
 from pharos.hardness.choices import choices_of
+from pharos.hardness.hitting_bounds import Bounds
 from pharos.hardness.hitting_times import HittingTimes
 from pharos.hardness.interval import Budget, Spending
 from pharos.hardness.stochastic_diameter import _Diameter
@@ -467,3 +469,25 @@ def test_actions_that_are_repeated_for_ever_may_all_lead_everywhere(next_states,
     assert found.exact
     assert found.lower <= len(next_states) - 1 <= found.upper < math.inf
     assert found.unreachable_pairs == 0
+
+
+@pytest.mark.long
+def test_a_target_without_an_upper_bound_so_far_is_not_ruled_out():
+    """Sweeps leave negative times of the end for a while, of which infinity is no multiple to go by."""
+    weights = [
+        [[1e-6, 0, 1, 1e-6], [1e-6, 1, 1, 0], [0, 2, 1e-6, 1e-6]],
+        [[0, 1e-6, 0, 1], [1, 0, 0, 0], [1e-6, 0, 2, 0]],
+        [[1, 0, 2, 1], [0, 2, 1, 1], [0, 1e-6, 1, 0]],
+    ]
+    matrix = np.array(weights) / np.sum(weights, axis=2, keepdims=True)
+    mdp = TabularMDP.from_matrices(matrix[..., :3], np.zeros((3, 3))).with_initial([1, 2])
+    mdp = sticky_actions(replace(mdp, start_probabilities=np.array([1 / 6, 5 / 6])), 1.0)
+    found = hardness.start_eccentricity_interval(mdp)
+    assert found.exact
+    truth = 4.333330166673335  # by elimination in fractions
+    assert found.lower <= truth * (1 + 1e-9)
+    assert truth <= found.upper * (1 + 1e-9)
+
+
+def test_where_no_upper_bound_is_known_there_is_none_of_times_of_0():
+    assert Bounds(0.5, math.inf, 0.0).upper == math.inf

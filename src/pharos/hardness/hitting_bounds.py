@@ -29,7 +29,12 @@ class Bounds:
     @property
     def upper(self) -> float:
         """Upper bound of the largest hitting time."""
-        return self.largest * self.high * PRODUCT
+        return self.at_most(self.largest) * PRODUCT
+
+    def at_most(self, j: float) -> float:
+        """Upper bound of what is j in J, but for rounding: infinite where none is known, also where J is no more than
+        0."""
+        return j * self.high if math.isfinite(self.high) else math.inf
 
     @property
     def apart(self) -> float:

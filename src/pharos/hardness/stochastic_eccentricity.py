@@ -98,16 +98,20 @@ class _Eccentricity:
             self.infinite = True
             return None
         bounds = targets.sweep(j, count, SWEEPS, 0.0, self.spending)
-        if float(self.weights @ j[self.nodes]) * bounds.high * rounding > self.settled_upper:
+        if bounds.at_most(self._mean(j)) * rounding > self.settled_upper:
             bounds = targets.solve(j, count, self.tolerance, 0.0, self.spending)
-            mean = float(self.weights @ j[self.nodes])
+            mean = self._mean(j)
             if mean * bounds.low / rounding > self.lower:
                 self.lower = mean * bounds.low / rounding
                 targets.initial_scale = targets.scale_of(j)
-            self.settled_upper = max(self.settled_upper, min(mean * bounds.high * rounding, before))
+            self.settled_upper = max(self.settled_upper, min(bounds.at_most(mean) * rounding, before))
             self.limited += bounds.limited and not bounds.meets(self.tolerance)
         self.upper[self.upper <= self.lower] = -math.inf
         return j * bounds.high if lost is None and math.isfinite(bounds.high) else None
+
+    def _mean(self, j: np.ndarray) -> float:
+        """Of the starts; no hitting time is below 0, which J may be before there is an upper bound."""
+        return float(self.weights @ np.maximum(j[self.nodes], 0.0))
 
     def _bound_others(self, hub: int, times: np.ndarray) -> None:
         """Bound all targets by way of one whose hitting times are bounded by `times` (nodes,)."""
