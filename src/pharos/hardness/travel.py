@@ -35,6 +35,7 @@ from each other, and every target by a short way from one of them: a few factors
 import itertools
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from functools import cached_property
 
 import numpy as np
 
@@ -84,7 +85,7 @@ class TravelBounds:
         first, _, node, _ = self._outcomes
         owner = np.repeat(np.arange(len(first) - 1), np.diff(first))
         self._num_actions = num_actions
-        self._into: tuple[np.ndarray, np.ndarray] | None = None
+        self._steps = -1, np.empty(0, np.int32)  # a hub, and those from it to each node
         self._fixed = (self._outcomes, owner, weights, num_actions if mdp.is_sticky else 0)
         self._threads = usable_workers(None) if len(node) > SMALL else 1
         with ThreadPoolExecutor(self._threads) as pool:
@@ -159,8 +160,6 @@ class TravelBounds:
         """
         outcomes, owner, weights, num_previous = self._fixed
         num_nodes = len(outcomes[0]) - 1
-        if self._into is None:
-            self._into = travel.outcomes_into(outcomes[2], num_nodes)
         room = [
             (
                 np.zeros(num_nodes, np.int32),
@@ -172,8 +171,8 @@ class TravelBounds:
             for _ in range(self._threads)
         ]
         bound, new = bound.copy(), np.empty(num_nodes)
-        steps = vicinity.steps_from(int(np.argmin(bound)), outcomes[0], outcomes[2])
-        graph, chance = (outcomes, owner, self._into, steps), (weights, num_previous, self._num_actions)
+        graph = (outcomes, owner, self._into, self._steps_from(int(np.argmin(bound))))
+        chance = (weights, num_previous, self._num_actions)
         fixed = (graph, chance, times, bound, new, SWEEPS)
         with ThreadPoolExecutor(self._threads) as pool:
             order = targets[np.argsort(bound[targets], kind="stable")]
@@ -189,6 +188,19 @@ class TravelBounds:
                     task.result()
                 bound[part] = new[part]
         return bound
+
+    @cached_property
+    def _into(self) -> tuple[np.ndarray, np.ndarray]:
+        """Which outcomes lead to each node; made anew for shortening, as many MDPs need none, and it is large."""
+        first, _, node, _ = self._outcomes
+        return travel.outcomes_into(node, len(first) - 1)
+
+    def _steps_from(self, hub: int) -> np.ndarray:
+        """(N,) int32, see `vicinity.steps_from`; the last ones are kept, as rounds of shortening have one hub."""
+        if hub != self._steps[0]:
+            first, _, node, _ = self._outcomes
+            self._steps = hub, vicinity.steps_from(hub, first, node)
+        return self._steps[1]
 
 
 def _outcomes(mdp: TabularMDP, restart: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

@@ -67,9 +67,9 @@ def shorten(targets, begin, end, graph, chance, times, bound, new, sweeps, room)
                     if by_cost[a] + by_leak[a] * guess < by_cost[best] + by_leak[best] * guess:
                         best = a
                 for b in range(-1, num_previous):
-                    chance, others = (first_now, first_uniform) if b < 0 else (now, uniform)
-                    c = always_cost + others * all_cost + chance * by_cost[best]
-                    left = always_leak + others * all_leak + chance * by_leak[best]
+                    weight, others = (first_now, first_uniform) if b < 0 else (now, uniform)
+                    c = always_cost + others * all_cost + weight * by_cost[best]
+                    left = always_leak + others * all_leak + weight * by_leak[best]
                     if b >= 0:
                         c += before * by_cost[b]
                         left += before * by_leak[b]
