@@ -60,6 +60,13 @@ def test_three_ranks_find_the_gaps_of_one():
 
 
 @pytest.mark.long
+def test_episodes_may_begin_in_any_range():
+    mdp = sticky_actions(walk().with_initial([3, 59]), 0.25)
+    solution = pharos.value_iteration(mdp, 1e-9)
+    check_same(by_threads(mdp, solution, processes=3), gaps(mdp, solution))
+
+
+@pytest.mark.long
 @settings(max_examples=150, deadline=None)
 @given(
     mdp=st.one_of(small_mdps(), outcome_mdps(), with_chance(small_mdps()), st.just(walk(20))),

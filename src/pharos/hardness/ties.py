@@ -126,7 +126,7 @@ class UnresolvedTies:
             return
         self.small += small
         self.equal += equal
-        if not self.small:
+        if not self.small and self.proof.holds:  # not so of parts, whose values have other rows
             own = part.step.own[part.states[0] : part.states[-1] + 1] if part.is_whole else part.step.own[part.states]
             self.proof.look_at(part.number, own, part.rewards, part.following, part.gap, part.counted)
 
