@@ -90,6 +90,18 @@ def test_one_pair_is_what_the_recursion_says():
     assert found[0, 1] == pytest.approx(entry(x, y), rel=1e-6)
 
 
+def test_zeros_pass_a_slope_of_one_through_hyperbolic_tangents():
+    """Without biases: of zeros the ReLUs have no slope, the tangents 1, so that their biases and the output's count."""
+    y = VECTORS[:1]
+    x = np.concatenate([np.zeros_like(y), y])
+    z, weights = np.polynomial.hermite_e.hermegauss(100)
+    deviation = np.sqrt(2 / 16 * (y.astype(float) ** 2).sum())  # of both hidden layers, with a gain of sqrt(2)
+    slope = (weights / weights.sum()) @ (1 - np.tanh(deviation * z) ** 2)
+    found = tangent_kernel(Network.of("mlp16x2+tanh", "sb3"), x)
+    np.testing.assert_allclose(found[0], [2, 1 + slope], rtol=1e-6)
+    assert tangent_kernel(Network.of("mlp16x3+tanh", "sb3"), x)[0, 0] == pytest.approx(4, rel=1e-6)
+
+
 @pytest.mark.parametrize("name", ["mlp128x2", "mlp64+tanh", "cnn16", "cnn4-32"])
 def test_blocks_give_the_same_kernel_as_one_by_one(name, monkeypatch):
     network, x = Network.of(name), IMAGES

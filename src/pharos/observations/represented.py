@@ -58,6 +58,8 @@ def representation(
     else:
         net = Network.of(default_network(observer.space) if network is None else network, initialisation)
         tangent, named = partial(tangent_kernel, net), {"network": net.name, "initialisation": net.initialisation}
+        if net.tanh and net.initialisation == "sb3":
+            named["kernel"] = 2  # results that were kept of zeros without a slope are not taken
     tangent(first, None)  # what does not fit is said before all states are looked at
 
     def inputs(states: np.ndarray) -> np.ndarray:

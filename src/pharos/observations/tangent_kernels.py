@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 BLOCK = 512  # observations on a side of a block of pairs
 MAPS = 1 << 26  # bytes of the maps of a block after a convolution
 TERMS, NODES = 48, 200  # of a power series of hyperbolic tangents; of a quadrature
+LEAST_VARIANCE = 1e-12  # of a hyperbolic tangent's pre-activations, in the place of 0: the limit in float64
 
 
 def ntk(
@@ -315,7 +316,8 @@ class _Head:
         """(L, N) of pre-activations; (L, N, M) Hermite coefficients, M = 0 where all units are ReLUs."""
         variances, coefficients = [variance], []
         for layer, kind in enumerate(self.kinds):
-            if kind:
+            if kind:  # an observation of zeros has slope 1 here; a ReLU, as in PyTorch, none
+                variances[-1] = np.maximum(variances[-1], LEAST_VARIANCE)
                 series, square = _tanh_coefficients(variances[-1])
             else:
                 series, square = np.zeros((len(variance), TERMS if self.kinds.any() else 0)), variances[-1] / 2
