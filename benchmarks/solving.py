@@ -97,7 +97,7 @@ def sweeps(mdp, folder: Path) -> None:
     given = (at["next_states"], at["rewards"], 0.99)
     ours = (next_states, table, palette, 0.99)
     plain = {
-        "pharos": lambda start, stop: bellman.optimal_block(*ours, 0.0, 1.0, v, out, actions, start, stop),
+        "pharos": lambda *part: bellman.optimal_backup(*ours, 0.0, 1.0, v, out, actions, np.array([part])),
         "C, any number of actions": lambda *part: of_any(*given, at["v"], at["out"], *part, num_actions),
         "C, this number of actions": lambda *part: of_these(*given, at["v"], at["out"], *part),
         "reading the values alone": lambda start, stop: gather(
@@ -107,8 +107,8 @@ def sweeps(mdp, folder: Path) -> None:
     values, results = at["by_action"], at["out_by_action"]
     weights = (0.75, 0.25, 0.0)
     by_previous = {
-        "pharos, sticky": lambda start, stop: bellman.sticky_block(
-            *ours, weights, 1.0, by_action, out_by_action, actions, start, stop
+        "pharos, sticky": lambda *part: bellman.sticky_backup(
+            *ours, weights, 1.0, by_action, out_by_action, actions, np.array([part])
         ),
         "C, sticky": lambda *part: sticky(*given, 0.25, values, results, *part),
     }

@@ -88,19 +88,15 @@ def optimal_sweep(transitions, table, palette, gamma, uniform, choice, v, action
 
 
 @njit(cache=True, nogil=True)
-def optimal_block(transitions, table, palette, gamma, uniform, choice, v, out, actions, start, stop):
-    """out[s] = the backup of v for s in [start, stop), not in place: what threads share, and horizons need."""
-    for s in range(start, stop):
-        if s + AHEAD < stop:
-            fetch_values(transitions, v, actions, s + AHEAD)
-        out[uint64(s)] = _backup(transitions, table, palette, gamma, uniform, choice, v, actions, s)
-
-
-@njit(cache=True, nogil=True)
-def optimal_runs(transitions, table, palette, gamma, uniform, choice, v, out, actions, runs):
-    """The same for the states of some runs (R, 2) of them, ascending."""
+def optimal_backup(transitions, table, palette, gamma, uniform, choice, v, out, actions, runs):
+    """out[s] = the backup of v for s of some runs (R, 2), not in place: what threads and ranks share, and horizons
+    need."""
     for i in range(len(runs)):
-        optimal_block(transitions, table, palette, gamma, uniform, choice, v, out, actions, runs[i, 0], runs[i, 1])
+        stop = runs[i, 1]
+        for s in range(runs[i, 0], stop):
+            if s + AHEAD < stop:
+                fetch_values(transitions, v, actions, s + AHEAD)
+            out[uint64(s)] = _backup(transitions, table, palette, gamma, uniform, choice, v, actions, s)
 
 
 @njit(forceinline=True)
@@ -153,24 +149,19 @@ def sticky_sweep(transitions, table, palette, gamma, weights, choice, v, actions
 
 
 @njit(cache=True, nogil=True)
-def sticky_block(transitions, table, palette, gamma, weights, choice, v, out, actions, start, stop):
-    """out[s, b] = the backup of v for s in [start, stop), not in place."""
+def sticky_backup(transitions, table, palette, gamma, weights, choice, v, out, actions, runs):
+    """out[s, b] = the backup of v for s of some runs (R, 2), not in place."""
     chosen, previous, uniform = weights
     q = np.empty(len(actions))
-    for s in range(start, stop):
-        if s + AHEAD < stop:
-            fetch_values(transitions, v, actions, s + AHEAD)
-        best, total = _sticky_values(transitions, table, palette, gamma, choice, v, actions, q, s)
-        shared = chosen * best + uniform * total / len(actions)
-        for b in range(len(actions)):
-            out[uint64(s), b] = shared + previous * q[b]
-
-
-@njit(cache=True, nogil=True)
-def sticky_runs(transitions, table, palette, gamma, weights, choice, v, out, actions, runs):
-    """The same for the states of some runs (R, 2) of them, ascending."""
     for i in range(len(runs)):
-        sticky_block(transitions, table, palette, gamma, weights, choice, v, out, actions, runs[i, 0], runs[i, 1])
+        stop = runs[i, 1]
+        for s in range(runs[i, 0], stop):
+            if s + AHEAD < stop:
+                fetch_values(transitions, v, actions, s + AHEAD)
+            best, total = _sticky_values(transitions, table, palette, gamma, choice, v, actions, q, s)
+            shared = chosen * best + uniform * total / len(actions)
+            for b in range(len(actions)):
+                out[uint64(s), b] = shared + previous * q[b]
 
 
 @njit(cache=True, nogil=True)

@@ -42,18 +42,15 @@ class CompiledDynamics(Dynamics):
             return super().backup(equation, x, out, runs)
         tables = (self.for_sweeps, rewards.table, rewards.palette, gamma)
         actions = bellman.actions_of(self.num_actions)
-        kernel, of_runs, weights, x_, out_ = (
-            (bellman.sticky_block, bellman.sticky_runs, chance.triple, x, out)
+        kernel, weights, x_, out_ = (
+            (bellman.sticky_backup, chance.triple, x, out)
             if chance.is_sticky
-            else (bellman.optimal_block, bellman.optimal_runs, chance.uniform, x[:, 0], out[:, 0])
+            else (bellman.optimal_backup, chance.uniform, x[:, 0], out[:, 0])
         )
         out[-1] = 0.0
         arrays = (*tables, weights, choice, x_, out_, actions)
-        if runs is None:
-            whole = np.array([[0, self.num_states]])
-            _shared(lambda part: kernel(*arrays, int(part[0, 0]), int(part[0, 1])), self, whole)
-        else:
-            _shared(lambda part: of_runs(*arrays, part), self, runs)
+        whole = np.array([[0, self.num_states]])
+        _shared(lambda part: kernel(*arrays, part), self, whole if runs is None else runs)
 
     def sweep(
         self, equation: BellmanEquation, x: np.ndarray, threads: int = 1, part: tuple[int, int] | None = None
