@@ -1,8 +1,8 @@
 """pharos solve: optimal values, beside those of the uniformly random policy."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -34,6 +34,9 @@ from pharos.cli.options import (
 )
 from pharos.cli.target import parse_target
 from pharos.wording import many
+
+if TYPE_CHECKING:
+    from pharos.solvers import Solution
 
 
 def solve(
@@ -113,7 +116,16 @@ def solve(
         return
     if out is not None:
         save(out, solution)
-    answer = {
+    options = {**chance, "tolerance": tolerance, "dtype": dtype, "processes": ranks}
+    if json:
+        print_json(_answer(solution, uniform, options, out))
+    else:
+        print_facts(" ".join((target, *(parameters or ()))), _facts(solution, uniform, chance, out))
+
+
+def _answer(solution: "Solution", uniform: "Solution", options: Mapping[str, Any], out: Path | None) -> dict[str, Any]:
+    """What --json prints; options: those that it repeats."""
+    return {
         "value_at_start": solution.value_at_start,
         "uniform_value_at_start": uniform.value_at_start,
         "error_bound": solution.error_bound,
@@ -122,37 +134,34 @@ def solve(
         "compiling_seconds": compiling.seconds(),
         "gamma": solution.gamma,
         "horizon": solution.horizon,
-        "sticky": sticky,
-        "random": random,
-        "lazy": lazy,
-        "tolerance": tolerance,
-        "dtype": dtype,
+        **options,
         "uniform_error_bound": uniform.error_bound,
         "uniform_seconds": uniform.seconds,
-        "processes": ranks,
-        "num_states": mdp.num_states,
-        "num_actions": mdp.num_actions,
+        "num_states": solution.mdp.num_states,
+        "num_actions": solution.mdp.num_actions,
         "file": None if out is None else str(out),
     }
-    if json:
-        print_json(answer)
-        return
+
+
+def _facts(
+    solution: "Solution", uniform: "Solution", chance: Mapping[str, float], out: Path | None
+) -> list[tuple[str, object]]:
+    """What is printed without --json."""
+    mdp = solution.mdp
     facts: list[tuple[str, object]] = [
         ("optimal value at the start", f"{solution.value_at_start:.8g}"),
         ("uniform policy at the start", f"{uniform.value_at_start:.8g}"),
         ("error at most", f"{max(solution.error_bound, uniform.error_bound):.2g}"),
         ("discount", describe_discount(solution.gamma, solution.horizon)),
-        ("chance", describe_chance(sticky, random, mdp.dynamics.has_chance, lazy)),
+        ("chance", describe_chance(chance["sticky"], chance["random"], mdp.dynamics.has_chance, chance["lazy"])),
         ("states", f"{mdp.num_states:,} x {many(mdp.num_actions, 'action')}"),
         ("sweeps", f"{solution.sweeps} in {solution.seconds:.2f} s"),
         *compiling_fact(),
     ]
-    if out is not None:
-        facts.append(("written", out))
-    print_facts(" ".join((target, *(parameters or ()))), facts)
+    return facts if out is None else [*facts, ("written", out)]
 
 
-def save(path: Path, solution: Any) -> None:
+def save(path: Path, solution: "Solution") -> None:
     """Write the policy (.npy), or values and policy (.npz)."""
     import numpy as np
 
