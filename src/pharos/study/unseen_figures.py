@@ -90,6 +90,9 @@ def observations_of_mdps(part: "pd.DataFrame", predictor: str | None = None) -> 
             axis.scatter([i], pair[1:], s=34, color=color, lw=0, label=observation)
         axis.set_title(_short(*map(str, key)), fontsize=8)
         axis.set(xticks=places, xticklabels=[], ylim=(-0.05, most + 0.08), xlim=(-0.6, len(observations) - 0.4))
+    said, did = {"facecolors": "none", "edgecolors": DIAGONAL}, {"color": DIAGONAL}
+    axes[0].scatter([], [], s=34, lw=1.4, label="predicted", **said)
+    axes[0].scatter([], [], s=34, lw=0, label=agent_name(str(part["agent"].iloc[0])), **did)
     _label_edges(axes, "", "regret")
     legend_below(figure, axes)
     return figure
@@ -115,6 +118,8 @@ def idealised_curves(part: "pd.DataFrame", points: "pd.DataFrame", runs: "pd.Dat
                 axis.plot(*zip(*dashed, strict=True), "--", color=color, lw=1.2, alpha=0.9)
         axis.set_title(_short(*map(str, key)), fontsize=8)
         axis.set(ylim=(-0.05, 1.5))
+    axes[0].plot([], [], "--", color=DIAGONAL, lw=1.2, label="idealised learner")
+    axes[0].plot([], [], color=DIAGONAL, lw=1.5, label=agent_name(str(part["agent"].iloc[0])))
     _label_edges(axes, "steps", "regret")
     legend_below(figure, axes)
     return figure
@@ -138,7 +143,7 @@ def _spread(groups: list[Any], most: int = MOST_PANELS) -> list[Any]:
 
 
 def _short(environment: str, instance: str, chance: str) -> str:
-    """`taxi: size 7`, with the chance where there is some."""
+    """`taxi: size 7`, with the chance, where there is some, in a line of its own."""
     inside = instance[instance.find("(") + 1 : -1] if instance.endswith(")") else instance.partition("/")[2] or instance
     first, *others = [part.strip().replace("=", " ").replace("_", " ") for part in inside.split(",")]
     text = f"{title(environment)}: {first}"
@@ -146,7 +151,7 @@ def _short(environment: str, instance: str, chance: str) -> str:
         if len(text) + len(word) > LONGEST_TITLE:
             break
         text += f", {word}"
-    return text + ("" if chance == "plain" else f", {chance}")
+    return text + ("" if chance == "plain" else f"\n{chance}")
 
 
 def _label_edges(axes: Sequence[Any], below: str, beside: str) -> None:
