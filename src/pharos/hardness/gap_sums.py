@@ -46,9 +46,13 @@ class GapSums:
     @staticmethod
     def of_numbers(numbers: np.ndarray) -> "GapSums":
         """What `to_numbers` was made of."""
-        floats, num_sums = numbers[:9].view(np.float64), 8
-        sums, counts, histogram = floats[:num_sums].reshape(2, 4), numbers[10:13], numbers[13:]
-        return GapSums(sums.copy(), counts.copy(), histogram.copy(), float(floats[num_sums]), int(numbers[9]))
+        empty = GapSums()
+        edges = np.cumsum([empty.sums.size, 1, 1, empty.counts.size])
+        sums, minimal, num_rows, counts, histogram = np.split(numbers, edges)
+        sums = sums.view(np.float64).reshape(empty.sums.shape)
+        return GapSums(
+            sums.copy(), counts.copy(), histogram.copy(), float(minimal.view(np.float64)[0]), int(num_rows[0])
+        )
 
     @staticmethod
     def of_all(parts: Iterable["GapSums"]) -> "GapSums":
