@@ -1,10 +1,12 @@
 """How fast is the batched engine beside Stable-Baselines3? Agent-steps per second of processor time of one thread.
 
     python benchmarks/batched.py [--instance NAME] [--rounds R] [--seconds S] [--agents dqn ppo] [--observations ...]
+                                 [--frames 1 4] [--grey]
 
 Both with the hyperparameters of pharos' table, after `learning_starts` and some updates. Rounds go through all
 contestants in turn, so that a busy machine slows all alike; the ratio is the median over rounds. The last columns:
 arithmetic of the networks in GFLOP/s, and its share of what a plain product of matrices reached in the same round.
+With several numbers of frames, of images, all of them are contestants of the same rounds; the ratio is each one's own.
 """
 
 import argparse
@@ -91,34 +93,52 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=2.0)
     parser.add_argument("--agents", nargs="+", default=["dqn", "ppo"])
     parser.add_argument("--observations", nargs="+", default=["vector", "simple_image"])
+    parser.add_argument("--frames", type=int, nargs="+", default=[1], help="of images: how many are stacked")
+    parser.add_argument("--grey", action="store_true", help="images of one plane for each frame")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     print(f"{arguments.instance}, torch {torch.__version__}, {torch.backends.cpu.get_cpu_capability()}, one thread")
-    print(f"{'':18}{'runs':>5}{'sb3/s':>9}{'batched/s':>11}{'ratio':>7}{'lowest':>8}{'GFLOP/s':>9}{'of peak':>9}")
+    print(f"{'':22}{'runs':>5}{'sb3/s':>9}{'batched/s':>11}{'ratio':>7}{'lowest':>8}{'GFLOP/s':>9}{'of peak':>9}")
     for agent in arguments.agents:
         for observation in arguments.observations:
-            task = Task.of(arguments.instance, observation=observation)
-            options = hyperparameters(agent, task.env.name, observation)
-            if agent == "dqn":  # both act by their networks from the first step that is timed
-                options["exploration_fraction"] = 1e-6
-            unit = options["n_envs"] * options["n_steps"] if agent == "ppo" else 200
-            warm = max(2 * unit, options.get("learning_starts", 0) + 200)
-            pair = [kind(agent, task, options, RUNS[observation]) for kind in (Alone, Together)]
-            flop = work(agent, task, options, pair[1].batch.lanes[0])
-            for contestant in pair:
-                contestant.learn(-(-warm // unit) * unit)
-            rounds = [
-                (*(speed(contestant, arguments.seconds, unit) for contestant in pair), peak())
-                for _ in range(arguments.rounds)
-            ]
-            alone, together, _ = (statistics.median(part) for part in zip(*rounds, strict=True))
-            ratios = [b / a for a, b, _ in rounds]
-            share = statistics.median(b * flop / p for _, b, p in rounds)
-            print(
-                f"{agent} {observation:14}{RUNS[observation]:5}{alone:9.0f}{together:11.0f}"
-                f"{statistics.median(ratios):7.1f}{min(ratios):8.1f}{together * flop / 1e9:9.1f}{share:9.2f}",
-                flush=True,
-            )
+            many = arguments.frames if "image" in observation else [1]
+            cases = [Case(agent, arguments.instance, observation, frames, arguments.grey) for frames in many]
+            for _ in range(arguments.rounds):
+                for case in cases:
+                    case.rounds.append((*(speed(each, arguments.seconds, case.unit) for each in case.pair), peak()))
+            for case in cases:
+                print(case, flush=True)
+
+
+class Case:
+    """Both engines on one observation, warmed up; each of its rounds: (agent-steps/s, agent-steps/s, FLOP/s)."""
+
+    def __init__(self, agent: str, instance: str, observation: str, frames: int, grey: bool):
+        seen = {
+            **({"frames": frames} if frames > 1 else {}),
+            **({"grey": True} if grey and "image" in observation else {}),
+        }
+        task = Task.of(instance, observation=observation, observation_options=seen)
+        options = hyperparameters(agent, task.env.name, observation)
+        if agent == "dqn":  # both act by their networks from the first step that is timed
+            options["exploration_fraction"] = 1e-6
+        self.name, self.runs = f"{agent} {observation}{f' x{frames}' if frames > 1 else ''}", RUNS[observation]
+        self.unit = options["n_envs"] * options["n_steps"] if agent == "ppo" else 200
+        self.pair = [kind(agent, task, options, self.runs) for kind in (Alone, Together)]
+        self.flop = work(agent, task, options, self.pair[1].batch.lanes[0])
+        warm = max(2 * self.unit, options.get("learning_starts", 0) + 200)
+        for contestant in self.pair:
+            contestant.learn(-(-warm // self.unit) * self.unit)
+        self.rounds: list[tuple[float, float, float]] = []
+
+    def __str__(self) -> str:
+        alone, together, _ = (statistics.median(part) for part in zip(*self.rounds, strict=True))
+        ratios = [b / a for a, b, _ in self.rounds]
+        share = statistics.median(b * self.flop / p for _, b, p in self.rounds)
+        return (
+            f"{self.name:22}{self.runs:5}{alone:9.0f}{together:11.0f}"
+            f"{statistics.median(ratios):7.1f}{min(ratios):8.1f}{together * self.flop / 1e9:9.1f}{share:9.2f}"
+        )
 
 
 if __name__ == "__main__":

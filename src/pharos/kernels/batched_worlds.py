@@ -7,7 +7,7 @@ a block of its own, as one draw holds for all copies of a run.
 """
 
 import numpy as np
-from numba import njit
+from numba import njit, uint64
 from numba.extending import overload
 
 from pharos.kernels.bellman import reward_at
@@ -56,16 +56,17 @@ def look_up_frames(table, begins, histories, piece, out):
 
     table (R, length): a row for each frame, of which `piece` is a part; begins (W,): the row of each run's first state.
     """
-    length, frames = table.shape[1], histories.shape[2]
+    length, frames, piece = uint64(table.shape[1]), uint64(histories.shape[2]), uint64(piece)
     for i in range(histories.shape[0]):
+        target = out[i]
         for b in range(histories.shape[1]):
             for f in range(frames):
                 row = table[begins[i] + histories[i, b, f]]
-                at = b * length * frames + f * piece
-                for first in range(0, length, piece):
-                    target = out[i, at : at + piece]
+                at, first = uint64(b) * length * frames + f * piece, uint64(0)
+                while first < length:
                     for j in range(piece):
-                        target[j] = row[first + j]
+                        target[at + j] = row[first + j]
+                    first += piece
                     at += frames * piece
 
 
