@@ -83,6 +83,12 @@ def test_a_file_of_predictions_has_its_hash_and_its_date(predicted, tmp_path):
     pq.write_table(swapped.replace_schema_metadata({}), tmp_path / "q.parquet", write_page_checksum=True)
     with pytest.raises(FileFormatError, match="holds no predictions"):
         read_predictions(tmp_path / "q.parquet")
+    for words in ('{"study": "tiny', "[1]", "{}"):
+        pq.write_table(swapped.replace_schema_metadata({b"pharos.predictions": words}), tmp_path / "q.parquet")
+        with pytest.raises(ResultCorrupted, match="what it says of itself is damaged"):
+            read_predictions(tmp_path / "q.parquet")
+    with pytest.raises(FileFormatError, match="no such file; expected predictions"):
+        read_predictions(tmp_path / "absent.parquet")
 
 
 def made_up(noise, classes=8, instances=3, slope=1.0, seed=0):

@@ -40,6 +40,7 @@ ACTOR_CRITICS = {"ppo": 0.95, "a2c": 1.0}
 """Agents that learn as actor-critics, and the lambda of their advantages where hyperparameters do not say it."""
 CURVE_POINTS = 40
 _KEY = b"pharos.predictions"
+_SAID = ("study", "sha256", "date", "version")
 
 Predictions: TypeAlias = "tuple[pd.DataFrame, Mapping[str, str]]"
 """Rows, and what their file says of itself."""
@@ -205,12 +206,21 @@ def read_predictions(file: str | os.PathLike) -> "tuple[pd.DataFrame, dict[str, 
     Raises:
         FileFormatError: it is no file of predictions. ResultCorrupted: it was changed after it was written.
     """
+    remedy = "write them with `pharos study predict SPEC --out FILE`"
+    if not Path(file).is_file():
+        raise FileFormatError(f"{file}: no such file; expected predictions: {remedy}")
     table = experiments.read_table(Path(file), "write it again")
     said = (table.schema.metadata or {}).get(_KEY)
-    if said is None or not {*PREDICTORS, "agent", "observation"} <= {*table.column_names}:
-        raise FileFormatError(f"{file}: holds no predictions; write them with `pharos study predict SPEC --out FILE`")
-    frame, about = table.to_pandas(), json.loads(said)
-    if about.get("sha256") != _hash(frame):
+    if said is None or not {*PREDICTORS, *CELL} <= {*table.column_names}:
+        raise FileFormatError(f"{file}: holds no predictions; {remedy}")
+    try:
+        about = json.loads(said)
+    except ValueError:
+        about = None
+    if not isinstance(about, dict) or not all(isinstance(about.get(name), str) for name in _SAID):
+        raise ResultCorrupted(f"{file}: what it says of itself is damaged; expected {', '.join(_SAID)}")
+    frame = table.to_pandas()
+    if about["sha256"] != _hash(frame):
         raise ResultCorrupted(f"{file}: its rows are not those whose hash it has; it was changed after it was written")
     return frame, about
 
