@@ -62,6 +62,18 @@ def test_an_actor_critic_is_idealised_with_the_rollouts_and_the_lambda_of_its_ag
     ]
 
 
+def test_the_layers_of_a_network_are_those_of_its_hyperparameters():
+    """Wherever Stable-Baselines3 takes them from; another network has no prediction instead of that of the default."""
+    layers = predictions._hidden_layers
+    assert layers({}) == [128]
+    assert layers({"net_arch": [64, 32]}) == layers({"policy_kwargs": {"net_arch": [64, 32]}}) == [64, 32]
+    assert layers({"net_arch": {"pi": [64], "vf": [64]}}) == [64]
+    with pytest.raises(ParameterError, match="same layers for policy and value"):
+        layers({"net_arch": {"pi": [64], "vf": [32]}})
+    with pytest.raises(ParameterError, match="'activation_fn'"):
+        layers({"policy_kwargs": {"activation_fn": "relu"}})
+
+
 def test_a_file_of_predictions_has_its_hash_and_its_date(predicted, tmp_path):
     said = write_predictions(specification(SPEC), predicted, tmp_path / "p.parquet")
     frame, about = read_predictions(tmp_path / "p.parquet")

@@ -154,10 +154,27 @@ def _network(config: Mapping[str, Any], task: Any) -> tuple[str, str]:
     from pharos.observations import default_network, observe
 
     observation = observe(task.env, task.observation, state_space=task.space, **dict(task.observation_options))
-    name, hidden = default_network(observation.space), config["hyperparameters"].get("net_arch", [128])
-    if isinstance(hidden, list) and hidden != [128]:
+    name, hidden = default_network(observation.space), _hidden_layers(config["hyperparameters"])
+    if hidden != [128]:
         name = "-".join([name.removesuffix("x2"), *(["128"] if "mlp" not in name else []), *map(str, hidden)])
     return (name, "pytorch") if config["agent"] == "dqn" else (f"{name}+tanh", "sb3")
+
+
+def _hidden_layers(hyperparameters: Mapping[str, Any]) -> list[int]:
+    """Units of the layers after the features, the same for policy and value.
+
+    Raises:
+        ParameterError: they differ, or the network is not of the kind that has a closed form.
+    """
+    own = dict(hyperparameters.get("policy_kwargs") or {})
+    layers = own.pop("net_arch", hyperparameters.get("net_arch", [128]))
+    if own:
+        raise ParameterError(f"policy_kwargs has {min(own)!r}; only net_arch may differ for predictions")
+    if isinstance(layers, Mapping):
+        if layers.get("pi") != layers.get("vf"):
+            raise ParameterError(f"net_arch is {dict(layers)}; predictions need the same layers for policy and value")
+        layers = layers.get("pi") or []
+    return list(layers)
 
 
 def _schedule(config: Mapping[str, Any]) -> "Schedule":
