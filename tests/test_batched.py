@@ -118,6 +118,7 @@ def test_what_the_engine_lacks_is_named(grid):
     assert supports("a2c", {}).startswith("agent 'a2c'")
     assert supports("dqn", {"train_freq": (1, "episode")}).startswith("train_freq")
     assert supports("ppo", {"use_sde": True}).startswith("use_sde")
+    assert supports("dqn", {"policy_kwargs": 3}) == "policy_kwargs: 3; expected a mapping"
     assert supports("dqn", {"policy_kwargs": {"activation_fn": None}}) == "policy_kwargs: activation_fn"
     with pytest.raises(ParameterError, match=r"learning_rate: .* takes a number"):
         make_batch("dqn", runs_of(grid, {**DQN, "learning_rate": "lin_0.1"}))

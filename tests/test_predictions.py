@@ -103,6 +103,23 @@ def test_a_file_of_predictions_has_its_hash_and_its_date(predicted, tmp_path):
         read_predictions(tmp_path / "absent.parquet")
 
 
+def test_no_predictions_are_lost_where_others_are_written(predicted, tmp_path):
+    file, spec = tmp_path / "p.parquet", specification(SPEC)
+    first = write_predictions(spec, predicted, file)
+    before = file.read_bytes()
+    assert write_predictions(spec, predicted, file) == first, "with the date that they had"
+    assert file.read_bytes() == before
+    for i in range(1, 4):
+        write_predictions(spec, predicted.assign(kernel_regret=float(i)), file)
+    kept = sorted(path for path in tmp_path.iterdir() if path != file)
+    assert len(kept) == 3 and all(path.name.startswith("p.20") and path.suffix == ".parquet" for path in kept)
+    regrets = sorted(read_predictions(path)[0]["kernel_regret"].iloc[0] for path in (file, *kept))
+    assert regrets == sorted([predicted["kernel_regret"].iloc[0], 1.0, 2.0, 3.0])
+    file.write_bytes(b"no predictions")
+    write_predictions(spec, predicted, file)
+    assert read_predictions(file)[1]["sha256"] == first["sha256"]
+
+
 def made_up(noise, classes=8, instances=3, slope=1.0, seed=0):
     """Cells whose regret is a line in kernel_regret; all else is noise."""
     rng = np.random.default_rng(seed)

@@ -1,6 +1,7 @@
 """Regret predicted before any run: what measures of representations say of each cell of a study, hashed and dated."""
 
 import hashlib
+import itertools
 import json
 import math
 import os
@@ -196,7 +197,9 @@ def _schedule(config: Mapping[str, Any]) -> "Schedule":
 def write_predictions(study: Specification, predictions: "pd.DataFrame", file: str | os.PathLike) -> dict[str, str]:
     """Write predictions into a Parquet file with their SHA-256, the date and the version; return these.
 
-    The hash is of the rows alone: the same predictions have the same hash on any day.
+    The hash is of the rows alone: the same predictions have the same hash on any day. No prediction is lost: where the
+    file holds the same ones it stays, with the date that it has, which is returned; where it holds others it is kept
+    beside, with its date in its name.
 
     Raises:
         OSError: the file cannot be written; an older one then stays as it was.
@@ -211,10 +214,30 @@ def write_predictions(study: Specification, predictions: "pd.DataFrame", file: s
         "date": datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ"),
         "version": __version__,
     }
+    older = _description(Path(file))
+    if older is not None and older["sha256"] == said["sha256"]:
+        return older
+    if older is not None:
+        os.replace(file, _place_beside(Path(file), older["date"]))
     table = pa.Table.from_pandas(predictions, preserve_index=False)
     Path(file).parent.mkdir(parents=True, exist_ok=True)
     experiments.write_table(Path(file), table.replace_schema_metadata({_KEY: json.dumps(said).encode()}))
     return said
+
+
+def _description(file: Path) -> dict[str, str] | None:
+    """What a file of predictions says of itself; None where there is none, or it is no such file."""
+    try:
+        return read_predictions(file)[1]
+    except PharosError:
+        return None
+
+
+def _place_beside(file: Path, date: str) -> Path:
+    """`predictions.2026-11-23T034702Z.parquet`, or with a number where that is taken."""
+    name = f"{file.stem}.{date.replace(':', '')}"
+    names = itertools.chain([name], (f"{name}-{number}" for number in itertools.count(2)))
+    return next(place for each in names if not (place := file.with_name(each + file.suffix)).exists())
 
 
 def read_predictions(file: str | os.PathLike) -> "tuple[pd.DataFrame, dict[str, str]]":

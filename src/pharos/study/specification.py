@@ -119,8 +119,9 @@ def given_environments(file: str | os.PathLike) -> list[Any]:
         ParameterError: it is no such list, or names code: classes of one's own belong into a study's own YAML file.
     """
     path = Path(file)
+    text = _text_of(path)
     try:
-        entries = yaml.load(_text_of(path), Loader)
+        entries = yaml.load(text, Loader)
     except yaml.YAMLError as error:
         raise ParameterError(f"{path}: {getattr(error, 'problem', None) or 'this is no YAML'}") from error
     except (ValueError, RecursionError, OverflowError) as error:

@@ -174,6 +174,8 @@ def supports(agent: str, hyperparameters: Mapping[str, Any]) -> str | None:
         return f"agent {agent!r}: the batched engine has {' and '.join(OF_A_RUN)}"
     for name, value in hyperparameters.items():
         if name == "policy_kwargs":
+            if value is not None and not isinstance(value, Mapping):
+                return f"policy_kwargs: {value!r}; expected a mapping"
             others = sorted(set(value or {}) - {"net_arch"})
             if others:
                 return f"policy_kwargs: {others[0]}"
