@@ -48,10 +48,11 @@ def main():
     print(f"{begun} began before they were predicted, {unknown} do not say when; predictions:")
     for _, said in foretold.parts:
         print(f"    {said['sha256']}, {said['date']}")
-    for outcome in OUTCOMES:
-        rows = judged[judged["outcome"] == outcome]
+    for (agent, outcome), rows in judged.groupby(["agent", "outcome"], sort=False):
+        if outcome not in OUTCOMES:
+            continue
         whole = rows.loc[rows["cells"].idxmax()]  # predictors that are undefined somewhere have ceilings of their own
-        print(f"\n{outcome}: ceiling {whole['ceiling']:.2f}, of agreement {whole['agreement_ceiling']:.2f}")
+        print(f"\n{agent}, {outcome}: ceiling {whole['ceiling']:.2f}, of agreement {whole['agreement_ceiling']:.2f}")
         print("| predictor | R2 | rank correlation | p (Holm) | given the tabular learner | rightly ordered | image |")
         print("|---|---|---|---|---|---|---|")
         for row in rows.to_dict("records"):
