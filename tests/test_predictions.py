@@ -120,6 +120,20 @@ def test_no_predictions_are_lost_where_others_are_written(predicted, tmp_path):
     assert read_predictions(file)[1]["sha256"] == first["sha256"]
 
 
+def test_predictions_stay_where_others_cannot_be_written(predicted, tmp_path, monkeypatch):
+    file, spec = tmp_path / "p.parquet", specification(SPEC)
+    write_predictions(spec, predicted, file)
+    before = file.read_bytes()
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(predictions.experiments, "write_table", full)
+    with pytest.raises(OSError, match="No space left"):
+        write_predictions(spec, predicted.assign(kernel_regret=1.0), file)
+    assert file.read_bytes() == before and list(tmp_path.iterdir()) == [file]
+
+
 def made_up(noise, classes=8, instances=3, slope=1.0, seed=0):
     """Cells whose regret is a line in kernel_regret; all else is noise."""
     rng = np.random.default_rng(seed)

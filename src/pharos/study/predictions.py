@@ -217,11 +217,19 @@ def write_predictions(study: Specification, predictions: "pd.DataFrame", file: s
     older = _description(Path(file))
     if older is not None and older["sha256"] == said["sha256"]:
         return older
-    if older is not None:
-        os.replace(file, _place_beside(Path(file), older["date"]))
     table = pa.Table.from_pandas(predictions, preserve_index=False)
+    table = table.replace_schema_metadata({_KEY: json.dumps(said).encode()})
     Path(file).parent.mkdir(parents=True, exist_ok=True)
-    experiments.write_table(Path(file), table.replace_schema_metadata({_KEY: json.dumps(said).encode()}))
+    if older is None:
+        experiments.write_table(Path(file), table)
+        return said
+    beside = _place_beside(Path(file), older["date"])
+    os.replace(file, beside)
+    try:
+        experiments.write_table(Path(file), table)
+    except BaseException:
+        os.replace(beside, file)
+        raise
     return said
 
 
