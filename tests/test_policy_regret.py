@@ -1,5 +1,7 @@
 """The expected actor-critic in a kernel: against closed forms, explicit loops, and a wide network of PyTorch."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -84,7 +86,12 @@ def plain_actor_critic(mdp, kernel, schedule, rollouts, ascend=None, descend=Non
             v = v + eta * kernel @ (d * (target - v))
         for _ in range(rollouts.gradient_steps):
             p = softmax(z)
-            z = z + eta * kernel @ (d[:, None] * p * (advantage - (p * advantage).sum(axis=1, keepdims=True)))
+            counted = advantage.copy()
+            for s, a in np.ndindex(S, A):
+                far = rollouts.clip_range is not None and abs(p[s, a] / pi[s, a] - 1) > rollouts.clip_range
+                if far and (p[s, a] > pi[s, a]) == (advantage[s, a] > 0):
+                    counted[s, a] = 0.0
+            z = z + eta * kernel @ (d[:, None] * p * (counted - (p * counted).sum(axis=1, keepdims=True)))
     return (np.array(column) for column in zip(*rows, strict=True))
 
 
@@ -102,6 +109,51 @@ def test_the_measure_is_what_its_definition_says(sticky, random):
         np.testing.assert_allclose(found.curve.played, played, atol=1e-3)
         np.testing.assert_allclose(found.curve.episodes, episodes, rtol=1e-3)
     np.testing.assert_allclose(found.tabular.played, played, atol=1e-3)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("sticky", [0.0, 0.3])
+@pytest.mark.parametrize("clip_range", [0.05, 0.2])
+def test_clipping_is_what_its_definition_says(sticky, clip_range):
+    """State by state, also where states that look alike are pushed apart."""
+    mdp, rollouts = pharos.sticky_actions(random_mdp(), sticky), replace(ROLLOUTS, clip_range=clip_range)
+    alike = np.array([0, 1, 1, 3, 3, 5, 6])
+    aliased = kernel_of(7)[np.ix_(alike, alike)]
+    for kernel, classes in ((kernel_of(7), None), (np.eye(7), None), (aliased, alike)):
+        seen = Representation.of_matrix(kernel, classes)
+        found = kernel_policy_regret(mdp, seen, schedule=SHORT, rollouts=rollouts)
+        greedy, played, _ = plain_actor_critic(mdp, np.asarray(kernel, float), SHORT, rollouts)
+        np.testing.assert_allclose(found.curve.greedy, greedy, atol=1e-3)
+        np.testing.assert_allclose(found.curve.played, played, atol=1e-3)
+        without = kernel_policy_regret(mdp, seen, schedule=SHORT, rollouts=ROLLOUTS)
+        assert np.abs(found.curve.played - without.curve.played).max() > 0.01
+        assert found.to_dict()["evaluated"] == pytest.approx(
+            np.minimum(played, mean_field.WORST_GREEDY).mean(), abs=1e-3
+        )
+        assert found.conventions["rollouts"]["clip_range"] == clip_range
+
+
+def test_clipping_stops_a_probability_that_has_moved_far_enough():
+    """One state, two actions, one pays: each is pushed until its own probability has left the range."""
+    mdp = TabularMDP.from_arrays([[-1, -1]], [[0.0, 1.0]], gamma=1.0, horizon=1)
+    rollouts = Rollouts(steps=1, gradient_steps=7, clip_range=0.2)
+    seen = Representation.of_matrix(3 * np.eye(1))
+    found = kernel_policy_regret(mdp, seen, schedule=Schedule(steps=6), rollouts=rollouts).curve
+    logit, expected, ways = 0.0, [], set()
+    for _ in range(6):
+        first = p = 1 / (1 + np.exp(-logit))
+        expected.append((1 - p) / 0.5)
+        for _ in range(7):
+            up = 0.0 if p / first > 1.2 else np.sqrt((1 - first) / first)
+            down = 0.0 if (1 - p) / (1 - first) < 0.8 else np.sqrt(first / (1 - first))
+            ways.add((up > 0, down > 0))
+            logit += 2 * p * (1 - p) * (up + down) / 1.05
+            p = 1 / (1 + np.exp(-logit))
+    assert ways == {(True, True), (True, False), (False, False)}
+    assert found.played == pytest.approx(expected, abs=1e-6)
+    free = kernel_policy_regret(mdp, seen, schedule=Schedule(steps=6), rollouts=replace(rollouts, clip_range=1e9)).curve
+    without = kernel_policy_regret(mdp, seen, schedule=Schedule(steps=6), rollouts=replace(rollouts, clip_range=None))
+    assert free.played.tolist() == without.curve.played.tolist()
 
 
 def test_the_identity_is_the_softmax_policy_gradient_of_a_table():
@@ -129,7 +181,11 @@ def test_it_is_part_of_a_report_and_says_what_it_needs():
         assert report[NAME].value["value"] == direct.value
     with pytest.raises(UndefinedMeasure, match="kernel_policy_regret is defined for episodes"):
         kernel_policy_regret(chain(horizon=None, gamma=0.9), Representation.of_matrix(np.eye(4)))
-    for wrong, words in (({"steps": 0}, "steps is 0"), ({"gae_lambda": 1.5}, "gae_lambda is 1.5")):
+    for wrong, words in (
+        ({"steps": 0}, "steps is 0"),
+        ({"gae_lambda": 1.5}, "gae_lambda is 1.5"),
+        ({"clip_range": 0}, "clip_range is 0"),
+    ):
         with pytest.raises(ParameterError, match=words):
             Rollouts(**wrong)
 

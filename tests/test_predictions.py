@@ -39,6 +39,8 @@ def test_every_cell_that_sees_observations_is_predicted(predicted):
     assert predicted[list(study.PREDICTORS)].notna().all().all()
     of_policies = predicted[list(POLICY_PREDICTORS)].notna()
     assert of_policies.all(axis=1).tolist() == of_policies.any(axis=1).tolist() == [False, False, True, True]
+    is_ppo = predicted["agent"] == "ppo"
+    assert (predicted.loc[is_ppo, "clipped_regret_evaluated"] != predicted.loc[is_ppo, "policy_regret_evaluated"]).all()
     plain, hidden = predicted.iloc[0], predicted.iloc[1]
     assert plain["aliasing_floor"] == 0 < hidden["aliasing_floor"]
     assert plain["kernel_regret"] <= hidden["kernel_regret"]
@@ -58,6 +60,7 @@ def test_an_actor_critic_is_idealised_with_the_rollouts_and_the_lambda_of_its_ag
         predictions._of_policy({"agent": agent, "steps": 1000, "hyperparameters": own}, None, {})
     assert rollouts == [
         hardness.Rollouts(steps=512, gradient_steps=16, gae_lambda=0.95),
+        hardness.Rollouts(steps=512, gradient_steps=16, gae_lambda=0.95, clip_range=0.2),  # as A2C has not
         hardness.Rollouts(steps=40, gradient_steps=1, gae_lambda=1.0),
     ]
 

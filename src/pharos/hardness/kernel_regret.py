@@ -64,6 +64,7 @@ class KernelRegret:
         return {
             "value": self.value,
             "played": self.curve.mean_played,
+            "evaluated": self.curve.mean_evaluated,
             "tabular": self.tabular.mean_greedy,
             "tabular_played": self.tabular.mean_played,
             "observations": self.observations,

@@ -2,7 +2,7 @@
 
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
@@ -77,11 +77,14 @@ class Rollouts:
         steps: of the environment in a rollout, after which policy and values learn.
         gradient_steps: that they learn by.
         gae_lambda: weight of longer returns, in returns and advantages.
+        clip_range: PPO's: how far the probability of an action moves, as a share of itself, before it is no longer
+            pushed further; None: without.
     """
 
     steps: int = 512
     gradient_steps: int = 16
     gae_lambda: float = 0.95
+    clip_range: float | None = None
 
     def __post_init__(self) -> None:
         for name in ("steps", "gradient_steps"):
@@ -90,6 +93,12 @@ class Rollouts:
                 raise ParameterError(f"rollouts: {name} is {value!r}; expected a whole number, at least 1")
         if not 0 <= self.gae_lambda <= 1:
             raise ParameterError(f"rollouts: gae_lambda is {self.gae_lambda!r}; expected a number in [0, 1]")
+        if self.clip_range is not None and not self.clip_range > 0:
+            raise ParameterError(f"rollouts: clip_range is {self.clip_range!r}; expected a number above 0, or None")
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able; without `clip_range` where there is none, as it was before there could be one."""
+        return {name: value for name, value in asdict(self).items() if value is not None}
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,6 +126,11 @@ class LearningCurve:
     def mean_played(self) -> float:
         """Mean over episodes; a policy counts at most WORST_PLAYED."""
         return float(np.average(np.minimum(self.played, WORST_PLAYED), weights=self.episodes))
+
+    @property
+    def mean_evaluated(self) -> float:
+        """Mean over phases of what is played, as evaluations at equal distances see it; at most WORST_GREEDY each."""
+        return float(np.minimum(self.played, WORST_GREEDY).mean())
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-able."""

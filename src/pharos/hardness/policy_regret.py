@@ -49,10 +49,12 @@ def kernel_policy_regret(
         g times:   V += eta K diag(d) (sum_a pi G - V)
         g times:   z(., a) += eta K diag(d) p(a) (A(., a) - sum_b p(b) A(., b)),   p = softmax(z) at the step
 
-    which goes up PPO's objective E[p / pi A] without clipping. eta is 1 / (1.05 times the largest eigenvalue of
-    K diag(d)), d of states: no learning rate, and what K learns slowly stays slow.
+    which goes up PPO's objective E[p / pi A]. With `rollouts.clip_range` it is clipped: an action of a state whose p /
+    pi is above 1 + clip_range is no longer pushed up, one below 1 - clip_range no longer down. eta is 1 / (1.05 times
+    the largest eigenvalue of K diag(d)), d of states: no learning rate, and what K learns slowly stays slow.
     The value is the mean over rollouts of (V* - V of the most probable actions) / (V* - V of uniform play); as played,
-    that of pi.
+    that of pi, weighted by episodes; as evaluated, that of pi with all rollouts alike, which is what evaluations of the
+    distribution over actions see.
 
     Args:
         representation: the kernel; of an actor-critic `initialisation="sb3"`.
@@ -77,7 +79,7 @@ def kernel_policy_regret(
     schedule, rollouts = schedule or Schedule(), rollouts or Rollouts()
     learner = PolicyLearner(mdp, schedule, episode, solution, rollouts)
     of_schedule = {name: asdict(schedule)[name] for name in ("steps", "gamma", "optimizer")}
-    settings = {"schedule": of_schedule, "rollouts": asdict(rollouts)}
+    settings = {"schedule": of_schedule, "rollouts": rollouts.to_dict()}
     return regret_in_kernel(mdp, learner, representation, settings, "d")
 
 
@@ -113,9 +115,11 @@ class PolicyLearner(Learner):
             error = np.divide(goal, weights, out=values.copy(), where=weights > 0) - values
             values = values + descent(apply, weights, error, of_critic, steps)
             largest = apply.largest_eigenvalue(weights, of_actor)
-            pull = observations.sums(visits * _standardised(returns - v[:, None], visits))
+            gain = visits * _standardised(returns - v[:, None], visits)
             if largest > 0:
-                logits = ascended(logits, pull, apply, 1 / (MARGIN * largest), steps)
+                pull, up = observations.sums(gain), observations.sums(np.maximum(gain, 0.0))
+                rate = 1 / (MARGIN * largest)
+                logits = ascended(logits, pull, up, apply, rate, steps, self.rollouts.clip_range)
         return LearningCurve(*(np.array(column) for column in zip(*rows, strict=True)))
 
     def _returns(
@@ -131,12 +135,27 @@ class PolicyLearner(Learner):
         return returns, visits
 
 
-def ascended(logits: np.ndarray, pull: np.ndarray, apply: KernelOperator, rate: float, steps: int) -> np.ndarray:
-    """Logits (C, A) after gradient steps up the sum of pull(., a) p(a) / pi(a), pi their policy before the first."""
-    behaviour = np.maximum(softmax(logits), 1e-30)
+def ascended(
+    logits: np.ndarray,
+    pull: np.ndarray,
+    up: np.ndarray,
+    apply: KernelOperator,
+    rate: float,
+    steps: int,
+    clip_range: float | None = None,
+) -> np.ndarray:
+    """Logits (C, A) after gradient steps up the sum of pull(., a) p(a) / pi(a), pi their policy before the first.
+
+    Args:
+        pull: (C, A) weighted advantages, summed over the states of an observation; up: the positive ones alone.
+        clip_range: where p / pi is that far above 1 the positive ones count no more, that far below the negative ones.
+    """
+    behaviour, far = np.maximum(softmax(logits), 1e-30), np.inf if clip_range is None else clip_range
     for _ in range(steps):
         policy = softmax(logits)
-        of_action = pull * policy / behaviour
+        ratio = policy / behaviour
+        counted = np.where(ratio > 1 + far, pull - up, np.where(ratio < 1 - far, up, pull))
+        of_action = counted * policy / behaviour
         logits = logits + rate * apply(of_action - policy * of_action.sum(axis=1, keepdims=True))
         logits = np.maximum(logits - logits.max(axis=1, keepdims=True), -SPAN)
     return logits

@@ -238,7 +238,7 @@ def _conventions(problem: Problem) -> dict[str, Any]:
         else {"representation": dict(representation.conventions), "schedule": asdict(problem.schedule)}
     )
     if representation is not None and problem.rollouts is not None:
-        represented["rollouts"] = asdict(problem.rollouts)
+        represented["rollouts"] = problem.rollouts.to_dict()
     return {
         **represented,
         "gamma": float(mdp.gamma),

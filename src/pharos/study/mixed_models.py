@@ -45,9 +45,9 @@ def mixed_fit(x: np.ndarray, y: np.ndarray, classes: np.ndarray, mdps: np.ndarra
         try:
             model = smf.mixedlm("y ~ z", data, groups="family", re_formula="1", vc_formula={"mdp": "0 + C(mdp)"})
             fit = model.fit(reml=True, method=["lbfgs", "powell"])
+            slope, error = float(fit.fe_params["z"]), float(fit.bse_fe["z"])  # of a perfect line: a root of about -0
         except (np.linalg.LinAlgError, ValueError):
             return None
-    slope, error = float(fit.fe_params["z"]), float(fit.bse_fe["z"])
     if not np.isfinite(slope) or not error > 0:
         return None
     p = float(2 * stats.t.sf(abs(slope / error), count - 2))

@@ -11,6 +11,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
+import numpy as np
+
 from pharos import experiments
 from pharos.agents import agent_kind
 from pharos.errors import FileFormatError, ParameterError, PharosError, ResultCorrupted
@@ -35,10 +37,14 @@ PREDICTORS = (
     *("kernel_learning_time", "kernel_sample_complexity", "aliasing_floor", "exploration_time", "num_states"),
 )
 """Columns of predictions, numbers; the larger, the harder. `adam_regret` is kernel regret with `optimizer="adam"`."""
-POLICY_PREDICTORS = ("policy_regret", "policy_regret_played", "policy_tabular_regret")
-"""Columns beside them where an agent is an actor-critic: `kernel_policy_regret`, as played, and of a table."""
-ACTOR_CRITICS = {"ppo": 0.95, "a2c": 1.0}
-"""Agents that learn as actor-critics, and the lambda of their advantages where hyperparameters do not say it."""
+POLICY_PREDICTORS = (
+    *("policy_regret", "policy_regret_played", "policy_tabular_regret"),
+    *("policy_regret_evaluated", "clipped_regret", "clipped_regret_evaluated"),
+)
+"""Columns beside them where an agent is an actor-critic: `kernel_policy_regret`, as played, of a table, as evaluated;
+and of PPO with its clipping, of the most probable actions and as evaluated."""
+ACTOR_CRITICS = {"ppo": {"gae_lambda": 0.95, "clip_range": 0.2}, "a2c": {"gae_lambda": 1.0, "clip_range": None}}
+"""Agents that learn as actor-critics, and what their hyperparameters are where they are not said."""
 CURVE_POINTS = 40
 _KEY = b"pharos.predictions"
 _SAID = ("study", "sha256", "date", "version")
@@ -125,20 +131,31 @@ def _of_policy(config: Mapping[str, Any], mdp: "TabularMDP", options: Mapping[st
     """POLICY_PREDICTORS and `policy_curve`, of the idealised actor-critic with the rollouts and steps of the agent."""
     from pharos.hardness import Rollouts, Schedule, report
 
-    name, own = "kernel_policy_regret", config["hyperparameters"]
+    name, own = "kernel_policy_regret", {**ACTOR_CRITICS[config["agent"]], **config["hyperparameters"]}
     steps = int(own["n_steps"]) * int(own.get("n_envs", 1))
     minibatches = math.ceil(steps / int(own["batch_size"])) if own.get("batch_size") else 1
     rollouts = Rollouts(
-        steps=steps,
-        gradient_steps=minibatches * int(own.get("n_epochs", 1)),
-        gae_lambda=own.get("gae_lambda", ACTOR_CRITICS[config["agent"]]),
+        steps=steps, gradient_steps=minibatches * int(own.get("n_epochs", 1)), gae_lambda=own["gae_lambda"]
     )
     schedule = Schedule(steps=config["steps"], gamma=own.get("gamma", Schedule.gamma))
-    regret = report(mdp, [name], schedule=schedule, rollouts=rollouts, **options)[name].value
-    if regret is None:
-        return {**dict.fromkeys(POLICY_PREDICTORS, math.nan), "policy_curve": ""}
-    numbers = (regret["value"], regret["played"], regret["tabular"])
-    return {**dict(zip(POLICY_PREDICTORS, numbers, strict=True)), "policy_curve": _curve(regret)}
+    regret, clipped = (
+        None if each is None else report(mdp, [name], schedule=schedule, rollouts=each, **options)[name].value
+        for each in (rollouts, own["clip_range"] and replace(rollouts, clip_range=own["clip_range"]))
+    )
+    row = {**dict.fromkeys(POLICY_PREDICTORS, math.nan), "policy_curve": ""}
+    if regret is not None:
+        numbers = (regret["value"], regret["played"], regret["tabular"], _evaluated(regret))
+        row |= {**dict(zip(POLICY_PREDICTORS, numbers, strict=False)), "policy_curve": _curve(regret)}
+    if clipped is not None:
+        row |= {"clipped_regret": clipped["value"], "clipped_regret_evaluated": _evaluated(clipped)}
+    return row
+
+
+def _evaluated(regret: Mapping[str, Any]) -> float:
+    """`LearningCurve.mean_evaluated`, which results that were kept before it was there do not have."""
+    from pharos.hardness.mean_field import WORST_GREEDY
+
+    return float(np.minimum(regret["curve"]["played"], WORST_GREEDY).mean())
 
 
 def _curve(regret: Mapping[str, Any]) -> str:
