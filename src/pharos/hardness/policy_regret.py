@@ -115,11 +115,10 @@ class PolicyLearner(Learner):
             error = np.divide(goal, weights, out=values.copy(), where=weights > 0) - values
             values = values + descent(apply, weights, error, of_critic, steps)
             largest = apply.largest_eigenvalue(weights, of_actor)
-            gain = visits * _standardised(returns - v[:, None], visits)
+            gain = visits * self.advantages(memory, policy, v, returns, visits)
             if largest > 0:
                 pull, up = observations.sums(gain), observations.sums(np.maximum(gain, 0.0))
-                rate = 1 / (MARGIN * largest)
-                logits = ascended(logits, pull, up, apply, rate, steps, self.rollouts.clip_range)
+                logits = self.ascended(logits, pull, up, apply, 1 / (MARGIN * largest))
         return LearningCurve(*(np.array(column) for column in zip(*rows, strict=True)))
 
     def _returns(
@@ -133,6 +132,18 @@ class PolicyLearner(Learner):
             if np.abs(returns - before).max() <= RETURNS * np.abs(returns).max():
                 break
         return returns, visits
+
+    def advantages(
+        self, memory: Memory, policy: np.ndarray, v: np.ndarray, returns: np.ndarray, visits: np.ndarray
+    ) -> np.ndarray:
+        """(N, A) by which the policy learns, from returns (N, A) of choices and values v (N,), at visits of sum 1."""
+        return standardised(returns - v[:, None], visits)
+
+    def ascended(
+        self, logits: np.ndarray, pull: np.ndarray, up: np.ndarray, apply: KernelOperator, rate: float
+    ) -> np.ndarray:
+        """(C, A) logits after the gradient steps of a rollout."""
+        return ascended(logits, pull, up, apply, rate, self.rollouts.gradient_steps, self.rollouts.clip_range)
 
 
 def ascended(
@@ -167,9 +178,8 @@ def softmax(logits: np.ndarray) -> np.ndarray:
     return grown / grown.sum(axis=1, keepdims=True)
 
 
-def _standardised(advantages: np.ndarray, visits: np.ndarray) -> np.ndarray:
-    """(N, A) of mean 0 and standard deviation 1 under visits of sum 1; 0 where they are all the same."""
+def standardised(advantages: np.ndarray, visits: np.ndarray, noise: float = 0.0) -> np.ndarray:
+    """(N, A) of mean 0 and variance 1 under visits of sum 1, `noise` added to it; 0 where they are all the same."""
     centred = advantages - (visits * advantages).sum()
-    spread = float(np.sqrt((visits * centred**2).sum()))
-    standardised: np.ndarray = centred / spread if spread > 1e-12 else np.zeros_like(centred)
-    return standardised
+    spread = float(np.sqrt((visits * centred**2).sum() + noise))
+    return centred / spread if spread > 1e-12 else np.zeros_like(centred)

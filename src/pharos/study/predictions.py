@@ -27,7 +27,7 @@ from pharos.wording import many
 if TYPE_CHECKING:
     import pandas as pd
 
-    from pharos.hardness import Schedule
+    from pharos.hardness import Rollouts, Schedule
     from pharos.mdp import TabularMDP
 
 MEASURES = ("kernel_regret", "kernel_learning_time", "kernel_sample_complexity", "aliasing_floor", "exploration_time")
@@ -43,7 +43,10 @@ POLICY_PREDICTORS = (
 )
 """Columns beside them where an agent is an actor-critic: `kernel_policy_regret`, as played, of a table, as evaluated;
 and of PPO with its clipping, of the most probable actions and as evaluated."""
-ACTOR_CRITICS = {"ppo": {"gae_lambda": 0.95, "clip_range": 0.2}, "a2c": {"gae_lambda": 1.0, "clip_range": None}}
+ACTOR_CRITICS: Mapping[str, Mapping[str, Any]] = {
+    "ppo": {"gae_lambda": 0.95, "clip_range": 0.2},
+    "a2c": {"gae_lambda": 1.0, "clip_range": None},
+}
 """Agents that learn as actor-critics, and what their hyperparameters are where they are not said."""
 CURVE_POINTS = 40
 _KEY = b"pharos.predictions"
@@ -129,19 +132,16 @@ def _predicted(run: Run) -> dict[str, Any]:
 
 def _of_policy(config: Mapping[str, Any], mdp: "TabularMDP", options: Mapping[str, Any]) -> dict[str, Any]:
     """POLICY_PREDICTORS and `policy_curve`, of the idealised actor-critic with the rollouts and steps of the agent."""
-    from pharos.hardness import Rollouts, Schedule, report
+    from pharos.hardness import Schedule, report
 
-    name, own = "kernel_policy_regret", {**ACTOR_CRITICS[config["agent"]], **config["hyperparameters"]}
-    steps = int(own["n_steps"]) * int(own.get("n_envs", 1))
-    minibatches = math.ceil(steps / int(own["batch_size"])) if own.get("batch_size") else 1
-    rollouts = Rollouts(
-        steps=steps, gradient_steps=minibatches * int(own.get("n_epochs", 1)), gae_lambda=own["gae_lambda"]
-    )
-    schedule = Schedule(steps=config["steps"], gamma=own.get("gamma", Schedule.gamma))
-    regret, clipped = (
-        None if each is None else report(mdp, [name], schedule=schedule, rollouts=each, **options)[name].value
-        for each in (rollouts, own["clip_range"] and replace(rollouts, clip_range=own["clip_range"]))
-    )
+    name, (rollouts, clip_range) = "kernel_policy_regret", _rollouts(config)
+    schedule = Schedule(steps=config["steps"], gamma=config["hyperparameters"].get("gamma", Schedule.gamma))
+
+    def learnt(rollouts: "Rollouts") -> Any:
+        return report(mdp, [name], schedule=schedule, rollouts=rollouts, **options)[name].value
+
+    regret = learnt(rollouts)
+    clipped = None if clip_range is None else learnt(replace(rollouts, clip_range=clip_range))
     row = {**dict.fromkeys(POLICY_PREDICTORS, math.nan), "policy_curve": ""}
     if regret is not None:
         numbers = (regret["value"], regret["played"], regret["tabular"], _evaluated(regret))
@@ -151,11 +151,22 @@ def _of_policy(config: Mapping[str, Any], mdp: "TabularMDP", options: Mapping[st
     return row
 
 
+def _rollouts(config: Mapping[str, Any]) -> tuple["Rollouts", float | None]:
+    """Those of an actor-critic, without clipping; and how far its agent clips."""
+    from pharos.hardness import Rollouts
+
+    own = {**ACTOR_CRITICS[config["agent"]], **config["hyperparameters"]}
+    steps = int(own["n_steps"]) * int(own.get("n_envs", 1))
+    minibatches = math.ceil(steps / int(own["batch_size"])) if own.get("batch_size") else 1
+    gradient_steps = minibatches * int(own.get("n_epochs", 1))
+    return Rollouts(steps=steps, gradient_steps=gradient_steps, gae_lambda=own["gae_lambda"]), own["clip_range"]
+
+
 def _evaluated(regret: Mapping[str, Any]) -> float:
     """`LearningCurve.mean_evaluated`, which results that were kept before it was there do not have."""
-    from pharos.hardness.mean_field import WORST_GREEDY
+    from pharos.hardness import LearningCurve
 
-    return float(np.minimum(regret["curve"]["played"], WORST_GREEDY).mean())
+    return LearningCurve(**{name: np.asarray(values) for name, values in regret["curve"].items()}).mean_evaluated
 
 
 def _curve(regret: Mapping[str, Any]) -> str:
