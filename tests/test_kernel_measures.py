@@ -261,7 +261,12 @@ def test_landmarks_are_exact_where_there_are_enough_of_them_and_say_so_where_not
     assert exact.landmarks is None
     assert exact.note == ""
     assert all_but_one.landmarks == 11
-    assert "no bound" in all_but_one.note
+    assert "no bounds" in all_but_one.note
+    half = kernel_regret(mdp, Representation.of_matrix(kernel, landmarks=5), schedule=SHORT)
+    changed = [
+        abs(getattr(all_but_one.curve, each) - getattr(half.curve, each)) for each in ("mean_greedy", "mean_played")
+    ]
+    assert [all_but_one.estimated_error, all_but_one.estimated_error_played] == pytest.approx(changed)
     assert all_but_one.value == pytest.approx(exact.value, abs=0.05)
     identity = kernel_regret(mdp, Representation.of_matrix(np.eye(12), landmarks=4), schedule=SHORT)
     np.testing.assert_allclose(identity.curve.greedy, identity.tabular.greedy, atol=1e-3)
@@ -438,6 +443,8 @@ def test_a_kernel_that_does_not_fit_is_told_before_anything_is_learnt(grid, monk
         raise AssertionError("learnt first")
 
     monkeypatch.setattr("pharos.hardness.mean_field.Learner.curve", learnt)
+    with pytest.raises(ParameterError, match="landmarks is 1; expected at least 2"):
+        representation(grid, "vector", "mlp16", landmarks=1)
     seen = representation(grid, "vector", "mlp16", landmarks=0)
     monkeypatch.setattr("pharos.memory.available_memory", lambda: 800)
     with pytest.raises(ParameterError, match=r"10 states fit into memory.*landmarks"):

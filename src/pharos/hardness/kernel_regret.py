@@ -30,7 +30,8 @@ class KernelRegret:
         curve: with the kernel; tabular: with the identity in its place, on the states themselves.
         observations: different ones that it learns from; states: that can be met and are not terminal.
         landmarks: of the approximation; None: the kernel is exact.
-        estimated_error: half of the landmarks change the value by that much: an estimate, not a bound; 0 where exact.
+        estimated_error, estimated_error_played: half of the landmarks change the regret of the greedy policies, and
+            what is played, by that much: estimates, not bounds; 0 where exact.
         conventions: schedule, episode, observation and network.
         name: of the measure.
     """
@@ -43,6 +44,7 @@ class KernelRegret:
     estimated_error: float
     conventions: Mapping[str, Any] = field(default_factory=dict)
     name: str = "kernel_regret"
+    estimated_error_played: float = 0.0
 
     @property
     def value(self) -> float:
@@ -56,7 +58,8 @@ class KernelRegret:
             return ""
         return (
             f"{self.name}: by {self.landmarks} landmarks of {self.observations:,} observations; half of them change "
-            f"it by {self.estimated_error:.2g}, which is an estimate of its error and no bound"
+            f"it by {self.estimated_error:.2g} ({self.estimated_error_played:.2g} as played), which are estimates of "
+            "the error and no bounds"
         )
 
     def to_dict(self) -> dict[str, Any]:
@@ -71,6 +74,7 @@ class KernelRegret:
             "states": self.states,
             "landmarks": self.landmarks,
             "estimated_error": self.estimated_error,
+            "estimated_error_played": self.estimated_error_played,
             "conventions": dict(self.conventions),
             "curve": self.curve.to_dict(),
             "tabular_curve": self.tabular.to_dict(),
@@ -142,7 +146,7 @@ def regret_in_kernel(
     """
     everything = learner.numbers[learner.states]
     observations = Grouped(representation.classes, everything)
-    landmarks, error = representation.landmarks, 0.0
+    landmarks, errors = representation.landmarks, (0.0, 0.0)
     if landmarks is None and len(observations) > MOST_EXACT:
         landmarks = LANDMARKS
     observed, is_adam = observations.representatives, learner.schedule.optimizer == "adam"
@@ -167,7 +171,7 @@ def regret_in_kernel(
             learnt(Landmarks(representation.kernel, observed, some))
             for some in (chosen, chosen[: max(1, landmarks // 2)])
         )
-        error = abs(curve.mean_greedy - half.mean_greedy)
+        errors = (abs(curve.mean_greedy - half.mean_greedy), abs(curve.mean_played - half.mean_played))
     conventions = {
         **settings,
         "episode": learner.episode,
@@ -178,5 +182,13 @@ def regret_in_kernel(
         **representation.conventions,
     }
     return KernelRegret(
-        curve, tabular, len(observations), len(everything), landmarks, error, conventions, learner.measure
+        curve=curve,
+        tabular=tabular,
+        observations=len(observations),
+        states=len(everything),
+        landmarks=landmarks,
+        estimated_error=errors[0],
+        estimated_error_played=errors[1],
+        conventions=conventions,
+        name=learner.measure,
     )

@@ -47,6 +47,8 @@ def empirical_ntk(
             total += (rows @ facing.T).double().numpy()
     if not np.isfinite(total).all():
         raise ParameterError("gradients of the network are not finite; expected finite parameters and inputs")
+    if others is None:
+        total = (total + total.T) / 2  # products of one matrix with its own transpose may differ in the last bits
     return (total / networks).astype(np.float32)
 
 

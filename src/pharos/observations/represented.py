@@ -40,8 +40,8 @@ def representation(
         network, initialisation: as for `ntk`. Or a network of one's own, a function of the shape of an input that
             returns a torch.nn.Module, or its name, "file.py:function" or "module:function": its kernel is the mean over
             20 random ones, see `empirical_ntk`; initialisation is the function's.
-        landmarks: of the approximation of the kernel; None: where there are more than 4,096 different observations; 0:
-            never.
+        landmarks: of the approximation of the kernel, at least 2; None: where there are more than 4,096 different
+            observations; 0: never.
     Raises:
         ParameterError: the environment's class is not known, the network has no closed form or does not fit the
             observation, the observation has no space that networks take, or landmarks is no number of them.
@@ -51,6 +51,8 @@ def representation(
         raise ParameterError(f"{space}: the class of its environment is not known, so nothing is seen of its states")
     if landmarks is not None and (isinstance(landmarks, bool) or not isinstance(landmarks, int) or landmarks < 0):
         raise ParameterError(f"landmarks is {landmarks!r}; expected a whole number, 0 for none, or None")
+    if landmarks == 1:
+        raise ParameterError("landmarks is 1; expected at least 2, as half of them tell the error, or 0 for none")
     observer = observe(space.environment, observation, state_space=space, **options)
     first = network_inputs(observer, space.states(slice(0, 1)))
     if callable(network) or sources.is_reference(network):
