@@ -134,6 +134,8 @@ def test_every_name_that_is_listed_can_be_made():
 @pytest.mark.parametrize(
     ("name", "parameters", "expected"),
     (
+        ("./absent", {}, "'./absent'; no such folder; expected what `pharos import` writes"),
+        ("/", {}, "'/'; no imported MDP is in that folder; expected"),
         ("brekout", {}, "unknown environment 'brekout'; did you mean 'breakout'?"),
         ("breakout", {"hight": 9}, "unknown parameter of breakout 'hight'; did you mean 'height'?"),
         ("simple_grid", {"zzz": 9}, "known: goal, height, penalties, rewards, width"),

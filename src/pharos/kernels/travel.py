@@ -174,7 +174,7 @@ def attempt(
             new[i] = own + max(mean - prob[i] * times[node[i]], 0.0) + (high - low + 2) * EPSILON * mean
             increase = max(increase, new[i] - value[i])
             continue
-        if node[i] == owner[i]:
+        if node[i] == owner[i]:  # an outcome that stays is on no shortest way, so that no sum takes its entry
             continue
         worst = 0.0
         for previous in range(-1, num_previous):
