@@ -39,6 +39,8 @@ def test_every_cell_that_sees_observations_is_predicted(predicted):
     assert predicted[list(study.PREDICTORS)].notna().all().all()
     of_policies = predicted[list(POLICY_PREDICTORS)].notna()
     assert of_policies.all(axis=1).tolist() == of_policies.any(axis=1).tolist() == [False, False, True, True]
+    assert json.loads(predicted.iloc[2]["clipped_curve"])[0] == [0, 1.0]  # it begins as uniform play
+    assert predicted.iloc[0][["policy_curve", "clipped_curve"]].tolist() == ["", ""]
     is_ppo = predicted["agent"] == "ppo"
     assert (predicted.loc[is_ppo, "clipped_regret_evaluated"] != predicted.loc[is_ppo, "policy_regret_evaluated"]).all()
     plain, hidden = predicted.iloc[0], predicted.iloc[1]

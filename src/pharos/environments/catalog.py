@@ -48,8 +48,8 @@ def make(name: str, **parameters: Any) -> Environment:
     if cls is None or (slash and instance not in cls.instances):
         if not sources.is_reference(name):
             if name.startswith((".", "/", "~")):
-                found = "no imported MDP is in that folder" if Path(name).expanduser().is_dir() else "no such folder"
-                raise UnknownName("environment", name, (), f"{found}; expected what `pharos import` writes")
+                reason = "no imported MDP is in that folder" if Path(name).expanduser().is_dir() else "no such folder"
+                raise UnknownName("environment", name, (), f"{reason}; expected what `pharos import` writes")
             shown = f"known: {', '.join(sorted(classes()))}; `pharos list` shows their parameters and named instances"
             raise UnknownName("environment", name, list_environments(), shown)
         cls, slash = imported(name), ""

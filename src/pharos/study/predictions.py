@@ -43,6 +43,7 @@ POLICY_PREDICTORS = (
 )
 """Columns beside them where an agent is an actor-critic: `kernel_policy_regret`, as played, of a table, as evaluated;
 and of PPO with its clipping, of the most probable actions and as evaluated."""
+POLICY_CURVES = ("policy_curve", "clipped_curve")
 ACTOR_CRITICS: Mapping[str, Mapping[str, Any]] = {
     "ppo": {"gae_lambda": 0.95, "clip_range": 0.2},
     "a2c": {"gae_lambda": 1.0, "clip_range": None},
@@ -69,7 +70,8 @@ def predict(
         that of `kernel_regret` where landmarks stand for the kernel; `curve` and `adam_curve`, the learner's steps and
         greedy regrets as JSON; `notes`, why a number is missing. The idealised learner has the steps of the run, and of
         a DQN its discount, exploration and target network; of actor-critics, with the rollouts, steps and discount of
-        the agent, POLICY_PREDICTORS and `policy_curve`, NaN and "" in rows of others.
+        the agent, POLICY_PREDICTORS, `policy_curve` and `clipped_curve`, that of the distribution over actions with
+        PPO's clipping, NaN and "" in rows of others.
     Raises:
         ParameterError: the study has no such cell.
     Cost: measures of hardness are kept beside the state spaces, so that a second call is quick.
@@ -90,7 +92,7 @@ def predict(
     if not rows:
         raise ParameterError(f"study {study.name!r}: no agent learns from observations, so there is nothing to predict")
     frame = pd.DataFrame(list(rows.values()))
-    return frame.fillna({"policy_curve": ""}) if "policy_curve" in frame else frame
+    return frame.fillna({name: "" for name in POLICY_CURVES if name in frame})
 
 
 def _predicted(run: Run) -> dict[str, Any]:
@@ -131,7 +133,7 @@ def _predicted(run: Run) -> dict[str, Any]:
 
 
 def _of_policy(config: Mapping[str, Any], mdp: "TabularMDP", options: Mapping[str, Any]) -> dict[str, Any]:
-    """POLICY_PREDICTORS and `policy_curve`, of the idealised actor-critic with the rollouts and steps of the agent."""
+    """POLICY_PREDICTORS and POLICY_CURVES, of the idealised actor-critic with the rollouts and steps of the agent."""
     from pharos.hardness import Schedule, report
 
     name, (rollouts, clip_range) = "kernel_policy_regret", _rollouts(config)
@@ -142,12 +144,13 @@ def _of_policy(config: Mapping[str, Any], mdp: "TabularMDP", options: Mapping[st
 
     regret = learnt(rollouts)
     clipped = None if clip_range is None else learnt(replace(rollouts, clip_range=clip_range))
-    row = {**dict.fromkeys(POLICY_PREDICTORS, math.nan), "policy_curve": ""}
+    row = {**dict.fromkeys(POLICY_PREDICTORS, math.nan), **dict.fromkeys(POLICY_CURVES, "")}
     if regret is not None:
         numbers = (regret["value"], regret["played"], regret["tabular"], _evaluated(regret))
         row |= {**dict(zip(POLICY_PREDICTORS, numbers, strict=False)), "policy_curve": _curve(regret)}
     if clipped is not None:
         row |= {"clipped_regret": clipped["value"], "clipped_regret_evaluated": _evaluated(clipped)}
+        row["clipped_curve"] = _curve(clipped, "played")
     return row
 
 
@@ -169,12 +172,12 @@ def _evaluated(regret: Mapping[str, Any]) -> float:
     return LearningCurve(**{name: np.asarray(values) for name, values in regret["curve"].items()}).mean_evaluated
 
 
-def _curve(regret: Mapping[str, Any]) -> str:
-    """Steps and greedy regret of the idealised learner, of at most CURVE_POINTS of its phases, as JSON."""
-    steps, greedy = regret["curve"]["steps"], regret["curve"]["greedy"]
+def _curve(regret: Mapping[str, Any], of: str = "greedy") -> str:
+    """Steps and regret of the idealised learner, of at most CURVE_POINTS of its phases, as JSON."""
+    steps, regrets = regret["curve"]["steps"], regret["curve"][of]
     every = max(1, math.ceil(len(steps) / CURVE_POINTS))
     return json.dumps(
-        [[int(step), round(value, 4)] for step, value in zip(steps[::every], greedy[::every], strict=True)]
+        [[int(step), round(value, 4)] for step, value in zip(steps[::every], regrets[::every], strict=True)]
     )
 
 
@@ -331,7 +334,7 @@ class Foretold:
                 f"{many(len(twice), 'cell')} predicted twice, such as {', '.join(twice.iloc[0])}; "
                 "expected files of different cells"
             )
-        object.__setattr__(self, "cells", cells.fillna({"policy_curve": ""}) if "policy_curve" in cells else cells)
+        object.__setattr__(self, "cells", cells.fillna({name: "" for name in POLICY_CURVES if name in cells}))
 
     @staticmethod
     def of(predictions: "Predictions | Sequence[Predictions] | None") -> "Foretold | None":

@@ -18,8 +18,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MOST_PANELS = 24
-# Predictor and curve of each idealised learner; the first that there is counts.
-LEARNERS = (("policy_regret", "policy_curve"), ("kernel_regret", "curve"))
+# Predictors and curves of the idealised learners; the first that there is counts.
+LEARNERS = ("clipped_regret_evaluated", "policy_regret", "kernel_regret")
+CURVES = ("clipped_curve", "policy_curve", "curve")
 DIAGONAL = "#888888"
 LONGEST_TITLE = 34
 
@@ -44,7 +45,7 @@ def unseen_figures(
 
 def predicted_by_class(part: "pd.DataFrame", predictor: str | None = None) -> "Figure | None":
     """A panel for each class: regret against what a line through the other classes predicts for it."""
-    predictor = predictor or _learner(part)[0]
+    predictor = predictor or _learner(part)
     cells = Cells.of(part, [predictor], "greedy")
     if len(np.unique(cells.classes)) < 2:
         return None
@@ -69,7 +70,7 @@ def predicted_by_class(part: "pd.DataFrame", predictor: str | None = None) -> "F
 
 def observations_of_mdps(part: "pd.DataFrame", predictor: str | None = None) -> "Figure | None":
     """A panel for each MDP, up to MOST_PANELS: regret under each observation, of the agent and as predicted."""
-    predictor = predictor or _learner(part)[0]
+    predictor = predictor or _learner(part)
     observations = list(dict.fromkeys(part["observation"]))
     groups = [
         (key, rows) for key, rows in part.groupby(["environment", "instance", "chance"], sort=False) if len(rows) > 1
@@ -100,8 +101,8 @@ def observations_of_mdps(part: "pd.DataFrame", predictor: str | None = None) -> 
 
 def idealised_curves(part: "pd.DataFrame", points: "pd.DataFrame", runs: "pd.DataFrame") -> "Figure | None":
     """A panel for each MDP, up to MOST_PANELS / 2: regret by steps of the agent and of the idealised learner."""
-    curve = _learner(part)[1]
-    if curve not in part:
+    curve = next((name for name in CURVES if name in part and part[name].fillna("").astype(bool).any()), None)
+    if curve is None:
         return None
     observations = list(dict.fromkeys(part["observation"]))
     groups = _spread(list(part.groupby(["environment", "instance", "chance"], sort=False)), MOST_PANELS // 2)
@@ -125,9 +126,9 @@ def idealised_curves(part: "pd.DataFrame", points: "pd.DataFrame", runs: "pd.Dat
     return figure
 
 
-def _learner(part: "pd.DataFrame") -> tuple[str, str]:
-    """Predictor and curve of the idealised learner that an agent is held against."""
-    has = (names for names in LEARNERS if names[0] in part and part[names[0]].notna().any())
+def _learner(part: "pd.DataFrame") -> str:
+    """The predictor that an agent is held against."""
+    has = (name for name in LEARNERS if name in part and part[name].notna().any())
     return next(has, LEARNERS[-1])
 
 
