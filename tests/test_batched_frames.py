@@ -156,7 +156,8 @@ def test_ppo_gathers_the_frames_and_values_that_stable_baselines3_gathers(sight,
         assert (channels_first(seen, tuple(shape)).reshape(their["observations"].shape) == their["observations"]).all()
         assert (their["episode_starts"] == mine["begins"]).all()
         for name, counterpart in (("rewards", "rewards"), ("values", "kept_values"), ("advantages", "advantages")):
-            assert np.abs(their[name] - mine[counterpart]).max() <= 1e-6, name
+            # of order 1 in float32: sums of a thousand products, in the order that the processor's library takes
+            assert np.abs(their[name] - mine[counterpart]).max() <= 1e-5, name
 
 
 def outcome(batch, i):
