@@ -445,6 +445,8 @@ def test_a_kernel_that_does_not_fit_is_told_before_anything_is_learnt(grid, monk
     monkeypatch.setattr("pharos.hardness.mean_field.Learner.curve", learnt)
     with pytest.raises(ParameterError, match="landmarks is 1; expected at least 2"):
         representation(grid, "vector", "mlp16", landmarks=1)
+    with pytest.raises(ParameterError, match="landmarks is 1; expected at least 2"):
+        Representation.of_matrix(np.eye(4), landmarks=1)
     seen = representation(grid, "vector", "mlp16", landmarks=0)
     monkeypatch.setattr("pharos.memory.available_memory", lambda: 800)
     with pytest.raises(ParameterError, match=r"10 states fit into memory.*landmarks"):

@@ -168,8 +168,7 @@ def regret_in_kernel(
         assert landmarks is not None
         chosen = observed[drawn(weights, landmarks)]
         curve, half = (
-            learnt(Landmarks(representation.kernel, observed, some))
-            for some in (chosen, chosen[: max(1, landmarks // 2)])
+            learnt(Landmarks(representation.kernel, observed, some)) for some in (chosen, chosen[: landmarks // 2])
         )
         errors = (abs(curve.mean_greedy - half.mean_greedy), abs(curve.mean_played - half.mean_played))
     conventions = {

@@ -22,8 +22,8 @@ class Representation:
             semidefinite, and symmetric where rows are columns.
         classes: (S,) the number of each state's observation, from 0: states of one number look alike.
         time_limit: steps of an episode that the agent sees, where the MDP has no horizon; or None.
-        landmarks: of the approximation beyond MOST_EXACT different observations; 0: none, whatever it takes; more than
-            0: for all sizes.
+        landmarks: of the approximation beyond MOST_EXACT different observations; 0: none, whatever it takes; 2 or more:
+            for all sizes.
         conventions: what it is, JSON-able.
     """
 
@@ -33,12 +33,17 @@ class Representation:
     landmarks: int | None = None
     conventions: Mapping[str, Any] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        if self.landmarks == 1:
+            raise ParameterError("landmarks is 1; expected at least 2, as half of them tell the error, or 0 for none")
+
     @staticmethod
     def of_matrix(kernel: Any, classes: Any = None, **options: Any) -> "Representation":
         """From a kernel (S, S), and numbers of observations (S,); None: every state looks different.
 
         Raises:
-            ParameterError: it is not square, symmetric and finite, or there is not one number for each state.
+            ParameterError: it is not square, symmetric and finite, there is not one number for each state, or there
+                is one landmark.
         """
         matrix = np.asarray(kernel, np.float32)
         if matrix.ndim != 2 or matrix.shape[0] != matrix.shape[1] or not np.isfinite(matrix).all():

@@ -51,8 +51,6 @@ def representation(
         raise ParameterError(f"{space}: the class of its environment is not known, so nothing is seen of its states")
     if landmarks is not None and (isinstance(landmarks, bool) or not isinstance(landmarks, int) or landmarks < 0):
         raise ParameterError(f"landmarks is {landmarks!r}; expected a whole number, 0 for none, or None")
-    if landmarks == 1:
-        raise ParameterError("landmarks is 1; expected at least 2, as half of them tell the error, or 0 for none")
     observer = observe(space.environment, observation, state_space=space, **options)
     first = network_inputs(observer, space.states(slice(0, 1)))
     if callable(network) or sources.is_reference(network):
