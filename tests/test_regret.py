@@ -4,6 +4,7 @@
 import math
 
 import numpy as np
+import pandas as pd
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -20,7 +21,8 @@ from pharos.experiments import (
     train,
 )
 from pharos.mdp import TabularMDP
-from pharos.solvers import uniform_value, value_iteration, worst_value
+from pharos.solvers import regret_scale, uniform_value, value_iteration, worst_value
+from pharos.study.unseen_classes import normalized_regrets
 from strategies import deterministic_mdps
 
 CHANCE = [{}, {"random": 0.2}, {"sticky": 0.25}]
@@ -181,3 +183,23 @@ def test_mistakes_are_named(tmp_path):
         cumulative_expected_regret([0, 5], [1, 1, 1])
     with pytest.raises(FileFormatError, match="no such file"):
         RegretCurve.read(tmp_path)
+
+
+@given(st.floats(-1e6, 1e6), st.floats(0, 1e6), st.floats(0, 1e3))
+def test_regret_has_a_scale_where_the_values_can_tell_the_reference_from_the_optimum(optimal, lost, error):
+    scale = regret_scale(optimal, optimal - lost, error)
+    between = optimal - (optimal - lost)
+    assert scale == between if between > max(1e-12, 2 * error) else math.isnan(scale)
+    np.testing.assert_array_equal(regret_scale([optimal] * 2, [optimal - lost] * 2, error), [scale] * 2)
+
+
+def test_runs_evaluations_and_tables_of_studies_divide_by_the_same_scale(run_folder):
+    """Of one run: what its record says, what `pharos.experiments.regret` says of its values, and what a study says."""
+    result, values = run_folder.result, RegretCurve.read(run_folder.folder).values
+    scale = regret_scale(values.optimal, values.uniform)
+    assert result["normalized_regret"] == pytest.approx(result["cumulative_regret"] / (result["episodes"] * scale))
+    last = run_folder.curve[-1]
+    assert last["normalized_regret"] == regret(last["value"], values, normalized_by="uniform")
+    runs = pd.DataFrame([{"id": "a", "value_optimal": values.optimal, "value_uniform": values.uniform}])
+    points = pd.DataFrame([{"id": "a", "value": last["value"]}])
+    assert normalized_regrets(points, runs).tolist() == [last["normalized_regret"]]

@@ -1,5 +1,6 @@
 """pharos evaluate: the exact value of a policy, between those of the best and the worst."""
 
+import math
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -62,6 +63,8 @@ def evaluate(
 
     Only a policy that sees several frames and reaches more than 100,000 histories is estimated, from 2,000 episodes.
     """
+    from pharos.solvers import regret_scale
+
     building = build_options(memory, workers, max_states)
     goal = parse_target(target, parameters)
     decisions = None if policy in POLICIES else read_policy(policy, trust=trust)
@@ -80,7 +83,9 @@ def evaluate(
             values["given"] = _worth(solution_of(mdp, policy, decisions, tolerance))
     best, uniform, worst = (values[name].value for name in POLICIES)
     worth = values["given"]
-    value, spread = worth.value, best - uniform
+    value = worth.value
+    error = max(values[name].error_bound for name in POLICIES)
+    relative, against_worst = ((best - value) / regret_scale(best, other, error) for other in (uniform, worst))
     answer = {
         "policy": policy,
         "value_at_start": value,
@@ -88,8 +93,8 @@ def evaluate(
         "exact": worth.episodes == 0,
         "episodes": worth.episodes,
         "regret": best - value,
-        "normalized_regret": (best - value) / spread if spread > 4 * tolerance else None,
-        "regret_relative_to_worst": (best - value) / (best - worst) if best - worst > 4 * tolerance else None,
+        "normalized_regret": relative,
+        "regret_relative_to_worst": against_worst,
         "optimal_value_at_start": best,
         "uniform_value_at_start": uniform,
         "worst_value_at_start": worst,
@@ -103,14 +108,13 @@ def evaluate(
     if json:
         print_json(answer)
         return
-    relative, against_worst = answer["normalized_regret"], answer["regret_relative_to_worst"]
     print_facts(
         f"{policy} policy on {' '.join((target, *(parameters or ())))}",
         [
             ("value at the start", f"{value:.8g}"),
             ("regret", f"{answer['regret']:.8g}"),
-            ("normalized regret", "-" if relative is None else f"{relative:.6g}  (0: optimal, 1: uniform)"),
-            ("relative to worst", "-" if against_worst is None else f"{against_worst:.6g}  (0: optimal, 1: worst)"),
+            ("normalized regret", "-" if math.isnan(relative) else f"{relative:.6g}  (0: optimal, 1: uniform)"),
+            ("relative to worst", "-" if math.isnan(against_worst) else f"{against_worst:.6g}  (0: optimal, 1: worst)"),
             ("optimal, uniform, worst", f"{best:.8g}, {uniform:.8g}, {worst:.8g}"),
             ("error at most", f"{max(each.error_bound for each in values.values()):.2g}{_estimated(worth)}"),
             ("discount", describe_discount(mdp.gamma, mdp.horizon)),

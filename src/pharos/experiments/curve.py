@@ -22,13 +22,13 @@ class Curve:
         unless its `evaluation` is there.
         """
         evaluation = evaluation or evaluate_agent(agent, self.task, again=True)
-        best, uniform = self.task.reference.optimal, self.task.reference.uniform
+        reference = self.task.reference
+        best = reference.optimal
         last = self.rows[-1] if self.rows else None
         finished = episodes - (last["episodes"] if last else 0)
         gained = returns - (last["returns"] if last else 0.0)
         mean = gained / finished if finished else math.nan
         regret = best - evaluation.value
-        spread = best - uniform
         row = {
             "step": step,
             "episodes": episodes,
@@ -37,7 +37,7 @@ class Curve:
             "cumulative_expected_regret": (
                 last["cumulative_expected_regret"] + finished * last["expected_regret"] if last else 0.0
             ),
-            "normalized_regret": regret / spread if spread > 1e-12 else math.nan,
+            "normalized_regret": regret / reference.spread(),
             "mean_return": mean,
             "realised_regret": best - mean,
             "cumulative_realised_regret": episodes * best - returns,
@@ -51,18 +51,17 @@ class Curve:
     def result(self) -> dict[str, Any]:
         """The summary of a finished run."""
         task, last = self.task, self.rows[-1]
-        best, uniform = task.reference.optimal, task.reference.uniform
-        scale = last["episodes"] * (best - uniform)
+        scale = last["episodes"] * task.reference.spread() or math.nan
         return {
-            "value_optimal": best,
-            "value_uniform": uniform,
+            "value_optimal": task.reference.optimal,
+            "value_uniform": task.reference.uniform,
             "value_worst": task.reference.worst,
             "final_value": last["value"],
             "final_regret": last["expected_regret"],
             "cumulative_regret": last["cumulative_expected_regret"],
-            "normalized_regret": last["cumulative_expected_regret"] / scale if scale > 1e-12 else math.nan,
+            "normalized_regret": last["cumulative_expected_regret"] / scale,
             "cumulative_realised_regret": last["cumulative_realised_regret"],
-            "normalized_realised_regret": last["cumulative_realised_regret"] / scale if scale > 1e-12 else math.nan,
+            "normalized_realised_regret": last["cumulative_realised_regret"] / scale,
             "mean_return": last["returns"] / last["episodes"] if last["episodes"] else math.nan,
             "episodes": last["episodes"],
             "exact": all(row["exact"] for row in self.rows),

@@ -24,11 +24,10 @@ import numpy as np
 
 from pharos.errors import ParameterError
 from pharos.experiments import results as _results
+from pharos.solvers import regret_scale
 
 if TYPE_CHECKING:
     from pharos.experiments.task import Task
-
-SMALLEST_SPREAD = 1e-12  # between the values of the optimal and the reference policy, for a ratio to mean anything
 
 
 @dataclass(frozen=True)
@@ -59,8 +58,7 @@ class ReferenceValues:
         """
         if reference not in ("uniform", "worst"):
             raise ParameterError(f"reference is {reference!r}; expected 'uniform' or 'worst'")
-        spread = self.optimal - getattr(self, reference)
-        return spread if spread > max(SMALLEST_SPREAD, 2 * self.error_bound) else math.nan
+        return regret_scale(self.optimal, getattr(self, reference), self.error_bound)
 
 
 def regret(value: Any, values: ReferenceValues, *, normalized_by: str | None = None) -> Any:

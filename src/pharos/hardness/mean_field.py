@@ -1,5 +1,6 @@
 """Q-learning of a network in expectation: the learner behind `kernel_regret`."""
 
+import math
 from collections import deque
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -12,7 +13,7 @@ from pharos.hardness.kernel_operator import KernelOperator
 from pharos.hardness.occupancy import Walk
 from pharos.hardness.representation import Grouped
 from pharos.mdp import TabularMDP
-from pharos.solvers import Solution, evaluate_policy, uniform_value, value_iteration
+from pharos.solvers import Solution, evaluate_policy, regret_scale, uniform_value, value_iteration
 
 TIES = 1e-6  # of the largest value of a state: actions that close are chosen alike
 MARGIN = 1.05  # of the largest eigenvalue, which is known to 0.1 %
@@ -154,8 +155,10 @@ class Learner:
     def __init__(self, mdp: TabularMDP, schedule: Schedule, episode: int, solution: Solution | None = None):
         solution = solution or value_iteration(mdp)
         uniform = uniform_value(mdp)
-        self.optimal, self.spread = solution.value_at_start, solution.value_at_start - uniform.value_at_start
-        if not self.spread > max(1e-12, 2 * (solution.error_bound + uniform.error_bound)):
+        self.optimal = solution.value_at_start
+        error = solution.error_bound + uniform.error_bound
+        self.spread = regret_scale(self.optimal, uniform.value_at_start, error)
+        if math.isnan(self.spread):
             raise UndefinedMeasure(f"{self.measure}: uniform play is optimal, so that there is no regret to speak of")
         self.schedule, self.episode = schedule, episode
         self.mdp, self.numbers = mdp, np.arange(mdp.num_states)

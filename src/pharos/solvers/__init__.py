@@ -1,6 +1,7 @@
 """Solving: optimal values and values of given policies, each with an error bound that is proven and met."""
 
 from pharos.solvers.policy_values import evaluate_apart, evaluate_policy, uniform_policy
+from pharos.solvers.regret import regret_scale
 from pharos.solvers.solution import Solution
 from pharos.solvers.values import uniform_value, value_iteration, worst_value
 
@@ -8,6 +9,7 @@ __all__ = [
     "Solution",
     "evaluate_apart",
     "evaluate_policy",
+    "regret_scale",
     "uniform_policy",
     "uniform_value",
     "value_iteration",

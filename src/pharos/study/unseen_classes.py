@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pharos.errors import ParameterError
+from pharos.solvers import regret_scale
 from pharos.study import held_out as _held_out
 from pharos.study.mixed_models import mixed_fit
 from pharos.study.predictions import POLICY_PREDICTORS, PREDICTORS
@@ -61,7 +62,8 @@ def outcomes(runs: "pd.DataFrame", points: "pd.DataFrame") -> "pd.DataFrame":
     if {"cumulative_realised_regret", "episodes"} <= {*runs}:
         cells["cumulative"] = runs["cumulative_realised_regret"]
         cells["random_scale"] = runs["episodes"] * (runs["value_optimal"] - runs["value_uniform"])
-        cells["played"] = (cells["cumulative"] / cells["random_scale"]).replace([np.inf, -np.inf], np.nan)
+        scale = runs["episodes"] * regret_scale(runs["value_optimal"], runs["value_uniform"])
+        cells["played"] = (cells["cumulative"] / scale).replace([np.inf, -np.inf], np.nan)
     groups = cells.groupby(CELL, sort=False)
     table = groups[[*OUTCOMES, "random_scale"]].mean()
     of_seeds = groups[list(OUTCOMES)]
@@ -77,9 +79,10 @@ def normalized_regrets(points: "pd.DataFrame", runs: "pd.DataFrame") -> "pd.Seri
         points, runs: of `curves` and `table`.
     """
     of_run = runs.set_index("id")
-    spread = of_run["value_optimal"] - of_run["value_uniform"]
+    scale = regret_scale(of_run["value_optimal"], of_run["value_uniform"])
+    scale = dict(zip(of_run.index, scale, strict=True))
     lost = points["id"].map(of_run["value_optimal"]) - points["value"]
-    return (lost / points["id"].map(spread)).replace([np.inf, -np.inf], np.nan)
+    return lost / points["id"].map(scale)
 
 
 @dataclass(frozen=True)
