@@ -73,6 +73,41 @@ def test_values_of_a_stochastic_policy_are_within_their_bound(mdp, seed):
 
 @pytest.mark.slow
 @often
+@given(hard_mdps(), st.integers(0, 2**32), st.sampled_from([1.0, 1 + 8e-7, 1 - 8e-7]))
+def test_rows_that_nearly_sum_to_1_are_normalised_and_the_bound_counts_it(mdp, seed, factor):
+    """Those of a softmax in float32, and rows that somebody multiplied."""
+    shape = (mdp.num_states, mdp.num_actions + 1) if mdp.is_sticky else (mdp.num_states,)
+    policy = np.random.default_rng(seed).dirichlet(np.ones(mdp.num_actions), shape).astype(np.float32)
+    policy = policy if factor == 1 else policy.astype(np.float64) * factor
+    solution = finest(evaluate_policy, mdp, policy)
+    written_out = naive_exact.exact(policy if mdp.is_sticky else policy[:, None])
+    written_out = written_out / written_out.sum(axis=-1, keepdims=True)
+    assert largest_error(solution, naive_exact.values_of(mdp, written_out)) <= Fraction(solution.error_bound)
+
+
+@pytest.mark.parametrize("factor", [1.0, 1 + 8e-7])
+def test_over_a_thousand_steps_a_softmax_in_float32_gains_nothing_by_its_rounding(factor):
+    rewards = np.array([[700.0, 0.0, 1.0], [0.0, 350.0, 2.0]])
+    mdp = TabularMDP.from_arrays([[0, 1, 1], [0, 1, 0]], rewards, gamma=1.0, horizon=1000)
+    scores = np.exp(np.array([[1.0, 0.3, -2.0], [0.5, 0.1, 0.9]], np.float32))
+    policy = (scores / scores.sum(axis=1, keepdims=True)).astype(np.float64) * factor
+    rows = naive_exact.exact(policy) / naive_exact.exact(policy).sum(axis=1, keepdims=True)
+    v = [Fraction(0), Fraction(0)]
+    for _ in range(1000):
+        ahead = [
+            sum(p * (Fraction(r) + v[t]) for p, r, t in zip(rows[s], rewards[s], mdp.next_states[s], strict=True))
+            for s in range(2)
+        ]
+        v = [Fraction(round(each * 2**300), 2**300) for each in ahead]
+    solution = evaluate_policy(mdp, policy)
+    as_given = 1000 * float(max(abs(policy.sum(axis=1) - 1))) * 350
+    assert abs(Fraction(float(solution.v[0])) - v[0]) <= Fraction(solution.error_bound) + Fraction(1, 2**200)
+    assert solution.error_bound < as_given / 100  # what was lacking, or too much, weighed more
+    assert solution.value_at_start <= value_iteration(mdp).value_at_start
+
+
+@pytest.mark.slow
+@often
 @given(hard_mdps(), st.integers(0, 2**32))
 def test_values_of_a_deterministic_policy_are_within_their_bound(mdp, seed):
     actions = np.random.default_rng(seed).integers(mdp.num_actions, size=mdp.num_states)

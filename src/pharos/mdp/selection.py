@@ -95,8 +95,10 @@ class PolicyTable:
             policy: (S,) integers, an action for each state; or (S, A) probabilities. Under sticky actions also (S, A +
                 1) integers or (S, A + 1, A) probabilities, for each previously executed action and, last, for none; or
                 a function from an array of state indices to any of these; None: uniform.
+        Rows are divided by their sums in float64, as those of a float32 softmax sum to 1 within 1e-7 only, and what is
+        lacking or too much would add up over the steps of an episode; `operations` counts the rounding of that.
         Raises:
-            ParameterError: the shape is wrong, or rows are not probabilities.
+            ParameterError: the shape is wrong, or rows are not probabilities that sum to 1 within 1e-6.
         """
         num_states, num_actions = mdp.num_states, mdp.num_actions
         if policy is None:
@@ -107,8 +109,7 @@ class PolicyTable:
             if table.ndim == 1:
                 return PolicyTable(num_actions, actions=table)
             return PolicyTable(num_actions, np.eye(num_actions)[table])
-        _check_probabilities(mdp, table)
-        table = table.astype(np.float64)
+        table = _normalized(mdp, table)
         return PolicyTable(num_actions, table if table.ndim == 3 else table[:, None])
 
     @property
@@ -141,7 +142,7 @@ class PolicyTable:
         return mass_of(largest, self.num_actions)
 
     def operations(self, num_actions: int) -> int:
-        return num_actions + 1
+        return (num_actions + 1) * (1 if self.actions is not None else 2)  # the sum of a row and a division by it
 
     def value(self, q: np.ndarray, states: Any = slice(None)) -> np.ndarray:
         return np.einsum("sba,sa...->sb...", self.later[states], q)
@@ -190,16 +191,19 @@ def _check_actions(mdp: "TabularMDP", actions: np.ndarray) -> None:
         raise ParameterError(f"the policy chooses action {actions[where]} at {where}; expected 0 to {num_actions - 1}")
 
 
-def _check_probabilities(mdp: "TabularMDP", table: np.ndarray) -> None:
+def _normalized(mdp: "TabularMDP", table: np.ndarray) -> np.ndarray:
+    """Rows divided by their sums, in float64; those that sum to 1 as they are stay so to the bit."""
     num_states, num_actions = mdp.num_states, mdp.num_actions
     shapes = [(num_states, num_actions)] + ([(num_states, num_actions + 1, num_actions)] if mdp.is_sticky else [])
     if table.shape not in shapes:
         raise ParameterError(
             f"the policy has shape {table.shape}; expected {' or '.join(map(str, shapes))} probabilities"
         )
+    table = table.astype(np.float64)
     sums = table.sum(axis=-1)
     if not (np.isfinite(table).all() and (table >= 0).all() and (np.abs(sums - 1) < 1e-6).all()):
         row = np.unravel_index(int(np.argmax(np.where(np.isfinite(sums), np.abs(sums - 1), np.inf))), sums.shape)
         raise ParameterError(
             f"the policy's row {tuple(map(int, row))} is {table[row]}; expected probabilities that sum to 1"
         )
+    return table if (sums == 1).all() else table / sums[..., None]
