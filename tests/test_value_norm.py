@@ -2,6 +2,7 @@
 
 import json
 import math
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -141,3 +142,38 @@ def test_the_interval_holds_the_norm_however_coarse_the_values_are(mdp, toleranc
     assert (
         found.lower - 1e-12 <= expected <= found.upper + 1e-12
     )  # the rounding of the twin, whose values are below 200
+
+
+@pytest.mark.parametrize("reward", [1e160, 1e-170, 1e300, 1e-290])
+def test_values_whose_squares_are_no_floats_have_their_deviation(reward):
+    """One state leads to 1 and 2 with probability 1/2 each, worth `reward` and nothing."""
+    table = [[[1, 2]], [[-1, -1]], [[-1, -1]]]
+    mdp = TabularMDP.from_outcomes(table, [[[0.5, 0.5]], [[1, 0]], [[1, 0]]], [[0.0], [reward], [0.0]], gamma=0.5)
+    found = certified_value_norm(mdp, pharos.value_iteration(mdp, tolerance=reward * 1e-9))
+    assert found.lower <= reward / 2 <= found.upper <= reward * (0.5 + 1e-6)
+
+
+@settings(deadline=None)
+@given(st.floats(2e-15, 1e-3), st.floats(0.1, 0.9999))
+def test_what_a_row_lacks_is_an_end_for_values_and_measures_alike(lack, gamma):
+    """A state that pays 1 and goes on with what its row holds, written as a matrix and as outcomes."""
+    stays = 1 - lack
+    lack = float(1 - Fraction(stays))  # exact, as the row is what it holds
+    matrix = TabularMDP.from_matrices([[[0.0, stays]], [[1.0, 0.0]]], [[1.0], [0.0]], gamma=gamma)
+    outcomes = TabularMDP.from_outcomes([[[1, -1]], [[0, 0]]], [[[stays, lack]], [[1, 0]]], [[1.0], [0.0]], gamma=gamma)
+    assert matrix.has_ends == outcomes.has_ends == (lack > 0)
+    truth = gamma * math.sqrt(lack * stays) / (1 - gamma**2 * stays)
+    for mdp in (matrix, outcomes):
+        assert hardness.diameter(mdp).upper == pytest.approx(2 / lack, rel=1e-9)
+        found = certified_value_norm(mdp)
+        assert found.lower - 1e-9 * truth <= truth <= found.upper + 1e-9 * truth
+
+
+def test_what_the_rounding_of_a_row_lacks_is_no_end():
+    thirds, tenths = [1 / 3] * 3, [0.1] * 10
+    assert sum(tenths) < 1
+    for row in (thirds, tenths):
+        size = len(row)
+        mdp = TabularMDP.from_matrices([[row]] * size, np.zeros((size, 1)))
+        assert not mdp.has_ends and not pharos.lazy_actions(mdp, 0.3).has_ends
+        assert not pharos.bisimulation.minimize(mdp).mdp.has_ends

@@ -54,8 +54,10 @@ def certified_value_norm(mdp: TabularMDP, solution: Solution | None = None) -> C
     if pairs is not None:
         reached = starts | pairs.any(axis=1)
     states, largest = np.flatnonzero(reached & live), 0.0
+    size = float(np.abs(solution.x).max(initial=0.0))
+    scale = 2.0 ** math.frexp(size)[1] if 0 < size < math.inf else 1.0  # squares of 1e160 and 1e-170 are no floats
     for block in np.array_split(states, max(1, -(-states.size // _BLOCK))):
-        means, within = _outcomes(mdp, solution.x, block)
+        means, within = _outcomes(mdp, solution.x, block, scale)
         if pairs is None:
             largest = max(largest, _largest_variance(mdp.chance, means, within))
             continue
@@ -64,23 +66,23 @@ def certified_value_norm(mdp: TabularMDP, solution: Solution | None = None) -> C
         for previous in range(mdp.num_actions):
             met = pairs[block, previous]
             largest = max(largest, _largest_variance(mdp.chance, means[met], within[met], previous))
-    value = math.sqrt(largest)
-    size = float(np.abs(solution.x).max(initial=0.0))
+    value = math.sqrt(largest) * scale
     error = solution.error_bound + (3 * mdp.num_actions + mdp.dynamics.operations + 16) * _UNIT * size
     lower, upper = max(0.0, value - error), value + error
     return Certified(value, lower, upper, upper - lower <= _NARROW * upper or upper == 0.0)
 
 
-def _outcomes(mdp: TabularMDP, x: np.ndarray, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """((N, A) mean less that of the row, (N, A) variance) of the value of what follows the execution of each action."""
-    means = mdp.dynamics.expected(x, states)
+def _outcomes(mdp: TabularMDP, x: np.ndarray, states: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:
+    """((N, A) mean less that of the row, (N, A) variance) of the value of what follows the execution of each action,
+    over `scale`."""
+    means = mdp.dynamics.expected(x, states) / scale
     within = np.zeros_like(means)
     if not mdp.dynamics.is_deterministic:
         rows = np.repeat(states, mdp.num_actions)
         actions = np.tile(np.arange(mdp.num_actions), states.size)
         outcomes = mdp.dynamics.outcomes(rows, actions)
         column = actions[outcomes.which] if x.shape[1] > 1 else 0
-        apart = x[outcomes.states, column] - means.ravel()[outcomes.which]
+        apart = x[outcomes.states, column] / scale - means.ravel()[outcomes.which]
         within = np.bincount(outcomes.which, outcomes.probabilities * apart**2, means.size).reshape(means.shape)
     return means - means.mean(axis=1, keepdims=True), within
 

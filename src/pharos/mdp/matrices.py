@@ -12,18 +12,17 @@ if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
 
-# What a row of a matrix lacks to 1 is the end from this probability on, and else the rounding of its entries.
-_SURE_END = 1e-12
-
 
 class Matrices(Dynamics):
     """Any number of outcomes, as a sparse matrix.
 
     Attributes:
-        transitions: (S A, S) CSR float64, row s A + a; what a row lacks to 1 is the probability that the episode ends.
+        transitions: (S A, S) CSR float64, row s A + a; what a row lacks to 1 is the probability that the episode ends,
+            but for 4 (n + 2) units of 2^-53 where rows have n entries: as much as their own rounding may lack.
     """
 
-    def __init__(self, transitions: "csr_matrix", num_actions: int):
+    def __init__(self, transitions: "csr_matrix", num_actions: int, entries: int = 0):
+        """`entries`: of the longest row of which these were made, where rounding of its entries was added up."""
         from scipy import sparse
 
         self.transitions = sparse.csr_matrix(transitions)
@@ -33,10 +32,11 @@ class Matrices(Dynamics):
         self.num_states, self.num_actions = transitions.shape[1], num_actions
         counts = np.diff(self.transitions.indptr)
         sums = np.asarray(self.transitions.sum(axis=1)).ravel()
-        self.operations = int(counts.max(initial=0)) + 1
+        self.operations = max(int(counts.max(initial=0)), entries) + 1
         self.mass = max(1.0, float(sums.max(initial=0.0)) * (1 + self.operations * 2.0**-53))
-        self._ends = np.maximum(1 - sums, 0.0)
-        self.has_ends = bool((self._ends >= _SURE_END).any())
+        lacking = 1 - sums
+        self._ends = np.where(lacking > 4 * (self.operations + 1) * 2.0**-53, lacking, 0.0)
+        self.has_ends = bool(self._ends.any())
         self.is_deterministic = bool(((counts == 0) | ((counts == 1) & (sums == 1.0))).all())
         self._table: np.ndarray | None = None
         self._columns_by_action: Any = None
@@ -64,7 +64,7 @@ class Matrices(Dynamics):
 
         rows = np.arange(self.transitions.shape[0])
         stays = sparse.csr_matrix((np.full(len(rows), p), (rows, rows // self.num_actions)), self.transitions.shape)
-        result = Matrices(((1.0 - p) * self.transitions + stays).tocsr(), self.num_actions)
+        result = Matrices(((1.0 - p) * self.transitions + stays).tocsr(), self.num_actions, self.operations + 2)
         result.laziness = 1.0 - (1.0 - self.laziness) * (1.0 - p)
         return result
 
@@ -100,7 +100,7 @@ class Matrices(Dynamics):
         part = self.transitions[rows]
         which = np.repeat(np.arange(len(rows)), np.diff(part.indptr))
         following, probabilities = part.indices.astype(np.int64), part.data
-        ended = np.flatnonzero(self._ends[rows] >= _SURE_END)
+        ended = np.flatnonzero(self._ends[rows])
         if len(ended):
             which = np.append(which, ended)
             following = np.append(following, np.full(len(ended), self.num_states))
@@ -118,10 +118,11 @@ class Matrices(Dynamics):
 
     def restricted_to(self, states: np.ndarray) -> "Matrices":
         """These states alone; what leads out of them ends."""
-        return Matrices(self.transitions[self._rows(states)][:, states].tocsr(), self.num_actions)
+        return Matrices(self.transitions[self._rows(states)][:, states].tocsr(), self.num_actions, self.operations)
 
     def merged(self, classes: np.ndarray, representatives: np.ndarray) -> "Matrices":
-        return Matrices(self.to_classes(classes, len(representatives))[self._rows(representatives)], self.num_actions)
+        transitions = self.to_classes(classes, len(representatives))[self._rows(representatives)]
+        return Matrices(transitions, self.num_actions, self.operations)
 
     def _rows(self, states: Any) -> np.ndarray | None:
         """The rows of some states; None: all."""

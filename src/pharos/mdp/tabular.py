@@ -164,7 +164,8 @@ class TabularMDP:
 
         Args:
             P: (S, A, S) array of probabilities P[s, a, t]; or a sparse (S A, S) matrix with rows s A + a; or a list of
-                A sparse (S, S) matrices. A row that sums to less than 1 ends the episode with the rest.
+                A sparse (S, S) matrices. A row that sums to less than 1 ends the episode with the
+                rest, but for what the rounding of its own n entries may lack, 4 (n + 2) units of 2^-53.
             R: expected rewards (S, A); or (S,) for every action alike; or (S, A, S), dense P only, averaged over P.
             gamma, initial, horizon: as in `from_arrays`.
         Raises:
