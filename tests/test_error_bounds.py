@@ -367,3 +367,20 @@ def test_elimination_is_counted_entry_by_entry():
         assert elimination.entries_of_factor(matrix.indptr, matrix.indices, 10**6).tolist() == counts.tolist()
         if counts.sum() > 5:
             assert elimination.entries_of_factor(matrix.indptr, matrix.indices, 5).sum() > 5
+
+
+@pytest.mark.parametrize("gamma", [0.9999, 0.999999, 0.99999999])
+@pytest.mark.parametrize("options", [{"blocks": 2}, {"dtype": "float32"}, {"blocks": 2, "dtype": "float32"}])
+@pytest.mark.parametrize("tolerance", [1e-3, 1.0, 1e6])
+def test_blocks_and_single_floats_end_near_gamma_1(gamma, options, tolerance):
+    """State 0 pays 1 where it goes to the other and comes back; there is half of that to stay with."""
+    mdp = TabularMDP.from_arrays([[1, 0], [0, 1]], [[1, 0], [0, 0.5]], gamma=gamma)
+    try:
+        solution = value_iteration(mdp, tolerance, **options)
+    except PrecisionError:
+        if "dtype" not in options or tolerance > 2.0**-24 / (1 - gamma):  # not what storing in 32 bits alone costs
+            with pytest.raises(PrecisionError):
+                value_iteration(mdp, tolerance)
+        return
+    truth = naive_exact.extreme_values(mdp)
+    assert largest_error(solution, truth) <= Fraction(solution.error_bound) <= Fraction(tolerance)

@@ -154,7 +154,7 @@ def test_values_whose_squares_are_no_floats_have_their_deviation(reward):
 
 
 @settings(deadline=None)
-@given(st.floats(2e-15, 1e-3), st.floats(0.1, 0.9999))
+@given(st.floats(2e-15, 1e-3), st.floats(0.1, 0.99))
 def test_what_a_row_lacks_is_an_end_for_values_and_measures_alike(lack, gamma):
     """A state that pays 1 and goes on with what its row holds, written as a matrix and as outcomes."""
     stays = 1 - lack
@@ -164,7 +164,7 @@ def test_what_a_row_lacks_is_an_end_for_values_and_measures_alike(lack, gamma):
     assert matrix.has_ends == outcomes.has_ends == (lack > 0)
     truth = gamma * math.sqrt(lack * stays) / (1 - gamma**2 * stays)
     for mdp in (matrix, outcomes):
-        assert hardness.diameter(mdp).upper == pytest.approx(2 / lack, rel=1e-9)
+        assert hardness.diameter(mdp).upper == pytest.approx(2 / lack, rel=1e-7)
         found = certified_value_norm(mdp)
         assert found.lower - 1e-9 * truth <= truth <= found.upper + 1e-9 * truth
 

@@ -12,7 +12,6 @@ if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
 
-
 class Matrices(Dynamics):
     """Any number of outcomes, as a sparse matrix.
 

@@ -18,7 +18,16 @@ from collections.abc import Callable
 import numpy as np
 
 from pharos.mdp import TabularMDP
-from pharos.solvers.fixed_point import SETTLING, Backup, FixedPoint, check_tolerance, imprecise, largest_of
+from pharos.solvers.fixed_point import (
+    SETTLING,
+    Backup,
+    FixedPoint,
+    check_tolerance,
+    fixed_point,
+    imprecise,
+    largest_of,
+)
+from pharos.solvers.sweeps_left import Endless
 
 MOST_BLOCKS = 4096
 # Sweeps of a range at most before the next one; fewer once they change it by a tenth of what the first one did.
@@ -42,6 +51,8 @@ def blocked_fixed_point(
     Args:
         progress: called with the number of rounds and the largest bound of a range.
         x: where to sweep, from any finite values; None: from zeros.
+    Returns:
+        Values and their bound; by `fixed_point`, of all ranges at once, where rounds would not end (near gamma = 1).
     Raises:
         PrecisionError: floats cannot reach the tolerance.
     """
@@ -50,7 +61,7 @@ def blocked_fixed_point(
     x = backup.zeros() if x is None else x
     cuts = [mdp.num_states * i // blocks for i in range(blocks + 1)]
     moved = np.full((blocks, blocks), math.inf)  # by how much range b has changed, at most, since range c was swept
-    rounds, sweeps, since, least = 0, 0.0, 0, math.inf
+    rounds, sweeps, since, least, endless = 0, 0.0, 0, math.inf, Endless()
     patience = SETTLING + math.ceil(1 / (1 - backup.factor))
     largest = largest_of(x)
     while True:
@@ -70,6 +81,8 @@ def blocked_fixed_point(
             progress(rounds, bound)
         if bound <= tolerance:
             return FixedPoint(x, bound, math.ceil(sweeps))
+        if math.isfinite(bound) and endless.after(bound, tolerance):
+            return fixed_point(mdp, backup.select, tolerance, progress, x, backup.threads, backup.dtype)
         if bound < 0.9 * least:
             least, since = bound, rounds
         if rounds - since > patience or not math.isfinite(bound):

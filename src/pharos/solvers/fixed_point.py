@@ -31,6 +31,7 @@ from pharos.large_arrays import large_zeros
 from pharos.mdp import BellmanEquation, Part, Selection, TabularMDP
 from pharos.solvers.components import ComponentSolver
 from pharos.solvers.policy_iteration import PolicyIteration
+from pharos.solvers.sweeps_left import Endless
 
 _UNIT = 2.0**-53
 # Sweeps that gain nothing, after values of the best policy were found, until it is clear that rounding stops them.
@@ -195,8 +196,9 @@ def fixed_point(
 def _in_single(
     backup: Backup, tolerance: float, progress: Callable[[int, float], None] | None, x: np.ndarray
 ) -> FixedPoint:
-    """The same for values of 32 bits, by sweeps alone."""
-    mdp, rho, sweeps, least, since = backup.mdp, backup.factor, 0, math.inf, 0
+    """The same for values of 32 bits, by sweeps alone; by those of 64 bits, which are stored then, where these would
+    not end: near gamma = 1 rounding to 32 bits adds up over 1 / (1 - gamma) sweeps."""
+    mdp, rho, sweeps, least, since, endless = backup.mdp, backup.factor, 0, math.inf, 0, Endless()
     patience = SETTLING + math.ceil(1 / (1 - rho))  # sweeps that gain a factor of 2.7, but for rounding
     while True:
         shift, sweeps = backup.sweep(x), sweeps + 1
@@ -209,6 +211,14 @@ def _in_single(
             return FixedPoint(x, bound, sweeps)
         if bound < 0.9 * least:
             least, since = bound, sweeps
+        if math.isfinite(bound) and endless.after(bound, tolerance):
+            result = fixed_point(mdp, backup.select, tolerance, progress, None, backup.threads)
+            with np.errstate(over="ignore"):
+                x[:] = result.x
+            bound = (result.bound + backup.stored(largest_of(result.x))) * MARGIN
+            if not bound <= tolerance:
+                raise imprecise(mdp, bound, tolerance, is_single=True)
+            return FixedPoint(x, bound, sweeps + result.sweeps)
         if shift == 0.0 or sweeps - since > patience or not math.isfinite(bound):
             raise imprecise(mdp, min(least, bound), tolerance, is_single=True)
 
