@@ -3,6 +3,7 @@
 import numpy as np
 import pandas as pd
 import pytest
+from scipy.stats import rankdata
 
 from pharos import study
 from pharos.errors import ParameterError
@@ -38,6 +39,22 @@ def test_left_out_classes_and_mdps_are_predicted_by_all_other_rows():
     x, y, classes, mdps = x[:-3], y[:-3], classes[:-3], mdps[:-3]  # classes of different sizes
     for blocks in (classes, mdps):
         np.testing.assert_allclose(held_out.predictions(x, y, blocks, classes), plainly(x, y, blocks, classes))
+
+
+def test_ranks_are_those_of_scipy_with_ties_joined_that_differ_by_rounding():
+    rng = np.random.default_rng(3)
+    values = rng.integers(0, 6, (40, 30)) * rng.choice([1e-12, 1.0, 1e12], (40, 1))
+    np.testing.assert_array_equal(held_out.ranks(values), rankdata(values, axis=1))
+    nearly = values * (1 + rng.uniform(-1, 1, values.shape) * 1e-15)
+    np.testing.assert_array_equal(held_out.ranks(nearly), rankdata(values, axis=1))
+    assert (rankdata(nearly, axis=1) != rankdata(values, axis=1)).any()
+    y = rng.normal(size=30)
+    assert held_out.spearman(nearly[0], y) == held_out.spearman(values[0], y)
+    partial = [
+        held_out.partial_correlation(x, y, values[1][:, None], np.arange(30) % 5, np.ones((1, 5), int))
+        for x in (values[0], nearly[0])
+    ]
+    np.testing.assert_array_equal(*partial)
 
 
 def test_samples_of_classes_count_each_as_often_as_it_was_drawn():

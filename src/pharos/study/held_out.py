@@ -11,6 +11,7 @@ import numpy as np
 
 BLOCK = 250  # permutations at a time
 MOST_RANKED = 400
+TIED = 1e-9  # of the spread: what differs by less is rounding, and has one rank
 Counts = np.ndarray
 """(R, C) how often each class counts in each of R samples."""
 
@@ -52,13 +53,26 @@ def calibration(y: np.ndarray, predicted: np.ndarray, classes: np.ndarray) -> tu
     return slope, float(weights @ y) - slope * float(weights @ predicted)
 
 
-def spearman(x: np.ndarray, y: np.ndarray) -> float:
-    """Rank correlation; NaN for fewer than three rows, or where one of both is constant."""
-    if len(x) < 3 or np.ptp(x) == 0 or np.ptp(y) == 0:
-        return np.nan
+def ranks(values: np.ndarray) -> np.ndarray:
+    """(..., N) ranks from 1 along the last axis; ties, and what lies within 1e-9 of the spread of its neighbour,
+    share their mean rank. So equal predictors whose predictions differ in the last bits are ranked alike everywhere."""
     from scipy.stats import rankdata
 
-    return float(np.corrcoef(rankdata(x), rankdata(y))[0, 1])
+    values = np.asarray(values, np.float64)
+    order = np.argsort(values, axis=-1, kind="stable")
+    ascending = np.take_along_axis(values, order, axis=-1)
+    is_new = np.diff(ascending, axis=-1) > TIED * np.ptp(ascending, axis=-1, keepdims=True)
+    levels = np.concatenate([np.zeros((*values.shape[:-1], 1)), np.cumsum(is_new, axis=-1)], axis=-1)
+    joined = np.empty_like(values)
+    np.put_along_axis(joined, order, levels, axis=-1)
+    return np.asarray(rankdata(joined, axis=-1))
+
+
+def spearman(x: np.ndarray, y: np.ndarray) -> float:
+    """Rank correlation by `ranks`; NaN for fewer than three rows, or where one of both is constant."""
+    if len(x) < 3 or np.ptp(x) == 0 or np.ptp(y) == 0:
+        return np.nan
+    return float(np.corrcoef(ranks(x), ranks(y))[0, 1])
 
 
 def resampled_classes(count: int, resamples: int, seed: int) -> Counts:
@@ -139,8 +153,6 @@ def permuted_classes(
 
 def _exchanged(x: np.ndarray, y: np.ndarray, orders: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """((R,) R2, (R,) rho) of left-out classes, x (C, K, P), y (C, K), where class c has the x of class orders[r, c]."""
-    from scipy.stats import rankdata
-
     design = np.concatenate([np.ones((*x.shape[:2], 1)), x], axis=2)
     products = np.einsum("ckp,ckq->cpq", design, design)[orders]
     targets = np.einsum("dkp,ck->dcp", design, y)[orders, np.arange(len(y))]
@@ -153,10 +165,10 @@ def _exchanged(x: np.ndarray, y: np.ndarray, orders: np.ndarray) -> tuple[np.nda
     predicted = np.einsum("rckp,rcp->rck", design[orders], lines).reshape(len(orders), -1)
     aims = y.ravel()
     scores = 1 - ((aims - predicted) ** 2).mean(axis=1) / aims.var()
-    ranks, of_aims = rankdata(predicted, axis=1), rankdata(aims)
-    ranks, of_aims = ranks - ranks.mean(axis=1, keepdims=True), of_aims - of_aims.mean()
-    lengths = np.linalg.norm(ranks, axis=1) * np.linalg.norm(of_aims)
-    return scores, np.divide(ranks @ of_aims, lengths, out=np.full(len(orders), np.nan), where=lengths > 0)
+    of_predicted, of_aims = ranks(predicted), ranks(aims)
+    of_predicted, of_aims = of_predicted - of_predicted.mean(axis=1, keepdims=True), of_aims - of_aims.mean()
+    lengths = np.linalg.norm(of_predicted, axis=1) * np.linalg.norm(of_aims)
+    return scores, np.divide(of_predicted @ of_aims, lengths, out=np.full(len(orders), np.nan), where=lengths > 0)
 
 
 def p_of(value: float, permuted: np.ndarray) -> float:
@@ -188,14 +200,12 @@ def partial_correlation(
     x: np.ndarray, y: np.ndarray, others: np.ndarray, classes: np.ndarray, counts: Counts
 ) -> np.ndarray:
     """(R,) rank correlation of x (N,) and y given the ranks of other predictors (N, Q), for samples of classes."""
-    from scipy.stats import rankdata
-
-    ranks = np.column_stack([rankdata(x), rankdata(y), *(rankdata(each) for each in others.T)]) / len(y)
+    columns = ranks(np.vstack([x, y, others.T])).T / len(y)
     sizes, correlations = np.bincount(classes), np.empty(len(counts))
     for r, count in enumerate(counts):
         root = np.sqrt((count / sizes)[classes])
-        design = root[:, None] * _with_one(ranks[:, 2:])
-        left = root[:, None] * ranks[:, :2]
+        design = root[:, None] * _with_one(columns[:, 2:])
+        left = root[:, None] * columns[:, :2]
         left = left - design @ np.linalg.lstsq(design, left, rcond=1e-10)[0]
         lengths = np.linalg.norm(left, axis=0)
         correlations[r] = left[:, 0] @ left[:, 1] / lengths.prod() if (lengths > 1e-9).all() else np.nan
