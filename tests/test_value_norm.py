@@ -177,3 +177,15 @@ def test_what_the_rounding_of_a_row_lacks_is_no_end():
         mdp = TabularMDP.from_matrices([[row]] * size, np.zeros((size, 1)))
         assert not mdp.has_ends and not pharos.lazy_actions(mdp, 0.3).has_ends
         assert not pharos.bisimulation.minimize(mdp).mdp.has_ends
+
+
+@pytest.mark.parametrize("reward", [1e3, 1e9, 1e15])
+def test_a_measure_answers_by_itself_however_large_the_values_are(reward):
+    """An error of 1e-9 is beyond floats there; the interval says what was reached."""
+    table = [[[1, 2]], [[0, 0]], [[0, 0]]]
+    rewards = [[0.0], [reward], [0.0]]
+    mdp = TabularMDP.from_outcomes(table, [[[0.5, 0.5]], [[1, 0]], [[1, 0]]], rewards, gamma=0.99)
+    found = certified_value_norm(mdp)
+    assert hardness.environmental_value_norm(mdp) == found.value
+    assert found.lower <= reward / 2 <= found.upper <= reward * (0.5 + 1e-6)
+    assert hardness.gaps(mdp).sum_of_reciprocals == 0 and hardness.distribution_mismatch(mdp).upper >= 1

@@ -61,7 +61,7 @@ def action_gap_regularity(
     actions pairs with the previously executed action; with a horizon the states of every step.
 
     Args:
-        solution: the optimal solution of `mdp`; None: solved here to an error of 1e-9.
+        solution: the optimal solution of `mdp`; None: solved here to an error of 1e-9, or what floats reach.
         zeta: the exponent, above 0 or 0.
         tie_tolerance: as for `gaps`.
     Raises:

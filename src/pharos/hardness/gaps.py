@@ -7,7 +7,7 @@ size, and its reciprocal anything.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any, cast
 
@@ -277,13 +277,13 @@ def gaps_of_states(
 
 
 def optimal_solution(mdp: TabularMDP, solution: Solution | None) -> Solution:
-    """The optimal solution of `mdp` that was given, or a new one.
+    """The optimal solution of `mdp` that was given, or a new one, to 1e-9 or to what 64-bit floats reach.
 
     Raises:
         ParameterError: it is of another kind or MDP.
     """
     if solution is None:
-        return value_iteration(mdp, 1e-9)
+        return solved(value_iteration, mdp, 1e-9)
     shape = (mdp.num_states, mdp.num_actions)
     solution_shape = (solution.mdp.num_states, solution.mdp.num_actions)
     chance, other = ((each.chance, each.laziness) for each in (mdp, solution.mdp))
@@ -295,6 +295,24 @@ def optimal_solution(mdp: TabularMDP, solution: Solution | None) -> Solution:
         x = solution.x.astype(np.float64)  # the same numbers, whose bound holds
         return replace(solution, x=x, next_x=x)
     return solution
+
+
+def solved(solve: Callable[..., Solution], mdp: TabularMDP, tolerance: float, **options: Any) -> Solution:
+    """A solution to a tolerance, in return; where floats do not reach it, to the least multiple by a power of ten that
+    they reach, which `error_bound` says.
+
+    Raises:
+        PrecisionError: they reach none below the largest value that the MDP may have.
+    """
+    rewards = mdp.reward_table
+    largest = max(abs(rewards.lowest), abs(rewards.highest)) / max(1 - mdp.gamma, 2.0**-53)
+    while True:
+        try:
+            return solve(mdp, tolerance, **options)
+        except PrecisionError:
+            if tolerance > largest or not math.isfinite(largest):
+                raise
+            tolerance *= 10
 
 
 def _error(mdp: TabularMDP, solution: Solution) -> float:
@@ -341,7 +359,7 @@ def _gaps_by_ranks(
         has_solution = together(processes, lambda rank: _told_by_first(rank, has_solution), capacity)
     if not has_solution:
         _check_plain(mdp.horizon)
-        solution = value_iteration(mdp, 1e-9, processes=processes)
+        solution = solved(value_iteration, mdp, 1e-9, processes=processes)
     warm(mdp)
 
     def program(rank: Rank) -> Gaps | None:

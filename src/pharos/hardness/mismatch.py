@@ -28,7 +28,7 @@ def distribution_mismatch(
 
     Args:
         policy: as for `evaluate_policy`; None: uniform.
-        solution: the optimal solution of `mdp`; None: solved here to an error of 1e-9.
+        solution: the optimal solution of `mdp`; None: solved here to an error of 1e-9, or what floats reach.
         tolerance: of the sums of d and of d*.
     Returns:
         An interval: it is wide where d(s) is not much larger than `tolerance`, and infinite at the upper end where it

@@ -7,8 +7,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from pharos.errors import ParameterError, PrecisionError, UndefinedMeasure, UnknownName
-from pharos.hardness.gaps import Gaps, resolved_gaps
+from pharos.errors import ParameterError, UndefinedMeasure, UnknownName
+from pharos.hardness.gaps import Gaps, resolved_gaps, solved
 from pharos.hardness.interval import Budget, Progress
 from pharos.hardness.mean_field import Rollouts, Schedule
 from pharos.hardness.representation import Representation
@@ -47,22 +47,14 @@ class Problem:
     @cached_property
     def solution(self) -> Solution:
         """Optimal values."""
-        tolerance, rewards = self.tolerance, self.mdp.reward_table
-        largest = max(abs(rewards.lowest), abs(rewards.highest)) / max(1 - self.mdp.gamma, 2.0**-53)
-        values = None if self.folder is None or self.mdp.horizon is not None else self.folder / "optimal.npy"
-        while True:
-            try:
-                return value_iteration(
-                    self.mdp,
-                    tolerance,
-                    keep_all=self.mdp.horizon is not None and self._is_small,
-                    progress=lambda sweeps, bound: self.report("values", f"sweep {sweeps}, error at most {bound:.2g}"),
-                    values=values,
-                )
-            except PrecisionError:
-                if tolerance > largest or not math.isfinite(largest):
-                    raise
-                tolerance *= 10
+        return solved(
+            value_iteration,
+            self.mdp,
+            self.tolerance,
+            keep_all=self.mdp.horizon is not None and self._is_small,
+            progress=lambda sweeps, bound: self.report("values", f"sweep {sweeps}, error at most {bound:.2g}"),
+            values=None if self.folder is None or self.mdp.horizon is not None else self.folder / "optimal.npy",
+        )
 
     @cached_property
     def gaps(self) -> Gaps:

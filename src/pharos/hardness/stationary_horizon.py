@@ -13,7 +13,7 @@ import numpy as np
 
 from pharos.errors import ParameterError, PrecisionError, UndefinedMeasure
 from pharos.hardness.choices import Choices, choices_of, reachable
-from pharos.hardness.gaps import optimal_solution
+from pharos.hardness.gaps import optimal_solution, solved
 from pharos.hardness.look_ahead import LookAhead
 from pharos.hardness.steps import expected_rewards, single_outcomes
 from pharos.mdp import TabularMDP, takes_mdp
@@ -186,11 +186,11 @@ class _Nodes:
         self.starts = np.array(sorted(node for node, _ in choices.starts))
         self.rewards = expected_rewards(mdp, choices)
         tell("values of optimal play")
-        best = optimal_solution(mdp, solution) if solution is not None else _solved(value_iteration, mdp, tolerance)
+        best = optimal_solution(mdp, solution) if solution is not None else solved(value_iteration, mdp, tolerance)
         tell("values of the worst play")
-        worst = _solved(worst_value, mdp, tolerance)
+        worst = solved(worst_value, mdp, tolerance)
         tell("values of uniform play")
-        explored = _solved(uniform_value, mdp, tolerance)
+        explored = solved(uniform_value, mdp, tolerance)
         self.error = mdp.gamma * max(best.error_bound, worst.error_bound, explored.error_bound)
         everywhere = np.arange(self.num_nodes)
         self.best, self.worst, self.explored = (
@@ -251,16 +251,6 @@ def _states_and_the_end(mdp: TabularMDP) -> tuple[Choices, np.ndarray]:
     starts = [(int(s), float(p)) for s, p in zip(mdp.start_states, mdp.start_probabilities, strict=True) if p > 0]
     none = np.zeros(size + 1, np.bool_)
     return Choices(None, np.arange(size + 1), np.full(size + 1, -1), starts, mdp.num_actions, size + 1, none), table
-
-
-def _solved(solver: Callable[..., Solution], mdp: TabularMDP, tolerance: float) -> Solution:
-    while True:
-        try:
-            return solver(mdp, tolerance)
-        except PrecisionError:
-            if tolerance > 1:
-                raise
-            tolerance *= 10
 
 
 def _on_nodes(solution: Solution, choices: Any, mdp: TabularMDP) -> np.ndarray:

@@ -26,7 +26,7 @@ def environmental_value_norm(mdp: TabularMDP, solution: Solution | None = None) 
     executed action), and so is s'. With a horizon, V* is that of the first step.
 
     Args:
-        solution: the optimal solution of `mdp`; None: solved here to an error of 1e-9.
+        solution: the optimal solution of `mdp`; None: solved here to an error of 1e-9, or what floats reach.
     Raises:
         ParameterError: `solution` belongs to another MDP or is not optimal.
     Exactness: `certified_value_norm` returns the interval that follows from the error of the values.
