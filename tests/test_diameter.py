@@ -106,6 +106,16 @@ def test_a_terminal_state_leads_to_the_start_in_one_step():
     assert "infinite" in str(without)
 
 
+def test_the_default_budget_is_not_spent_on_counting_the_pairs_of_an_infinite_diameter(monkeypatch):
+    monkeypatch.setattr(sum_sweep, "COUNTING", 0.0)
+    size = 5000
+    forward = TabularMDP.from_arrays(np.minimum(np.arange(size) + 1, size - 1)[:, None], np.zeros((size, 1)))
+    known, counted = hardness.diameter(forward), hardness.diameter(forward, budget=60)
+    assert known.exact and known.upper == counted.upper == math.inf and not known.counted
+    assert 1 <= known.unreachable_pairs <= counted.unreachable_pairs == size * (size - 1) // 2
+    assert known.finite_part <= counted.finite_part == size - 1 and counted.counted
+
+
 def test_the_implicit_end_is_a_state_on_the_way_back_to_the_start():
     mdp = TabularMDP.from_arrays(
         [[1], [2], [-1]], [[0], [0], [1]]

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from pharos.hardness.hidden_clock import HiddenClock
-from pharos.hardness.interval import Interval, Spending
+from pharos.hardness.interval import Budget, Interval, Spending
 from pharos.hardness.layers import WIDE, Layers
 from pharos.hardness.orbits import orbits
 from pharos.hardness.restored import largest_distances, restored
@@ -30,6 +30,7 @@ _FEW_LEVELS = 100
 _FEW_ORBITS = 64
 # Bytes that searches from many nodes may take.
 _BATCH_MEMORY = 2**31
+COUNTING = 10.0  # seconds for counting the pairs of an infinite diameter, unless a budget is given
 
 
 class SumSweep:
@@ -327,13 +328,17 @@ class SumSweep:
 
 
 def _infinite_diameter(graph: Graph, spending: Spending, conventions: dict[str, Any]) -> Interval:
-    """D of a graph that is not strongly connected: infinite, with unreachable pairs and the finite part."""
+    """D of a graph that is not strongly connected: infinite, with unreachable pairs and the finite part.
+
+    The value is known before any pair is counted, so of the default budget no more than COUNTING seconds go into that.
+    """
     size = graph.num_nodes
+    end = spending.seconds + COUNTING if spending.budget == Budget() else math.inf
     words = 8 if 24 * 8 * size <= _BATCH_MEMORY else 1
     bits = [np.zeros((size, words), np.uint64) for _ in range(3)]
     scratch = (graph.queue, np.empty_like(graph.queue))
     reached = finite = done = 0
-    while done < size and not spending.is_over:
+    while done < size and not spending.is_over and spending.seconds < end:
         sources = np.arange(done, min(done + 64 * words, size), dtype=graph.dtype)
         bits[0][:] = 0
         largest = np.empty(len(sources), np.int64)
@@ -349,7 +354,8 @@ def _infinite_diameter(graph: Graph, spending: Spending, conventions: dict[str, 
     counted = done == size
     note = "some states cannot be reached from others"
     if not counted:
-        note += f"; budget spent after the pairs from {done} of {many(size, 'state')}, so the counts are lower bounds"
+        note += f"; counted for {spending.seconds:.0f} s: the pairs from {done} of {many(size, 'state')}"
+        note += ", so the counts are lower bounds"
         unreachable = max(unreachable, 1)
     return Interval(
         math.inf,

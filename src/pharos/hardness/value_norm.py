@@ -76,7 +76,7 @@ def _outcomes(mdp: TabularMDP, x: np.ndarray, states: np.ndarray, scale: float) 
     """((N, A) mean less that of the row, (N, A) variance) of the value of what follows the execution of each action,
     over `scale`."""
     means = mdp.dynamics.expected(x, states) / scale
-    within = np.zeros_like(means)
+    within: np.ndarray = np.zeros_like(means)
     if not mdp.dynamics.is_deterministic:
         rows = np.repeat(states, mdp.num_actions)
         actions = np.tile(np.arange(mdp.num_actions), states.size)
