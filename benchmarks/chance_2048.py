@@ -17,7 +17,7 @@ from pathlib import Path
 import pharos
 from pharos.environments import Game2048
 from pharos.environments.base import Environment
-from pharos.environments.game_2048 import executed
+from pharos.environments.worlds.game_2048 import executed
 from pharos.mdp import BEST
 from pharos.solvers.fixed_point import Backup
 

@@ -13,8 +13,8 @@ import time
 import numpy as np
 
 import pharos
-from pharos.hardness.choices import choices_of
-from pharos.hardness.transition_graph import Graph
+from pharos.hardness.distances.transition_graph import Graph
+from pharos.hardness.planning.expanded import choices_of
 
 SMALL = {
     "frozen_lake 100": ("frozen_lake", {"size": 100, "seed": 0}),

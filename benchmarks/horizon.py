@@ -16,8 +16,8 @@ from pathlib import Path
 
 import pharos
 from pharos import hardness, importers
-from pharos.hardness.effective_horizon import TIE, _compiled, _Steps, _vectorized
-from pharos.hardness.large_horizon import LargeHorizon
+from pharos.hardness.planning.effective_horizon import TIE, _compiled, _Steps, _vectorized
+from pharos.hardness.planning.large_horizon import LargeHorizon
 from pharos.mdp import sticky_actions
 
 CORRIDOR = Path(__file__).parents[1] / "tests" / "data" / "bridge" / "key-corridor-s3r1.npz"

@@ -17,11 +17,11 @@ from pathlib import Path
 import numpy as np
 
 import pharos
-from pharos.hardness.lean_sweep import LeanGraph
-from pharos.hardness.transition_graph import Graph
+from pharos.hardness.distances.lean_sweep import LeanGraph
+from pharos.hardness.distances.transition_graph import Graph
 from pharos.mdp import BEST, BellmanEquation, Table, sticky_actions
-from pharos.packed_indices import PackedIndices
 from pharos.state_space import search
+from pharos.system.packed_indices import PackedIndices
 
 
 def sweeps(mdp, dynamics):

@@ -37,12 +37,12 @@ import torch
 
 from pharos import study
 from pharos.errors import PharosError
-from pharos.hardness import kernel_spectrum
-from pharos.hardness.kernel_operator import Exact
-from pharos.hardness.kernel_regret import RAREST
-from pharos.hardness.mean_field import WORST_GREEDY, Learner, Memory
-from pharos.hardness.representation import Grouped
-from pharos.hardness.standard_occupancy import standard_occupancy
+from pharos.hardness.representation import kernel_spectrum
+from pharos.hardness.representation.kernel_operator import Exact
+from pharos.hardness.representation.kernel_regret import RAREST
+from pharos.hardness.representation.mean_field import WORST_GREEDY, Learner, Memory
+from pharos.hardness.representation.representation import Grouped
+from pharos.hardness.visitation.standard_occupancy import standard_occupancy
 from pharos.observations import Network, network_inputs, observe, representation, tangent_kernel
 from pharos.study.predictions import _network, _schedule
 from pharos.study.values import task_of

@@ -28,9 +28,16 @@ import pandas as pd
 from pharos import study
 from pharos.errors import PharosError
 from pharos.hardness import Schedule
-from pharos.hardness.kernel_operator import Exact
-from pharos.hardness.policy_regret import MOST_BACKUPS, RETURNS, SPAN, PolicyLearner, softmax, standardised
-from pharos.hardness.representation import Grouped
+from pharos.hardness.representation.kernel_operator import Exact
+from pharos.hardness.representation.policy_regret import (
+    MOST_BACKUPS,
+    RETURNS,
+    SPAN,
+    PolicyLearner,
+    softmax,
+    standardised,
+)
+from pharos.hardness.representation.representation import Grouped
 from pharos.observations import representation
 from pharos.solvers import value_iteration
 from pharos.study.predictions import _network, _rollouts

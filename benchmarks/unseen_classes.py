@@ -16,8 +16,8 @@ import pandas as pd
 
 from pharos import study
 from pharos.study.figures import save
+from pharos.study.leave_one_class_out import PERMUTATIONS
 from pharos.study.predictions import Foretold
-from pharos.study.unseen_classes import PERMUTATIONS
 from pharos.study.unseen_figures import unseen_figures
 
 OUTCOMES = ("greedy", "played")

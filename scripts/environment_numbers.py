@@ -11,9 +11,10 @@ import tempfile
 from pathlib import Path
 
 import pharos
-from pharos import solvers, storage
+from pharos import solvers
 from pharos.environments import classes, named_instances
 from pharos.errors import StateSpaceTooLarge
+from pharos.system import storage
 
 FILE = Path(__file__).parents[1] / "docs" / "environments.json"
 GAMMA = 0.99

@@ -15,7 +15,7 @@ import pharos
 from pharos import drawing
 from pharos.environments import start_distribution
 from pharos.observations import observe, render
-from pharos.wording import many
+from pharos.system.wording import many
 
 DOCS = Path(__file__).parents[1] / "docs"
 FOLDER = DOCS / "gallery"

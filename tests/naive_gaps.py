@@ -1,4 +1,4 @@
-"""Suboptimality gaps from the explicit matrices of `naive_mdp.augmented`: the slow twin of pharos.hardness.gaps."""
+"""Suboptimality gaps from the explicit matrices of `naive_mdp.augmented`: the slow twin of `pharos.hardness.gaps`."""
 
 from naive_mdp import augmented, finite_values, optimal_values, outcomes
 

@@ -13,9 +13,9 @@ from pharos.agents import hyperparameters
 from pharos.errors import ParameterError, PharosError, UnknownName
 from pharos.experiments import (
     FailedRun,
-    Members,
     RunConfig,
     Task,
+    TaskCache,
     evaluate_agent,
     load_agent,
     read_curve,
@@ -24,7 +24,7 @@ from pharos.experiments import (
     train_many,
     tune,
 )
-from pharos.experiments.parts import parts_of
+from pharos.experiments.process_pool import parts_of
 from pharos.experiments.results import COLUMNS
 
 run_folder = importlib.import_module("pharos.experiments.run_folder")
@@ -238,7 +238,7 @@ def test_a_device_that_is_not_there_is_named_before_anything_is_trained(engine):
 
 def test_members_know_the_device_and_nobody_contradicts_them(engine):
     with pytest.raises(ParameterError, match="device is 'cuda', and the members are for 'cpu'; expected one device"):
-        train_configs([], members=Members(), device="cuda")
+        train_configs([], members=TaskCache(), device="cuda")
     assert engine.made == []
 
 
@@ -313,7 +313,7 @@ def test_whole_lanes_are_dealt_out_to_processes():
 
 @pytest.mark.long
 def test_processes_leave_what_one_leaves(tmp_path, monkeypatch):
-    monkeypatch.setattr(importlib.import_module("pharos.experiments.parts"), "lane_width", lambda *_: 2)
+    monkeypatch.setattr(importlib.import_module("pharos.experiments.process_pool"), "lane_width", lambda *_: 2)
     small = {"learning_starts": 50, "buffer_size": 500, "optimize_memory_usage": False}
     options = {"seeds": (0, 1, 2), "steps": 200, "evaluation_interval": 100, "hyperparameters": small}
     done = []

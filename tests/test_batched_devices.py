@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from pharos.agents.batched import BatchRun, ObservationSource, group_key, handover, layers, make_batch, observed
-from pharos.agents.batched.handover import Mirror, Program
+from pharos.agents.batched import BatchRun, ObservationSource, group_key, layers, make_batch, observed
+from pharos.agents.batched import device_buffers as handover
+from pharos.agents.batched.device_buffers import CudaGraph, PinnedBuffer
 from pharos.environments import make
 from pharos.errors import ParameterError
 from pharos.experiments import Task
@@ -106,7 +107,7 @@ def test_convolutions_side_by_side_are_those_run_by_run(monkeypatch):
 
 
 def test_mirrors_are_one_array_on_the_processor_and_two_elsewhere():
-    here, there = (Mirror((3,), torch.float32, device) for device in ("cpu", ELSEWHERE))
+    here, there = (PinnedBuffer((3,), torch.float32, device) for device in ("cpu", ELSEWHERE))
     for mirror, alike in ((here, True), (there, False)):
         mirror.array[:] = (1, 2, 3)
         assert mirror.tensor.tolist() == ([1, 2, 3] if alike else [0, 0, 0])
@@ -119,7 +120,7 @@ def test_mirrors_are_one_array_on_the_processor_and_two_elsewhere():
 
 def test_a_program_runs_each_time_it_is_called():
     calls = []
-    program = Program(lambda: calls.append(0), ELSEWHERE)
+    program = CudaGraph(lambda: calls.append(0), ELSEWHERE)
     for _ in range(3):
         program()
     assert len(calls) == 3
@@ -146,7 +147,7 @@ def recorder(monkeypatch):
 
 
 def test_a_program_is_recorded_by_its_second_call_and_then_replayed(recorder):
-    program = Program(lambda: recorder.append("run"), "cuda")
+    program = CudaGraph(lambda: recorder.append("run"), "cuda")
     for _ in range(3):
         program()
     assert recorder == ["run", "record", "run", "replay", "replay"]
@@ -158,7 +159,7 @@ def test_a_program_that_cannot_be_recorded_is_run_as_it_is(recorder):
         if recorder[-2:] == ["record", "run"]:
             raise RuntimeError("operation not permitted when stream is capturing")
 
-    program = Program(operations, "cuda")
+    program = CudaGraph(operations, "cuda")
     program()
     with pytest.warns(UserWarning, match="does not record the updates, which are slower so: operation not permitted"):
         program()

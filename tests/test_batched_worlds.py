@@ -5,11 +5,11 @@ import pytest
 from scipy.stats import kstest
 
 from pharos.agents.batched import BatchRun, ObservationSource, make_batch, observed
-from pharos.agents.batched.worlds import Worlds
+from pharos.agents.batched.batched_episodes import BatchedEpisodes
 from pharos.environments import make
 from pharos.experiments.task import Task
 from pharos.interaction import Interaction
-from pharos.interaction.payment import Payment
+from pharos.interaction.reward_channel import RewardChannel
 from pharos.kernels import batched_worlds as kernels
 from pharos.mdp import TabularMDP, random_actions, sticky_actions
 
@@ -48,7 +48,7 @@ def test_episodes_are_as_likely_as_the_mdp_says(slippery, chance):
         mdp = random_actions(sticky_actions(mdp, 0.3), 0.2)
     rng = np.random.default_rng(2)
     runs = runs_on(mdp, 40, outcome_rewards=rewards.ravel())
-    worlds = Worlds(runs, np.array([run.key for run in runs], np.uint64), 5)
+    worlds = BatchedEpisodes(runs, np.array([run.key for run in runs], np.uint64), 5)
     met, executed_after, starts = np.zeros((5, 2, 5)), np.zeros((3, 2, 2)), np.zeros(5)
     np.add.at(starts, worlds.state, 1)
     paid = {(s, a, t): rewards[s, a, successors[s, a] == t] for s in range(5) for a in range(2) for t in range(5)}
@@ -82,7 +82,7 @@ def test_lazy_actions_stay_as_often_as_they_should_and_pay_what_staying_pays(sli
     mdp, successors, probabilities, rewards = slippery
     staying = 100.0 + np.arange(10.0).reshape(5, 2)
     runs = runs_on(mdp, 40, outcome_rewards=rewards.ravel(), laziness=0.3, staying=staying)
-    worlds = Worlds(runs, np.array([run.key for run in runs], np.uint64), 5)
+    worlds = BatchedEpisodes(runs, np.array([run.key for run in runs], np.uint64), 5)
     rng, counts, met = np.random.default_rng(3), np.zeros(2), np.zeros(5)
     for step in range(300):
         state, chosen = worlds.state.copy(), rng.integers(0, 2, worlds.state.shape)
@@ -107,8 +107,8 @@ def test_pay_is_late_and_noisy_as_elsewhere_and_returns_are_of_what_is_earned(sl
         {"reward_delay": 3, "reward_noise": 2.0},
     )
     runs = [run for way in ways for run in runs_on(mdp, 8, outcome_rewards=rewards.ravel(), **way)]
-    worlds = Worlds(runs, np.array([run.key for run in runs], np.uint64), 5)
-    payments = [Payment(Interaction(reward_delay=delay), 40) for delay in (1, 3)]
+    worlds = BatchedEpisodes(runs, np.array([run.key for run in runs], np.uint64), 5)
+    payments = [RewardChannel(Interaction(reward_delay=delay), 40) for delay in (1, 3)]
     rng, noise = np.random.default_rng(4), []
     for step in range(500):
         actions = np.tile(rng.integers(0, 2, (8, 5)), (5, 1))
@@ -128,7 +128,7 @@ def test_pay_is_late_and_noisy_as_elsewhere_and_returns_are_of_what_is_earned(sl
 def test_returns_are_counted_until_the_end_of_the_training_alone(slippery):
     mdp, *_ = slippery
     runs = runs_on(mdp, 3, gamma=0.5)
-    worlds = Worlds(runs, np.array([run.key for run in runs], np.uint64), 4)
+    worlds = BatchedEpisodes(runs, np.array([run.key for run in runs], np.uint64), 4)
     episodes, sums = np.zeros(3, np.int64), np.zeros(3)
     running, discount = np.zeros((3, 4)), np.ones((3, 4))
     for step in range(60):

@@ -261,7 +261,7 @@ def test_the_mdp_of_a_class_with_an_age_is_solved_in_one_pass(tmp_path):
 
 def test_an_age_without_chance_is_checked_too(tmp_path):
     @dataclass(frozen=True, kw_only=True)
-    class Steps(Environment):
+    class FiniteHorizonValues(Environment):
         back: bool = False
         name = "steps"
         actions = ("on", "on_too")
@@ -284,10 +284,10 @@ def test_an_age_without_chance_is_checked_too(tmp_path):
         def age(self, state):
             return state[0]
 
-    space = build(Steps(), tmp_path / "space")
+    space = build(FiniteHorizonValues(), tmp_path / "space")
     assert space.manifest["format_version"] == 1 and (space.ages == space.states()[:, 0]).all()
     with pytest.raises(RuleError, match=r"action 'on_too' leads from state \(50,\) of age 50 to state \(3,\) of age 3"):
-        build(Steps(back=True), tmp_path / "back")
+        build(FiniteHorizonValues(back=True), tmp_path / "back")
 
 
 @pytest.mark.long

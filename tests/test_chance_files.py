@@ -12,8 +12,8 @@ import pytest
 import pharos
 from chance_worlds import ChanceWorld
 from pharos.errors import DiskFull, PharosError, StateSpaceCorrupted, StateSpaceMismatch, StateSpaceTooLarge
-from pharos.packed_indices import PACKED, PackedIndices, unpacked
 from pharos.state_space import read_manifest
+from pharos.system.packed_indices import PACKED, PackedIndices, unpacked
 from test_hostile_spaces import edited, refused, sealed
 from test_resuming import FullDisk, _build_and_die_at, _InterruptAtLine, build, files_of, in_a_child
 

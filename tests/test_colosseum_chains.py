@@ -21,7 +21,7 @@ from naive_colosseum import (
     within_ulps,
 )
 from pharos import TabularMDP, hardness
-from pharos.hardness.colosseum import colosseum_diameter
+from pharos.hardness.distances.colosseum import colosseum_diameter
 
 pytestmark = pytest.mark.long  # with each class compiled
 

@@ -7,8 +7,8 @@ import pytest
 
 from pharos import solvers
 from pharos.agents.batched import make_batch
-from pharos.experiments import ChanceSetting, Members, RunConfig, evaluate_agent
-from pharos.experiments.side_by_side import values_together
+from pharos.experiments import ChanceSetting, RunConfig, TaskCache, evaluate_agent
+from pharos.experiments.joint_evaluation import values_together
 from pharos.mdp import TabularMDP, lazy_actions, random_actions, sticky_actions
 from pharos.policies import Evaluation, TableAnswers, is_small_table, table_values, whole_values
 
@@ -94,7 +94,7 @@ def test_which_mdps_have_copies():
 @pytest.mark.long
 @pytest.mark.parametrize("agent", ["dqn", "ppo"])
 def test_the_runs_of_a_batch_have_the_values_that_each_has_alone(agent):
-    members = Members()
+    members = TaskCache()
     group = [
         members.member(
             seed,

@@ -12,8 +12,8 @@ import pytest
 
 import pharos
 from pharos.drawing import planes_of
-from pharos.environments import mini_grid
-from pharos.environments.freeway import NUM_COLORS
+from pharos.environments.mini_grid import mini_grid
+from pharos.environments.worlds.freeway import NUM_COLORS
 from pharos.observations import observe
 from pharos.observations.drawn import num_values
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 import pharos
 from naive_hardness import distances
 from pharos import TabularMDP, hardness
-from pharos.hardness.transition_graph import Graph
+from pharos.hardness.distances.transition_graph import Graph
 from pharos.kernels import dense_search
 from solution_lengths import solution_lengths
 

@@ -10,12 +10,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from naive_hardness import distances
-from pharos import TabularMDP, compiling, hardness, random_actions
+from pharos import TabularMDP, hardness, random_actions
 from pharos.errors import ParameterError
-from pharos.hardness import hidden_clock, sum_sweep
-from pharos.hardness.interval import Spending
-from pharos.hardness.transition_graph import Graph
+from pharos.hardness.distances import hidden_clock, sum_sweep
+from pharos.hardness.distances.transition_graph import Graph
+from pharos.hardness.interval import BudgetClock
 from pharos.kernels import clocks
+from pharos.system import compiling
 
 
 @st.composite
@@ -302,7 +303,7 @@ def test_the_interval_of_a_mean_distance_holds_its_exact_fraction():
 
 def test_seconds_of_compiling_are_not_taken_from_a_budget(monkeypatch):
     """Else a value is exact on one machine and an interval on a slower one, where nothing is compiled yet."""
-    spending = Spending(hardness.Budget(seconds=0.01), None)
+    spending = BudgetClock(hardness.Budget(seconds=0.01), None)
     time.sleep(0.02)
     assert spending.is_over
     monkeypatch.setattr(compiling, "_total", compiling.seconds() + 60)

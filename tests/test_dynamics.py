@@ -14,7 +14,7 @@ from pharos.mdp import (
     Dynamics,
     Matrices,
     Outcomes,
-    Play,
+    PolicyStep,
     PolicyTable,
     Table,
     TabularMDP,
@@ -168,14 +168,14 @@ def test_compiled_backups_and_moves_are_those_of_the_formulas(mdp, seed):
         assert (swept == slow).all()
     live = ~np.asarray(mdp.terminal)
     for play, width in (
-        (Play(live, policy.later, mdp.chance), mdp.width),
-        (Play(live, policy.first, mdp.chance.first), 1),
+        (PolicyStep(live, policy.later, mdp.chance), mdp.width),
+        (PolicyStep(live, policy.first, mdp.chance.first), 1),
     ):
         now = rng.random((mdp.num_states, width))
         fast, slow = (np.empty((mdp.num_states, mdp.width)) for _ in range(2))
         assert mdp.dynamics.move(play, now, fast) == pytest.approx(Dynamics.move(Listed.of(mdp), play, now, slow))
         np.testing.assert_allclose(fast, slow, atol=1e-12)
-    play = Play(live, policy.later, mdp.chance)
+    play = PolicyStep(live, policy.later, mdp.chance)
     fast, slow = (np.zeros((mdp.num_states, mdp.width)) for _ in range(2))
     fast[mdp.starts] = slow[mdp.starts] = 1.0
     fast[~live] = slow[~live] = 0.0

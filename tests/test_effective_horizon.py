@@ -14,9 +14,9 @@ import pharos
 from naive_horizon import analysis
 from pharos import hardness
 from pharos.errors import ParameterError, PrecisionError, UndefinedMeasure
-from pharos.hardness.effective_horizon import _compiled, _vectorized
-from pharos.hardness.large_horizon import LargeHorizon
-from pharos.hardness.steps import TIE, Steps
+from pharos.hardness.planning.effective_horizon import _compiled, _vectorized
+from pharos.hardness.planning.large_horizon import LargeHorizon
+from pharos.hardness.planning.steps import TIE, FiniteHorizonValues
 from pharos.mdp import TabularMDP, random_actions, sticky_actions
 from strategies import FEW, deterministic_mdps, general_mdps, outcome_mdps
 
@@ -109,7 +109,7 @@ def test_it_is_what_its_definition_says(mdp, chance, steps):
 @settings(max_examples=150, deadline=None)
 @given(deterministic_mdps(max_states=6, max_actions=3), st.integers(1, 7))
 def test_the_compiled_analysis_is_the_other_one(mdp, steps):
-    one = _vectorized(Steps(mdp, steps))
+    one = _vectorized(FiniteHorizonValues(mdp, steps))
     other = _compiled(LargeHorizon(mdp, steps, TIE))
     assert one.keys() == other.keys()
     for name in one:
@@ -129,7 +129,7 @@ def test_the_compiled_analysis_of_key_corridor_is_the_published_one():
 def test_larger_games_are_analysed_by_the_compiled_one(monkeypatch):
     mdp = pharos.build(pharos.make("frozen_lake/8x8")).mdp(gamma=1.0)
     expected = hardness.effective_horizon(mdp, horizon=30)
-    monkeypatch.setattr(importlib.import_module("pharos.hardness.effective_horizon"), "COMPILED", 0)
+    monkeypatch.setattr(importlib.import_module("pharos.hardness.planning.effective_horizon"), "COMPILED", 0)
     assert hardness.effective_horizon(mdp, horizon=30) == expected
 
 
@@ -201,7 +201,7 @@ def test_a_report_with_a_horizon_has_it_and_one_without_says_what_is_missing():
 )
 def test_states_that_no_episode_meets_do_not_matter(mdp, chance, steps):
     mdp = random_actions(sticky_actions(mdp, chance.get("sticky", 0.0)), chance.get("random", 0.0))
-    whole, part = (_vectorized(Steps(each, steps)) for each in (mdp, mdp.within(steps)))
+    whole, part = (_vectorized(FiniteHorizonValues(each, steps)) for each in (mdp, mdp.within(steps)))
     for name in whole:
         assert part[name] == pytest.approx(whole[name], rel=1e-9, abs=1e-12), name
     if not chance and mdp.next_states is not None:
@@ -227,7 +227,7 @@ def test_actions_that_rounding_or_less_than_the_tie_tolerance_tells_apart_are_bo
     )
     expected = 1 if less < TIE else 2
     assert 0.1 + 0.2 > 0.3
-    assert _vectorized(Steps(mdp, 2))["k_min"] == expected
+    assert _vectorized(FiniteHorizonValues(mdp, 2))["k_min"] == expected
     assert _compiled(LargeHorizon(mdp, 2, TIE))["k_min"] == expected
 
 

@@ -13,10 +13,10 @@ import numba
 import pytest
 
 import pharos
-from pharos import compiling
 from pharos.cli.options import complete_target
 from pharos.environments import list_environments
 from pharos.environments.built_in import BUILT_IN
+from pharos.system import compiling
 
 
 def pharos_command(*words, **environment):

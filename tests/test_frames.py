@@ -18,7 +18,7 @@ from pharos.interaction import GymEnv, make_sb3_vec, make_vec
 from pharos.mdp import PolicyTable
 from pharos.observations import aliasing, history_aliasing, observation_classes, observe
 from pharos.policies import Evaluation, estimation
-from pharos.policies.histories import HistoryAnswers
+from pharos.policies.histories import QueriedHistories
 
 BREAKOUT = pharos.make("breakout", height=6, columns=3, brick_rows=1)
 WORDS = ["height=6", "columns=3", "brick_rows=1"]
@@ -160,7 +160,7 @@ def test_beyond_a_limit_the_value_is_estimated_over_histories():
     assert exact.exact
     assert not estimated.exact
     assert abs(exact.value - estimated.value) <= estimated.error_bound
-    answers = HistoryAnswers(policy, task.mdp, task.sight)
+    answers = QueriedHistories(policy, task.mdp, task.sight)
     low, high = task.return_range
     value, width = estimation.estimate(answers, (low, high), 20_000, np.random.default_rng(0))
     assert abs(value - exact.value) <= width

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from naive_gorp import failure_probability, returns_of_paths
 from pharos import hardness, importers
 from pharos.errors import ParameterError, UndefinedMeasure
-from pharos.hardness.gorp import METHODS, Search
-from pharos.hardness.gorp_tails import knapsack
+from pharos.hardness.planning.gorp import METHODS, Search
+from pharos.hardness.planning.gorp_tails import knapsack
 from pharos.mdp import TabularMDP, sticky_actions
 from strategies import deterministic_mdps, small_mdps
 

@@ -22,7 +22,7 @@ from pharos.solvers.blocks import blocked_fixed_point
 from pharos.solvers.fixed_point import Backup, largest_of
 from strategies import small_mdps
 
-memory_map = importlib.import_module("pharos.large_arrays")
+memory_map = importlib.import_module("pharos.system.large_arrays")
 
 
 def ring(size: int = 400, gamma: float = 0.99) -> TabularMDP:

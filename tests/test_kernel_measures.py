@@ -274,7 +274,7 @@ def test_landmarks_are_exact_where_there_are_enough_of_them_and_say_so_where_not
 
 def test_gradient_steps_in_a_series_are_those_made_one_by_one():
     """Of all three operators, with 300 observations and rows of more than one block."""
-    from pharos.hardness.kernel_operator import Exact, Identity, Landmarks
+    from pharos.hardness.representation.kernel_operator import Exact, Identity, Landmarks
 
     rng = np.random.default_rng(2)
     kernel, states = kernel_of(300), np.arange(300)
@@ -300,7 +300,7 @@ def test_gradient_steps_in_a_series_are_those_made_one_by_one():
 
 def test_adams_kernel_has_the_square_roots_of_eigenvalues():
     """Under the weights; by landmarks that are all observations as exactly."""
-    from pharos.hardness.kernel_operator import Exact, Landmarks
+    from pharos.hardness.representation.kernel_operator import Exact, Landmarks
 
     kernel, states, weights = kernel_of(9), np.arange(9), np.random.default_rng(1).dirichlet(np.ones(9))
 
@@ -365,7 +365,7 @@ def test_learning_time_of_one_eigenvalue_is_a_logarithm():
 
 def test_sample_complexity_is_that_of_regression_by_simulation():
     """Kernel regression of a fixed function on random samples: the predicted number leaves about a tenth."""
-    from pharos.hardness import kernel_spectrum
+    from pharos.hardness.representation import kernel_spectrum
 
     rng = np.random.default_rng(0)
     features = rng.normal(size=(400, 60)) * np.arange(1, 61) ** -1.0
@@ -442,13 +442,13 @@ def test_a_kernel_that_does_not_fit_is_told_before_anything_is_learnt(grid, monk
     def learnt(*_):
         raise AssertionError("learnt first")
 
-    monkeypatch.setattr("pharos.hardness.mean_field.Learner.curve", learnt)
+    monkeypatch.setattr("pharos.hardness.representation.mean_field.Learner.curve", learnt)
     with pytest.raises(ParameterError, match="landmarks is 1; expected at least 2"):
         representation(grid, "vector", "mlp16", landmarks=1)
     with pytest.raises(ParameterError, match="landmarks is 1; expected at least 2"):
         Representation.of_matrix(np.eye(4), landmarks=1)
     seen = representation(grid, "vector", "mlp16", landmarks=0)
-    monkeypatch.setattr("pharos.memory.available_memory", lambda: 800)
+    monkeypatch.setattr("pharos.system.memory.available_memory", lambda: 800)
     with pytest.raises(ParameterError, match=r"10 states fit into memory.*landmarks"):
         kernel_regret(grid.mdp(), seen)
 

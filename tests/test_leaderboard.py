@@ -203,8 +203,8 @@ def test_a_world_of_ones_own_is_executed_only_where_it_is_trusted(tmp_path, monk
     pharos.train("q_learning", "two.py:Two", steps=200, out="run")
     file = leaderboard.submit("run", "two.safetensors")
     (tmp_path / "executed").unlink()
-    pharos.sources._MODULES.clear()
-    pharos.sources._LOADED.clear()
+    pharos.system.sources._MODULES.clear()
+    pharos.system.sources._LOADED.clear()
     with pytest.raises(UntrustedCode, match=r"two\.py:Two.*--trust"):
         leaderboard.verify(file)
     assert not (tmp_path / "executed").exists()

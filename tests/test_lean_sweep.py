@@ -8,10 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from naive_hardness import distances
-from pharos import TabularMDP, hardness, large_arrays
+from pharos import TabularMDP, hardness
 from pharos.errors import FileFormatError
-from pharos.hardness import lean_sweep
-from pharos.hardness.transition_graph import Graph
+from pharos.hardness.distances import lean_sweep
+from pharos.hardness.distances.transition_graph import Graph
+from pharos.system import large_arrays
 from test_diameter import deterministic_mdps
 
 pytestmark = pytest.mark.long

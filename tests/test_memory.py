@@ -2,7 +2,7 @@
 
 import pytest
 
-from pharos import memory as _memory
+from pharos.system import memory as _memory
 
 GIB = 1 << 30
 

@@ -11,13 +11,14 @@ import pytest
 from typer.testing import CliRunner
 
 import pharos
-from pharos import sources, study
+from pharos import study
 from pharos.cli import app
 from pharos.environments import catalog
 from pharos.errors import FileFormatError, ParameterError, UntrustedCode
 from pharos.experiments import RunConfig, load_agent, read_record, run_id, train
 from pharos.observations import observation
-from pharos.sources import Source
+from pharos.system import sources
+from pharos.system.sources import Source
 
 TAXI = """
 from dataclasses import dataclass

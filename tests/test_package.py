@@ -12,7 +12,8 @@ import pytest
 import yaml
 
 import pharos
-from pharos import errors, installation
+from pharos import errors
+from pharos.system import installation
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -126,7 +127,7 @@ import importlib, sys, types
 from pathlib import Path
 sys.modules["pharos"] = other = types.ModuleType("pharos")
 other.__path__ = [FOLDER]
-from pharos import installation
+from pharos.system import installation
 from pharos.cli import main
 importlib.import_module("pharos.cli.app").conflict = lambda: installation.conflict(Path(OTHER))
 main()

@@ -17,17 +17,18 @@ from hypothesis.extra import numpy as hnp
 
 import pharos
 from chance_worlds import ChanceWorld
-from pharos import hardness, large_arrays, packed_indices
+from pharos import hardness
 from pharos.errors import StateSpaceCorrupted, StateSpaceMismatch, StateSpaceTooLarge
-from pharos.hardness import lean_sweep, ranked_search
-from pharos.hardness.transition_graph import Graph
+from pharos.hardness.distances import lean_sweep, ranked_search
+from pharos.hardness.distances.transition_graph import Graph
 from pharos.interaction import GymEnv, make_vec
 from pharos.mdp import OutcomeTable, Table, lazy_actions, random_actions, sticky_actions
-from pharos.packed_indices import INT40, PACKED, PackedIndices, blocks_of, holds_end
 from pharos.solvers import evaluate_policy, uniform_value, value_iteration, worst_value
 from pharos.state_space import files as writing
 from pharos.state_space import manifest as manifests
 from pharos.state_space import search, shards
+from pharos.system import large_arrays, packed_indices
+from pharos.system.packed_indices import INT40, PACKED, PackedIndices, blocks_of, holds_end
 from strategies import deterministic_mdps, outcome_mdps
 from test_format_page import CODE_OF_40_BITS
 from test_hostile_spaces import sealed

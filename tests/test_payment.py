@@ -12,7 +12,7 @@ from pharos.agents import QLearning
 from pharos.errors import ParameterError
 from pharos.experiments import ChanceSetting, RunConfig, Task
 from pharos.interaction import GymEnv, Interaction, make_sb3_vec, make_vec
-from pharos.interaction.payment import Payment
+from pharos.interaction.reward_channel import RewardChannel
 from pharos.solvers import value_iteration
 
 GRID = pharos.make("simple_grid", height=3, width=3, rewards=(((0, 1), 0.25), ((1, 0), -0.5)))
@@ -23,7 +23,7 @@ BOTH = {"reward_noise": 0.5, "reward_delay": 2}
 @settings(max_examples=100, deadline=None)
 @given(st.lists(st.lists(st.integers(-3, 3), min_size=1, max_size=8), min_size=1, max_size=4), st.integers(0, 9))
 def test_what_is_paid_in_an_episode_is_what_was_earned(episodes, delay):
-    payment = Payment(Interaction(reward_delay=delay), 1)
+    payment = RewardChannel(Interaction(reward_delay=delay), 1)
     for episode in episodes:
         received = []
         for t, earned in enumerate(episode):

@@ -8,7 +8,8 @@ import pytest
 import pharos
 from pharos import hardness
 from pharos.errors import ParameterError, UndefinedMeasure
-from pharos.hardness import Representation, Rollouts, Schedule, kernel_policy_regret, kernel_regret, mean_field
+from pharos.hardness import Representation, Rollouts, Schedule, kernel_policy_regret, kernel_regret
+from pharos.hardness.representation import mean_field
 from pharos.mdp import TabularMDP, lazy_actions
 from pharos.observations import Network, tangent_kernel
 from test_kernel_measures import chain, kernel_of, random_mdp

@@ -18,7 +18,7 @@ from rank_threads import Killed, fails_at, out_of_order, threads
 from strategies import outcome_mdps, small_mdps, with_chance
 
 MPIEXEC = shutil.which("mpiexec", path=Path(sys.executable).parent)
-MODULE = sys.modules["pharos.hardness.gaps"]
+MODULE = sys.modules["pharos.hardness.gaps.gaps"]
 EXACT = ("minimal", "count", "ties", "unresolved", "small", "tie_tolerance", "error", "conventions")
 SUMS = ("sum_of_reciprocals", "lower", "upper", "regularized")
 ROUNDING = 1e-12

@@ -7,9 +7,10 @@ from hypothesis import strategies as st
 
 import pharos
 from pharos.errors import ParameterError
-from pharos.hardness import ranked_search, start_eccentricity
-from pharos.hardness.ranked_search import FAR, ranked_distances
-from pharos.hardness.transition_graph import Graph
+from pharos.hardness import start_eccentricity
+from pharos.hardness.distances import ranked_search
+from pharos.hardness.distances.ranked_search import FAR, ranked_distances
+from pharos.hardness.distances.transition_graph import Graph
 from pharos.mdp import TabularMDP, sticky_actions
 from rank_threads import out_of_order, threads
 from strategies import deterministic_mdps

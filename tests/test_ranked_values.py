@@ -21,9 +21,10 @@ from pharos.errors import ParameterError, PrecisionError
 from pharos.mdp import BEST, WORST, Matrices, PolicyTable, TabularMDP
 from pharos.ranks import RankFailed
 from pharos.solvers import checkpoint as checkpoints
-from pharos.solvers import evaluate_policy, ranked, sharing, uniform_value, value_iteration
+from pharos.solvers import distributed as sharing
+from pharos.solvers import evaluate_policy, ranked, uniform_value, value_iteration
+from pharos.solvers.distributed import DistributedOptions, shared_solution
 from pharos.solvers.fixed_point import Backup
-from pharos.solvers.sharing import Sharing, shared_solution
 from rank_threads import Killed, fails_at, out_of_order, threads
 from strategies import FEW, deterministic_mdps, hard_mdps, lazy_mdps, outcome_mdps, small_mdps
 
@@ -45,7 +46,7 @@ def solved(mdp, size, *, select=BEST, tolerance=1e-6, horizon=None, disturb=lamb
     with threads(sharing, disturb), pytest.MonkeyPatch.context() as patch:
         if cuts is not None:
             patch.setattr(ranked, "cuts_of", lambda num_rows, ranks: np.array(cuts))
-        return shared_solution(mdp, select, tolerance, horizon, Sharing(size, **options))
+        return shared_solution(mdp, select, tolerance, horizon, DistributedOptions(size, **options))
 
 
 # The same values ------------------------------------------------------------------------------------------------------
@@ -300,7 +301,7 @@ def test_three_processes_solve_and_go_on_after_a_kill(tmp_path, monkeypatch):
     alone = value_iteration(mdp, jacobi=True)
     monkeypatch.setattr(checkpoints, "_SHARE", 0)
     monkeypatch.setattr(checkpoints, "SECONDS", -1.0)
-    monkeypatch.setattr(Sharing, "checkpoint_seconds", -1.0)
+    monkeypatch.setattr(DistributedOptions, "checkpoint_seconds", -1.0)
     sweep, sweeps = ranked.RankedBackup.plain_sweep, []
 
     def dies(backup):
@@ -311,12 +312,12 @@ def test_three_processes_solve_and_go_on_after_a_kill(tmp_path, monkeypatch):
 
     monkeypatch.setattr(ranked.RankedBackup, "plain_sweep", dies)
     with pytest.raises(RankFailed, match=r"rank 2 of 3 died \(exit code -9\); the same command resumes"):
-        shared_solution(mdp, BEST, 1e-6, None, Sharing(3, True, tmp_path, -1.0))
+        shared_solution(mdp, BEST, 1e-6, None, DistributedOptions(3, True, tmp_path, -1.0))
     assert len(list(tmp_path.iterdir())) == 1
     monkeypatch.setattr(ranked.RankedBackup, "plain_sweep", sweep)
     first = []
     result = shared_solution(
-        mdp, BEST, 1e-6, None, Sharing(2, True, tmp_path, -1.0), lambda sweeps, _: first.append(sweeps)
+        mdp, BEST, 1e-6, None, DistributedOptions(2, True, tmp_path, -1.0), lambda sweeps, _: first.append(sweeps)
     )
     assert first[0] > 10
     assert (result.x == alone.x).all()

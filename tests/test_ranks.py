@@ -22,7 +22,8 @@ from pharos import ranks
 from pharos.errors import ParameterError, RuleError, StateSpaceError, StateSpaceTooLarge
 from pharos.kernels import key_owner
 from pharos.ranks import RankFailed
-from pharos.state_space import crew, ranked_search, ranked_table, search
+from pharos.state_space import build_processes as crew
+from pharos.state_space import ranked_search, ranked_table, search
 from pharos.state_space.files import lock
 from pharos.state_space.plan import Plan
 from pharos.state_space.progress import reporter

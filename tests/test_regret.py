@@ -22,7 +22,7 @@ from pharos.experiments import (
 )
 from pharos.mdp import TabularMDP
 from pharos.solvers import regret_scale, uniform_value, value_iteration, worst_value
-from pharos.study.unseen_classes import normalized_regrets
+from pharos.study.leave_one_class_out import normalized_regrets
 from strategies import deterministic_mdps
 
 CHANCE = [{}, {"random": 0.2}, {"sticky": 0.25}]

@@ -8,11 +8,12 @@ import pytest
 from typer.testing import CliRunner
 
 import pharos
-from pharos import hardness, storage
+from pharos import hardness
 from pharos.cli.app import app
 from pharos.errors import ParameterError, UndefinedMeasure, UnknownName
 from pharos.hardness import registry as _registry
 from pharos.mdp import TabularMDP
+from pharos.system import storage
 
 MEASURES = {
     "diameter",

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 import pharos
 from naive_hardness import distances
 from pharos import TabularMDP, hardness
-from pharos.hardness.restored import largest_distances, restored
+from pharos.hardness.distances.restored import largest_distances, restored
 from test_symmetry import covers
 
 pytestmark = pytest.mark.long  # with each class compiled

@@ -26,13 +26,13 @@ values = st.recursive(
 )
 
 
-class Stopped(RuntimeError):
+class CallbackError(RuntimeError):
     pass
 
 
 def stop(done, *_):
     if done >= 200:
-        raise Stopped("no space left")
+        raise CallbackError("no space left")
 
 
 @settings(max_examples=100, deadline=None)
@@ -73,7 +73,7 @@ def test_a_curve_without_a_column_is_refused(tmp_path):
 
 def test_a_run_that_fails_says_why_and_can_be_started_again(tmp_path):
     options = {"steps": 400, "evaluation_interval": 100, "out": tmp_path / "run"}
-    with pytest.raises(Stopped):
+    with pytest.raises(CallbackError):
         train("q_learning", "simple_grid/4x4-plain", progress=stop, **options)
     record = read_record(tmp_path / "run")
     assert record["status"] == "failed"
@@ -88,7 +88,7 @@ def test_a_run_that_fails_says_why_and_can_be_started_again(tmp_path):
 def test_a_damaged_checkpoint_is_said_to_be_one(agent, file, tmp_path, monkeypatch):
     monkeypatch.setattr(run_folder, "CHECKPOINT_SECONDS", 0.0)
     options = {"steps": 400, "evaluation_interval": 100, "out": tmp_path / "run"}
-    with pytest.raises(Stopped):
+    with pytest.raises(CallbackError):
         train(agent, "simple_grid/4x4-plain", progress=stop, **options)
     (tmp_path / "run" / "checkpoint" / file).write_bytes(b"PK")
     with pytest.raises(FileFormatError, match=r"checkpoint: cannot be resumed from.*delete the folder to start anew"):

@@ -16,17 +16,17 @@ import numpy as np
 import pytest
 
 import pharos
-from pharos import storage
 from pharos.environments import Environment
 from pharos.errors import DiskFull, RuleError, StateSpaceIncomplete, StateSpaceLocked, StateSpaceTooLarge
-from pharos.packed_indices import PackedIndices
 from pharos.state_space import files as writing
+from pharos.system import storage
+from pharos.system.packed_indices import PackedIndices
 from table_worlds import TableWorld
 
 building = importlib.import_module("pharos.state_space.build")
 search = importlib.import_module("pharos.state_space.search")
 table = importlib.import_module("pharos.state_space.table")
-machine = importlib.import_module("pharos.memory")
+machine = importlib.import_module("pharos.system.memory")
 
 BREAKOUT = pharos.make("breakout", height=7, columns=5)  # 27,692 states; a frontier of hundreds
 NARROW = TableWorld(num_positions=5000, lows="-1000,0,7", sizes=f"{2**40},{2**30},1", num_starts=3, end_share=0.05)

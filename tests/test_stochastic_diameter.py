@@ -13,12 +13,12 @@ import naive_hitting
 import pharos
 from pharos import hardness
 from pharos.errors import UndefinedMeasure
-from pharos.hardness.choices import choices_of
-from pharos.hardness.hitting_bounds import Bounds
-from pharos.hardness.hitting_times import HittingTimes
-from pharos.hardness.interval import Budget, Spending
-from pharos.hardness.stochastic_diameter import _Diameter
-from pharos.hardness.travel import TravelBounds
+from pharos.hardness.hitting.hitting_bounds import Bounds
+from pharos.hardness.hitting.hitting_times import HittingTimes
+from pharos.hardness.hitting.stochastic_diameter import _Diameter
+from pharos.hardness.hitting.travel import HubBounds
+from pharos.hardness.interval import Budget, BudgetClock
+from pharos.hardness.planning.expanded import choices_of
 from pharos.kernels import hitting
 from pharos.mdp import TabularMDP, random_actions, sticky_actions
 from strategies import deterministic_mdps, general_mdps, outcome_mdps
@@ -54,9 +54,9 @@ def test_diameters_are_those_of_the_explicit_matrices(mdp, restart):
 @pytest.mark.parametrize("workers", [2, 5])
 def test_results_do_not_depend_on_the_number_of_threads(workers, monkeypatch):
     mdp = random_actions(pharos.build(pharos.make("frozen_lake/8x8")).mdp(), 0.1)
-    monkeypatch.setattr("pharos.hardness.stochastic_diameter.usable_workers", lambda _: 1)
+    monkeypatch.setattr("pharos.hardness.hitting.stochastic_diameter.usable_workers", lambda _: 1)
     expected = hardness.diameter(mdp)
-    monkeypatch.setattr("pharos.hardness.stochastic_diameter.usable_workers", lambda _: workers)
+    monkeypatch.setattr("pharos.hardness.hitting.stochastic_diameter.usable_workers", lambda _: workers)
     found = hardness.diameter(mdp)
     assert (found.lower, found.upper, found.searches) == (expected.lower, expected.upper, expected.searches)
 
@@ -98,7 +98,7 @@ def test_bounds_from_a_hub_hold_for_every_target(mdp):
     states, largest = largest_times(mdp)
     if not np.isfinite(largest[np.ix_(states, states)]).all():
         return  # such an MDP is not bounded from hubs
-    bounds = TravelBounds(mdp, True)
+    bounds = HubBounds(mdp, True)
     size = mdp.num_states + naive_hitting.any_end(mdp)
     for hub in states:
         found = bounds.times_from(hub, np.maximum(largest[:size, hub], 0.0))
@@ -113,7 +113,7 @@ def test_bounds_through_the_nodes_around_a_target_hold_and_never_grow(mdp, chanc
     states, largest = largest_times(mdp)
     if not np.isfinite(largest[np.ix_(states, states)]).all():
         return
-    bounds = TravelBounds(mdp, True)
+    bounds = HubBounds(mdp, True)
     size = mdp.num_states + naive_hitting.any_end(mdp)
     for hub in states:
         to_hub = np.maximum(largest[:size, hub], 0.0)
@@ -155,7 +155,7 @@ def test_spaces_too_large_for_a_look_at_each_target_have_the_same_diameter(mdp):
     mdp = random_actions(mdp, 0.25)
     expected, _ = naive_hitting.diameter(mdp, True)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("pharos.hardness.stochastic_diameter.MANY", -1)
+        patch.setattr("pharos.hardness.hitting.stochastic_diameter.MANY", -1)
         found = hardness.diameter(mdp)
     if math.isinf(expected):
         assert math.isinf(found.lower) and (found.exact or not found.counted)
@@ -243,14 +243,14 @@ def test_a_target_that_is_not_the_farthest_or_beyond_the_budget_costs_no_linear_
     problem = HittingTimes(choices_of(ring(50, 0.9), restart=True))
     monkeypatch.setattr(problem, "_factored", lambda _: pytest.fail("solves a linear system"))
     j, count, _ = problem.open(0)
-    bounds = problem.solve(j, count, 1e-12, enough, Spending(hardness.Budget(seconds=seconds), None))
+    bounds = problem.solve(j, count, 1e-12, enough, BudgetClock(hardness.Budget(seconds=seconds), None))
     assert not bounds.meets(1e-12) and bounds.lower <= 490 <= bounds.upper
 
 
 def test_the_farthest_target_so_far_makes_the_guess_for_the_next():
     """Every step of a lazy ring takes ten."""
     mdp = ring(20, 0.9)
-    search = _Diameter(mdp, True, choices_of(mdp, restart=True), 1e-6, Spending(hardness.Budget(), None))
+    search = _Diameter(mdp, True, choices_of(mdp, restart=True), 1e-6, BudgetClock(hardness.Budget(), None))
     search.interval({})
     assert search.targets.initial_scale == pytest.approx(10, rel=1e-3)
 
@@ -432,7 +432,7 @@ def test_hitting_times_of_random_graphs_take_sweeps_where_factors_would_fill_in(
     targets = HittingTimes(choices_of(TabularMDP.from_outcomes(successors, chances, np.zeros((3000, 2))), True))
     monkeypatch.setattr(HittingTimes, "_factored", None)
     j, count, _ = targets.open(7)
-    bounds = targets.solve(j, count, 1e-6, 0.0, Spending(hardness.Budget(), None))
+    bounds = targets.solve(j, count, 1e-6, 0.0, BudgetClock(hardness.Budget(), None))
     assert bounds.meets(1e-6)
 
 
@@ -455,7 +455,7 @@ def test_attempts_that_fail_a_million_times_take_few_sweeps():
     mdp = TabularMDP.from_outcomes(successors, np.full((20, 1, 2), 0.5), np.zeros((20, 1)))
     targets = HittingTimes(choices_of(mdp, restart=True))
     j, count, _ = targets.open(19)
-    bounds = targets.sweep(j, count, 400, 0.0, Spending(Budget(), None))
+    bounds = targets.sweep(j, count, 400, 0.0, BudgetClock(Budget(), None))
     assert bounds.lower <= 2**20 - 2 <= bounds.upper
     assert bounds.apart < 1e-3
 
@@ -463,7 +463,7 @@ def test_attempts_that_fail_a_million_times_take_few_sweeps():
 @pytest.mark.parametrize("next_states", [[[0, 0]], [[1, 1], [0, 0]]])
 @pytest.mark.parametrize("many", [0, 10**9])
 def test_actions_that_are_repeated_for_ever_may_all_lead_everywhere(next_states, many, monkeypatch):
-    monkeypatch.setattr("pharos.hardness.stochastic_diameter.MANY", many)
+    monkeypatch.setattr("pharos.hardness.hitting.stochastic_diameter.MANY", many)
     mdp = TabularMDP.from_arrays(np.array(next_states), np.zeros((len(next_states), 2)))
     found = hardness.diameter(sticky_actions(mdp, 1.0), restart=False)
     assert found.exact

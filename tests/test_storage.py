@@ -18,8 +18,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pharos import storage
 from pharos.errors import FileFormatError, FolderLocked, ParameterError, StateSpaceLocked
+from pharos.system import storage
 
 fork = multiprocessing.get_context("fork")
 values = st.recursive(
@@ -109,7 +109,7 @@ def test_links_are_followed_and_devices_are_written_to(tmp_path):
     storage.replace_file(tmp_path / "link", "new")
     assert (tmp_path / "link").is_symlink() and (tmp_path / "real" / "file").read_text() == "new"
     done = subprocess.run(
-        [sys.executable, "-c", "from pharos import storage; storage.replace_file('/dev/stdout', 'hello')"],
+        [sys.executable, "-c", "from pharos.system import storage; storage.replace_file('/dev/stdout', 'hello')"],
         capture_output=True,
         text=True,
         check=True,
@@ -318,7 +318,7 @@ def test_a_file_has_the_digest_of_its_bytes(tmp_path):
 
 
 def test_nothing_heavy_is_loaded():
-    code = "import sys, pharos.storage; print([n for n in ('numba', 'scipy', 'pandas') if n in sys.modules])"
+    code = "import sys, pharos.system.storage; print([n for n in ('numba', 'scipy', 'pandas') if n in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
     assert Path(storage.__file__).name == "storage.py"

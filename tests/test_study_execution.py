@@ -15,7 +15,7 @@ import fake_training
 from pharos import study
 from pharos.errors import ParameterError, PharosError
 from pharos.study import execution as _execution
-from pharos.study import preparing
+from pharos.study import prebuild as preparing
 from pharos.study import worker as _worker
 from pharos.study.execution import shard_of
 
@@ -391,7 +391,7 @@ def test_where_locks_are_not_supported_runs_and_instances_are_no_longer_taken_fo
 
 def test_a_run_that_another_process_holds_is_busy_and_says_so_of_training(tmp_path, log):
     from pharos.errors import FolderLocked, StateSpaceLocked
-    from pharos.storage import lock
+    from pharos.system.storage import lock
 
     run = specification().runs[0]
     place = tmp_path / "locks" / run.id

@@ -179,7 +179,7 @@ def test_what_has_no_kernel_says_so_in_a_line(grid, monkeypatch):
         ntk(grid, "vector", initialisation="he")
     with pytest.raises(UnknownName, match="vector"):
         ntk(grid, "vectr")
-    monkeypatch.setattr("pharos.memory.available_memory", lambda: 800)
+    monkeypatch.setattr("pharos.system.memory.available_memory", lambda: 800)
     with pytest.raises(ParameterError, match="10 states fit into memory"):
         ntk(grid, "vector")
 

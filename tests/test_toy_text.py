@@ -8,7 +8,7 @@ import pytest
 
 import pharos
 from pharos.environments import start_distribution
-from pharos.environments.blackjack import HIT, LOST, PLAYING, STICK, WON
+from pharos.environments.worlds.blackjack import HIT, LOST, PLAYING, STICK, WON
 from pharos.errors import ParameterError
 
 

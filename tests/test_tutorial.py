@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from pharos import paths
 from pharos.environments import catalog
 from pharos.rules.kernel_cache import private_folder
+from pharos.system import paths
 
 PAGE = Path(__file__).parents[1] / "docs" / "adding-an-environment.md"
 BLOCK = re.compile(r"^```(python|text)\n(.*?)^```$", re.MULTILINE | re.DOTALL)

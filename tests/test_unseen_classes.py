@@ -7,7 +7,8 @@ from scipy.stats import rankdata
 
 from pharos import study
 from pharos.errors import ParameterError
-from pharos.study import held_out, mixed_models, predictions, within_mdps
+from pharos.study import cross_validation as held_out
+from pharos.study import mixed_models, predictions, within_mdps
 from pharos.study.predictions import Foretold
 from pharos.study.specification import specification
 from pharos.study.tables import CELL

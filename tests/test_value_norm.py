@@ -14,7 +14,7 @@ import pharos
 from naive_mdp import augmented, optimal_values
 from pharos import hardness
 from pharos.errors import ParameterError, UndefinedMeasure
-from pharos.hardness.value_norm import certified_value_norm
+from pharos.hardness.gaps.value_norm import certified_value_norm
 from pharos.mdp import TabularMDP, random_actions
 from strategies import deterministic_mdps, small_mdps
 from test_effective_horizon import key_corridor

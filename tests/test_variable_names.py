@@ -12,8 +12,8 @@ PARTICIPLES = {"asked", "found", "given", "kept", "known", "seen", "taken", "tol
 # Keywords and fields that callers write, and rules, whose variables are part of the fingerprint of their state spaces.
 LICENSED = {
     "agents/hyperparameters.py": {"given"},
-    "environments/game_2048.py": {"found"},
-    "environments/mini_grid_empty.py": {"taken"},
+    "environments/worlds/game_2048.py": {"found"},
+    "environments/mini_grid/mini_grid_empty.py": {"taken"},
     "errors.py": {"found", "known"},
     "hardness/report.py": {"kept"},
     "leaderboard/verification.py": {"found"},

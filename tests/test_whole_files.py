@@ -14,7 +14,7 @@ from pharos import drawing, exporters
 from pharos.cli.solve import save
 from pharos.mdp import TabularMDP
 from pharos.plots import save as save_figure
-from pharos.storage import replace_file
+from pharos.system.storage import replace_file
 
 fork = multiprocessing.get_context("fork")
 

@@ -4,7 +4,7 @@ import pytest
 
 from pharos.mdp import TabularMDP
 from pharos.study.status import Status
-from pharos.wording import many
+from pharos.system.wording import many
 
 
 @pytest.mark.parametrize(

@@ -15,8 +15,8 @@ import importlib
 import warnings as _warnings
 from typing import Any
 
-from pharos.installation import conflict as _conflict
 from pharos.interaction import registration as _registration  # noqa: F401  (Gymnasium's registry)
+from pharos.system.installation import conflict as _conflict
 
 if _conflict() is not None:
     _warnings.warn(str(_conflict()), stacklevel=2)

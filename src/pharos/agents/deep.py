@@ -17,7 +17,7 @@ import numpy as np
 from pharos.agents.kinds import AGENTS, agent_source, is_known
 from pharos.errors import MissingExtra, ParameterError, UnknownName
 from pharos.policies import DeepPolicy
-from pharos.sources import load
+from pharos.system.sources import load
 
 __all__ = ["ALGORITHMS", "DeepPolicy", "algorithm", "check_hyperparameters", "extractor", "make_model"]
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pharos.errors import ParameterError
-from pharos.sources import Source, find, is_reference, load
+from pharos.system.sources import Source, find, is_reference, load
 
 TABULAR_OBSERVATION = "index"
 """What tabular agents see."""

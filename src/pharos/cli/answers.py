@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pharos import compiling
+from pharos.system import compiling
 
 if TYPE_CHECKING:
     from rich.console import Console

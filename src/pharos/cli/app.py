@@ -34,7 +34,7 @@ from pharos.cli import (
 )
 from pharos.cli.answers import complain
 from pharos.errors import DivergenceError, ParameterError, PharosError
-from pharos.installation import conflict
+from pharos.system.installation import conflict
 
 EXIT_FAILED, EXIT_USAGE, EXIT_INTERRUPTED = 1, 2, 130
 # What NumPy says of an array that no machine can hold, by a ValueError

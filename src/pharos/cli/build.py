@@ -26,7 +26,7 @@ from pharos.cli.options import (
     ranks_of,
 )
 from pharos.cli.target import parse_environment
-from pharos.compiling import Stopwatch
+from pharos.system.compiling import Stopwatch
 
 if TYPE_CHECKING:
     from pharos.state_space import StateSpace

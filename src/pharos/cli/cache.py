@@ -10,7 +10,7 @@ import typer
 from pharos.cli.answers import bytes_of, console, print_json, size_text
 from pharos.cli.options import Json
 from pharos.errors import PharosError, StateSpaceLocked, UnknownName
-from pharos.wording import many
+from pharos.system.wording import many
 
 app = typer.Typer(help="List or clear the cached state spaces.", no_args_is_help=False)
 
@@ -18,7 +18,7 @@ app = typer.Typer(help="List or clear the cached state spaces.", no_args_is_help
 @app.command("list")
 def list_(json: Json = False) -> None:
     """Show the cached state spaces and how much room they take."""
-    from pharos import paths
+    from pharos.system import paths
 
     directory = paths.cache_directory()
     spaces = _spaces(directory)
@@ -41,7 +41,7 @@ def clear(
     json: Json = False,
 ) -> None:
     """Delete cached state spaces (and, when no name is given, compiled rules). They are made again when needed."""
-    from pharos import paths, storage
+    from pharos.system import paths, storage
 
     directory = paths.cache_directory()
     spaces = _spaces(directory)
@@ -67,7 +67,7 @@ def clear(
 
 
 def _compiled(directory: Path) -> list[Path]:
-    from pharos import paths
+    from pharos.system import paths
 
     return [folder for folder in paths.compiled_folders(directory) if folder.is_dir()]
 

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 from pharos.cli.answers import compiling_fact, print_json
 from pharos.cli.options import Json, MaxStates, Memory, Parameters, TargetArgument, Workers, parse_size
 from pharos.cli.target import Target, parse_target
-from pharos.compiling import Stopwatch
 from pharos.errors import ParameterError, StateSpaceTooLarge
-from pharos.wording import many
+from pharos.system.compiling import Stopwatch
+from pharos.system.wording import many
 
 if TYPE_CHECKING:
     from pharos.mdp import TabularMDP
@@ -63,8 +63,8 @@ def _table_of(goal: Target) -> "TabularMDP":
 
 def _counts_of_space(goal: Target, **options: Any) -> dict[str, int]:
     """Counts of a folder, or of the cache where the space is there; else it is built beside the cache and removed."""
-    from pharos import paths
     from pharos.state_space import cached_folder, load, read_manifest
+    from pharos.system import paths
 
     if goal.environment is None:
         assert goal.path is not None

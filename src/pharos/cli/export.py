@@ -30,7 +30,8 @@ def export(
         raise UnknownName("format", format, ENDINGS)
     check_format(out, (ENDINGS[format],))
     mdp = parse_target(target, parameters).mdp(gamma=gamma, random=random)
-    from pharos import exporters, storage
+    from pharos import exporters
+    from pharos.system import storage
 
     if format == "bridge":
         exporters.bridge(mdp, out)

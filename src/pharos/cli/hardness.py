@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pharos import compiling
 from pharos.cli.answers import compiling_fact, console, describe_chance, print_json, progress_line
 from pharos.cli.options import (
     Json,
@@ -23,7 +22,8 @@ from pharos.cli.options import (
 )
 from pharos.cli.target import parse_target
 from pharos.errors import ParameterError
-from pharos.wording import many
+from pharos.system import compiling
+from pharos.system.wording import many
 
 if TYPE_CHECKING:
     from pharos.cli.target import Target

@@ -8,7 +8,7 @@ import typer
 from pharos.cli.answers import print_facts, print_json
 from pharos.cli.options import Json, parse_parameters
 from pharos.errors import ParameterError
-from pharos.wording import many
+from pharos.system.wording import many
 
 if TYPE_CHECKING:
     from pharos.mdp import TabularMDP

@@ -8,7 +8,7 @@ import typer
 from pharos.cli.answers import complain, console, print_facts, print_json, progress_bar, progress_line, size_text
 from pharos.cli.options import Json, Trust
 from pharos.errors import ParameterError, PharosError
-from pharos.wording import many
+from pharos.system.wording import many
 
 if TYPE_CHECKING:
     from pharos.leaderboard import Verdict

@@ -21,7 +21,7 @@ from pharos.cli.options import (
 )
 from pharos.cli.target import parse_target
 from pharos.errors import ParameterError
-from pharos.wording import many
+from pharos.system.wording import many
 
 if TYPE_CHECKING:
     import numpy as np

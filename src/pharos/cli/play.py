@@ -15,7 +15,7 @@ from pharos.cli.render import environment_of, find_state
 from pharos.cli.target import parse_target
 from pharos.errors import PharosError
 from pharos.explorer import keys_of
-from pharos.wording import many
+from pharos.system.wording import many
 
 if TYPE_CHECKING:
     from rich.console import RenderableType

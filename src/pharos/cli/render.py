@@ -44,7 +44,8 @@ def render(
     json: Json = False,
 ) -> None:
     """Draw a state (PNG) or an episode (GIF, or the state after --steps as PNG); in the terminal without --out."""
-    from pharos import drawing, observations, storage
+    from pharos import drawing, observations
+    from pharos.system import storage
 
     goal = parse_target(target, parameters)
     suffix = check_format(out, (".png", ".gif", ".txt")) if out else ""

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pharos import compiling
 from pharos.cli.answers import (
     compiling_fact,
     describe_chance,
@@ -33,7 +32,8 @@ from pharos.cli.options import (
     ranks_of,
 )
 from pharos.cli.target import parse_target
-from pharos.wording import many
+from pharos.system import compiling
+from pharos.system.wording import many
 
 if TYPE_CHECKING:
     from pharos.solvers import Solution
@@ -90,8 +90,8 @@ def solve(
     building = build_options(memory, workers, max_states)
     chance: dict[str, Any] = {"sticky": sticky, "random": random, "lazy": lazy}
     mdp = parse_target(target, parameters).mdp(gamma=gamma, horizon=horizon, **chance, **building, processes=ranks)
-    from pharos import paths
     from pharos.solvers import uniform_value, value_iteration
+    from pharos.system import paths
 
     checkpoint = (values or paths.cache_directory() / "values") if ranks != 1 else None
     sharing: dict[str, Any] = {"processes": ranks, "jacobi": jacobi, "checkpoint": checkpoint}
@@ -165,7 +165,7 @@ def save(path: Path, solution: "Solution") -> None:
     """Write the policy (.npy), or values and policy (.npz)."""
     import numpy as np
 
-    from pharos import storage
+    from pharos.system import storage
 
     if path.suffix.lower() == ".npy":
         storage.replace_array(path, solution.policy)

@@ -15,7 +15,7 @@ from pharos.cli.answers import complain, console, print_json, progress_line
 from pharos.cli.options import Json, Trust, parse_parameters
 from pharos.errors import ParameterError, UnknownName
 from pharos.observations import title
-from pharos.wording import many
+from pharos.system.wording import many
 
 app = typer.Typer(help="Run a grid of training runs, and make the paper's figures and tables of it.")
 

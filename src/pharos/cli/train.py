@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pharos import compiling
 from pharos.cli.answers import compiling_fact, complain, describe_chance, print_facts, print_json, progress_bar
 from pharos.cli.options import Json, Lazy, Parameters, Random, Sticky, TargetArgument, parse_parameters, parse_seeds
 from pharos.cli.target import parse_environment
 from pharos.errors import ParameterError
-from pharos.wording import many
+from pharos.system import compiling
+from pharos.system.wording import many
 
 if TYPE_CHECKING:
     from pharos.environments import Environment
@@ -121,7 +121,7 @@ def train(
         if seed or tensorboard:
             raise ParameterError("--seeds goes with neither --seed nor --tensorboard; expected one of them")
         title = f"{agent} on {' '.join((target, *(parameters or ())))}"
-        from pharos.workers import usable_workers
+        from pharos.system.workers import usable_workers
 
         together = {"seeds": parse_seeds(seeds), "device": device, "workers": usable_workers(workers)}
         _train_many(title, agent, env, {**setting, **together}, json)

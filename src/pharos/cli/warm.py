@@ -8,9 +8,9 @@ import typer
 from pharos.cli.answers import print_facts, print_json, progress_line
 from pharos.cli.options import Json, Random, Sticky, complete_target
 from pharos.cli.target import parse_target
-from pharos.compiling import Stopwatch
 from pharos.errors import StateSpaceTooLarge
-from pharos.wording import many
+from pharos.system.compiling import Stopwatch
+from pharos.system.wording import many
 
 if TYPE_CHECKING:
     from pharos.environments import Environment

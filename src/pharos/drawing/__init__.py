@@ -5,7 +5,7 @@ A file is loaded when something in it is first used.
 
 from typing import TYPE_CHECKING
 
-from pharos import lazy
+from pharos.system import lazy
 
 if TYPE_CHECKING:
     from pharos.drawing.pictures import INK, NIGHT, episode, human, image, save_gif, save_png

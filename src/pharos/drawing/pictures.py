@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pharos import storage
 from pharos.drawing.planes import planes_of
 from pharos.drawing.scenery import ground_of, inside
 from pharos.drawing.shapes import tile
 from pharos.environments import Environment, State
+from pharos.system import storage
 
 if TYPE_CHECKING:
     from PIL.Image import Image

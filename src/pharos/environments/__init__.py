@@ -5,13 +5,11 @@
 
 from typing import TYPE_CHECKING
 
-from pharos import lazy
 from pharos.environments.built_in import BUILT_IN, BuiltIn, on_registration
+from pharos.system import lazy
 
 if TYPE_CHECKING:
     from pharos.environments.base import Components, Environment, State, start_distribution
-    from pharos.environments.blackjack import Blackjack
-    from pharos.environments.breakout import Breakout
     from pharos.environments.catalog import (
         class_called,
         class_of,
@@ -23,20 +21,10 @@ if TYPE_CHECKING:
         register,
         source_of,
     )
-    from pharos.environments.catch import Catch
-    from pharos.environments.cliff_walking import CliffWalking
-    from pharos.environments.corner_grid import CornerGrid
-    from pharos.environments.deep_sea import DeepSea
-    from pharos.environments.discounting_chain import DiscountingChain
-    from pharos.environments.endless_sea import EndlessSea
-    from pharos.environments.freeway import Freeway
-    from pharos.environments.frozen_lake import FrozenLake
-    from pharos.environments.game_2048 import Game2048
     from pharos.environments.look import Color, Ground, Layer, Look, Margin, Scenery, Shape, Sprite
-    from pharos.environments.memory_chain import MemoryChain
-    from pharos.environments.mini_grid import MiniGrid
-    from pharos.environments.mini_grid_empty import MiniGridEmpty
-    from pharos.environments.mini_grid_rooms import MiniGridRooms
+    from pharos.environments.mini_grid.mini_grid import MiniGrid
+    from pharos.environments.mini_grid.mini_grid_empty import MiniGridEmpty
+    from pharos.environments.mini_grid.mini_grid_rooms import MiniGridRooms
     from pharos.environments.parameters import (
         CELL,
         CELLS,
@@ -49,16 +37,28 @@ if TYPE_CHECKING:
         one_of,
         parameter,
     )
-    from pharos.environments.pocket_cube import PocketCube
-    from pharos.environments.river_swim import RiverSwim
-    from pharos.environments.simple_grid import SimpleGrid
-    from pharos.environments.sliding_tiles import SlidingTiles
-    from pharos.environments.sokoban import Sokoban
-    from pharos.environments.taxi import Taxi
-    from pharos.environments.umbrella_chain import UmbrellaChain
+    from pharos.environments.worlds.blackjack import Blackjack
+    from pharos.environments.worlds.breakout import Breakout
+    from pharos.environments.worlds.catch import Catch
+    from pharos.environments.worlds.cliff_walking import CliffWalking
+    from pharos.environments.worlds.corner_grid import CornerGrid
+    from pharos.environments.worlds.deep_sea import DeepSea
+    from pharos.environments.worlds.discounting_chain import DiscountingChain
+    from pharos.environments.worlds.endless_sea import EndlessSea
+    from pharos.environments.worlds.freeway import Freeway
+    from pharos.environments.worlds.frozen_lake import FrozenLake
+    from pharos.environments.worlds.game_2048 import Game2048
+    from pharos.environments.worlds.memory_chain import MemoryChain
+    from pharos.environments.worlds.pocket_cube import PocketCube
+    from pharos.environments.worlds.river_swim import RiverSwim
+    from pharos.environments.worlds.simple_grid import SimpleGrid
+    from pharos.environments.worlds.sliding_tiles import SlidingTiles
+    from pharos.environments.worlds.sokoban import Sokoban
+    from pharos.environments.worlds.taxi import Taxi
+    from pharos.environments.worlds.umbrella_chain import UmbrellaChain
 
 _FILES = {
-    **{entry.class_name: entry.name for entry in BUILT_IN},
+    **{entry.class_name: entry.file for entry in BUILT_IN},
     "CELL": "parameters",
     "CELLS": "parameters",
     "VALUED_CELLS": "parameters",

@@ -15,7 +15,7 @@ class BuiltIn(NamedTuple):
     """A class of environments that comes with pharos.
 
     Attributes:
-        name: of the class, as users type it, and of its file.
+        name: of the class, as users type it, and of its file in `worlds/`, or in `mini_grid/`.
         class_name: as Python has it.
         instances: the names of its named instances, separated by spaces.
         version: of its Gymnasium ids.
@@ -25,6 +25,11 @@ class BuiltIn(NamedTuple):
     class_name: str
     instances: str = ""
     version: int = 0
+
+    @property
+    def file(self) -> str:
+        """Its module, below `pharos.environments`."""
+        return f"{'mini_grid' if self.name.startswith('mini_grid') else 'worlds'}.{self.name}"
 
     @property
     def instance_names(self) -> tuple[str, ...]:

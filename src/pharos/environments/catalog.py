@@ -12,14 +12,15 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from pharos import mdp_files, sources
 from pharos.environments.base import Environment
 from pharos.environments.built_in import BUILT_IN, announce
 from pharos.environments.parameters import as_tuples
 from pharos.errors import ParameterError, UnknownName
-from pharos.sources import Source
+from pharos.system import mdp_files, sources
+from pharos.system.sources import Source
 
 _CLASS_NAMES = {entry.name: entry.class_name for entry in BUILT_IN}
+_MODULES = {entry.name: entry.file for entry in BUILT_IN}
 _IMPORTED = {"imported": "ImportedWorld"}  # named by its folder, so it stands in no list
 _OWN = _CLASS_NAMES | _IMPORTED
 _REGISTERED: dict[str, type[Environment]] = {}
@@ -82,7 +83,7 @@ def classes() -> dict[str, type[Environment]]:
 
 
 def _built_in(name: str) -> type[Environment]:
-    return getattr(importlib.import_module(f"pharos.environments.{name}"), _OWN[name])
+    return getattr(importlib.import_module(f"pharos.environments.{_MODULES.get(name, name)}"), _OWN[name])
 
 
 def named_instances() -> dict[str, tuple[str, Mapping[str, Any]]]:
@@ -110,7 +111,7 @@ def class_of(source: Source, *, trust: bool = False, strict: bool = False) -> ty
     """The class that a stored configuration names; registered, so that `make` knows it.
 
     Args:
-        trust, strict: as for `pharos.sources.resolve`.
+        trust, strict: as for `pharos.system.sources.resolve`.
     Raises:
         UntrustedCode: it was not imported before, and is not trusted. ParameterError: it cannot be imported.
     """

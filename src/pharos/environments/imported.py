@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from pharos import mdp_files, storage
 from pharos.environments.base import Environment
 from pharos.environments.look import Layer
 from pharos.environments.parameters import store
 from pharos.errors import FileFormatError, ParameterError
+from pharos.system import mdp_files, storage
 
 TIME_LIMIT = 1000  # of an MDP that has no horizon, and whose source has no limit
 MOST_ENTRIES = 1 << 28  # of a table of outcomes, written out

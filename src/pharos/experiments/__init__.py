@@ -4,10 +4,8 @@ from pharos.experiments.batch import train_configs
 from pharos.experiments.bootstrap import bootstrap_interval
 from pharos.experiments.config import ENGINES, ChanceSetting, Horizon, RunConfig, run_id
 from pharos.experiments.evaluation import Evaluation, evaluate_agent
-from pharos.experiments.ledger import Progress
 from pharos.experiments.loading import load_agent
-from pharos.experiments.many import train_many
-from pharos.experiments.members import FailedRun, Members
+from pharos.experiments.many_seeds import train_many
 from pharos.experiments.pace import steps_in_seconds
 from pharos.experiments.regret import ReferenceValues, RegretCurve, cumulative_expected_regret, regret
 from pharos.experiments.results import (
@@ -24,7 +22,9 @@ from pharos.experiments.results import (
 from pharos.experiments.run_folder import TrainingResult
 from pharos.experiments.search_space import SPACES
 from pharos.experiments.task import Task, TaskValues
+from pharos.experiments.task_cache import FailedRun, TaskCache
 from pharos.experiments.train import train, train_config
+from pharos.experiments.training_jobs import Progress
 from pharos.experiments.tuning import TuningResult, tune
 
 __all__ = [
@@ -34,12 +34,12 @@ __all__ = [
     "Evaluation",
     "FailedRun",
     "Horizon",
-    "Members",
     "Progress",
     "ReferenceValues",
     "RegretCurve",
     "RunConfig",
     "Task",
+    "TaskCache",
     "TaskValues",
     "TrainingResult",
     "TuningResult",

@@ -15,11 +15,11 @@ from pathlib import Path
 from typing import Any
 
 from pharos.errors import FileFormatError, ParameterError, PharosError
+from pharos.experiments.batch_run import Batch
 from pharos.experiments.config import RunConfig
-from pharos.experiments.ledger import Ledger, Stopped, Tell
-from pharos.experiments.members import FailedRun, Member, Members
-from pharos.experiments.one_batch import Batch
 from pharos.experiments.run_folder import TrainingResult, finished_result
+from pharos.experiments.task_cache import FailedRun, Member, TaskCache
+from pharos.experiments.training_jobs import CallbackError, Tell, TrainingJobs
 from pharos.policies import is_small_table
 
 
@@ -29,7 +29,7 @@ def train_configs(
     *,
     checkpoints: Path | None = None,
     progress: Tell | None = None,
-    members: Members | None = None,
+    members: TaskCache | None = None,
     device: str | None = None,
     lane: int | None = None,
 ) -> list[TrainingResult | FailedRun]:
@@ -51,7 +51,7 @@ def train_configs(
             for another one.
         MissingExtra: PyTorch is not installed.
     """
-    members = Members(device=device or "cpu") if members is None else members
+    members = TaskCache(device=device or "cpu") if members is None else members
     if device not in (None, members.device):
         raise ParameterError(f"device is {device!r}, and the members are for {members.device!r}; expected one device")
     _check_device(members.device)
@@ -73,7 +73,7 @@ def _check_device(device: str) -> None:
         raise ParameterError(f"device is {device!r}, which torch does not have here: {reason}; try cpu") from None
 
 
-class _Work(Ledger):
+class _Work(TrainingJobs):
     """The runs of one call: which train alone, which together, one batch after the other."""
 
     def run(self) -> None:
@@ -129,7 +129,7 @@ class _Work(Ledger):
             self.results[place] = train_task(
                 config, self.members.task(config), folder, progress=progress, algorithm=algorithm
             )
-        except Stopped as stop:
+        except CallbackError as stop:
             raise stop.args[0] from None
         except Exception as error:
             self.fail(place, error)

@@ -15,7 +15,7 @@ from pharos.agents import BATCHED, agent_kind, agent_source, is_known
 from pharos.environments import Environment, as_tuples, class_of, make, source_of
 from pharos.errors import FileFormatError, ParameterError, UnknownName, UntrustedCode
 from pharos.observations import OwnObservation, observation_of
-from pharos.sources import Source, is_reference, resolve
+from pharos.system.sources import Source, is_reference, resolve
 
 if TYPE_CHECKING:
     from pharos.experiments.task import Task, TaskValues
@@ -77,7 +77,7 @@ class ChanceSetting:
         return dict(vars(self))
 
     @property
-    def pays_otherwise(self) -> bool:
+    def modifies_rewards(self) -> bool:
         """Whether rewards are paid late or with noise."""
         return bool(self.reward_noise or self.reward_delay)
 

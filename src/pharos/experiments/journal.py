@@ -6,7 +6,7 @@ import time
 from pathlib import Path
 
 from pharos.errors import FileFormatError, FolderLocked
-from pharos.storage import lock
+from pharos.system.storage import lock
 
 WAIT_SECONDS = 0.005
 

@@ -7,8 +7,8 @@ from typing import Any
 from pharos.agents import hyperparameters as hyperparameters_of
 from pharos.experiments.config import RunConfig
 from pharos.experiments.learners import make_learner
-from pharos.experiments.members import Members
 from pharos.experiments.task import Task
+from pharos.experiments.task_cache import TaskCache
 
 EARLY = 100  # steps before DQN learns, in place of its own
 NO_ROW = {"value": 0.0, "expected_regret": 0.0, "mean_return": 0.0}
@@ -34,7 +34,7 @@ def steps_in_seconds(config: RunConfig, task: Task, warm: int, measured: int, to
     if config.engine == "batched":
         from pharos.agents.batched import make_batch
 
-        members = Members()
+        members = TaskCache()
         members.adopt(short, task)
         runs = [members.member(None, replace(short, seed=config.seed + i), None).run for i in range(together)]
         batch = make_batch(config.agent, runs)

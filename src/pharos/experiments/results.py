@@ -14,9 +14,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pharos import storage
 from pharos.errors import FileFormatError, MissingExtra, ResultCorrupted
 from pharos.experiments.config import run_id
+from pharos.system import storage
 
 if TYPE_CHECKING:
     import numpy as np

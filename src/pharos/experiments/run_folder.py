@@ -14,7 +14,7 @@ from pharos.environments import class_called
 from pharos.errors import ParameterError
 from pharos.experiments import results as _results
 from pharos.experiments.config import RunConfig, run_id
-from pharos.storage import sync
+from pharos.system.storage import sync
 
 CHECKPOINT_SECONDS = 10.0
 # Writing checkpoints takes at most this share of the time

@@ -13,7 +13,7 @@ from pharos.errors import ParameterError
 from pharos.experiments.config import ChanceSetting, Horizon
 from pharos.experiments.regret import ReferenceValues
 from pharos.mdp import TabularMDP
-from pharos.policies import Reach, Sight, reach_of_any
+from pharos.policies import ReachableRows, Sight, reachable_rows
 from pharos.solvers import Solution, uniform_value, value_iteration, worst_value
 from pharos.state_space import StateSpace, build
 
@@ -159,14 +159,14 @@ class Task:
         return self.chance.of(self._mdp_without_chance)
 
     @cached_property
-    def _reaches(self) -> dict[tuple[int, int], Reach]:
+    def _reaches(self) -> dict[tuple[int, int], ReachableRows]:
         return {}
 
-    def reach(self, max_rows: int, steps: int) -> Reach:
-        """What every policy reaches that gives each action a chance, remembered; see `pharos.policies.reach_of_any`."""
+    def reach(self, max_rows: int, steps: int) -> ReachableRows:
+        """Rows that policies of positive probability reach, remembered; see `pharos.policies.reachable_rows`."""
         key = max_rows, steps
         if key not in self._reaches:
-            self._reaches[key] = reach_of_any(self.mdp, *key, sees_previous_action=self.previous_action)
+            self._reaches[key] = reachable_rows(self.mdp, *key, sees_previous_action=self.previous_action)
         return self._reaches[key]
 
     @property

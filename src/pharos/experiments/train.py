@@ -16,7 +16,6 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from pharos import compiling
 from pharos.agents import agent_kind
 from pharos.agents import hyperparameters as hyperparameters_of
 from pharos.environments import Environment, make
@@ -28,6 +27,7 @@ from pharos.experiments.learners import Learner, make_learner
 from pharos.experiments.run_folder import Checkpoint, Record, TrainingResult, finished_result
 from pharos.experiments.task import Task, TaskValues
 from pharos.observations import own_observation
+from pharos.system import compiling
 
 Progress = Callable[[int, int, Mapping[str, Any]], None]
 
@@ -233,11 +233,11 @@ def _as_a_batch(
 ) -> TrainingResult:
     """A single run of the batched engine: a batch of one."""
     from pharos.experiments.batch import train_configs
-    from pharos.experiments.members import FailedRun, Members
+    from pharos.experiments.task_cache import FailedRun, TaskCache
 
     if tensorboard:
         raise ParameterError("TensorBoard's logs are those of Stable-Baselines3; expected the engine sb3, or none")
-    members = Members()
+    members = TaskCache()
     members.adopt(config, task)
 
     def tell(now: Any) -> None:

@@ -22,7 +22,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from pharos import storage
 from pharos.agents import agent_kind
 from pharos.agents import hyperparameters as hyperparameters_of
 from pharos.environments import Environment, make
@@ -31,13 +30,14 @@ from pharos.experiments import results as _results
 from pharos.experiments.batch import train_configs
 from pharos.experiments.config import ChanceSetting, RunConfig
 from pharos.experiments.journal import JournalLock, mend_journal
-from pharos.experiments.ledger import Progress
-from pharos.experiments.members import FailedRun, Members
 from pharos.experiments.search_space import allows, checked_space, default_value, suggested_value
 from pharos.experiments.task import Task
+from pharos.experiments.task_cache import FailedRun, TaskCache
 from pharos.experiments.train import train_on
+from pharos.experiments.training_jobs import Progress
 from pharos.observations import own_observation
-from pharos.wording import many
+from pharos.system import storage
+from pharos.system.wording import many
 
 EVALUATIONS = 20  # of a run
 
@@ -244,8 +244,8 @@ class _Search:
                 yield task, {**options, "hyperparameters": {**self.table, **chosen}}
 
     @cached_property
-    def _members(self) -> Members:
-        return Members()
+    def _members(self) -> TaskCache:
+        return TaskCache()
 
     def _score_of_a_batch(self, trial: Any, pruned: type[Exception], chosen: Mapping[str, Any]) -> float:
         """As `score`, of all runs at once: the mean so far is that of all of them at the same step."""

@@ -5,27 +5,27 @@ A file is loaded when something in it is first used.
 
 from typing import TYPE_CHECKING
 
-from pharos import lazy
+from pharos.system import lazy
 
 if TYPE_CHECKING:
     from pharos.explorer.exploration import Exploration
     from pharos.explorer.keys import ARROWS, keys_of
-    from pharos.explorer.learnt import Learnt
-    from pharos.explorer.opening import Explorer, exploration_of, explore, open_browser
+    from pharos.explorer.launch import Explorer, exploration_of, explore, open_browser
+    from pharos.explorer.learned_policy import Learnt
     from pharos.explorer.pages import contents, page, write
     from pharos.explorer.server import Server
 
 _FILES = {
     "ARROWS": "keys",
     "Exploration": "exploration",
-    "Explorer": "opening",
-    "Learnt": "learnt",
+    "Explorer": "launch",
+    "Learnt": "learned_policy",
     "Server": "server",
     "contents": "pages",
-    "exploration_of": "opening",
-    "explore": "opening",
+    "exploration_of": "launch",
+    "explore": "launch",
     "keys_of": "keys",
-    "open_browser": "opening",
+    "open_browser": "launch",
     "page": "pages",
     "write": "pages",
 }

@@ -13,7 +13,7 @@ from pharos.environments import Environment
 from pharos.errors import ParameterError
 from pharos.explorer.keys import keys_of
 from pharos.explorer.layers import Layers
-from pharos.explorer.learnt import LEARNT, OPTIMAL, UNIFORM, Learnt, probabilities
+from pharos.explorer.learned_policy import LEARNT, OPTIMAL, UNIFORM, Learnt, probabilities
 from pharos.explorer.picture import Pictures
 from pharos.explorer.states import NumberedStates, SpaceStates, States
 from pharos.explorer.visits import Visits

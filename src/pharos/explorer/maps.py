@@ -11,7 +11,7 @@ import numpy as np
 
 from pharos.errors import ParameterError, UnknownName
 from pharos.explorer.exploration import Exploration, number
-from pharos.explorer.learnt import OPTIMAL
+from pharos.explorer.learned_policy import OPTIMAL
 from pharos.explorer.states import Axis, axes_of, find_axis
 
 BLOCK = 1 << 18  # states that are looked at in one go

@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from pharos import storage
 from pharos.errors import ParameterError
 from pharos.explorer.exploration import Exploration
 from pharos.explorer.maps import quantities, quantity
 from pharos.mdp import TabularMDP
+from pharos.system import storage
 
 MOST_POSITIONS = 10_000  # states, under sticky actions times previous ones, that a page of its own holds
 MOST_BYTES = 64 << 20  # of such a page

@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pharos.explorer.learnt import OPTIMAL, UNIFORM
+from pharos.explorer.learned_policy import OPTIMAL, UNIFORM
 from pharos.hardness import discounted_visits, occupancy
 
 if TYPE_CHECKING:

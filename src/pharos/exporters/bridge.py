@@ -5,12 +5,12 @@ from pathlib import Path
 
 import numpy as np
 
-from pharos import storage
 from pharos.errors import ParameterError
-from pharos.mdp import TabularMDP, takes_mdp
+from pharos.mdp import TabularMDP, require_mdp
+from pharos.system import storage
 
 
-@takes_mdp
+@require_mdp
 def bridge(mdp: TabularMDP, path: str | os.PathLike) -> Path:
     """Write an MDP as BRIDGE does: npz with `transitions` int64 (S, A) and `rewards` float32 (S, A).
 

@@ -7,13 +7,13 @@ from typing import TextIO
 
 import numpy as np
 
-from pharos import storage
 from pharos.errors import ParameterError
 from pharos.exporters.gymnasium import gym_p
-from pharos.mdp import TabularMDP, takes_mdp
+from pharos.mdp import TabularMDP, require_mdp
+from pharos.system import storage
 
 
-@takes_mdp
+@require_mdp
 def drn(mdp: TabularMDP, path: str | os.PathLike) -> Path:
     """Write an MDP for Storm, with a reward model "reward" on actions and labels "init" and "terminal".
 

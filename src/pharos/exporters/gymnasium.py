@@ -3,13 +3,13 @@
 import numpy as np
 
 from pharos.errors import ParameterError
-from pharos.mdp import TabularMDP, rewards_of_outcomes, rewards_of_space, rewards_of_staying, takes_mdp
+from pharos.mdp import TabularMDP, require_mdp, rewards_of_outcomes, rewards_of_space, rewards_of_staying
 from pharos.state_space import load
 
 Outcome = tuple[float, int, float, bool]
 
 
-@takes_mdp
+@require_mdp
 def gym_p(mdp: TabularMDP) -> dict[int, dict[int, list[Outcome]]]:
     """Return P[s][a] = [(probability, next state, reward, terminated), ...], as Gymnasium's toy texts have it.
 

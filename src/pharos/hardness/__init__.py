@@ -6,33 +6,33 @@ Visitation complexity: `diameter`, `start_eccentricity`, `covering`. Estimation 
 """
 
 from pharos.hardness import built_in as _built_in  # noqa: F401  (registers the measures; the order of a report)
-from pharos.hardness.action_gap import ActionGapRegularity, action_gap_regularity
-from pharos.hardness.colosseum import colosseum_diameter
-from pharos.hardness.covering import Covering, covering
-from pharos.hardness.diameter import diameter, start_eccentricity, start_eccentricity_interval
-from pharos.hardness.effective_horizon import EffectiveHorizon, effective_horizon
-from pharos.hardness.exploration_time import ExplorationTime, exploration_time
-from pharos.hardness.gaps import Gaps, gaps, minimal_gap, sum_of_reciprocal_gaps
-from pharos.hardness.gorp import GorpBound, GorpRuns, gorp_bound, run_gorp
+from pharos.hardness.distances.colosseum import colosseum_diameter
+from pharos.hardness.distances.diameter import diameter, start_eccentricity, start_eccentricity_interval
+from pharos.hardness.gaps.action_gap import ActionGapRegularity, action_gap_regularity
+from pharos.hardness.gaps.gaps import Gaps, gaps, minimal_gap, sum_of_reciprocal_gaps
+from pharos.hardness.gaps.value_norm import environmental_value_norm
 from pharos.hardness.interval import Budget, Certificate, Certified, Interval, Progress
-from pharos.hardness.kernel_regret import KernelRegret, kernel_regret
-from pharos.hardness.kernel_spectrum import (
+from pharos.hardness.planning.effective_horizon import EffectiveHorizon, effective_horizon
+from pharos.hardness.planning.gorp import GorpBound, GorpRuns, gorp_bound, run_gorp
+from pharos.hardness.planning.return_distribution import ReturnDistribution, return_distribution
+from pharos.hardness.planning.stationary_horizon import StationaryHorizon, stationary_effective_horizon
+from pharos.hardness.registry import Measure, Problem, chosen, measures, register
+from pharos.hardness.report import Report, Result, report
+from pharos.hardness.representation.kernel_regret import KernelRegret, kernel_regret
+from pharos.hardness.representation.kernel_spectrum import (
     Spectral,
     aliasing_floor,
     kernel_learning_time,
     kernel_sample_complexity,
 )
-from pharos.hardness.mean_field import LearningCurve, Rollouts, Schedule
-from pharos.hardness.mismatch import distribution_mismatch
-from pharos.hardness.mixing_time import MixingTime, mixing_time
-from pharos.hardness.occupancy import Occupancy, discounted_visits, occupancy
-from pharos.hardness.policy_regret import kernel_policy_regret
-from pharos.hardness.registry import Measure, Problem, chosen, measures, register
-from pharos.hardness.report import Report, Result, report
-from pharos.hardness.representation import Representation
-from pharos.hardness.return_distribution import ReturnDistribution, return_distribution
-from pharos.hardness.stationary_horizon import StationaryHorizon, stationary_effective_horizon
-from pharos.hardness.value_norm import environmental_value_norm
+from pharos.hardness.representation.mean_field import LearningCurve, Rollouts, Schedule
+from pharos.hardness.representation.policy_regret import kernel_policy_regret
+from pharos.hardness.representation.representation import Representation
+from pharos.hardness.visitation.covering import Covering, covering
+from pharos.hardness.visitation.exploration_time import ExplorationTime, exploration_time
+from pharos.hardness.visitation.mismatch import distribution_mismatch
+from pharos.hardness.visitation.mixing_time import MixingTime, mixing_time
+from pharos.hardness.visitation.occupancy import Occupancy, discounted_visits, occupancy
 
 __all__ = [
     "ActionGapRegularity",

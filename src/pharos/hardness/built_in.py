@@ -4,21 +4,25 @@ import math
 from typing import Any
 
 from pharos.errors import UndefinedMeasure
-from pharos.hardness.action_gap import action_gap_regularity
-from pharos.hardness.covering import covering
-from pharos.hardness.diameter import diameter, start_eccentricity_interval
-from pharos.hardness.effective_horizon import effective_horizon
-from pharos.hardness.exploration_time import exploration_time
-from pharos.hardness.gorp import gorp_bound
+from pharos.hardness.distances.diameter import diameter, start_eccentricity_interval
+from pharos.hardness.gaps.action_gap import action_gap_regularity
+from pharos.hardness.gaps.value_norm import certified_value_norm
 from pharos.hardness.interval import Certified
-from pharos.hardness.kernel_regret import kernel_regret
-from pharos.hardness.kernel_spectrum import aliasing_floor, kernel_learning_time, kernel_sample_complexity
-from pharos.hardness.mismatch import distribution_mismatch
-from pharos.hardness.mixing_time import mixing_time
-from pharos.hardness.policy_regret import kernel_policy_regret
+from pharos.hardness.planning.effective_horizon import effective_horizon
+from pharos.hardness.planning.gorp import gorp_bound
+from pharos.hardness.planning.stationary_horizon import stationary_effective_horizon
 from pharos.hardness.registry import Problem, register
-from pharos.hardness.stationary_horizon import stationary_effective_horizon
-from pharos.hardness.value_norm import certified_value_norm
+from pharos.hardness.representation.kernel_regret import kernel_regret
+from pharos.hardness.representation.kernel_spectrum import (
+    aliasing_floor,
+    kernel_learning_time,
+    kernel_sample_complexity,
+)
+from pharos.hardness.representation.policy_regret import kernel_policy_regret
+from pharos.hardness.visitation.covering import covering
+from pharos.hardness.visitation.exploration_time import exploration_time
+from pharos.hardness.visitation.mismatch import distribution_mismatch
+from pharos.hardness.visitation.mixing_time import mixing_time
 
 
 def _diameter(problem: Problem) -> Any:

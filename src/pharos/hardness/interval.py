@@ -5,9 +5,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from pharos.compiling import Stopwatch
 from pharos.errors import ParameterError
 from pharos.mdp import TabularMDP
+from pharos.system.compiling import Stopwatch
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class Interval:
 
 
 def interval_of_search(
-    largest: int, is_whole: bool, method: str, spending: "Spending", conventions: Mapping[str, Any]
+    largest: int, is_whole: bool, method: str, spending: "BudgetClock", conventions: Mapping[str, Any]
 ) -> Interval:
     """The eccentricity of the node that one search started from, in steps.
 
@@ -227,7 +227,7 @@ class Progress:
     seconds: float
 
 
-class Spending:
+class BudgetClock:
     """A budget being spent: tells when to stop, and reports progress at most every tenth of a second.
 
     Seconds of compiling do not count: what is proven must not depend on whether the code was compiled before.

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from pharos.errors import ParameterError, UndefinedMeasure, UnknownName
-from pharos.hardness.gaps import Gaps, resolved_gaps, solved
+from pharos.hardness.gaps.gaps import Gaps, resolved_gaps, solved
 from pharos.hardness.interval import Budget, Progress
-from pharos.hardness.mean_field import Rollouts, Schedule
-from pharos.hardness.representation import Representation
+from pharos.hardness.representation.mean_field import Rollouts, Schedule
+from pharos.hardness.representation.representation import Representation
 from pharos.mdp import TabularMDP
 from pharos.solvers import Solution, value_iteration
 

@@ -9,14 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from pharos.compiling import Stopwatch
 from pharos.errors import ParameterError, PrecisionError, UndefinedMeasure
 from pharos.hardness.interval import Budget, Certificate, Certified, certificate_of
-from pharos.hardness.mean_field import Rollouts, Schedule
 from pharos.hardness.registry import Measure, Problem, chosen
-from pharos.hardness.representation import Representation
+from pharos.hardness.representation.mean_field import Rollouts, Schedule
+from pharos.hardness.representation.representation import Representation
 from pharos.hardness.results_file import ResultsFile
-from pharos.mdp import TabularMDP, takes_mdp
+from pharos.mdp import TabularMDP, require_mdp
+from pharos.system.compiling import Stopwatch
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ class Report:
         )
 
 
-@takes_mdp
+@require_mdp
 def report(
     mdp: TabularMDP,
     measures: str | Iterable[str] | None = None,

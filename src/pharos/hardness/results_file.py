@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 import xxhash
 
-from pharos import storage
 from pharos.hardness.interval import Budget, Certificate
 from pharos.hardness.registry import Measure
 from pharos.mdp import TabularMDP
+from pharos.system import storage
 
 FILE = "hardness.json"
 FORMAT = 2

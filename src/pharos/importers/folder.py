@@ -8,11 +8,22 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pharos import mdp_files, paths, storage
 from pharos.environments import Environment, make
 from pharos.errors import FileFormatError, ParameterError
 from pharos.mdp import OutcomeTable, TabularMDP
-from pharos.mdp_files import AGAIN, COMMON, FORMAT, MANIFEST, MATRIX, OBSERVATIONS, OUTCOMES, PAID, TABLE, is_folder
+from pharos.system import mdp_files, paths, storage
+from pharos.system.mdp_files import (
+    AGAIN,
+    COMMON,
+    FORMAT,
+    MANIFEST,
+    MATRIX,
+    OBSERVATIONS,
+    OUTCOMES,
+    PAID,
+    TABLE,
+    is_folder,
+)
 
 
 class Outcomes(NamedTuple):

@@ -5,7 +5,7 @@
 
 from typing import TYPE_CHECKING
 
-from pharos import lazy
+from pharos.system import lazy
 
 if TYPE_CHECKING:
     from pharos.interaction.gym_env import GymEnv

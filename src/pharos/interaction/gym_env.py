@@ -13,8 +13,8 @@ import numpy as np
 
 from pharos.environments import Environment
 from pharos.errors import ParameterError
-from pharos.interaction.payment import Payment
-from pharos.interaction.seeing import Seeing
+from pharos.interaction.frame_stack import FrameStack
+from pharos.interaction.reward_channel import RewardChannel
 from pharos.interaction.simulator import SimulatedEnv, Simulator, Stream, split_options
 from pharos.observations import NO_ACTION, Index
 
@@ -87,9 +87,9 @@ class GymEnv(SimulatedEnv, gymnasium.Env):
         self._outcome_one = simulator.rules.outcome_one
         self._stream: Stream | None = None  # of random numbers, where the rules have chance
         self._is_index = simulator.context.is_plain and isinstance(observation, Index)
-        self._seeing = Seeing(simulator, 1) if simulator.context.has_more else None
+        self._seeing = FrameStack(simulator, 1) if simulator.context.has_more else None
         self._last: Any = None  # the observation, where it is more than a function of the state
-        self._payment = Payment(interaction, 1) if simulator.pays_otherwise else None
+        self._payment = RewardChannel(interaction, 1) if simulator.modifies_rewards else None
         space = simulator.state_space
         self._successors = None if space is None or self._has_outcomes else space.successors
 

@@ -38,7 +38,7 @@ class Interaction:
         reward_noise: standard deviation of normal noise that is added to what is paid at each step. It has mean 0, so
             values and optimal policies stay what they are.
         reward_delay: steps by which rewards are paid late; at the end of an episode everything is paid that is due, see
-            `Payment`.
+            `RewardChannel`.
         initial_previous_action: what sticks on the first step. None: nothing, the chosen action is executed (as in
             Gymnasium's StickyAction); the Arcade Learning Environment starts with its action "noop".
         previous_action: whether the agent sees the previously executed action.
@@ -94,7 +94,7 @@ class Simulator:
         self.chance, self.first_chosen = chance.triple, float(chance.first_chosen)
         self.lazy = float(options.lazy)
         self._weights = (*self.chance, self.first_chosen, *([self.lazy] if self.lazy else []))
-        self.pays_otherwise = _pays_otherwise(options)
+        self.modifies_rewards = _pays_otherwise(options)
         self.has_chance = self.chance != (1.0, 0.0, 0.0)
         self.has_outcomes = self.env.has_chance
         self.first_previous = _first_previous(options.initial_previous_action, self.env)

@@ -17,8 +17,8 @@ from gymnasium.vector.utils import batch_space
 
 from pharos.environments import Environment
 from pharos.errors import ParameterError
-from pharos.interaction.payment import Payment
-from pharos.interaction.seeing import Seeing
+from pharos.interaction.frame_stack import FrameStack
+from pharos.interaction.reward_channel import RewardChannel
 from pharos.interaction.simulator import SimulatedEnv, Simulator, split_options, stream_of
 from pharos.interaction.walks import RulesWalk, TableWalk
 from pharos.kernels.stepping import DISABLED, SAME_STEP, Batch, first_outside
@@ -85,8 +85,8 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
         self._previous = np.full(n, NO_ACTION, np.int64)
         self._elapsed = np.zeros(n, np.int64)
         self._ended = np.zeros(n, np.bool_)
-        self._seeing = Seeing(simulator, n) if simulator.context.has_more else None
-        self._payment = Payment(interaction, n) if simulator.pays_otherwise else None
+        self._seeing = FrameStack(simulator, n) if simulator.context.has_more else None
+        self._payment = RewardChannel(interaction, n) if simulator.modifies_rewards else None
         self._num_drawn = n if simulator.has_outcomes else 0  # outcomes that are drawn in a step
         walk = RulesWalk if simulator.state_space is None else TableWalk
         self._walk: Any = walk(simulator, n, self._mode)

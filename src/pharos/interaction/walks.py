@@ -12,7 +12,7 @@ from pharos.interaction.simulator import Simulator
 from pharos.kernels import stepping
 from pharos.mdp import rewards_of_outcomes, rewards_of_staying
 from pharos.observations import Index, in_blocks
-from pharos.packed_indices import as_array
+from pharos.system.packed_indices import as_array
 
 if TYPE_CHECKING:
     from pharos.state_space import StateSpace

@@ -3,8 +3,8 @@
 The package announces its files; each is loaded where it is used, and loads Numba.
 """
 
-from pharos import compiling
 from pharos.kernels import packed_indices
+from pharos.system import compiling
 
 __all__ = [
     "batched_learning",

@@ -1,4 +1,4 @@
-"""Suboptimality gaps of blocks of states, and their sums; hardness/gaps.py says what they mean.
+"""Suboptimality gaps of blocks of states, and their sums; hardness/gaps/gaps.py says what they mean.
 
 gap (N, A) float64 >= 0, 0 for the best actions; counted (N,) int64, how often a row counts.
 """

@@ -1,7 +1,8 @@
 """Least expected hitting times on explicit choices: nodes, A actions each, row n A + a of a sparse matrix (first, node,
 weight).
 
-hardness/hitting_times.py says what is computed and why the bounds hold. `goal` (N,) bool marks the nodes of the target,
+hardness/hitting/hitting_times.py says what is computed and why the bounds hold.
+`goal` (N,) bool marks the nodes of the target,
 `alike` (N,) bool nodes that all have the same rows, such as those in which episodes end: what holds for the first of
 them is not worked out again for the others.
 """

@@ -19,7 +19,7 @@ from numba.extending import (
     unbox,
 )
 
-from pharos.packed_indices import PACKED, PackedIndices
+from pharos.system.packed_indices import PACKED, PackedIndices
 
 
 class PackedIndicesType(types.Type):

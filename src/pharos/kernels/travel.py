@@ -1,4 +1,4 @@
-"""Bounds of expected times between neighbouring states, for all pairs at once; hardness/travel.py says what and why.
+"""Bounds of expected times between neighbouring states, for all pairs at once (hardness/hitting/travel.py).
 
 Outcomes: state x has those numbered first[x] to first[x + 1]: outcome i happens with probability prob[i] when action[i]
 is executed (-1: any action), and leads to node[i]. Outcome i stands for the aim to go from x to node[i] by choosing

@@ -1,5 +1,5 @@
-"""Bounds of expected times to each target from a hub, through the nodes around the target; hardness/travel.py says what
-and why, kernels/travel.py what outcomes are."""
+"""Bounds of expected times to each target from a hub, through the nodes around the target; see
+hardness/hitting/travel.py; kernels/travel.py says what outcomes are."""
 
 import numpy as np
 from numba import njit

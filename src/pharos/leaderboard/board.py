@@ -13,14 +13,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from pharos import storage
 from pharos.environments import Environment, make
 from pharos.errors import ParameterError, PharosError
 from pharos.experiments import TaskValues
 from pharos.leaderboard.entry import SUFFIX
 from pharos.leaderboard.verification import MAX_STATES, REACHED, TOLERANCE, Verdict, task_key, verify
 from pharos.observations import title as observation_title
-from pharos.templates import templates
+from pharos.system import storage
+from pharos.system.templates import templates
 
 Progress = Callable[[int, int, str], None]
 

@@ -21,9 +21,9 @@ from typing import Any
 
 import numpy as np
 
-from pharos import storage
 from pharos.errors import FileFormatError, ParameterError, ResultCorrupted
 from pharos.experiments import RunConfig, run_id
+from pharos.system import storage
 
 FORMAT = 1
 SUFFIX = ".safetensors"

@@ -7,15 +7,15 @@ from collections.abc import MutableMapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from pharos import storage
 from pharos.environments import BUILT_IN
 from pharos.errors import FileFormatError, ParameterError, StateSpaceTooLarge, UntrustedCode
 from pharos.experiments import RunConfig, Task, TaskValues, evaluate_agent
 from pharos.leaderboard.entry import POLICY, Entry, read
 from pharos.leaderboard.policy import policy_of
 from pharos.observations import names as observation_names
-from pharos.sources import is_reference
 from pharos.state_space import build
+from pharos.system import storage
+from pharos.system.sources import is_reference
 
 TOLERANCE = 1e-6
 MAX_STATES = 10_000_000

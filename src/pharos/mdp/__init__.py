@@ -5,13 +5,13 @@ A file is loaded when something in it is first used: to step an environment need
 
 from typing import TYPE_CHECKING
 
-from pharos import lazy
+from pharos.system import lazy
 
 if TYPE_CHECKING:
-    from pharos.mdp.arguments import takes_mdp
+    from pharos.mdp.arguments import require_mdp
     from pharos.mdp.bisimulation import Minimization, minimize
     from pharos.mdp.chance import Chance, lazy_actions, random_actions, sticky_actions
-    from pharos.mdp.dynamics import BellmanEquation, Dynamics, Outcomes, Play, split
+    from pharos.mdp.dynamics import BellmanEquation, Dynamics, Outcomes, PolicyStep, split
     from pharos.mdp.lazy import Lazy
     from pharos.mdp.matrices import Matrices
     from pharos.mdp.outcome_table import OutcomeTable
@@ -36,7 +36,7 @@ _FILES = {
     "OutcomeTable": "outcome_table",
     "Outcomes": "dynamics",
     "Part": "part",
-    "Play": "dynamics",
+    "PolicyStep": "dynamics",
     "PolicyTable": "selection",
     "Rewards": "rewards",
     "Selection": "selection",
@@ -57,7 +57,7 @@ _FILES = {
     "shares_of": "runs",
     "split": "dynamics",
     "sticky_actions": "chance",
-    "takes_mdp": "arguments",
+    "require_mdp": "arguments",
 }
 
 __all__ = [
@@ -73,7 +73,7 @@ __all__ = [
     "OutcomeTable",
     "Outcomes",
     "Part",
-    "Play",
+    "PolicyStep",
     "PolicyTable",
     "Rewards",
     "Selection",
@@ -86,6 +86,7 @@ __all__ = [
     "minimize",
     "random_actions",
     "ranged_rewards",
+    "require_mdp",
     "rewards_of_outcomes",
     "rewards_of_space",
     "rewards_of_staying",
@@ -94,7 +95,6 @@ __all__ = [
     "shares_of",
     "split",
     "sticky_actions",
-    "takes_mdp",
 ]
 
 __getattr__ = lazy.attributes(__name__, _FILES)

@@ -10,7 +10,7 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 
-def takes_mdp(function: Callable[P, R]) -> Callable[P, R]:
+def require_mdp(function: Callable[P, R]) -> Callable[P, R]:
     """The function, which raises ParameterError, with what to write, unless its first argument is a TabularMDP."""
 
     @functools.wraps(function)

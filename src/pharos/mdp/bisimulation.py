@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 
 from pharos.errors import ParameterError
-from pharos.mdp.arguments import takes_mdp
+from pharos.mdp.arguments import require_mdp
 from pharos.mdp.rewards import Rewards
 from pharos.mdp.tabular import TabularMDP
-from pharos.packed_indices import Indices
+from pharos.system.packed_indices import Indices
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +39,7 @@ class Minimization:
         return len(self.representatives)
 
 
-@takes_mdp
+@require_mdp
 def minimize(mdp: TabularMDP, observations: Any = None) -> Minimization:
     """Return the smallest MDP that cannot be told from this one.
 

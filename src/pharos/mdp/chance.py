@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pharos.errors import ParameterError
-from pharos.mdp.arguments import takes_mdp
+from pharos.mdp.arguments import require_mdp
 
 if TYPE_CHECKING:
     from pharos.mdp.tabular import TabularMDP
@@ -175,7 +175,7 @@ class Chance:
         }
 
 
-@takes_mdp
+@require_mdp
 def random_actions(mdp: "TabularMDP", p: float) -> "TabularMDP":
     """The MDP in which, with probability p, the executed action is uniform over all A actions.
 
@@ -190,7 +190,7 @@ def random_actions(mdp: "TabularMDP", p: float) -> "TabularMDP":
     return replace(mdp, chance=mdp.chance.with_random(p))
 
 
-@takes_mdp
+@require_mdp
 def sticky_actions(mdp: "TabularMDP", p: float) -> "TabularMDP":
     """The MDP in which, with probability p, the previously executed action is executed again.
 
@@ -205,7 +205,7 @@ def sticky_actions(mdp: "TabularMDP", p: float) -> "TabularMDP":
     return replace(mdp, chance=mdp.chance.with_sticky(p))
 
 
-@takes_mdp
+@require_mdp
 def lazy_actions(mdp: "TabularMDP", p: float, *, staying: Any = None) -> "TabularMDP":
     """The MDP in which, with probability p, the executed action has no effect: the state stays what it is.
 

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from pharos.kernels import bellman, graph, occupancy, outcomes
-from pharos.large_arrays import ranges_from_the_end
-from pharos.mdp.dynamics import BellmanEquation, Components, Dynamics, Order, Play
+from pharos.mdp.dynamics import BellmanEquation, Components, Dynamics, Order, PolicyStep
 from pharos.mdp.runs import count_of, shares_of
 from pharos.mdp.selection import Extreme, PolicyTable, Selection
+from pharos.system.large_arrays import ranges_from_the_end
 
 
 class CompiledDynamics(Dynamics):
@@ -96,7 +96,7 @@ class CompiledDynamics(Dynamics):
     def sweep_once(self, equation: BellmanEquation, x: np.ndarray, order: Order) -> None:
         swept(self.for_sweeps, self.num_actions, equation, x, order.states)
 
-    def move(self, play: Play, now: np.ndarray, after: np.ndarray) -> float:
+    def move(self, play: PolicyStep, now: np.ndarray, after: np.ndarray) -> float:
         if now.shape[1] != after.shape[1]:  # the first step of sticky actions
             return super().move(play, now, after)
         return occupancy.push(self.for_kernels, play.live, play.policy, play.chance.triple, now, after)
@@ -106,11 +106,11 @@ class CompiledDynamics(Dynamics):
         outcomes.pushed(self.for_kernels, np.ascontiguousarray(mass, np.float64), after)
         return after
 
-    def settle(self, play: Play, gamma: float, least: float, waiting: np.ndarray, visits: np.ndarray) -> float:
+    def settle(self, play: PolicyStep, gamma: float, least: float, waiting: np.ndarray, visits: np.ndarray) -> float:
         weights = play.chance.triple
         return occupancy.settle(self.for_kernels, play.live, play.policy, weights, gamma, least, waiting, visits)
 
-    def support(self, play: Play, reached: np.ndarray) -> None:
+    def support(self, play: PolicyStep, reached: np.ndarray) -> None:
         occupancy.support(self.for_kernels, play.live, play.policy, play.chance.triple, reached)
 
     def reachable(self, starts: np.ndarray, steps: int | None = None) -> np.ndarray:
@@ -185,7 +185,7 @@ def _choice(select: Selection) -> "float | np.ndarray | None":
 
 def _shared(block: Callable[[np.ndarray], None], dynamics: CompiledDynamics, runs: np.ndarray) -> None:
     """block(part) over the states of runs (R, 2), on all processors where there are enough states to share."""
-    from pharos.workers import usable_workers
+    from pharos.system.workers import usable_workers
 
     workers = usable_workers(dynamics.workers) if count_of(runs) >= 1 << 16 else 1
     if workers == 1:

@@ -24,7 +24,7 @@ from pharos.mdp.chance import Chance
 from pharos.mdp.rewards import Rewards
 from pharos.mdp.runs import rows_of
 from pharos.mdp.selection import Selection, chosen_mass
-from pharos.packed_indices import Indices, blocks_of, room_for_indices
+from pharos.system.packed_indices import Indices, blocks_of, room_for_indices
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
@@ -54,7 +54,7 @@ class BellmanEquation(NamedTuple):
         return self.chance.choice(q, self.select.value(q, states))
 
 
-class Play(NamedTuple):
+class PolicyStep(NamedTuple):
     """How mass moves: live (S,) bool, the states that play goes on in; policy and chance of choosing, one step's."""
 
     live: np.ndarray
@@ -221,7 +221,7 @@ class Dynamics(ABC):
         x[:] = new
         return change
 
-    def move(self, play: Play, now: np.ndarray, after: np.ndarray) -> float:
+    def move(self, play: PolicyStep, now: np.ndarray, after: np.ndarray) -> float:
         """after (S, W) = the mass now (S, W') one step later, without what has ended.
 
         Returns the sum over live states.
@@ -231,7 +231,7 @@ class Dynamics(ABC):
         after[:] = self.pushed(executed, after.shape[1])
         return float(after[play.live].sum())
 
-    def settle(self, play: Play, gamma: float, least: float, waiting: np.ndarray, visits: np.ndarray) -> float:
+    def settle(self, play: PolicyStep, gamma: float, least: float, waiting: np.ndarray, visits: np.ndarray) -> float:
         """Count the waiting mass (S, W) as visits (S, W) and move it on, discounted. Returns what waits afterwards.
 
         Masses below `least` may stay.
@@ -243,7 +243,7 @@ class Dynamics(ABC):
         waiting[~play.live] = 0.0
         return float(waiting.sum())
 
-    def support(self, play: Play, reached: np.ndarray) -> None:
+    def support(self, play: PolicyStep, reached: np.ndarray) -> None:
         """Set reached (S, W), 1 where mass may be and else 0, to 1 wherever it may come to."""
         after = np.empty_like(reached)
         while True:

@@ -11,7 +11,7 @@ from pharos.kernels import outcomes as kernels
 from pharos.mdp.compiled import CompiledDynamics
 from pharos.mdp.dynamics import Outcomes, as_indices, split
 from pharos.mdp.outcome_arrays import check_outcome_arrays, checked_outcomes, compact_outcomes
-from pharos.packed_indices import Indices, PackedIndices, as_array, blocks_of, holds_end, rows_of
+from pharos.system.packed_indices import Indices, PackedIndices, as_array, blocks_of, holds_end, rows_of
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix

@@ -9,7 +9,7 @@ import numpy as np
 
 from pharos.environments import Environment
 from pharos.errors import ParameterError, StateSpaceError
-from pharos.workers import usable_workers
+from pharos.system.workers import usable_workers
 
 if TYPE_CHECKING:
     from pharos.mdp.rewards import Rewards

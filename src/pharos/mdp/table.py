@@ -7,7 +7,7 @@ import numpy as np
 
 from pharos.mdp.compiled import CompiledDynamics
 from pharos.mdp.dynamics import Outcomes, as_indices, split
-from pharos.packed_indices import Indices, PackedIndices, blocks_of, holds_end, rows_of
+from pharos.system.packed_indices import Indices, PackedIndices, blocks_of, holds_end, rows_of
 
 
 class Table(CompiledDynamics):

@@ -25,7 +25,7 @@ from pharos.mdp.tabular_arrays import (
     start_of,
     terminal_states,
 )
-from pharos.packed_indices import Indices
+from pharos.system.packed_indices import Indices
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix

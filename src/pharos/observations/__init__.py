@@ -6,46 +6,52 @@ states. Images are loaded when they are first asked for.
 
 from typing import TYPE_CHECKING
 
-from pharos import lazy
 from pharos.observations.blocks import in_blocks
 from pharos.observations.context import NO_ACTION, ObservationInContext
 from pharos.observations.observation import FunctionObservation, Observation, names, observe, register, title
 from pharos.observations.vector import Index, OneHot, Vector
+from pharos.system import lazy
 
 if TYPE_CHECKING:
     from pharos.observations.complex_image import ComplexImage
+    from pharos.observations.custom import OwnObservation, imported, observation_of, own_observation
     from pharos.observations.empirical import empirical_ntk
     from pharos.observations.hash import Hash
-    from pharos.observations.look_alikes import Aliasing, aliasing, counted, history_aliasing, observation_classes
     from pharos.observations.memoryless import MemorylessLoss, memoryless_loss
     from pharos.observations.networks import Network, default_network
-    from pharos.observations.own import OwnObservation, imported, observation_of, own_observation
+    from pharos.observations.observation_aliasing import (
+        Aliasing,
+        aliasing,
+        counted,
+        history_aliasing,
+        observation_classes,
+    )
     from pharos.observations.rendered import RENDERERS, render, renderers
     from pharos.observations.represented import representation
     from pharos.observations.simple_image import SimpleImage
     from pharos.observations.tangent_kernels import network_inputs, ntk, tangent_kernel
 
 _FILES = {
-    "Aliasing": "look_alikes",
+    "Aliasing": "observation_aliasing",
     "ComplexImage": "complex_image",
     "Hash": "hash",
     "MemorylessLoss": "memoryless",
     "Network": "networks",
-    "OwnObservation": "own",
+    "OwnObservation": "custom",
     "RENDERERS": "rendered",
     "SimpleImage": "simple_image",
-    "aliasing": "look_alikes",
-    "counted": "look_alikes",
+    "aliasing": "observation_aliasing",
+    "counted": "observation_aliasing",
     "default_network": "networks",
     "empirical_ntk": "empirical",
-    "history_aliasing": "look_alikes",
-    "imported": "own",
+    "history_aliasing": "observation_aliasing",
+    "imported": "custom",
     "memoryless_loss": "memoryless",
     "network_inputs": "tangent_kernels",
     "ntk": "tangent_kernels",
-    "observation_classes": "look_alikes",
-    "observation_of": "own",
-    "own_observation": "own",
+    "observation_classes": "observation_aliasing",
+    "observation_of": "custom",
+    "own_observation": "custom",
     "render": "rendered",
     "renderers": "rendered",
     "representation": "represented",

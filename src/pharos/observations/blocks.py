@@ -13,7 +13,7 @@ def in_blocks(run: Callable[[int, int], None], number: int, block: int) -> None:
     if number < 2 * block:
         run(0, number)
         return
-    from pharos.workers import usable_workers
+    from pharos.system.workers import usable_workers
 
     workers = usable_workers(None)
     if workers < 2:

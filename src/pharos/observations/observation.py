@@ -9,7 +9,7 @@ import numpy as np
 
 from pharos.environments import Environment, make
 from pharos.errors import ParameterError, UnknownName
-from pharos.sources import is_reference
+from pharos.system.sources import is_reference
 
 if TYPE_CHECKING:
     import gymnasium
@@ -225,7 +225,7 @@ def _own(observation: Any) -> Any:
     """The user's own observation, where that is what `observation` names."""
     if isinstance(observation, str) and not is_reference(observation):
         return None
-    from pharos.observations.own import OwnObservation, imported
+    from pharos.observations.custom import OwnObservation, imported
 
     if isinstance(observation, OwnObservation):
         return observation

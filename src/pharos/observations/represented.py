@@ -6,14 +6,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pharos import sources
 from pharos.errors import MissingExtra, ParameterError, PharosError
 from pharos.hardness import Representation
 from pharos.observations.empirical import empirical_ntk
-from pharos.observations.look_alikes import observation_classes
 from pharos.observations.networks import Network, default_network
 from pharos.observations.observation import observe
+from pharos.observations.observation_aliasing import observation_classes
 from pharos.observations.tangent_kernels import check_memory, network_inputs, tangent_kernel
+from pharos.system import sources
 
 if TYPE_CHECKING:
     from pharos.state_space import StateSpace

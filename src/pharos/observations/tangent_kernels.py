@@ -89,7 +89,7 @@ def check_memory(rows: int, columns: int, what: str) -> None:
     Raises:
         ParameterError: it takes more than half of what is free; the size that fits, and what to do, are said.
     """
-    from pharos.memory import available_memory
+    from pharos.system.memory import available_memory
 
     free = available_memory() // 2
     if 4 * rows * columns > free:

@@ -7,7 +7,7 @@ import numpy as np
 
 from pharos.errors import ParameterError
 from pharos.plots.style import COLORS, plain_log, single, styled
-from pharos.wording import many
+from pharos.system.wording import many
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -6,8 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
-from pharos import storage
 from pharos.errors import MissingExtra, ParameterError
+from pharos.system import storage
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -1,6 +1,5 @@
 """Policies: tables, and functions of observations; asked in the states that they reach, and evaluated."""
 
-from pharos.policies.asking import Answers, PolicyAnswers, Reach, Sight, TableAnswers, reach_of_any
 from pharos.policies.copies import is_small_table, table_values, whole_values
 from pharos.policies.evaluation import (
     Evaluation,
@@ -10,17 +9,18 @@ from pharos.policies.evaluation import (
     evaluate_seeing,
 )
 from pharos.policies.policy import DeepPolicy, Model, Policy, PolicyLike, TabularAgent, policy_function
+from pharos.policies.query import PolicyAnswers, QueriedPolicy, ReachableRows, Sight, TableAnswers, reachable_rows
 from pharos.policies.walks import is_walk, walk_values
 
 __all__ = [
-    "Answers",
     "DeepPolicy",
     "Evaluation",
     "Model",
     "Policy",
     "PolicyAnswers",
     "PolicyLike",
-    "Reach",
+    "QueriedPolicy",
+    "ReachableRows",
     "ReachedSolution",
     "Sight",
     "TableAnswers",
@@ -31,7 +31,7 @@ __all__ = [
     "is_small_table",
     "is_walk",
     "policy_function",
-    "reach_of_any",
+    "reachable_rows",
     "table_values",
     "walk_values",
     "whole_values",

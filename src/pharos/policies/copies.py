@@ -11,8 +11,8 @@ import numpy as np
 
 from pharos import solvers
 from pharos.mdp import Rewards, Table, TabularMDP
-from pharos.policies.asking import TableAnswers
 from pharos.policies.evaluation import Evaluation
+from pharos.policies.query import TableAnswers
 
 MOST_ROWS = 1 << 16  # pairs of a state and what came before, so that all of them may be reached
 MOST_TOGETHER = 1 << 18  # of all copies

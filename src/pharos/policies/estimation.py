@@ -4,14 +4,14 @@ import math
 
 import numpy as np
 
-from pharos.policies.asking import Answers
+from pharos.policies.query import QueriedPolicy
 
 # Probability that an interval misses the value.
 RISK = 0.01
 
 
 def estimate(
-    answers: Answers, return_range: tuple[float, float], episodes: int, rng: np.random.Generator
+    answers: QueriedPolicy, return_range: tuple[float, float], episodes: int, rng: np.random.Generator
 ) -> tuple[float, float]:
     """(mean return, half the width of the interval around it) of simulated episodes.
 

@@ -13,11 +13,11 @@ import numpy as np
 
 from pharos import solvers
 from pharos.errors import DivergenceError, ParameterError
-from pharos.mdp import PolicyTable, TabularMDP, takes_mdp
-from pharos.policies.asking import Answers, PolicyAnswers, Reach, Sight, TableAnswers
+from pharos.mdp import PolicyTable, TabularMDP, require_mdp
 from pharos.policies.estimation import estimate
 from pharos.policies.histories import answers_of
 from pharos.policies.policy import Model, Policy, PolicyLike, TabularAgent
+from pharos.policies.query import PolicyAnswers, QueriedPolicy, ReachableRows, Sight, TableAnswers
 from pharos.solvers import Solution
 from pharos.state_space import load
 
@@ -55,7 +55,7 @@ def evaluate_seeing(
     max_states: int = 100_000,
     episodes: int = 2_000,
     seed: int = 0,
-    reach: Callable[[int, int], Reach] | None = None,
+    reach: Callable[[int, int], ReachableRows] | None = None,
 ) -> Evaluation:
     """Return the value of a policy from the start: exact where it reaches few states, else estimated with a bound.
 
@@ -68,7 +68,7 @@ def evaluate_seeing(
     """
     if isinstance(policy, TabularAgent):
         policy = policy.policy_table()
-    answers: Answers
+    answers: QueriedPolicy
     if isinstance(policy, np.ndarray):
         table = policy.argmax(axis=-1) if deterministic and policy.dtype.kind == "f" else policy
         if mdp.num_states <= max_states:
@@ -86,7 +86,7 @@ def evaluate_seeing(
     return Evaluation(value, False, width, len(answers.rows), episodes)
 
 
-@takes_mdp
+@require_mdp
 def evaluate_policy(
     mdp: TabularMDP,
     policy: PolicyLike,
@@ -216,7 +216,7 @@ def evaluate_observing(
     )
 
 
-def _on_all_states(answers: Answers, x: np.ndarray) -> np.ndarray:
+def _on_all_states(answers: QueriedPolicy, x: np.ndarray) -> np.ndarray:
     """(S + 1, W): values on the states that the policy reaches (N + 1, W), NaN elsewhere; 0 in terminal states."""
     mdp = answers.mdp
     states = np.unique(answers.rows // answers.width) if mdp.is_sticky else answers.rows

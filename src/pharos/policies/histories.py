@@ -7,14 +7,14 @@ import numpy as np
 
 from pharos.errors import ParameterError
 from pharos.mdp import TabularMDP
-from pharos.policies.asking import PolicyAnswers, Reach, Sight
 from pharos.policies.policy import PolicyLike
+from pharos.policies.query import PolicyAnswers, ReachableRows, Sight
 
 # Histories whose frames are drawn at once
 BATCH = 512
 
 
-class HistoryAnswers(PolicyAnswers):
+class QueriedHistories(PolicyAnswers):
     """Answers of a policy that sees k frames; a row is the number of a history, the last k states of an episode.
 
     The histories that a policy reaches, with what is executed in them, are an MDP again: a history leads to the one
@@ -38,7 +38,7 @@ class HistoryAnswers(PolicyAnswers):
         numbers = self._numbers([(*self._histories[row][1:], t) for row, t in pairs.tolist()])
         return numbers[inverse.reshape(-1)]
 
-    def take(self, reach: Callable[[], Reach]) -> bool | None:
+    def take(self, reach: Callable[[], ReachableRows]) -> bool | None:
         """Never: rows are histories."""
         return None
 
@@ -46,7 +46,7 @@ class HistoryAnswers(PolicyAnswers):
         return np.array([self._histories[row][-1] for row in rows], np.int64)
 
     def reach(self, max_rows: int | None = None, steps: int | None = None) -> bool:
-        """As of `Answers`; under sticky actions a history is looked at once with each previous action."""
+        """As of `QueriedPolicy`; under sticky actions a history is looked at once with each previous action."""
         mdp, num_actions = self.mdp, self.num_actions
         width = num_actions + 1 if mdp.is_sticky else 1
         frontier = np.unique(self.start_rows()) * width + (width - 1)
@@ -114,5 +114,5 @@ class HistoryAnswers(PolicyAnswers):
 
 def answers_of(policy: PolicyLike, mdp: TabularMDP, sight: Sight, *, deterministic: bool = False) -> PolicyAnswers:
     """The answers of a policy that sees observations, of one state or of several."""
-    kind = HistoryAnswers if sight.frames > 1 else PolicyAnswers
+    kind = QueriedHistories if sight.frames > 1 else PolicyAnswers
     return kind(policy, mdp, sight, deterministic=deterministic)

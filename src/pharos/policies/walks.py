@@ -9,8 +9,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from pharos.mdp import TabularMDP
-from pharos.packed_indices import as_array
 from pharos.policies.evaluation import Evaluation, steps_that_matter
+from pharos.system.packed_indices import as_array
 
 _UNIT = 2.0**-53
 

@@ -5,9 +5,9 @@ Only what loads no Numba is imported at once; the rest is when it is asked for.
 
 from typing import TYPE_CHECKING
 
-from pharos import lazy
 from pharos.rules.fingerprint import fingerprint_of_rules
 from pharos.rules.layout import Layout, layout_of, pack, unpack
+from pharos.system import lazy
 
 if TYPE_CHECKING:
     from pharos.rules.compiled import CompiledDrawing, CompiledExploration, CompiledMotion

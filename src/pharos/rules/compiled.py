@@ -11,9 +11,9 @@ import numpy as np
 
 from pharos.environments import Environment
 from pharos.errors import RuleError
-from pharos.packed_indices import PackedIndices
 from pharos.rules.compiler import exploration_kernels, interaction_kernels, numeric_attributes, type_text
 from pharos.rules.layout import Layout
+from pharos.system.packed_indices import PackedIndices
 
 COUNTED = np.empty(0, np.int64)
 """No ranks of outcomes: those of a state and action are all its possible ones, in their order."""

@@ -20,8 +20,8 @@ from numba.core.caching import NullCache
 from numba.core.compiler import CompileResult
 from numba.core.serialize import dumps
 
-from pharos import paths, storage
-from pharos.paths import compiled_folders
+from pharos.system import paths, storage
+from pharos.system.paths import compiled_folders
 
 DIGEST_BYTES = 32
 

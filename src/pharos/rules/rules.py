@@ -19,7 +19,6 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 
 from pharos.environments import Environment
-from pharos.packed_indices import Indices
 from pharos.rules.compiled import (
     COUNTED,
     CompiledAges,
@@ -32,6 +31,7 @@ from pharos.rules.compiled import (
 )
 from pharos.rules.compiler import reason_of
 from pharos.rules.layout import Layout, layout_of
+from pharos.system.packed_indices import Indices
 
 Engine = TypeVar("Engine")
 

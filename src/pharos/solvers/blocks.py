@@ -18,6 +18,7 @@ from collections.abc import Callable
 import numpy as np
 
 from pharos.mdp import TabularMDP
+from pharos.solvers.convergence import Endless
 from pharos.solvers.fixed_point import (
     SETTLING,
     Backup,
@@ -27,7 +28,6 @@ from pharos.solvers.fixed_point import (
     imprecise,
     largest_of,
 )
-from pharos.solvers.sweeps_left import Endless
 
 MOST_BLOCKS = 4096
 # Sweeps of a range at most before the next one; fewer once they change it by a tenth of what the first one did.

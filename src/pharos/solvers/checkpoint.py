@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pharos import storage
+from pharos.system import storage
 
 if TYPE_CHECKING:
     from pharos.solvers.ranked import RankedBackup

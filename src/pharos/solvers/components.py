@@ -14,8 +14,8 @@ import math
 import numpy as np
 
 from pharos.mdp import BellmanEquation, PolicyTable, Selection, TabularMDP
-from pharos.memory import available_memory
-from pharos.solvers.sweeps_left import SETTLED, operations, shrinking, sweeps_left
+from pharos.solvers.convergence import SETTLED, operations, shrinking, sweeps_left
+from pharos.system.memory import available_memory
 
 # Sweeps before the attempt, and how many must be left: finding components takes as long as some tens of them.
 FIRST_ATTEMPT, LEFT = 32, 100

@@ -27,11 +27,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pharos.errors import DivergenceError, PrecisionError
-from pharos.large_arrays import large_zeros
 from pharos.mdp import BellmanEquation, Part, Selection, TabularMDP
 from pharos.solvers.components import ComponentSolver
+from pharos.solvers.convergence import Endless
 from pharos.solvers.policy_iteration import PolicyIteration
-from pharos.solvers.sweeps_left import Endless
+from pharos.system.large_arrays import large_zeros
 
 _UNIT = 2.0**-53
 # Sweeps that gain nothing, after values of the best policy were found, until it is clear that rounding stops them.

@@ -14,9 +14,9 @@ import numpy as np
 
 from pharos.kernels import bellman, krylov
 from pharos.mdp import BellmanEquation, PolicyTable, Rewards, Selection, TabularMDP
-from pharos.memory import available_memory
+from pharos.solvers.convergence import SETTLED, operations, shrinking, sweeps_left
 from pharos.solvers.linear_systems import bicgstab, solution_of_system
-from pharos.solvers.sweeps_left import SETTLED, operations, shrinking, sweeps_left
+from pharos.system.memory import available_memory
 
 # Sweeps before the first attempt, and before that of the inexact way, which gains less: most games are solved by then.
 # Later attempts come after twice as many sweeps each, four times where they failed.

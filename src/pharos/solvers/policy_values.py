@@ -5,17 +5,17 @@ from typing import Any
 
 import numpy as np
 
-from pharos.compiling import Stopwatch
 from pharos.errors import DivergenceError
-from pharos.mdp import PolicyTable, TabularMDP, mass_of, takes_mdp
+from pharos.mdp import PolicyTable, TabularMDP, mass_of, require_mdp
+from pharos.solvers.distributed import DistributedOptions
 from pharos.solvers.fixed_point import MARGIN, Backup, chain_bound
 from pharos.solvers.policy_iteration import chain, chain_values
-from pharos.solvers.sharing import Sharing
 from pharos.solvers.solution import Solution
 from pharos.solvers.values import check_tolerance, checked_horizon, solution_of
+from pharos.system.compiling import Stopwatch
 
 
-@takes_mdp
+@require_mdp
 def evaluate_policy(
     mdp: TabularMDP,
     policy: Any,
@@ -53,7 +53,7 @@ def evaluate_policy(
         policy = policy.policy_table()
     watch = Stopwatch()
     select = PolicyTable.of(mdp, policy)
-    sharing = Sharing(processes, jacobi, checkpoint)
+    sharing = DistributedOptions(processes, jacobi, checkpoint)
     if select.actions is not None and mdp.is_deterministic and horizon is None and not sharing.is_wanted:
         return _on_its_graph(mdp, select, watch)
     return solution_of(mdp, select, tolerance, horizon, sharing=sharing)
@@ -97,7 +97,7 @@ def evaluate_apart(
     return list(zip(values, (bounds * MARGIN).tolist(), strict=True))
 
 
-@takes_mdp
+@require_mdp
 def uniform_policy(mdp: TabularMDP) -> np.ndarray:
     """(S, A) probabilities, all 1 / A."""
     return np.full((mdp.num_states, mdp.num_actions), 1 / mdp.num_actions)

@@ -30,7 +30,7 @@ from pharos.mdp import Part, Selection, TabularMDP, runs_between, runs_of, share
 from pharos.ranks import Halo, Rank, check_ranks, cuts_of
 from pharos.solvers.checkpoint import Checkpoint
 from pharos.solvers.fixed_point import SETTLING, Backup, bound_of_steps, check_tolerance, imprecise, largest_of
-from pharos.workers import usable_workers
+from pharos.system.workers import usable_workers
 
 _ROWS = 1 << 20  # of values that a rank sends to the first in one exchange
 _BLOCK = 1 << 16  # states whose fingerprint is taken in one go

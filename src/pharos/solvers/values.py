@@ -6,18 +6,18 @@ from typing import Any
 
 import numpy as np
 
-from pharos.compiling import Stopwatch
 from pharos.errors import ParameterError
-from pharos.mdp import BEST, WORST, Selection, TabularMDP, random_actions, takes_mdp
+from pharos.mdp import BEST, WORST, Selection, TabularMDP, random_actions, require_mdp
 from pharos.solvers.blocks import MOST_BLOCKS, blocked_fixed_point, can_be_swept_by_blocks
+from pharos.solvers.distributed import DistributedOptions, shared_solution
 from pharos.solvers.fixed_point import Backup, backward_induction, fixed_point
-from pharos.solvers.kept_values import kept_values
-from pharos.solvers.sharing import Sharing, shared_solution
 from pharos.solvers.solution import Solution
-from pharos.workers import usable_workers
+from pharos.solvers.stored_values import kept_values
+from pharos.system.compiling import Stopwatch
+from pharos.system.workers import usable_workers
 
 
-@takes_mdp
+@require_mdp
 def value_iteration(
     mdp: TabularMDP,
     tolerance: float = 1e-6,
@@ -77,12 +77,12 @@ def value_iteration(
         action) times actions are up to 2 million (up to 500 MB then), or nodes are up to 3000.
     Source: Bellman (1957); in place: Puterman (1994), section 6.3.3; the sticky equation: the pharos paper, appendix A.
     """
-    sharing = Sharing(processes, jacobi, checkpoint)
+    sharing = DistributedOptions(processes, jacobi, checkpoint)
     storage: dict[str, Any] = {"values": values, "threads": threads, "dtype": dtype, "blocks": blocks}
     return solution_of(mdp, BEST, tolerance, horizon, keep_all, progress, sharing=sharing, **storage)
 
 
-@takes_mdp
+@require_mdp
 def worst_value(
     mdp: TabularMDP,
     tolerance: float = 1e-6,
@@ -93,10 +93,10 @@ def worst_value(
     checkpoint: str | os.PathLike | None = None,
 ) -> Solution:
     """The values of the worst policy: as `value_iteration`, minimising."""
-    return solution_of(mdp, WORST, tolerance, horizon, sharing=Sharing(processes, jacobi, checkpoint))
+    return solution_of(mdp, WORST, tolerance, horizon, sharing=DistributedOptions(processes, jacobi, checkpoint))
 
 
-@takes_mdp
+@require_mdp
 def uniform_value(
     mdp: TabularMDP,
     tolerance: float = 1e-6,
@@ -115,7 +115,7 @@ def uniform_value(
 
     The arguments are those of `value_iteration`.
     """
-    sharing = Sharing(processes, jacobi, checkpoint)
+    sharing = DistributedOptions(processes, jacobi, checkpoint)
     mdp = random_actions(mdp, 1.0)
     storage: dict[str, Any] = {"values": values, "threads": threads, "dtype": dtype, "blocks": blocks}
     return solution_of(mdp, BEST, tolerance, horizon, progress=progress, sharing=sharing, **storage)
@@ -129,7 +129,7 @@ def solution_of(
     keep_all: bool = False,
     progress: Callable[[int, float], None] | None = None,
     values: str | os.PathLike | None = None,
-    sharing: Sharing | None = None,
+    sharing: DistributedOptions | None = None,
     threads: int = 1,
     dtype: Any = "float64",
     blocks: int = 1,

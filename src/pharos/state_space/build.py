@@ -12,8 +12,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pharos import memory as machine
-from pharos import paths, storage
 from pharos.environments import Environment, make
 from pharos.errors import ParameterError, StateSpaceMismatch
 from pharos.state_space.files import lock
@@ -22,9 +20,11 @@ from pharos.state_space.plan import Plan
 from pharos.state_space.progress import Progress, reporter
 from pharos.state_space.shards import SHARDS, check_files, shard
 from pharos.state_space.store import StateSpace, load
+from pharos.system import memory as machine
+from pharos.system import paths, storage
 
 if TYPE_CHECKING:
-    from pharos.state_space.crew import Crew
+    from pharos.state_space.build_processes import BuildProcesses
     from pharos.state_space.search import Options
 
 OUR_FILES = (*ARRAYS, *PARTS.values(), SHARDS, MANIFEST + ".tmp", storage.LOCK, storage.CLAIM)
@@ -73,7 +73,7 @@ def build(
     Cost: see docs/performance.md; 40 to 110 ns a state, 8 W + 8 to 16 bytes of memory a state (W words of 64 bits).
     Source: the pharos paper, appendix A, Algorithm 1 (whose successors are stored under the wrong index there).
     """
-    from pharos.state_space.crew import crew_of  # loads Numba
+    from pharos.state_space.build_processes import crew_of  # loads Numba
     from pharos.state_space.search import Options
 
     if isinstance(env, str):
@@ -97,7 +97,9 @@ def build(
     return load(path, verify=was_there, environment=env)
 
 
-def _build(plan: Plan, path: Path, crew: "Crew", options: "Options", progress: Progress | bool | None) -> bool:
+def _build(
+    plan: Plan, path: Path, crew: "BuildProcesses", options: "Options", progress: Progress | bool | None
+) -> bool:
     """Make the folder hold the finished state space; returns whether it did before."""
     from pharos.state_space.outcome_journal import remove_parts
     from pharos.state_space.search import check_size, journal_of

@@ -8,9 +8,9 @@ import numpy as np
 
 from pharos.environments import Environment
 from pharos.errors import StateSpaceCorrupted, StateSpaceMismatch
-from pharos.packed_indices import Indices
 from pharos.rules import Layout, unpack
 from pharos.state_space.manifest import AGAIN, STATES, SUCCESSORS, TERMINAL
+from pharos.system.packed_indices import Indices
 
 _BLOCK_ENTRIES = 1 << 17
 

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import xxhash
 
-from pharos import storage
 from pharos.errors import DiskFull, StateSpaceCorrupted, StateSpaceLocked
 from pharos.state_space.manifest import AGAIN, CHECKSUM_BYTES, MANIFEST, digest_of
+from pharos.system import storage
 
 # Appended bytes that are sent on to the disk together, while the search goes on.
 SENT_BYTES = 1 << 20

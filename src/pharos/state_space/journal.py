@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 
 from pharos.errors import DiskFull
-from pharos.packed_indices import as_stored, dtype_of, from_stored
 from pharos.rules import pack
 from pharos.state_space.checks import check_rules
 from pharos.state_space.files import GrowingFile, write_manifest
@@ -33,6 +32,7 @@ from pharos.state_space.manifest import (
 )
 from pharos.state_space.plan import Plan
 from pharos.state_space.table import Block
+from pharos.system.packed_indices import as_stored, dtype_of, from_stored
 
 BLOCK_BYTES = 1 << 22  # of a file that are copied at a time
 

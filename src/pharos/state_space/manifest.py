@@ -6,9 +6,9 @@ import math
 from pathlib import Path
 from typing import Any
 
-from pharos import storage
 from pharos.errors import StateSpaceCorrupted, StateSpaceError, StateSpaceMismatch
-from pharos.packed_indices import INT40
+from pharos.system import storage
+from pharos.system.packed_indices import INT40
 
 FORMAT, FORMAT_VERSION = "pharos state space", 1
 OUTCOMES_VERSION = 2

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from pharos.kernels import palettes
-from pharos.packed_indices import dtype_of
 from pharos.state_space.checks import states_to_check
 from pharos.state_space.files import GrowingFile
 from pharos.state_space.journal import Journal, Position
@@ -33,6 +32,7 @@ from pharos.state_space.outcome_checks import check_outcome_rules
 from pharos.state_space.outcome_parts import OutcomeParts
 from pharos.state_space.plan import Plan
 from pharos.state_space.table import Block
+from pharos.system.packed_indices import dtype_of
 
 _SLOTS = 1 << 17  # of the table of the palette: twice as many as codes
 

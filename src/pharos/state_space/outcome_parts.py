@@ -14,10 +14,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pharos.kernels import palettes
-from pharos.packed_indices import as_stored, dtype_of, from_stored
 from pharos.state_space.files import GrowingFile, cannot_write
 from pharos.state_space.manifest import CODES, INDEX_TYPES, OFFSETS, PALETTE, PARTS, PROBABILITIES
 from pharos.state_space.stored_outcomes import OutcomesOfState
+from pharos.system.packed_indices import as_stored, dtype_of, from_stored
 
 MOST_PADDING = (3, 10)
 """The share of (S, A, K) that may be padding, as a fraction."""

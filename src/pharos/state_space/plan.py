@@ -1,6 +1,7 @@
 """What a state space needs to know of an environment."""
 
 import json
+import re
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -40,7 +41,7 @@ class Plan:
         env, layout = self.env, self.layout
         return {
             "environment": env.name,
-            "class": f"{type(env).__module__}:{type(env).__qualname__}",
+            "class": f"{_module_of(type(env))}:{type(env).__qualname__}",
             "rules_version": env.version,
             "parameters": json.loads(json.dumps(env.parameters)),
             "actions": list(env.actions),
@@ -71,3 +72,8 @@ class Plan:
     def fingerprint(self) -> str:
         chance = ("probability",) * self.env.has_chance
         return fingerprint_of_rules(self.env, ("transition", "is_terminal", *chance))
+
+
+def _module_of(cls: type) -> str:
+    """The module of a class, as manifests name it: built-in classes without the folder of their file."""
+    return re.sub(r"^(pharos\.environments)\.(worlds|mini_grid)\b", r"\1", cls.__module__)

@@ -19,11 +19,11 @@ import numpy as np
 from pharos.environments import Environment
 from pharos.errors import StateSpaceError
 from pharos.kernels import key_owner
-from pharos.large_arrays import huge_pages
 from pharos.ranks import Rank, loop
 from pharos.rules import rules_of
 from pharos.state_space.plan import Plan
 from pharos.state_space.table import Block, MemoryTable
+from pharos.system.large_arrays import huge_pages
 
 ROWS = 1 << 16  # of a rank in a superstep, at most
 SUCCESSORS = 1 << 20  # of a rank's rows, at most

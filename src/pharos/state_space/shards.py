@@ -16,10 +16,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pharos import storage
 from pharos.errors import ParameterError, StateSpaceCorrupted, StateSpaceError, StateSpaceMismatch
 from pharos.state_space.files import cannot_write
 from pharos.state_space.manifest import check_lengths
+from pharos.system import storage
 
 SHARDS, SHARD = "shards.json", "shard.json"
 BORDER = 1 << 20  # a multiple of the pages of all machines

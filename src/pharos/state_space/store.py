@@ -19,7 +19,6 @@ from pharos.errors import (
     StateSpaceIncomplete,
     StateSpaceMismatch,
 )
-from pharos.packed_indices import Indices, dtype_of, from_stored
 from pharos.rules import Layout, pack, rules_of, unpack
 from pharos.state_space.checks import check_environment, check_rules, check_states, check_successors, states_to_check
 from pharos.state_space.manifest import (
@@ -36,6 +35,7 @@ from pharos.state_space.outcome_checks import check_outcome_rules, check_outcome
 from pharos.state_space.plan import Plan
 from pharos.state_space.shards import blocks_of_ranges, check_files, mapped, ranges_of
 from pharos.state_space.stored_outcomes import StoredOutcomes
+from pharos.system.packed_indices import Indices, dtype_of, from_stored
 
 if TYPE_CHECKING:
     from pharos.mdp import Dynamics, TabularMDP

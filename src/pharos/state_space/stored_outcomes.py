@@ -5,9 +5,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pharos.packed_indices import Indices, dtype_of, from_stored
 from pharos.state_space.manifest import CODES, OFFSETS, PALETTE, PROBABILITIES, successors_name
 from pharos.state_space.shards import mapped, ranges_of
+from pharos.system.packed_indices import Indices, dtype_of, from_stored
 
 OutcomesOfState = list[tuple[np.ndarray, np.ndarray]]
 """For each action the next states and their probabilities, possible outcomes alone."""

@@ -6,10 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pharos import memory as machine
 from pharos.kernels.hash_table import fill, fill_more, fill_range, insert_missing
-from pharos.large_arrays import huge_pages, reserved_states, reserved_table
-from pharos.packed_indices import INT32_STATES
+from pharos.system import memory as machine
+from pharos.system.large_arrays import huge_pages, reserved_states, reserved_table
+from pharos.system.packed_indices import INT32_STATES
 
 LOAD = 0.5  # the table in memory grows beyond this share of used slots
 FULLEST = 0.8  # the same, where memory has no room for a table of twice the size

@@ -17,6 +17,7 @@ from pharos.study.clusters import run_on_ray, submit
 from pharos.study.execution import Status, opened, run, status
 from pharos.study.findings import findings
 from pharos.study.forecast import Forecast
+from pharos.study.leave_one_class_out import outcomes, validation
 from pharos.study.logs import LOGGERS, RunLog, log
 from pharos.study.paper import paper_regressions, paper_returns
 from pharos.study.predictions import POLICY_PREDICTORS, PREDICTORS, predict, read_predictions, write_predictions
@@ -25,7 +26,6 @@ from pharos.study.report import StudyReport, report
 from pharos.study.specification import presets, specification
 from pharos.study.statistics import Estimate, interquartile_mean, stratified_interval
 from pharos.study.tables import cells, curves, hardness_table, paper_instance, table
-from pharos.study.unseen_classes import outcomes, validation
 
 __all__ = [
     "LOGGERS",

@@ -11,7 +11,7 @@ import numpy as np
 from pharos.agents import TABULAR_OBSERVATION
 from pharos.errors import FileFormatError, PharosError
 from pharos.observations import Aliasing, aliasing
-from pharos.storage import digest_of_json, is_intact, read_json, replace_json, sealed
+from pharos.system.storage import digest_of_json, is_intact, read_json, replace_json, sealed
 
 if TYPE_CHECKING:
     import pandas as pd

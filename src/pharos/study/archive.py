@@ -10,12 +10,13 @@ from typing import TYPE_CHECKING, Any
 
 import yaml
 
-from pharos import experiments, storage
+from pharos import experiments
 from pharos.errors import FileFormatError, ParameterError, ResultCorrupted
 from pharos.experiments import run_id
 from pharos.study import worker as _worker
 from pharos.study.execution import claim, opened
 from pharos.study.specification import Source, parse
+from pharos.system import storage
 
 if TYPE_CHECKING:
     import pyarrow as pa

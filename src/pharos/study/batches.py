@@ -19,13 +19,13 @@ from typing import Any
 
 import numpy as np
 
-from pharos import storage
 from pharos.agents.batched import lane_width
 from pharos.environments import Environment
 from pharos.errors import FolderLocked
 from pharos.study import values as _values
 from pharos.study import worker as _worker
 from pharos.study.blocks import Run
+from pharos.system import storage
 
 BATCHES = "batches"
 TABLES = 16  # runs of one program that learn tables
@@ -38,13 +38,13 @@ def train_batch(
     configs: Sequence[Mapping[str, Any]], folders: Sequence[Path], checkpoints: Path, *, device: str = "cpu"
 ) -> list[str | None]:
     """The usual one: `pharos.experiments.train_configs`, with the values that the study has solved already."""
-    from pharos.experiments import FailedRun, Members, RunConfig, TaskValues, train_configs
+    from pharos.experiments import FailedRun, RunConfig, TaskCache, TaskValues, train_configs
 
     def values(config: RunConfig) -> TaskValues | None:
         stored = _values.stored_values(config.to_dict())
         return None if stored is None else TaskValues.from_dict(stored)
 
-    members = Members(values, trust=True, strict=True, device=device)
+    members = TaskCache(values, trust=True, strict=True, device=device)
     ends = train_configs(configs, folders, checkpoints=checkpoints, members=members)
     return [end.error if isinstance(end, FailedRun) else None for end in ends]
 

@@ -12,8 +12,8 @@ from pharos.environments import as_tuples, imported, make, source_of
 from pharos.errors import MissingExtra, ParameterError, UnknownName
 from pharos.experiments import ENGINES, ChanceSetting, Horizon, RunConfig
 from pharos.observations import OwnObservation, names, own_observation, title
-from pharos.sources import is_reference
 from pharos.study.regression import MEASURES
+from pharos.system.sources import is_reference
 
 try:
     from pydantic import (
@@ -228,7 +228,7 @@ def _horizon(value: Any) -> Any:
 
 
 Seeds = Annotated[list[Annotated[int, Field(ge=0)]], BeforeValidator(_seeds), Field(min_length=1)]
-Steps = Annotated[int, Field(ge=1)]
+FiniteHorizonValues = Annotated[int, Field(ge=1)]
 Gamma = Annotated[float, Field(ge=0, le=1)]
 EngineEntry = Annotated[str | dict[str, str], BeforeValidator(_engines)]
 HorizonEntry = Annotated[Any, BeforeValidator(_horizon)]
@@ -245,8 +245,8 @@ class Block(_Part):
     agents: list[str] = Field(min_length=1)
     setting: str = Field("", pattern=NAME)
     seeds: Seeds | None = None
-    steps: Steps | None = None
-    evaluations: Steps | None = None
+    steps: FiniteHorizonValues | None = None
+    evaluations: FiniteHorizonValues | None = None
     gamma: Gamma | None = None
     horizon: HorizonEntry | None = None
     hyperparameters: dict[str, str | dict[str, Any]] = {}
@@ -261,8 +261,8 @@ class Specification(_Part):
     folder: str | None = None
     blocks: list[Block] = Field(min_length=1)
     seeds: Seeds = list(range(5))
-    steps: Steps = 50_000
-    evaluations: Steps = 100
+    steps: FiniteHorizonValues = 50_000
+    evaluations: FiniteHorizonValues = 100
     gamma: Gamma = 1.0
     horizon: HorizonEntry = "limit"
     hyperparameters: dict[str, dict[str, Any]] = {}

@@ -18,17 +18,17 @@ from pathlib import Path
 from typing import Any
 
 from pharos.errors import FileFormatError, ParameterError, PharosError
-from pharos.storage import replace_json
 from pharos.study import batches as _batches
 from pharos.study import values as _values
 from pharos.study import worker as _worker
 from pharos.study.blocks import Run, Specification
 from pharos.study.forecast import Forecast, forecast
-from pharos.study.preparing import prepare_instance, prepare_instances
+from pharos.study.prebuild import prepare_instance, prepare_instances
 from pharos.study.processes import end_processes, one_thread, processors, worker_context
 from pharos.study.specification import Source
 from pharos.study.status import Status, claim, duration, opened, status
-from pharos.wording import many
+from pharos.system.storage import replace_json
+from pharos.system.wording import many
 
 __all__ = ["Execution", "Options", "Status", "claim", "duration", "opened", "processors", "run", "shard_of", "status"]
 

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pharos import storage
 from pharos.environments import classes
 from pharos.study.analysis import IMAGE, REGRETS, VECTOR, Models
 from pharos.study.curves import MORE_COLORS, Curves, agent_name, slug, title
 from pharos.study.regression import Fit
+from pharos.system import storage
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -17,13 +17,13 @@ from typing import Any
 
 from pharos.agents.batched import lane_width
 from pharos.errors import FileFormatError
-from pharos.storage import read_json, replace_json
 from pharos.study import worker as _worker
 from pharos.study.batches import most_states
 from pharos.study.blocks import Run
 from pharos.study.processes import end_processes, one_thread
 from pharos.study.status import duration
-from pharos.wording import many
+from pharos.system.storage import read_json, replace_json
+from pharos.system.wording import many
 
 NIGHT_HOURS = 10
 # Below so many seconds in all, guesses do
@@ -130,7 +130,7 @@ def _guess(kind: Kind) -> float:
 
 
 def _file() -> Path:
-    from pharos.paths import cache_directory
+    from pharos.system.paths import cache_directory
 
     return cache_directory() / "paces.json"
 

@@ -16,13 +16,13 @@ import numpy as np
 from pharos import experiments
 from pharos.agents import agent_kind
 from pharos.errors import FileFormatError, ParameterError, PharosError, ResultCorrupted
-from pharos.storage import plain
 from pharos.study.blocks import Run, Specification
 from pharos.study.specification import Source
 from pharos.study.status import opened
 from pharos.study.tables import CELL
 from pharos.study.values import task_of
-from pharos.wording import many
+from pharos.system.storage import plain
+from pharos.system.wording import many
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pharos.errors import ParameterError
-from pharos.wording import many
+from pharos.system.wording import many
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -26,10 +26,10 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from pharos import mdp_files
 from pharos.agents import AGENTS, BATCHED, agent_source, is_known
 from pharos.errors import MissingExtra, ParameterError, UnknownName, UntrustedCode
-from pharos.sources import is_reference
+from pharos.system import mdp_files
+from pharos.system.sources import is_reference
 
 try:
     import yaml

@@ -11,9 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from pharos.errors import FileFormatError, ParameterError
-from pharos.storage import replace_file
 from pharos.study import worker as _worker
-from pharos.study.own_code import warn_of_changes
+from pharos.study.custom_code import warn_of_changes
 from pharos.study.specification import (
     STUDIES,
     STUDY_FILE,
@@ -23,7 +22,8 @@ from pharos.study.specification import (
     study_folder,
     study_name,
 )
-from pharos.wording import many
+from pharos.system.storage import replace_file
+from pharos.system.wording import many
 
 
 @dataclass(frozen=True)

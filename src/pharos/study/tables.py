@@ -19,11 +19,11 @@ from pharos import experiments
 from pharos.environments import classes, make
 from pharos.errors import FileFormatError, ParameterError, UnknownName
 from pharos.experiments import ChanceSetting
-from pharos.storage import is_intact, read_json, replace_json, sealed
 from pharos.study import worker as _worker
 from pharos.study.blocks import Run, Specification
 from pharos.study.execution import opened
 from pharos.study.specification import Source
+from pharos.system.storage import is_intact, read_json, replace_json, sealed
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pharos.study import held_out
+from pharos.study import cross_validation as held_out
 from pharos.study.curves import agent_name, observation_color, slug, title
 from pharos.study.figures import legend_below, panels
+from pharos.study.leave_one_class_out import Cells, normalized_regrets
 from pharos.study.tables import CELL
-from pharos.study.unseen_classes import Cells, normalized_regrets
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 from pharos.environments import start_distribution
 from pharos.errors import FileFormatError
 from pharos.experiments import RunConfig
-from pharos.paths import cache_directory
-from pharos.storage import is_intact, read_json, replace_json, sealed
+from pharos.system.paths import cache_directory
+from pharos.system.storage import is_intact, read_json, replace_json, sealed
 
 if TYPE_CHECKING:
     from pharos.experiments import Task

@@ -20,8 +20,9 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from pharos import experiments, storage
+from pharos import experiments
 from pharos.errors import FileFormatError, FolderLocked, PharosError, ResultCorrupted
+from pharos.system import storage
 
 FINISHED, FAILED, BUSY = "finished", "failed", "busy"
 EXIT_BUSY = 75

@@ -5,7 +5,7 @@ torch is loaded when a batch is made.
 
 from typing import TYPE_CHECKING
 
-from pharos import lazy
+from pharos.system import lazy
 
 if TYPE_CHECKING:
     from pharos.agents.batched.batch import Batch, make_batch

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pharos.agents.batched.handover import Mirror, is_gpu
+from pharos.agents.batched.device_buffers import PinnedBuffer, is_gpu
 from pharos.kernels import batched_learning, batched_rollouts
 
 learning: Any = batched_learning  # compiled functions, whose types are hidden
@@ -24,14 +24,16 @@ class CompiledArithmetic:
         self.device = device
         self._steps: Any = None  # what the next step of Adam takes
 
-    def huber(self, q: Tensor, q_next: Tensor, q_choice: Tensor, minibatch: Any, dq: Tensor, loss: Mirror) -> None:
+    def huber(
+        self, q: Tensor, q_next: Tensor, q_choice: Tensor, minibatch: Any, dq: Tensor, loss: PinnedBuffer
+    ) -> None:
         """The loss of DQN (W,) and its gradient; minibatch: (actions, rewards, discounts) (W, B)."""
         arrays = tuple(part.numpy() for part in minibatch)
         learning.huber(q.numpy(), q_next.numpy(), q_choice.numpy(), *arrays, dq.numpy(), loss.array)
 
     def clipped_loss(
-        self, scores: Tensor, values: Tensor, minibatch: Any, weights: Any, gradients: Any, loss: Mirror,
-        divergence: Mirror,
+        self, scores: Tensor, values: Tensor, minibatch: Any, weights: Any, gradients: Any, loss: PinnedBuffer,
+        divergence: PinnedBuffer,
     ) -> None:  # fmt: skip
         """The loss of PPO and its gradients; minibatch: (actions, old log p, advantages, returns) (W, B).
 
@@ -63,10 +65,12 @@ class TensorArithmetic(CompiledArithmetic):
 
     def __init__(self, device: str, width: int):
         super().__init__(device, width)
-        self._planned = Mirror((5, width, 1), torch.float32, device)
+        self._planned = PinnedBuffer((5, width, 1), torch.float32, device)
         self._fused = fused_adam() if is_gpu(device) else None
 
-    def huber(self, q: Tensor, q_next: Tensor, q_choice: Tensor, minibatch: Any, dq: Tensor, loss: Mirror) -> None:
+    def huber(
+        self, q: Tensor, q_next: Tensor, q_choice: Tensor, minibatch: Any, dq: Tensor, loss: PinnedBuffer
+    ) -> None:
         """As `CompiledArithmetic` says."""
         actions, rewards, discounts = minibatch
         best = q_choice.argmax(2, keepdim=True)
@@ -78,8 +82,8 @@ class TensorArithmetic(CompiledArithmetic):
         dq.zero_().scatter_(2, actions[..., None], (difference.clamp(-1.0, 1.0) / q.shape[1])[..., None])
 
     def clipped_loss(
-        self, scores: Tensor, values: Tensor, minibatch: Any, weights: Any, gradients: Any, loss: Mirror,
-        divergence: Mirror,
+        self, scores: Tensor, values: Tensor, minibatch: Any, weights: Any, gradients: Any, loss: PinnedBuffer,
+        divergence: PinnedBuffer,
     ) -> None:  # fmt: skip
         """As `CompiledArithmetic` says."""
         actions, old, advantages, returns = minibatch

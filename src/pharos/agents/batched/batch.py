@@ -5,8 +5,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import torch
 
+from pharos.agents.batched.device_buffers import is_gpu
 from pharos.agents.batched.dqn import DQNLane
-from pharos.agents.batched.handover import is_gpu
 from pharos.agents.batched.lane import Lane, RunPolicy
 from pharos.agents.batched.ppo import PPOLane
 from pharos.agents.batched.runs import BatchRun, group_key, lane_width, lane_widths

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from pharos.agents.batched.handover import Mirror, Program, wait
+from pharos.agents.batched.device_buffers import CudaGraph, PinnedBuffer, wait
 from pharos.agents.batched.lane import Lane
 from pharos.agents.batched.networks import QNetworks
 from pharos.agents.batched.replay import Replay
@@ -32,7 +32,7 @@ class DQNLane(Lane):
         size, rows = int(self.shared["batch_size"]), int(self.shared["buffer_size"])
         self.replay = Replay(self.keys, self.number, rows, self.copies, size, device, runs[0].observe.frames)
         self._dq = torch.zeros((width, size, self.num_actions), device=device)
-        self._descend = Program(self.descend, device)
+        self._descend = CudaGraph(self.descend, device)
         self.epsilon = np.zeros(width)
         names = ("initial_eps", "final_eps", "fraction")
         self._exploration = tuple(self.own[f"exploration_{name}"] for name in names)
@@ -116,7 +116,7 @@ class DQNLane(Lane):
         self.network.backward(self.values, self.gradient_views, self._dq)
         self.adam()
 
-    def _target_scores(self, states: Mirror) -> torch.Tensor:
+    def _target_scores(self, states: PinnedBuffer) -> torch.Tensor:
         """(W, B, A) values of states (W, B) by the target networks."""
         if not self._remembers:
             return self.network.scores(self.target_values, self.observed(states)).clone()
@@ -128,7 +128,7 @@ class DQNLane(Lane):
         """(W, S, A) of all states, `size` of each run at a time; runs with fewer states repeat their last one."""
         numbers = np.array([run.mdp.num_states for run in self.runs])
         scores = torch.empty((self.width, int(numbers.max()), self.num_actions), device=self.device)
-        states = Mirror((self.width, size), torch.int64, self.device)
+        states = PinnedBuffer((self.width, size), torch.int64, self.device)
         for first in range(0, scores.shape[1], size):
             states.array[:] = np.minimum(np.arange(first, first + size), numbers[:, None] - 1)
             part = scores[:, first : first + size]

@@ -7,12 +7,12 @@ import numpy as np
 import torch
 
 from pharos.agents.batched.arithmetic import CompiledArithmetic, TensorArithmetic
-from pharos.agents.batched.handover import Mirror, Program, wait
+from pharos.agents.batched.batched_episodes import BatchedEpisodes
+from pharos.agents.batched.device_buffers import CudaGraph, PinnedBuffer, wait
 from pharos.agents.batched.layers import MASK, Shape, Values, room
 from pharos.agents.batched.networks import names_of, spread
-from pharos.agents.batched.observed import Seen, SeenOnDevice
+from pharos.agents.batched.observed import DeviceObservationTable, ObservationTable
 from pharos.agents.batched.runs import BatchRun, resolved
-from pharos.agents.batched.worlds import Worlds
 from pharos.kernels import batched_worlds as kernels
 from pharos.kernels import philox
 
@@ -48,10 +48,10 @@ class Lane:
         self.num_actions = runs[0].mdp.num_actions
         self.keys = np.array([run.key % 2**64 for run in self.runs], np.uint64)
         self.is_idle = np.arange(width) >= len(runs)
-        self.worlds = Worlds(self.runs, self.keys, self.copies, runs[0].observe.frames)
+        self.worlds = BatchedEpisodes(self.runs, self.keys, self.copies, runs[0].observe.frames)
         self.depth = self.worlds.depth
         self.actions = np.zeros((width, self.copies), np.int64)
-        self.seen = (Seen if device == "cpu" else SeenOnDevice)(self.runs, device)
+        self.seen = (ObservationTable if device == "cpu" else DeviceObservationTable)(self.runs, device)
         self._rooms: dict[int, torch.Tensor] = {}
         self.network = self.network_seeing(self.seen.shape)
         self._own_networks = [
@@ -62,12 +62,12 @@ class Lane:
         self.gradients = torch.zeros_like(self.parameters)
         self.means, self.squares = torch.zeros_like(self.parameters), torch.zeros_like(self.parameters)
         self.updates = np.zeros(width, np.int64)
-        self.loss = Mirror((width,), torch.float64, device)
+        self.loss = PinnedBuffer((width,), torch.float64, device)
         self.values: Values = self.views(self.parameters)
         self.gradient_views: Values = self.network.parameters.views(self.gradients)
-        self._asked = Mirror((width, self.copies, *self.depth), torch.int64, device)
-        self._scores = Mirror((width, self.copies, self.num_actions), torch.float32, device)
-        self._answer = Program(self.answer, device)
+        self._asked = PinnedBuffer((width, self.copies, *self.depth), torch.int64, device)
+        self._scores = PinnedBuffer((width, self.copies, self.num_actions), torch.float32, device)
+        self._answer = CudaGraph(self.answer, device)
         self.steps = self.calls = self.collected = 0
         self.is_due = False
 
@@ -119,7 +119,7 @@ class Lane:
         views: Values = self.network.parameters.views(rows)
         return views if self.seen.mask is None else {**views, MASK: self.seen.mask}
 
-    def observed(self, states: Mirror) -> torch.Tensor:
+    def observed(self, states: PinnedBuffer) -> torch.Tensor:
         """(W, B, size) float32 observations of states (W, B, *depth); they stay until the next call with as many."""
         number = states.array.shape[1]
         if number not in self._rooms:

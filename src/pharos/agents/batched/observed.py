@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from pharos.agents.batched.handover import Mirror, is_gpu
+from pharos.agents.batched.device_buffers import PinnedBuffer, is_gpu
 from pharos.agents.batched.layers import KERNEL, whole
 from pharos.agents.batched.runs import BLOCK, BatchRun, ObservationSource, as_networks_see, is_small
 from pharos.kernels import batched_worlds
@@ -68,7 +68,7 @@ def places_of(shape: tuple[int, ...], is_small: bool) -> np.ndarray:
     return np.ascontiguousarray(windows.transpose(1, 2, 0, 3, 4)).ravel()
 
 
-class Seen:
+class ObservationTable:
     """The observations of runs that see alike.
 
     Images are kept as bytes, those of the small convolution with the 9 C neighbours of each pixel, so that nothing is
@@ -110,7 +110,7 @@ class Seen:
                 rows = sight.raw(block)[:, sight.of_a_frame]
                 self._table[begin + first : begin + first + len(block)] = torch.from_numpy(rows)
 
-    def at(self, states: Mirror, out: torch.Tensor) -> torch.Tensor:
+    def at(self, states: PinnedBuffer, out: torch.Tensor) -> torch.Tensor:
         """Write what is seen in states (W, B) into out (W, B, size) float32; images from 0 to 255.
 
         Where k frames are seen states are (W, B, k), the last ones of the episode, the oldest first.
@@ -133,7 +133,7 @@ class Seen:
         return torch.nn.functional.pad(rows, (0, self.size - rows.shape[1])).to(self.device)
 
 
-class SeenOnDevice(Seen):
+class DeviceObservationTable(ObservationTable):
     """The same on another device than the processor, for runs that see alike but for the size of what they see.
 
     A table of all observations lies there. Smaller observations are filled up with zeros, and a mask says which pixels
@@ -177,8 +177,8 @@ class SeenOnDevice(Seen):
         self._offsets = torch.from_numpy(offsets).to(self.device)
         self._places = torch.from_numpy(places[self.which][:, None]).to(self.device)
 
-    def at(self, states: Mirror, out: torch.Tensor) -> torch.Tensor:
-        """As `Seen` says; a GPU can record it."""
+    def at(self, states: PinnedBuffer, out: torch.Tensor) -> torch.Tensor:
+        """As `ObservationTable` says; a GPU can record it."""
         assert self._table is not None
         rows = (states.tensor + self._offsets).view(-1)
         raw = self._table.index_select(0, rows).view(*states.tensor.shape[:2], -1)

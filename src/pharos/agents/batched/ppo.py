@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from pharos.agents.batched.handover import Mirror, Program, wait
+from pharos.agents.batched.device_buffers import CudaGraph, PinnedBuffer, wait
 from pharos.agents.batched.lane import Lane
 from pharos.agents.batched.networks import ActorCritics
 from pharos.kernels import batched_rollouts as rollouts
@@ -41,13 +41,13 @@ class PPOLane(Lane):
         self.begin = np.ones((width, self.copies), np.float32)
         self._log_p = np.zeros((width, self.copies), np.float32)
         self._order = np.zeros((width, shape[1] * shape[2]), np.int64)
-        self._valued = Mirror((width, self.copies, 1), torch.float32, device)
-        self.divergence = Mirror((width,), torch.float64, device)
-        self.weights = tuple(Mirror((width,), torch.float64, device) for _ in WEIGHTS)
+        self._valued = PinnedBuffer((width, self.copies, 1), torch.float32, device)
+        self.divergence = PinnedBuffer((width,), torch.float64, device)
+        self.weights = tuple(PinnedBuffer((width,), torch.float64, device) for _ in WEIGHTS)
         for mirror, name in zip(self.weights, WEIGHTS, strict=True):
             mirror.array[:] = self.own[name]
             mirror.send()
-        self._lessons: dict[int, Lesson] = {}
+        self._lessons: dict[int, MinibatchUpdate] = {}
 
     def network_seeing(self, shape: tuple[int, ...]) -> ActorCritics:
         """As `Lane` says."""
@@ -136,7 +136,7 @@ class PPOLane(Lane):
         """
         size = minibatch[0].shape[1]
         if size not in self._lessons:
-            self._lessons[size] = Lesson(self, size)
+            self._lessons[size] = MinibatchUpdate(self, size)
         lesson = self._lessons[size]
         wait(self.device)
         for mirror, part in zip(lesson.minibatch, minibatch, strict=True):
@@ -157,7 +157,7 @@ class PPOLane(Lane):
         return {f"rollout_{name}": getattr(self, name) for name in (*names, "timeouts")} | {"begin": self.begin}
 
 
-class Lesson:
+class MinibatchUpdate:
     """What PPO learns from minibatches of one size: forwards with the loss, backwards with Adam; a GPU records both.
 
     Attributes:
@@ -169,10 +169,10 @@ class Lesson:
         device, shape = lane.device, (lane.width, size)
         kinds = [torch.int64] * 2 + [torch.float32] * 3
         shapes = [(*shape, *lane.depth), *[shape] * 4]
-        self.minibatch = tuple(Mirror(each, kind, device) for each, kind in zip(shapes, kinds, strict=True))
+        self.minibatch = tuple(PinnedBuffer(each, kind, device) for each, kind in zip(shapes, kinds, strict=True))
         self._lane = lane
         self._gradients = tuple(torch.zeros((*shape, last), device=device) for last in (lane.num_actions, 1))
-        self.assess, self.descend = Program(self._assess, device), Program(self._descend, device)
+        self.assess, self.descend = CudaGraph(self._assess, device), CudaGraph(self._descend, device)
 
     def _assess(self) -> None:
         lane = self._lane

@@ -6,7 +6,7 @@ Where several frames are seen a transition is no larger: the states before are t
 import numpy as np
 import torch
 
-from pharos.agents.batched.handover import Mirror
+from pharos.agents.batched.device_buffers import PinnedBuffer
 from pharos.kernels import batched_learning as kernels
 from pharos.kernels.batched_worlds import DONE
 
@@ -46,7 +46,7 @@ class Replay:
         )
         kinds, depth = [torch.int64] * 3 + [torch.float32] * 2, (frames,) if frames > 1 else ()
         shapes = [(width, batch_size, *depth)] * 2 + [(width, batch_size)] * 3
-        self.drawn = tuple(Mirror(each, kind, device) for each, kind in zip(shapes, kinds, strict=True))
+        self.drawn = tuple(PinnedBuffer(each, kind, device) for each, kind in zip(shapes, kinds, strict=True))
         self.states, self.next_states, self.actions, self.rewards, self.discounts = self.drawn
 
     def add(

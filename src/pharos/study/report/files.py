@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pharos.storage import replace_file
 from pharos.study.curves import all_curves
 from pharos.study.figures import all_figures, save
 from pharos.study.latex import tables_of
@@ -18,6 +17,7 @@ from pharos.study.report.unseen_section import doubts, judged, unseen_section
 from pharos.study.specification import Source
 from pharos.study.status import opened
 from pharos.study.unseen_figures import unseen_figures
+from pharos.system.storage import replace_file
 
 if TYPE_CHECKING:
     import pandas as pd

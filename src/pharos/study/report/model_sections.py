@@ -11,7 +11,7 @@ from pharos.study.regression import Fit
 from pharos.study.report.page import Figures, image, table
 from pharos.study.report.results import Results, coefficients
 from pharos.study.report.section import Section
-from pharos.wording import many
+from pharos.system.wording import many
 
 
 def models_section(results: Results, figures: Figures, left_out: list[str]) -> Section | None:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pharos.templates import templates
+from pharos.system.templates import templates
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -21,7 +21,7 @@ from pharos.study.report.results import Results
 from pharos.study.report.section import Section
 from pharos.study.specification import Specification
 from pharos.study.status import duration
-from pharos.wording import many
+from pharos.system.wording import many
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -7,12 +7,12 @@ import numpy as np
 
 from pharos.errors import ParameterError
 from pharos.study.curves import agent_name, slug
+from pharos.study.leave_one_class_out import OUTCOMES, outcomes, validation
 from pharos.study.predictions import Foretold
 from pharos.study.report.page import Figures, image, table
 from pharos.study.report.results import Results
 from pharos.study.report.section import Section
-from pharos.study.unseen_classes import OUTCOMES, outcomes, validation
-from pharos.wording import many
+from pharos.system.wording import many
 
 if TYPE_CHECKING:
     import pandas as pd

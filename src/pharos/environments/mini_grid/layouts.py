@@ -1,0 +1,297 @@
+"""Layouts of MiniGrid: for each kind, the grid that the package minigrid draws for a seed, drawn again without it.
+
+Numbers are drawn in the order in which minigrid 3.2.0 asks for them, so a seed means the same layout here and there,
+which tests/test_mini_grid.py compares. Cells are (column, row) here; mini_grid_canvas.py says how they are written.
+
+Source: Chevalier-Boisvert et al. (2023), "Minigrid & Miniworld", and the behaviour of the package.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+from pharos.environments.mini_grid.canvas import (
+    COLORS,
+    DOWN,
+    FLOOR,
+    GOAL,
+    LAVA,
+    LEFT,
+    RIGHT,
+    UP,
+    WALL,
+    Canvas,
+    Layout,
+    Place,
+    Rooms,
+)
+from pharos.errors import ParameterError
+
+# The kinds ----------------------------------------------------------------------------------------------------------
+
+
+def _walled(width: int, height: int, seed: int | None) -> Canvas:
+    """An empty room with the player in its top-left corner and the goal in the opposite one."""
+    canvas = Canvas(width, height, seed)
+    canvas.walls_around(0, 0, width, height)
+    canvas.cells[width - 2, height - 2] = GOAL
+    canvas.player = (1, 1)
+    return canvas
+
+
+def empty(size: int) -> Layout:
+    return _walled(size, size, None).layout()
+
+
+def empty_random(size: int, seed: int) -> Layout:
+    canvas = _walled(size, size, seed)
+    canvas.put_player()
+    return canvas.layout()
+
+
+def dist_shift(size: int, strip: int) -> Layout:
+    canvas = _walled(size, size - 2, None)
+    canvas.cells[size - 2, size - 4], canvas.cells[size - 2, 1] = FLOOR, GOAL
+    canvas.cells[3 : size - 3, [1, strip]] = LAVA
+    return canvas.layout()
+
+
+def four_rooms(size: int, seed: int) -> Layout:
+    canvas = Canvas(size, size, seed)
+    canvas.walls_around(0, 0, size, size)
+    middle = size // 2
+    canvas.cells[middle, : 2 * middle] = canvas.cells[: 2 * middle, middle] = WALL
+    gaps = (
+        (middle, canvas.integer(1, middle)),
+        (canvas.integer(1, middle), middle),
+        (canvas.integer(middle + 1, 2 * middle), middle),
+        (middle, canvas.integer(middle + 1, 2 * middle)),
+    )
+    for gap in gaps:
+        canvas.cells[gap] = FLOOR
+    canvas.put_player()
+    canvas.cells[canvas.free_cell((0, 0), (size, size))] = GOAL
+    return canvas.layout()
+
+
+def door_key(size: int, seed: int) -> Layout:
+    canvas = _walled(size, size, seed)
+    wall = canvas.integer(2, size - 2)
+    canvas.cells[wall, :] = WALL
+    canvas.put_player((0, 0), (wall, size))
+    canvas.cells[wall, canvas.integer(1, size - 2)] = "LY"
+    canvas.cells[canvas.free_cell((0, 0), (wall, size))] = "KY"
+    return canvas.layout()
+
+
+def lava_gap(size: int, seed: int) -> Layout:
+    canvas = _walled(size, size, seed)
+    column, row = canvas.integer(2, size - 2), canvas.integer(1, size - 1)
+    canvas.cells[column, 1 : size - 1] = LAVA
+    canvas.cells[column, row] = FLOOR
+    return canvas.layout()
+
+
+def crossing(size: int, crossings: int, seed: int, obstacle: str) -> Layout:
+    """Straight obstacles across the room, and one opening in each, along a path that crosses them in random order."""
+    canvas = _walled(size, size, seed)
+    lines = [(side, place) for side in (RIGHT, DOWN) for place in range(2, size - 2, 2)]
+    canvas.rng.shuffle(lines)  # type: ignore[arg-type]
+    columns = sorted(place for side, place in lines[:crossings] if side == RIGHT)
+    rows = sorted(place for side, place in lines[:crossings] if side == DOWN)
+    canvas.cells[1:-1, rows] = obstacle
+    canvas.cells[columns, 1:-1] = obstacle
+    path = [RIGHT] * len(columns) + [DOWN] * len(rows)
+    canvas.rng.shuffle(path)
+    columns, rows = [0, *columns, size - 1], [0, *rows, size - 1]
+    i, j = 0, 0
+    for side in path:
+        if side == RIGHT:
+            opening = columns[i + 1], int(canvas.rng.choice(range(rows[j] + 1, rows[j + 1])))
+            i += 1
+        else:
+            opening = int(canvas.rng.choice(range(columns[i] + 1, columns[i + 1]))), rows[j + 1]
+            j += 1
+        canvas.cells[opening] = FLOOR
+    return canvas.layout()
+
+
+def lava_crossing(size: int, crossings: int, seed: int) -> Layout:
+    return crossing(size, crossings, seed, LAVA)
+
+
+def simple_crossing(size: int, crossings: int, seed: int) -> Layout:
+    return crossing(size, crossings, seed, WALL)
+
+
+def unlock(size: int, seed: int) -> Layout:
+    canvas = Rooms(2, 1, size, seed)
+    color = canvas.add_door(0, 0, RIGHT, locked=True)
+    canvas.add_thing(0, 0, "K", color)
+    canvas.put_player_into(0, 0)
+    return canvas.layout("L" + color)
+
+
+def unlock_pickup(size: int, seed: int) -> Layout:
+    canvas = Rooms(2, 1, size, seed)
+    box = canvas.add_thing(1, 0, "B")
+    canvas.add_thing(0, 0, "K", canvas.add_door(0, 0, RIGHT, locked=True))
+    canvas.put_player_into(0, 0)
+    return canvas.layout(box)
+
+
+def key_corridor(size: int, rows: int, seed: int) -> Layout:
+    canvas = Rooms(3, rows, size, seed)
+    for row in range(1, rows):
+        canvas.remove_wall(1, row, UP)
+    row = canvas.integer(0, rows)
+    color = canvas.add_door(2, row, LEFT, locked=True)
+    ball = canvas.add_thing(2, row, "A")
+    canvas.add_thing(0, canvas.integer(0, rows), "K", color)
+    canvas.put_player_into(1, rows // 2)
+    canvas.connect()
+    return canvas.layout(ball)
+
+
+# A chain of rooms of random sizes -----------------------------------------------------------------------------------
+
+SMALLEST_ROOM, TRIES, CHAINS = 4, 8, 5_000
+MULTI_ROOM_SIDE = 25
+
+
+class Room(NamedTuple):
+    """A rectangle, walls included, and where one comes in."""
+
+    left: int
+    top: int
+    width: int
+    height: int
+    side: int
+    entry: Place
+
+
+def multi_room(size: int, rooms: int, seed: int) -> Layout:
+    side = MULTI_ROOM_SIDE
+    canvas = Canvas(side, side, seed)
+    canvas.integer(rooms, rooms + 1)  # how many
+    chain: list[Room] = []
+    for _ in range(CHAINS):
+        drawn = _chain(canvas, size, rooms)
+        chain = drawn if len(drawn) > len(chain) else chain
+        if len(chain) == rooms:
+            break
+    else:
+        raise ParameterError(
+            f"MiniGrid: none of {CHAINS} chains of rooms={rooms} fits into {side} x {side} cells; "
+            f"lower rooms or size, or choose another seed"
+        )
+    before = ""
+    for number, room in enumerate(chain):
+        canvas.walls_around(*room[:4])
+        if number > 0:
+            colors = COLORS.replace(before, "") if before else COLORS
+            before = colors[canvas.integer(0, len(colors))]
+            canvas.cells[room.entry] = "D" + before
+    canvas.put_player(chain[0][:2], chain[0][2:4])
+    canvas.cells[canvas.free_cell(chain[-1][:2], chain[-1][2:4])] = GOAL
+    return canvas.layout()
+
+
+def _chain(canvas: Canvas, size: int, rooms: int) -> list[Room]:
+    """As many rooms as find their place, at most `rooms`, each entered from the one before."""
+    entry = (canvas.integer(0, canvas.width - 2), canvas.integer(0, canvas.width - 2))
+    first = _room(canvas, size, LEFT, entry, is_first=True)
+    chain = [first] if _fits(canvas, first, []) else []
+    tries = TRIES if chain else 0
+    while tries > 0 and len(chain) < rooms:
+        tries -= 1
+        side, entry = _exit(canvas, chain[-1])
+        following = _room(canvas, size, (side + 2) % 4, entry)
+        if _fits(canvas, following, chain[:-1]):
+            chain.append(following)
+            tries = TRIES
+    return chain
+
+
+def _exit(canvas: Canvas, room: Room) -> tuple[int, Place]:
+    """A side of a room other than that of its entry, and a cell there."""
+    sides = [side for side in range(4) if side != room.side]
+    side = sides[canvas.integer(0, 3)]
+    if side in (RIGHT, LEFT):
+        column = room.left + (room.width - 1 if side == RIGHT else 0)
+        return side, (column, room.top + canvas.integer(1, room.height - 1))
+    row = room.top + (room.height - 1 if side == DOWN else 0)
+    return side, (room.left + canvas.integer(1, room.width - 1), row)
+
+
+def _room(canvas: Canvas, size: int, side: int, entry: Place, *, is_first: bool = False) -> Room:
+    """A room of random size with its entry on a side; the first has it in its corner."""
+    width, height = canvas.integer(SMALLEST_ROOM, size + 1), canvas.integer(SMALLEST_ROOM, size + 1)
+    left, top = entry
+    if not is_first:
+        if side in (RIGHT, LEFT):
+            left = entry[0] - width + 1 if side == RIGHT else entry[0]
+            top = canvas.integer(entry[1] - height + 2, entry[1])
+        else:
+            left = canvas.integer(entry[0] - width + 2, entry[0])
+            top = entry[1] - height + 1 if side == DOWN else entry[1]
+    return Room(left, top, width, height, side, entry)
+
+
+def _fits(canvas: Canvas, room: Room, others: list[Room]) -> bool:
+    if min(room.left, room.top) < 0 or room.left + room.width > canvas.width or room.top + room.height >= canvas.height:
+        return False
+    return all(
+        room.left + room.width < other.left
+        or other.left + other.width <= room.left
+        or room.top + room.height < other.top
+        or other.top + other.height <= room.top
+        for other in others
+    )
+
+
+class Bounds(NamedTuple):
+    """What a parameter may be: its default, its lowest and highest value; the highest by the size."""
+
+    default: int
+    low: int
+    high: Callable[[int], int] | None = None
+    odd: bool = False
+
+
+class Recipe(NamedTuple):
+    """A kind of layouts.
+
+    Attributes:
+        draw: function of the parameters below, by name, that returns the layout.
+        parameters: name -> what it may be; "seed" where something is drawn.
+        max_steps: the time limit of minigrid, by size and number of rooms.
+    """
+
+    draw: Callable[..., Layout]
+    parameters: dict[str, Bounds]
+    max_steps: Callable[[int, int], int]
+
+
+def _recipe(draw: Callable[..., Layout], max_steps: Callable[[int, int], int], **parameters: Bounds) -> Recipe:
+    return Recipe(draw, {**parameters, "seed": Bounds(0, 0)}, max_steps)
+
+
+_CROSSINGS = {"size": Bounds(9, 5, odd=True), "crossings": Bounds(1, 0, lambda size: size - 3)}
+KINDS = {
+    "empty": Recipe(empty, {"size": Bounds(8, 4)}, lambda size, _: 4 * size**2),
+    "empty_random": _recipe(empty_random, lambda size, _: 4 * size**2, size=Bounds(6, 4)),
+    "four_rooms": _recipe(four_rooms, lambda size, _: 100, size=Bounds(19, 5)),
+    "door_key": _recipe(door_key, lambda size, _: 10 * size**2, size=Bounds(8, 5)),
+    "unlock": _recipe(unlock, lambda size, _: 8 * size**2, size=Bounds(6, 4)),
+    "unlock_pickup": _recipe(unlock_pickup, lambda size, _: 8 * size**2, size=Bounds(6, 4)),
+    "key_corridor": _recipe(key_corridor, lambda size, _: 30 * size**2, size=Bounds(6, 3), rows=Bounds(3, 1)),
+    "lava_gap": _recipe(lava_gap, lambda size, _: 4 * size**2, size=Bounds(7, 5)),
+    "lava_crossing": _recipe(lava_crossing, lambda size, _: 4 * size**2, **_CROSSINGS),
+    "simple_crossing": _recipe(simple_crossing, lambda size, _: 4 * size**2, **_CROSSINGS),
+    "multi_room": _recipe(multi_room, lambda _, rooms: 20 * rooms, size=Bounds(10, 4), rooms=Bounds(6, 1)),
+    "dist_shift": Recipe(
+        dist_shift,
+        {"size": Bounds(9, 7), "strip": Bounds(2, 2, lambda size: size - 4)},
+        lambda size, _: 4 * size * (size - 2),
+    ),
+}

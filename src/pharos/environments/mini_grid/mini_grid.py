@@ -1,0 +1,326 @@
+"""MiniGrid: rooms with doors and keys, boxes, lava and a goal, for a player who turns and walks.
+
+Source: Chevalier-Boisvert et al. (2023), "Minigrid & Miniworld"; the package minigrid 3.2.0.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from pharos.environments.base import Environment
+from pharos.environments.mini_grid.canvas import Layout
+from pharos.environments.mini_grid.layouts import KINDS
+from pharos.environments.mini_grid.level import (
+    BLOCKED,
+    BOX,
+    CLOSED,
+    DOOR,
+    FREE,
+    KEY,
+    LOCKED,
+    LOST,
+    OPEN,
+    WON,
+    Level,
+    level_of,
+    rows_of,
+)
+from pharos.environments.mini_grid.look import LAYERS, LOOK
+from pharos.environments.parameters import one_of, parameter, store
+from pharos.errors import ParameterError
+
+ROW, COLUMN, DIRECTION, DOORS = range(4)  # the condition of each door, then row and column of each thing
+LEFT, RIGHT, FORWARD, PICKUP, DROP, TOGGLE = range(6)
+LOOKS_RIGHT, LOOKS_DOWN, LOOKS_LEFT, LOOKS_UP = range(4)
+CARRIED = 0  # the column in row 0 of what is carried; boxes that were opened are in the last: nobody sees the corners
+
+INSTANCES: dict[str, dict[str, Any]] = {
+    **{f"empty-{n}x{n}": {"kind": "empty", "size": n} for n in (5, 6, 8, 16)},
+    **{f"empty-random-{n}x{n}": {"kind": "empty_random", "size": n} for n in (5, 6)},
+    "four-rooms": {"kind": "four_rooms"},
+    **{f"door-key-{n}x{n}": {"kind": "door_key", "size": n} for n in (5, 6, 8, 16)},
+    "unlock": {"kind": "unlock"},
+    "unlock-pickup": {"kind": "unlock_pickup"},
+    **{
+        f"key-corridor-s{n}r{rows}": {"kind": "key_corridor", "size": n, "rows": rows}
+        for n, rows in ((3, 1), (3, 2), (3, 3), (4, 3), (5, 3), (6, 3))
+    },
+    **{f"lava-gap-s{n}": {"kind": "lava_gap", "size": n} for n in (5, 6, 7)},
+    **{
+        f"{what}-crossing-s{n}n{crossings}": {"kind": f"{what}_crossing", "size": n, "crossings": crossings}
+        for what in ("lava", "simple")
+        for n, crossings in ((9, 1), (9, 2), (9, 3), (11, 5))
+    },
+    **{
+        f"multi-room-n{rooms}-s{n}": {"kind": "multi_room", "size": n, "rooms": rooms}
+        for n, rooms in ((4, 2), (5, 4), (5, 6), (10, 6))
+    },
+    **{f"dist-shift{i}": {"kind": "dist_shift", "strip": strip} for i, strip in ((1, 2), (2, 5))},
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class MiniGrid(Environment):
+    """Walk through rooms to the goal, or to what has to be opened or picked up.
+
+    Rules    As in the package minigrid. The player turns by a quarter, or steps forward onto floor, a goal, lava or an
+             open door. It picks up what lies before it, one thing at a time, and drops it onto floor. To toggle opens
+             and closes a door, unlocks and opens a locked one with a key of its colour in hand, and opens a box, which
+             is empty and vanishes.
+    State    (row, column, direction, condition of each door, row and column of each thing). Directions are right,
+             down, left, up; doors are open, closed or locked. A thing at (0, 0) is carried, and a box in
+             the other corner of row 0 is gone.
+    Actions  left, right, forward, pickup, drop, toggle, numbered as in minigrid; its seventh, done, does nothing.
+    Reward   1 on reaching a goal, opening the door or picking up the thing that is the target, otherwise 0. Minigrid
+             pays 1 - 0.9 t / max_steps at step t, which is not of a state: a discount says it better. So do
+             `importers.minigrid` and BRIDGE.
+    Ends     with that reward, or in lava.
+    Limit    the max_steps of minigrid.
+    Ours     Layouts are those of minigrid 3.2.0 for the same seed, drawn without it. Other sizes, and levels of one's
+             own, are possible.
+    Source   Chevalier-Boisvert et al. (2023).
+
+    Attributes:
+        kind: of the layout: empty, empty_random (start anywhere), four_rooms, door_key, unlock, unlock_pickup,
+            key_corridor, lava_gap, lava_crossing, simple_crossing, multi_room, dist_shift. None stands for empty.
+        size: cells on a side, walls included: of the grid, of a room (unlock, unlock_pickup, key_corridor), or of the
+            largest room (multi_room, on 25 x 25 cells). The grid of dist_shift is size - 2 high. None: that of
+            minigrid.
+        seed: of the layout, as given to minigrid's `reset`; None stands for 0.
+        rows: of rooms, in key_corridor; None stands for 3.
+        rooms: how many, in multi_room; None stands for 6.
+        crossings: obstacles to cross, in lava_crossing and simple_crossing; None stands for 1.
+        strip: the row of the second strip of lava, in dist_shift; None stands for 2.
+        level: a layout of one's own, in place of the above: two characters a cell (see mini_grid_canvas.py), rows
+            separated by "/" or line ends, with walls around.
+        target: of a level: what to pick up, such as "BR" for the red box, or which door to open, such as "LY"; None:
+            only goals.
+    """
+
+    kind: str | None = parameter(None, kind=one_of(*KINDS))
+    size: int | None = parameter(None, kind=int, low=3, high=100)
+    seed: int | None = parameter(None, kind=int, low=0)
+    rows: int | None = parameter(None, kind=int)
+    rooms: int | None = parameter(None, kind=int)
+    crossings: int | None = parameter(None, kind=int)
+    strip: int | None = parameter(None, kind=int)
+    level: str | None = None
+    target: str | None = None
+
+    name = "mini_grid"
+    actions = ("left", "right", "forward", "pickup", "drop", "toggle")
+    version = 1
+    layers = LAYERS
+    look = LOOK
+    instances = INSTANCES
+    hyperparameters = {  # chosen by hand: goals are far, and most actions do nothing
+        "q_learning": {"default": {"gamma": 0.97}},
+        "dqn": {
+            "default": {
+                "gamma": 0.97,
+                "learning_rate": 0.001,
+                "target_update_interval": 1000,
+                "exploration_fraction": 0.5,
+                "exploration_final_eps": 0.05,
+            }
+        },
+        "ppo": {"default": {"gamma": 0.97, "n_steps": 128, "batch_size": 256, "ent_coef": 0.02}},
+    }
+
+    def validate(self) -> None:
+        options = {name: getattr(self, name) for name in ("size", "seed", "rows", "rooms", "crossings", "strip")}
+        if self.level is not None:
+            others = [name for name, value in {"kind": self.kind, **options}.items() if value is not None]
+            if others:
+                raise ParameterError(f"MiniGrid: level was given with {', '.join(others)}; expected a level alone")
+            store(self, "level", "/".join(rows_of(self.level)))
+            store(self, "target", None if self.target is None else str(self.target).upper())
+        else:
+            if self.target is not None:
+                raise ParameterError(f"MiniGrid: target={self.target!r} goes with level=...; a kind has its own")
+            store(self, "kind", self.kind or "empty")
+            for name, value in options.items():
+                store(self, name, self._completed(name, value))
+        _ = self.parsed
+
+    def _completed(self, name: str, value: int | None) -> int | None:
+        """The default of the kind in place of None; ParameterError where the kind takes other values, or none."""
+        declared = KINDS[str(self.kind)].parameters
+        if name not in declared:
+            if value is None:
+                return None
+            raise ParameterError(
+                f"MiniGrid: {name}={value} has no effect with kind={self.kind!r}; it takes {', '.join(declared)}"
+            )
+        bounds = declared[name]
+        value = bounds.default if value is None else value
+        high = bounds.high(self.size or 0) if bounds.high else None
+        if value < bounds.low or (high is not None and value > high) or (bounds.odd and value % 2 == 0):
+            words = f"{'an odd' if bounds.odd else 'an'} integer of at least {bounds.low}"
+            raise ParameterError(
+                f"MiniGrid: {name}={value}; expected {words}{'' if high is None else f' and at most {high}'} "
+                f"with kind={self.kind!r}"
+            )
+        return value
+
+    # The layout, as text and as numbers -----------------------------------------------------------------------------
+
+    @cached_property
+    def layout(self) -> Layout:
+        """The grid as text, as `level` takes it, and the target."""
+        if self.level is not None:
+            return Layout(rows_of(self.level), self.target)
+        recipe = KINDS[str(self.kind)]
+        return recipe.draw(**{name: getattr(self, name) for name in recipe.parameters})
+
+    @cached_property
+    def parsed(self) -> Level:
+        """The grid as numbers."""
+        return level_of(self.layout)
+
+    @property
+    def cells(self) -> np.ndarray:
+        """(rows, columns) int64: FREE, WON, LOST, BLOCKED, or DOOR + the number of a door."""
+        return self.parsed.cells
+
+    @property
+    def width(self) -> int:
+        """Columns of the grid."""
+        return self.cells.shape[1]
+
+    @property
+    def num_doors(self) -> int:
+        """Doors of the layout."""
+        return len(self.parsed.door_colors)
+
+    @property
+    def door_colors(self) -> np.ndarray:
+        """(doors,) int64: numbers of `COLORS`."""
+        return self.parsed.door_colors
+
+    @property
+    def things(self) -> np.ndarray:
+        """(things, 4) int64: row, column, kind and colour at the start."""
+        return self.parsed.things
+
+    @property
+    def target_door(self) -> int:
+        """The door that has to be opened; -1: none."""
+        return self.parsed.target_door
+
+    @property
+    def target_thing(self) -> int:
+        """The thing that has to be picked up; -1: none."""
+        return self.parsed.target_thing
+
+    @property
+    def max_episode_steps(self) -> int:  # type: ignore[override]
+        if self.level is not None:
+            return 4 * self.cells.size
+        return KINDS[str(self.kind)].max_steps(self.size or 0, self.rooms or 0)
+
+    def __str__(self) -> str:
+        arguments = ", ".join(f"{name}={value!r}" for name, value in self.parameters.items() if value is not None)
+        return f"MiniGrid({arguments})"
+
+    # The rules ------------------------------------------------------------------------------------------------------
+
+    def variables(self):
+        height, width = self.cells.shape
+        declared: dict[str, Any] = {"row": range(1, height - 1), "column": range(1, width - 1), "direction": range(4)}
+        if self.num_doors:
+            declared["doors"] = [range(3 if condition == LOCKED else 2) for condition in self.parsed.door_conditions]
+        if len(self.things):
+            declared["things"] = [[range(height - 1), range(width)] for _ in self.things]
+        return declared
+
+    def initial_state(self):
+        return (*self.parsed.start, *self.parsed.door_conditions.tolist(), *self.things[:, :2].ravel().tolist())
+
+    def transition(self, state, action, out):
+        direction = state[DIRECTION]
+        if action == LEFT:
+            out[DIRECTION] = (direction + 3) % 4
+            return
+        if action == RIGHT:
+            out[DIRECTION] = (direction + 1) % 4
+            return
+        row = state[ROW] + (direction == LOOKS_DOWN) - (direction == LOOKS_UP)  # the cell ahead
+        column = state[COLUMN] + (direction == LOOKS_RIGHT) - (direction == LOOKS_LEFT)
+        cell = self.cells[row, column]
+        first, count = DOORS + self.num_doors, len(self.things)
+        ahead = thing_at(state, first, count, row, column)
+        carried = thing_at(state, first, count, 0, CARRIED)
+        if action == FORWARD:
+            is_way = cell < BLOCKED or (cell >= DOOR and state[DOORS + cell - DOOR] == OPEN)
+            if ahead < 0 and is_way:
+                out[ROW] = row
+                out[COLUMN] = column
+        elif action == PICKUP:
+            if ahead >= 0 and carried < 0:
+                out[first + 2 * ahead] = 0
+                out[first + 2 * ahead + 1] = CARRIED
+        elif action == DROP:
+            if ahead < 0 and carried >= 0 and cell == FREE:
+                out[first + 2 * carried] = row
+                out[first + 2 * carried + 1] = column
+        elif cell >= DOOR:
+            door = cell - DOOR
+            if state[DOORS + door] != LOCKED:
+                out[DOORS + door] = CLOSED if state[DOORS + door] == OPEN else OPEN
+            elif carried >= 0 and is_key(self.things[carried], self.door_colors[door]):
+                out[DOORS + door] = OPEN
+        elif ahead >= 0 and self.things[ahead, 2] == BOX:
+            out[first + 2 * ahead] = 0
+            out[first + 2 * ahead + 1] = self.width - 1
+
+    def is_terminal(self, state):
+        return self.cells[state[ROW], state[COLUMN]] == LOST or is_won(
+            self.cells, self.num_doors, self.target_door, self.target_thing, state
+        )
+
+    def reward(self, state, action, next_state):
+        return float(is_won(self.cells, self.num_doors, self.target_door, self.target_thing, next_state))
+
+    def grid(self):
+        return self.cells.shape
+
+    def draw(self, state, planes):
+        height, width = self.cells.shape
+        for row in range(height):
+            for column in range(width):
+                cell = self.cells[row, column]
+                if WON <= cell < DOOR:
+                    planes[cell - WON, row, column] = 1
+                elif cell >= DOOR:
+                    planes[3, row, column] = 1 + 3 * self.door_colors[cell - DOOR] + state[DOORS + cell - DOOR]
+        for i in range(len(self.things)):
+            row, column = state[DOORS + self.num_doors + 2 * i], state[DOORS + self.num_doors + 2 * i + 1]
+            if row == 0 and column == CARRIED:  # seen in the player's cell
+                row, column = state[ROW], state[COLUMN]
+            if row > 0:
+                planes[4, row, column] = 1 + 3 * self.things[i, 3] + self.things[i, 2]
+        planes[5, state[ROW], state[COLUMN]] = 1 + state[DIRECTION]
+
+
+def thing_at(state, first, count, row, column):
+    """The thing that is there; -1: none."""
+    for i in range(count):
+        if state[first + 2 * i] == row and state[first + 2 * i + 1] == column:
+            return i
+    return -1
+
+
+def is_key(thing, color):
+    return thing[2] == KEY and thing[3] == color
+
+
+def is_won(cells, num_doors, target_door, target_thing, state):
+    if cells[state[ROW], state[COLUMN]] == WON:
+        return True
+    if target_door >= 0 and state[DOORS + target_door] == OPEN:
+        return True
+    place = DOORS + num_doors + 2 * target_thing
+    return target_thing >= 0 and state[place] == 0 and state[place + 1] == CARRIED

@@ -1,0 +1,1 @@
+"""Distances without chance: diameter and start eccentricity, by searches on the graph of transitions."""

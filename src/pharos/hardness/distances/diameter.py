@@ -1,0 +1,177 @@
+"""Diameter: the largest number of steps of the best way between two states. Source: Jaksch, Ortner and Auer (2010).
+
+Deterministic MDPs: directed ExactSumSweep (Borassi et al. 2015) from the start state, searches from many nodes at once
+where it does not close (Then et al. 2014), and an argument of ours for spaces that contain a clock. Chance:
+`stochastic_diameter`.
+"""
+
+import math
+import os
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from pharos.errors import ParameterError, UndefinedMeasure
+from pharos.hardness.distances.lean_sweep import lean_diameter, lean_eccentricity, needs_more_than_memory
+from pharos.hardness.distances.ranked_search import ranked_eccentricity
+from pharos.hardness.distances.sum_sweep import SumSweep
+from pharos.hardness.distances.transition_graph import Graph
+from pharos.hardness.hitting.stochastic_diameter import stochastic_diameter
+from pharos.hardness.hitting.stochastic_eccentricity import stochastic_start_eccentricity
+from pharos.hardness.interval import Budget, BudgetClock, Interval, Progress, conventions_of
+from pharos.mdp import TabularMDP, require_mdp
+from pharos.system.wording import many
+
+
+@require_mdp
+def diameter(
+    mdp: TabularMDP,
+    *,
+    restart: bool = True,
+    tolerance: float = 1e-6,
+    budget: Budget | float | None = None,
+    progress: Callable[[Progress], None] | None = None,
+    bounds: str | os.PathLike | None = None,
+) -> Interval:
+    """Return D, the maximum over ordered pairs of states s != s' of the least expected number of steps from s to s'.
+
+        D = max over s != s' of min over policies of E[steps from s to s']
+
+    Deterministic MDPs: the largest distance in the graph, exact. With chance: the largest optimal expected hitting
+    time, up to `tolerance`. Rewards, gamma and the horizon do not matter.
+
+    Args:
+        restart: in a terminal state every action leads to a start state, drawn from the start distribution, in one
+            step.
+            False: terminal states are absorbing, so that D is infinite wherever a state cannot be reached from one.
+        tolerance: relative width of the interval from which on it counts as exact. Counted steps are exact anyway.
+        budget: seconds (300 by default), or a `Budget`; a value out of reach comes as the interval proven by then.
+        progress: called with a `Progress` now and then.
+        bounds: a folder for the bounds on all states, 8 bytes each, where memory has no room for searches of a
+            deterministic MDP: the same call goes on from them where one was killed, or its budget spent. They are
+            removed once the diameter is known.
+    Returns:
+        An `Interval`, in steps. The implicit end of an episode (-1 in a row of `next_states`) counts as one more state,
+        the only one beside the S states. Under sticky actions s' is a state reached with any previous action, and s
+        stands for every reachable (state, previously executed action) and the start states without a previous action.
+    Raises:
+        ParameterError: an option is out of range. FileFormatError: `bounds` are of another MDP. FolderLocked: in use.
+    Cost:
+        deterministic: usually 3 to 100 breadth-first searches, each one pass over the table in the order of discovery;
+        memory 8 bytes an edge and 32 a state. Where there is less, some ten sweeps over the table in place of each
+        search, and 12 bytes a state, which may be mapped files. Chance: see `stochastic_diameter`.
+    Source: Jaksch, Ortner and Auer (2010), definition 1; Borassi et al. (2015), "Fast diameter and radius BFS-based
+        computation in (weakly connected) real-world graphs", section 4.
+    """
+    _check_tolerance(tolerance)
+    spending = BudgetClock(Budget.of(budget), progress)
+    graph = Graph.of(mdp, restart)
+    if graph is None:
+        return stochastic_diameter(mdp, restart, tolerance, spending)
+    if needs_more_than_memory(graph):
+        return lean_diameter(graph, spending, conventions_of(mdp, restart), bounds)
+    return SumSweep(graph, spending, conventions_of(mdp, restart)).interval()
+
+
+@require_mdp
+def start_eccentricity(
+    mdp: TabularMDP,
+    *,
+    restart: bool = True,
+    tolerance: float = 1e-6,
+    budget: Budget | float | None = None,
+    processes: int | str = 1,
+) -> float:
+    """Return the largest least expected number of steps from the start to a state: the paper's (1), read literally.
+
+        max over s' of min over policies of E[steps from a start state to s'], the start being drawn
+
+    Args:
+        restart: as in `diameter`; without chance and with one start state it makes no difference.
+        tolerance: relative accuracy under chance, and with several start states; else it is counted.
+        budget: seconds (300 by default), or a `Budget`, under chance and with several start states.
+        processes: without chance and with one start state, as many that share the search, see `value_iteration`; under
+            MPI all get the result.
+    Returns:
+        Steps; infinite where some state cannot be reached from some start state. An expectation comes as its upper
+        bound, proven to lie within `tolerance`.
+    Raises:
+        UndefinedMeasure: out of reach of the budget or of 64-bit floats; it names the interval that is proven.
+        `start_eccentricity_interval` returns it.
+    Cost: one search for each start state; under chance, and where terminal states lead back to several start states,
+        one stochastic shortest path problem for each target that bounds do not rule out.
+    Source: the pharos paper, equation 1.
+    """
+    options: dict[str, Any] = {"restart": restart, "tolerance": tolerance, "budget": budget, "processes": processes}
+    interval = start_eccentricity_interval(mdp, **options)
+    if not interval.exact:
+        raise UndefinedMeasure(
+            f"start_eccentricity: between {interval.lower:.6g} and {interval.upper:.6g}; {interval.note}"
+        )
+    return interval.upper
+
+
+@require_mdp
+def start_eccentricity_interval(
+    mdp: TabularMDP,
+    *,
+    restart: bool = True,
+    tolerance: float = 1e-6,
+    budget: Budget | float | None = None,
+    processes: int | str = 1,
+) -> Interval:
+    """Return `start_eccentricity` as an `Interval`: exact, or what is proven within the budget. Arguments: the same."""
+    _check_tolerance(tolerance)
+    spending = BudgetClock(Budget.of(budget), None)
+    graph = Graph.of(mdp, restart)
+    if graph is None:
+        if processes != 1:
+            raise ParameterError(f"{mdp}: has chance, under which one process searches; expected processes=1")
+        return stochastic_start_eccentricity(mdp, restart, tolerance, spending)
+    starts = mdp.start_states[mdp.start_probabilities > 0]
+    if processes != 1:
+        if len(starts) > 1:
+            raise ParameterError(f"{mdp}: has {len(starts)} start states; expected processes=1")
+        return ranked_eccentricity(graph, int(starts[0]), processes, spending, conventions_of(mdp, restart))
+    if len(starts) == 1 and needs_more_than_memory(graph):
+        return lean_eccentricity(graph, int(starts[0]), spending, conventions_of(mdp, restart))
+    weights = mdp.start_probabilities[mdp.start_probabilities > 0]
+    mean, distance = np.zeros(graph.num_nodes), np.empty(graph.num_nodes, np.int32)
+    note, infinite, largest = "", False, 0
+    for start, weight in zip(starts, weights, strict=True):
+        if spending.is_over and spending.searches:
+            note = f"budget spent after the searches from {spending.searches} of {many(len(starts), 'start state')}"
+            break
+        reached, largest, _ = graph.search_forward(int(start), distance)
+        spending.searches += 1
+        if reached < graph.num_nodes:
+            infinite = True
+            break
+        mean += weight * distance
+    if infinite:
+        lower = upper = math.inf
+    elif len(starts) == 1:
+        lower = upper = float(largest)
+    else:  # a rounding of each product and each sum; a distance is at most the number of nodes less one
+        rounding = 1 + (len(starts) + 2) * 2.0**-53
+        lower, upper = float(mean.max()) / rounding, float(mean.max()) * rounding
+    if note:
+        upper = math.inf
+    return Interval(
+        lower,
+        upper,
+        exact=not note,
+        finite_part=0.0 if infinite else lower,
+        tolerance=0.0 if len(starts) == 1 else tolerance,
+        searches=spending.searches,
+        method="a breadth-first search from each start state",
+        conventions=conventions_of(mdp, restart),
+        note=note,
+        seconds=spending.seconds,
+    )
+
+
+def _check_tolerance(tolerance: float) -> None:
+    if not (isinstance(tolerance, int | float) and 0 < tolerance < 1):
+        raise ParameterError(f"tolerance is {tolerance!r}; expected a number between 0 and 1")

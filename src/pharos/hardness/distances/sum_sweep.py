@@ -1,0 +1,372 @@
+"""The diameter of a graph by directed ExactSumSweep, searches from many nodes at once, and the argument of clocks.
+
+Source: Borassi et al. (2015); Then et al. (2014). Clocks are an argument of ours.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+
+from pharos.hardness.distances.hidden_clock import HiddenClock
+from pharos.hardness.distances.layers import WIDE, Layers
+from pharos.hardness.distances.orbits import orbits
+from pharos.hardness.distances.restored import largest_distances, restored
+from pharos.hardness.distances.transition_graph import Graph
+from pharos.hardness.interval import Budget, BudgetClock, Interval
+from pharos.kernels import clocks, dense_search, graph, many_searches
+from pharos.system.wording import many
+
+# Untyped, as starred arguments of compiled functions are not checked.
+kernels: Any = graph
+clock: Any = clocks
+dense: Any = dense_search
+searches: Any = many_searches
+# Widths of searches from many nodes, in words of 64 sources: eight words are a cache line.
+_WORDS = (1, 8)
+# Levels up to which every node is asked on every level. Breakout has six times as many, puzzles half of them.
+_FEW_LEVELS = 100
+# Orbits from each of which a search is made.
+_FEW_ORBITS = 64
+# Bytes that searches from many nodes may take.
+_BATCH_MEMORY = 2**31
+COUNTING = 10.0  # seconds for counting the pairs of an infinite diameter, unless a budget is given
+
+
+class SumSweep:
+    """Bounds on all eccentricities, tightened by searches until one side leaves no node that could be farther.
+
+    out(v) = max over w of d(v, w), in(v) = max over w of d(w, v). From d(v, w) <= d(v, p) + d(p, w) follow
+    out(v) <= d(v, p) + out(p) and in(v) <= in(p) + d(p, v) for a pivot p searched in both directions; a search from w
+    in one direction gives out(w) or in(w) exactly, and a lower bound for everyone. D = max out = max in: it is proven
+    as soon as no out(v), or no in(v), can exceed the largest eccentricity found.
+    """
+
+    def __init__(self, graph: Graph, spending: BudgetClock, conventions: dict[str, Any]):
+        self.graph, self.spending, self.conventions = graph, spending, conventions
+        size, dtype = graph.num_nodes, graph.dtype
+        self.away, self.to = np.empty(size, dtype), np.empty(size, dtype)
+        self.out_lower, self.in_lower = np.zeros(size, dtype), np.zeros(size, dtype)
+        unknown = np.iinfo(dtype).max
+        self.out_upper, self.in_upper = np.full(size, unknown, dtype), np.full(size, unknown, dtype)
+        self.best = 0
+        self.method = "directed ExactSumSweep"
+
+    def interval(self) -> Interval:
+        graph = self.graph
+        if not self._pivot(graph.pivot):
+            return _infinite_diameter(graph, self.spending, self.conventions)
+        note = ""
+        clock = self._from_clock()
+        if isinstance(clock, Interval):
+            return clock
+        self._search_in_step()
+        if not self._search_orbits():
+            self._search_restored()
+        self._sweep()
+        upper = self._upper()
+        if upper > self.best:
+            note = f"budget spent: {many(self._open()[0], 'state')} may have a larger eccentricity than {self.best}"
+            if clock:
+                note += f"; {clock}"
+        return self._result(self.best, upper, note)
+
+    def _result(self, lower: int, upper: int, note: str) -> Interval:
+        exact = lower == upper
+        self.spending.report(lower, upper, 0 if exact else self._open()[0], now=True)
+        return Interval(
+            float(lower),
+            float(upper),
+            exact,
+            finite_part=float(lower),
+            counted=exact,
+            searches=self.spending.searches,
+            method=self.method,
+            conventions=self.conventions,
+            note=note,
+            seconds=self.spending.seconds,
+        )
+
+    # Searches ---------------------------------------------------------------------------------------------------------
+
+    def _pivot(self, p: int) -> bool:
+        """Search from p in both directions; False where p does not reach all nodes, or not all reach p."""
+        forward, out_pivot, _ = self.graph.search_forward(p, self.away)
+        backward, in_pivot, _ = self.graph.search_backward(p, self.to)
+        self.spending.searches += 2
+        if forward < self.graph.num_nodes or backward < self.graph.num_nodes:
+            return False
+        kernels.bound_eccentricities(
+            self.away, self.to, out_pivot, in_pivot, self.out_lower, self.out_upper, self.in_lower, self.in_upper
+        )
+        self._settle_out(p, out_pivot)
+        self._settle_in(p, in_pivot)
+        return True
+
+    def _search_out(self, v: int) -> None:
+        _, largest, _ = self.graph.search_forward(v, self.away)
+        kernels.raise_lower(self.away, self.in_lower)
+        self._settle_out(v, largest)
+        self.spending.searches += 1
+
+    def _search_in(self, v: int) -> None:
+        _, largest, _ = self.graph.search_backward(v, self.to)
+        kernels.raise_lower(self.to, self.out_lower)
+        self._settle_in(v, largest)
+        self.spending.searches += 1
+
+    def _settle_out(self, v: int, value: int) -> None:
+        self.out_lower[v] = self.out_upper[v] = value
+        self.best = max(self.best, int(value))
+
+    def _settle_in(self, v: int, value: int) -> None:
+        self.in_lower[v] = self.in_upper[v] = value
+        self.best = max(self.best, int(value))
+
+    def _open(self) -> tuple[int, tuple[int, int, int, int, int]]:
+        counts = kernels.open_eccentricities(self.out_lower, self.out_upper, self.in_lower, self.in_upper, self.best)
+        return min(counts[0], counts[1]), counts
+
+    def _upper(self) -> int:
+        return max(self.best, min(int(self.out_upper.max()), int(self.in_upper.max())))
+
+    # The sweep --------------------------------------------------------------------------------------------------------
+
+    def _sweep(self) -> None:
+        """Search where it pays: the kind that closed most nodes for its cost, the others now and then.
+
+        The kinds: from the node of the largest upper bound forward, or backward; from the middle in both directions;
+        from up to 512 open nodes at once, telling their neighbours or, where levels are few, asking them. Costs are
+        counted in table entries read, not in seconds, so that the searches made are the same on every machine.
+        """
+        one = max(1, self.graph.num_nodes * self.graph.next_states.shape[1])
+        worth = {"out": math.inf, "in": math.inf, "middle": math.inf}
+        still_open, (num_out, num_in, far_out, far_in, middle) = self._open()
+        while still_open and not self.spending.is_over:
+            if len(worth) == 3 and self.spending.searches >= 12 and still_open >= 16:
+                if self.best <= _FEW_LEVELS and self._fits(dense.WORDS):
+                    worth["dense"] = math.inf
+                else:
+                    worth |= {f"many {words}": math.inf for words in _WORDS if self._fits(words)}
+            kind = max(worth, key=lambda name: worth[name])
+            cost = 1.0
+            if kind == "out":
+                self._search_out(far_out)
+            elif kind == "in":
+                self._search_in(far_in)
+            elif kind == "middle":
+                self._pivot(middle)
+                cost = 2.0
+            elif kind == "dense":
+                cost = self._search_densely() / one
+            else:
+                cost = self._search_many(num_out <= num_in, int(kind.split()[1])) / one
+            before = still_open
+            still_open, (num_out, num_in, far_out, far_in, middle) = self._open()
+            for name in worth:
+                worth[name] *= 1.05
+            worth[kind] = (before - still_open + 1e-3) / max(cost, 1e-3)
+            self.spending.report(self.best, self._upper(), still_open)
+
+    def _fits(self, words: int) -> bool:
+        return 24 * words * self.graph.num_nodes <= _BATCH_MEMORY
+
+    def _search_many(self, outward: bool, words: int) -> int:
+        """The exact eccentricities of the open nodes with the largest upper bounds; table entries read, times words."""
+        graph = self.graph
+        upper, lower = (self.out_upper, self.out_lower) if outward else (self.in_upper, self.in_lower)
+        nodes = np.flatnonzero(np.greater(upper, self.best))
+        limit = int(min(64 * words, max(1, self.spending.budget.searches - self.spending.searches)))
+        if len(nodes) > limit:
+            nodes = np.sort(nodes[np.argsort(-upper[nodes].astype(np.int64), kind="stable")[:limit]])
+        sources = nodes.astype(graph.dtype)
+        words = -(-len(sources) // 64)
+        largest = np.empty(len(sources), np.int64)
+        bits = [np.zeros((graph.num_nodes, words), np.uint64) for _ in range(3)]
+        scratch = (graph.queue, np.empty_like(graph.queue))
+        if outward:
+            _, reads = searches.search_forward_from_many(
+                graph.next_states, graph.ends, graph.start, sources, *bits, *scratch, largest
+            )
+        else:
+            _, reads = searches.search_backward_from_many(
+                *graph.backward, graph.start, sources, *bits, *scratch, largest
+            )
+        upper[nodes] = lower[nodes] = largest
+        self.best = max(self.best, int(largest.max()))
+        self.spending.searches += len(sources)
+        self.method = "directed ExactSumSweep, then searches from many states at once"
+        return int(reads) * (1 + words)
+
+    def _search_densely(self) -> int:
+        """The exact in(v) of up to 512 open nodes, and what follows along edges; the cost, in table entries.
+
+        Where most eccentricities are nearly equal, as in puzzles whose moves can be taken back, no pivot rules many
+        nodes out; but a node with in(u) < D does so for its successors, as in(v) <= 1 + in(u). So none of the nodes is
+        a successor of another one, and those with many successors come first: they lie in the middle and close most.
+        A line asked for takes an eighth of the time of one told (0.25 s for 512 nodes of the 8-puzzle, 2.8 s).
+        """
+        graph = self.graph
+        table, ends, start = graph.next_states, graph.ends, graph.start
+        nodes = np.flatnonzero(np.greater(self.in_upper, self.best)).astype(graph.dtype)
+        degrees = dense.num_successors(table, ends, graph.num_nodes)[nodes]
+        order = nodes[np.lexsort((-self.in_upper[nodes].astype(np.int64), -degrees.astype(np.int64)))]
+        limit = int(min(64 * dense.WORDS, max(1, self.spending.budget.searches - self.spending.searches)))
+        blocked, active, arriving = (np.zeros(graph.num_nodes, np.bool_) for _ in range(3))
+        sources = np.sort(dense.spread_out(table, ends, order, blocked, limit))
+        bits = [np.zeros((graph.num_nodes, dense.WORDS), np.uint64) for _ in range(3)]
+        largest = np.empty(len(sources), np.int64)
+        reads = dense.dense_search_backward(table, ends, start, sources, *bits, active, arriving, largest)
+        self.in_upper[sources] = self.in_lower[sources] = largest
+        self.best = max(self.best, int(largest.max()))
+        passes = 1
+        while dense.lower_along_edges(table, ends, start, self.in_upper, self.out_upper):
+            passes += 1
+        self.spending.searches += len(sources)
+        self.method = "directed ExactSumSweep, then searches from many states at once"
+        return int(reads) * (1 + dense.WORDS) // 8 + passes * table.size
+
+    # Symmetries -------------------------------------------------------------------------------------------------------
+
+    def _search_orbits(self) -> bool:
+        """Where symmetries leave few orbits of states, the exact out(v) of all, by a search from one of each; whether
+        there are symmetries."""
+        graph = self.graph
+        orbit = orbits(graph.next_states, graph.ends, graph.start, graph.pivot, lambda: self.spending.is_over)
+        if orbit is None:
+            return False
+        representatives = np.flatnonzero(orbit == np.arange(len(orbit)))
+        if len(representatives) > _FEW_ORBITS:
+            return True
+        for v in representatives:
+            if self.spending.is_over:
+                return True
+            self._search_out(int(v))
+            self.out_upper[: len(orbit)][orbit == v] = self.out_upper[v]
+        self.method = f"searches from one state of each of {len(representatives)} orbits of symmetries"
+        return True
+
+    def _search_restored(self) -> None:
+        """Where the only end hides symmetries, upper bounds on out(v), as `pharos.hardness.distances.restored` says."""
+        graph = self.graph
+        if graph.start < 0 or graph.has_end:
+            return
+        space = restored(graph.next_states, graph.ends, graph.pivot, lambda: self.spending.is_over)
+        if space is None:
+            return
+        representatives = np.flatnonzero(space.orbit == np.arange(graph.num_nodes))
+        if len(representatives) > _FEW_ORBITS:
+            return
+        bounds = largest_distances(space, representatives)
+        if bounds is None:
+            return
+        self.spending.searches += len(bounds)
+        for v, bound in zip(representatives, bounds, strict=True):
+            alike = space.orbit == v
+            alike[space.end] = False
+            self.out_upper[alike] = np.minimum(self.out_upper[alike], bound)
+        self._search_out(space.end)
+        self.method = (
+            f"detours from one of each of {len(representatives)} kinds of states that the end alone tells apart"
+        )
+
+    # Clocks -----------------------------------------------------------------------------------------------------------
+
+    def _search_in_step(self) -> None:
+        """Where only restarts hide a clock, in(v) of all that are open, the farthest first."""
+        is_tried = self._open()[0] and self._fits(1)
+        clock = HiddenClock.of(self.graph, self.to, self.away) if is_tried else None
+        while clock is not None and self._open()[0] and not self.spending.is_over:
+            nodes = np.flatnonzero(np.greater(self.in_upper, self.best))
+            words = _WORDS[-1] if self._fits(_WORDS[-1]) else 1
+            limit = int(min(64 * words, max(1, self.spending.budget.searches - self.spending.searches)))
+            targets = nodes[np.argsort(-self.in_upper[nodes].astype(np.int64), kind="stable")[:limit]]
+            largest, _ = clock.largest_to(self.graph, targets, self.best)
+            self.in_upper[targets] = largest
+            self.best = max(self.best, int(largest.max()))
+            self.spending.searches += len(targets)
+            self.method = f"searches in step with {clock.layers.number} layers of a clock that restarts hide"
+            self.spending.report(self.best, self._upper(), self._open()[0])
+
+    def _from_clock(self) -> "Interval | str":
+        """D of a graph that contains a clock, or why this argument does not give it ("": there is no clock).
+
+        Let the graph be strongly connected and P the greatest common divisor of the lengths of its cycles. The layers
+        C_j = {v: d(p, v) = j modulo P} are such that every edge leads from C_j to C_{j+1}. Let R_k(u) be the set of
+        nodes that u in C_j reaches in exactly k steps, a subset of C_{j+k}. Once R_k(u) is all of C_{j+k}, so is
+        R_{k+1}(u) all of C_{j+k+1}, as every node has a predecessor, which lies in the layer before. Let g be the
+        largest k at which some u does not reach its whole layer, g = -1 if there is none.
+
+        Claim: if g < P then D = P + g. At most: for all u and v one of g + 1, ..., g + P is the difference of their
+        layers modulo P, and R of that many steps is whole, so d(u, v) <= g + P. At least, for g >= 0: let v be missing
+        in R_g(u). All walks from u to v have a length of g modulo P; g itself is none, and as g < P nothing smaller is,
+        so d(u, v) >= g + P. For g = -1 every layer is one node and the graph is a cycle of P nodes: D = P - 1.
+
+        The sets are found for one layer at a time, a bit for each of its nodes; this pays where layers are narrow.
+        """
+        graph = self.graph
+        if graph.num_nodes < 64:
+            return ""
+        cycle = int(clock.period(graph.next_states, graph.ends, graph.start, self.away, graph.has_end))
+        if cycle < 8:
+            return ""
+        layer = self.away % cycle
+        widths = np.bincount(layer, minlength=cycle)
+        widest = int(widths.max())
+        if widest > WIDE:
+            return f"all cycles have multiples of {cycle} steps, but a layer of {widest} states is too wide to follow"
+        layers = Layers.of(layer, widths, graph.dtype)
+        scratch = [np.empty((widest, -(-widest // 64)), np.uint64) for _ in range(2)]
+        max_reads = 200 * graph.num_nodes * graph.next_states.shape[1] + 10**8
+        gap, _ = clock.last_gap(graph.next_states, graph.ends, graph.start, *layers, *scratch, max_reads)
+        if gap == -2:
+            return f"all cycles have multiples of {cycle} steps, but some state needs more to reach its whole layer"
+        if gap == -3:
+            return f"all cycles have multiples of {cycle} steps, but following the layers takes too long"
+        self.method = f"reach sets in the {cycle} layers of a clock, none of more than {widest} states"
+        return self._result(cycle + int(gap), cycle + int(gap), "")
+
+
+def _infinite_diameter(graph: Graph, spending: BudgetClock, conventions: dict[str, Any]) -> Interval:
+    """D of a graph that is not strongly connected: infinite, with unreachable pairs and the finite part.
+
+    The value is known before any pair is counted, so of the default budget no more than COUNTING seconds go into that.
+    """
+    size = graph.num_nodes
+    end = spending.seconds + COUNTING if spending.budget == Budget() else math.inf
+    words = 8 if 24 * 8 * size <= _BATCH_MEMORY else 1
+    bits = [np.zeros((size, words), np.uint64) for _ in range(3)]
+    scratch = (graph.queue, np.empty_like(graph.queue))
+    reached = finite = done = 0
+    while done < size and not spending.is_over and spending.seconds < end:
+        sources = np.arange(done, min(done + 64 * words, size), dtype=graph.dtype)
+        bits[0][:] = 0
+        largest = np.empty(len(sources), np.int64)
+        pairs, _ = searches.search_forward_from_many(
+            graph.next_states, graph.ends, graph.start, sources, *bits, *scratch, largest
+        )
+        reached += int(pairs)
+        finite = max(finite, int(largest.max()))
+        done += len(sources)
+        spending.searches += len(sources)
+        spending.report(finite, math.inf, size - done)
+    unreachable = done * (size - 1) - reached
+    counted = done == size
+    note = "some states cannot be reached from others"
+    if not counted:
+        note += f"; counted for {spending.seconds:.0f} s: the pairs from {done} of {many(size, 'state')}"
+        note += ", so the counts are lower bounds"
+        unreachable = max(unreachable, 1)
+    return Interval(
+        math.inf,
+        math.inf,
+        True,
+        unreachable_pairs=unreachable,
+        finite_part=float(finite),
+        counted=counted,
+        searches=spending.searches,
+        method="searches from all states, many at once",
+        conventions=conventions,
+        note=note,
+        seconds=spending.seconds,
+    )

@@ -1,0 +1,1 @@
+"""Suboptimality gaps, proofs of ties, and the value norm."""

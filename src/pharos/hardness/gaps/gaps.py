@@ -1,0 +1,424 @@
+"""Suboptimality gaps: how much worse an action is than the best one. Source: Simchowitz and Jamieson (2019).
+
+What is proven. Each value is within the solution's error bound of the true one, so a gap is known to twice that. A gap
+above the tie tolerance is a gap. Below it, a tie is proven where the best action and this one pay the same and lead to
+the same states, or where `ties` shows that equal values come from equal rewards for ever; else it may be a gap of any
+size, and its reciprocal anything.
+"""
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import Any, cast
+
+import numpy as np
+
+from pharos.errors import ParameterError, PrecisionError
+from pharos.hardness.gaps.gap_blocks import weighted_gaps
+from pharos.hardness.gaps.gap_sums import REGULARIZER, GapSums
+from pharos.hardness.gaps.ranked_gaps import RankedGaps, TieRule, capacity_of, warm
+from pharos.hardness.gaps.ties import TieProof, UnresolvedTies
+from pharos.hardness.interval import Certified
+from pharos.kernels import gaps as kernels
+from pharos.mdp import BEST, BellmanEquation, TabularMDP, require_mdp
+from pharos.ranks import Rank, check_number, check_ranks, together
+from pharos.solvers import Solution, value_iteration
+from pharos.system.large_arrays import large_zeros
+
+# Relative width up to which an interval counts as the value.
+NARROW = 1e-6
+# The default tie tolerance is this times the error bound of the values; more than 2, as a gap is known to twice the
+# bound.
+ERRORS_PER_TIE = 2.5
+# Relative rounding of a gap, its reciprocal and sums of these: a few units each, and one for each action.
+_ROUNDING = 1e-12
+_UNIT = 2.0**-53
+# Sweeps at most, after the solution, until values settle; and sweeps that change values by no more than rounding.
+_SWEEPS = 200
+_AT_REST = 40
+
+
+@dataclass(frozen=True)
+class Gaps:
+    """The suboptimality gaps gap(s, a) = V*(s) - Q*(s, a) of an MDP, summed up.
+
+    Attributes:
+        sum_of_reciprocals: sum of 1 / gap over the states that can be reached and are not terminal, and the actions
+            with gap > tie_tolerance. Unit: 1 / return.
+        lower, upper: the true sum lies between them: each gap is known up to twice the error bound of the solution.
+            `upper` is infinite where ties are unresolved.
+        regularized: sum of 1 / (gap + 0.1) over all states and actions, optimal ones and terminal states included, as
+            Colosseum prints it.
+        minimal: the smallest gap > tie_tolerance; infinite where there is none.
+        count, ties: how many gaps exceed tie_tolerance, and how many do not, the best actions among them.
+        unresolved: how many ties are not proven, so that they may be gaps smaller than the tolerance; with a
+            `tie_tolerance` of the caller's own, how many gaps are within their error of it.
+        small: how many gaps are computed as larger than 0, and no larger than the tolerance.
+        histogram, edges: (B,) numbers of gaps in bins of a quarter of a decade, and their (B + 1,) edges.
+        tie_tolerance: gaps up to it count as ties.
+        error: of a gap, at most; twice the error bound of the solution.
+        conventions: what the values refer to.
+    """
+
+    sum_of_reciprocals: float
+    lower: float
+    upper: float
+    regularized: float
+    minimal: float
+    count: int
+    ties: int
+    unresolved: int
+    small: int
+    histogram: np.ndarray
+    edges: np.ndarray
+    tie_tolerance: float
+    error: float
+    conventions: dict[str, Any]
+
+    @property
+    def is_resolved(self) -> bool:
+        """Whether ties are ties, and the sum is known to a relative 1e-6."""
+        return not self.unresolved and self.upper - self.lower <= NARROW * self.upper
+
+    @property
+    def certified_sum(self) -> Certified:
+        """The sum of reciprocals, with its interval."""
+        return self._certified(self.sum_of_reciprocals, self.lower, self.upper)
+
+    @property
+    def certified_minimal(self) -> Certified:
+        """The smallest gap, with its interval: from 0 on where ties are unresolved."""
+        low, high = self.minimal * (1 - _ROUNDING) - self.error, self.minimal * (1 + _ROUNDING) + self.error
+        return self._certified(self.minimal, 0.0 if self.unresolved else max(low, 0.0), high)
+
+    @property
+    def certified_regularized(self) -> Certified:
+        """The regularized sum, with its interval: each 1 / (gap + 0.1) changes by a factor up to 1 + error / 0.1."""
+        share = self.error / REGULARIZER
+        high = self.regularized / (1 - share) * (1 + _ROUNDING) if share < 1 else math.inf
+        low = self.regularized / (1 + share) * (1 - _ROUNDING)
+        return Certified(self.regularized, low, high, high - low <= NARROW * high)
+
+    def _certified(self, value: float, lower: float, upper: float) -> Certified:
+        exact = not self.unresolved and (lower == upper or upper - lower <= NARROW * upper)
+        note = ""
+        if self.unresolved:
+            note = (
+                f"{self.unresolved} of {self.ties} ties at a tolerance of {self.tie_tolerance:.2g} are not resolved: "
+                f"they may be smaller gaps"
+            )
+        extra = {"ties": self.ties, "unresolved_ties": self.unresolved, "tie_tolerance": self.tie_tolerance}
+        return Certified(value, lower, upper, exact, note, extra)
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able; what is infinite is None."""
+        return {
+            "sum_of_reciprocals": self.sum_of_reciprocals,
+            "lower": self.lower,
+            "upper": self.upper if math.isfinite(self.upper) else None,
+            "regularized": self.regularized,
+            "minimal": self.minimal if math.isfinite(self.minimal) else None,
+            "count": self.count,
+            "ties": self.ties,
+            "unresolved": self.unresolved,
+            "histogram": self.histogram.tolist(),
+            "edges": self.edges.tolist(),
+            "tie_tolerance": self.tie_tolerance,
+            "error": self.error,
+        }
+
+    def __str__(self) -> str:
+        ties = f", {self.unresolved} unresolved ties" if self.unresolved else ""
+        return (
+            f"sum of reciprocal gaps {self.sum_of_reciprocals:.10g}, minimal gap {self.minimal:.6g}, "
+            f"{self.count} gaps{ties}"
+        )
+
+
+@require_mdp
+def gaps(
+    mdp: TabularMDP,
+    solution: Solution | None = None,
+    *,
+    tie_tolerance: float | None = None,
+    processes: int | str = 1,
+) -> Gaps:
+    """Return the suboptimality gaps of an MDP, summed up.
+
+        gap(s, a) = V*(s) - Q*(s, a)
+
+    Under random actions Q* is the value of choosing an action. Under sticky actions a state is a pair (state,
+    previously executed action) that can be reached, and a start state without a previous action is one more; gap((s,
+    b), a) is the weight of the choice times the difference of the values of executing. With a horizon T, gaps belong to
+    steps: the sum runs over t = 1, ..., T and the states that can be reached at step t, as in Simchowitz and Jamieson.
+
+    Args:
+        solution: the optimal solution of `mdp`; None: solved here to an error of 1e-9, and where that leaves ties
+            unresolved to what 64-bit floats can reach.
+        tie_tolerance: gaps up to it count as ties. None: 2.5 times the error bound of the solution.
+        processes: of this machine, each of which adds up the gaps of a range of the states; or "mpi": those that
+            `mpiexec` has started, all of which make this call: the first with the solution, if there is one, the others
+            with None or anything, and the first gets the Gaps, the others None. Of one solution they find the gaps,
+            counts, ties and histogram that one process finds, to the last bit, and sums of floats within the relative
+            rounding of 1e-12 that `lower` and `upper` count. Without `solution` they solve as `value_iteration` does;
+            sweeps that settle ties after it are the first process's alone, and so is the proof that equal values come
+            from equal rewards for ever.
+    Raises:
+        ParameterError: `solution` belongs to another MDP or is not optimal; several processes, and a horizon.
+        RankFailed: a process died.
+        PrecisionError: tie_tolerance is not larger than twice the error bound, so that a tie could be counted as a gap.
+    Cost: one pass over the table, 50 to 100 ns a state with its proofs of ties, and 1 to 40 sweeps before it; with a
+        horizon T passes and 8 T S bytes.
+    Source: Simchowitz and Jamieson (2019), "Non-asymptotic gap-dependent regret bounds for tabular MDPs", section 2;
+        the pharos paper, equation 2; regularized: Colosseum (Conserva and Rauber, 2022).
+    """
+    check_number(processes)
+    if processes != 1:
+        return _gaps_by_ranks(mdp, solution, tie_tolerance, processes)
+    if solution is None and tie_tolerance is None:
+        return resolved_gaps(mdp, optimal_solution(mdp, None))
+    return _summed(mdp, optimal_solution(mdp, solution), tie_tolerance)
+
+
+def resolved_gaps(mdp: TabularMDP, solution: Solution, in_place: bool = False, ranks: RankedGaps | None = None) -> Gaps:
+    """The gaps of a solution; of a more accurate one where ties are unresolved, or the sum is wide.
+
+    in_place: whether the values of the solution may become the more accurate ones; its bound holds for these, too.
+    ranks: who adds up; None for this process.
+    """
+    if solution.horizon is not None or mdp.gamma == 1.0:
+        return _summed(mdp, solution, None, ranks)
+    settled = solution
+    if TieProof(mdp).holds:  # else ties cannot be proven that way
+        settled = _settled(mdp, solution, in_place)
+    result = _summed(mdp, settled, None, ranks)
+    if result.is_resolved or settled is not solution:
+        return result
+    settled = _settled(mdp, solution, in_place)
+    return _summed(mdp, settled, None, ranks) if settled.error_bound < solution.error_bound else result
+
+
+def _settled(mdp: TabularMDP, solution: Solution, in_place: bool) -> Solution:
+    """The solution after more sweeps, until values do not change, or by no more than rounding.
+
+    The bound is that of `pharos.solvers`: (rho change + rounding) / (1 - rho). Values that do not change at all make
+    proofs of ties possible, as equal states then have equal floats. A sweep keeps every bound D of that form: new
+    entries are within rho D + rounding <= D of the fixed point.
+    """
+    equation = BellmanEquation(mdp.reward_table, mdp.gamma, mdp.chance, BEST)
+    operations = 2 * mdp.num_actions + mdp.dynamics.operations + 16
+    rho = mdp.gamma * max(1.0, mdp.dynamics.mass) * (1 + 16 * _UNIT)
+    if rho >= 1:
+        return solution
+    largest_reward = max(abs(mdp.reward_table.lowest), abs(mdp.reward_table.highest))
+    x, bound, at_rest = solution.x, solution.error_bound, 0
+    if not in_place:
+        x = large_zeros(solution.x.shape, np.float64)
+        x[:] = solution.x
+    largest = max(float(x.max(initial=0.0)), -float(x.min(initial=0.0)))
+    sweeps = 0
+    while sweeps < _SWEEPS:
+        sweeps += 1
+        change = mdp.dynamics.sweep(equation, x)
+        largest += change
+        rounding = operations * _UNIT * (largest_reward + largest + change)
+        bound = min(bound, (rho * change + rounding) / (1 - rho) * (1 + _ROUNDING))
+        at_rest += change <= rounding
+        if change == 0.0 or at_rest == _AT_REST:
+            break
+    return replace(solution, x=x, next_x=x, error_bound=bound, sweeps=solution.sweeps + sweeps)
+
+
+@require_mdp
+def sum_of_reciprocal_gaps(
+    mdp: TabularMDP,
+    solution: Solution | None = None,
+    *,
+    tie_tolerance: float | None = None,
+    regularized: bool = False,
+    processes: int | str = 1,
+) -> float:
+    """Return the sum of 1 / gap(s, a) over reachable, non-terminal states s and actions a with a gap; as `gaps` says.
+
+    Args:
+        regularized: instead, the sum of 1 / (gap + 0.1) over all states and actions.
+        processes: as `gaps` takes them; under "mpi" the first gets the sum, the others None.
+    """
+    result = gaps(mdp, solution, tie_tolerance=tie_tolerance, processes=processes)
+    if result is None:  # another one of MPI's
+        return cast(Any, None)
+    return result.regularized if regularized else result.sum_of_reciprocals
+
+
+@require_mdp
+def minimal_gap(
+    mdp: TabularMDP,
+    solution: Solution | None = None,
+    *,
+    tie_tolerance: float | None = None,
+    processes: int | str = 1,
+) -> float:
+    """Return the smallest gap(s, a) that is no tie; infinite where there is none. As `gaps` says.
+
+    processes: as `gaps` takes them; under "mpi" the first gets the gap, the others None.
+    """
+    result = gaps(mdp, solution, tie_tolerance=tie_tolerance, processes=processes)
+    return cast(Any, None) if result is None else result.minimal
+
+
+def gaps_of_states(
+    mdp: TabularMDP, solution: Solution | None, tie_tolerance: float | None
+) -> tuple[Iterator[tuple[np.ndarray, np.ndarray]], float, dict[str, Any]]:
+    """(blocks of (gap (N, A), weight (N,): how often each row counts, 0 for none), tie tolerance, conventions)."""
+    solution = optimal_solution(mdp, solution)
+    tolerance = _tolerance(solution, tie_tolerance, _error(mdp, solution))
+    blocks = ((part.gap, part.counted) for part in weighted_gaps(mdp, solution))
+    return blocks, tolerance, _conventions(mdp, solution, tolerance)
+
+
+def optimal_solution(mdp: TabularMDP, solution: Solution | None) -> Solution:
+    """The optimal solution of `mdp` that was given, or a new one, to 1e-9 or to what 64-bit floats reach.
+
+    Raises:
+        ParameterError: it is of another kind or MDP.
+    """
+    if solution is None:
+        return solved(value_iteration, mdp, 1e-9)
+    shape = (mdp.num_states, mdp.num_actions)
+    solution_shape = (solution.mdp.num_states, solution.mdp.num_actions)
+    chance, other = ((each.chance, each.laziness) for each in (mdp, solution.mdp))
+    if solution.kind != "optimal" or solution_shape != shape or chance != other:
+        raise ParameterError(
+            f"solution is of kind {solution.kind!r} for {solution.mdp}; expected the optimal one of {mdp}"
+        )
+    if solution.x.dtype != np.float64:
+        x = solution.x.astype(np.float64)  # the same numbers, whose bound holds
+        return replace(solution, x=x, next_x=x)
+    return solution
+
+
+def solved(solve: Callable[..., Solution], mdp: TabularMDP, tolerance: float, **options: Any) -> Solution:
+    """A solution to a tolerance, in return; where floats do not reach it, to the least multiple by a power of ten that
+    they reach, which `error_bound` says.
+
+    Raises:
+        PrecisionError: they reach none below the largest value that the MDP may have.
+    """
+    rewards = mdp.reward_table
+    largest = max(abs(rewards.lowest), abs(rewards.highest)) / max(1 - mdp.gamma, 2.0**-53)
+    while True:
+        try:
+            return solve(mdp, tolerance, **options)
+        except PrecisionError:
+            if tolerance > largest or not math.isfinite(largest):
+                raise
+            tolerance *= 10
+
+
+def _error(mdp: TabularMDP, solution: Solution) -> float:
+    """By how much a gap may be off: values of all steps are within the error bound of the solution.
+
+    With a horizon the bound is that of the first step. Where gamma is below 1, that of a later one may be larger: it is
+    a sum of discounted rounding errors, in proportion to the largest reward and value of its own steps.
+    """
+    error = 2 * solution.error_bound
+    if solution.horizon is None or mdp.gamma == 1.0 or solution.error_bound == 0.0:
+        return error
+    reward = max(abs(mdp.reward_table.lowest), abs(mdp.reward_table.highest))
+    steps = min(solution.horizon, 1 / (1 - mdp.gamma))
+    return error * steps * (1 + steps) if reward else error
+
+
+def _tolerance(solution: Solution, tie_tolerance: float | None, error: float) -> float:
+    tolerance = max(np.finfo(float).tiny, ERRORS_PER_TIE / 2 * error) if tie_tolerance is None else tie_tolerance
+    if not (isinstance(tolerance, int | float | np.floating) and math.isfinite(tolerance) and tolerance > error):
+        raise PrecisionError(
+            f"tie_tolerance is {tolerance!r}; expected more than twice the error bound of the solution, {error:.3g}: "
+            f"raise it, or solve with a smaller tolerance"
+        )
+    return float(tolerance)
+
+
+def _conventions(mdp: TabularMDP, solution: Solution, tolerance: float) -> dict[str, Any]:
+    return {
+        **solution.conventions(),
+        "tie_tolerance": tolerance,
+        "states": "pairs (state, previously executed action), and starts without one" if mdp.is_sticky else "states",
+        "steps": "each step of the horizon" if solution.horizon is not None else "any",
+    }
+
+
+def _gaps_by_ranks(
+    mdp: TabularMDP, solution: Solution | None, tie_tolerance: float | None, processes: int | str
+) -> Gaps:
+    """The gaps by several processes. Under MPI the first gets them, and the others None."""
+    size = processes if isinstance(processes, int) else 1
+    check_ranks(mdp.num_states, size)
+    has_solution, capacity = solution is not None, capacity_of(mdp, size)
+    if processes == "mpi":
+        has_solution = together(processes, lambda rank: _told_by_first(rank, has_solution), capacity)
+    if not has_solution:
+        _check_plain(mdp.horizon)
+        solution = solved(value_iteration, mdp, 1e-9, processes=processes)
+    warm(mdp)
+
+    def program(rank: Rank) -> Gaps | None:
+        ranks = RankedGaps(mdp, rank)
+        if rank.rank:
+            ranks.follow()
+            return None
+        optimal = optimal_solution(mdp, solution)
+        _check_plain(optimal.horizon)
+        is_plain = has_solution or tie_tolerance is not None
+        result = _summed(mdp, optimal, tie_tolerance, ranks) if is_plain else resolved_gaps(mdp, optimal, ranks=ranks)
+        ranks.end()
+        return result
+
+    return cast(Any, together(processes, program, capacity))
+
+
+def _check_plain(horizon: int | None) -> None:
+    if horizon is not None:
+        raise ParameterError(f"gaps: the horizon is {horizon}; several processes take none: expected processes=1")
+
+
+def _told_by_first(rank: Rank, value: bool) -> bool:
+    return bool(rank.broadcast(np.array([value]) if rank.rank == 0 else None, np.zeros(0, np.bool_))[0])
+
+
+def _summed(mdp: TabularMDP, solution: Solution, tie_tolerance: float | None, ranks: RankedGaps | None = None) -> Gaps:
+    error = _error(mdp, solution)
+    tolerance = _tolerance(solution, tie_tolerance, error)
+    rule = TieRule(tolerance, error, tie_tolerance is not None)
+    ties = UnresolvedTies(mdp, *rule)
+    if ranks is None:
+        added = GapSums()
+        for part in weighted_gaps(mdp, solution):
+            ties.look_at(part, *added.add(part, tolerance, error))
+        unresolved = ties.unresolved(weighted_gaps(mdp, solution))
+    else:
+        added, small, equal, alike = ranks.totals(solution, rule)
+        unresolved = ties.unresolved_of_ranges(small, equal, alike, weighted_gaps(mdp, solution))
+    return _gaps_of(mdp, solution, rule, added, ties.small, unresolved)
+
+
+def _gaps_of(mdp: TabularMDP, solution: Solution, rule: TieRule, added: GapSums, small: int, unresolved: int) -> Gaps:
+    total, low, high, regularized = added.sums[0].tolist()
+    count, bins = int(added.counts[0]), np.flatnonzero(added.histogram)
+    first, last = (int(bins[0]), int(bins[-1])) if bins.size else (0, -1)
+    return Gaps(
+        sum_of_reciprocals=total,
+        lower=low * (1 - _ROUNDING),
+        upper=high * (1 + _ROUNDING) if not unresolved else math.inf,
+        regularized=regularized,
+        minimal=added.minimal,
+        count=count,
+        ties=added.num_rows * mdp.num_actions - count,
+        unresolved=unresolved,
+        small=small,
+        histogram=added.histogram[first : last + 1].copy(),
+        edges=10.0 ** ((np.arange(first, last + 2) - kernels.BIN_OF_ONE) / 4),
+        tie_tolerance=rule.tolerance,
+        error=rule.error,
+        conventions=_conventions(mdp, solution, rule.tolerance),
+    )

@@ -1,0 +1,1 @@
+"""Distances under chance: expected hitting times with certificates, and diameters made of them."""

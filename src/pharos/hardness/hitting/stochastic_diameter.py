@@ -1,0 +1,289 @@
+"""Diameter under chance: for every target one stochastic shortest path problem, most of them only as far as bounds
+need.
+
+`hitting_times` bounds the hitting times of one target. This file chooses the targets. A target whose upper bound falls
+below the largest hitting time proven so far is dropped at once. Solved targets bound the others (`travel`), so that
+there is an interval whenever the budget ends. Where a look at each target would take longer than that, the target with
+the largest upper bound is always the next.
+"""
+
+import itertools
+import math
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from pharos.hardness.hitting.hitting_times import HittingTimes
+from pharos.hardness.hitting.travel import HubBounds
+from pharos.hardness.interval import BudgetClock, Interval, conventions_of
+from pharos.hardness.planning.expanded import ExpandedMDP, choices_of
+from pharos.mdp import TabularMDP
+from pharos.system.workers import usable_workers
+
+# Most targets that threads look at before they learn of a larger hitting time: a target may be looked at in vain that
+# often.
+BATCH = 64
+# Nodes times targets from which on one search for each target, to find the most promising, takes minutes.
+MANY = 10**9
+# Targets that are solved before it is judged whether their bounds rule out others.
+TRIAL = 16
+# Targets that each of the last `TRIAL` ones must have ruled out on average, or all of them half of those left; else
+# looking at the others one by one is quicker.
+RULED_OUT = 40
+# Nodes on the way to a target through which its bound is shortened, and one in how many targets, drawn by their
+# numbers: a few are bounded by long ways, and the others from these by short ones. 0: those of the largest bounds, as
+# many as of the long ways.
+WAYS = ((64, 1), (4096, 64), (1024, 16), (256, 1), (4096, 0))
+# Nodes there must be for each node on a way; the share that is left of the median and of the largest of the bounds
+# beyond which no more is tried; and times as long as the ways before take the next ones.
+NODES_EACH, TAKEN, LONGER = 8, 0.95, 5
+# Mixes the numbers of targets, neighbours among which are alike.
+_MIX = np.uint64(0x9E3779B97F4A7C15)
+# Targets that are solved before that, where there are too many for a look at each, or bounds are so many times apart.
+FIRST, APART = 3, 2.0
+# `crude_upper` is a product of up to N rounded factors.
+CRUDE = 1.01
+
+
+def stochastic_diameter(mdp: TabularMDP, restart: bool, tolerance: float, spending: BudgetClock) -> Interval:
+    """The diameter of an MDP with chance: exact up to `tolerance`, or the interval proven by budget and floats."""
+    choices = choices_of(mdp, restart)
+    conventions = {**conventions_of(mdp, restart), "nodes": len(choices.underlying), "sticky_pairs": mdp.is_sticky}
+    return _Diameter(mdp, restart, choices, tolerance, spending).interval(conventions)
+
+
+class _Diameter:
+    """Bounds of the largest hitting time of every target, tightened until none may exceed the largest that is proven.
+
+    Attributes:
+        upper: (targets,) of the largest hitting time of each; -inf where it is settled.
+        lower: the largest hitting time that is proven, of pairs that are surely connected.
+        settled_upper: the largest upper bound of settled targets.
+        limited: targets whose bounds are as close as floats allow, and no closer than the tolerance.
+    """
+
+    def __init__(self, mdp: TabularMDP, restart: bool, choices: ExpandedMDP, tolerance: float, spending: BudgetClock):
+        self.mdp, self.restart, self.choices = mdp, restart, choices
+        self.tolerance, self.spending = tolerance, spending
+        self.targets = HittingTimes(choices)
+        self.threads = [self.targets, *(self.targets.for_another_thread() for _ in range(usable_workers(None) - 1))]
+        has_nodes = np.diff(self.targets.edges) > 0
+        self.many = len(choices.underlying) * choices.num_targets > MANY
+        crude = math.inf if self.many else choices.crude_upper * CRUDE
+        self.upper = np.where(has_nodes, crude, -math.inf)
+        self.lower = self.settled_upper = 0.0
+        self.limited = 0
+        # States that cannot be reached at all are unreachable from all others.
+        self.unreachable = int(np.count_nonzero(~has_nodes)) * (choices.num_targets - 1)
+        self._travel: HubBounds | None = None
+        self._start: tuple[np.ndarray, np.ndarray] | None = None
+
+    def interval(self, conventions: dict[str, Any]) -> Interval:
+        """Look at targets until the bounds meet, or the budget ends."""
+        connected = self.choices.is_connected
+        with ThreadPoolExecutor(len(self.threads)) as pool:
+            if connected:
+                for batch in self._widest():
+                    self._look_at(batch, pool, bounding=True)
+            if not self.many:  # else, where not connected: it is infinite, and that is all that can be said
+                for batch in self._promising():
+                    self._look_at(batch, pool, bounding=False)
+        left = self._num_open
+        lower, upper = self.lower, self._upper()
+        exact = not left and math.isfinite(upper) and upper - lower <= 2 * self.tolerance * upper
+        note = "" if exact else self._why_not_exact(left)
+        if self.unreachable or not connected:
+            lower = upper = math.inf
+            exact = not left
+            note = note if left else ""
+        self.spending.report(lower, upper, left, now=True)
+        return Interval(
+            lower,
+            upper,
+            exact,
+            unreachable_pairs=int(self.unreachable),
+            finite_part=self.lower,
+            counted=not left,
+            tolerance=self.tolerance,
+            searches=self.spending.searches,
+            method="a stochastic shortest path problem for each target, bounds from residuals",
+            conventions=conventions,
+            note=note,
+            seconds=self.spending.seconds,
+        )
+
+    def _why_not_exact(self, left: int) -> str:
+        if left:
+            return f"budget spent: {left} of {self.choices.num_targets} targets may have a larger hitting time"
+        if self.limited:
+            return f"hitting times are so large that 64-bit floats prove no closer bounds of {self.limited} targets"
+        return "budget spent before the bounds of the last targets met"
+
+    @property
+    def _num_open(self) -> int:
+        return int(np.count_nonzero(self.upper > -math.inf))
+
+    def _upper(self) -> float:
+        return float(max(self.settled_upper, self.lower, self.upper.max()))
+
+    def _promising(self) -> Iterator[list[int]]:
+        """Batches of open targets, the farthest from some node first; they grow, as one makes a guess for the next."""
+        order = [int(target) for target in _by_promise(self.targets, self.upper > -math.inf, self.spending)]
+        size = 1
+        while order and not self.spending.is_over:
+            order = [target for target in order if self.upper[target] > -math.inf]
+            left = self.spending.budget.searches - self.spending.searches
+            batch, order = order[: int(min(size, left))], order[int(min(size, left)) :]
+            if batch:
+                yield batch
+            size = min(2 * size, BATCH)
+
+    def _widest(self) -> Iterator[list[int]]:
+        """A start state, then the targets of the largest upper bounds, two at once, as long as this rules out others.
+
+        Where there are too many targets for a look at each, to the end of the budget.
+        """
+        batch = [int(self.choices.underlying[self.choices.starts[0][0]])]
+        apart = self.choices.num_targets // 64 + 1
+        trial, left_before = TRIAL, self._num_open
+        while batch and not self.spending.is_over:
+            yield batch
+            if self.spending.searches >= FIRST and (self.many or self._upper() > APART * self.lower):
+                self._shorten()
+            if not self.many and self.spending.searches >= trial:
+                if left_before - self._num_open < min(RULED_OUT * TRIAL, left_before / 2):
+                    self._shorten()
+                    return
+                trial, left_before = self.spending.searches + TRIAL, self._num_open
+            widest = int(self.upper.argmax())
+            others = self.upper.copy()
+            others[max(0, widest - apart) : widest + apart] = -math.inf  # neighbours bound each other
+            left = self.spending.budget.searches - self.spending.searches
+            batch = [each for each in (widest, int(others.argmax())) if self.upper[each] > -math.inf]
+            batch = list(dict.fromkeys(batch))[: int(min(2, left))]
+
+    def _look_at(self, batch: list[int], pool: ThreadPoolExecutor, bounding: bool) -> None:
+        """Solve the targets of a batch, in threads. What a target must exceed is the same for all of a batch.
+
+        So results do not depend on the number of threads. `bounding`: their hitting times bound those of other targets.
+        """
+        threads = self.threads
+        scaling = bounding or not self.spending.searches
+        task = (self.tolerance, self.lower, self.spending, scaling, bounding)
+        looks = [
+            pool.submit(_look, own, part, *task) for i, own in enumerate(threads) if (part := batch[i :: len(threads)])
+        ]
+        for look in itertools.chain.from_iterable(look.result() for look in looks):
+            if scaling and look.lower >= self.lower:
+                self.targets.initial_scale = look.scale
+            self.lower = max(self.lower, look.lower)
+            self.settled_upper = max(self.settled_upper, min(look.upper, self.upper[look.target]))
+            self.limited += look.limited
+            self.unreachable += look.unreachable
+            self.upper[look.target] = -math.inf
+            if look.times is not None:
+                self._bound_others(look.target, look.times)
+        self.upper[self.upper <= self.lower] = -math.inf
+        self.spending.searches += len(batch)
+        for own in threads:
+            own.initial_scale = self.targets.initial_scale
+        self.spending.report(self.lower, self._upper(), self._num_open)
+
+    def _bound_others(self, hub: int, times: np.ndarray) -> None:
+        """Bound all targets by upper bounds (nodes,) of the hitting times of a solved one."""
+        is_first = self._travel is None  # of the start, to which all that fails comes back
+        if self._travel is None:
+            self._travel = HubBounds(self.mdp, self.restart)
+        by_state = np.zeros(self.choices.num_targets)
+        np.maximum.at(by_state, self.choices.underlying, times)
+        away = self._travel.times_from(hub, by_state)
+        if is_first:
+            self._start = by_state, away
+        np.minimum(self.upper, float(by_state.max()) + away, out=self.upper)
+
+    def _shorten(self) -> None:
+        """Shorten the bounds by way of the start, once, as long as this narrows them."""
+        if self._start is None or self._travel is None:
+            return
+        (times, away), self._start = self._start, None
+        for shorter in shortened(self._travel, times, away, self.spending):
+            np.minimum(self.upper, float(times.max()) + shorter, out=self.upper)
+            self.upper[self.upper <= self.lower] = -math.inf
+            self.spending.report(self.lower, self._upper(), self._num_open)
+
+
+def shortened(travel: HubBounds, times: np.ndarray, away: np.ndarray, spending: BudgetClock) -> Iterator[np.ndarray]:
+    """Bounds of the times from a hub to each target, ever shorter, while this helps and the budget allows for more.
+
+    times, away: (targets,) upper bounds of the expected steps to the hub, and from it.
+    """
+    count = len(away)
+    drawn = np.argsort(np.arange(count, dtype=np.uint64) * _MIX, kind="stable")
+    for size, every in WAYS:
+        if size * NODES_EACH > count:
+            continue
+        began, long = spending.seconds, count // WAYS[1][1]
+        targets = np.sort(drawn[: count // every]) if every else np.argpartition(away, count - long)[count - long :]
+        before, away = away, travel.shortened(times, away, targets, size, lambda: spending.is_over)
+        yield away
+        if spending.is_over or LONGER * (spending.seconds - began) > spending.budget.seconds - spending.seconds:
+            return
+        if size > WAYS[0][0] and all(f(away[targets]) > TAKEN * f(before[targets]) for f in (np.median, np.max)):
+            return
+
+
+@dataclass
+class _Look:
+    """What is known of a target: bounds of its largest hitting time, and how many states do not surely reach it.
+
+    Attributes:
+        limited: whether floats allow no closer bounds.
+        scale: 99th percentile of hitting time divided by distance.
+        times: (nodes,) upper bounds of the hitting times, where other targets are to be bounded.
+    """
+
+    target: int
+    lower: float
+    upper: float
+    limited: bool
+    unreachable: int
+    scale: float
+    times: np.ndarray | None
+
+
+def _look(
+    targets: HittingTimes,
+    some: Sequence[int],
+    tolerance: float,
+    enough: float,
+    spending: BudgetClock,
+    scaling: bool,
+    bounding: bool,
+) -> list[_Look]:
+    """Solve each of `some`; one with an upper bound of at most `enough` no further than that."""
+    looks = []
+    for target in some:
+        j, count, lost = targets.open(target)
+        missing = 0 if lost is None else np.unique(targets.choices.underlying[lost]).size
+        bounds = targets.solve(j, count, tolerance, enough, spending)
+        times = j * bounds.high if bounding and lost is None and math.isfinite(bounds.high) else None
+        limited = bounds.limited and not bounds.meets(tolerance)
+        scale = targets.scale_of(j) if scaling else 1.0
+        looks.append(_Look(target, max(bounds.lower, targets.least), bounds.upper, limited, missing, scale, times))
+    return looks
+
+
+def _by_promise(targets: HittingTimes, wanted: np.ndarray, spending: BudgetClock) -> np.ndarray:
+    """The targets wanted, those first that are farthest from some node: a large hitting time, early, rules out
+    others."""
+    promise = np.zeros(len(wanted))
+    for target in np.flatnonzero(wanted):
+        if spending.is_over:
+            break
+        count = targets.distances(int(target))
+        promise[target] = targets.distance[targets.order[count - 1]] if count else 0
+    order = np.argsort(-promise, kind="stable")
+    return order[wanted[order]]

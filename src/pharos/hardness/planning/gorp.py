@@ -1,0 +1,291 @@
+"""Greedy over random policy (GORP), and how many samples it needs.
+
+Source: Laidlaw, Russell and Dragan (2023), appendix C.
+
+In round t, GORP plays each sequence of k actions m times, goes on at random to the end of the episode, and takes the
+first action of the sequence with the best mean return. H_k = k + log_A m, where m makes it fail with probability at
+most 1/2.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from pharos.errors import ParameterError, UndefinedMeasure
+from pharos.hardness.planning.gorp_tails import Tails, knapsack, sequences_of
+from pharos.hardness.planning.return_distribution import central_moments
+from pharos.hardness.planning.steps import TIE, FiniteHorizonValues, check_returns, steps_of
+from pharos.mdp import TabularMDP, require_mdp
+from pharos.system.wording import many
+
+METHODS = ("binomial", "berry_esseen", "bernstein", "bennett", "exact")
+MOST_SAMPLES = 10**100
+
+
+@dataclass(frozen=True)
+class GorpBound:
+    """How many samples GORP needs.
+
+    Attributes:
+        value: the effective horizon by this bound, the smallest H_k; infinite where no number of samples is proven to
+            do.
+        ks, ms, values: k, the samples m for each sequence, and H_k = k + log_A m; m is None where H_k is infinite.
+        failure_probabilities: the bound on the probability of failure at m, at most 1/2.
+        proven: whether every method is proven. `binomial` is not, where all returns of a node may be 0 at once.
+        conventions: horizon, methods, precision of m, tie tolerance.
+    """
+
+    value: float
+    ks: list[int]
+    ms: list[int | None]
+    values: list[float]
+    failure_probabilities: list[float]
+    proven: bool
+    conventions: dict[str, Any] = field(default_factory=dict)
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able; infinite values are None."""
+        finite = [value if math.isfinite(value) else None for value in (self.value, *self.values)]
+        return {
+            "value": finite[0],
+            "ks": self.ks,
+            "ms": self.ms,
+            "values": finite[1:],
+            "failure_probabilities": self.failure_probabilities,
+            "proven": self.proven,
+            **self.conventions,
+        }
+
+    def __str__(self) -> str:
+        return f"{self.value:.6g} (m = {', '.join('infinite' if m is None else f'{m:,}' for m in self.ms)})"
+
+
+@require_mdp
+def gorp_bound(
+    mdp: TabularMDP, *, horizon: int | None = None, max_k: int = 1, methods: Sequence[str] = METHODS[:4]
+) -> GorpBound:
+    """Return a bound on the samples that GORP needs to act optimally through an episode with probability 1/2.
+
+        F_t(s) = max over p of sum_sequences p(sequence) f(first action),  low <= p <= high,  sum p = 1
+        f(a) = 1 where a is not optimal in (t, s), else F_{t+1}(next state),  F_T of an optimal action 0
+
+    [low, high] encloses the probability that a sequence has the best mean of m samples. Of all methods the smallest F
+    counts, node by node. The maximum is a fractional knapsack: the largest f first. m is found by bisection, to 1 %.
+
+    Args:
+        horizon: T; None: that of the MDP.
+        max_k: k = 1, ..., max_k are tried.
+        methods: of `binomial` (as BRIDGE has it: k = 1, returns 0 or R, m up to 10^6; 100 cells by quantiles, without
+            the outcome that all samples are 0, which is given to every sequence only in so far as the bounds do not add
+            up to 1), `berry_esseen` (with the moments of the return distribution) and `bernstein`, both for up to 100
+            sequences, `bennett`; `exact` (returns 0 or R, any k, m up to 10^6: the probabilities themselves).
+            The first four are BRIDGE's, and the default. With `exact` instead of `binomial` the bound is proven, and
+            far smaller.
+    Raises:
+        UndefinedMeasure: the MDP has chance or several outcomes: GORP's sequences of actions then lead nowhere in
+            particular.
+        ParameterError: an option is wrong. PrecisionError: returns may pass 1e150.
+    Cost: for each of about 15 values of m a pass over the nodes that optimal play can meet, A^2k 100 tails for each.
+        KeyCorridor (168 states, T = 100, k = 1) takes 20 s; only `exact` and `bennett` 4 s.
+    Source: Laidlaw, Russell and Dragan (2023), "Bridging RL theory and practice with the effective horizon", appendix
+        C.
+    """
+    steps, names = steps_of("gorp_bound", mdp, horizon), tuple(methods)
+    check_returns("gorp_bound", mdp, steps)
+    if isinstance(max_k, bool) or not isinstance(max_k, int | np.integer) or max_k < 1:
+        raise ParameterError(f"max_k is {max_k!r}; expected a whole number, at least 1")
+    for name in names:
+        if name not in METHODS:
+            raise ParameterError(f"unknown method {name!r}; expected some of {', '.join(METHODS)}")
+    if not names:
+        raise ParameterError(f"no methods given; expected some of {', '.join(METHODS)}")
+    _needs_one_outcome("gorp_bound", mdp)
+    search = Search(mdp, steps, names)
+    ms: list[int | None] = []
+    values: list[float] = []
+    failures: list[float] = []
+    for k in range(1, int(max_k) + 1):
+        samples, failure = search.samples(k)
+        ms.append(samples)
+        failures.append(failure)
+        if samples is None:
+            values.append(math.inf)
+        else:
+            values.append(k + (math.log(samples) / math.log(mdp.num_actions) if mdp.num_actions > 1 else 0.0))
+    return GorpBound(
+        min(values),
+        list(range(1, int(max_k) + 1)),
+        ms,
+        values,
+        failures,
+        proven="binomial" not in names or not search.two_valued,
+        conventions={"horizon": steps, "methods": list(names), "precision": 0.01, "tie_tolerance": TIE},
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class GorpRuns:
+    """What GORP did, once for each run.
+
+    Attributes:
+        returns: (runs,) float64, the return of the sequence of actions that was found (its expectation under chance).
+        actions: (runs, T) int64.
+        optimal_return: of the MDP, from its start.
+        timesteps: steps that one run simulates at most: T^2 A^k m.
+    """
+
+    returns: np.ndarray
+    actions: np.ndarray
+    optimal_return: float
+    timesteps: int
+
+    @property
+    def success_rate(self) -> float:
+        """The fraction of runs that found an optimal sequence."""
+        return float((self.returns >= self.optimal_return - TIE).mean())
+
+    def to_dict(self) -> dict[str, Any]:
+        """A summary, JSON-able."""
+        return {
+            "runs": len(self.returns),
+            "mean_return": float(self.returns.mean()),
+            "optimal_return": self.optimal_return,
+            "success_rate": self.success_rate,
+            "timesteps": self.timesteps,
+        }
+
+    def __str__(self) -> str:
+        return (
+            f"{self.success_rate:.3g} of {many(len(self.returns), 'run')} optimal, {many(self.timesteps, 'step')} each"
+        )
+
+
+@require_mdp
+def run_gorp(
+    mdp: TabularMDP, *, k: int = 1, m: int = 1, horizon: int | None = None, runs: int = 1, seed: int = 0
+) -> GorpRuns:
+    """Run GORP: find a sequence of T actions, one a round, by m random completions of each sequence of k actions.
+
+    Ties between means go to the first sequence, in the order of its actions.
+
+    Args:
+        k: actions that are tried before play becomes random.
+        m: samples of each of the A^k sequences.
+        horizon: T; None: that of the MDP.
+        runs: repetitions, each with random numbers of its own.
+        seed: of the random numbers.
+    Raises:
+        UndefinedMeasure: the MDP has chance, several outcomes or several start states.
+        ParameterError: an option is wrong.
+    Cost: T^2 / 2 vector operations over A^k m completions for each run: KeyCorridor (T = 100) with m = 50 takes 0.1 s.
+    Source: Laidlaw, Russell and Dragan (2023), algorithm 1.
+    """
+    steps = steps_of("run_gorp", mdp, horizon)
+    for name, value in (("k", k), ("m", m), ("runs", runs)):
+        if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
+            raise ParameterError(f"{name} is {value!r}; expected a whole number, at least 1")
+    _needs_one_outcome("run_gorp", mdp)
+    tree = FiniteHorizonValues(mdp, steps)
+    if len(tree.starts) != 1:
+        raise UndefinedMeasure(f"run_gorp: there are {len(tree.starts)} start states; GORP plans from one")
+    assert tree.table is not None
+    start = tree.starts[0][0]
+    sequences = sequences_of(mdp.num_actions, int(k))
+    actions = np.empty((int(runs), steps), np.int64)
+    returns = np.zeros(int(runs))
+    for run, generator in enumerate(np.random.default_rng(seed).spawn(int(runs))):
+        node = start
+        for t in range(steps):
+            total = _completions(tree, node, t, sequences, int(m), generator)
+            best = sequences[int(total.reshape(len(sequences), int(m)).mean(axis=1).argmax()), 0]
+            actions[run, t] = best
+            returns[run] += tree.rewards[node, best]
+            node = tree.table[node, best]
+    optimal = tree.at_start(tree.best.max(axis=2)[0])
+    return GorpRuns(returns, actions, optimal, steps**2 * len(sequences) * int(m))
+
+
+def _completions(
+    tree: FiniteHorizonValues, node: int, t: int, sequences: np.ndarray, m: int, generator: np.random.Generator
+) -> np.ndarray:
+    """(A^k m,): the returns from step t of each sequence m times, continued at random."""
+    assert tree.table is not None
+    nodes = np.full(len(sequences) * m, node)
+    total = np.zeros(len(nodes))
+    for i in range(tree.steps - t):
+        if i < sequences.shape[1]:
+            actions = np.repeat(sequences[:, i], m)
+        else:
+            actions = generator.integers(tree.num_actions, size=len(nodes))
+        total += tree.rewards[nodes, actions]
+        nodes = tree.table[nodes, actions]
+    return total
+
+
+def _needs_one_outcome(name: str, mdp: TabularMDP) -> None:
+    if not mdp.is_deterministic:
+        raise UndefinedMeasure(f"{name} is defined for deterministic MDPs: {mdp} has chance; take the MDP without it")
+
+
+class Search:
+    """The smallest m, to 1 %, that is proven to make GORP fail with probability 1/2 at most."""
+
+    def __init__(self, mdp: TabularMDP, steps: int, methods: tuple[str, ...]):
+        self.tree, self.methods = FiniteHorizonValues(mdp, steps), methods
+        assert self.tree.table is not None
+        self.nodes_at = [self.tree.first]
+        for t in range(steps - 1):
+            self.nodes_at.append(self.tree.following(self.nodes_at[-1], self.tree.optimal[t]))
+        most = float(self.tree.best.max())
+        rewards = self.tree.rewards
+        self.two_valued = most > 0 and bool(((rewards == 0) | (rewards == most)).all())
+        self.scale = most if self.two_valued else 1.0
+        self.moments = None
+        if "berry_esseen" in methods:
+            self.moments = [each[:, self.tree.underlying] for each in central_moments(mdp, steps)]
+
+    def samples(self, k: int) -> tuple[int | None, float]:
+        if (self.tree.num_actions**k) > 10**6:
+            raise ParameterError(f"there are {self.tree.num_actions}^{k} sequences; take a smaller max_k")
+        most, least, failure = MOST_SAMPLES, 0, self.failure(MOST_SAMPLES, k)
+        if failure > 0.5:
+            return None, failure
+        while most > least + 1 and (most - least) > 0.01 * most:
+            m = math.isqrt(most * (least + 1))
+            if (now := self.failure(m, k)) <= 0.5:
+                most, failure = m, now
+            else:
+                least = m
+        return most, failure
+
+    def failure(self, m: int, k: int) -> float:
+        """The bound on the probability that GORP with m samples takes an action that is not optimal."""
+        tree = self.tree
+        assert tree.table is not None
+        after = np.zeros(tree.num_nodes)
+        for t in range(tree.steps - 1, -1, -1):
+            nodes = np.flatnonzero(self.nodes_at[t])
+            f = np.where(tree.optimal[t, nodes], after[tree.table[nodes]], 1.0)
+            now = np.zeros(tree.num_nodes)
+            now[nodes] = f.max(axis=1)
+            open_ = np.flatnonzero(f.max(axis=1) > f.min(axis=1))
+            for block in np.array_split(open_, max(1, len(open_) * tree.num_actions ** (2 * k) // 10**6)):
+                if len(block):
+                    now[nodes[block]] = self._worst_case(nodes[block], t, f[block], m, k)
+            after = now
+        return tree.at_start(after)
+
+    def _worst_case(self, nodes: np.ndarray, t: int, f: np.ndarray, m: int, k: int) -> np.ndarray:
+        """(n,): F_t of nodes, the smallest over all methods."""
+        tails = Tails(self, nodes, t, k)
+        each = np.repeat(f, tails.mean.shape[1] // f.shape[1], axis=1)
+        least, result = f.min(axis=1), f.max(axis=1)
+        for name in reversed(self.methods):  # the cheap ones first
+            todo = result - least > 1e-9
+            tail = getattr(tails, name)(m, todo) if todo.any() else None
+            if tail is not None:
+                result[todo] = np.minimum(result[todo], knapsack(tail[0], tail[1], each[todo]))
+        return result

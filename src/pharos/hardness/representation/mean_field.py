@@ -1,0 +1,330 @@
+"""Q-learning of a network in expectation: the learner behind `kernel_regret`."""
+
+import math
+from collections import deque
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from typing import Any, Generic, NamedTuple, TypeVar
+
+import numpy as np
+
+from pharos.errors import ParameterError, UndefinedMeasure
+from pharos.hardness.representation.kernel_operator import KernelOperator
+from pharos.hardness.representation.representation import Grouped
+from pharos.hardness.visitation.occupancy import Walk
+from pharos.mdp import TabularMDP
+from pharos.solvers import Solution, evaluate_policy, regret_scale, uniform_value, value_iteration
+
+TIES = 1e-6  # of the largest value of a state: actions that close are chosen alike
+MARGIN = 1.05  # of the largest eigenvalue, which is known to 0.1 %
+ACCURACY = 1e-5  # of values, as a share of what is between optimal and uniform play
+WORST_GREEDY, WORST_PLAYED = 1.5, 3.0  # a policy's regret counts no more than this
+
+
+@dataclass(frozen=True, kw_only=True)
+class Schedule:
+    """How the idealised learner learns.
+
+    Attributes:
+        steps: of the environment.
+        period: steps between copies of the target network; a phase.
+        gradient_steps: in a phase.
+        learning_starts: steps before the first gradient step.
+        exploration_initial_eps, exploration_final_eps, exploration_fraction: epsilon falls linearly from one to the
+            other over this share of the steps; before `learning_starts` it is 1.
+        gamma: the learner's own discount; that of values is the MDP's.
+        optimizer: "gradient", descent with the largest stable step; or "adam", the same with gradients rescaled as by
+            full-matrix Adam at the standard occupancy, see `KernelOperator.preconditioned`.
+    """
+
+    steps: int = 30_000
+    period: int = 250
+    gradient_steps: int = 62
+    learning_starts: int = 1000
+    exploration_initial_eps: float = 1.0
+    exploration_final_eps: float = 0.05
+    exploration_fraction: float = 0.3
+    gamma: float = 0.95
+    optimizer: str = "gradient"
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "period", "gradient_steps"):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
+                raise ParameterError(f"schedule: {name} is {value!r}; expected a whole number, at least 1")
+        if not self.learning_starts >= 0:
+            raise ParameterError(f"schedule: learning_starts is {self.learning_starts!r}; expected at least 0")
+        for name in ("exploration_initial_eps", "exploration_final_eps", "exploration_fraction", "gamma"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ParameterError(f"schedule: {name} is {getattr(self, name)!r}; expected a number in [0, 1]")
+
+        if self.optimizer not in ("gradient", "adam"):
+            raise ParameterError(f"schedule: optimizer is {self.optimizer!r}; expected gradient or adam")
+
+    def epsilon(self, step: int) -> float:
+        """The share of uniform actions at a step."""
+        first, last = self.exploration_initial_eps, self.exploration_final_eps
+        if step < self.learning_starts:
+            return 1.0
+        share = min(step / (self.exploration_fraction * self.steps), 1.0) if self.exploration_fraction else 1.0
+        return first + (last - first) * share
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rollouts:
+    """How the idealised actor-critic learns.
+
+    Attributes:
+        steps: of the environment in a rollout, after which policy and values learn.
+        gradient_steps: that they learn by.
+        gae_lambda: weight of longer returns, in returns and advantages.
+        clip_range: PPO's: how far the probability of an action moves, as a share of itself, before it is no longer
+            pushed further; None: without.
+    """
+
+    steps: int = 512
+    gradient_steps: int = 16
+    gae_lambda: float = 0.95
+    clip_range: float | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "gradient_steps"):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
+                raise ParameterError(f"rollouts: {name} is {value!r}; expected a whole number, at least 1")
+        if not 0 <= self.gae_lambda <= 1:
+            raise ParameterError(f"rollouts: gae_lambda is {self.gae_lambda!r}; expected a number in [0, 1]")
+        if self.clip_range is not None and not self.clip_range > 0:
+            raise ParameterError(f"rollouts: clip_range is {self.clip_range!r}; expected a number above 0, or None")
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able; without `clip_range` where there is none, as it was before there could be one."""
+        return {name: value for name, value in asdict(self).items() if value is not None}
+
+
+@dataclass(frozen=True, eq=False)
+class LearningCurve:
+    """What the idealised learner does in each of its J phases; regrets are normalised: 0 optimal, 1 uniform play.
+
+    Attributes:
+        steps: (J,) at the beginning of a phase.
+        greedy: (J,) regret of the greedy policy.
+        played: (J,) regret of what is played, exploration included.
+        episodes: (J,) expected episodes in a phase.
+    """
+
+    steps: np.ndarray
+    greedy: np.ndarray
+    played: np.ndarray
+    episodes: np.ndarray
+
+    @property
+    def mean_greedy(self) -> float:
+        """Mean over phases; a policy counts at most WORST_GREEDY."""
+        return float(np.minimum(self.greedy, WORST_GREEDY).mean())
+
+    @property
+    def mean_played(self) -> float:
+        """Mean over episodes; a policy counts at most WORST_PLAYED."""
+        return float(np.average(np.minimum(self.played, WORST_PLAYED), weights=self.episodes))
+
+    @property
+    def mean_evaluated(self) -> float:
+        """Mean over phases of what is played, as evaluations at equal distances see it; at most WORST_GREEDY each."""
+        return float(np.minimum(self.played, WORST_GREEDY).mean())
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able."""
+        return {name: np.round(values, 6).tolist() for name, values in vars(self).items()}
+
+
+class Learner:
+    """An MDP, and what learners on it have in common.
+
+    Attributes:
+        measure: what is said to be undefined, or estimated.
+        mdp: as given, without states that its horizon keeps out of reach.
+        numbers: (S,) of its states in the MDP as it was given.
+        states: (N,) those that an episode can meet and that are not terminal.
+    Raises:
+        UndefinedMeasure: uniform play is optimal, so that regret has no scale.
+    """
+
+    measure = "kernel_regret"
+
+    def __init__(self, mdp: TabularMDP, schedule: Schedule, episode: int, solution: Solution | None = None):
+        solution = solution or value_iteration(mdp)
+        uniform = uniform_value(mdp)
+        self.optimal = solution.value_at_start
+        error = solution.error_bound + uniform.error_bound
+        self.spread = regret_scale(self.optimal, uniform.value_at_start, error)
+        if math.isnan(self.spread):
+            raise UndefinedMeasure(f"{self.measure}: uniform play is optimal, so that there is no regret to speak of")
+        self.schedule, self.episode = schedule, episode
+        self.mdp, self.numbers = mdp, np.arange(mdp.num_states)
+        met = mdp.states_within(episode)
+        met[mdp.start_states] = True
+        if mdp.horizon is not None and mdp.horizon == episode and not met.all():
+            self.mdp, self.numbers = mdp.within(episode), np.flatnonzero(met)
+            met = np.ones(len(self.numbers), np.bool_)
+        self.states = np.flatnonzero(met & ~np.asarray(self.mdp.terminal))
+        self.visits = OfPolicies(lambda policy: visits_of(self.mdp, self.everywhere(policy), self.episode))
+        self.value = OfPolicies(self._value)
+
+    def curve(self, observations: Grouped, apply: KernelOperator) -> LearningCurve:
+        """Learn from observations, the groups of states that look alike, with a kernel over them."""
+        schedule, actions = self.schedule, self.mdp.num_actions
+        values = np.zeros((len(observations), actions))
+        memory = Memory(self.mdp, self.states)
+        vector = np.full((len(observations), 1), len(observations) ** -0.5)
+        rows = []
+        for step in range(0, schedule.steps, schedule.period):
+            period, epsilon = min(schedule.period, schedule.steps - step), schedule.epsilon(step)
+            greedy = greedy_policy(values)[observations.groups]
+            policy = (1 - epsilon) * greedy + epsilon / actions
+            played, length = memory.play(self.visits(policy), policy, period)
+            played = played if self.is_return else self.value(policy)
+            rows.append((step, self.regret(self.value(greedy)), self.regret(played), period / length))
+            if step < schedule.learning_starts:
+                continue
+            q = values[observations.groups]
+            target, visits = memory.targets(q.max(axis=1), schedule.gamma)
+            weights = observations.sums(visits / visits.sum())
+            total = observations.sums(visits / visits.sum() * target)
+            error = np.divide(total, weights, out=values.copy(), where=weights > 0) - values
+            values += self.learnt(apply, weights, error, vector)
+        return LearningCurve(*(np.array(column) for column in zip(*rows, strict=True)))
+
+    def learnt(self, apply: KernelOperator, weights: np.ndarray, error: np.ndarray, vector: np.ndarray) -> np.ndarray:
+        """(C, A): what the gradient steps of a phase add; see `descent`."""
+        return descent(apply, weights, error, vector, self.schedule.gradient_steps)
+
+    @property
+    def is_return(self) -> bool:
+        """Whether a value is the expected return of an episode, so that walks tell it."""
+        return self.mdp.gamma == 1.0 and self.mdp.horizon == self.episode
+
+    def regret(self, value: float) -> float:
+        """Normalised, of a policy's value."""
+        return (self.optimal - value) / self.spread
+
+    def _value(self, policy: np.ndarray) -> float:
+        """Of a policy (N, A) of the states, at the start."""
+        if self.is_return:
+            return float((self.visits(policy).executed * self.mdp.rewards).sum())
+        if policy.max(axis=1).min() == 1.0:
+            actions = np.zeros(self.mdp.num_states, np.int64)
+            actions[self.states] = policy.argmax(axis=1)
+            return evaluate_policy(self.mdp, actions, ACCURACY * self.spread).value_at_start
+        return evaluate_policy(self.mdp, self.everywhere(policy), ACCURACY * self.spread).value_at_start
+
+    def everywhere(self, policy: np.ndarray) -> np.ndarray:
+        """(S, A), uniform where nobody acts."""
+        table = np.full((self.mdp.num_states, self.mdp.num_actions), 1 / self.mdp.num_actions)
+        table[self.states] = policy
+        return table
+
+
+def descent(
+    apply: KernelOperator, weights: np.ndarray, error: np.ndarray, vector: np.ndarray, steps: int
+) -> np.ndarray:
+    """(C, A): what `steps` gradient steps of the largest stable size add to values whose error is (C, A).
+
+    Args:
+        weights: (C, A), of the squared errors. vector: (C, 1), the last phase's eigenvector; replaced.
+    """
+    largest = apply.largest_eigenvalue(weights.max(axis=1, keepdims=True), vector)
+    before = float((weights * error**2).sum())
+    while largest > 0 and before > 0:
+        with np.errstate(over="ignore", invalid="ignore"):  # where the eigenvalue was far too small
+            added = apply.descended(weights, error, 1 / (MARGIN * largest), steps)
+            after = float((weights * (error - added) ** 2).sum())
+        if after <= 1.001 * before:  # no step of a stable size makes it larger
+            return added
+        largest *= 1.1
+    return np.zeros_like(error)
+
+
+class Memory:
+    """Expected visits so far, by state, previously executed action and chosen action: the replay buffer."""
+
+    def __init__(self, mdp: TabularMDP, states: np.ndarray):
+        self.mdp, self.states = mdp, states
+        shape = (len(states), mdp.num_actions)
+        self.first = np.zeros(shape)  # the first steps of episodes
+        self.later = np.zeros((shape[0], mdp.width, shape[1]))
+        self.rewards = np.asarray(mdp.reward_table.rows(states), np.float64)
+
+    def play(self, visits: "Visits", policy: np.ndarray, period: int) -> tuple[float, float]:
+        """Add `period` steps of a policy (N, A), by its visits. Returns (expected return, expected steps) of an
+        episode."""
+        length = float(visits.executed.sum())
+        scale, later = period / length, visits.later[self.states]
+        if self.mdp.is_sticky:
+            self.first += scale * visits.first[self.states, None] * policy
+        else:
+            later[:, 0] += visits.first[self.states]
+        self.later += scale * later[:, :, None] * policy[:, None]
+        return float((visits.executed[self.states] * self.rewards).sum()), length
+
+    def targets(self, v: np.ndarray, gamma: float) -> tuple[np.ndarray, np.ndarray]:
+        """((N, A), (N, A)): the mean target of each choice, by the values v (N,) of states; and its visits."""
+        chance, x = self.mdp.chance, np.zeros(self.mdp.num_states + 1)
+        x[self.states] = v
+        q = self.rewards + gamma * self.mdp.dynamics.expected(x, self.states)
+        later = self.later.sum(axis=1)
+        if not self.mdp.is_sticky:
+            return chance.chosen_values(q), later
+        mean, visits = q.mean(axis=1, keepdims=True), self.first + later
+        chosen = chance.first_chosen * self.first + chance.chosen * later
+        uniform = chance.first_uniform * self.first + chance.uniform * later
+        total = chosen * q + uniform * mean + chance.previous * np.einsum("sba,sb->sa", self.later, q)
+        return np.divide(total, visits, out=q.copy(), where=visits > 0), visits
+
+
+class Visits(NamedTuple):
+    """Expected visits in an episode: first (S,), of the first step; later (S, W), by the previously executed action;
+    executed (S, A), of all steps by what is executed."""
+
+    first: np.ndarray
+    later: np.ndarray
+    executed: np.ndarray
+
+
+Answer = TypeVar("Answer")
+
+
+class OfPolicies(Generic[Answer]):
+    """A function of policies that knows its last answers: what is learnt settles, and is asked about again."""
+
+    def __init__(self, function: Callable[[np.ndarray], Answer], last: int = 4):
+        self.function, self.known = function, deque[tuple[np.ndarray, Answer]](maxlen=last)
+
+    def __call__(self, policy: np.ndarray) -> Answer:
+        place = next((i for i, (other, _) in enumerate(self.known) if np.array_equal(other, policy)), None)
+        answer = self.function(policy) if place is None else self.known[place][1]
+        if place is not None:
+            del self.known[place]
+        self.known.append((policy, answer))
+        return answer
+
+
+def visits_of(mdp: TabularMDP, policy: np.ndarray, episode: int) -> Visits:
+    """The visits of a policy (S, A) in an episode of some steps, without terminal states."""
+    walk = Walk(mdp, policy, episode)
+    first, later = np.zeros(mdp.num_states), np.zeros((mdp.num_states, mdp.width))
+    for nodes, alive in walk.distributions():
+        if alive <= 1e-12:
+            break
+        if nodes.first:
+            first += nodes.mass[:, 0]
+        else:
+            later += nodes.mass
+    first[~walk.live] = later[~walk.live] = 0.0
+    return Visits(first, later, walk.executed(first, later))
+
+
+def greedy_policy(values: np.ndarray) -> np.ndarray:
+    """(C, A) probabilities: the best action, or all that are as good up to rounding alike."""
+    best = values >= (values.max(axis=1) - TIES * np.abs(values).max(axis=1))[:, None]
+    return best / best.sum(axis=1, keepdims=True)

@@ -1,0 +1,1 @@
+"""Where policies go and how long that takes: occupancy, covering, mixing, exploration."""

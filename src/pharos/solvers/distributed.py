@@ -1,0 +1,92 @@
+"""Solving that several processes share: who takes part, and the Solution that comes of it."""
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+
+from pharos.errors import ParameterError
+from pharos.mdp import Part, Selection, TabularMDP
+from pharos.ranks import Rank, check_number, check_ranks, together
+from pharos.solvers.checkpoint import SECONDS, Checkpoint
+from pharos.solvers.fixed_point import Backup
+from pharos.solvers.ranked import RankedBackup, capacity_of, ranked_fixed_point, ranked_induction
+from pharos.solvers.solution import Solution
+from pharos.system.compiling import Stopwatch
+
+
+@dataclass(frozen=True)
+class DistributedOptions:
+    """Who sweeps, and how.
+
+    Attributes:
+        processes: of this machine; or "mpi": those that `mpiexec` has started, all of which make the call.
+        jacobi: whether sweeps are not in place.
+        checkpoint: a folder for the values so far; None to keep none.
+        checkpoint_seconds: between two of them.
+    """
+
+    processes: int | str = 1
+    jacobi: bool = False
+    checkpoint: str | os.PathLike | None = None
+    checkpoint_seconds: float = SECONDS
+
+    def __post_init__(self) -> None:
+        check_number(self.processes)
+
+    @property
+    def is_wanted(self) -> bool:
+        """Whether this is anything else than one process as ever."""
+        return self.processes != 1 or self.jacobi or self.checkpoint is not None
+
+
+def shared_solution(
+    mdp: TabularMDP,
+    select: Selection,
+    tolerance: float,
+    horizon: int | None,
+    sharing: DistributedOptions,
+    progress: Callable[[int, float], None] | None = None,
+) -> Solution:
+    """The values of what is chosen, by several processes. Under MPI the first gets them, and the others None."""
+    watch = Stopwatch()
+    processes = sharing.processes
+    if processes != "mpi":
+        check_ranks(mdp.num_states, int(processes))
+    _warm(mdp, select, sharing.jacobi or horizon is not None)
+    folder = None if sharing.checkpoint is None else Path(sharing.checkpoint)
+    if folder is not None and folder.exists() and not folder.is_dir():
+        raise ParameterError(f"checkpoint {folder}: is a file; expected a folder")
+
+    def program(rank: Rank) -> tuple[float, int, np.ndarray, np.ndarray] | None:
+        what = f"{mdp.gamma!r} {mdp.chance} horizon {horizon}"
+        checkpoint = Checkpoint(folder, what, sharing.checkpoint_seconds)
+        backup = RankedBackup(mdp, select, rank)
+        if horizon is None:
+            bound, sweeps = ranked_fixed_point(backup, tolerance, sharing.jacobi, checkpoint, progress)
+            following = x = backup.gathered(backup.x)
+        else:
+            sweeps = horizon
+            bound, before = ranked_induction(backup, horizon, checkpoint, progress)
+            x, following = backup.gathered(backup.x), backup.gathered(before)
+        checkpoint.finish(backup)
+        return None if x is None or following is None else (bound, sweeps, x, following)
+
+    answer = together(processes, program, capacity_of(mdp, processes if isinstance(processes, int) else 1))
+    if answer is None:
+        return cast(Any, None)
+    bound, sweeps, x, following = answer
+    return Solution(mdp, bound, sweeps, watch.seconds, horizon, select, x, following)
+
+
+def _warm(mdp: TabularMDP, select: Selection, is_plain: bool) -> None:
+    """Compile what ranks run, once, before they are forked."""
+    part = Part.of(mdp, 0, min(mdp.num_states, 2))
+    backup, x = Backup(part, part.selection(select)), part.zeros()
+    if is_plain:
+        part.dynamics.backup(backup.equation, x, np.empty_like(x), np.array([[0, len(part)]]))
+    else:
+        backup.sweep(x)

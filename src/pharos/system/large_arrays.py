@@ -1,0 +1,137 @@
+"""Arrays in reserved address space: memory is taken as they are written, in huge pages, and never copied to grow.
+
+And arrays that may be larger than memory: mapped files, of which the system keeps in memory what is used.
+"""
+
+import contextlib
+import math
+import mmap
+import os
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from pharos.errors import DiskFull
+from pharos.system import memory as machine
+from pharos.system import paths
+from pharos.system.packed_indices import PackedIndices
+
+# Bytes that are always taken from memory; beyond them, the share of what is free that one array may take.
+SMALL, SHARE = 1 << 26, 4
+_BLOCK = 1 << 24
+# Rows of a mapped array that are swept while the next ones are read.
+RANGE = 1 << 22
+# Advice of Linux 5.4 that Python has no name for: these pages may go first.
+_COLD = 20
+
+
+def reserved_states(num_words: int) -> np.ndarray:
+    """(rows, W) uint64, zeros."""
+    for rows in (1 << 32, 1 << 30, 1 << 28, 1 << 26):
+        try:
+            return huge_pages(rows * num_words, np.dtype("<u8")).reshape(-1, num_words)
+        except (OSError, ValueError):
+            continue
+    raise MemoryError("no address space for 2^26 states; set a larger ulimit -v")
+
+
+def reserved_table() -> np.ndarray:
+    """Bytes in which the table grows; an empty array where there is no address space."""
+    for size in (1 << 35, 1 << 33, 1 << 31):
+        with contextlib.suppress(OSError, ValueError):
+            return huge_pages(size, np.dtype("|u1"))
+    return np.empty(0, np.uint8)
+
+
+def huge_pages(length: int, dtype: np.dtype) -> np.ndarray:
+    """An array of zeros in huge pages, where the system has them."""
+    if not hasattr(mmap, "MAP_PRIVATE"):
+        return np.zeros(min(length, 1 << 28), dtype)
+    no_reserve = 0x4000 if sys.platform == "linux" else 0  # MAP_NORESERVE, which Python names from 3.13 on
+    flags = mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS | no_reserve
+    memory = mmap.mmap(-1, length * dtype.itemsize, flags=flags)
+    if hasattr(mmap, "MADV_HUGEPAGE"):
+        with contextlib.suppress(OSError):
+            memory.madvise(mmap.MADV_HUGEPAGE)
+    return np.frombuffer(memory, dtype)
+
+
+def large_zeros(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
+    """An array of zeros: in memory, or, where it would take more than a quarter of what is free, a mapped file.
+
+    The file is in the cache's folder and has no name: it is gone with the array, whatever becomes of the process. What
+    is read and written in order, or near to where it was before, costs little more there than in memory.
+
+    Raises:
+        DiskFull: the file cannot be written.
+    """
+    dtype = np.dtype(dtype)
+    size = math.prod(shape) * dtype.itemsize
+    if size <= SMALL or size <= machine.available_memory() // SHARE:
+        return np.zeros(shape, dtype)
+    folder = paths.cache_directory()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        return np.frombuffer(mapped_file(folder, size), dtype).reshape(shape)
+    except OSError as error:
+        raise DiskFull(
+            f"{folder}: {size / 2**30:.1f} GiB of scratch, which memory has no room for: {error.strerror}; "
+            "free room on the disk, or set PHAROS_CACHE_DIR to a folder on another one"
+        ) from error
+
+
+def mapped_file(folder: Path, size: int) -> mmap.mmap:
+    """A file of zeros without a name, its room on the disk taken: a mapped file that finds the disk full when it is
+    written kills the process. OSError where that room is missing.
+    """
+    with tempfile.TemporaryFile(dir=folder) as file:
+        append_zeros(file, size)
+        return mmap.mmap(file.fileno(), size)
+
+
+def append_zeros(file: BinaryIO, size: int) -> None:
+    """Append so many zero bytes to what was written, their room on the disk taken. OSError where it cannot be."""
+    file.flush()
+    if hasattr(os, "posix_fallocate"):
+        os.posix_fallocate(file.fileno(), file.tell(), size)
+    else:
+        for start in range(0, size, _BLOCK):
+            file.write(bytes(min(_BLOCK, size - start)))
+        file.flush()
+
+
+def ranges_from_the_end(rows: Any, low: int, high: int) -> Iterator[tuple[int, int]]:
+    """Ranges [start, stop) that make up [low, high), the last one first: how rows are swept from the last to the first.
+
+    Rows in memory are one range. Of a mapped array, `RANGE` rows are swept while the system reads those before them: it
+    finds out by itself what is read from the first byte to the last, but not what is read the other way round. Where
+    the rows fill memory, those that were swept go before anything else: values, which may be mapped as well, are needed
+    all the time.
+    """
+    rows = rows.packed if isinstance(rows, PackedIndices) else rows
+    if not isinstance(rows, np.memmap):
+        yield low, high
+        return
+    fills_memory = 2 * rows.nbytes > machine.available_memory()
+    for stop in range(high, low, -RANGE):
+        start = max(stop - RANGE, low)
+        _advise(rows, max(start - RANGE, low), start, getattr(mmap, "MADV_WILLNEED", None))
+        yield start, stop
+        if fills_memory and sys.platform == "linux":
+            _advise(rows, start, stop, _COLD)
+
+
+def _advise(array: np.memmap, start: int, stop: int, advice: int | None) -> None:
+    """Tell the system what becomes of rows of a mapped array: that they will be read soon, which it does while this
+    process works; or that they will not.
+    """
+    mapping = getattr(array, "_mmap", None)
+    if start < stop and isinstance(mapping, mmap.mmap) and advice is not None:
+        row = array.strides[0]
+        first = start * row // mmap.PAGESIZE * mmap.PAGESIZE
+        with contextlib.suppress(OSError, ValueError):
+            mapping.madvise(advice, first, stop * row - first)

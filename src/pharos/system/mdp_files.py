@@ -1,0 +1,112 @@
+"""The files of imported MDPs: a manifest with checksums and a digest, and plain .npy arrays. Knows nothing of MDPs.
+
+FOLDER/manifest.json     what is there, written last
+FOLDER/NAME.npy          an array of COMMON, and those of one of the forms below
+FOLDER/observations.npy  where the source shows states: format version 2 or 3
+FOLDER/outcome_*.npy     in format version 3: outcomes, with the reward of each
+"""
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pharos.errors import FileFormatError
+from pharos.system import storage
+
+FORMAT, VERSION, MANIFEST = "pharos mdp", 1, "manifest.json"
+OBSERVED_VERSION = 2
+"""Of folders with observations."""
+PAID_VERSION = 3
+"""Of folders that know the reward of each outcome, with observations or without."""
+VERSIONS = (VERSION, OBSERVED_VERSION, PAID_VERSION)
+
+COMMON = ("rewards", "terminal", "start_states", "start_probabilities")
+TABLE = ("next_states",)
+MATRIX = ("transitions_data", "transitions_indices", "transitions_indptr")
+OUTCOMES = ("successors",)  # and, where they are: offsets; probabilities, or codes and palette
+OBSERVATIONS = "observations"
+PAID = ("outcome_offsets", "outcome_states", "outcome_probabilities", "outcome_rewards")
+AGAIN = "import it again"
+
+
+def is_folder(folder: str | os.PathLike) -> bool:
+    """Whether an imported MDP lies there."""
+    try:
+        manifest = storage.read_json(Path(folder) / MANIFEST)
+    except (OSError, FileFormatError):
+        return False
+    return isinstance(manifest, dict) and manifest.get("format") == FORMAT
+
+
+def read_manifest(folder: str | os.PathLike) -> dict[str, Any]:
+    """Return the manifest of a folder.
+
+    Raises:
+        FileFormatError: there is none, it was changed, or it is of another version.
+    """
+    path = Path(folder) / MANIFEST
+    try:
+        manifest = storage.read_json(path, FileFormatError, AGAIN)
+    except FileNotFoundError:
+        raise FileFormatError(f"{path}: no such file; expected a folder that `pharos import` wrote") from None
+    if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
+        raise FileFormatError(f"{folder}: is no imported MDP; expected a folder that `pharos import` wrote")
+    if manifest.get("format_version") not in VERSIONS:
+        raise FileFormatError(
+            f"{folder}: format version {manifest.get('format_version')!r}; this pharos reads versions "
+            f"{', '.join(map(str, VERSIONS))}; {AGAIN}"
+        )
+    if not storage.is_intact(manifest):
+        raise FileFormatError(f"{path}: was changed after it was written; {AGAIN}")
+    if not isinstance(manifest.get("arrays"), dict):
+        raise FileFormatError(
+            f"{path}: arrays is {manifest.get('arrays')!r}; expected a checksum for each array; {AGAIN}"
+        )
+    return manifest
+
+
+def read_arrays(folder: str | os.PathLike, manifest: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """Return the arrays of the MDP by their names, compared with their checksums.
+
+    Raises:
+        FileFormatError: one is missing, damaged or changed. ValueError: they are not those of an MDP.
+    """
+    checksums = manifest["arrays"]
+    kind = TABLE if TABLE[0] in checksums else MATRIX
+    if OUTCOMES[0] in checksums:
+        offsets = ("offsets",) if "offsets" in checksums else ()
+        kind = (*OUTCOMES, *offsets, *(("probabilities",) if "probabilities" in checksums else ("codes", "palette")))
+    names = (*COMMON, *kind)
+    version = manifest["format_version"]
+    has_shown = version == OBSERVED_VERSION or (version == PAID_VERSION and OBSERVATIONS in checksums)
+    shown, paid = (OBSERVATIONS,) * has_shown, PAID * (version == PAID_VERSION)
+    if set(checksums) != {*names, *shown, *paid}:
+        raise ValueError(f"its arrays are {', '.join(checksums)}; expected {', '.join((*names, *shown, *paid))}")
+    return {name: read_array(folder, manifest, name) for name in (*names, *paid)}
+
+
+def read_array(folder: str | os.PathLike, manifest: Mapping[str, Any], name: str) -> np.ndarray:
+    """Return one array.
+
+    Raises:
+        FileFormatError: it is missing, damaged or changed.
+    """
+    path = Path(folder) / f"{name}.npy"
+    try:
+        digest = storage.digest_of_file(path)
+    except OSError as error:
+        wrong = "no such file" if isinstance(error, FileNotFoundError) else f"cannot be read: {error.strerror}"
+        raise FileFormatError(f"{path}: {wrong}; {AGAIN}") from None
+    if digest != manifest["arrays"][name]:
+        raise FileFormatError(f"{path} was changed after it was written; {AGAIN}")
+    try:
+        array = np.load(path, allow_pickle=False)
+    except Exception as error:  # headers are read as Python literals: whatever that may raise
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise FileFormatError(f"{path}: cannot be read as plain numbers: {reason}; {AGAIN}") from None
+    if not isinstance(array, np.ndarray) or array.dtype.kind not in "biuf":
+        raise FileFormatError(f"{path}: holds no plain numbers; {AGAIN}")
+    return array
