@@ -18,7 +18,7 @@ from pharos.interaction.gym_env import GymEnv
 from pharos.interaction.vector_env import make_vec
 from pharos.rules import reason_of
 from pharos.rules.compiler import exploration_kernels, interaction_kernels, numeric_attributes
-from pharos.rules.kernel_cache import private_folder
+from pharos.system.compiling import private_folder
 
 
 def corridor_class(**rules):

@@ -1,7 +1,9 @@
 """What is published: one version, metadata, links that work on the index, and the other project of that name."""
 
 import importlib.util
+import os
 import re
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -136,3 +138,24 @@ main()
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 1 and "another project" in done.stderr and done.stderr.count("\n") == 1, done.stderr
     assert not done.stdout
+
+
+@pytest.mark.slow
+def test_an_installation_and_a_home_that_cannot_be_written_to(tmp_path):
+    """Files in place of `__pycache__` and of the home, which nobody can write into, whoever the user is."""
+    shutil.copytree(ROOT / "src/pharos", tmp_path / "src/pharos", ignore=shutil.ignore_patterns("__pycache__"))
+    for folder in ("kernels", "rules"):
+        (tmp_path / "src/pharos" / folder / "__pycache__").touch()
+    (tmp_path / "home").touch()
+    cache = tmp_path / "cache"
+    there = {name: value for name, value in os.environ.items() if not name.startswith(("NUMBA", "XDG", "PHAROS"))}
+    there |= {"PYTHONPATH": str(tmp_path / "src"), "HOME": str(tmp_path / "home"), "TMPDIR": str(tmp_path)}
+    there |= {"PYTHONDONTWRITEBYTECODE": "1"}
+    command = [sys.executable, "-m", "pharos", "solve", "frozen_lake/4x4", "--json"]
+    named = subprocess.run(command, env=there | {"PHAROS_CACHE_DIR": str(cache)}, capture_output=True, text=True)
+    assert named.returncode == 0 and not named.stderr, named.stderr
+    assert list((cache / "compiled").rglob("*.nbi")) and list((cache / "spaces").iterdir())
+    code = "import os, pharos.rules.decisions; from pharos.system import paths; print(paths.cache_directory().parent)"
+    nowhere = subprocess.run([sys.executable, "-c", code], env=there, capture_output=True, text=True)
+    assert nowhere.stdout == f"{tmp_path}\n" and "set PHAROS_CACHE_DIR" in nowhere.stderr, nowhere.stderr
+    assert not list(tmp_path.glob("pharos-*"))

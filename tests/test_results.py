@@ -77,7 +77,7 @@ def test_a_run_that_fails_says_why_and_can_be_started_again(tmp_path):
         train("q_learning", "simple_grid/4x4-plain", progress=stop, **options)
     record = read_record(tmp_path / "run")
     assert record["status"] == "failed"
-    assert record["error"] == "Stopped: no space left"
+    assert record["error"] == "CallbackError: no space left"
     train("q_learning", "simple_grid/4x4-plain", **options)
     assert read_record(tmp_path / "run")["status"] == "finished"
     assert "error" not in read_record(tmp_path / "run")

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from pharos.environments import catalog
-from pharos.rules.kernel_cache import private_folder
 from pharos.system import paths
+from pharos.system.compiling import private_folder
 
 PAGE = Path(__file__).parents[1] / "docs" / "adding-an-environment.md"
 BLOCK = re.compile(r"^```(python|text)\n(.*?)^```$", re.MULTILINE | re.DOTALL)

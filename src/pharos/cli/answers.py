@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pharos.system import compiling
+from pharos.system import compiling, paths
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -150,7 +150,8 @@ def _written(value: Any) -> str:
 def compiling_fact() -> list[tuple[str, str]]:
     """What this command has spent on compiling, a fact or none: where little was compiled there is nothing to tell."""
     seconds = compiling.seconds()
-    return [("compiling", f"{seconds:.1f} s, kept for the next time")] if seconds >= NOTABLE_SECONDS else []
+    kept = "" if paths.is_temporary() else ", kept for the next time"
+    return [("compiling", f"{seconds:.1f} s{kept}")] if seconds >= NOTABLE_SECONDS else []
 
 
 def peak_memory_bytes() -> int:

@@ -3,8 +3,13 @@
 The package announces its files; each is loaded where it is used, and loads Numba.
 """
 
-from pharos.kernels import packed_indices
+from pathlib import Path
+
 from pharos.system import compiling
+
+compiling.prepare(Path(__file__).parent)
+
+from pharos.kernels import packed_indices  # noqa: E402  (it loads Numba, which reads where to keep compiled code)
 
 __all__ = [
     "batched_learning",
@@ -47,5 +52,3 @@ __all__ = [
     "travel",
     "vicinity",
 ]
-
-compiling.listen()

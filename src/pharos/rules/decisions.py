@@ -7,8 +7,15 @@ where its children begin in children, one for each value from the lowest on, -1 
 leaf returns. Node b is the root of branch b (an action, or an outcome of one), node B that of `is_terminal`.
 """
 
+from pathlib import Path
+
 import numpy as np
-from numba import njit
+
+from pharos.system import compiling
+
+compiling.prepare(Path(__file__).parent)
+
+from numba import njit  # noqa: E402
 
 UNKNOWN, LEAF = -1, -2
 

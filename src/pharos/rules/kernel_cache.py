@@ -6,12 +6,8 @@ is noticed by a checksum: a damaged file is deleted, and the kernel is compiled 
 
 import contextlib
 import hashlib
-import os
 import pickle
-import stat
 import sys
-import warnings
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +17,7 @@ from numba.core.compiler import CompileResult
 from numba.core.serialize import dumps
 
 from pharos.system import paths, storage
-from pharos.system.paths import compiled_folders
+from pharos.system.compiling import private_folder
 
 DIGEST_BYTES = 32
 
@@ -75,47 +71,3 @@ def cache_of_kernel(name: str) -> Any:
     """The cache of the kernel with this name; one that keeps nothing where no folder is private."""
     folder = private_folder(paths.cache_directory())
     return NullCache() if folder is None else KernelCache(folder / name)
-
-
-@cache
-def private_folder(cache_directory: Path) -> Path | None:
-    """The folder of compiled rules, which is this user's and which nobody else can write to; None where there is none.
-
-    It is `compiled`, or, where several users share the cache, `compiled-` and the user's number. A warning says what is
-    wrong with a folder that is refused.
-    """
-    problems = []
-    for folder in compiled_folders(cache_directory):
-        problem = _problem_of(folder)
-        if not problem:
-            break
-        problems.append(f"{folder} {problem}")
-    if problems:
-        instead = f"{folder} is used instead" if not problem else "rules are compiled anew by every process"
-        warnings.warn(
-            f"compiled rules: {'; '.join(problems)}; {instead}. "
-            f"Reading compiled rules runs them: `chmod 700` the folder or delete it, or set PHAROS_CACHE_DIR",
-            RuntimeWarning,
-            stacklevel=2,
-        )
-    return None if problem else folder
-
-
-def _problem_of(folder: Path) -> str:
-    """Make the folder where it is missing. Returns why it is not to be used, "" where it is."""
-    try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        with contextlib.suppress(FileExistsError):
-            folder.mkdir(mode=0o700)
-        status = folder.stat()
-    except OSError as error:
-        return f"cannot be used ({error.strerror})"
-    if not stat.S_ISDIR(status.st_mode):
-        return "is no folder"
-    if not hasattr(os, "getuid"):
-        return ""
-    if status.st_uid != os.getuid():
-        return f"belongs to another user (number {status.st_uid})"
-    if status.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
-        return "can be written to by other users"
-    return "" if os.access(folder, os.W_OK | os.X_OK) else "cannot be written to"

@@ -1,11 +1,21 @@
-"""Seconds that compiling takes, told apart from seconds of work: compiled code is kept, so that it comes once.
+"""Where compiled code is kept, so that it is compiled once, and the seconds that compiling takes, told apart from work.
 
-`pharos.kernels` listens as it is loaded; before that nothing can have been compiled.
+`pharos.kernels` calls `prepare` as it is loaded; before that nothing can have been compiled.
 """
 
+import contextlib
+import os
+import stat
+import tempfile
 import threading
 import time
+import warnings
+from functools import cache
+from pathlib import Path
 from typing import Any
+
+from pharos.system import paths
+from pharos.system.paths import compiled_folders
 
 _lock = threading.Lock()
 _total, _running, _began = 0.0, 0, 0.0
@@ -34,9 +44,33 @@ class Stopwatch:
         return max(0.0, time.perf_counter() - self._began - self.compiling)
 
 
-def listen() -> None:
-    """Begin to measure; loads Numba."""
-    from numba.core import event
+def prepare(kernels: Path) -> None:
+    """Begin to measure, and see to it that Numba can keep the compiled code of the files in `kernels`; loads Numba.
+
+    Numba keeps it beside the files. Where nothing can be written there (an installation for all users, a container), it
+    goes into the private folder of the cache, for the processes that this one starts, too; where there is none, into a
+    temporary folder of this process.
+    """
+    if not os.environ.get("NUMBA_CACHE_DIR") and not _can_be_written(kernels / "__pycache__"):
+        os.environ["NUMBA_CACHE_DIR"] = str(
+            private_folder(paths.cache_directory()) or paths.temporary_folder("pharos-")
+        )
+    _listen()
+
+
+def _can_be_written(folder: Path) -> bool:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            return True
+    except OSError:
+        return False
+
+
+def _listen() -> None:
+    from numba.core import config, event
+
+    vars(config)["CACHE_DIR"] = os.environ.get("NUMBA_CACHE_DIR", "")  # Numba may have been loaded before
 
     class Compiling(event.Listener):
         def on_start(self, event: Any) -> None:
@@ -54,3 +88,47 @@ def listen() -> None:
                     _total += time.perf_counter() - _began
 
     event.register("numba:compile", Compiling())
+
+
+@cache
+def private_folder(cache_directory: Path) -> Path | None:
+    """The folder of compiled code, which is this user's and which nobody else can write to; None where there is none.
+
+    It is `compiled`, or, where several users share the cache, `compiled-` and the user's number. A warning says what is
+    wrong with a folder that is refused.
+    """
+    problems = []
+    for folder in compiled_folders(cache_directory):
+        problem = _problem_of(folder)
+        if not problem:
+            break
+        problems.append(f"{folder} {problem}")
+    if problems:
+        instead = f"{folder} is used instead" if not problem else "code is compiled anew by every process"
+        warnings.warn(
+            f"compiled code: {'; '.join(problems)}; {instead}. "
+            f"Reading compiled code runs it: `chmod 700` the folder or delete it, or set PHAROS_CACHE_DIR",
+            RuntimeWarning,
+            stacklevel=2,
+        )
+    return None if problem else folder
+
+
+def _problem_of(folder: Path) -> str:
+    """Make the folder where it is missing. Returns why it is not to be used, "" where it is."""
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with contextlib.suppress(FileExistsError):
+            folder.mkdir(mode=0o700)
+        status = folder.stat()
+    except OSError as error:
+        return f"cannot be used ({error.strerror})"
+    if not stat.S_ISDIR(status.st_mode):
+        return "is no folder"
+    if not hasattr(os, "getuid"):
+        return ""
+    if status.st_uid != os.getuid():
+        return f"belongs to another user (number {status.st_uid})"
+    if status.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+        return "can be written to by other users"
+    return "" if os.access(folder, os.W_OK | os.X_OK) else "cannot be written to"
