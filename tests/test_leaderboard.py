@@ -13,8 +13,10 @@ import pharos
 from pharos import leaderboard
 from pharos.cli import app
 from pharos.errors import FileFormatError, ParameterError, ResultCorrupted, UntrustedCode
-from pharos.experiments import read_record
+from pharos.experiments import read_record, run_id
+from pharos.leaderboard import verification
 from pharos.leaderboard.entry import write
+from pharos.system import storage
 
 OWN = """
 from dataclasses import dataclass
@@ -259,6 +261,105 @@ def test_the_page_ranks_what_was_computed_and_escapes_what_it_shows(entry, tmp_p
         leaderboard.board(tmp_path / "nothing", tmp_path / "board.html")
 
 
+def reworded(file, edit):
+    """The file with another record, with digests that fit, as whoever forges one would write it."""
+    data = file.read_bytes()
+    (length,) = struct.unpack("<Q", data[:8])
+    header = json.loads(data[8 : 8 + length])
+    record = json.loads(header["__metadata__"]["pharos"])
+    edit(record)
+    record["id"] = run_id(record["config"])
+    header["__metadata__"]["pharos"] = json.dumps(storage.sealed(record), sort_keys=True)
+    head = json.dumps(header).encode()
+    file.write_bytes(struct.pack("<Q", len(head)) + head + data[8 + length :])
+    return file
+
+
+def endless(*_):
+    while True:
+        pass
+
+
+def test_one_hostile_entry_costs_its_own_row(entry, tmp_path, monkeypatch):
+    folder = tmp_path / "entries"
+    folder.mkdir()
+    huge = 10**400
+    edits = {
+        "value": lambda record: record["claim"].update(value=huge),
+        "bound": lambda record: record["claim"].update(error_bound=huge),
+        "gamma": lambda record: record["config"].update(gamma=huge),
+        "learning": lambda record: record["training"].update(normalized_regret=huge),
+        "horizon": lambda record: record["config"].update(horizon=10**9),
+        "chance": lambda record: record["config"]["chance"].update(sticky=1e-300),
+        "bug": lambda record: record.update(name="bug"),
+        "slow": lambda record: record.update(name="slow"),
+    }
+    for name, edit in edits.items():
+        write(entry, folder / f"{name}.safetensors")
+        reworded(folder / f"{name}.safetensors", edit)
+    write(entry, folder / "good.safetensors")
+    usual = verification.policy_of
+
+    def policy_of(entry, *given, **options):
+        return (
+            usual(entry, *given, **options)
+            if entry.name == "q_learning"
+            else {"bug": dict.pop, "slow": endless}[entry.name]({}, "it is not there")
+        )
+
+    monkeypatch.setattr(verification, "policy_of", policy_of)
+    made = leaderboard.board(folder, tmp_path / "board.html", max_seconds=2)
+    assert [verdict.file.name for verdict in made.verified] == ["good.safetensors"]
+    said = {name.split(".")[0]: text for name, text in made.refused.items()}
+    assert said.keys() == edits.keys() and not any("\n" in text for text in said.values())
+    for name in ("value", "bound", "gamma", "learning"):
+        assert "expected a finite number" in said[name], said[name]
+    assert "expected at most 100,000" in said["horizon"] and "at least 1e-12" in said["chance"]
+    assert said["bug"] == "KeyError: 'it is not there'" and said["slow"] == "takes more than 2 s"
+    assert made.verified[0].limits["seconds"] == 2
+    several = pharos_("verify", folder / "bug.safetensors", folder / "good.safetensors")
+    assert several.exit_code == 1 and "the claim holds" in several.output and "KeyError" in several.output
+
+
+def test_one_task_in_several_spellings_is_one_task(entry, tmp_path):
+    folder = tmp_path / "entries"
+    folder.mkdir()
+    for k, change in enumerate(({}, {"gamma": 1}, {"chance": {"sticky": -0.0, "random": 0.1}})):
+        write(entry, folder / f"{k}.safetensors")
+        reworded(folder / f"{k}.safetensors", lambda record, change=change: record["config"].update(change))
+    made = leaderboard.board(folder, tmp_path / "board.html")
+    assert not made.refused
+    assert len({verification.task_key(verdict.entry.config) for verdict in made.verified}) == 1
+    assert made.file.read_text().count("<table") == 1
+
+
+def test_claims_that_cannot_be_true_do_not_hold(entry, file):
+    wide = dataclasses.replace(entry.claim, value=1000.0, regret=-999.0, exact=False, error_bound=1e9)
+    verdict = leaderboard.verify(changed(entry, file, claim=wide))
+    assert all(check.holds for check in verdict.checks) and not verdict.holds
+    assert "is larger than the values of policies are apart" in verdict.objections[0]
+    said = pharos_("verify", file)
+    assert said.exit_code == 1 and "is larger than" in said.output and "does not hold" in said.output
+    best, slack = entry.claim.value_optimal, 1e-4
+    above = dataclasses.replace(entry.claim, value=best + slack, regret=-slack, exact=False, error_bound=slack / 2)
+    verdict = leaderboard.verify(changed(entry, file, claim=above))
+    assert "is above that of the optimal policy" in verdict.objections[0] and not verdict.holds
+    reaches = dataclasses.replace(above, error_bound=2 * slack)
+    assert not leaderboard.verify(changed(entry, file, claim=reaches)).objections
+
+
+@pytest.mark.parametrize("text", ["\u3164", "A\u2800", "a" + "\u0301" * 9])
+def test_authors_whom_nobody_would_see_are_refused(entry, file, text):
+    with pytest.raises(FileFormatError, match=r"printed as nothing|more than 4 accents"):
+        leaderboard.read(changed(entry, file, author=text))
+    assert leaderboard.read(changed(entry, file, author="Ngô Bảo Châu")).author
+
+
+def test_names_are_shown_as_they_are(entry, file):
+    changed(entry, file, name="evil:x: on")
+    assert "evil:x: on" in pharos_("verify", file).output
+
+
 @pytest.mark.slow
 def test_what_a_network_claims_is_computed_again(tmp_path):
     pytest.importorskip("stable_baselines3")
@@ -269,8 +370,18 @@ def test_what_a_network_claims_is_computed_again(tmp_path):
     assert not any("optimizer" in name for name in entry.arrays)
     assert leaderboard.verify(file).holds
     for given in ({"net_arch": [1 << 20, 1 << 20]}, {"net_arch": [16, 16]}, {"policy_kwargs": {"activation_fn": "x"}}):
-        with pytest.raises(FileFormatError, match=r"dqn\.safetensors: its"):
+        with pytest.raises(FileFormatError, match=r"dqn\.safetensors: its (hyperparameters|policy_kwargs)"):
             leaderboard.verify(changed(entry, file, hyperparameters={**entry.hyperparameters, **given}))
+    for given in ({"features_extractor_kwargs": {"features_dim": [1]}}, {"net_arch": [-4]}):
+        with pytest.raises(FileFormatError, match=r"its features_dim is|its net_arch is"):
+            leaderboard.verify(changed(entry, file, hyperparameters={**entry.hyperparameters, "policy_kwargs": given}))
+    wide = {**entry.arrays, "q_net.q_net.0.bias": np.zeros(1 << 22, np.uint8)}  # 4 MB; the network would take 2 GB
+    with pytest.raises(FileFormatError, match=r"ask for layers \[\(8, 4194304\)"):
+        leaderboard.verify(changed(entry, file, arrays=wide, hyperparameters={"net_arch": [1 << 22, 8]}))
+    name = next(iter(entry.arrays))
+    missing = {**entry.arrays, name: np.full_like(entry.arrays[name], np.nan)}
+    with pytest.raises(FileFormatError, match="are not finite"):
+        leaderboard.verify(changed(entry, file, arrays=missing))
     few = dict(list(entry.arrays.items())[1:])
     with pytest.raises(FileFormatError, match=r"its network is none of dqn|does not have"):
         leaderboard.verify(changed(entry, file, arrays=few))

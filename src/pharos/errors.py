@@ -93,6 +93,10 @@ class ResultCorrupted(FileFormatError):
     """A file of a result was cut short, or changed after it was written."""
 
 
+class TimeLimit(PharosError):
+    """Work on what somebody else has sent takes longer than was allowed."""
+
+
 class PrecisionError(PharosError):
     """The requested precision is finer than the error bound of the solution allows."""
 

@@ -3,7 +3,7 @@ trains them on a task.
 """
 
 from pharos.agents import batched
-from pharos.agents.deep import algorithm, check_hyperparameters, make_model
+from pharos.agents.deep import algorithm, check_hyperparameters, extractor, make_model
 from pharos.agents.hyperparameters import hyperparameters
 from pharos.agents.kinds import AGENTS, BATCHED, TABULAR_OBSERVATION, AgentKind, agent_kind, agent_source, is_known
 from pharos.agents.q_learning import DEFAULTS as Q_LEARNING_DEFAULTS
@@ -22,6 +22,7 @@ __all__ = [
     "algorithm",
     "batched",
     "check_hyperparameters",
+    "extractor",
     "hyperparameters",
     "is_known",
     "joined_states",

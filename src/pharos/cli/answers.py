@@ -52,7 +52,7 @@ def console(*, stderr: bool = False) -> "Console":
 
     stream = sys.stderr if stderr else sys.stdout
     width = None if stream.isatty() or "COLUMNS" in os.environ else 160
-    return Console(stderr=stderr, width=width, highlight=False)
+    return Console(emoji=False, stderr=stderr, width=width, highlight=False)
 
 
 @contextlib.contextmanager

@@ -7,7 +7,7 @@ import typer
 
 from pharos.cli.answers import complain, console, print_facts, print_json, progress_bar, progress_line, size_text
 from pharos.cli.options import Json, Trust
-from pharos.errors import ParameterError, PharosError
+from pharos.errors import ParameterError
 from pharos.system.wording import many
 
 if TYPE_CHECKING:
@@ -21,6 +21,8 @@ MaxStates = Annotated[int, typer.Option("--max-states", min=1, help="Refuse stat
 MaxReached = Annotated[
     int, typer.Option("--max-reached", min=1, help="Values of policies that reach more states are estimated.")
 ]
+MaxHorizon = Annotated[int, typer.Option("--max-horizon", min=1, help="Refuse entries with more steps than this.")]
+MaxSeconds = Annotated[float, typer.Option("--max-seconds", min=1, help="Refuse entries that take longer, each.")]
 
 
 def submit(
@@ -68,6 +70,8 @@ def verify(
     tolerance: Within = 1e-6,
     max_states: MaxStates = 10_000_000,
     max_reached: MaxReached = 100_000,
+    max_horizon: MaxHorizon = 100_000,
+    max_seconds: MaxSeconds = 600.0,
     trust: Trust = False,
     json: Json = False,
 ) -> None:
@@ -79,13 +83,20 @@ def verify(
         try:
             with progress_line(f"verifying {file}"):
                 verdict = leaderboard.verify(
-                    file, trust=trust, tolerance=tolerance, max_states=max_states, max_reached=max_reached
+                    file,
+                    trust=trust,
+                    tolerance=tolerance,
+                    max_states=max_states,
+                    max_reached=max_reached,
+                    max_horizon=max_horizon,
+                    max_seconds=max_seconds,
                 )
-        except PharosError as error:
+        except Exception as error:
             if len(files) == 1:
                 raise
-            complain(error)
-            answers.append({"file": file, "holds": False, "error": str(error)})
+            said = leaderboard.reason(error)
+            complain(said if str(file) in said else f"{file}: {said}")
+            answers.append({"file": file, "holds": False, "error": said})
             holds = False
             continue
         holds = holds and verdict.holds
@@ -109,7 +120,9 @@ def _answer(verdict: "Verdict") -> dict[str, Any]:
             check.name: {"claimed": check.claimed, "found": check.found, "within": check.within, "holds": check.holds}
             for check in verdict.checks
         },
+        "objections": list(verdict.objections),
         "seconds": verdict.seconds,
+        "limits": dict(verdict.limits),
     }
 
 
@@ -142,6 +155,8 @@ def _print(verdict: "Verdict") -> None:
         )
     if verdict.claims_too_much:
         to.print("the entry claims an exact value, which is an estimate here")
+    for objection in verdict.objections:
+        to.print(objection, soft_wrap=True)
     to.print("the claim holds" if verdict.holds else "[bold]the claim does not hold[/bold]")
 
 
@@ -152,6 +167,8 @@ def board(
     tolerance: Within = 1e-6,
     max_states: MaxStates = 10_000_000,
     max_reached: MaxReached = 100_000,
+    max_horizon: MaxHorizon = 100_000,
+    max_seconds: MaxSeconds = 600.0,
     trust: Trust = False,
     json: Json = False,
 ) -> None:
@@ -174,6 +191,8 @@ def board(
             tolerance=tolerance,
             max_states=max_states,
             max_reached=max_reached,
+            max_horizon=max_horizon,
+            max_seconds=max_seconds,
             progress=show,
         )
     if json:

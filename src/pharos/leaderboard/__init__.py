@@ -1,8 +1,8 @@
 """Entries of a leaderboard: what a run has learnt and what it claims, in one file that anybody can verify."""
 
-from pharos.leaderboard.board import board
+from pharos.leaderboard.board import board, reason
 from pharos.leaderboard.entry import Claim, Entry, read
 from pharos.leaderboard.submission import submit
 from pharos.leaderboard.verification import Check, Verdict, verify
 
-__all__ = ["Check", "Claim", "Entry", "Verdict", "board", "read", "submit", "verify"]
+__all__ = ["Check", "Claim", "Entry", "Verdict", "board", "read", "reason", "submit", "verify"]

@@ -17,10 +17,21 @@ from pharos.environments import Environment, make
 from pharos.errors import ParameterError, PharosError
 from pharos.experiments import TaskValues
 from pharos.leaderboard.entry import SUFFIX
-from pharos.leaderboard.verification import MAX_STATES, REACHED, TOLERANCE, Verdict, task_key, verify
+from pharos.leaderboard.verification import (
+    MAX_HORIZON,
+    MAX_SECONDS,
+    MAX_STATES,
+    REACHED,
+    TOLERANCE,
+    Verdict,
+    task_key,
+    verify,
+)
 from pharos.observations import title as observation_title
 from pharos.system import storage
 from pharos.system.templates import templates
+
+LONGEST_REASON = 400
 
 Progress = Callable[[int, int, str], None]
 
@@ -83,6 +94,8 @@ def board(
     tolerance: float = TOLERANCE,
     max_states: int = MAX_STATES,
     max_reached: int = REACHED,
+    max_horizon: int = MAX_HORIZON,
+    max_seconds: float = MAX_SECONDS,
     progress: Progress | None = None,
 ) -> Board:
     """Verify every entry in a folder, and write a page that ranks them; entries of one task share its solution.
@@ -91,7 +104,7 @@ def board(
         folder: entries, *.safetensors, in it and below.
         out: the page, one self-contained file of HTML.
         title: of the page.
-        trust, tolerance, max_states, max_reached: as for `verify`.
+        trust, tolerance, max_states, max_reached, max_horizon, max_seconds: as for `verify`, for each entry.
         progress: called with how many entries are done, how many there are, and the next one.
     Returns:
         What holds and what was refused; those refused stand at the end of the page, with the reason.
@@ -110,10 +123,17 @@ def board(
             progress(k, len(files), name)
         try:
             verdict = verify(
-                path, trust=trust, tolerance=tolerance, max_states=max_states, max_reached=max_reached, values=values
+                path,
+                trust=trust,
+                tolerance=tolerance,
+                max_states=max_states,
+                max_reached=max_reached,
+                max_horizon=max_horizon,
+                max_seconds=max_seconds,
+                values=values,
             )
-        except (PharosError, OSError, MemoryError) as error:
-            made.refused[name] = " ".join(str(error).split()).removeprefix(f"{path}: ")
+        except Exception as error:  # whatever is wrong with it, and whatever pharos lacks for it: one row of many
+            made.refused[name] = reason(error).removeprefix(f"{path}: ")
             continue
         if verdict.holds:
             made.verified.append(verdict)
@@ -135,6 +155,12 @@ def board(
     return made
 
 
+def reason(error: Exception) -> str:
+    """An error in a line, with its kind where pharos did not raise it on purpose."""
+    text = " ".join(str(error).split())[:LONGEST_REASON]
+    return text if isinstance(error, PharosError) and text else f"{type(error).__name__}: {text}".removesuffix(": ")
+
+
 def why_not(verdict: Verdict) -> str:
     """Why a claim does not hold, in a line."""
     wrong = [
@@ -144,7 +170,7 @@ def why_not(verdict: Verdict) -> str:
     ]
     if verdict.claims_too_much:
         wrong.append(f"the value is claimed to be exact, and is an estimate here (± {verdict.error_bound:.2g})")
-    return "; ".join(wrong)
+    return "; ".join((*wrong, *verdict.objections))
 
 
 def _rankings(verdicts: Sequence[Verdict]) -> list[Ranking]:

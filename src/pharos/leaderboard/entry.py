@@ -14,6 +14,8 @@ import json
 import math
 import os
 import struct
+import sys
+import unicodedata
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -32,6 +34,10 @@ POLICY = "policy"
 LARGEST_HEADER = 1 << 22
 LARGEST_FILE = 1 << 30
 LONGEST_TEXT = 2000
+SHOWN = ("name", "author", "note")
+INVISIBLE = "\u115f\u1160\u2800\u3164\uffa0"
+"""Printable, and nothing to see: fillers of Hangul and the empty pattern of Braille."""
+MOST_MARKS = 4
 _METADATA, _RECORD, _ARRAYS = "__metadata__", "pharos", "arrays"
 _AGAIN = "fetch it again, or ask for it again"
 _DTYPES = {
@@ -217,7 +223,7 @@ def _places(header: Mapping[str, Any], size: int) -> dict[str, tuple[np.dtype, t
 
 
 def _entry(record: Mapping[str, Any], arrays: dict[str, np.ndarray]) -> Entry:
-    _check_texts(record)
+    _check_values(record)
     for name, kinds in _KINDS.items():
         if type(record["config"][name]) not in kinds:
             raise TypeError(f"its {name} is {str(record['config'][name])[:40]!r}")
@@ -231,7 +237,7 @@ def _entry(record: Mapping[str, Any], arrays: dict[str, np.ndarray]) -> Entry:
     for name in ("hyperparameters", "versions", "training"):
         if not isinstance(record[name], dict):
             raise TypeError(f"its {name} are no object")
-    texts = {name: record[name] for name in ("name", "author", "note")}
+    texts = {name: record[name] for name in SHOWN}
     if not all(isinstance(text, str) for text in (*texts.values(), *record["versions"].values())):
         raise TypeError("its name, author, note and versions are no texts")
     if type(claim["exact"]) is not bool or type(record["rules_version"]) is not int or claim["error_bound"] < 0:
@@ -248,20 +254,33 @@ def _entry(record: Mapping[str, Any], arrays: dict[str, np.ndarray]) -> Entry:
     )
 
 
-def _check_texts(value: Any, name: str = "record") -> None:
-    """Refuse texts that would do something to a terminal, or hide what they say."""
+def _check_values(value: Any, name: str = "record") -> None:
+    """Refuse texts that would do something to a terminal, or hide what they say, and numbers that no float holds."""
     if isinstance(value, Mapping):
         for key, item in value.items():
-            _check_texts(key, name)
-            _check_texts(item, key)
+            _check_values(key, name)
+            _check_values(item, key)
     elif isinstance(value, list):
         for item in value:
-            _check_texts(item, name)
+            _check_values(item, name)
     elif isinstance(value, str):
         if not all(character.isprintable() or character == "\n" for character in value):
             raise ValueError(f"a text of its {name} has characters that cannot be printed")
-        if name in ("name", "author", "note") and len(value) > LONGEST_TEXT:
-            raise ValueError(f"its {name} has {len(value):,} characters; expected at most {LONGEST_TEXT:,}")
+        if name in SHOWN:
+            _check_shown(value, name)
+    elif isinstance(value, int | float) and not abs(value) <= sys.float_info.max:
+        raise ValueError(f"its {name} is {str(value)[:20]}; expected a finite number")
+
+
+def _check_shown(text: str, name: str) -> None:
+    """Refuse what a page shows as nothing, or as a heap of accents."""
+    if len(text) > LONGEST_TEXT:
+        raise ValueError(f"its {name} has {len(text):,} characters; expected at most {LONGEST_TEXT:,}")
+    if any(character in INVISIBLE for character in text):
+        raise ValueError(f"its {name} has characters that are printed as nothing")
+    marks = [unicodedata.category(character).startswith("M") for character in unicodedata.normalize("NFC", text)]
+    if "1" * (MOST_MARKS + 1) in "".join("01"[mark] for mark in marks):
+        raise ValueError(f"its {name} has more than {MOST_MARKS} accents on one character")
 
 
 def _little_endian(name: str, array: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from pharos.agents import AGENTS, algorithm, make_model
+from pharos.agents import AGENTS, algorithm, extractor, make_model
 from pharos.errors import FileFormatError, ParameterError, UntrustedCode
 from pharos.experiments import Task
 from pharos.leaderboard.entry import POLICY, Entry
@@ -65,9 +65,13 @@ def _network(entry: Entry, task: Task, trust: bool) -> DeepPolicy:
     smallest = next((options for options in SMALLEST if set(options) <= set(parameters)), {})
     env = make_sb3_vec(task.env, 1, seed=0, **task.interaction)
     try:
+        if not trust:
+            _check_arrays(entry, env, hyperparameters)
         model = make_model(agent, env, {**hyperparameters, **smallest}, seed=0)
         tensors = {name: torch.from_numpy(np.array(array)) for name, array in entry.arrays.items()}
         model.policy.load_state_dict(tensors)
+    except FileFormatError:
+        raise
     except ParameterError as error:
         raise FileFormatError(str(error)) from None
     except (RuntimeError, TypeError, ValueError, KeyError, AttributeError) as error:
@@ -106,22 +110,45 @@ def _network_options(entry: Entry) -> dict[str, Any]:
 
 
 def _check_sizes(entry: Entry, task: Task, hyperparameters: dict[str, Any]) -> None:
-    """Refuse a network that is not the one in the file before it takes memory: each layer is found among the arrays."""
-    shapes = {array.shape for array in entry.arrays.values()}
+    """Refuse layers and observations of other types, or of more entries, than a network has."""
     kwargs = hyperparameters.get("policy_kwargs", {})
-    features = kwargs.get("features_extractor_kwargs", {}).get("features_dim")
-    widths: list[tuple[int, ...]] = [] if features is None else [(features,)]
-    for layers in (hyperparameters.get("net_arch", []), kwargs.get("net_arch", [])):
-        lists = list(layers.values()) if isinstance(layers, dict) else [layers]
-        for each in lists:
-            if not isinstance(each, list) or not all(type(width) is int for width in each):
-                raise FileFormatError(f"its net_arch is {layers!r}; expected widths of layers")
-            widths += [(width,) for width in each] + [(after, before) for before, after in itertools.pairwise(each)]
-    missing = [shape for shape in widths if shape not in shapes]
-    if missing or len(widths) > 4 * len(shapes) + 8:
-        raise FileFormatError(f"its hyperparameters ask for layers {missing[:3]} that its network does not have")
+    features = kwargs.get("features_extractor_kwargs", {}).get("features_dim", 1)
+    if type(features) is not int or features < 1:
+        raise FileFormatError(f"its features_dim is {str(features)[:40]}; expected a whole number of at least 1")
+    layers = 0
+    for given in (hyperparameters.get("net_arch", []), kwargs.get("net_arch", [])):
+        for each in given.values() if isinstance(given, dict) else [given]:
+            if not isinstance(each, list) or not all(type(width) is int and width >= 1 for width in each):
+                raise FileFormatError(f"its net_arch is {str(given)[:80]}; expected widths of layers")
+            layers += len(each)
+    if layers > 2 * len(entry.arrays) + 8:
+        raise FileFormatError(f"its hyperparameters ask for {layers:,} layers that its network does not have")
     space = {"state_space": task.space} if task.observation == "index" else {}
     observation = observe(task.env, task.observation, **space, **task.observation_options)
     size = math.prod(observation.space.shape or (1,))
     if size > LARGEST_OBSERVATION:
         raise FileFormatError(f"its observations have {size:,} entries; expected at most {LARGEST_OBSERVATION:,}")
+
+
+def _check_arrays(entry: Entry, env: Any, hyperparameters: dict[str, Any]) -> None:
+    """Refuse a network that is not the one in the file before it takes memory: each layer is found among the arrays.
+
+    The extractor of features is made without numbers (on PyTorch's device "meta"), which tells its shapes.
+    """
+    import torch
+
+    kwargs = hyperparameters.get("policy_kwargs", {})
+    with torch.device("meta"):
+        features = extractor(env.observation_space)(
+            env.observation_space, **kwargs.get("features_extractor_kwargs", {})
+        )
+    expected = {tuple(each.shape) for each in features.state_dict().values()}
+    for given in (hyperparameters.get("net_arch", []), kwargs.get("net_arch", [])):
+        for layers in given.values() if isinstance(given, dict) else [given]:
+            expected |= {(after, before) for before, after in itertools.pairwise((features.features_dim, *layers))}
+    shapes = {array.shape for array in entry.arrays.values() if array.dtype == np.float32}
+    if missing := sorted(expected - shapes):
+        raise FileFormatError(f"its hyperparameters ask for layers {missing[:3]} that its network does not have")
+    for name, array in entry.arrays.items():
+        if not np.isfinite(array).all():
+            raise FileFormatError(f"its weights {name!r} are not finite")

@@ -1,16 +1,22 @@
 """Verifying an entry: value and regret of its policy, computed again from the rules and held against its claim."""
 
+import contextlib
 import math
 import os
+import signal
+import threading
 import time
-from collections.abc import MutableMapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, MutableMapping
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from pharos.environments import BUILT_IN
-from pharos.errors import FileFormatError, ParameterError, StateSpaceTooLarge, UntrustedCode
-from pharos.experiments import RunConfig, Task, TaskValues, evaluate_agent
-from pharos.leaderboard.entry import POLICY, Entry, read
+from pharos.errors import FileFormatError, ParameterError, StateSpaceTooLarge, TimeLimit, UntrustedCode
+from pharos.experiments import ReferenceValues, RunConfig, Task, TaskValues, evaluate_agent
+from pharos.leaderboard.entry import LARGEST_FILE, POLICY, Claim, Entry, read
 from pharos.leaderboard.policy import policy_of
 from pharos.observations import names as observation_names
 from pharos.state_space import build
@@ -20,6 +26,9 @@ from pharos.system.sources import is_reference
 TOLERANCE = 1e-6
 MAX_STATES = 10_000_000
 REACHED = 100_000
+MAX_HORIZON = 100_000
+MAX_SECONDS = 600.0
+SMALLEST_CHANCE = 1e-12
 SEED = 1
 """Of estimates; another one than that of runs, so that an estimate is not compared with itself."""
 
@@ -58,7 +67,9 @@ class Verdict:
         error_bound: how far the value may be off; of an estimate half the width of a 99 % interval.
         states: in which the policy was asked; episodes: behind an estimate.
         checks: the claim, number by number.
+        objections: what cannot be true of the claim, whatever was computed; sentences.
         seconds: that it took.
+        limits: under which it was computed: the largest "states", "reached", "horizon", "seconds" and "bytes".
     """
 
     file: Path
@@ -74,11 +85,13 @@ class Verdict:
     episodes: int
     checks: tuple[Check, ...]
     seconds: float
+    objections: tuple[str, ...] = ()
+    limits: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def holds(self) -> bool:
-        """Whether all that can be computed is as claimed, and nothing is claimed to be exact that is not."""
-        return all(check.holds for check in self.checks) and not self.claims_too_much
+        """Whether all that can be computed is as claimed, possible, and not claimed to be exact where it is not."""
+        return all(check.holds for check in self.checks) and not self.claims_too_much and not self.objections
 
     @property
     def claims_too_much(self) -> bool:
@@ -93,13 +106,16 @@ def verify(
     tolerance: float = TOLERANCE,
     max_states: int = MAX_STATES,
     max_reached: int = REACHED,
+    max_horizon: int = MAX_HORIZON,
+    max_seconds: float = MAX_SECONDS,
     values: MutableMapping[str, TaskValues] | None = None,
 ) -> Verdict:
     """Compute the value and the regret of an entry's policy again, and compare them with its claim.
 
     The states are enumerated from pharos' own rules, solved, and the policy is evaluated on them; of the file only
-    numbers and names are used. A claim holds where its interval (its error bound) and the one found here meet. A value
-    that can only be estimated is estimated from other episodes than the run's own.
+    numbers and names are used. A claim holds where its interval (its error bound) and the one found here meet, where it
+    is not above V*, and where its interval is narrower than V* - U. A value that can only be estimated is estimated
+    from other episodes than the run's own.
 
     Args:
         trust: whether code that the entry names may be imported: an environment, observation or agent that is no part
@@ -110,24 +126,35 @@ def verify(
         Cost only:
         max_states: StateSpaceTooLarge beyond. A table says itself how many states there are.
         max_reached: up to so many reached states a value is exact.
+        max_horizon: of values, in steps.
+        max_seconds: by the clock, for all of it; counted in the main thread alone, and not on Windows.
         values: filled with the values of each task, for the entries that follow.
     Raises:
         ParameterError: there is no such file. FileFormatError: it is no entry, or not one of this version of the rules.
         ResultCorrupted: it was cut short or changed. UntrustedCode: it names code, and is not trusted.
+        StateSpaceTooLarge: it has more states. TimeLimit: it takes longer.
     """
     began, path = time.perf_counter(), Path(file)
     entry = read(path)
+    if (entry.config.horizon or 0) > max_horizon:
+        raise FileFormatError(
+            f"{path}: its horizon is {entry.config.horizon:,} steps; expected at most {max_horizon:,}"
+        )
     try:
-        task = _task(entry, trust, max_states, values)
-        policy = policy_of(entry, task, trust=trust)
-        evaluation = evaluate_agent(policy, task, max_states=max_reached, seed=SEED)
+        with _time_limit(max_seconds):
+            task = _task(entry, trust, max_states, values)
+            policy = policy_of(entry, task, trust=trust)
+            evaluation = evaluate_agent(policy, task, max_states=max_reached, seed=SEED)
+            reference, range_of_returns = task.reference, task.return_range
+    except TimeLimit as error:
+        raise TimeLimit(f"{path}: {error}") from None
     except UntrustedCode as error:
         raise UntrustedCode(f"{path}: {error}") from None
     except (ParameterError, FileFormatError) as error:
         raise FileFormatError(f"{path}: {error}") from None
     except StateSpaceTooLarge as error:
         raise StateSpaceTooLarge(f"{path}: {error}") from None
-    reference, claim = task.reference, entry.claim
+    claim = entry.claim
     slack = tolerance * max(1.0, abs(reference.optimal)) + reference.error_bound
     apart = slack + evaluation.error_bound + (min(claim.error_bound, slack) if claim.exact else claim.error_bound)
     regret, spread = reference.optimal - evaluation.value, reference.spread()
@@ -151,13 +178,64 @@ def verify(
         evaluation.episodes,
         checks,
         time.perf_counter() - began,
+        _objections(claim, reference, spread if math.isfinite(spread) else float(np.ptp(range_of_returns)), slack),
+        {
+            "states": max_states,
+            "reached": max_reached,
+            "horizon": max_horizon,
+            "seconds": max_seconds,
+            "bytes": LARGEST_FILE,
+        },
     )
+
+
+def _objections(claim: Claim, reference: ReferenceValues, spread: float, slack: float) -> tuple[str, ...]:
+    """What cannot be true of a claim."""
+    said = []
+    bound = min(claim.error_bound, slack) if claim.exact else claim.error_bound
+    if claim.value - bound > reference.optimal + slack:
+        said.append(
+            f"the value claimed, {claim.value:.8g}, is above that of the optimal policy, {reference.optimal:.8g}"
+        )
+    if claim.error_bound > spread + slack:
+        said.append(
+            f"the error bound claimed, {claim.error_bound:.3g}, is larger than the values of policies are apart, "
+            f"{spread:.3g}"
+        )
+    return tuple(said)
+
+
+@contextlib.contextmanager
+def _time_limit(seconds: float) -> Iterator[None]:
+    """Raise TimeLimit within the block after so many seconds by the clock, and each second after that until it ends.
+
+    A compiled kernel is not interrupted; it raises when it returns. Only the main thread can be stopped, by SIGALRM:
+    elsewhere, and on Windows, there is no limit.
+    """
+    able = hasattr(signal, "setitimer") and threading.current_thread() is threading.main_thread()
+    if not able or not seconds < math.inf:
+        yield
+        return
+
+    def stop(*_: Any) -> None:
+        raise TimeLimit(f"takes more than {seconds:g} s")
+
+    before = signal.signal(signal.SIGALRM, stop)
+    signal.setitimer(signal.ITIMER_REAL, max(seconds, 1e-6), 1.0)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
 
 
 def _task(entry: Entry, trust: bool, max_states: int, values: MutableMapping[str, TaskValues] | None) -> Task:
     """The task of an entry, its state space built, within limits that hold before it is."""
     config = entry.config
     _check_code(config, trust)
+    for name, value in config.chance.to_dict().items():
+        if 0 < value < SMALLEST_CHANCE:
+            raise FileFormatError(f"its {name} is {value:g}; expected 0, or at least {SMALLEST_CHANCE:g}")
     key = task_key(config)
     try:
         task = config.task(None if values is None else values.get(key), trust=trust, strict=True)
@@ -182,9 +260,18 @@ def _task(entry: Entry, trust: bool, max_states: int, values: MutableMapping[str
 
 
 def task_key(config: RunConfig) -> str:
-    """A digest of what an entry is compared in: environment, chance, and the setting of values."""
-    chance = config.chance.to_dict()
-    return storage.digest_of_json([config.environment, config.parameters, chance, config.gamma, config.horizon])
+    """A digest of what an entry is compared in: environment, chance, and the setting of values; 1 and 1.0 are one."""
+    chance = {name: value for name, value in config.chance.to_dict().items() if value}
+    task = [config.environment, config.parameters, chance, config.gamma, config.horizon]
+    return storage.digest_of_json(_as_floats(storage.plain(task)))
+
+
+def _as_floats(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {name: _as_floats(item) for name, item in value.items()}
+    if isinstance(value, list):
+        return [_as_floats(item) for item in value]
+    return float(value) + 0.0 if isinstance(value, int | float) else value  # 0.0, where it is -0.0
 
 
 def _check_code(config: RunConfig, trust: bool) -> None:
