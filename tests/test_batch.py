@@ -10,7 +10,7 @@ import pytest
 import fake_engine
 import pharos
 from pharos.agents import hyperparameters
-from pharos.errors import ParameterError, PharosError, UnknownName
+from pharos.errors import AllRunsFailed, ParameterError, PharosError, UnknownName
 from pharos.experiments import (
     FailedRun,
     RunConfig,
@@ -323,10 +323,10 @@ def test_processes_leave_what_one_leaves(tmp_path, monkeypatch):
     assert [end.result for end in parts] == [end.result for end in whole]
     for seed in options["seeds"]:
         assert bytes_of(tmp_path / "parts" / f"seed-{seed}") == bytes_of(tmp_path / "whole" / f"seed-{seed}")
-    lacking = many(
-        tmp_path / "bad", workers=2, seeds=(0, 1, 2), steps=200, hyperparameters={"optimize_memory_usage": True}
-    )
-    assert all(isinstance(end, FailedRun) and "optimize_memory_usage" in end.error for end in lacking)
+    bad = {**options, "hyperparameters": {"optimize_memory_usage": True}}
+    with pytest.raises(AllRunsFailed, match="all 3 runs failed") as lacking:
+        many(tmp_path / "bad", workers=2, **bad)
+    assert all(isinstance(end, FailedRun) and "optimize_memory_usage" in end.error for end in lacking.value.outcome)
 
 
 def test_knobs_of_chance_and_pay_are_those_of_the_run_alone():

@@ -14,7 +14,7 @@ import pharos
 from pharos import study
 from pharos.cli import app
 from pharos.environments import catalog
-from pharos.errors import FileFormatError, ParameterError, UntrustedCode
+from pharos.errors import AllRunsFailed, FileFormatError, ParameterError, UntrustedCode
 from pharos.experiments import RunConfig, load_agent, read_record, run_id, train
 from pharos.observations import observation
 from pharos.system import sources
@@ -402,3 +402,45 @@ def test_algorithms_of_known_libraries_need_no_trust():
         environment="frozen_lake", agent="stable_baselines3:SAC", steps=1, horizon=1, evaluation_interval=1
     )
     assert config.algorithm() == "stable_baselines3:SAC"
+
+
+SCRIPT = """
+import pharos
+from pharos import study
+
+lakes = {
+    "name": "lakes",
+    "steps": 200,
+    "evaluations": 2,
+    "seeds": 2,
+    "blocks": [{"environments": ["frozen_lake/4x4"], "agents": ["q_learning"]}],
+}
+done = study.run(lakes, "results", workers=2)
+print(done.finished, len(study.table("results")))
+options = {"steps": 40, "evaluation_interval": 40, "out": "many", "workers": 2}
+runs = pharos.train_many("dqn", "frozen_lake/4x4", seeds=range(40), **options)
+print(len(runs), {run.result["exact"] for run in runs})
+"""
+
+
+@pytest.mark.slow
+def test_a_script_needs_no_guard_for_workers(tmp_path):
+    """Workers do not import the script again: what it prints, it prints once."""
+    (tmp_path / "script.py").write_text(SCRIPT)
+    line = [sys.executable, "script.py"]
+    done = subprocess.run(line, cwd=tmp_path, capture_output=True, text=True, timeout=300, env=dict(os.environ))
+    assert (done.returncode, done.stdout) == (0, "2 2\n40 {True}\n"), done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def fails(config, folder):
+    raise RuntimeError("no luck")
+
+
+def test_where_all_runs_fail_it_is_raised(tmp_path):
+    lakes = {"name": "lakes", "steps": 20, "blocks": [{"environments": ["frozen_lake/4x4"], "agents": ["q_learning"]}]}
+    with pytest.raises(AllRunsFailed, match=r"all 5 runs failed; the first, .*no luck") as caught:
+        study.run(lakes, tmp_path / "results", workers=1, runner=fails)
+    assert caught.value.outcome.failed == 5
+    with pytest.raises(AllRunsFailed, match="seed 3"):
+        pharos.train_many("dqn", "frozen_lake/4x4", seeds=[3], steps=10, hyperparameters={"net_arch": [-1]})

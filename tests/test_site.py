@@ -82,6 +82,22 @@ def test_tutorials_print_what_they_show(name):
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.long
+@pytest.mark.parametrize("path", TUTORIALS, ids=lambda path: path.stem)
+def test_tutorials_run_as_scripts(path, tmp_path):
+    """Saved as a file, without a guard, they print what the notebooks show."""
+    cells = [cell for cell in json.loads(path.read_text())["cells"] if cell["cell_type"] == "code"]
+    (tmp_path / "script.py").write_text("\n\n".join("".join(cell["source"]) for cell in cells))
+    done = subprocess.run(
+        [sys.executable, "script.py"],
+        **{"cwd": tmp_path, "capture_output": True, "text": True, "timeout": 900},
+        env={**os.environ, "MPLBACKEND": "agg"},
+    )
+    assert done.returncode == 0 and "Traceback" not in done.stderr, done.stderr
+    shown = [output for cell in cells for output in cell["outputs"] if output.get("name") == "stdout"]
+    assert done.stdout == "".join("".join(output["text"]) for output in shown)
+
+
 def test_there_are_tutorials_and_all_have_been_executed():
     assert len(TUTORIALS) >= 5
     for path in TUTORIALS:

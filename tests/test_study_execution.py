@@ -13,7 +13,7 @@ import pytest
 
 import fake_training
 from pharos import study
-from pharos.errors import ParameterError, PharosError
+from pharos.errors import AllRunsFailed, ParameterError, PharosError
 from pharos.study import execution as _execution
 from pharos.study import prebuild as preparing
 from pharos.study import worker as _worker
@@ -72,10 +72,17 @@ def test_a_run_that_fails_fails_alone_says_why_and_is_repeated_only_on_request(t
 @pytest.mark.slow
 def test_failed_runs_that_are_repeated_with_success_replace_the_failure(tmp_path):
     spec = specification(agents=["dqn"], seeds=2)
-    assert study.run(spec, tmp_path, runner=raise_always, workers=2).failed == 2
-    assert study.run(spec, tmp_path, runner=fake_training.train, workers=2).failed == 2
+    assert end_of_failures(spec, tmp_path, runner=raise_always, workers=2).failed == 2
+    assert end_of_failures(spec, tmp_path, runner=fake_training.train, workers=2).failed == 2
     end = study.run(spec, tmp_path, runner=fake_training.train, workers=2, retry_failed=True)
     assert (end.finished, end.failed) == (2, 0)
+
+
+def end_of_failures(*given, **options):
+    """The status of a study all of whose runs fail."""
+    with pytest.raises(AllRunsFailed) as caught:
+        study.run(*given, **options)
+    return caught.value.outcome
 
 
 def raise_always(config, folder):
@@ -95,19 +102,19 @@ def kill_itself(config, folder):
 
 
 def test_a_runner_that_writes_nothing_has_failed(tmp_path):
-    end = study.run(specification(agents=["dqn"], seeds=1), tmp_path, runner=write_nothing)
+    end = end_of_failures(specification(agents=["dqn"], seeds=1), tmp_path, runner=write_nothing)
     assert "without a finished run.json" in next(iter(end.errors.values()))
 
 
 @pytest.mark.slow
 def test_a_run_that_takes_too_long_is_ended(tmp_path):
-    end = study.run(specification(agents=["dqn"], seeds=1), tmp_path, runner=never_end, timeout=0.5)
+    end = end_of_failures(specification(agents=["dqn"], seeds=1), tmp_path, runner=never_end, timeout=0.5)
     assert list(end.errors.values()) == ["took longer than 0.5 s"]
 
 
 @pytest.mark.slow
 def test_a_process_that_dies_three_times_has_failed(tmp_path):
-    end = study.run(specification(agents=["dqn"], seeds=1), tmp_path, runner=kill_itself)
+    end = end_of_failures(specification(agents=["dqn"], seeds=1), tmp_path, runner=kill_itself)
     assert "ended by signal 9, 3 times" in next(iter(end.errors.values()))
 
 

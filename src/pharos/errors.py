@@ -15,6 +15,8 @@
     ├── FolderLocked                    another process is at work in a folder
     ├── FileFormatError (ValueError)    a file lacks something or holds nonsense
     │   └── ResultCorrupted             a result was cut short, or changed after it was written
+    ├── TimeLimit                       work on what somebody else has sent takes longer than was allowed
+    ├── AllRunsFailed                   every run of a study or of a batch failed; the message says why the first did
     ├── PrecisionError                  the requested precision is finer than the error bound allows
     ├── DivergenceError (ValueError)    the value asked for may be infinite
     ├── UndefinedMeasure                the measure does not exist for this MDP; the message says what would define it
@@ -24,7 +26,8 @@ A message says whose, expected, found, and what to try, in one line.
 """
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from typing import Any
 
 
 class PharosError(Exception):
@@ -95,6 +98,20 @@ class ResultCorrupted(FileFormatError):
 
 class TimeLimit(PharosError):
     """Work on what somebody else has sent takes longer than was allowed."""
+
+
+class AllRunsFailed(PharosError):
+    """Every run of a study, or of a batch, has failed.
+
+    Attributes:
+        errors: of a run -> why it failed.
+        outcome: what would have been returned: the Status of a study, the FailedRuns of a batch.
+    """
+
+    def __init__(self, where: object, errors: Mapping[Any, Any], outcome: Any):
+        first, why = next(iter(errors.items()))
+        super().__init__(f"{where}: all {len(errors):,} runs failed; the first, {first}: {why}")
+        self.errors, self.outcome = errors, outcome
 
 
 class PrecisionError(PharosError):

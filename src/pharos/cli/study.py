@@ -13,7 +13,7 @@ import typer
 
 from pharos.cli.answers import complain, console, print_json, progress_line
 from pharos.cli.options import Json, Trust, parse_parameters
-from pharos.errors import ParameterError, UnknownName
+from pharos.errors import AllRunsFailed, ParameterError, UnknownName
 from pharos.observations import title
 from pharos.system.wording import many
 
@@ -150,18 +150,21 @@ def run(
                 progress=progress,
             )
         else:
-            end = study.run(
-                opened,
-                place,
-                shard=shard,
-                retry_failed=retry_failed,
-                resume=resume,
-                timeout=timeout,
-                workers=workers,
-                progress=progress,
-                foretold=_say,
-                device=device,
-            )
+            try:
+                end = study.run(
+                    opened,
+                    place,
+                    shard=shard,
+                    retry_failed=retry_failed,
+                    resume=resume,
+                    timeout=timeout,
+                    workers=workers,
+                    progress=progress,
+                    foretold=_say,
+                    device=device,
+                )
+            except AllRunsFailed as error:  # the answer says of each why
+                end = error.outcome
     if logs is not None:
         logs.update()
     _answer(end, json)

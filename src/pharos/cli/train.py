@@ -12,7 +12,7 @@ import typer
 from pharos.cli.answers import compiling_fact, complain, describe_chance, print_facts, print_json, progress_bar
 from pharos.cli.options import Json, Lazy, Parameters, Random, Sticky, TargetArgument, parse_parameters, parse_seeds
 from pharos.cli.target import parse_environment
-from pharos.errors import ParameterError
+from pharos.errors import AllRunsFailed, ParameterError
 from pharos.system import compiling
 from pharos.system.wording import many
 
@@ -153,7 +153,10 @@ def _train_many(title: str, agent: str, env: "Environment", setting: dict[str, A
 
     seeds, steps, began = setting["seeds"], setting["steps"], time.perf_counter()
     with progress_bar("training", len(seeds) * steps, "loading, building, compiling, first evaluation") as show:
-        ends = train_many(agent, env, progress=_telling_of_many(show), **setting)
+        try:
+            ends = train_many(agent, env, progress=_telling_of_many(show), **setting)
+        except AllRunsFailed as all_failed:  # the answer says of each why
+            ends = all_failed.outcome
     seconds = time.perf_counter() - began
     failed = {seed: end.error for seed, end in zip(seeds, ends, strict=True) if isinstance(end, FailedRun)}
     results = {seed: end for seed, end in zip(seeds, ends, strict=True) if not isinstance(end, FailedRun)}

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from pharos.environments import Environment
-from pharos.errors import ParameterError
+from pharos.errors import AllRunsFailed, ParameterError
 from pharos.experiments.batch import train_configs
 from pharos.experiments.config import RunConfig
 from pharos.experiments.process_pool import parts_of, train_parts
@@ -47,8 +47,8 @@ def train_many(
         engine: "batched", all runs as one program (dqn, ppo, and q_learning one after the other); or "sb3", one after
             the other.
         device: of the batched engine: "cpu" or "cuda".
-        workers: processes that share whole lanes of the batched engine, where there is a folder for results; a script
-            that asks for more than one needs `if __name__ == "__main__":`. Results do not depend on it.
+        workers: processes that share whole lanes of the batched engine, where there is a folder for results. Results do
+            not depend on it.
         out: a folder, in which each run has its own, seed-0 and so on; None: nothing is written. Finished runs there
             are returned, and what was killed goes on from its last checkpoint.
         progress: called after each evaluation.
@@ -56,7 +56,7 @@ def train_many(
     Returns:
         The result of each run in the order of the seeds; a run that failed says why, and does not stop the others.
     Raises:
-        ParameterError: no seed, or one twice; or as `train`.
+        ParameterError: no seed, or one twice; or as `train`. AllRunsFailed: none has a result.
     """
     numbers = [int(seed) for seed in seeds]
     if not numbers or len(set(numbers)) != len(numbers):
@@ -90,7 +90,7 @@ def train_many(
     ]
     folder = None if out is None else Path(out)
     if folder is not None and len(parts := parts_of(configs, workers, device)) > 1:
-        return train_parts(
+        results = train_parts(
             configs,
             [folder / f"seed-{seed}" for seed in numbers],
             parts,
@@ -98,12 +98,19 @@ def train_many(
             device=device,
             progress=progress,
         )
-    members = TaskCache(device=device)
-    members.adopt(configs[0], task)
-    return train_configs(
-        configs,
-        None if folder is None else [folder / f"seed-{seed}" for seed in numbers],
-        checkpoints=None if folder is None else folder / "checkpoints",
-        progress=progress,
-        members=members,
-    )
+    else:
+        members = TaskCache(device=device)
+        members.adopt(configs[0], task)
+        results = train_configs(
+            configs,
+            None if folder is None else [folder / f"seed-{seed}" for seed in numbers],
+            checkpoints=None if folder is None else folder / "checkpoints",
+            progress=progress,
+            members=members,
+        )
+    failed = {
+        f"seed {seed}": end.error for seed, end in zip(numbers, results, strict=True) if isinstance(end, FailedRun)
+    }
+    if len(failed) == len(numbers):
+        raise AllRunsFailed("train_many" if folder is None else folder, failed, results)
+    return results

@@ -19,6 +19,7 @@ from pharos.experiments.config import RunConfig
 from pharos.experiments.run_folder import TrainingResult, finished_result
 from pharos.experiments.task_cache import FailedRun, TaskCache
 from pharos.experiments.training_jobs import Progress, Tell
+from pharos.system.workers import without_interrupts, without_main
 
 
 def parts_of(configs: Sequence[RunConfig], workers: int, device: str = "cpu") -> list[list[int]]:
@@ -51,7 +52,8 @@ def train_parts(
             receiver, sender = context.Pipe(duplex=False)
             entries = [(configs[place].to_dict(), folders[place]) for place in part]
             process = context.Process(target=_train, args=(entries, checkpoints, device, sender), daemon=True)
-            process.start()
+            with without_main(), without_interrupts():
+                process.start()
             sender.close()
             processes.append(process)
             places[receiver] = (number, part)

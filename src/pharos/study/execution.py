@@ -17,18 +17,19 @@ from multiprocessing import connection
 from pathlib import Path
 from typing import Any
 
-from pharos.errors import FileFormatError, ParameterError, PharosError
+from pharos.errors import AllRunsFailed, FileFormatError, ParameterError, PharosError
 from pharos.study import batches as _batches
 from pharos.study import values as _values
 from pharos.study import worker as _worker
 from pharos.study.blocks import Run, Specification
 from pharos.study.forecast import Forecast, forecast
 from pharos.study.prebuild import prepare_instance, prepare_instances
-from pharos.study.processes import end_processes, one_thread, processors, worker_context
+from pharos.study.processes import end_processes, one_thread, processors, ready, worker_context
 from pharos.study.specification import Source
 from pharos.study.status import Status, claim, duration, opened, status
 from pharos.system.storage import replace_json
 from pharos.system.wording import many
+from pharos.system.workers import without_main
 
 __all__ = ["Execution", "Options", "Status", "claim", "duration", "opened", "processors", "run", "shard_of", "status"]
 
@@ -106,6 +107,7 @@ def run(
         The Status at the end. Failed runs do not stop the others.
     Raises:
         ParameterError: the specification or an option is wrong, or the folder holds another study.
+        AllRunsFailed: every run has failed; its `outcome` is the Status.
     """
     study, place = opened(source, folder)
     runs = shard_of(study.runs, shard)
@@ -133,7 +135,10 @@ def run(
         prepare = prepare_instance
     if prepare is not None:
         execution.prepare(prepare)
-    return execution.run()
+    end = execution.run()
+    if end.failed and end.failed == end.total:
+        raise AllRunsFailed(place, end.errors, end)
+    return end
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -252,7 +257,8 @@ class Execution:
             where = (run.id, folder, run.id in self.repeated, self.options.resume)
             arguments = (self.options.runner, dict(run.config), *where, dict(os.environ))
         process = context.Process(target=target, args=arguments, name=run.id)
-        with one_thread():
+        with one_thread(), without_main(self.options.runner, self.options.batch_runner):
+            ready(context)
             process.start()
         return process
 

@@ -24,6 +24,7 @@ from pharos.study.processes import end_processes, one_thread
 from pharos.study.status import duration
 from pharos.system.storage import read_json, replace_json
 from pharos.system.wording import many
+from pharos.system.workers import without_interrupts, without_main
 
 NIGHT_HOURS = 10
 # Below so many seconds in all, guesses do
@@ -161,7 +162,7 @@ def _measured(runs: Sequence[Run], tell: Callable[[str], Any]) -> dict[Kind, flo
     context = multiprocessing.get_context("spawn")
     receiver, sender = context.Pipe(duplex=False)
     process = context.Process(target=_send_paces, args=([dict(run.config) for run in runs], sender))
-    with one_thread():
+    with one_thread(), without_main(), without_interrupts():
         process.start()
     sender.close()
     paces: dict[Kind, float] = {}

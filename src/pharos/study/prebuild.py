@@ -12,6 +12,7 @@ from pharos.study import values as _values
 from pharos.study import worker as _worker
 from pharos.study.blocks import Run
 from pharos.study.processes import end_processes
+from pharos.system.workers import without_interrupts, without_main
 
 POLL_SECONDS = 2.0
 
@@ -43,7 +44,8 @@ def _prepare(
     context = multiprocessing.get_context("spawn")
     receiver, sender = context.Pipe(duplex=False)
     process = context.Process(target=_prepare_all, args=(prepare, [run.config for run in todo], sender))
-    process.start()
+    with without_main(prepare), without_interrupts():
+        process.start()
     sender.close()
     done, waits_for = 0, ""
     try:

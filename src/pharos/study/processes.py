@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 from pharos.study import worker as _worker
+from pharos.system.workers import without_interrupts
 
 TERMINATION_SECONDS = 5.0
 
@@ -51,3 +52,12 @@ def worker_context(warm: bool) -> Any:
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["pharos.study.warm" if warm else "pharos.study.worker"])
     return context
+
+
+def ready(context: Any) -> None:
+    """See to it that the process which forks workers is there; it loads much, and leaves interrupts to this one."""
+    if context.get_start_method() == "forkserver":
+        from multiprocessing import forkserver
+
+        with without_interrupts():
+            forkserver.ensure_running()

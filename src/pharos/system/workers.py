@@ -1,6 +1,12 @@
-"""How many threads or processes this process may use."""
+"""Processes that work for this one: how many there may be, and what they import."""
 
+import contextlib
 import os
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from typing import Any
 
 from pharos.errors import ParameterError
 
@@ -12,3 +18,36 @@ def usable_workers(workers: int | None) -> int:
     if workers < 1:
         raise ParameterError(f"workers is {workers}; expected at least 1")
     return int(workers)
+
+
+@contextlib.contextmanager
+def without_main(*functions: Any) -> Iterator[None]:
+    """Processes that are started within do not import the user's script, which therefore needs no guard.
+
+    multiprocessing lets each new process import the `__main__` of the first one, under another name. Code of the user's
+    own travels by its file (`sources`), so nothing is missing, but for `functions` that are defined in the script.
+    """
+    if any(getattr(getattr(each, "func", each), "__module__", None) == "__main__" for each in functions):
+        yield
+        return
+    main = vars(sys.modules["__main__"])
+    hidden: dict[str, Any] = {name: main[name] for name in ("__spec__", "__file__") if name in main}
+    main["__spec__"] = None
+    main.pop("__file__", None)
+    try:
+        yield
+    finally:
+        main.update(hidden)
+
+
+@contextlib.contextmanager
+def without_interrupts() -> Iterator[None]:
+    """Programs that are started within leave interrupts to this one, from their first line on."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # which new programs inherit
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler if before is None else before)
