@@ -1,5 +1,6 @@
 """Values in files: the same as in memory, to the last bit, with bounds that hold from whatever a file holds."""
 
+import errno
 import importlib
 import io
 import itertools
@@ -20,6 +21,7 @@ from pharos.mdp import BEST, TabularMDP
 from pharos.solvers import uniform_value, value_iteration
 from pharos.solvers.blocks import blocked_fixed_point
 from pharos.solvers.fixed_point import Backup, largest_of
+from pharos.system import kept_arrays
 from strategies import small_mdps
 
 memory_map = importlib.import_module("pharos.system.large_arrays")
@@ -159,13 +161,23 @@ def _killed_in_sweep(mdp, path, last):
     )
 
 
-def test_a_file_of_values_is_for_one_solve_of_one_mdp_at_a_time(tmp_path):
+@pytest.mark.parametrize("answer", [None, errno.ENOLCK, errno.ENOSYS])
+def test_a_file_of_values_is_for_one_solve_of_one_mdp_at_a_time(tmp_path, monkeypatch, answer):
+    """Where the file system has no locks, too: a claim stands for one, and goes with the values."""
+    if answer is not None:
+
+        def refuse(*_):
+            raise OSError(answer, os.strerror(answer))
+
+        monkeypatch.setattr(kept_arrays.fcntl, "flock", refuse)
     path = tmp_path / "values.npy"
     solution = value_iteration(ring(), values=path)
-    with pytest.raises(FolderLocked, match="in use"):
+    with pytest.raises(FolderLocked, match=r"in use|is using values there"):
         value_iteration(ring(), values=path)
     assert solution.v[-1] > 0
+    assert (tmp_path / "values.npy.claim").exists() == (answer is not None)
     del solution
+    assert [file.name for file in tmp_path.iterdir()] == ["values.npy"]
     with pytest.raises(
         FileFormatError, match=r"holds float64 of shape \(401, 1\); expected float64 of shape \(11, 1\)"
     ):

@@ -6,8 +6,10 @@ import importlib
 import multiprocessing
 import os
 import resource
+import shutil
 import signal
 import sys
+import threading
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -713,6 +715,31 @@ def test_two_builds_do_not_share_a_folder(tmp_path, undisturbed, small_blocks):
         process.join()
     assert process.exitcode == 0
     assert_same_files(folder, undisturbed["breakout"])
+
+
+def test_in_the_cache_another_build_is_waited_for(tmp_path, undisturbed, small_blocks, monkeypatch):
+    """As the jobs of an array do, whose cache is cold: nobody named that folder."""
+    monkeypatch.setenv("PHAROS_CACHE_DIR", str(tmp_path))
+    folder = building.cached_folder(BREAKOUT)
+    ready, release = fork.Event(), fork.Event()
+    process = in_a_child(_hold, BREAKOUT, folder, ready, release)
+    ready.wait()
+    threading.Timer(0.5, release.set).start()
+    with pytest.warns(RuntimeWarning, match="another process is building there; waiting until it is done"):
+        build(BREAKOUT, None)
+    process.join()
+    assert_same_files(folder, undisturbed["breakout"])
+
+
+def test_a_folder_in_which_somebody_has_just_begun_is_not_foreign(tmp_path, undisturbed, monkeypatch):
+    """Its manifest comes between a look for it and a look for what else is there."""
+    shutil.copytree(undisturbed["breakout"], tmp_path / "space")
+    usual, looks = building.read_manifest, []
+    monkeypatch.setattr(
+        building, "read_manifest", lambda path: looks.append(path) or (usual(path) if len(looks) > 1 else None)
+    )
+    build(BREAKOUT, tmp_path / "space")
+    assert len(looks) > 1
 
 
 def test_a_killed_build_leaves_no_lock(tmp_path, undisturbed, small_blocks):

@@ -8,12 +8,13 @@ the only other memory (table.py). The search (search.py) expands states and numb
 import hashlib
 import json
 import os
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pharos.environments import Environment, make
-from pharos.errors import ParameterError, StateSpaceMismatch
+from pharos.errors import ParameterError, StateSpaceLocked, StateSpaceMismatch
 from pharos.state_space.files import lock
 from pharos.state_space.manifest import ARRAYS, MANIFEST, PARTS, read_manifest
 from pharos.state_space.plan import Plan
@@ -42,6 +43,7 @@ def build(
     progress: Progress | bool | None = None,
     checkpoint_seconds: float = CHECKPOINT_SECONDS,
     shards: Sequence[str | os.PathLike] = (),
+    wait: bool | None = None,
 ) -> StateSpace:
     """Enumerate the states of `env` that can be reached from its start states, and their transitions.
 
@@ -63,13 +65,15 @@ def build(
         checkpoint_seconds: at most this much work is lost when the process is killed.
         shards: folders, on other disks for example, that the files are moved to once they are finished, each a range of
             them; the reader maps the ranges as one file.
+        wait: where another process is building in the folder, wait for it, with a warning; None: in the user's cache,
+            which nobody has named.
     Returns:
         The StateSpace, whose files are in `folder`.
     Raises:
         StateSpaceTooLarge, DiskFull: what was found is kept; the same command resumes.
         StateSpaceMismatch: the folder holds another environment, or other rules. StateSpaceLocked: somebody else is
-        building there. StateSpaceCorrupted: files were changed. RuleError: a rule failed or left the declared ranges,
-        in the state that is named. ParameterError: the folder cannot be used.
+        building there, and is not waited for. StateSpaceCorrupted: files were changed. RuleError: a rule failed or left
+        the declared ranges, in the state that is named. ParameterError: the folder cannot be used.
     Cost: see docs/performance.md; 40 to 110 ns a state, 8 W + 8 to 16 bytes of memory a state (W words of 64 bits).
     Source: the pharos paper, appendix A, Algorithm 1 (whose successors are stored under the wrong index there).
     """
@@ -90,7 +94,8 @@ def build(
     path = Path(folder) if folder is not None else folder_of(plan)
     options = Options(max_states, memory, workers, checkpoint_seconds)
     with crew_of(processes, plan, memory) as crew:
-        was_there = crew.is_first and _build(plan, path, crew, options, progress)
+        hold = _waiting if (folder is None if wait is None else wait) else lock
+        was_there = crew.is_first and _build(plan, path, crew, options, progress, hold)
         if crew.is_first and shards:
             with lock(path):
                 shard(path, read_manifest(path) or {}, [Path(each) for each in shards])
@@ -98,7 +103,7 @@ def build(
 
 
 def _build(
-    plan: Plan, path: Path, crew: "BuildProcesses", options: "Options", progress: Progress | bool | None
+    plan: Plan, path: Path, crew: "BuildProcesses", options: "Options", progress: Progress | bool | None, hold: Any
 ) -> bool:
     """Make the folder hold the finished state space; returns whether it did before."""
     from pharos.state_space.outcome_journal import remove_parts
@@ -114,12 +119,19 @@ def _build(
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ParameterError(f"{path}: cannot be made a folder: {error.strerror}; choose another one") from error
-    with lock(path), reporter(progress, plan.env) as report:
+    with hold(path), reporter(progress, plan.env) as report:
         manifest = _manifest_of(plan, path)  # it may have grown while we waited
         if manifest is None or not manifest["complete"]:
             with crew.search(plan, journal_of(path, plan), options, report) as search:
                 search.run(manifest)
     return False
+
+
+def _waiting(path: Path) -> Any:
+    def tell(text: str) -> None:
+        warnings.warn(text, RuntimeWarning, stacklevel=4)
+
+    return storage.waiting_lock(path, StateSpaceLocked, "building", tell)
 
 
 def cached_folder(env: Environment) -> Path:
@@ -139,6 +151,8 @@ def _manifest_of(plan: Plan, path: Path) -> dict[str, Any] | None:
     manifest = read_manifest(path)
     if manifest is None:
         if path.is_dir() and any(not _is_ours(item.name) for item in path.iterdir()):
+            if read_manifest(path) is not None:  # another process has just begun there
+                return _manifest_of(plan, path)
             raise ParameterError(f"{path}: is not empty and holds no state space; choose another folder")
         return None
     for key, expected in plan.identity.items():

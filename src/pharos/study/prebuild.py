@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 from pharos.errors import StateSpaceLocked
+from pharos.state_space import build
 from pharos.study import values as _values
 from pharos.study import worker as _worker
 from pharos.study.blocks import Run
@@ -19,7 +20,7 @@ POLL_SECONDS = 2.0
 
 def prepare_instance(config: Mapping[str, Any]) -> None:
     """Build the state space of a run into the cache, and keep the values of its task at the start."""
-    _values.task_of(config).space.num_states  # noqa: B018
+    build(_values.task_of(config).env, wait=False)
     _values.solve(config)
 
 

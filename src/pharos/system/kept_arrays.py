@@ -5,8 +5,11 @@ They are for what may be left in the middle and is as good as ever: values that 
 Nobody else may write into such a file meanwhile: it is locked as long as its array is in use.
 """
 
+import contextlib
 import mmap
 import os
+import weakref
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -34,10 +37,10 @@ def kept_array(path: str | os.PathLike, shape: tuple[int, ...], dtype: Any, what
     try:
         if not path.exists():
             _make(path, shape, dtype)
-        with open(path, "r+b") as file:
-            _lock(path, file, what)
+        with open(path, "r+b") as file, _locked(path, file, what) as claim:
             offset = _checked_offset(path, file, shape, dtype, what)
             mapping = mmap.mmap(file.fileno(), 0)  # it holds the lock, too
+            weakref.finalize(mapping, claim.pop_all().close)
     except OSError as error:
         raise ParameterError(f"{path}: cannot be used for {what}: {error.strerror}; choose another file") from error
     return np.frombuffer(mapping, dtype, offset=offset).reshape(shape)
@@ -51,13 +54,20 @@ def _make(path: Path, shape: tuple[int, ...], dtype: np.dtype) -> None:
         append_zeros(file, dtype.itemsize * int(np.prod(shape, dtype=np.int64)))
 
 
-def _lock(path: Path, file: BinaryIO, what: str) -> None:
-    if fcntl is None:
-        return
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as error:
-        raise FolderLocked(f"{path}: its {what} are in use; choose another file, or wait") from error
+@contextlib.contextmanager
+def _locked(path: Path, file: BinaryIO, what: str) -> Iterator[contextlib.ExitStack]:
+    """The file held, by a claim beside it where the file system has no locks (`storage.lock`); what gives that back."""
+    with contextlib.ExitStack() as claim:
+        try:
+            if fcntl is not None:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise FolderLocked(f"{path}: its {what} are in use; choose another file, or wait") from error
+        except OSError as error:
+            if not storage.has_no_locks(error):
+                raise
+            claim.enter_context(storage.claim(path.with_name(f"{path.name}.claim"), FolderLocked, f"using {what}"))
+        yield claim
 
 
 def _checked_offset(path: Path, file: BinaryIO, shape: tuple[int, ...], dtype: np.dtype, what: str) -> int:

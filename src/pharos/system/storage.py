@@ -15,7 +15,7 @@ import socket
 import stat
 import time
 import uuid
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -31,6 +31,7 @@ except ImportError:  # Windows
 
 LOCK = "lock"
 CLAIM = "lock.claim"
+WAITING_SECONDS = 0.2
 """Stands in for a lock where the file system has none: whoever makes it holds the folder."""
 CLAIM_ATTEMPTS = 200
 
@@ -234,7 +235,7 @@ def lock(folder: Path, error: type[PharosError] = FolderLocked, activity: str = 
         raise ParameterError(f"{folder}: cannot be written to: {problem.strerror}; choose another folder") from problem
     with file:
         if not _flock(file, folder, error, activity):
-            with _claim(folder, error, activity):
+            with claim(folder / CLAIM, error, activity):
                 yield
             return
         file.truncate(0)
@@ -244,6 +245,26 @@ def lock(folder: Path, error: type[PharosError] = FolderLocked, activity: str = 
             yield
         finally:
             file.truncate(0)
+
+
+def waiting_lock(
+    folder: Path, error: type[PharosError], activity: str, tell: Callable[[str], Any]
+) -> contextlib.ExitStack:
+    """As `lock`, but where another process holds the folder it is waited for; `tell` is called once, with a line.
+
+    Returns:
+        A context in which the folder is held, already entered: `with waiting_lock(...):`.
+    """
+    held, told = contextlib.ExitStack(), False
+    while True:
+        try:
+            held.enter_context(lock(folder, error, activity))
+            return held
+        except error:
+            if not told:
+                tell(f"{folder}: another process is {activity} there; waiting until it is done")
+                told = True
+            time.sleep(WAITING_SECONDS)
 
 
 def _flock(file: Any, folder: Path, error: type[PharosError], activity: str) -> bool:
@@ -262,10 +283,15 @@ def _flock(file: Any, folder: Path, error: type[PharosError], activity: str) -> 
     return True
 
 
+def has_no_locks(problem: OSError) -> bool:
+    """Whether a file system answers so that it has no locks."""
+    return problem.errno in _UNSUPPORTED
+
+
 @contextlib.contextmanager
-def _claim(folder: Path, error: type[PharosError], activity: str) -> Iterator[None]:
-    """Hold a folder by making the file `lock.claim`, which only one process can."""
-    path = folder / CLAIM
+def claim(path: Path, error: type[PharosError], activity: str) -> Iterator[None]:
+    """Hold the folder of `path` by making that file, which only one process can; see `lock`."""
+    folder = path.parent
     mine = f"{_holder()}, {uuid.uuid4().hex}"
     for _ in range(CLAIM_ATTEMPTS):
         if _create(path, mine):
