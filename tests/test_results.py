@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pharos.errors import FileFormatError, ResultCorrupted
+from pharos.errors import FileFormatError, FolderLocked, ResultCorrupted
 from pharos.experiments import evaluate_agent, load_agent, read_curve, read_record, run_id, train
 from pharos.experiments import results as _results
 
@@ -93,6 +93,40 @@ def test_a_damaged_checkpoint_is_said_to_be_one(agent, file, tmp_path, monkeypat
     (tmp_path / "run" / "checkpoint" / file).write_bytes(b"PK")
     with pytest.raises(FileFormatError, match=r"checkpoint: cannot be resumed from.*delete the folder to start anew"):
         train(agent, "simple_grid/4x4-plain", **options)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("agent", "engine", "file"),
+    [
+        ("q_learning", "sb3", "curve.json"),
+        ("q_learning", "sb3", "q_learning.npz"),
+        ("dqn", "sb3", "model.json"),
+        ("dqn", "batched", "curve.json"),
+    ],
+)
+def test_one_digit_of_a_checkpoint_is_not_learnt_from(agent, engine, file, tmp_path, monkeypatch):
+    monkeypatch.setattr(run_folder, "CHECKPOINT_SECONDS", 0.0)
+    options = {"steps": 400, "evaluation_interval": 100, "out": tmp_path / "run", "engine": engine}
+    with pytest.raises((CallbackError, RuntimeError)):
+        train(agent, "simple_grid/4x4-plain", progress=stop, **options)
+    (changed,) = [path for path in (tmp_path / "run").rglob(file) if "checkpoint" in path.parts]
+    data = changed.read_bytes()
+    place = data.index(b"1", data.find(b'"rows"') + 1) if file.endswith("json") else len(data) // 2
+    changed.write_bytes(data[:place] + b"2" + data[place + 1 :])
+    with pytest.raises(FileFormatError, match="was changed after it was written; delete the folder to start anew"):
+        train(agent, "simple_grid/4x4-plain", **options)
+
+
+def test_two_processes_do_not_train_one_run(tmp_path):
+    options = {"steps": 400, "evaluation_interval": 100}
+
+    def again(*_):
+        with pytest.raises(FolderLocked, match=r"another process .* is training there; wait for it"):
+            train("q_learning", "simple_grid/4x4-plain", out=tmp_path / "run", **options)
+
+    train("q_learning", "simple_grid/4x4-plain", out=tmp_path / "run", progress=again, **options)
+    assert {path.name for path in (tmp_path / "run").iterdir()} == {"run.json", "curve.parquet", "policy.npy"}
 
 
 @pytest.mark.slow

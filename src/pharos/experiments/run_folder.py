@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from pharos.environments import class_called
-from pharos.errors import ParameterError
+from pharos.errors import FileFormatError, ParameterError
 from pharos.experiments import results as _results
 from pharos.experiments.config import RunConfig, run_id
-from pharos.system.storage import sync
+from pharos.system.storage import digest_of_bytes, digest_of_file, sync
 
 CHECKPOINT_SECONDS = 10.0
 # Writing checkpoints takes at most this share of the time
@@ -94,6 +94,17 @@ def finished_result(folder: Path, config: RunConfig) -> TrainingResult | None:
     return TrainingResult(record["config"], record["result"], rows, None, folder, record["seconds"])
 
 
+def _digests(folder: Path) -> dict[str, str]:
+    """The digest of each file below a folder, but for the one that holds the digests."""
+    files = sorted(path for path in folder.rglob("*") if path.is_file() and path != folder / "curve.json")
+    return {path.relative_to(folder).as_posix(): digest_of_file(path) for path in files}
+
+
+def _digest(record: Mapping[str, Any]) -> str:
+    """Of a record that may hold infinities and nan."""
+    return digest_of_bytes(json.dumps(record, sort_keys=True).encode())
+
+
 class Checkpoint:
     """A folder that holds the last checkpoint, replaced in one step."""
 
@@ -110,7 +121,8 @@ class Checkpoint:
         shutil.rmtree(partial, ignore_errors=True)
         partial.mkdir(parents=True)
         learner.save(partial)
-        (partial / "curve.json").write_text(json.dumps({"id": self.id, "rows": rows, "seconds": seconds}))
+        record = {"id": self.id, "rows": rows, "seconds": seconds, "files": _digests(partial)}
+        (partial / "curve.json").write_text(json.dumps({**record, "digest": _digest(record)}))
         for path in (*partial.rglob("*"), partial):  # the older one goes only when this one is on the disk
             sync(path)
         old = self.folder.with_name(f"{self.folder.name}.old")
@@ -124,13 +136,23 @@ class Checkpoint:
         self._next = now + max(CHECKPOINT_SECONDS, (now - began) / SHARE_OF_TIME if CHECKPOINT_SECONDS else 0.0)
 
     def restore(self, learner: Stored) -> tuple[list[Any], float] | None:
-        """(rows of the curve, seconds spent) of the last checkpoint, from which the learner goes on; or None."""
+        """(rows of the curve, seconds spent) of the last checkpoint, from which the learner goes on; or None.
+
+        Raises:
+            FileFormatError: it was changed after it was written.
+        """
         for folder in (self.folder, self.folder.with_name(f"{self.folder.name}.old")):
             try:
                 record = json.loads((folder / "curve.json").read_text())
             except (FileNotFoundError, ValueError):
                 continue
             if record.get("id") == self.id:
+                digest = record.pop("digest", None)  # which an older pharos did not write
+                if digest is not None and (digest != _digest(record) or record["files"] != _digests(folder)):
+                    raise FileFormatError(
+                        f"{folder}: cannot be resumed from: it was changed after it was written; "
+                        f"delete the folder to start anew"
+                    )
                 learner.load(folder)
                 return record["rows"], record["seconds"]
         return None

@@ -19,7 +19,7 @@ from typing import Any
 from pharos.agents import agent_kind
 from pharos.agents import hyperparameters as hyperparameters_of
 from pharos.environments import Environment, make
-from pharos.errors import ParameterError
+from pharos.errors import FolderLocked, ParameterError
 from pharos.experiments import results as _results
 from pharos.experiments.config import RunConfig
 from pharos.experiments.curve import Curve
@@ -28,6 +28,7 @@ from pharos.experiments.run_folder import Checkpoint, Record, TrainingResult, fi
 from pharos.experiments.task import Task, TaskValues
 from pharos.observations import own_observation
 from pharos.system import compiling
+from pharos.system.storage import CLAIM, LOCK, lock
 
 Progress = Callable[[int, int, Mapping[str, Any]], None]
 
@@ -197,14 +198,31 @@ def train_task(
         )
     if config.engine == "batched":
         return _as_a_batch(config, task, folder, tensorboard, progress)
+    if folder is None:
+        return _train(config, task, None, tensorboard, progress, algorithm)
+    if (done := finished_result(folder, config)) is not None:
+        return done
+    folder.mkdir(parents=True, exist_ok=True)
+    with lock(folder, FolderLocked, "training"):
+        result = _train(config, task, folder, tensorboard, progress, algorithm)
+        for name in (LOCK, CLAIM):  # whoever waits for it finds a finished run
+            (folder / name).unlink(missing_ok=True)
+    return result
+
+
+def _train(
+    config: RunConfig,
+    task: Task,
+    folder: Path | None,
+    tensorboard: bool,
+    progress: Progress | None,
+    algorithm: str | type | None,
+) -> TrainingResult:
+    """A run that nobody else is at."""
     began, compiled = time.perf_counter(), compiling.seconds()
-    if folder is not None:
-        done = finished_result(folder, config)
-        if done is not None:
-            return done
+    if folder is not None and (done := finished_result(folder, config)) is not None:
+        return done
     chosen = hyperparameters_of(config.agent, config.environment, config.observation, config.hyperparameters)
-    if folder is not None:
-        folder.mkdir(parents=True, exist_ok=True)
     logs = folder / "tensorboard" if folder is not None and tensorboard else None
     learner = make_learner(config, algorithm or config.algorithm(), task, chosen, logs)
     curve, checkpoint = Curve(task), None
