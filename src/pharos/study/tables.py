@@ -6,6 +6,7 @@ A cell is one agent on one instance under one kind of chance with one observatio
 
 import json
 import os
+import warnings
 from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
@@ -24,6 +25,7 @@ from pharos.study.blocks import Run, Specification
 from pharos.study.execution import opened
 from pharos.study.specification import Source
 from pharos.system.storage import is_intact, read_json, replace_json, sealed
+from pharos.system.wording import many
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -91,7 +93,7 @@ def finished_runs(study: Specification, place: Path) -> FinishedRuns:
 
 
 def table(source: Source, folder: str | os.PathLike | None = None) -> "pd.DataFrame":
-    """One row a finished run; runs whose files are damaged are left out.
+    """One row a finished run; runs whose files are damaged are left out, with a warning that names them.
 
     Returns:
         Columns `id`, `environment` (class), `instance`, `chance`, `agent`, `observation`, `seed`, `steps`, `seconds`,
@@ -103,12 +105,24 @@ def table(source: Source, folder: str | os.PathLike | None = None) -> "pd.DataFr
     Raises:
         ParameterError: no run is finished.
     """
-    return finished_runs(*opened(source, folder)).runs
+    return _warned(finished_runs(*opened(source, folder))).runs
 
 
 def curves(source: Source, folder: str | os.PathLike | None = None) -> "pd.DataFrame":
     """One row an evaluation of a finished run: the columns of curve.parquet, and those that describe the run."""
-    return finished_runs(*opened(source, folder)).points
+    return _warned(finished_runs(*opened(source, folder))).points
+
+
+def _warned(runs: FinishedRuns) -> FinishedRuns:
+    if runs.damaged:
+        first = next(iter(runs.damaged.values()))
+        warnings.warn(
+            f"{many(len(runs.damaged), 'run')} left out, {', '.join(runs.damaged)}: {first}; "
+            f"`pharos study run` makes them again",
+            RuntimeWarning,
+            stacklevel=3,
+        )
+    return runs
 
 
 def _result_of(record: Mapping[str, Any], folder: Path) -> dict[str, Any]:

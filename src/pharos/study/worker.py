@@ -21,13 +21,12 @@ from pathlib import Path
 from typing import Any
 
 from pharos import experiments
-from pharos.errors import FileFormatError, FolderLocked, PharosError, ResultCorrupted
+from pharos.errors import FileFormatError, FolderLocked, PharosError
 from pharos.system import storage
 
 FINISHED, FAILED, BUSY = "finished", "failed", "busy"
 EXIT_BUSY = 75
 PARENT_GONE = 76
-PARQUET = b"PAR1"
 # Seconds in a record that no run can take: ten thousand years
 LONGEST = 3e11
 CLEAN_SECONDS = 2.0
@@ -49,7 +48,9 @@ def read_record(folder: Path) -> dict[str, Any] | None:
     """What run.json of one run says; None where there is none.
 
     Raises:
-        FileFormatError: it is not the record of a run that is over. ResultCorrupted: it was cut short or changed.
+        FileFormatError: it is not the record of a run that is over. ResultCorrupted: it, or the curve of a finished
+        run, was cut short or changed.
+    Cost: 1.2 ms for a curve of a hundred rows.
     """
     file = folder / "run.json"
     if not file.exists():
@@ -65,21 +66,8 @@ def read_record(folder: Path) -> dict[str, Any] | None:
     if record["status"] == FINISHED:
         if not isinstance(record.get("result"), dict):
             raise FileFormatError(f"{file}: is of a finished run, but has no result")
-        _check_curve(folder / "curve.parquet")
+        experiments.read_curve_table(folder, ())
     return record
-
-
-def _check_curve(file: Path) -> None:
-    """Refuse a file that is not there, or whose beginning or end is not that of a Parquet file: it was cut short."""
-    try:
-        with open(file, "rb") as data:
-            start = data.read(len(PARQUET))
-            data.seek(-len(PARQUET), os.SEEK_END)
-            end = data.read()
-    except OSError as error:
-        raise FileFormatError(f"{file}: cannot be read ({error.strerror})") from None
-    if not start == end == PARQUET:
-        raise ResultCorrupted(f"{file}: is no Parquet file, or was cut short")
 
 
 def attempt(
