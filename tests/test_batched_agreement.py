@@ -117,6 +117,20 @@ def shared_extractor(name):
     return name.removeprefix("pi_").removeprefix("vf_")
 
 
+def test_an_update_of_ppo_values_what_a_time_limit_cuts_off():
+    batch = batch_of("ppo", Task.of(make("frozen_lake/4x4"), horizon=3), PPO)
+    lane = batch.lanes[0]
+    batch.learn([24], lambda point: None)
+    rewards = lane.rewards.copy()
+    assert lane.timeouts.any()
+    lane.add_values_of_cut_episodes()
+    expected = lane.rewards.copy()
+    assert (expected != rewards)[lane.timeouts].any() and (expected == rewards)[~lane.timeouts].all()
+    lane.rewards[:] = rewards
+    lane.update()
+    assert np.array_equal(lane.rewards, expected)
+
+
 @pytest.mark.parametrize("max_grad_norm", (0.05, 10.0))
 def test_updates_of_ppo_are_those_of_stable_baselines3(task, max_grad_norm):
     hyperparameters = {**PPO, "max_grad_norm": max_grad_norm}

@@ -384,3 +384,12 @@ def test_blocks_and_single_floats_end_near_gamma_1(gamma, options, tolerance):
         return
     truth = naive_exact.extreme_values(mdp)
     assert largest_error(solution, truth) <= Fraction(solution.error_bound) <= Fraction(tolerance)
+
+
+def test_the_bound_of_32_bit_values_holds_in_the_middle_between_two_of_them():
+    """1 + 2^-24 is stored as 1, half a unit away: as much as storing ever rounds."""
+    value = 1.0 + 2.0**-24
+    solution = value_iteration(TabularMDP.from_arrays([[-1]], [[value]], gamma=0.0), 1e-6, dtype="float32")
+    assert solution.v.dtype == np.float32
+    error = abs(float(solution.v[0]) - value)
+    assert error == 2.0**-24 <= solution.error_bound

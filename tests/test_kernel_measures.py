@@ -415,6 +415,12 @@ def test_exploration_time_is_that_of_a_linear_system(sticky, random):
     assert found.episodes == pytest.approx(1 / found.probability)
 
 
+def test_an_episode_has_met_a_large_reward_once_though_it_would_go_on():
+    always = TabularMDP.from_arrays([[0, 0]], [[1.0, 1.0]], gamma=1.0, horizon=5)
+    found = hardness.exploration_time(always)
+    assert (found.steps, found.episodes, found.probability) == (1.0, 1.0, 1.0)
+
+
 def test_what_does_not_exist_says_so():
     endless = chain(horizon=None, gamma=0.9)
     seen = Representation.of_matrix(np.eye(4))

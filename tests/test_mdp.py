@@ -117,6 +117,8 @@ def test_a_row_of_minus_one_that_pays_is_no_terminal_state():
         ({"next_states": [[0, -2], [1, 0]]}, r"is -2"),
         ({"next_states": [[0.5, 1.0], [1.0, 0.0]]}, "expected integers"),
         ({"next_states": [0, 1]}, "expected integers of shape"),
+        ({"next_states": [[1, 0], [0]]}, "next_states: .*inhomogeneous.*expected an array of numbers"),
+        ({"rewards": [["a", 1], [0, 0]]}, "rewards: could not convert .*expected an array of numbers"),
         ({"rewards": [[0, np.nan], [0, 0]]}, "state 0, action 1 is nan"),
         ({"rewards": [[0, np.inf], [0, 0]]}, "inf"),
         ({"rewards": [[0, 1]]}, r"shape \(1, 2\)"),

@@ -1,12 +1,18 @@
 """Policies asked in the states that they reach: on any kind of MDP, what they reach has the values of the whole."""
 
+import math
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import pharos
+from pharos import evaluate_policy as evaluate_policy_of_any_kind
+from pharos.errors import ParameterError
 from pharos.mdp import TabularMDP
 from pharos.policies import TableAnswers, evaluate_seeing
+from pharos.policies.estimation import _half_width
 from pharos.solvers import evaluate_policy
 from strategies import small_mdps
 
@@ -35,3 +41,32 @@ def test_an_estimate_on_a_general_mdp_holds_the_value(seed):
     estimate = evaluate_seeing(table, mdp, None, lambda: (0.0, 5.0), max_states=0, episodes=2000, seed=seed)
     assert not estimate.exact and estimate.episodes == 2000
     assert abs(estimate.value - evaluate_policy(mdp, table).value_at_start) <= estimate.error_bound
+
+
+def test_the_interval_of_an_estimate_is_that_of_maurer_and_pontil():
+    """Theorem 4 on each side, with a risk of 0.005; returns 0, 1, 1 of [0, 1] have a variance of 1/3."""
+    log = math.log(2 / 0.005)
+    expected = math.sqrt(2 * (1 / 3) * log / 3) + 7 * log / (3 * 2)
+    assert _half_width(np.array([0.0, 1.0, 1.0]), 0.0, 1.0) == pytest.approx(expected, rel=1e-14)
+    assert expected == pytest.approx(8.14392, abs=1e-5)
+
+
+class RecurrentDistribution:
+    """What sb3-contrib's recurrent policies have in place of `get_distribution(observations)`."""
+
+    def get_distribution(self, observations, lstm_states, episode_starts):
+        raise AssertionError
+
+
+class RecurrentPPO:
+    policy = RecurrentDistribution()
+
+    def predict(self, observation, *, deterministic=False):
+        raise AssertionError
+
+
+def test_a_policy_with_a_memory_is_refused_in_one_line(tmp_path):
+    mdp = pharos.build("frozen_lake/4x4", tmp_path / "lake", progress=False).mdp()
+    with pytest.raises(ParameterError, match=r"RecurrentPPO: its policy has a memory, .*frames=4") as caught:
+        evaluate_policy_of_any_kind(mdp, RecurrentPPO(), observation="vector")
+    assert "\n" not in str(caught.value)

@@ -111,3 +111,14 @@ def test_a_reward_function_in_place_of_the_rules_may_look_at_the_outcome(tmp_pat
     assert space.mdp(rewards=outcome_itself).rewards[0, 0] == 0.5 * 1 + 0.25 * 2 + 0.25 * 3
     with pytest.raises(ParameterError, match="may be a fifth argument"):
         space.mdp(rewards=lambda state: 0.0)
+
+
+def test_the_exported_table_of_a_class_that_nobody_registered_pays_each_outcome(tmp_path):
+    """And so it does where only the MDP knows whose states these are."""
+    mdp = pharos.build(Toll(), tmp_path / "toll", progress=False).mdp()
+    assert "toll" not in pharos.list_environments()
+    law = [(round(p, 12), t, r) for p, t, r, _ in pharos.exporters.gym_p(mdp)[0][1]]
+    assert sorted(law) == [(0.25, 0, 21.0), (0.25, 2, -8.0), (0.5, 2, 11.0)]
+    stays = pharos.evaluate_policy(mdp, lambda seen: np.zeros(len(seen), int), observation="vector")
+    walks = pharos.evaluate_policy(mdp, np.zeros(mdp.num_states, int))
+    assert stays.value_at_start == pytest.approx(walks.value_at_start, abs=1e-9)

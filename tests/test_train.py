@@ -313,6 +313,17 @@ def test_what_is_wrong_is_said_before_anything_is_learnt(options, error, message
         train(agent, "simple_grid/4x4-plain", **{"steps": 100, **options})
 
 
+def test_a_missing_package_of_agents_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "sb3_contrib", None)
+    with pytest.raises(ParameterError, match="needs sb3-contrib; install it with: pip install sb3-contrib"):
+        train("sb3_contrib:TRPO", "simple_grid/4x4-plain", steps=10)
+
+
+def test_policies_that_an_algorithm_lacks_are_told_with_those_that_it_has():
+    with pytest.raises(ParameterError, match=r"Policy NoPolicy unknown; .* policy: MlpPolicy, CnnPolicy"):
+        train("ppo", "simple_grid/4x4-plain", steps=10, hyperparameters={"policy": "NoPolicy"})
+
+
 @pytest.mark.parametrize(
     ("agent", "given", "expected"),
     [

@@ -53,6 +53,10 @@ def algorithm(agent: str | type) -> type:
     except ModuleNotFoundError as error:
         if (error.name or "").startswith(("stable_baselines3", "torch")):
             raise MissingExtra(f"the agent {agent!r}", "stable-baselines3", "agents") from error
+        if error.name == "sb3_contrib":
+            raise ParameterError(
+                f"the agent {agent!r} needs sb3-contrib; install it with: pip install sb3-contrib"
+            ) from error
         raise UnknownName("module of an agent", module, []) from error
     except AttributeError as error:
         raise UnknownName(
@@ -148,7 +152,9 @@ def make_model(
             **options,
         )
     except (TypeError, ValueError, AssertionError) as error:
-        raise ParameterError(f"agent {_title(agent)!r} cannot be made: {error}") from error
+        names = getattr(algorithm(agent), "policy_aliases", {})
+        remedy = f"; give its hyperparameter policy: {', '.join(names)}" if "policy" in str(error).lower() else ""
+        raise ParameterError(f"agent {_title(agent)!r} cannot be made: {error}{remedy}") from error
     if tensorboard is None:  # the logger that it would make itself leaves a folder among the temporary files
         from stable_baselines3.common.logger import HumanOutputFormat, KVWriter, Logger
 

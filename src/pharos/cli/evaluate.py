@@ -2,7 +2,7 @@
 
 import math
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -29,15 +29,29 @@ from pharos.cli.target import Target, parse_target
 from pharos.errors import FileFormatError, ParameterError, UnknownName
 
 if TYPE_CHECKING:
+    from pharos.experiments import Task
     from pharos.mdp import TabularMDP
     from pharos.solvers import Solution
 
-    Given = tuple[Any, dict[str, Any]]
-
 POLICIES = ("optimal", "uniform", "worst")
+SETTING = ("gamma", "horizon", "sticky", "random", "lazy")
+
+
+@dataclass(frozen=True)
+class Given:
+    """A policy that a command names: how `pharos.evaluate_policy` is to take it, and the task that it was trained on.
+
+    Attributes:
+        task: None for a file.
+    """
+
+    policy: Any
+    seeing: dict[str, Any] = field(default_factory=dict)
+    task: "Task | None" = None
 
 
 def evaluate(
+    context: typer.Context,
     target: TargetArgument,
     parameters: Parameters = None,
     policy: Annotated[
@@ -61,6 +75,7 @@ def evaluate(
 ) -> None:
     """Evaluate a policy exactly, and say where it stands: regret 0 is optimal, 1 is as bad as playing at random.
 
+    What a run has learnt is evaluated in the run's own setting (discount, horizon, chance) but for what options say.
     Only a policy that sees several frames and reaches more than 100,000 histories is estimated, from 2,000 episodes.
     """
     from pharos.solvers import regret_scale
@@ -68,6 +83,16 @@ def evaluate(
     building = build_options(memory, workers, max_states)
     goal = parse_target(target, parameters)
     decisions = None if policy in POLICIES else read_policy(policy, trust=trust)
+    source = "given"
+    if decisions is not None and decisions.task is not None:
+        own = decisions.task
+        given = {name for name in SETTING if context.get_parameter_source(name).name == "COMMANDLINE"}  # type: ignore[union-attr]
+        gamma = gamma if "gamma" in given else own.gamma
+        horizon = horizon if "horizon" in given else own.horizon_steps
+        sticky = sticky if "sticky" in given else own.sticky
+        random = random if "random" in given else own.random
+        lazy = lazy if "lazy" in given else own.lazy
+        source = "the run's own" if not given else f"the run's own, but for {', '.join(sorted(given))}"
     if goal.is_imported and Path(policy).expanduser().is_dir():  # what was learnt on the environment of the table
         table = goal.mdp()
         gamma, horizon = table.gamma if gamma is None else gamma, table.horizon if horizon is None else horizon
@@ -81,6 +106,8 @@ def evaluate(
             values["given"] = _worth_over_histories(goal, mdp, decisions, sticky=sticky, random=random, lazy=lazy)
         else:
             values["given"] = _worth(solution_of(mdp, policy, decisions, tolerance))
+    is_network = decisions is not None and "observation" in decisions.seeing
+    rounding = ", for the probabilities that its network computes in 32 bits" if is_network else ""
     best, uniform, worst = (values[name].value for name in POLICIES)
     worth = values["given"]
     value = worth.value
@@ -104,6 +131,8 @@ def evaluate(
         "sticky": sticky,
         "random": random,
         "lazy": lazy,
+        "setting": source,
+        "policy_dtype": "float32" if is_network else None,
     }
     if json:
         print_json(answer)
@@ -116,7 +145,8 @@ def evaluate(
             ("normalized regret", "-" if math.isnan(relative) else f"{relative:.6g}  (0: optimal, 1: uniform)"),
             ("relative to worst", "-" if math.isnan(against_worst) else f"{against_worst:.6g}  (0: optimal, 1: worst)"),
             ("optimal, uniform, worst", f"{best:.8g}, {uniform:.8g}, {worst:.8g}"),
-            ("error at most", f"{max(each.error_bound for each in values.values()):.2g}{_estimated(worth)}"),
+            ("error at most", f"{max(each.error_bound for each in values.values()):.2g}{_estimated(worth)}{rounding}"),
+            *([] if source == "given" else [("setting", source)]),
             ("discount", describe_discount(mdp.gamma, mdp.horizon)),
             ("chance", describe_chance(sticky, random, mdp.dynamics.has_chance, lazy)),
         ],
@@ -141,9 +171,9 @@ def _estimated(worth: Worth) -> str:
     return f" with a probability of 99 % (estimated from {worth.episodes:,} episodes)" if worth.episodes else ""
 
 
-def _sees_frames(goal: Target, decisions: "Given") -> bool:
+def _sees_frames(goal: Target, decisions: Given) -> bool:
     """Whether the policy sees several frames, so that its values belong to histories of states."""
-    _, seeing = decisions
+    seeing = decisions.seeing
     if "observation" not in seeing:
         return False
     from pharos.observations import observe
@@ -152,28 +182,27 @@ def _sees_frames(goal: Target, decisions: "Given") -> bool:
     return "frames" in options and observe(goal.found_environment(), name, **options).frames > 1
 
 
-def _worth_over_histories(goal: Target, mdp: "TabularMDP", decisions: "Given", **chance: float) -> Worth:
+def _worth_over_histories(goal: Target, mdp: "TabularMDP", decisions: Given, **chance: float) -> Worth:
     """Of a policy that sees several frames: exact where it reaches few histories, else estimated."""
     from pharos.experiments import Task, evaluate_agent
 
-    agent, seeing = decisions
     began = time.perf_counter()
-    task = Task(goal.found_environment(), **chance, **seeing, gamma=mdp.gamma, horizon=mdp.horizon)  # type: ignore[arg-type]
-    evaluation = evaluate_agent(agent, task)
+    task = Task(goal.found_environment(), **chance, **decisions.seeing, gamma=mdp.gamma, horizon=mdp.horizon)  # type: ignore[arg-type]
+    evaluation = evaluate_agent(decisions.policy, task)
     return Worth(evaluation.value, evaluation.error_bound, time.perf_counter() - began, evaluation.episodes)
 
 
-def solution_of(mdp: "TabularMDP", policy: str, decisions: "Given | None", tolerance: float) -> "Solution":
+def solution_of(mdp: "TabularMDP", policy: str, decisions: Given | None, tolerance: float) -> "Solution":
     """The values of a policy: one of POLICIES, or what `read_policy` gave."""
     from pharos.policies import evaluate_policy
     from pharos.solvers import uniform_value, value_iteration, worst_value
 
     if decisions is not None:
-        return evaluate_policy(mdp, decisions[0], tolerance, **decisions[1])
+        return evaluate_policy(mdp, decisions.policy, tolerance, **decisions.seeing)
     return {"optimal": value_iteration, "uniform": uniform_value, "worst": worst_value}[policy](mdp, tolerance)
 
 
-def read_policy(name: str, *, trust: bool = False) -> "Given":
+def read_policy(name: str, *, trust: bool = False) -> Given:
     """The policy in a file: .npy, or `policy` of .npz; or what a finished run has learnt, in the folder of the run.
 
     Args:
@@ -192,16 +221,16 @@ def read_policy(name: str, *, trust: bool = False) -> "Given":
 
         task, agent = load_agent(path, trust=trust)
         if isinstance(agent, np.ndarray):
-            return agent, {}
-        return agent, {"observation": task.observation, "observation_options": task.observation_options}
+            return Given(agent, {}, task)
+        return Given(agent, {"observation": task.observation, "observation_options": task.observation_options}, task)
     if path.suffix.lower() not in (".npy", ".npz"):
         raise UnknownName("policy", name, [*POLICIES, "FILE.npy", "RUN_DIR"])
     if not path.is_file():
         raise ParameterError(f"--policy {name}: no such file")
     try:
         if path.suffix.lower() == ".npy":
-            return np.load(path, allow_pickle=False), {}
+            return Given(np.load(path, allow_pickle=False))
         with np.load(path, allow_pickle=False) as arrays:
-            return arrays["policy"], {}
+            return Given(arrays["policy"])
     except (ValueError, KeyError, EOFError) as error:
         raise FileFormatError(f"{path}: {error}; expected an array of actions (S,) or probabilities (S, A)") from error

@@ -115,7 +115,8 @@ def _learnt(policy: str | None, trust: bool) -> "Learnt | None":
         return None
     from pharos.explorer import Learnt
 
-    agent, seeing = read_policy(policy, trust=trust)
+    given = read_policy(policy, trust=trust)
+    agent, seeing = given.policy, given.seeing
     return Learnt(agent, Path(policy).name, **seeing)
 
 

@@ -56,7 +56,11 @@ def _outcomes_of_environment(mdp: TabularMDP) -> list[dict[tuple[int, float], fl
     """Of each state and action: (next state, reward) -> probability, by the rules where the MDP has chance and is of an
     environment; else nothing.
     """
-    space = None if mdp.folder is None or mdp.dynamics.is_deterministic else load(mdp.folder, verify=False)
+    space = (
+        None
+        if mdp.folder is None or mdp.dynamics.is_deterministic
+        else load(mdp.folder, verify=False, environment=mdp.environment)
+    )
     if space is None or space.environment is None:
         return []
     rows = np.arange(space.num_states * space.num_actions)

@@ -1,7 +1,7 @@
 """Environment + observation + chance -> gymnasium.Env.
 
-`import pharos` registers pharos/SimpleGrid-v0, pharos/FrozenLake-v0, pharos/Freeway-v0 and pharos/Breakout-v0 with
-Gymnasium: `gymnasium.make("pharos/Breakout-v0", height=12, observation="simple_image", sticky=0.25)`. No state space
+`import pharos` registers every built-in class with Gymnasium, such as pharos/FrozenLake-v0 and pharos/Breakout-v0:
+`gymnasium.make("pharos/Breakout-v0", height=12, observation="simple_image", sticky=0.25)`. No state space
 needs to be built.
 """
 

@@ -49,7 +49,13 @@ def to_gymnax(
     mdp = source.mdp(gamma=1.0) if isinstance(source, StateSpace) else source
     if not isinstance(mdp, TabularMDP):
         raise ParameterError(f"to_gymnax: found {source!r}; expected a StateSpace or a TabularMDP")
-    space = source if isinstance(source, StateSpace) else None if mdp.folder is None else load(mdp.folder, verify=False)
+    space = (
+        source
+        if isinstance(source, StateSpace)
+        else None
+        if mdp.folder is None
+        else load(mdp.folder, verify=False, environment=mdp.environment)
+    )
     env = None if space is None else space.environment
     limit = time_limit or mdp.horizon or (env.max_episode_steps if env is not None else None)
     if limit is None:

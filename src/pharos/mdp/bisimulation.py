@@ -128,6 +128,7 @@ def _merged(mdp: TabularMDP, classes: np.ndarray, representatives: np.ndarray) -
         reward_table=Rewards.from_array(mdp.reward_table.rows(representatives)),
         terminal=np.asarray(mdp.terminal)[representatives],
         folder=None,
+        environment=None,
         age=None,
         staying=None if mdp.staying is None else _lost,
     ).with_initial(start)

@@ -7,6 +7,7 @@ import numpy as np
 from pharos.errors import ParameterError
 from pharos.mdp.compiled import swept
 from pharos.mdp.dynamics import BellmanEquation, Dynamics, Order, Outcomes, as_indices
+from pharos.mdp.tabular_arrays import as_array
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
@@ -149,7 +150,7 @@ def transitions_of(P: Any) -> tuple["csr_matrix", int]:
         num_states = matrix.shape[1]
         num_actions = matrix.shape[0] // max(num_states, 1)
     else:
-        dense = np.asarray(P, np.float64)
+        dense = as_array(P, "P", np.float64)
         if dense.ndim != 3 or dense.shape[0] != dense.shape[2]:
             raise ParameterError(f"P has shape {dense.shape}; expected (states, actions, states)")
         num_states, num_actions = dense.shape[:2]
@@ -174,7 +175,7 @@ def expected_rewards(P: Any, R: Any, num_states: int, num_actions: int) -> np.nd
 
     What is none of these comes back as it is.
     """
-    rewards = np.asarray(R, np.float64)
+    rewards = as_array(R, "R", np.float64)
     if rewards.shape == (num_states, num_actions, num_states) and isinstance(P, np.ndarray | list | tuple):
         probabilities = np.asarray(P)
         if probabilities.dtype != object and probabilities.shape == rewards.shape:

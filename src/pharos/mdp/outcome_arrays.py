@@ -6,6 +6,7 @@ import numpy as np
 
 from pharos.errors import ParameterError
 from pharos.mdp.dynamics import as_indices
+from pharos.mdp.tabular_arrays import as_array
 
 # The share of a dense table that may be padding before successors are kept one row after another.
 MOST_PADDING = 0.3
@@ -22,7 +23,7 @@ def checked_outcomes(successors: Any, probabilities: Any) -> tuple[np.ndarray, n
         ParameterError: a shape or type is wrong, an index is outside, or a row holds no probabilities; the first such
             entry is named.
     """
-    table, chances = np.asarray(successors), np.asarray(probabilities)
+    table, chances = as_array(successors, "successors"), as_array(probabilities, "probabilities")
     if table.ndim != 3 or table.size == 0 or table.dtype.kind not in "iu":
         raise ParameterError(
             f"successors have shape {table.shape} and type {table.dtype}; expected integers of shape "

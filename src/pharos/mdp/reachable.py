@@ -50,6 +50,7 @@ def restricted_to(mdp: "TabularMDP", states: np.ndarray) -> "TabularMDP":
         terminal=np.asarray(mdp.terminal[states]),
         start_states=number[mdp.start_states],
         folder=None,
+        environment=None,
         age=None,
     )
 

@@ -50,6 +50,7 @@ class TabularMDP:
         start_states, start_probabilities: the start distribution.
         chance: weights of the chosen, the previously executed and a uniform action.
         folder: of the state space, where there is one.
+        environment: whose states these are, where that is known.
         age: (S,) integers that each transition out of a state that is not terminal makes larger; None where they are
             not known. Solvers take the states in this order then, once.
     """
@@ -65,6 +66,7 @@ class TabularMDP:
     folder: Any = None
     age: np.ndarray | None = None
     staying: Callable[[], Rewards] | None = None
+    environment: Any = None
 
     def __post_init__(self) -> None:
         check_gamma(self.gamma)
@@ -201,6 +203,7 @@ class TabularMDP:
             space.start_probabilities,
             folder=space.folder,
             staying=staying,
+            environment=space.environment,
         )
         has_age = space.environment is not None and space.environment.has_age
         return mdp.with_age(space.ages) if has_age else mdp

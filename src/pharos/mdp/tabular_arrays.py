@@ -9,13 +9,21 @@ from pharos.errors import ParameterError
 from pharos.mdp.rewards import Rewards
 
 
+def as_array(value: Any, name: str, dtype: Any = None) -> np.ndarray:
+    """An array of what a user gave under a name; ParameterError where it is none, such as lists of several lengths."""
+    try:
+        return np.asarray(value, dtype)
+    except (ValueError, TypeError) as error:
+        raise ParameterError(f"{name}: {' '.join(str(error).split())[:200]}; expected an array of numbers") from None
+
+
 def checked_next_states(next_states: Any) -> np.ndarray:
     """(S, A) int32 or int64: where each action leads, -1 for the end.
 
     Raises:
         ParameterError: it is not a table of states; the first wrong entry is named.
     """
-    table = np.asarray(next_states)
+    table = as_array(next_states, "next_states")
     if table.ndim != 2 or table.size == 0 or table.dtype.kind not in "iu":
         raise ParameterError(
             f"next_states has shape {table.shape} and type {table.dtype}; expected integers of shape (states, actions)"
@@ -45,7 +53,7 @@ def check_horizon(horizon: Any) -> None:
 
 def rewards_of_shape(rewards: Any, shape: tuple[int, ...]) -> Rewards:
     """Rewards (S, A) of this shape; ParameterError where they have another, or one is not finite."""
-    array = np.asarray(rewards, np.float64)
+    array = as_array(rewards, "rewards", np.float64)
     if array.shape != shape:
         raise ParameterError(f"rewards have shape {array.shape}; expected {shape}, one for each state and action")
     return Rewards.from_array(array)
@@ -57,7 +65,7 @@ def expected_over_outcomes(rewards: Any, probabilities: np.ndarray) -> np.ndarra
     Raises:
         ParameterError: they have neither shape, or one of a possible outcome is not finite.
     """
-    array, shape = np.asarray(rewards, np.float64), probabilities.shape
+    array, shape = as_array(rewards, "rewards", np.float64), probabilities.shape
     if array.shape == shape[:2]:
         return array
     if array.shape != shape:

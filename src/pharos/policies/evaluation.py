@@ -142,7 +142,7 @@ class ReachedSolution(Solution):
 
     Attributes:
         start: value of an episode's first state.
-        states_reached: number of states in which the policy was answers.
+        states_reached: number of states in which the policy was asked.
     """
 
     start: float = math.nan
@@ -180,7 +180,7 @@ def evaluate_observing(
         raise ParameterError(
             "the policy sees the previous action, so its values belong to no state; use experiments.evaluate_agent"
         )
-    space = None if mdp.folder is None else load(mdp.folder, verify=False)
+    space = None if mdp.folder is None else load(mdp.folder, verify=False, environment=mdp.environment)
     if space is None or space.environment is None:
         raise ParameterError(
             f"{mdp}: is not of a state space whose environment is known, so there is nothing to observe; "

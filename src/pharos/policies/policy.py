@@ -1,5 +1,6 @@
 """What a policy is: a table over the states, or something that answers observations with probabilities or actions."""
 
+import inspect
 from collections.abc import Callable
 from typing import Any, Protocol, runtime_checkable
 
@@ -59,11 +60,23 @@ def policy_function(policy: PolicyLike) -> Callable[[Any], Any]:
 class DeepPolicy:
     """The policy of a model as probabilities: greedy for DQN and its kin, the distribution itself for PPO and its kin.
 
+    The probabilities are those that the network computes, in 32-bit floats on this processor: an exact value is the
+    value of these.
+
     Args:
         deterministic: the most probable action of a distribution, instead of the distribution.
+    Raises:
+        ParameterError: the policy has a memory, so that its probabilities do not belong to observations.
     """
 
     def __init__(self, model: Any, *, deterministic: bool = False):
+        asked = getattr(model.policy, "get_distribution", None)
+        if asked is not None and "lstm_states" in inspect.signature(asked).parameters:
+            raise ParameterError(
+                f"{type(model).__name__}: its policy has a memory, so its values belong to whole histories, which are "
+                f"not evaluated; expected a policy of observations: frames=4 among the observation's options shows the "
+                f"last four"
+            )
         self.model, self.deterministic = model, deterministic
 
     def action_probabilities(self, observations: Any) -> np.ndarray:

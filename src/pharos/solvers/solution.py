@@ -26,9 +26,10 @@ class Solution:
             under sticky actions, else 1; row S, the end, is 0.
         next_x: the values of next states: x, or with a horizon those with one step less to go.
         all_steps: with a horizon, where they were kept: (T + 1, S), or (T + 1, S, A), row t with t steps to go.
+
     Under sticky actions values belong to pairs: `v` is (S, A), the value of (state, previously executed action), and
-        `q` is
-    (S, A), the value of executing an action. Otherwise `v` is (S,), and `q` (S, A) is the value of choosing an action.
+    `q` is (S, A), the value of executing an action. Otherwise `v` is (S,), and `q` (S, A) is the value of choosing an
+    action.
     """
 
     mdp: TabularMDP

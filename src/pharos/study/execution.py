@@ -1,6 +1,6 @@
 """Executes what is missing of a study: one process a run, from a process that has loaded everything already.
 
-Runs are independent, named by the hash of their config, and appear whole or not at all (`_worker`): runner or workers
+Runs are independent, named by the hash of their config, and appear whole or not at all (worker.py): runner or workers
 may be killed at any moment, several runners may share a folder, and the same command goes on from there.
 """
 

@@ -12,8 +12,9 @@ import numpy as np
 
 from pharos.errors import UndefinedMeasure
 from pharos.mdp import TabularMDP
+from pharos.system import memory
 
-_PARTS = 0.6  # of the memory of the machine
+_PARTS = 0.6  # of the memory that is free
 
 
 def applies(mdp: TabularMDP) -> bool:
@@ -43,7 +44,7 @@ class LargeHorizon:
             raise UndefinedMeasure(
                 f"effective_horizon: {steps} steps of the {states} states that they can meet need "
                 f"{needed / 2**30:.1f} GiB, more than {room / 2**30:.1f}, "
-                f"{_PARTS:.0%} of this machine's memory; a smaller horizon or instance would define it"
+                f"{_PARTS:.0%} of the free memory; a smaller horizon or instance would define it"
             )
         table = mdp.dynamics.deterministic_table()
         assert table is not None
@@ -131,9 +132,4 @@ class LargeHorizon:
 
 
 def _room() -> float:
-    import os
-
-    try:
-        return _PARTS * os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    except (AttributeError, ValueError, OSError):  # not on this system
-        return 8 * 2**30
+    return _PARTS * memory.available_memory()
