@@ -263,3 +263,13 @@ def test_environments_are_given_to_studies_that_ask_for_them_alone(tmp_path):
         specification("quick", environments=tmp_path / "list.yaml")
     with pytest.raises(ParameterError, match="cannot be read"):
         specification("hardness-sealed", environments=tmp_path / "nothing.yaml")
+
+
+def test_observations_that_differ_in_an_option_are_cells_of_their_own():
+    """Where one name would stand for two of them; else names are the usual ones, which published tables have."""
+    codes = [{"name": "hash", "options": {"bits": bits}} for bits in (8, 64)]
+    block = {"environments": ["frozen_lake/4x4"], "agents": ["dqn"], "observations": ["vector", *codes]}
+    cells = [run.cell["observation"] for run in study.specification({"name": "a", "seeds": 1, "blocks": [block]}).runs]
+    assert cells == ["vector", "hash(bits=8)", "hash(bits=64)"]
+    block["observations"] = codes[:1]
+    assert study.specification({"name": "a", "seeds": 1, "blocks": [block]}).runs[0].cell["observation"] == "hash"

@@ -123,11 +123,15 @@ def names() -> list[str]:
     return [*_BUILT_IN, *_registered]
 
 
-def title(name: str, options: Mapping[str, Any]) -> str:
+def title(name: str, options: Mapping[str, Any], *, whole: bool = False) -> str:
     """The name of an observation in tables and figures, with the options that change what the agent is told:
     "simple_image(motion=True)".
+
+    Args:
+        whole: with all options.
     """
-    words = (f"{option}={_words(options[option])}" for option in TELLING if options.get(option))
+    told = (*TELLING, *sorted(set(options) - set(TELLING))) if whole else TELLING
+    words = (f"{option}={_words(options[option])}" for option in told if options.get(option))
     return f"{name}({', '.join(words)})".removesuffix("()")
 
 

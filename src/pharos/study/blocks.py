@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any
@@ -43,6 +43,7 @@ class Run:
         engine: "batched" where it is trained together with others; a table, too, whose configuration does not say so.
         family: what it counts as where classes are compared: the class of its environment, unless the study says else.
         setting: what tells its cell from that of other blocks, where the study says so: "tuned".
+        observation: the name of its observation in tables.
     """
 
     configuration: RunConfig
@@ -50,6 +51,15 @@ class Run:
     engine: str = "sb3"
     family: str = ""
     setting: str = ""
+    observation: str = ""
+
+    def __post_init__(self) -> None:
+        if not self.observation:
+            object.__setattr__(self, "observation", self._title())
+
+    def _title(self, *, whole: bool = False) -> str:
+        config = self.configuration
+        return title(config.observation, config.observation_options, whole=whole)
 
     @cached_property
     def config(self) -> Mapping[str, Any]:
@@ -70,7 +80,7 @@ class Run:
             "instance": self.instance,
             "chance": self.chance,
             "agent": f"{config.agent} {self.setting}".rstrip(),
-            "observation": title(config.observation, config.observation_options),
+            "observation": self.observation,
         }
 
     @property
@@ -276,7 +286,14 @@ class Specification(_Part):
         for block in self.blocks:
             for run in self._runs_of(block):
                 runs.setdefault(run.id, run)
-        return tuple(runs.values())
+        options: dict[str, set[str]] = {}  # of the observations that share a title
+        for run in runs.values():
+            options.setdefault(run.observation, set()).add(str(run.configuration.observation_options))
+        shared = {name for name, all_options in options.items() if len(all_options) > 1}
+        return tuple(
+            replace(run, observation=run._title(whole=True)) if run.observation in shared else run
+            for run in runs.values()
+        )
 
     def _runs_of(self, block: Block) -> Iterator[Run]:
         steps = block.steps or self.steps
