@@ -5,6 +5,7 @@ import json
 import os
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 
@@ -295,6 +296,22 @@ def test_the_cache_is_listed_and_cleared(tmp_path, monkeypatch):
     assert not (tmp_path / "compiled").exists()
 
 
+def test_only_state_spaces_are_cleared(tmp_path, monkeypatch):
+    monkeypatch.setenv("PHAROS_CACHE_DIR", str(tmp_path))
+    run, spaces, elsewhere = CliRunner(), tmp_path / "spaces", tmp_path / "elsewhere"
+    assert run.invoke(app, ["build", "simple_grid"]).exit_code == 0
+    (own,) = spaces.iterdir()
+    (spaces / "photos").mkdir()
+    (spaces / "photos" / "a.jpg").touch()
+    shutil.copytree(spaces / "photos", spaces / f"photos-{'0' * 16}")
+    shutil.copytree(own, elsewhere)
+    (spaces / f"linked-{'0' * 16}").symlink_to(elsewhere)
+    before = set(spaces.iterdir())
+    cleared = run.invoke(app, ["cache", "clear", "--json"])
+    assert json.loads(cleared.stdout)["removed"] == [str(own)]
+    assert set(spaces.iterdir()) == before - {own} and (elsewhere / "manifest.json").exists()
+
+
 def test_compiled_rules_in_the_folder_of_ones_own_are_listed_and_cleared(tmp_path, monkeypatch):
     monkeypatch.setenv("PHAROS_CACHE_DIR", str(tmp_path))
     run = CliRunner()
@@ -491,6 +508,22 @@ def test_exit_codes_reach_the_shell(cache):
         done = process(*words, cache=cache)
         assert done.returncode == code
         assert "Traceback" not in done.stderr
+
+
+@pytest.mark.slow
+def test_what_the_environment_lacks_or_forbids_is_a_line(cache):
+    for words, added in (
+        ("solve frozen_lake/4x4", "NUMBA_DISABLE_JIT=1"),
+        ("solve frozen_lake/4x4", "NUMBA_NUM_THREADS=0"),
+    ):
+        name, value = added.split("=")
+        environment = {**os.environ, "PHAROS_CACHE_DIR": str(cache), name: value}
+        line = [sys.executable, "-m", "pharos", *words.split()]
+        done = subprocess.run(line, env=environment, capture_output=True, text=True, timeout=120)
+        assert done.returncode == 2 and done.stderr.count("\n") == 1 and "NUMBA_" in done.stderr, done.stderr
+    closed = f"{sys.executable} -m pharos list >&-"
+    done = subprocess.run(closed, shell=True, stderr=subprocess.PIPE, text=True, timeout=120, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 @pytest.mark.slow

@@ -154,6 +154,9 @@ app.add_typer(cache.app, name="cache")
 
 def main() -> None:
     """Entry point of the `pharos` command."""
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):  # closed by whoever started it
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, mode))  # noqa: SIM115
     warnings.showwarning = lambda message, *_, **__: complain(f"warning: {message}")
     if not hasattr(sys.modules["pharos"], "make") and (wrong := conflict()):  # the __init__.py is the other project's
         complain(wrong)

@@ -1,6 +1,7 @@
 """pharos cache: what pharos keeps so that it need not be made again, and throwing it away."""
 
 import contextlib
+import re
 import shutil
 from pathlib import Path
 from typing import Annotated, Any
@@ -11,6 +12,9 @@ from pharos.cli.answers import bytes_of, console, print_json, size_text
 from pharos.cli.options import Json
 from pharos.errors import PharosError, StateSpaceLocked, UnknownName
 from pharos.system.wording import many
+
+SPACE = re.compile(r".+-[0-9a-f]{16}")
+"""Names of folders in the cache: of the environment, and a digest of its rules."""
 
 app = typer.Typer(help="List or clear the cached state spaces.", no_args_is_help=False)
 
@@ -69,16 +73,16 @@ def clear(
 def _compiled(directory: Path) -> list[Path]:
     from pharos.system import paths
 
-    return [folder for folder in paths.compiled_folders(directory) if folder.is_dir()]
+    return [folder for folder in paths.compiled_folders(directory) if folder.is_dir() and not folder.is_symlink()]
 
 
 def _spaces(directory: Path) -> list[dict[str, Any]]:
     """Every cached state space, the largest first."""
-    from pharos.state_space import read_manifest
+    from pharos.state_space import is_of_state_space, read_manifest
 
     listed = []
     for folder in sorted((directory / "spaces").glob("*")):
-        if not folder.is_dir():
+        if folder.is_symlink() or not SPACE.fullmatch(folder.name) or not is_of_state_space(folder):
             continue
         manifest: dict[str, Any] | None = None
         with contextlib.suppress(PharosError):

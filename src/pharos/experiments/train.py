@@ -28,7 +28,7 @@ from pharos.experiments.run_folder import Checkpoint, Record, TrainingResult, fi
 from pharos.experiments.task import Task, TaskValues
 from pharos.observations import own_observation
 from pharos.system import compiling
-from pharos.system.storage import CLAIM, LOCK, lock
+from pharos.system.storage import CLAIM, LOCK, lock, remove_leftovers
 
 Progress = Callable[[int, int, Mapping[str, Any]], None]
 
@@ -204,6 +204,8 @@ def train_task(
         return done
     folder.mkdir(parents=True, exist_ok=True)
     with lock(folder, FolderLocked, "training"):
+        for name in (_results.RECORD, _results.CURVE, "policy.npy", "regret.png"):  # of a process that was killed
+            remove_leftovers(folder / name)
         result = _train(config, task, folder, tensorboard, progress, algorithm)
         for name in (LOCK, CLAIM):  # whoever waits for it finds a finished run
             (folder / name).unlink(missing_ok=True)

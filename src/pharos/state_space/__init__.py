@@ -1,6 +1,6 @@
 """Enumerating states onto disk, and reading them back."""
 
-from pharos.state_space.build import build, cached_folder
+from pharos.state_space.build import build, cached_folder, is_of_state_space
 from pharos.state_space.manifest import read_manifest
 from pharos.state_space.progress import BuildProgress
 from pharos.state_space.store import StateSpace, load
@@ -10,6 +10,7 @@ __all__ = [
     "StateSpace",
     "build",
     "cached_folder",
+    "is_of_state_space",
     "load",
     "read_manifest",
 ]

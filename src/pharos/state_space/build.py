@@ -165,6 +165,13 @@ def _manifest_of(plan: Plan, path: Path) -> dict[str, Any] | None:
     return manifest
 
 
+def is_of_state_space(folder: Path) -> bool:
+    """Whether a folder holds a state space, whole, unfinished or damaged, as far as the names of its files tell."""
+    if not folder.is_dir():
+        return False
+    return (folder / MANIFEST).is_file() or all(_is_ours(item.name) for item in folder.iterdir())
+
+
 def _is_ours(name: str) -> bool:
     return name in OUR_FILES or storage.is_temporary(name)
 

@@ -14,6 +14,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from pharos.errors import ParameterError
 from pharos.system import paths
 from pharos.system.paths import compiled_folders
 
@@ -50,7 +51,12 @@ def prepare(kernels: Path) -> None:
     Numba keeps it beside the files. Where nothing can be written there (an installation for all users, a container), it
     goes into the private folder of the cache, for the processes that this one starts, too; where there is none, into a
     temporary folder of this process.
+
+    Raises:
+        ParameterError: variables of the environment keep Numba from compiling.
     """
+    if os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0"):
+        raise ParameterError("NUMBA_DISABLE_JIT is set, and pharos' kernels work compiled alone; unset it")
     if not os.environ.get("NUMBA_CACHE_DIR") and not _can_be_written(kernels / "__pycache__"):
         os.environ["NUMBA_CACHE_DIR"] = str(
             private_folder(paths.cache_directory()) or paths.temporary_folder("pharos-")
@@ -68,7 +74,10 @@ def _can_be_written(folder: Path) -> bool:
 
 
 def _listen() -> None:
-    from numba.core import config, event
+    try:
+        from numba.core import config, event
+    except (ValueError, RuntimeError) as error:
+        raise ParameterError(f"Numba cannot be loaded: {error}; look at its variables, NUMBA_...") from error
 
     vars(config)["CACHE_DIR"] = os.environ.get("NUMBA_CACHE_DIR", "")  # Numba may have been loaded before
 
