@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 
 import pharos
-from pharos import drawing, exporters
+from pharos import drawing, exporters, hardness, importers
 from pharos.cli.solve import save
+from pharos.errors import FileFormatError
+from pharos.experiments import load_agent, read_rows
 from pharos.mdp import TabularMDP
 from pharos.plots import save as save_figure
 from pharos.system.storage import replace_file
@@ -73,3 +75,56 @@ def test_a_full_disk_leaves_the_older_file(name, tmp_path):
     assert process.exitcode == 7
     assert (tmp_path / name).read_text() == "older"
     assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+@pytest.fixture
+def at_most_20_seconds():
+    """A reader that waits for a pipe is ended."""
+
+    def stop(*_):
+        raise TimeoutError
+
+    before = signal.signal(signal.SIGALRM, stop)
+    signal.alarm(20)
+    yield
+    signal.alarm(0)
+    signal.signal(signal.SIGALRM, before)
+
+
+def be_a_pipe(path):
+    path.unlink()
+    os.mkfifo(path)
+
+
+def be_endless(path):
+    path.unlink()
+    path.symlink_to("/dev/zero")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("become", [be_a_pipe, be_endless])
+@pytest.mark.parametrize("name", ["run.json", "curve.parquet", "policy.npy"])
+def test_pipes_and_devices_in_the_folder_of_a_run_are_refused(name, become, tmp_path, at_most_20_seconds):
+    pharos.train("q_learning", "frozen_lake/4x4", steps=50, out=tmp_path / "run")
+    become(tmp_path / "run" / name)
+    with pytest.raises(FileFormatError, match=rf"{name}: cannot be read.* it is no regular file"):
+        read_rows(tmp_path / "run") if name == "curve.parquet" else load_agent(tmp_path / "run")
+
+
+@pytest.mark.parametrize("become", [be_a_pipe, be_endless])
+def test_pipes_and_devices_among_the_files_of_mdps_are_refused(become, tmp_path, at_most_20_seconds):
+    importers.save(mdp(), tmp_path / "mdp")
+    for file in sorted((tmp_path / "mdp").glob("*.npy")):
+        whole = file.read_bytes()
+        become(file)
+        with pytest.raises(FileFormatError, match=rf"{file.name}: cannot be read: it is no regular file"):
+            importers.load(tmp_path / "mdp")
+        file.unlink()
+        file.write_bytes(whole)
+    exporters.bridge(mdp(), tmp_path / "x.npz")
+    become(tmp_path / "x.npz")
+    with pytest.raises(FileFormatError, match=r"x\.npz: cannot be read .*no regular file"):
+        importers.bridge(tmp_path / "x.npz")
+    hardness.report(pharos.build("simple_grid", tmp_path / "grid", progress=False).mdp(), ["diameter"])
+    become(tmp_path / "grid" / "hardness.json")
+    assert hardness.report(pharos.load(tmp_path / "grid").mdp(), ["diameter"])["diameter"].value is not None

@@ -8,6 +8,7 @@ from pharos.errors import FileFormatError, UntrustedCode
 from pharos.experiments import results as _results
 from pharos.experiments.config import RunConfig
 from pharos.experiments.task import Task
+from pharos.system.storage import check_regular
 
 
 def load_agent(folder: str | os.PathLike, *, trust: bool = False) -> tuple[Task, Any]:
@@ -42,6 +43,7 @@ def load_agent(folder: str | os.PathLike, *, trust: bool = False) -> tuple[Task,
         raise FileFormatError(f"{folder / 'run.json'}: {error}") from error
     if config.is_tabular:
         try:
+            check_regular(folder / "policy.npy")
             return task, np.load(folder / "policy.npy", allow_pickle=False)
         except (OSError, ValueError, EOFError) as error:
             raise FileFormatError(f"{folder / 'policy.npy'}: cannot be read: {error}") from error

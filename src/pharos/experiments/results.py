@@ -249,6 +249,7 @@ def read_table(path: Path, advice: str = AGAIN) -> "pa.Table":
     import pyarrow.parquet as pq
 
     try:
+        storage.check_regular(path)
         with pq.ParquetFile(path, page_checksum_verification=True) as file:
             return file.read(use_threads=False)  # in half the time of pq.read_table, for small files
     except FileNotFoundError:

@@ -124,6 +124,7 @@ class ResultsFile:
         """Entries by key; none where the file is missing, of another format, or damaged."""
         assert self.path is not None
         try:
+            storage.check_regular(self.path)
             text = self.path.read_bytes()
         except OSError:
             return {}

@@ -9,6 +9,7 @@ import numpy as np
 
 from pharos.errors import FileFormatError, ParameterError
 from pharos.mdp import TabularMDP
+from pharos.system import storage
 
 MINIGRID_STEPS = 100
 LARGEST_HORIZON = 100_000
@@ -72,6 +73,7 @@ def bridge_screens(path: str | os.PathLike) -> np.ndarray:
 def has_screens(path: str | os.PathLike) -> bool:
     """Whether a file of BRIDGE has the screens of its states; only the list of its members is read."""
     try:
+        storage.check_regular(path)
         with zipfile.ZipFile(path) as file:
             return {"screens.npy", "screen_mapping.npy"} <= set(file.namelist())
     except (OSError, zipfile.BadZipFile):
@@ -80,6 +82,7 @@ def has_screens(path: str | os.PathLike) -> bool:
 
 def _members(path: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:
     try:
+        storage.check_regular(path)
         with open(path, "rb") as file, np.load(file, allow_pickle=False) as stored:
             missing = [name for name in names if name not in stored.files]
             if missing:

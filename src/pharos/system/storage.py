@@ -391,6 +391,16 @@ def plain(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
+def check_regular(path: str | os.PathLike) -> None:
+    """Refuse what is there and is no regular file: a pipe or a device, which may never end.
+
+    Raises:
+        OSError: it is none, or there is nothing; `strerror` says so.
+    """
+    if not stat.S_ISREG(os.stat(path).st_mode):
+        raise OSError(errno.EINVAL, "it is no regular file", os.fspath(path))
+
+
 def read_json(path: str | os.PathLike, error: type[PharosError] = FileFormatError, advice: str = "") -> Any:
     """The value that a file of JSON holds.
 
@@ -401,6 +411,7 @@ def read_json(path: str | os.PathLike, error: type[PharosError] = FileFormatErro
     """
     advice = f"; {advice}" if advice else ""
     try:
+        check_regular(path)
         data = Path(path).read_bytes()
     except (FileNotFoundError, NotADirectoryError) as problem:
         raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path)) from problem
@@ -430,6 +441,7 @@ def digest_of_bytes(data: bytes | memoryview) -> str:
 def digest_of_file(path: str | os.PathLike, block_bytes: int = BLOCK_BYTES) -> str:
     """XXH3-128 of a file, read in blocks."""
     digest = xxhash.xxh3_128()
+    check_regular(path)
     with open(path, "rb") as file:
         while block := file.read(block_bytes):
             digest.update(block)
