@@ -313,6 +313,19 @@ def test_what_is_wrong_is_said_before_anything_is_learnt(options, error, message
         train(agent, "simple_grid/4x4-plain", **{"steps": 100, **options})
 
 
+@pytest.mark.parametrize("text", ["[" * 5000, "9" * 5000, "2020-99-99"])
+def test_yaml_that_cannot_be_read_is_a_line(text, tmp_path):
+    (tmp_path / "own.yaml").write_text(f"q_learning: {{frozen_lake: {{index: {{learning_rate: {text}}}}}}}")
+    with pytest.raises(ParameterError, match=r"own\.yaml: cannot be read: ") as caught:
+        train("q_learning", "frozen_lake/4x4", steps=10, hyperparameters=tmp_path / "own.yaml")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_network_that_no_machine_holds_is_a_line():
+    with pytest.raises(MemoryError, match=r"the network of 'dqn': net_arch is \[1000000000000\]"):
+        train("dqn", "frozen_lake/4x4", steps=10, hyperparameters={"net_arch": [10**12]})
+
+
 def test_a_missing_package_of_agents_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "sb3_contrib", None)
     with pytest.raises(ParameterError, match="needs sb3-contrib; install it with: pip install sb3-contrib"):

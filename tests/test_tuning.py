@@ -3,8 +3,10 @@
 import json
 import time
 
+import optuna
 import pytest
 import yaml
+from optuna.storages.journal import JournalFileBackend
 from typer.testing import CliRunner
 
 from pharos.agents import hyperparameters
@@ -175,4 +177,26 @@ def test_a_journal_that_is_damaged_elsewhere_is_one_line(tmp_path):
     lines = journal.read_bytes().splitlines(keepends=True)
     journal.write_bytes(b"".join([lines[0], lines[1][:9] + b"\n", *lines[2:]]))
     with pytest.raises(FileFormatError, match=r"journal\.log:2: is no JSON"):
+        tune("q_learning", "frozen_lake/4x4", steps=200, trials=3, seeds=[0], out=tmp_path)
+
+
+def test_a_search_that_was_killed_goes_on_as_it_would_have(tmp_path):
+    options = {"steps": 200, "seeds": [0], "search_seed": 5}
+    once = tune("q_learning", "frozen_lake/4x4", trials=6, out=tmp_path / "once", **options)
+    tune("q_learning", "frozen_lake/4x4", trials=3, out=tmp_path / "twice", **options)
+    storage = optuna.storages.JournalStorage(JournalFileBackend(str(tmp_path / "twice" / "journal.log")))
+    optuna.load_study(study_name=None, storage=storage).ask()  # a trial that has begun and never ends
+    twice = tune("q_learning", "frozen_lake/4x4", trials=6, out=tmp_path / "twice", **options)
+    told = ("number", "hyperparameters", "score", "status")
+    assert [[each[name] for name in told] for each in twice.trials] == [
+        [each[name] for name in told] for each in once.trials
+    ]
+    assert len({str(each["hyperparameters"]) for each in once.trials}) == 6
+
+
+def test_a_journal_that_lacks_a_name_is_one_line(tmp_path):
+    tune("q_learning", "frozen_lake/4x4", steps=200, trials=2, seeds=[0], out=tmp_path)
+    journal = tmp_path / "journal.log"
+    journal.write_text(journal.read_text().replace('"trial_id"', '"trial_if"'))
+    with pytest.raises(FileFormatError, match=r"journal\.log: is not as Optuna wrote it \(KeyError.*delete the folder"):
         tune("q_learning", "frozen_lake/4x4", steps=200, trials=3, seeds=[0], out=tmp_path)

@@ -155,6 +155,10 @@ def make_model(
         names = getattr(algorithm(agent), "policy_aliases", {})
         remedy = f"; give its hyperparameter policy: {', '.join(names)}" if "policy" in str(error).lower() else ""
         raise ParameterError(f"agent {_title(agent)!r} cannot be made: {error}{remedy}") from error
+    except RuntimeError as error:  # torch, of memory
+        if "allocate" not in str(error):
+            raise
+        raise MemoryError(f"the network of {_title(agent)!r}: net_arch is {network['net_arch']}") from error
     if tensorboard is None:  # the logger that it would make itself leaves a folder among the temporary files
         from stable_baselines3.common.logger import HumanOutputFormat, KVWriter, Logger
 

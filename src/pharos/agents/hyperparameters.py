@@ -48,8 +48,10 @@ def _read(path: Path) -> dict[str, Any]:
         raise MissingExtra("reading hyperparameters", "pyyaml", "study") from error
     try:
         table = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, yaml.YAMLError) as error:
-        raise ParameterError(f"{path}: cannot be read: {error}") from error
+    except RecursionError:
+        raise ParameterError(f"{path}: cannot be read: its brackets are nested too deeply") from None
+    except (OSError, yaml.YAMLError, ValueError) as error:
+        raise ParameterError(f"{path}: cannot be read: {' '.join(str(error).split())[:300]}") from error
     levels = [table, *(table.values() if isinstance(table, dict) else [])]
     if not all(isinstance(level, dict) for level in levels):
         raise ParameterError(f"{path}: expected agent, then class, then observation, each with names and values")

@@ -22,10 +22,12 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from pharos.agents import agent_kind
 from pharos.agents import hyperparameters as hyperparameters_of
 from pharos.environments import Environment, make
-from pharos.errors import MissingExtra, ParameterError
+from pharos.errors import FileFormatError, MissingExtra, ParameterError
 from pharos.experiments import results as _results
 from pharos.experiments.batch import train_configs
 from pharos.experiments.config import ChanceSetting, RunConfig
@@ -137,9 +139,9 @@ def tune(
         if progress is not None:
             progress(_done(study), trials, _best(study))
 
-    missing = trials - _done(study)
-    if missing > 0:
-        study.optimize(lambda trial: search.score(trial, optuna.TrialPruned), n_trials=missing, callbacks=[after])
+    while (done := _done(study)) < trials:
+        study.sampler = _sampler(optuna, search, done, trials)
+        study.optimize(lambda trial: search.score(trial, optuna.TrialPruned), n_trials=1, callbacks=[after])
     if not math.isfinite(_best(study)):
         raise ParameterError(f"none of {many(trials, 'trial')} was finished; give more trials, or look at tuning.json")
     records = _trials(study)
@@ -213,7 +215,7 @@ class _Search:
     def check_tasks(self) -> None:
         """ParameterError for a task on which regret cannot be normalised."""
         for task in self.tasks:
-            if not task.reference.optimal - task.reference.uniform > 1e-12:
+            if not math.isfinite(task.reference.spread()):
                 raise ParameterError(
                     f"{task.env}: acting at random is optimal, so regret cannot be normalised; leave it out"
                 )
@@ -270,19 +272,33 @@ class _Search:
 
 def _opened(optuna: Any, search: _Search, folder: Path | None, trials: int) -> Any:
     """Optuna's study, new or as it was left; its first trial is what the table says."""
-    optuna.logging.set_verbosity(optuna.logging.WARNING)
-    study = optuna.create_study(
-        study_name=_results.identifier(search.config),
-        storage=_storage(optuna, folder),
-        sampler=optuna.samplers.TPESampler(seed=search.search_seed, n_startup_trials=min(10, max(2, trials // 4))),
-        pruner=optuna.pruners.MedianPruner(n_startup_trials=5, n_warmup_steps=10),
-        direction="minimize",
-        load_if_exists=True,
-    )
+    optuna.logging.set_verbosity(optuna.logging.ERROR)  # what fails is raised
+    try:
+        study = optuna.create_study(
+            study_name=_results.identifier(search.config),
+            storage=_storage(optuna, folder),
+            sampler=_sampler(optuna, search, 0, trials),
+            pruner=optuna.pruners.MedianPruner(n_startup_trials=5, n_warmup_steps=10),
+            direction="minimize",
+            load_if_exists=True,
+        )
+    except (KeyError, ValueError, TypeError, AttributeError) as error:
+        if isinstance(error, FileFormatError) or folder is None:
+            raise
+        raise FileFormatError(
+            f"{folder / 'journal.log'}: is not as Optuna wrote it ({type(error).__name__}: {error}); delete the folder "
+            f"and search again"
+        ) from error
     if not _trials(study) and all(trial.state.name != "WAITING" for trial in study.trials):
         before = {key: search.table.get(key, default_value(search.agent, key)) for key in search.space}
         study.enqueue_trial({key: value for key, value in before.items() if allows(search.space[key], value)})
     return study
+
+
+def _sampler(optuna: Any, search: _Search, done: int, trials: int) -> Any:
+    """What proposes the next trial, from those that are done: a search that was killed goes on as it would have."""
+    seed = int(np.random.SeedSequence([search.search_seed, done]).generate_state(1)[0])
+    return optuna.samplers.TPESampler(seed=seed, n_startup_trials=min(10, max(2, trials // 4)))
 
 
 def _checked_chances(
@@ -355,14 +371,13 @@ def _trials(study: Any) -> list[dict[str, Any]]:
     words = {"COMPLETE": "finished", "PRUNED": "given up", "FAIL": "failed"}
     return [
         {
-            "number": trial.number,
+            "number": number,
             "hyperparameters": trial.params,
             "score": trial.value if trial.state.name == "COMPLETE" else None,
             "status": words[trial.state.name],
             "seconds": trial.duration.total_seconds() if trial.duration else None,
         }
-        for trial in study.trials
-        if trial.state.name in words
+        for number, trial in enumerate(each for each in study.trials if each.state.name in words)
     ]
 
 
