@@ -44,13 +44,13 @@ BUILT_IN = (  # in the order in which they are listed
         "freeway",
         "Freeway",
         "20x11-speed1 20x11-speed2 25x13-speed1 25x13-speed2 20x5-speed1 20x5-speed2 16x7-speed1 16x7-speed2 "
-        "25x9-speed1 25x9-speed2",
+        "25x9-speed1 25x9-speed2 5x5-speed1",
     ),
     BuiltIn(
         "breakout",
         "Breakout",
         "12x10x1 12x8x1 16x8x1 20x8x1 24x8x1 12x10x3 12x8x3 16x8x3 20x8x3 24x8x3 14x8x1 14x10x3 20x10x1 20x10x3 "
-        "24x10x3 20x10x1-3rows 30x10x1-3rows",
+        "24x10x3 20x10x1-3rows 30x10x1-3rows 6x4x1",
     ),
     BuiltIn("sliding_tiles", "SlidingTiles", "2x2 2x3 3x3 3x3-hardest 2x4 2x5 3x4"),
     BuiltIn("pocket_cube", "PocketCube", "half quarter half-4 quarter-4"),

@@ -29,6 +29,7 @@ INSTANCES = {
 INSTANCES |= {  # 923,305,259 and 1,083,934,871 states
     f"{height}x10x1-3rows": {"height": height, "columns": 10, "brick_rows": 3} for height in (20, 30)
 }
+INSTANCES["6x4x1"] = {"height": 6, "columns": 4}  # 4,620 states, for examples and pages
 
 # found by searches on courts of 11 x 7 and 10 x 8 under three kinds of chance, docs/agents.md
 VECTOR = {

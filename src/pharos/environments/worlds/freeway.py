@@ -58,10 +58,14 @@ WIDE_CHICKEN = (
 CLOCK = ("." * 20,) * 9 + ("#" * 20,) * 3  # below the car, or the player, whose timer it shows
 MOST_SHOWN = 255  # values of a timer
 
-INSTANCES = {
+PAPER = {
     f"{cars}x{length}-speed{speed}": {"num_cars": cars, "lane_length": length, "player_speed": speed}
     for cars, length in ((20, 11), (25, 13), (20, 5), (16, 7), (25, 9))
     for speed in (1, 2)
+}
+INSTANCES = {  # the small one, of 1,620 states, for examples and pages
+    **PAPER,
+    "5x5-speed1": {"num_cars": 5, "lane_length": 5, "player_speed": 1},
 }
 
 
@@ -134,7 +138,7 @@ class Freeway(Environment):
         ),
     )
     instances = INSTANCES
-    paper_instances = tuple(INSTANCES)
+    paper_instances = tuple(PAPER)
     hyperparameters = ARCADE
 
     def validate(self) -> None:
