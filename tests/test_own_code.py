@@ -444,3 +444,22 @@ def test_where_all_runs_fail_it_is_raised(tmp_path):
     assert caught.value.outcome.failed == 5
     with pytest.raises(AllRunsFailed, match="seed 3"):
         pharos.train_many("dqn", "frozen_lake/4x4", seeds=[3], steps=10, hyperparameters={"net_arch": [-1]})
+
+
+@pytest.mark.slow
+def test_a_packed_study_says_nothing_of_the_machine_and_is_unpacked_beside_its_code(lab, tmp_path):
+    import pyarrow.parquet as pq
+
+    words = ("own.yaml", "--out", "elsewhere/results", "--to", tmp_path / "own.parquet")
+    assert command("study", "pack", *words, cwd=lab).returncode == 0
+    table = pq.read_table(tmp_path / "own.parquet")
+    told = str(table.schema.metadata) + str(table["record"].to_pylist())
+    assert str(lab) not in told and str(lab.parent) not in told
+    files = {json.loads(record)["config"]["sources"]["environment"]["file"] for record in table["record"].to_pylist()}
+    assert files == {"code/taxi_of_mine.py", "taxi_module.py"}
+    for name in ("code", "taxi_module.py", "corners.py", "learner_module.py"):
+        (shutil.copytree if (lab / name).is_dir() else shutil.copy)(lab / name, tmp_path / name)
+    done = command("study", "unpack", "own.parquet", "--out", "got", "--trust", "--json", cwd=tmp_path)
+    assert (done.returncode, json.loads(done.stdout)["added"]) == (0, 3), done.stderr
+    done = command("study", "status", "got", "--trust", "--json", cwd=tmp_path)
+    assert json.loads(done.stdout)["finished"] == 3, done.stderr

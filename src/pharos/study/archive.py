@@ -32,7 +32,8 @@ def pack(source: Source, folder: str | os.PathLike | None = None, *, file: str |
 
     A row for each run: `id`; `record`, its run.json; and for each column of curve.parquet a list. Among the metadata of
     the file are the specification, its digest, and a digest of each run. What agents learnt stays in the folder: some
-    hundred kilobytes a run, where a row takes two.
+    hundred kilobytes a run, where a row takes two. Files of code are named relative to the specification, or by their
+    name alone where they are elsewhere, with their checksums; nothing tells where they were on this machine.
 
     Raises:
         ParameterError: no run is finished. OSError: the file cannot be written; an older one then stays as it was.
@@ -45,7 +46,7 @@ def pack(source: Source, folder: str | os.PathLike | None = None, *, file: str |
         record = _worker.read_record(place / "runs" / run.id)
         if record is not None and record["status"] == _worker.FINISHED:
             ids.append(run.id)
-            records.append(json.dumps(record))
+            records.append(json.dumps(_placeless(record, study.folder)))
             curves.append(experiments.read_curve_table(place / "runs" / run.id, CURVE_COLUMNS))
     if not ids:
         raise ParameterError(f"{place}: no run of {study.name!r} is finished; execute `pharos study run` first")
@@ -53,7 +54,10 @@ def pack(source: Source, folder: str | os.PathLike | None = None, *, file: str |
     for field in pa.unify_schemas([curve.schema for curve in curves]):
         lists = [curve.column(field.name).to_pylist() if field.name in curve.column_names else None for curve in curves]
         columns[field.name] = pa.array(lists, pa.list_(field.type))
-    text = yaml.safe_dump(study.model_dump(mode="json", exclude_unset=True), sort_keys=False, width=120)
+    described = study.model_dump(mode="json", exclude_unset=True)
+    if "folder" in described:
+        described["folder"] = "."
+    text = yaml.safe_dump(described, sort_keys=False, width=120)
     runs = zip(ids, records, curves, strict=True)
     digests = {"study": storage.digest_of_json(text), "runs": {id: _digest(id, *rest) for id, *rest in runs}}
     metadata = {_STUDY: text.encode(), _FORMAT: str(FORMAT).encode(), _DIGESTS: json.dumps(digests).encode()}
@@ -61,6 +65,20 @@ def pack(source: Source, folder: str | os.PathLike | None = None, *, file: str |
     file.parent.mkdir(parents=True, exist_ok=True)
     experiments.write_table(file, pa.table(columns).replace_schema_metadata(metadata))
     return len(ids)
+
+
+def _placeless(record: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """A record whose files of code are named relative to a folder."""
+    sources = record["config"].get("sources")
+    if not sources:
+        return record
+    moved = {}
+    for part, source in sources.items():
+        file = Path(source["file"])
+        inside = file.relative_to(folder) if file.is_relative_to(folder) else Path(file.name)
+        moved[part] = {**source, "file": inside.as_posix()}
+    record = {**record, "config": {**record["config"], "sources": moved}}
+    return storage.sealed(record) if storage.DIGEST in record else record
 
 
 def unpack(
@@ -76,7 +94,8 @@ def unpack(
         file: written by `pack`.
         folder: of the study; studies/NAME in the current directory when not given. Runs that it has stay as they are.
         into: another study, which gets those of the runs that it has as well; None: the packed one.
-        trust: whether code that the packed study names may be imported; `into` is read in its place.
+        trust: whether code that the packed study names may be imported, from beside the file; `into` is read in its
+            place.
     Returns:
         The folder, and how many runs were added.
     Raises:
@@ -85,7 +104,7 @@ def unpack(
     """
     file = Path(file)
     text, table, digests = _read(file)
-    packed = parse(text, str(file), trust=trust) if into is None else into
+    packed = parse(text, str(file), folder=file.absolute().parent, trust=trust) if into is None else into
     target, place = opened(packed, folder, trust=trust or None)
     wanted = {run.id for run in target.runs}
     runs = []
