@@ -67,15 +67,16 @@ def pack(source: Source, folder: str | os.PathLike | None = None, *, file: str |
     return len(ids)
 
 
-def _placeless(record: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """A record whose files of code are named relative to a folder."""
+def _placeless(record: dict[str, Any], folder: str | None) -> dict[str, Any]:
+    """A record whose files of code are named relative to the folder of the specification."""
     sources = record["config"].get("sources")
     if not sources:
         return record
     moved = {}
     for part, source in sources.items():
         file = Path(source["file"])
-        inside = file.relative_to(folder) if file.is_relative_to(folder) else Path(file.name)
+        within = folder is not None and file.is_relative_to(folder)
+        inside = file.relative_to(str(folder)) if within else Path(file.name)
         moved[part] = {**source, "file": inside.as_posix()}
     record = {**record, "config": {**record["config"], "sources": moved}}
     return storage.sealed(record) if storage.DIGEST in record else record
