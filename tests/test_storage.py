@@ -305,7 +305,7 @@ def test_what_is_no_json_is_said_in_one_line(data, message, tmp_path):
         storage.read_json(tmp_path / "x.json", advice="write it again")
     assert str(tmp_path / "x.json") in str(caught.value) and "\n" not in str(caught.value)
     assert str(caught.value).endswith("; write it again")
-    with pytest.raises(FileFormatError, match="cannot be read: Is a directory"):
+    with pytest.raises(FileFormatError, match="cannot be read: it is no regular file"):
         storage.read_json(tmp_path)
     with pytest.raises(FileNotFoundError):
         storage.read_json(tmp_path / "none.json")

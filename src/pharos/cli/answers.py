@@ -150,8 +150,8 @@ def _written(value: Any) -> str:
 def compiling_fact() -> list[tuple[str, str]]:
     """What this command has spent on compiling, a fact or none: where little was compiled there is nothing to tell."""
     seconds = compiling.seconds()
-    kept = "" if paths.is_temporary() else ", kept for the next time"
-    return [("compiling", f"{seconds:.1f} s{kept}")] if seconds >= NOTABLE_SECONDS else []
+    suffix = "" if paths.is_temporary() else ", kept for the next time"
+    return [("compiling", f"{seconds:.1f} s{suffix}")] if seconds >= NOTABLE_SECONDS else []
 
 
 def peak_memory_bytes() -> int:

@@ -86,13 +86,13 @@ def evaluate(
     source = "given"
     if decisions is not None and decisions.task is not None:
         own = decisions.task
-        given = {name for name in SETTING if context.get_parameter_source(name).name == "COMMANDLINE"}  # type: ignore[union-attr]
-        gamma = gamma if "gamma" in given else own.gamma
-        horizon = horizon if "horizon" in given else own.horizon_steps
-        sticky = sticky if "sticky" in given else own.sticky
-        random = random if "random" in given else own.random
-        lazy = lazy if "lazy" in given else own.lazy
-        source = "the run's own" if not given else f"the run's own, but for {', '.join(sorted(given))}"
+        overridden = {name for name in SETTING if context.get_parameter_source(name).name == "COMMANDLINE"}  # type: ignore[union-attr]
+        gamma = gamma if "gamma" in overridden else own.gamma
+        horizon = horizon if "horizon" in overridden else own.horizon_steps
+        sticky = sticky if "sticky" in overridden else own.sticky
+        random = random if "random" in overridden else own.random
+        lazy = lazy if "lazy" in overridden else own.lazy
+        source = "the run's own" if not overridden else f"the run's own, but for {', '.join(sorted(overridden))}"
     if goal.is_imported and Path(policy).expanduser().is_dir():  # what was learnt on the environment of the table
         table = goal.mdp()
         gamma, horizon = table.gamma if gamma is None else gamma, table.horizon if horizon is None else horizon

@@ -115,8 +115,8 @@ def _learnt(policy: str | None, trust: bool) -> "Learnt | None":
         return None
     from pharos.explorer import Learnt
 
-    given = read_policy(policy, trust=trust)
-    agent, seeing = given.policy, given.seeing
+    named = read_policy(policy, trust=trust)
+    agent, seeing = named.policy, named.seeing
     return Learnt(agent, Path(policy).name, **seeing)
 
 

@@ -116,10 +116,10 @@ def _check_sizes(entry: Entry, task: Task, hyperparameters: dict[str, Any]) -> N
     if type(features) is not int or features < 1:
         raise FileFormatError(f"its features_dim is {str(features)[:40]}; expected a whole number of at least 1")
     layers = 0
-    for given in (hyperparameters.get("net_arch", []), kwargs.get("net_arch", [])):
-        for each in given.values() if isinstance(given, dict) else [given]:
+    for arch in (hyperparameters.get("net_arch", []), kwargs.get("net_arch", [])):
+        for each in arch.values() if isinstance(arch, dict) else [arch]:
             if not isinstance(each, list) or not all(type(width) is int and width >= 1 for width in each):
-                raise FileFormatError(f"its net_arch is {str(given)[:80]}; expected widths of layers")
+                raise FileFormatError(f"its net_arch is {str(arch)[:80]}; expected widths of layers")
             layers += len(each)
     if layers > 2 * len(entry.arrays) + 8:
         raise FileFormatError(f"its hyperparameters ask for {layers:,} layers that its network does not have")
@@ -143,8 +143,8 @@ def _check_arrays(entry: Entry, env: Any, hyperparameters: dict[str, Any]) -> No
             env.observation_space, **kwargs.get("features_extractor_kwargs", {})
         )
     expected = {tuple(each.shape) for each in features.state_dict().values()}
-    for given in (hyperparameters.get("net_arch", []), kwargs.get("net_arch", [])):
-        for layers in given.values() if isinstance(given, dict) else [given]:
+    for arch in (hyperparameters.get("net_arch", []), kwargs.get("net_arch", [])):
+        for layers in arch.values() if isinstance(arch, dict) else [arch]:
             expected |= {(after, before) for before, after in itertools.pairwise((features.features_dim, *layers))}
     shapes = {array.shape for array in entry.arrays.values() if array.dtype == np.float32}
     if missing := sorted(expected - shapes):

@@ -130,8 +130,8 @@ def title(name: str, options: Mapping[str, Any], *, whole: bool = False) -> str:
     Args:
         whole: with all options.
     """
-    told = (*TELLING, *sorted(set(options) - set(TELLING))) if whole else TELLING
-    words = (f"{option}={_words(options[option])}" for option in told if options.get(option))
+    shown = (*TELLING, *sorted(set(options) - set(TELLING))) if whole else TELLING
+    words = (f"{option}={_words(options[option])}" for option in shown if options.get(option))
     return f"{name}({', '.join(words)})".removesuffix("()")
 
 

@@ -70,8 +70,8 @@ class DeepPolicy:
     """
 
     def __init__(self, model: Any, *, deterministic: bool = False):
-        asked = getattr(model.policy, "get_distribution", None)
-        if asked is not None and "lstm_states" in inspect.signature(asked).parameters:
+        distribution = getattr(model.policy, "get_distribution", None)
+        if distribution is not None and "lstm_states" in inspect.signature(distribution).parameters:
             raise ParameterError(
                 f"{type(model).__name__}: its policy has a memory, so its values belong to whole histories, which are "
                 f"not evaluated; expected a policy of observations: frames=4 among the observation's options shows the "

@@ -255,15 +255,15 @@ def waiting_lock(
     Returns:
         A context in which the folder is held, already entered: `with waiting_lock(...):`.
     """
-    held, told = contextlib.ExitStack(), False
+    held, is_announced = contextlib.ExitStack(), False
     while True:
         try:
             held.enter_context(lock(folder, error, activity))
             return held
         except error:
-            if not told:
+            if not is_announced:
                 tell(f"{folder}: another process is {activity} there; waiting until it is done")
-                told = True
+                is_announced = True
             time.sleep(WAITING_SECONDS)
 
 
