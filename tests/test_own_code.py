@@ -463,3 +463,46 @@ def test_a_packed_study_says_nothing_of_the_machine_and_is_unpacked_beside_its_c
     assert (done.returncode, json.loads(done.stdout)["added"]) == (0, 3), done.stderr
     done = command("study", "status", "got", "--trust", "--json", cwd=tmp_path)
     assert json.loads(done.stdout)["finished"] == 3, done.stderr
+
+
+WALK = """
+from dataclasses import dataclass
+import pharos
+from pharos import study
+
+@dataclass(frozen=True, kw_only=True)
+class Walk(pharos.Environment):
+    name = "walk_of_a_script"
+    actions = ("left", "right")
+    max_episode_steps = 20
+    def variables(self):
+        return {"cell": range(4)}
+    def initial_state(self):
+        return (0,)
+    def transition(self, state, action, out):
+        out[0] = min(max(state[0] + 2 * action - 1, 0), 3)
+    def is_terminal(self, state):
+        return state[0] == 3
+    def reward(self, state, action, next_state):
+        return 1.0 if next_state[0] == 3 else 0.0
+
+pharos.register(Walk)
+block = {"environments": ["walk_of_a_script"], "agents": ["q_learning"]}
+if GUARD:
+    try:
+        print(study.run({"name": "own", "steps": 200, "evaluations": 2, "seeds": 2, "blocks": [block]}, "out").finished)
+    except pharos.errors.ParameterError as error:
+        print(error)
+"""
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("guard", "said"), [('__name__ == "__main__"', "2\n"), ("True", "workers import this script, since it defines")]
+)
+def test_a_script_that_defines_a_class_needs_a_guard_and_says_so(guard, said, tmp_path):
+    (tmp_path / "script.py").write_text(WALK.replace("GUARD", guard))
+    line = [sys.executable, "script.py"]
+    done = subprocess.run(line, cwd=tmp_path, capture_output=True, text=True, timeout=300, env=dict(os.environ))
+    assert done.returncode == 0 and done.stdout.startswith(said) and "Traceback" not in done.stderr, done.stderr
+    assert done.stdout.count("\n") == 1

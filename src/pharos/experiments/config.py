@@ -12,9 +12,9 @@ from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any
 
 from pharos.agents import BATCHED, agent_kind, agent_source, is_known
-from pharos.environments import Environment, as_tuples, class_of, make, source_of
+from pharos.environments import Environment, as_tuples, class_called, class_of, make, source_of
 from pharos.errors import FileFormatError, ParameterError, UnknownName, UntrustedCode
-from pharos.observations import OwnObservation, observation_of
+from pharos.observations import OwnObservation, observation_of, registered
 from pharos.system.sources import Source, is_reference, resolve
 
 if TYPE_CHECKING:
@@ -331,6 +331,11 @@ class RunConfig:
             horizon=self.horizon,
             values=values,
         )
+
+    @property
+    def definitions(self) -> tuple[Any, ...]:
+        """The registered class of its environment, and what its observation was registered with, where they are."""
+        return (class_called(self.environment), *(registered(self.observation) or ()))
 
     def algorithm(self, *, trust: bool = False, strict: bool = False) -> "str | type":
         """The agent: its name, or the class of the user's own.

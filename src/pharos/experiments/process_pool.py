@@ -19,7 +19,7 @@ from pharos.experiments.config import RunConfig
 from pharos.experiments.run_folder import TrainingResult, finished_result
 from pharos.experiments.task_cache import FailedRun, TaskCache
 from pharos.experiments.training_jobs import Progress, Tell
-from pharos.system.workers import without_interrupts, without_main
+from pharos.system.workers import check_guard, without_interrupts, without_main
 
 
 def parts_of(configs: Sequence[RunConfig], workers: int, device: str = "cpu") -> list[list[int]]:
@@ -52,7 +52,7 @@ def train_parts(
             receiver, sender = context.Pipe(duplex=False)
             entries = [(configs[place].to_dict(), folders[place]) for place in part]
             process = context.Process(target=_train, args=(entries, checkpoints, device, sender), daemon=True)
-            with without_main(), without_interrupts():
+            with without_main(*configs[0].definitions), without_interrupts():
                 process.start()
             sender.close()
             processes.append(process)
@@ -75,6 +75,8 @@ def train_parts(
             if places:
                 process.terminate()
             process.join()
+    for process in processes:
+        check_guard(process.exitcode)
     return [_end(config, folder) for config, folder in zip(configs, folders, strict=True)]
 
 

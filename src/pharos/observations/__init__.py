@@ -8,7 +8,15 @@ from typing import TYPE_CHECKING
 
 from pharos.observations.blocks import in_blocks
 from pharos.observations.context import NO_ACTION, ObservationInContext
-from pharos.observations.observation import FunctionObservation, Observation, names, observe, register, title
+from pharos.observations.observation import (
+    FunctionObservation,
+    Observation,
+    names,
+    observe,
+    register,
+    registered,
+    title,
+)
 from pharos.observations.vector import Index, OneHot, Vector
 from pharos.system import lazy
 
@@ -90,6 +98,7 @@ __all__ = [
     "observe",
     "own_observation",
     "register",
+    "registered",
     "render",
     "renderers",
     "representation",

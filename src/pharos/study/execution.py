@@ -29,7 +29,7 @@ from pharos.study.specification import Source
 from pharos.study.status import Status, claim, duration, opened, status
 from pharos.system.storage import replace_json
 from pharos.system.wording import many
-from pharos.system.workers import without_main
+from pharos.system.workers import check_guard, without_main
 
 __all__ = ["Execution", "Options", "Status", "claim", "duration", "opened", "processors", "run", "shard_of", "status"]
 
@@ -257,7 +257,8 @@ class Execution:
             where = (run.id, folder, run.id in self.repeated, self.options.resume)
             arguments = (self.options.runner, dict(run.config), *where, dict(os.environ))
         process = context.Process(target=target, args=arguments, name=run.id)
-        with one_thread(), without_main(self.options.runner, self.options.batch_runner):
+        definitions = [each for run in unit for each in run.configuration.definitions]
+        with one_thread(), without_main(self.options.runner, self.options.batch_runner, *definitions):
             ready(context)
             process.start()
         return process
@@ -281,6 +282,7 @@ class Execution:
 
     def _ended(self, unit: tuple[Run, ...], code: int) -> None:
         """A process is over: what it has not left behind is done again."""
+        check_guard(code)
         if code == _worker.EXIT_BUSY:
             left = list(unit)
         else:

@@ -162,7 +162,11 @@ def _measured(runs: Sequence[Run], tell: Callable[[str], Any]) -> dict[Kind, flo
     context = multiprocessing.get_context("spawn")
     receiver, sender = context.Pipe(duplex=False)
     process = context.Process(target=_send_paces, args=([dict(run.config) for run in runs], sender))
-    with one_thread(), without_main(), without_interrupts():
+    with (
+        one_thread(),
+        without_main(*(each for run in runs for each in run.configuration.definitions)),
+        without_interrupts(),
+    ):
         process.start()
     sender.close()
     paces: dict[Kind, float] = {}

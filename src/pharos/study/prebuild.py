@@ -13,7 +13,7 @@ from pharos.study import values as _values
 from pharos.study import worker as _worker
 from pharos.study.blocks import Run
 from pharos.study.processes import end_processes
-from pharos.system.workers import without_interrupts, without_main
+from pharos.system.workers import check_guard, without_interrupts, without_main
 
 POLL_SECONDS = 2.0
 
@@ -45,7 +45,7 @@ def _prepare(
     context = multiprocessing.get_context("spawn")
     receiver, sender = context.Pipe(duplex=False)
     process = context.Process(target=_prepare_all, args=(prepare, [run.config for run in todo], sender))
-    with without_main(prepare), without_interrupts():
+    with without_main(prepare, *(each for run in todo for each in run.configuration.definitions)), without_interrupts():
         process.start()
     sender.close()
     done, waits_for = 0, ""
@@ -66,6 +66,7 @@ def _prepare(
     finally:
         receiver.close()
     process.join()
+    check_guard(process.exitcode)
     return done
 
 

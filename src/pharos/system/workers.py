@@ -1,6 +1,7 @@
 """Processes that work for this one: how many there may be, and what they import."""
 
 import contextlib
+import multiprocessing
 import os
 import signal
 import sys
@@ -20,14 +21,21 @@ def usable_workers(workers: int | None) -> int:
     return int(workers)
 
 
+NO_GUARD = 78
+"""Exit code of a process that imports a script which starts processes, without a guard."""
+
+
 @contextlib.contextmanager
-def without_main(*functions: Any) -> Iterator[None]:
+def without_main(*definitions: Any) -> Iterator[None]:
     """Processes that are started within do not import the user's script, which therefore needs no guard.
 
     multiprocessing lets each new process import the `__main__` of the first one, under another name. Code of the user's
-    own travels by its file (`sources`), so nothing is missing, but for `functions` that are defined in the script.
+    own travels by its file (`sources`), so nothing is missing; but where one of the `definitions` (classes, functions)
+    that the processes need stands in the script, they import it, and it needs the guard (`check_guard`).
     """
-    if any(getattr(getattr(each, "func", each), "__module__", None) == "__main__" for each in functions):
+    if getattr(multiprocessing.current_process(), "_inheriting", False):
+        sys.exit(NO_GUARD)
+    if any(getattr(getattr(each, "func", each), "__module__", None) == "__main__" for each in definitions):
         yield
         return
     main = vars(sys.modules["__main__"])
@@ -38,6 +46,16 @@ def without_main(*functions: Any) -> Iterator[None]:
         yield
     finally:
         main.update(hidden)
+
+
+def check_guard(exit_code: int | None) -> None:
+    """ParameterError where a process has ended since the script that it imported starts processes."""
+    if exit_code == NO_GUARD:
+        raise ParameterError(
+            "workers import this script, since it defines an environment, observation or function of the runs, and "
+            'it starts them again: put what starts runs below `if __name__ == "__main__":`, or move the definitions '
+            "into a file of their own"
+        )
 
 
 @contextlib.contextmanager
