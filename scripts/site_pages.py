@@ -43,15 +43,15 @@ COUNTED = {  # instance -> states, and the page that tells how they were counted
     "game_2048/3x3-to-256": (7_270_259, "game-2048.md"),
     "mini_grid/key-corridor-s5r3": (5_582_592, "mini-grid.md"),
     "mini_grid/key-corridor-s6r3": (16_844_288, "mini-grid.md"),
-    "freeway/25x13-speed1": (3_001_973, "study.md"),
-    "breakout/20x10x1-3rows": (923_305_259, "performance.md"),
-    "breakout/30x10x1-3rows": (1_083_934_871, "performance.md"),
+    "freeway/25x13-speed1": (3_001_973, "evidence/paper-grid.md"),
+    "breakout/20x10x1-3rows": (923_305_259, "evidence/performance.md"),
+    "breakout/30x10x1-3rows": (1_083_934_871, "evidence/performance.md"),
 }
 NOT_COMPUTED = {  # instance -> why its values are not there
     "breakout/20x10x1-3rows": "V\\* is 3.580966, within 2.2e-8: 1,328 s, and 10.4 GiB of memory beside mapped files "
-    "([performance](../performance.md)); the uniform and the worst policy were not solved",
-    "breakout/30x10x1-3rows": "V\\* is 2.212515, within 4.5e-9 ([performance](../performance.md)); the uniform and the "
-    "worst policy were not solved",
+    "([performance](../evidence/performance.md)); the uniform and the worst policy were not solved",
+    "breakout/30x10x1-3rows": "V\\* is 2.212515, within 4.5e-9 ([performance](../evidence/performance.md)); the "
+    "uniform and the worst policy were not solved",
     "sliding_tiles/3x4": "enumerated once ([302 s of a processor, 5.8 GB of files](../large-runs.md)); not solved",
     "game_2048/3x3": "541,821,326 possible outcomes, 33 minutes to enumerate; undiscounted the optimum is worth "
     "5,468.49 ([2048](../game-2048.md)); the uniform and the worst policy were not solved",
@@ -134,7 +134,7 @@ def values_of_all(stored: Mapping[str, dict]) -> str:
             "",
             "## Without values",
             "",
-            "`pharos solve` computes them, [as far as memory and disk go](../performance.md).",
+            "`pharos solve` computes them, [as far as memory and disk go](../evidence/performance.md).",
             "",
             "| instance | states | why |",
             "|---|---|---|",

@@ -74,7 +74,8 @@ def build(
         StateSpaceMismatch: the folder holds another environment, or other rules. StateSpaceLocked: somebody else is
         building there, and is not waited for. StateSpaceCorrupted: files were changed. RuleError: a rule failed or left
         the declared ranges, in the state that is named. ParameterError: the folder cannot be used.
-    Cost: see docs/performance.md; 40 to 110 ns a state, 8 W + 8 to 16 bytes of memory a state (W words of 64 bits).
+    Cost: 40 to 110 ns a state, 8 W + 8 to 16 bytes of memory a state (W words of 64 bits);
+        docs/evidence/performance.md.
     Source: the pharos paper, appendix A, Algorithm 1 (whose successors are stored under the wrong index there).
     """
     from pharos.state_space.build_processes import crew_of  # loads Numba
