@@ -18,8 +18,8 @@ import torch
 
 from pharos.agents import hyperparameters, make_model
 from pharos.agents.batched import BatchRun, ObservationSource, make_batch
-from pharos.experiments import Task
 from pharos.interaction import make_sb3_vec
+from pharos.training import Task
 
 RUNS = {"vector": 32, "simple_image": 8, "complex_image": 8}
 STEPS = 1_000_000  # of the training that the schedules belong to

@@ -17,7 +17,7 @@ import torch
 from batched import work
 from pharos.agents import hyperparameters
 from pharos.agents.batched import BatchRun, ObservationSource, make_batch
-from pharos.experiments import Task
+from pharos.training import Task
 
 STEPS = 1_000_000  # of the training that the schedules belong to
 

@@ -17,8 +17,8 @@ import numpy as np
 from pharos.agents import hyperparameters
 from pharos.agents.batched import BatchRun, ObservationSource, make_batch
 from pharos.environments import make
-from pharos.experiments import Task
 from pharos.observations import observe as observation_of
+from pharos.training import Task
 
 INSTANCE = "breakout/12x8x3"
 VARIANTS = {

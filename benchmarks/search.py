@@ -21,7 +21,7 @@ from drawing import drawn_set
 from pharos.agents import hyperparameters
 from pharos.agents.batched import BatchRun, ObservationSource, make_batch
 from pharos.environments import make
-from pharos.experiments import Task, evaluate_agent
+from pharos.training import Task, evaluate_agent
 
 CHANCES = ({}, {"random": 0.1}, {"sticky": 0.25})
 SPACES = {

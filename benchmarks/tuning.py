@@ -20,7 +20,7 @@ import torch
 
 import pharos
 from drawing import drawn_set
-from pharos import experiments
+from pharos import training
 from pharos.agents import hyperparameters as hyperparameters_of
 
 SPACES = {
@@ -67,7 +67,7 @@ def compare(agent, tasks, candidates, seeds, steps):
         for task in tasks:
             for seed in seeds:
                 configs.append(
-                    experiments.RunConfig.of_task(
+                    training.RunConfig.of_task(
                         task,
                         agent,
                         steps=steps,
@@ -77,7 +77,7 @@ def compare(agent, tasks, candidates, seeds, steps):
                         engine="batched",
                     )
                 )
-    ends = experiments.train_configs(configs)
+    ends = training.train_configs(configs)
     regrets, finals = [], []
     for end in ends:
         if not hasattr(end, "curve"):
@@ -123,7 +123,7 @@ def main():
     named = [value_of(each) for each in given.instance or [given.environment]]
     envs = [pharos.make(given.environment, **each) if isinstance(each, dict) else pharos.make(each) for each in named]
     chances = [{} if each == "plain" else read([each])[0] for each in given.chance or ["plain"]]
-    tasks = [experiments.Task(env, observation=given.observation, **chance) for env in envs for chance in chances]
+    tasks = [training.Task(env, observation=given.observation, **chance) for env in envs for chance in chances]
     table = hyperparameters_of(given.agent, given.environment, given.observation)
     if given.check:
         candidates, seeds = [table, *({**table, **each} for each in read(given.check))], list(range(5))
@@ -167,7 +167,7 @@ def main():
             "search_seed": given.search_seed,
             "engine": "batched",
         },
-        "versions": experiments.results.versions() if hasattr(experiments, "results") else {},
+        "versions": training.results.versions() if hasattr(training, "results") else {},
         "seconds": round(used, 1),
         "trials": trials,
         "best": {"trial": best, "score": float(scores[best]), "hyperparameters": candidates[best]},

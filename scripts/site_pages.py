@@ -90,7 +90,7 @@ PACKAGES = {  # page of the reference -> (title, module)
     "interaction": ("pharos.interaction", "pharos.interaction"),
     "policies": ("pharos.policies", "pharos.policies"),
     "agents": ("pharos.agents", "pharos.agents"),
-    "experiments": ("pharos.experiments", "pharos.experiments"),
+    "training": ("pharos.training", "pharos.training"),
     "leaderboard": ("pharos.leaderboard", "pharos.leaderboard"),
     "study": ("pharos.study", "pharos.study"),
     "plots": ("pharos.plots", "pharos.plots"),

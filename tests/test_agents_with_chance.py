@@ -8,8 +8,8 @@ import pytest
 import naive_mdp
 import pharos
 from chance_worlds import ChanceWorld
-from pharos import experiments
-from pharos.experiments import Task, evaluate_agent
+from pharos import training
+from pharos.training import Task, evaluate_agent
 
 CLIFF = {"height": 3, "width": 4, "slippery": True}
 
@@ -21,7 +21,7 @@ def task() -> Task:
 
 @pytest.mark.long
 def test_q_learning_learns_and_its_regret_is_exact():
-    run = experiments.train("q_learning", pharos.make("cliff_walking", **CLIFF), steps=60_000, seed=0)
+    run = training.train("q_learning", pharos.make("cliff_walking", **CLIFF), steps=60_000, seed=0)
     result = run.result
     assert result["exact"] and result["value_uniform"] < result["final_value"] <= result["value_optimal"]
     assert result["normalized_regret"] < 0.5 and result["final_regret"] < 0.1 * abs(result["value_optimal"])
@@ -39,7 +39,7 @@ def test_networks_learn_and_their_regret_is_that_of_the_policy_read_off_them(age
     """The last policy, asked in every state and solved by an independent route, is worth what the run says."""
     pytest.importorskip("torch")
     env = pharos.make("cliff_walking", height=2, width=3, slippery=True)
-    run = experiments.train(
+    run = training.train(
         agent, env, steps=800, seed=1, evaluation_interval=400, horizon=20, hyperparameters=SMALL[agent], out=tmp_path
     )
     result = run.result

@@ -11,7 +11,7 @@ import fake_engine
 import pharos
 from pharos.agents import hyperparameters
 from pharos.errors import AllRunsFailed, ParameterError, PharosError, UnknownName
-from pharos.experiments import (
+from pharos.training import (
     FailedRun,
     RunConfig,
     Task,
@@ -24,10 +24,10 @@ from pharos.experiments import (
     train_many,
     tune,
 )
-from pharos.experiments.process_pool import parts_of
-from pharos.experiments.results import COLUMNS
+from pharos.training.process_pool import parts_of
+from pharos.training.results import COLUMNS
 
-run_folder = importlib.import_module("pharos.experiments.run_folder")
+run_folder = importlib.import_module("pharos.training.run_folder")
 
 
 @pytest.fixture
@@ -313,7 +313,7 @@ def test_whole_lanes_are_dealt_out_to_processes():
 
 @pytest.mark.long
 def test_processes_leave_what_one_leaves(tmp_path, monkeypatch):
-    monkeypatch.setattr(importlib.import_module("pharos.experiments.process_pool"), "lane_width", lambda *_: 2)
+    monkeypatch.setattr(importlib.import_module("pharos.training.process_pool"), "lane_width", lambda *_: 2)
     small = {"learning_starts": 50, "buffer_size": 500, "optimize_memory_usage": False}
     options = {"seeds": (0, 1, 2), "steps": 200, "evaluation_interval": 100, "hyperparameters": small}
     done = []

@@ -10,10 +10,10 @@ from pharos.agents.batched.arithmetic import TensorArithmetic
 from pharos.agents.batched.runs import lane_width, lane_widths
 from pharos.environments import make
 from pharos.errors import ParameterError
-from pharos.experiments import Task, evaluate_agent
 from pharos.kernels.philox import philox
 from pharos.mdp import lazy_actions, random_actions
 from pharos.policies import is_walk, walk_values
+from pharos.training import Task, evaluate_agent
 
 DQN = {"learning_rate": 0.01, "buffer_size": 60, "learning_starts": 20, "batch_size": 8, "train_freq": 4, "n_envs": 2,
        "target_update_interval": 10, "net_arch": [12], "n_steps": 2}  # fmt: skip

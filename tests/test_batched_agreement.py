@@ -8,10 +8,10 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples, RolloutBu
 from pharos.agents import make_model
 from pharos.agents.batched import BatchRun, ObservationSource, make_batch
 from pharos.environments import make
-from pharos.experiments.task import Task
 from pharos.interaction import make_sb3_vec
 from pharos.kernels import batched_rollouts as rollouts
 from pharos.policies import DeepPolicy
+from pharos.training.task import Task
 
 DQN = {"learning_rate": 0.001, "buffer_size": 200, "learning_starts": 40, "batch_size": 16, "train_freq": 4,
        "target_update_interval": 20, "net_arch": [24], "max_grad_norm": 0.05}  # fmt: skip

@@ -14,7 +14,7 @@ from pharos.agents.batched import device_buffers as handover
 from pharos.agents.batched.device_buffers import CudaGraph, PinnedBuffer
 from pharos.environments import make
 from pharos.errors import ParameterError
-from pharos.experiments import Task
+from pharos.training import Task
 
 ELSEWHERE = "cpu:0"
 DQN = {"learning_rate": 0.01, "buffer_size": 60, "learning_starts": 20, "batch_size": 8, "train_freq": 4,

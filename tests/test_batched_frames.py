@@ -14,12 +14,12 @@ import pharos
 from pharos.agents import make_model
 from pharos.agents.batched import BatchRun, ObservationSource, group_key, make_batch, observed
 from pharos.errors import ParameterError
-from pharos.experiments import Task, evaluate_agent, load_agent, train_many
 from pharos.interaction import make_sb3_vec
 from pharos.kernels import batched_learning as learning
 from pharos.kernels import batched_worlds as worlds
 from pharos.kernels import philox
 from pharos.policies import walk_values
+from pharos.training import Task, evaluate_agent, load_agent, train_many
 
 BREAKOUT = pharos.make("breakout", height=6, columns=3, brick_rows=1)
 SIGHTS = {
@@ -287,7 +287,7 @@ def bytes_of(folder):
 @pytest.mark.long
 @pytest.mark.parametrize(("agent", "chance"), [("dqn", {}), ("dqn", {"random": 0.1}), ("ppo", {})])
 def test_runs_with_frames_are_measured_exactly_kept_and_resumed(agent, chance, tmp_path, monkeypatch):
-    monkeypatch.setattr(importlib.import_module("pharos.experiments.run_folder"), "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr(importlib.import_module("pharos.training.run_folder"), "CHECKPOINT_SECONDS", 0.0)
     small = (
         {"learning_starts": 50, "buffer_size": 100}
         if agent == "dqn"

@@ -7,11 +7,11 @@ from scipy.stats import kstest
 from pharos.agents.batched import BatchRun, ObservationSource, make_batch, observed
 from pharos.agents.batched.batched_episodes import BatchedEpisodes
 from pharos.environments import make
-from pharos.experiments.task import Task
 from pharos.interaction import Interaction
 from pharos.interaction.reward_channel import RewardChannel
 from pharos.kernels import batched_worlds as kernels
 from pharos.mdp import TabularMDP, random_actions, sticky_actions
+from pharos.training.task import Task
 
 DQN = {"learning_rate": 0.01, "buffer_size": 50, "learning_starts": 20, "batch_size": 8, "net_arch": [8], "n_envs": 2}
 SIGMAS = 5.0

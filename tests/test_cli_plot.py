@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 import pharos
 from pharos.cli import app
-from pharos.experiments import Task, load_agent, read_record, train
+from pharos.training import Task, load_agent, read_record, train
 
 
 def run(*words):

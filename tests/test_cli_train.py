@@ -6,7 +6,7 @@ import pytest
 from typer.testing import CliRunner
 
 from pharos.cli import app
-from pharos.experiments import read_record
+from pharos.training import read_record
 
 
 def run(*words):

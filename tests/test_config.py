@@ -8,9 +8,9 @@ import pytest
 import pharos
 from pharos import study
 from pharos.errors import FileFormatError, ParameterError, UnknownName
-from pharos.experiments import ChanceSetting, Horizon, RunConfig, Task, run_id
 from pharos.mdp import random_actions, sticky_actions
 from pharos.solvers import value_iteration
+from pharos.training import ChanceSetting, Horizon, RunConfig, Task, run_id
 
 LAKE = {"size": 4, "map": None, "seed": None, "frozen_probability": 0.8}
 STICKY = {

@@ -7,10 +7,10 @@ import pytest
 
 from pharos import solvers
 from pharos.agents.batched import make_batch
-from pharos.experiments import ChanceSetting, RunConfig, TaskCache, evaluate_agent
-from pharos.experiments.joint_evaluation import values_together
 from pharos.mdp import TabularMDP, lazy_actions, random_actions, sticky_actions
 from pharos.policies import Evaluation, TableAnswers, is_small_table, table_values, whole_values
+from pharos.training import ChanceSetting, RunConfig, TaskCache, evaluate_agent
+from pharos.training.joint_evaluation import values_together
 
 SETTING = {"steps": 300, "horizon": 16, "evaluation_interval": 100, "engine": "batched"}
 

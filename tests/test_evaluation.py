@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 import pharos
 from pharos.errors import DivergenceError, ParameterError
-from pharos.experiments import Task, evaluate_agent, train
+from pharos.training import Task, evaluate_agent, train
 
 CHANCE = [{}, {"random": 0.2}, {"sticky": 0.25}, {"sticky": 0.25, "random": 0.2}]
 
@@ -176,7 +176,7 @@ def test_steps_that_no_longer_matter_are_not_asked_about(chance, gamma):
 @pytest.mark.parametrize("observation", ["vector", "simple_image"])
 def test_models_of_stable_baselines_are_policies(name, observation):
     from pharos.agents.deep import make_model
-    from pharos.experiments.learners import vector_environment
+    from pharos.training.learners import vector_environment
 
     task = Task.of("frozen_lake/4x4", random=0.1, observation=observation)
     model = make_model(name, vector_environment(task, 1, 0), {}, seed=0)

@@ -10,15 +10,15 @@ from typer.testing import CliRunner
 
 import naive_mdp
 import pharos
-from pharos import experiments
+from pharos import training
 from pharos.cli import app
 from pharos.errors import ParameterError
-from pharos.experiments import Task, evaluate_agent
 from pharos.interaction import GymEnv, make_sb3_vec, make_vec
 from pharos.mdp import PolicyTable
 from pharos.observations import aliasing, history_aliasing, observation_classes, observe
 from pharos.policies import Evaluation, estimation
 from pharos.policies.histories import QueriedHistories
+from pharos.training import Task, evaluate_agent
 
 BREAKOUT = pharos.make("breakout", height=6, columns=3, brick_rows=1)
 WORDS = ["height=6", "columns=3", "brick_rows=1"]
@@ -299,7 +299,7 @@ def test_runs_are_measured_exactly(agent, observation, options, tmp_path, monkey
     assert answer["value_at_start"] == pytest.approx(run.result["final_value"], abs=1e-6)
     assert answer["regret"] == pytest.approx(run.result["final_regret"], abs=2e-6)
     if "frames" in options:
-        monkeypatch.setattr(experiments, "evaluate_agent", lambda *_: Evaluation(0.5, False, 0.25, 9, 2000))
+        monkeypatch.setattr(training, "evaluate_agent", lambda *_: Evaluation(0.5, False, 0.25, 9, 2000))
         told = CliRunner().invoke(app, evaluate)  # whose lines are as long as the name of the folder lets them be
         assert "0.25 with a probability of 99 % (estimated from 2,000 episodes)" in " ".join(told.stdout.split())
     if "irrelevant" in options:

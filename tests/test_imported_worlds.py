@@ -9,7 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 import pharos
-from pharos import drawing, experiments, importers, study
+from pharos import drawing, importers, study, training
 from pharos.cli import app
 from pharos.errors import FileFormatError, ParameterError
 from pharos.mdp import TabularMDP
@@ -233,7 +233,7 @@ def test_a_study_has_imported_worlds_beside_others(folders, tmp_path):
     runs = study.specification({"name": "mixed", "blocks": [block]}).runs
     assert [each.config["environment"] for each in runs] == ["imported", "simple_grid"]
     assert runs[0].config["parameters"]["folder"] == str(folders["matrices"])
-    (result, _) = experiments.train_configs([each.config for each in runs])
+    (result, _) = training.train_configs([each.config for each in runs])
     assert result.result["exact"] and result.result["conventions"]["time_limit"] == 20
 
 

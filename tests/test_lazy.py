@@ -15,11 +15,11 @@ import pharos
 from pharos import exporters, hardness, importers, study
 from pharos.cli import app
 from pharos.errors import ParameterError, UnknownName
-from pharos.experiments import ChanceSetting, Task
 from pharos.interaction import GymEnv, make_vec
 from pharos.mdp import Lazy, TabularMDP, lazy_actions, minimize, random_actions, sticky_actions
 from pharos.rules.stepping import InterpretedStepping
 from pharos.solvers import evaluate_policy, value_iteration, worst_value
+from pharos.training import ChanceSetting, Task
 from strategies import deterministic_mdps, lazy_mdps
 
 often = settings(max_examples=60, deadline=None)

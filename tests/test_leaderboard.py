@@ -13,10 +13,10 @@ import pharos
 from pharos import leaderboard
 from pharos.cli import app
 from pharos.errors import FileFormatError, ParameterError, ResultCorrupted, UntrustedCode
-from pharos.experiments import read_record, run_id
 from pharos.leaderboard import verification
 from pharos.leaderboard.entry import write
 from pharos.system import storage
+from pharos.training import read_record, run_id
 
 OWN = """
 from dataclasses import dataclass

@@ -15,10 +15,10 @@ from pharos import study
 from pharos.cli import app
 from pharos.environments import catalog
 from pharos.errors import AllRunsFailed, FileFormatError, ParameterError, UntrustedCode
-from pharos.experiments import RunConfig, load_agent, read_record, run_id, train
 from pharos.observations import observation
 from pharos.system import sources
 from pharos.system.sources import Source
+from pharos.training import RunConfig, load_agent, read_record, run_id, train
 
 TAXI = """
 from dataclasses import dataclass
@@ -189,7 +189,7 @@ def test_a_file_that_changes_between_the_study_and_its_worker_fails_the_run(tmp_
 
 def config_of(file, **options):
     """The configuration of a run on the class in a file."""
-    task = pharos.experiments.Task.of(f"{file}:Taxi", observation="index")
+    task = pharos.training.Task.of(f"{file}:Taxi", observation="index")
     return json.loads(json.dumps(RunConfig.of_task(task, "q_learning", steps=10, **options).to_dict()))
 
 

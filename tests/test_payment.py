@@ -10,10 +10,10 @@ import pharos
 from naive_learning import paid
 from pharos.agents import QLearning
 from pharos.errors import ParameterError
-from pharos.experiments import ChanceSetting, RunConfig, Task
 from pharos.interaction import GymEnv, Interaction, make_sb3_vec, make_vec
 from pharos.interaction.reward_channel import RewardChannel
 from pharos.solvers import value_iteration
+from pharos.training import ChanceSetting, RunConfig, Task
 
 GRID = pharos.make("simple_grid", height=3, width=3, rewards=(((0, 1), 0.25), ((1, 0), -0.5)))
 SLIPPERY = pharos.make("frozen_lake", slippery=True)

@@ -15,11 +15,11 @@ from PIL import Image
 import pharos
 from pharos import hardness, plots
 from pharos.errors import FileFormatError, ParameterError
-from pharos.experiments import Task, read_curve, train
 from pharos.plots.plane import _label
 from pharos.plots.regret import _label as run_label
 from pharos.plots.regret import _labels as run_labels
 from pharos.plots.style import thousands
+from pharos.training import Task, read_curve, train
 
 
 @pytest.fixture(scope="module")

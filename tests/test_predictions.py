@@ -133,7 +133,7 @@ def test_predictions_stay_where_others_cannot_be_written(predicted, tmp_path, mo
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(predictions.experiments, "write_table", full)
+    monkeypatch.setattr(predictions.training, "write_table", full)
     with pytest.raises(OSError, match="No space left"):
         write_predictions(spec, predicted.assign(kernel_regret=1.0), file)
     assert file.read_bytes() == before and list(tmp_path.iterdir()) == [file]

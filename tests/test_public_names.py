@@ -17,6 +17,7 @@ CONTRACT = (
     ("pharos", "make list_environments check_environment Environment build load StateSpace"),
     ("pharos", "TabularMDP sticky_actions random_actions value_iteration evaluate_policy Solution"),
     ("pharos.hardness", "diameter Interval"),
+    ("pharos.experiments", "RunConfig evaluate_agent train_configs"),  # as pharos.training was called
 )
 
 HEAVY = ("numba", "scipy", "pandas", "matplotlib", "torch", "rich", "typer", "stable_baselines3")
@@ -33,8 +34,8 @@ ORDER = (
         "rules",
     ),
     *("state_space", "mdp", "solvers"),
-    *("hardness", "importers", "exporters", "observations", "interaction", "policies", "agents", "experiments"),
-    *("leaderboard", "plots", "study", "sb3_env", "bisimulation", "explorer", "cli", "__main__"),
+    *("hardness", "importers", "exporters", "observations", "interaction", "policies", "agents", "training"),
+    *("experiments", "leaderboard", "plots", "study", "sb3_env", "bisimulation", "explorer", "cli", "__main__"),
 )
 
 # Its modules are its names: each is a part of its own.

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from pharos.errors import ParameterError
-from pharos.experiments import Task, evaluate_agent
 from pharos.mdp import TabularMDP, random_actions, sticky_actions
 from pharos.policies import TableAnswers, reachable_rows
+from pharos.training import Task, evaluate_agent
 
 CHANCES = [
     lambda mdp: mdp,

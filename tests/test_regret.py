@@ -11,7 +11,10 @@ from hypothesis import strategies as st
 
 import pharos
 from pharos.errors import FileFormatError, ParameterError
-from pharos.experiments import (
+from pharos.mdp import TabularMDP
+from pharos.solvers import regret_scale, uniform_value, value_iteration, worst_value
+from pharos.study.leave_one_class_out import normalized_regrets
+from pharos.training import (
     ReferenceValues,
     RegretCurve,
     Task,
@@ -20,9 +23,6 @@ from pharos.experiments import (
     regret,
     train,
 )
-from pharos.mdp import TabularMDP
-from pharos.solvers import regret_scale, uniform_value, value_iteration, worst_value
-from pharos.study.leave_one_class_out import normalized_regrets
 from strategies import deterministic_mdps
 
 CHANCE = [{}, {"random": 0.2}, {"sticky": 0.25}]
@@ -194,7 +194,7 @@ def test_regret_has_a_scale_where_the_values_can_tell_the_reference_from_the_opt
 
 
 def test_runs_evaluations_and_tables_of_studies_divide_by_the_same_scale(run_folder):
-    """Of one run: what its record says, what `pharos.experiments.regret` says of its values, and what a study says."""
+    """Of one run: what its record says, what `pharos.training.regret` says of its values, and what a study says."""
     result, values = run_folder.result, RegretCurve.read(run_folder.folder).values
     scale = regret_scale(values.optimal, values.uniform)
     assert result["normalized_regret"] == pytest.approx(result["cumulative_regret"] / (result["episodes"] * scale))

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 import pharos
-from pharos.experiments import train
+from pharos.training import train
 
 PAGE = (Path(__file__).parents[1] / "docs" / "regret.md").read_text(encoding="utf-8")
 

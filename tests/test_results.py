@@ -13,10 +13,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pharos.errors import FileFormatError, FolderLocked, ResultCorrupted
-from pharos.experiments import evaluate_agent, load_agent, read_curve, read_record, run_id, train
-from pharos.experiments import results as _results
+from pharos.training import evaluate_agent, load_agent, read_curve, read_record, run_id, train
+from pharos.training import results as _results
 
-run_folder = importlib.import_module("pharos.experiments.run_folder")
+run_folder = importlib.import_module("pharos.training.run_folder")
 
 ROW = {name: 1 if dtype == "int64" else True if dtype == "bool" else 0.5 for name, dtype in _results.COLUMNS.items()}
 values = st.recursive(

@@ -15,8 +15,8 @@ import fake_training
 from pharos import study
 from pharos.agents.batched import lane_width
 from pharos.errors import ParameterError
-from pharos.experiments import read_record
 from pharos.study.batches import Batches
+from pharos.training import read_record
 
 TESTS = Path(__file__).parent
 

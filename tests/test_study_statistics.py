@@ -6,7 +6,6 @@ import pytest
 from scipy import stats
 
 from pharos.errors import ParameterError
-from pharos.experiments import bootstrap_interval
 from pharos.study import (
     aggregate_r_squared,
     fit,
@@ -19,6 +18,7 @@ from pharos.study import (
 )
 from pharos.study.profiles import improvements, profiles
 from pharos.study.statistics import performance_profile, probability_of_improvement
+from pharos.training import bootstrap_interval
 
 
 def study_table(noise: float, seed: int = 0, num_instances: int = 12) -> pd.DataFrame:

@@ -7,9 +7,9 @@ from dataclasses import asdict
 import pytest
 
 from pharos import study
-from pharos.experiments import train_config
 from pharos.study import execution as _execution
 from pharos.study import values as _values
+from pharos.training import train_config
 
 
 @pytest.fixture(scope="module")

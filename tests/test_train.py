@@ -22,12 +22,12 @@ import pytest
 import pharos
 from pharos.agents.deep import check_hyperparameters
 from pharos.errors import FileFormatError, ParameterError, ResultCorrupted, UnknownName
-from pharos.experiments import read_curve, read_record, train, train_config
-from pharos.experiments.learners import Deep
-from pharos.experiments.results import COLUMNS
-from pharos.experiments.task import Task
+from pharos.training import read_curve, read_record, train, train_config
+from pharos.training.learners import Deep
+from pharos.training.results import COLUMNS
+from pharos.training.task import Task
 
-run_folder = importlib.import_module("pharos.experiments.run_folder")
+run_folder = importlib.import_module("pharos.training.run_folder")
 
 SMALL = {"learning_starts": 50, "buffer_size": 1000, "target_update_interval": 50}
 

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from pharos.agents import hyperparameters
 from pharos.cli import app
 from pharos.errors import FileFormatError, ParameterError
-from pharos.experiments import SPACES, read_record, train, tune
+from pharos.training import SPACES, read_record, train, tune
 
 LAKE = "frozen_lake/4x4"
 ONE = {"learning_rate": ("log", 0.001, 1.0)}

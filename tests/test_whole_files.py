@@ -13,10 +13,10 @@ import pharos
 from pharos import drawing, exporters, hardness, importers
 from pharos.cli.solve import save
 from pharos.errors import FileFormatError
-from pharos.experiments import load_agent, read_rows
 from pharos.mdp import TabularMDP
 from pharos.plots import save as save_figure
 from pharos.system.storage import replace_file
+from pharos.training import load_agent, read_rows
 
 fork = multiprocessing.get_context("fork")
 

@@ -44,13 +44,17 @@ _HOMES = {
     "GymEnv": "pharos.interaction",
     "make_vec": "pharos.interaction",
     "to_gymnax": "pharos.interaction",
-    "train": "pharos.experiments",
-    "train_many": "pharos.experiments",
+    "train": "pharos.training",
+    "train_many": "pharos.training",
     "explore": "pharos.explorer",
     "PharosError": "pharos.errors",
 }
 # Modules that stand in another folder than their public name says.
-_MODULES = {"bisimulation": "pharos.bisimulation", "sb3_env": "pharos.sb3_env"}
+_MODULES = {
+    "bisimulation": "pharos.bisimulation",
+    "experiments": "pharos.experiments",
+    "sb3_env": "pharos.sb3_env",
+}
 _PACKAGES = (
     "errors",
     "environments",
@@ -65,7 +69,7 @@ _PACKAGES = (
     "interaction",
     "policies",
     "agents",
-    "experiments",
+    "training",
     "leaderboard",
     "plots",
     "study",

@@ -1,4 +1,4 @@
-"""Agents: tabular Q-learning, and algorithms of Stable-Baselines3, one by one or batched. `pharos.experiments.train`
+"""Agents: tabular Q-learning, and algorithms of Stable-Baselines3, one by one or batched. `pharos.training.train`
 trains them on a task.
 """
 

@@ -29,9 +29,9 @@ from pharos.cli.target import Target, parse_target
 from pharos.errors import FileFormatError, ParameterError, UnknownName
 
 if TYPE_CHECKING:
-    from pharos.experiments import Task
     from pharos.mdp import TabularMDP
     from pharos.solvers import Solution
+    from pharos.training import Task
 
 POLICIES = ("optimal", "uniform", "worst")
 SETTING = ("gamma", "horizon", "sticky", "random", "lazy")
@@ -184,7 +184,7 @@ def _sees_frames(goal: Target, decisions: Given) -> bool:
 
 def _worth_over_histories(goal: Target, mdp: "TabularMDP", decisions: Given, **chance: float) -> Worth:
     """Of a policy that sees several frames: exact where it reaches few histories, else estimated."""
-    from pharos.experiments import Task, evaluate_agent
+    from pharos.training import Task, evaluate_agent
 
     began = time.perf_counter()
     task = Task(goal.found_environment(), **chance, **decisions.seeing, gamma=mdp.gamma, horizon=mdp.horizon)  # type: ignore[arg-type]
@@ -217,7 +217,7 @@ def read_policy(name: str, *, trust: bool = False) -> Given:
 
     path = Path(name).expanduser()
     if path.is_dir():
-        from pharos.experiments import load_agent
+        from pharos.training import load_agent
 
         task, agent = load_agent(path, trust=trust)
         if isinstance(agent, np.ndarray):

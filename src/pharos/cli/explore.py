@@ -59,8 +59,8 @@ def explore(
         check_format(out, (".html",))
     goal = parse_target(target, parameters)
     building = build_options(memory, workers, max_states)
-    from pharos.experiments import ChanceSetting
     from pharos.explorer import Server, write
+    from pharos.training import ChanceSetting
 
     with progress_line("exploring") as report:
         options: dict[str, Any] = {

@@ -143,8 +143,8 @@ def policies(
     import numpy as np
 
     from pharos import plots
-    from pharos.experiments import load_agent
     from pharos.solvers import value_iteration
+    from pharos.training import load_agent
 
     loaded = {folder.name: load_agent(folder, trust=trust) for folder in runs}
     tasks = [task for task, _ in loaded.values()]

@@ -67,7 +67,7 @@ class Target:
 
         by_range: whether rewards may wait until they are asked for; they do under MPI.
         """
-        from pharos.experiments import ChanceSetting
+        from pharos.training import ChanceSetting
 
         chance = ChanceSetting(sticky, random, lazy)
         if self.is_imported:

@@ -18,7 +18,7 @@ from pharos.system.wording import many
 
 if TYPE_CHECKING:
     from pharos.environments import Environment
-    from pharos.experiments import TrainingResult
+    from pharos.training import TrainingResult
 
 
 def train(
@@ -94,7 +94,7 @@ def train(
     env = parse_environment(target, parameters)
     from pharos.agents import agent_kind
     from pharos.agents import hyperparameters as hyperparameters_of
-    from pharos.experiments import train as learn
+    from pharos.training import train as learn
 
     hyperparameters = parse_parameters(hyperparameter)
     if table is not None:
@@ -149,7 +149,7 @@ def train(
 
 def _train_many(title: str, agent: str, env: "Environment", setting: dict[str, Any], json: bool) -> None:
     """A run for each seed; what they have in common is told, and what went wrong."""
-    from pharos.experiments import FailedRun, train_many
+    from pharos.training import FailedRun, train_many
 
     seeds, steps, began = setting["seeds"], setting["steps"], time.perf_counter()
     with progress_bar("training", len(seeds) * steps, "loading, building, compiling, first evaluation") as show:

@@ -54,7 +54,7 @@ def tune(
 ) -> None:
     """Search hyperparameters of an agent for one class of environments."""
     instances = [parse_environment(target) for target in targets]
-    from pharos.experiments import tune as find
+    from pharos.training import tune as find
 
     with progress_bar("tuning", trials) as show:
         result = find(

@@ -64,8 +64,8 @@ def warm(
 def _use(env: "Environment", sticky: float, random: float) -> None:
     """Do a little of everything with an environment; a space beyond LARGEST states is stepped through alone."""
     from pharos import hardness, solvers, state_space
-    from pharos.experiments import ChanceSetting, train
     from pharos.interaction import GymEnv, VectorEnv
+    from pharos.training import ChanceSetting, train
 
     chance: dict[str, Any] = {"sticky": sticky, "random": random}
     for observation in ("vector", "simple_image"):

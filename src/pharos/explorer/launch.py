@@ -11,7 +11,6 @@ from typing import Any
 
 from pharos.environments import Environment, class_called, make
 from pharos.errors import ParameterError
-from pharos.experiments import ChanceSetting, load_agent, read_record
 from pharos.explorer.exploration import Exploration
 from pharos.explorer.learned_policy import Learnt
 from pharos.explorer.pages import check_size, write
@@ -19,6 +18,7 @@ from pharos.explorer.server import Server
 from pharos.mdp import TabularMDP
 from pharos.policies import PolicyLike
 from pharos.state_space import StateSpace, build, load
+from pharos.training import ChanceSetting, load_agent, read_record
 
 RECORD = "run.json"
 GAMMA = 0.99

@@ -15,7 +15,6 @@ from typing import Any
 
 from pharos.environments import Environment, make
 from pharos.errors import ParameterError, PharosError
-from pharos.experiments import TaskValues
 from pharos.leaderboard.entry import SUFFIX
 from pharos.leaderboard.verification import (
     MAX_HORIZON,
@@ -30,6 +29,7 @@ from pharos.leaderboard.verification import (
 from pharos.observations import title as observation_title
 from pharos.system import storage
 from pharos.system.templates import templates
+from pharos.training import TaskValues
 
 LONGEST_REASON = 400
 

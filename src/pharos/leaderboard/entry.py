@@ -24,8 +24,8 @@ from typing import Any
 import numpy as np
 
 from pharos.errors import FileFormatError, ParameterError, ResultCorrupted
-from pharos.experiments import RunConfig, run_id
 from pharos.system import storage
+from pharos.training import RunConfig, run_id
 
 FORMAT = 1
 SUFFIX = ".safetensors"

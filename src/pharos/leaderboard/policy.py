@@ -9,10 +9,10 @@ import numpy as np
 
 from pharos.agents import AGENTS, algorithm, extractor, make_model
 from pharos.errors import FileFormatError, ParameterError, UntrustedCode
-from pharos.experiments import Task
 from pharos.leaderboard.entry import POLICY, Entry
 from pharos.observations import observe
 from pharos.policies import DeepPolicy
+from pharos.training import Task
 
 LIBRARIES = ("stable_baselines3", "sb3_contrib")
 LARGEST_OBSERVATION = 1 << 21
@@ -23,7 +23,7 @@ SMALLEST = ({"buffer_size": 1}, {"n_steps": 2, "batch_size": 2})
 
 
 def policy_of(entry: Entry, task: Task, *, trust: bool = False) -> np.ndarray | DeepPolicy:
-    """The policy of an entry, as `experiments.evaluate_agent` takes it.
+    """The policy of an entry, as `training.evaluate_agent` takes it.
 
     Args:
         trust: whether the agent may be code that is no part of pharos or of Stable-Baselines3.

@@ -8,8 +8,8 @@ import numpy as np
 
 from pharos.environments import class_called
 from pharos.errors import FileFormatError, ParameterError, ResultCorrupted
-from pharos.experiments import RunConfig, check_agent, read_record, read_rows
 from pharos.leaderboard.entry import POLICY, SUFFIX, Claim, Entry, read, write
+from pharos.training import RunConfig, check_agent, read_record, read_rows
 
 TRAINING = (
     "episodes",

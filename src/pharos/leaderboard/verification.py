@@ -15,13 +15,13 @@ import numpy as np
 
 from pharos.environments import BUILT_IN
 from pharos.errors import FileFormatError, ParameterError, StateSpaceTooLarge, TimeLimit, UntrustedCode
-from pharos.experiments import ReferenceValues, RunConfig, Task, TaskValues, evaluate_agent
 from pharos.leaderboard.entry import LARGEST_FILE, POLICY, Claim, Entry, read
 from pharos.leaderboard.policy import policy_of
 from pharos.observations import names as observation_names
 from pharos.state_space import build
 from pharos.system import storage
 from pharos.system.sources import is_reference
+from pharos.training import ReferenceValues, RunConfig, Task, TaskValues, evaluate_agent
 
 TOLERANCE = 1e-6
 MAX_STATES = 10_000_000

@@ -15,7 +15,7 @@ from pharos.policies import PolicyAnswers
 
 if TYPE_CHECKING:
     from pharos.environments import State
-    from pharos.experiments import Task
+    from pharos.training import Task
 
 GAP = 12  # pixels between two pictures
 
@@ -38,7 +38,7 @@ def policies(
 
     Args:
         task: environment, chance, and what the agents see.
-        agents: label -> what `experiments.evaluate_agent` takes: a table (S,) or (S, A), a model, or a function of
+        agents: label -> what `training.evaluate_agent` takes: a table (S,) or (S, A), a model, or a function of
             observations.
         path: of the .gif.
         steps: at most; None for the time limit of the task.

@@ -11,9 +11,9 @@ import numpy as np
 from pharos.agents import agent_kind
 from pharos.environments import as_tuples, class_called, make
 from pharos.errors import ParameterError
-from pharos.experiments import bootstrap_interval, read_curve, read_record
 from pharos.observations import title
 from pharos.plots.style import COLORS, INK, figure, styled, thousands
+from pharos.training import bootstrap_interval, read_curve, read_record
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

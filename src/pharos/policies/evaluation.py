@@ -62,7 +62,7 @@ def evaluate_seeing(
     Args:
         sight: gives what the policy sees; called for policies over observations alone.
         return_range: gives the lowest and the highest return of an episode; called where the value is estimated.
-        deterministic, max_states, episodes, seed: as for `experiments.evaluate_agent`.
+        deterministic, max_states, episodes, seed: as for `training.evaluate_agent`.
         reach: (rows at most, steps) -> what every policy reaches that gives each action a chance, where more than one
             policy is evaluated: those that do are asked at once. Changes no value.
     """
@@ -164,7 +164,7 @@ def evaluate_observing(
     previous_action: bool = False,
     deterministic: bool = False,
 ) -> ReachedSolution:
-    """Evaluate a policy that sees observations; `experiments.evaluate_agent` also gives estimates.
+    """Evaluate a policy that sees observations; `training.evaluate_agent` also gives estimates.
 
     Raises:
         ParameterError: the MDP was not made from a state space of an environment, the policy is none for its
@@ -178,7 +178,7 @@ def evaluate_observing(
         )
     if previous_action and not mdp.is_sticky:
         raise ParameterError(
-            "the policy sees the previous action, so its values belong to no state; use experiments.evaluate_agent"
+            "the policy sees the previous action, so its values belong to no state; use training.evaluate_agent"
         )
     space = None if mdp.folder is None else load(mdp.folder, verify=False, environment=mdp.environment)
     if space is None or space.environment is None:
@@ -190,7 +190,7 @@ def evaluate_observing(
     if sight.frames > 1:
         raise ParameterError(
             "the policy sees several frames, so its values belong to no state; use `pharos evaluate`, or "
-            "experiments.evaluate_agent"
+            "training.evaluate_agent"
         )
     answers = PolicyAnswers(policy, mdp, sight, deterministic=deterministic)
     answers.reach()

@@ -1,6 +1,5 @@
 """From hardness and regret to the paper's models, figures and tables."""
 
-from pharos.experiments import run_id
 from pharos.study.analysis import (
     Comparison,
     Models,
@@ -26,6 +25,7 @@ from pharos.study.report import StudyReport, report
 from pharos.study.specification import presets, specification
 from pharos.study.statistics import Estimate, interquartile_mean, stratified_interval
 from pharos.study.tables import cells, curves, hardness_table, paper_instance, table
+from pharos.training import run_id
 
 __all__ = [
     "LOGGERS",

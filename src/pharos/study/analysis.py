@@ -8,12 +8,12 @@ import numpy as np
 
 from pharos.agents import TABULAR_OBSERVATION
 from pharos.errors import ParameterError
-from pharos.experiments import bootstrap_interval
 from pharos.study.blocks import Run
 from pharos.study.paper import paper_regressions, paper_returns
 from pharos.study.regression import MEASURES, Fit, aggregate_r_squared, fit, leave_one_class_out_r_squared
 from pharos.study.statistics import mean_of_means, stratified_interval
 from pharos.study.tables import paper_instance
+from pharos.training import bootstrap_interval
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Any
 
 import yaml
 
-from pharos import experiments
+from pharos import training
 from pharos.errors import FileFormatError, ParameterError, ResultCorrupted
-from pharos.experiments import run_id
 from pharos.study import worker as _worker
 from pharos.study.execution import claim, opened
 from pharos.study.specification import Source, parse
 from pharos.system import storage
+from pharos.training import run_id
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -47,7 +47,7 @@ def pack(source: Source, folder: str | os.PathLike | None = None, *, file: str |
         if record is not None and record["status"] == _worker.FINISHED:
             ids.append(run.id)
             records.append(json.dumps(_placeless(record, study.folder)))
-            curves.append(experiments.read_curve_table(place / "runs" / run.id, CURVE_COLUMNS))
+            curves.append(training.read_curve_table(place / "runs" / run.id, CURVE_COLUMNS))
     if not ids:
         raise ParameterError(f"{place}: no run of {study.name!r} is finished; execute `pharos study run` first")
     columns: dict[str, Any] = {"id": pa.array(ids), "record": pa.array(records)}
@@ -63,7 +63,7 @@ def pack(source: Source, folder: str | os.PathLike | None = None, *, file: str |
     metadata = {_STUDY: text.encode(), _FORMAT: str(FORMAT).encode(), _DIGESTS: json.dumps(digests).encode()}
     file = Path(file)
     file.parent.mkdir(parents=True, exist_ok=True)
-    experiments.write_table(file, pa.table(columns).replace_schema_metadata(metadata))
+    training.write_table(file, pa.table(columns).replace_schema_metadata(metadata))
     return len(ids)
 
 
@@ -127,7 +127,7 @@ def _read(file: Path) -> tuple[str, "pa.Table", dict[str, Any] | None]:
     it."""
     if not file.exists():
         raise ParameterError(f"{file}: no such file")
-    table = experiments.read_table(file, _AGAIN)
+    table = training.read_table(file, _AGAIN)
     metadata = table.schema.metadata or {}
     if _STUDY not in metadata or not {"id", "record"} <= set(table.column_names):
         raise FileFormatError(f"{file}: not a packed study; expected a file made by `pharos study pack`")
@@ -157,7 +157,7 @@ def _rows(file: Path, table: "pa.Table") -> list[dict[str, Any]]:
 
 def _digest(id: str, record: str, curve: "pa.Table") -> str:
     """The digest of a run: of its id, its record as text, and the values of its curve."""
-    return storage.digest_of_json([id, record, experiments.digest_of_curve(curve)])
+    return storage.digest_of_json([id, record, training.digest_of_curve(curve)])
 
 
 def _checked(file: Path, id: str, record: str, ids: set[str] | None) -> dict[str, Any]:
@@ -197,7 +197,7 @@ def _write(place: Path, id: str, record: dict[str, Any], curve: "pa.Table") -> b
     partial = place / "partial" / f"{id}.{uuid.uuid4().hex}"
     partial.mkdir(parents=True)
     try:
-        experiments.write_table(partial / "curve.parquet", curve)
+        training.write_table(partial / "curve.parquet", curve)
         storage.replace_json(partial / "run.json", record)
         _worker.publish(partial, place, id)
     finally:

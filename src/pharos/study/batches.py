@@ -37,8 +37,8 @@ BatchRunner = Callable[[Sequence[Mapping[str, Any]], Sequence[Path], Path], Sequ
 def train_batch(
     configs: Sequence[Mapping[str, Any]], folders: Sequence[Path], checkpoints: Path, *, device: str = "cpu"
 ) -> list[str | None]:
-    """The usual one: `pharos.experiments.train_configs`, with the values that the study has solved already."""
-    from pharos.experiments import FailedRun, RunConfig, TaskCache, TaskValues, train_configs
+    """The usual one: `pharos.training.train_configs`, with the values that the study has solved already."""
+    from pharos.training import FailedRun, RunConfig, TaskCache, TaskValues, train_configs
 
     def values(config: RunConfig) -> TaskValues | None:
         stored = _values.stored_values(config.to_dict())

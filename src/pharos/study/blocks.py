@@ -10,10 +10,10 @@ from typing import Annotated, Any
 from pharos.agents import TABULAR_OBSERVATION, agent_kind, agent_source, hyperparameters
 from pharos.environments import as_tuples, imported, make, source_of
 from pharos.errors import MissingExtra, ParameterError, UnknownName
-from pharos.experiments import ENGINES, ChanceSetting, Horizon, RunConfig
 from pharos.observations import OwnObservation, names, own_observation, title
 from pharos.study.regression import MEASURES
 from pharos.system.sources import is_reference
+from pharos.training import ENGINES, ChanceSetting, Horizon, RunConfig
 
 try:
     from pydantic import (

@@ -5,8 +5,8 @@ from collections import defaultdict
 from pathlib import Path
 
 from pharos.errors import PharosError
-from pharos.experiments import read_record
 from pharos.study.specification import Specification
+from pharos.training import read_record
 
 
 def warn_of_changes(study: Specification, folder: Path) -> None:

@@ -46,7 +46,7 @@ SERVER_LOST = 255
 
 def train(config: Mapping[str, Any], folder: Path) -> None:
     """The runner of studies: trains as `config` says and writes run.json and curve.parquet into `folder`."""
-    from pharos.experiments import TaskValues, train_config
+    from pharos.training import TaskValues, train_config
 
     values = _values.stored_values(config)
     task_values = None if values is None else TaskValues.from_dict(values)

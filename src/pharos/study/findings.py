@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.linalg import helmert
 
-from pharos.experiments import bootstrap_interval
 from pharos.study.analysis import IMAGE, VECTOR, Models, agreement, paper_agreement
 from pharos.study.regression import Fit, r_squared
+from pharos.training import bootstrap_interval
 
 if TYPE_CHECKING:
     import pandas as pd

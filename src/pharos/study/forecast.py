@@ -202,7 +202,7 @@ def pace_of(config: Mapping[str, Any]) -> float:
     """Seconds for a step of a run, measured on some steps, with learning from the beginning; with its share of an
     evaluation, unless a large space would have to be built for that.
     """
-    from pharos.experiments import RunConfig, evaluate_agent, steps_in_seconds
+    from pharos.training import RunConfig, evaluate_agent, steps_in_seconds
 
     made = RunConfig.from_dict(config)
     together = 1 if made.engine != "batched" else lane_width("image" in made.observation)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from pharos import experiments
+from pharos import training
 from pharos.agents import agent_kind
 from pharos.errors import FileFormatError, ParameterError, PharosError, ResultCorrupted
 from pharos.study.blocks import Run, Specification
@@ -252,12 +252,12 @@ def write_predictions(study: Specification, predictions: "pd.DataFrame", file: s
     table = table.replace_schema_metadata({_KEY: json.dumps(said).encode()})
     Path(file).parent.mkdir(parents=True, exist_ok=True)
     if older is None:
-        experiments.write_table(Path(file), table)
+        training.write_table(Path(file), table)
         return said
     beside = _place_beside(Path(file), older["date"])
     os.replace(file, beside)
     try:
-        experiments.write_table(Path(file), table)
+        training.write_table(Path(file), table)
     except BaseException:
         os.replace(beside, file)
         raise
@@ -288,7 +288,7 @@ def read_predictions(file: str | os.PathLike) -> "tuple[pd.DataFrame, dict[str, 
     remedy = "write them with `pharos study predict SPEC --out FILE`"
     if not Path(file).is_file():
         raise FileFormatError(f"{file}: no such file; expected predictions: {remedy}")
-    table = experiments.read_table(Path(file), "write it again")
+    table = training.read_table(Path(file), "write it again")
     said = (table.schema.metadata or {}).get(_KEY)
     if said is None or not {*PREDICTORS, *CELL} <= {*table.column_names}:
         raise FileFormatError(f"{file}: holds no predictions; {remedy}")

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pharos.experiments import bootstrap_interval
 from pharos.study.statistics import mean_of_means, performance_profile, probability_of_improvement
+from pharos.training import bootstrap_interval
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from pharos.experiments import bootstrap_interval
+from pharos.training import bootstrap_interval
 
 
 @dataclass(frozen=True)

@@ -16,16 +16,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pharos import experiments
+from pharos import training
 from pharos.environments import classes, make
 from pharos.errors import FileFormatError, ParameterError, UnknownName
-from pharos.experiments import ChanceSetting
 from pharos.study import worker as _worker
 from pharos.study.blocks import Run, Specification
 from pharos.study.execution import opened
 from pharos.study.specification import Source
 from pharos.system.storage import is_intact, read_json, replace_json, sealed
 from pharos.system.wording import many
+from pharos.training import ChanceSetting
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -184,7 +184,7 @@ def read_curve(folder: Path, id: str) -> "pd.DataFrame":
     Raises:
         FileFormatError: it cannot be read, is not that of its record, or has no evaluation.
     """
-    curve = experiments.read_curve(folder / "runs" / id, columns=POINTS)
+    curve = training.read_curve(folder / "runs" / id, columns=POINTS)
     if len(curve) == 0 or any(curve[name].dtype.kind not in "iufb" for name in POINTS):
         raise FileFormatError(f"{folder / 'runs' / id}: its curve has no evaluation, or words in place of numbers")
     return curve

@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any
 
 from pharos.environments import start_distribution
 from pharos.errors import FileFormatError
-from pharos.experiments import RunConfig
 from pharos.system.paths import cache_directory
 from pharos.system.storage import is_intact, read_json, replace_json, sealed
+from pharos.training import RunConfig
 
 if TYPE_CHECKING:
-    from pharos.experiments import Task
+    from pharos.training import Task
 
 
 def task_of(config: Mapping[str, Any]) -> "Task":
@@ -28,7 +28,7 @@ def solve(config: Mapping[str, Any]) -> dict[str, Any]:
     """The values at the start of a task, as `TaskValues.to_dict` writes them; solved now unless they are stored."""
     values = stored_values(config)
     if values is None:
-        from pharos.experiments import TaskValues  # loads what an MDP needs
+        from pharos.training import TaskValues  # loads what an MDP needs
 
         task = task_of(config)
         values = TaskValues(task.reference, task.return_range).to_dict()

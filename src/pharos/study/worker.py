@@ -20,7 +20,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from pharos import experiments
+from pharos import training
 from pharos.errors import FileFormatError, FolderLocked, PharosError
 from pharos.system import storage
 
@@ -57,7 +57,7 @@ def read_record(folder: Path) -> dict[str, Any] | None:
         if folder.exists() and not folder.is_dir():
             raise FileFormatError(f"{folder}: is a file; expected the folder of a run")
         return None
-    record = experiments.read_record(folder)
+    record = training.read_record(folder)
     if record.get("status") not in (FINISHED, FAILED):
         raise FileFormatError(f"{file}: is not the record of a run that is over")
     seconds = record.get("seconds")
@@ -66,7 +66,7 @@ def read_record(folder: Path) -> dict[str, Any] | None:
     if record["status"] == FINISHED:
         if not isinstance(record.get("result"), dict):
             raise FileFormatError(f"{file}: is of a finished run, but has no result")
-        experiments.read_curve_table(folder, ())
+        training.read_curve_table(folder, ())
     return record
 
 

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from pharos.errors import PharosError
-from pharos.experiments.task import Task
-from pharos.experiments.task_cache import Member
 from pharos.policies import Evaluation, PolicyAnswers, is_small_table, is_walk, table_values, walk_values, whole_values
+from pharos.training.task import Task
+from pharos.training.task_cache import Member
 
 BLOCK = 4096  # observations that policies are asked about at once
 

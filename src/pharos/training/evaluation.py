@@ -1,7 +1,7 @@
 """The value of what an agent has learnt, in the setting of its task."""
 
-from pharos.experiments.task import Task
 from pharos.policies import Evaluation, PolicyLike, evaluate_seeing
+from pharos.training.task import Task
 
 __all__ = ["Evaluation", "evaluate_agent"]
 

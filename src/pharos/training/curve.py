@@ -4,8 +4,8 @@ import math
 from dataclasses import dataclass, field
 from typing import Any
 
-from pharos.experiments.evaluation import Evaluation, evaluate_agent
-from pharos.experiments.task import Task
+from pharos.training.evaluation import Evaluation, evaluate_agent
+from pharos.training.task import Task
 
 
 @dataclass

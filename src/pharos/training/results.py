@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pharos.errors import FileFormatError, MissingExtra, ResultCorrupted
-from pharos.experiments.config import run_id
 from pharos.system import storage
+from pharos.training.config import run_id
 
 if TYPE_CHECKING:
     import numpy as np

@@ -13,13 +13,13 @@ from typing import Any
 
 from pharos.agents.batched import lane_width
 from pharos.errors import FileFormatError, ParameterError, PharosError
-from pharos.experiments import results as _results
-from pharos.experiments.batch import train_configs
-from pharos.experiments.config import RunConfig
-from pharos.experiments.run_folder import TrainingResult, finished_result
-from pharos.experiments.task_cache import FailedRun, TaskCache
-from pharos.experiments.training_jobs import Progress, Tell
 from pharos.system.workers import check_guard, without_interrupts, without_main
+from pharos.training import results as _results
+from pharos.training.batch import train_configs
+from pharos.training.config import RunConfig
+from pharos.training.run_folder import TrainingResult, finished_result
+from pharos.training.task_cache import FailedRun, TaskCache
+from pharos.training.training_jobs import Progress, Tell
 
 
 def parts_of(configs: Sequence[RunConfig], workers: int, device: str = "cpu") -> list[list[int]]:

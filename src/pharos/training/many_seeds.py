@@ -7,13 +7,13 @@ from typing import Any
 
 from pharos.environments import Environment
 from pharos.errors import AllRunsFailed, ParameterError
-from pharos.experiments.batch import train_configs
-from pharos.experiments.config import RunConfig
-from pharos.experiments.process_pool import parts_of, train_parts
-from pharos.experiments.run_folder import TrainingResult
-from pharos.experiments.task_cache import FailedRun, TaskCache
-from pharos.experiments.train import given_hyperparameters, task_for
-from pharos.experiments.training_jobs import Tell
+from pharos.training.batch import train_configs
+from pharos.training.config import RunConfig
+from pharos.training.process_pool import parts_of, train_parts
+from pharos.training.run_folder import TrainingResult
+from pharos.training.task_cache import FailedRun, TaskCache
+from pharos.training.train import given_hyperparameters, task_for
+from pharos.training.training_jobs import Tell
 
 
 def train_many(

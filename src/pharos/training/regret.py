@@ -23,11 +23,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pharos.errors import ParameterError
-from pharos.experiments import results as _results
 from pharos.solvers import regret_scale
+from pharos.training import results as _results
 
 if TYPE_CHECKING:
-    from pharos.experiments.task import Task
+    from pharos.training.task import Task
 
 
 @dataclass(frozen=True)

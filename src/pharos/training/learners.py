@@ -10,10 +10,10 @@ import numpy as np
 
 from pharos.agents import QLearning, check_hyperparameters, make_model
 from pharos.errors import FileFormatError
-from pharos.experiments import results
-from pharos.experiments.config import RunConfig
-from pharos.experiments.task import Task
 from pharos.policies import DeepPolicy
+from pharos.training import results
+from pharos.training.config import RunConfig
+from pharos.training.task import Task
 
 AtPoint = Callable[[int, int, float], dict[str, Any]]
 """at_point(steps, finished episodes, sum of their returns) -> row of the curve."""
@@ -107,7 +107,7 @@ class Deep:
 
     def learn(self, points: list[int], at_point: AtPoint) -> None:
         """As `Learner` says."""
-        from pharos.experiments.callback import AtPoints
+        from pharos.training.callback import AtPoints
 
         callback = AtPoints(points, at_point, self.task.gamma, self.finished, lambda: self.env.earned)
         callback.counted_by(self)

@@ -18,8 +18,8 @@ from pharos.observations import OwnObservation, observation_of, registered
 from pharos.system.sources import Source, is_reference, resolve
 
 if TYPE_CHECKING:
-    from pharos.experiments.task import Task, TaskValues
     from pharos.mdp import TabularMDP
+    from pharos.training.task import Task, TaskValues
 
 ENGINES = ("sb3", "batched")
 """What trains networks: Stable-Baselines3, one run in a process; or many runs as one program."""
@@ -315,7 +315,7 @@ class RunConfig:
             values: at the start, which are not computed again where they are given.
             trust, strict: as for `make_environment`.
         """
-        from pharos.experiments.task import Task
+        from pharos.training.task import Task
 
         observation: str | OwnObservation = self.observation
         if "observation" in self.sources:

@@ -15,12 +15,12 @@ from pathlib import Path
 from typing import Any
 
 from pharos.errors import FileFormatError, ParameterError, PharosError
-from pharos.experiments.batch_run import Batch
-from pharos.experiments.config import RunConfig
-from pharos.experiments.run_folder import TrainingResult, finished_result
-from pharos.experiments.task_cache import FailedRun, Member, TaskCache
-from pharos.experiments.training_jobs import CallbackError, Tell, TrainingJobs
 from pharos.policies import is_small_table
+from pharos.training.batch_run import Batch
+from pharos.training.config import RunConfig
+from pharos.training.run_folder import TrainingResult, finished_result
+from pharos.training.task_cache import FailedRun, Member, TaskCache
+from pharos.training.training_jobs import CallbackError, Tell, TrainingJobs
 
 
 def train_configs(
@@ -117,7 +117,7 @@ class _Work(TrainingJobs):
 
     def _alone(self, place: int) -> None:
         """A run that has no batch: a table, or a model of Stable-Baselines3."""
-        from pharos.experiments.train import train_task
+        from pharos.training.train import train_task
 
         config, folder, before = self.configs[place], self.folder(place), self.done
 

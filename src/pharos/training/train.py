@@ -20,15 +20,15 @@ from pharos.agents import agent_kind
 from pharos.agents import hyperparameters as hyperparameters_of
 from pharos.environments import Environment, make
 from pharos.errors import FolderLocked, ParameterError
-from pharos.experiments import results as _results
-from pharos.experiments.config import RunConfig
-from pharos.experiments.curve import Curve
-from pharos.experiments.learners import Learner, make_learner
-from pharos.experiments.run_folder import Checkpoint, Record, TrainingResult, finished_result
-from pharos.experiments.task import Task, TaskValues
 from pharos.observations import own_observation
 from pharos.system import compiling
 from pharos.system.storage import CLAIM, LOCK, lock, remove_leftovers
+from pharos.training import results as _results
+from pharos.training.config import RunConfig
+from pharos.training.curve import Curve
+from pharos.training.learners import Learner, make_learner
+from pharos.training.run_folder import Checkpoint, Record, TrainingResult, finished_result
+from pharos.training.task import Task, TaskValues
 
 Progress = Callable[[int, int, Mapping[str, Any]], None]
 
@@ -252,8 +252,8 @@ def _as_a_batch(
     config: RunConfig, task: Task, folder: Path | None, tensorboard: bool, progress: Progress | None
 ) -> TrainingResult:
     """A single run of the batched engine: a batch of one."""
-    from pharos.experiments.batch import train_configs
-    from pharos.experiments.task_cache import FailedRun, TaskCache
+    from pharos.training.batch import train_configs
+    from pharos.training.task_cache import FailedRun, TaskCache
 
     if tensorboard:
         raise ParameterError("TensorBoard's logs are those of Stable-Baselines3; expected the engine sb3, or none")

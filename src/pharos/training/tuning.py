@@ -28,18 +28,18 @@ from pharos.agents import agent_kind
 from pharos.agents import hyperparameters as hyperparameters_of
 from pharos.environments import Environment, make
 from pharos.errors import FileFormatError, MissingExtra, ParameterError
-from pharos.experiments import results as _results
-from pharos.experiments.batch import train_configs
-from pharos.experiments.config import ChanceSetting, RunConfig
-from pharos.experiments.journal import JournalLock, mend_journal
-from pharos.experiments.search_space import allows, checked_space, default_value, suggested_value
-from pharos.experiments.task import Task
-from pharos.experiments.task_cache import FailedRun, TaskCache
-from pharos.experiments.train import train_on
-from pharos.experiments.training_jobs import Progress
 from pharos.observations import own_observation
 from pharos.system import storage
 from pharos.system.wording import many
+from pharos.training import results as _results
+from pharos.training.batch import train_configs
+from pharos.training.config import ChanceSetting, RunConfig
+from pharos.training.journal import JournalLock, mend_journal
+from pharos.training.search_space import allows, checked_space, default_value, suggested_value
+from pharos.training.task import Task
+from pharos.training.task_cache import FailedRun, TaskCache
+from pharos.training.train import train_on
+from pharos.training.training_jobs import Progress
 
 EVALUATIONS = 20  # of a run
 

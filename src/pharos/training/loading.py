@@ -5,10 +5,10 @@ from pathlib import Path
 from typing import Any
 
 from pharos.errors import FileFormatError, UntrustedCode
-from pharos.experiments import results as _results
-from pharos.experiments.config import RunConfig
-from pharos.experiments.task import Task
 from pharos.system.storage import check_regular
+from pharos.training import results as _results
+from pharos.training.config import RunConfig
+from pharos.training.task import Task
 
 
 def load_agent(folder: str | os.PathLike, *, trust: bool = False) -> tuple[Task, Any]:
@@ -47,7 +47,7 @@ def load_agent(folder: str | os.PathLike, *, trust: bool = False) -> tuple[Task,
             return task, np.load(folder / "policy.npy", allow_pickle=False)
         except (OSError, ValueError, EOFError) as error:
             raise FileFormatError(f"{folder / 'policy.npy'}: cannot be read: {error}") from error
-    from pharos.experiments.learners import Deep
+    from pharos.training.learners import Deep
 
     learner = Deep(agent, task, record["hyperparameters"], config.steps, config.seed, None)
     learner.load(folder / "agent")

@@ -12,9 +12,9 @@ from typing import Any, Protocol
 
 from pharos.environments import class_called
 from pharos.errors import FileFormatError, ParameterError
-from pharos.experiments import results as _results
-from pharos.experiments.config import RunConfig, run_id
 from pharos.system.storage import digest_of_bytes, digest_of_file, sync
+from pharos.training import results as _results
+from pharos.training.config import RunConfig, run_id
 
 CHECKPOINT_SECONDS = 10.0
 # Writing checkpoints takes at most this share of the time

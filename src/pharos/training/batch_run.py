@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 
 from pharos.errors import FileFormatError, FolderLocked, PharosError
-from pharos.experiments import results as _results
-from pharos.experiments.joint_evaluation import values_together
-from pharos.experiments.learners import publish_network
-from pharos.experiments.run_folder import Checkpoint, TrainingResult
-from pharos.experiments.tables import Tables
-from pharos.experiments.task_cache import FailedRun, Member, in_one_line
-from pharos.experiments.training_jobs import CallbackError, TrainingJobs
 from pharos.system.storage import digest_of_json, lock, replace_json
 from pharos.system.wording import many
+from pharos.training import results as _results
+from pharos.training.joint_evaluation import values_together
+from pharos.training.learners import publish_network
+from pharos.training.run_folder import Checkpoint, TrainingResult
+from pharos.training.tables import Tables
+from pharos.training.task_cache import FailedRun, Member, in_one_line
+from pharos.training.training_jobs import CallbackError, TrainingJobs
 
 # What a member is begun anew from, where its batch is halved.
 BEGINNING = ("place", "config", "folder", "task", "hyperparameters", "run", "key")

@@ -5,10 +5,10 @@ from dataclasses import replace
 from typing import Any
 
 from pharos.agents import hyperparameters as hyperparameters_of
-from pharos.experiments.config import RunConfig
-from pharos.experiments.learners import make_learner
-from pharos.experiments.task import Task
-from pharos.experiments.task_cache import TaskCache
+from pharos.training.config import RunConfig
+from pharos.training.learners import make_learner
+from pharos.training.task import Task
+from pharos.training.task_cache import TaskCache
 
 EARLY = 100  # steps before DQN learns, in place of its own
 NO_ROW = {"value": 0.0, "expected_regret": 0.0, "mean_return": 0.0}

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pharos.experiments import results as _results
-from pharos.experiments.config import RunConfig
-from pharos.experiments.run_folder import Record, TrainingResult
-from pharos.experiments.task_cache import FailedRun, TaskCache, in_one_line
+from pharos.training import results as _results
+from pharos.training.config import RunConfig
+from pharos.training.run_folder import Record, TrainingResult
+from pharos.training.task_cache import FailedRun, TaskCache, in_one_line
 
 
 @dataclass(frozen=True)

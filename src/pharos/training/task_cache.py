@@ -9,11 +9,11 @@ from typing import Any
 from pharos.agents import check_hyperparameters
 from pharos.agents import hyperparameters as hyperparameters_of
 from pharos.errors import ParameterError, PharosError
-from pharos.experiments.config import RunConfig
-from pharos.experiments.curve import Curve
-from pharos.experiments.learners import Tabular
-from pharos.experiments.run_folder import Record
-from pharos.experiments.task import Task, TaskValues
+from pharos.training.config import RunConfig
+from pharos.training.curve import Curve
+from pharos.training.learners import Tabular
+from pharos.training.run_folder import Record
+from pharos.training.task import Task, TaskValues
 
 # What of a configuration decides about rewards and states, about the task, about what is seen
 WORLD = ("environment", "parameters", "gamma", "sources")
