@@ -7,7 +7,7 @@ import numpy as np
 
 from pharos.errors import ParameterError
 from pharos.kernels import gaps as kernels
-from pharos.mdp import Part, TabularMDP
+from pharos.mdp import TabularMDP
 from pharos.solvers import Solution, value_iteration
 
 # States at once; fixed, so that sums do not depend on the machine, and so few that a block stays in the cache.
@@ -53,27 +53,19 @@ class GapBlock(NamedTuple):
 def weighted_gaps(mdp: TabularMDP, solution: Solution) -> Iterator[GapBlock]:
     """The gaps of all states, in blocks."""
     for number, step in enumerate(steps_of(mdp, solution)):
-        yield from gaps_of_step(mdp, mdp.terminal, step, number, is_any=solution.horizon is None)
+        yield from _gaps_of_step(mdp, step, number, solution.horizon is None and not mdp.is_sticky)
 
 
-def gaps_of_step(
-    part: TabularMDP | Part, terminal: np.ndarray, step: Step, number: int = 0, start: int = 0, is_any: bool = True
-) -> Iterator[GapBlock]:
-    """The gaps of one step, in blocks.
-
-    Args:
-        part: the MDP; or some of its states, from `start` on, whose next states have the rows of `step.next_x`.
-        terminal: (S,) bool, of these states, as `step.later` and `step.first` are.
-        is_any: whether there is no horizon.
-    """
-    chance, everywhere = part.chance, is_any and not part.chance.is_sticky
-    for first in range(0, part.num_states, _BLOCK):
-        block = slice(first, min(first + _BLOCK, part.num_states))
-        states = np.arange(start + block.start, start + block.stop)
-        rewards = part.reward_table.rows(block)
-        following = part.dynamics.expected(step.next_x, block)
-        difference = kernels.differences(rewards, following, part.gamma)
-        live = ~np.asarray(terminal[block])
+def _gaps_of_step(mdp: TabularMDP, step: Step, number: int, everywhere: bool) -> Iterator[GapBlock]:
+    """The gaps of one step, in blocks; `everywhere`: states that cannot be reached have a weight, too."""
+    chance = mdp.chance
+    for first in range(0, mdp.num_states, _BLOCK):
+        block = slice(first, min(first + _BLOCK, mdp.num_states))
+        states = np.arange(block.start, block.stop)
+        rewards = mdp.reward_table.rows(block)
+        following = mdp.dynamics.expected(step.next_x, block)
+        difference = kernels.differences(rewards, following, mdp.gamma)
+        live = ~np.asarray(mdp.terminal[block])
         later = step.later[block].astype(np.int64)
         weight = later + (everywhere & (later == 0))
         arrays = (number, states, rewards, following)

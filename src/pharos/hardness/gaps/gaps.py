@@ -9,22 +9,21 @@ size, and its reciprocal anything.
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
 from pharos.errors import ParameterError, PrecisionError
-from pharos.hardness.gaps.gap_blocks import weighted_gaps
-from pharos.hardness.gaps.gap_sums import REGULARIZER, GapSums
-from pharos.hardness.gaps.ranked_gaps import RankedGaps, TieRule, capacity_of, warm
+from pharos.hardness.gaps.gap_blocks import GapBlock, weighted_gaps
 from pharos.hardness.gaps.ties import TieProof, UnresolvedTies
 from pharos.hardness.interval import Certified
 from pharos.kernels import gaps as kernels
 from pharos.mdp import BEST, BellmanEquation, TabularMDP, require_mdp
-from pharos.ranks import Rank, check_number, check_ranks, together
 from pharos.solvers import Solution, value_iteration
 from pharos.system.large_arrays import large_zeros
 
+# Of Colosseum.
+REGULARIZER = 0.1
 # Relative width up to which an interval counts as the value.
 NARROW = 1e-6
 # The default tie tolerance is this times the error bound of the values; more than 2, as a gap is known to twice the
@@ -141,7 +140,6 @@ def gaps(
     solution: Solution | None = None,
     *,
     tie_tolerance: float | None = None,
-    processes: int | str = 1,
 ) -> Gaps:
     """Return the suboptimality gaps of an MDP, summed up.
 
@@ -156,46 +154,34 @@ def gaps(
         solution: the optimal solution of `mdp`; None: solved here to an error of 1e-9, and where that leaves ties
             unresolved to what 64-bit floats can reach.
         tie_tolerance: gaps up to it count as ties. None: 2.5 times the error bound of the solution.
-        processes: of this machine, each of which adds up the gaps of a range of the states; or "mpi": those that
-            `mpiexec` has started, all of which make this call: the first with the solution, if there is one, the others
-            with None or anything, and the first gets the Gaps, the others None. Of one solution they find the gaps,
-            counts, ties and histogram that one process finds, to the last bit, and sums of floats within the relative
-            rounding of 1e-12 that `lower` and `upper` count. Without `solution` they solve as `value_iteration` does;
-            sweeps that settle ties after it are the first process's alone, and so is the proof that equal values come
-            from equal rewards for ever.
     Raises:
-        ParameterError: `solution` belongs to another MDP or is not optimal; several processes, and a horizon.
-        RankFailed: a process died.
+        ParameterError: `solution` belongs to another MDP or is not optimal.
         PrecisionError: tie_tolerance is not larger than twice the error bound, so that a tie could be counted as a gap.
     Cost: one pass over the table, 50 to 100 ns a state with its proofs of ties, and 1 to 40 sweeps before it; with a
         horizon T passes and 8 T S bytes.
     Source: Simchowitz and Jamieson (2019), "Non-asymptotic gap-dependent regret bounds for tabular MDPs", section 2;
         the pharos paper, equation 2; regularized: Colosseum (Conserva and Rauber, 2022).
     """
-    check_number(processes)
-    if processes != 1:
-        return _gaps_by_ranks(mdp, solution, tie_tolerance, processes)
     if solution is None and tie_tolerance is None:
         return resolved_gaps(mdp, optimal_solution(mdp, None))
     return _summed(mdp, optimal_solution(mdp, solution), tie_tolerance)
 
 
-def resolved_gaps(mdp: TabularMDP, solution: Solution, in_place: bool = False, ranks: RankedGaps | None = None) -> Gaps:
+def resolved_gaps(mdp: TabularMDP, solution: Solution, in_place: bool = False) -> Gaps:
     """The gaps of a solution; of a more accurate one where ties are unresolved, or the sum is wide.
 
     in_place: whether the values of the solution may become the more accurate ones; its bound holds for these, too.
-    ranks: who adds up; None for this process.
     """
     if solution.horizon is not None or mdp.gamma == 1.0:
-        return _summed(mdp, solution, None, ranks)
+        return _summed(mdp, solution, None)
     settled = solution
     if TieProof(mdp).holds:  # else ties cannot be proven that way
         settled = _settled(mdp, solution, in_place)
-    result = _summed(mdp, settled, None, ranks)
+    result = _summed(mdp, settled, None)
     if result.is_resolved or settled is not solution:
         return result
     settled = _settled(mdp, solution, in_place)
-    return _summed(mdp, settled, None, ranks) if settled.error_bound < solution.error_bound else result
+    return _summed(mdp, settled, None) if settled.error_bound < solution.error_bound else result
 
 
 def _settled(mdp: TabularMDP, solution: Solution, in_place: bool) -> Solution:
@@ -236,17 +222,13 @@ def sum_of_reciprocal_gaps(
     *,
     tie_tolerance: float | None = None,
     regularized: bool = False,
-    processes: int | str = 1,
 ) -> float:
     """Return the sum of 1 / gap(s, a) over reachable, non-terminal states s and actions a with a gap; as `gaps` says.
 
     Args:
         regularized: instead, the sum of 1 / (gap + 0.1) over all states and actions.
-        processes: as `gaps` takes them; under "mpi" the first gets the sum, the others None.
     """
-    result = gaps(mdp, solution, tie_tolerance=tie_tolerance, processes=processes)
-    if result is None:  # another one of MPI's
-        return cast(Any, None)
+    result = gaps(mdp, solution, tie_tolerance=tie_tolerance)
     return result.regularized if regularized else result.sum_of_reciprocals
 
 
@@ -256,14 +238,9 @@ def minimal_gap(
     solution: Solution | None = None,
     *,
     tie_tolerance: float | None = None,
-    processes: int | str = 1,
 ) -> float:
-    """Return the smallest gap(s, a) that is no tie; infinite where there is none. As `gaps` says.
-
-    processes: as `gaps` takes them; under "mpi" the first gets the gap, the others None.
-    """
-    result = gaps(mdp, solution, tie_tolerance=tie_tolerance, processes=processes)
-    return cast(Any, None) if result is None else result.minimal
+    """Return the smallest gap(s, a) that is no tie; infinite where there is none. As `gaps` says."""
+    return gaps(mdp, solution, tie_tolerance=tie_tolerance).minimal
 
 
 def gaps_of_states(
@@ -348,61 +325,13 @@ def _conventions(mdp: TabularMDP, solution: Solution, tolerance: float) -> dict[
     }
 
 
-def _gaps_by_ranks(
-    mdp: TabularMDP, solution: Solution | None, tie_tolerance: float | None, processes: int | str
-) -> Gaps:
-    """The gaps by several processes. Under MPI the first gets them, and the others None."""
-    size = processes if isinstance(processes, int) else 1
-    check_ranks(mdp.num_states, size)
-    has_solution, capacity = solution is not None, capacity_of(mdp, size)
-    if processes == "mpi":
-        has_solution = together(processes, lambda rank: _told_by_first(rank, has_solution), capacity)
-    if not has_solution:
-        _check_plain(mdp.horizon)
-        solution = solved(value_iteration, mdp, 1e-9, processes=processes)
-    warm(mdp)
-
-    def program(rank: Rank) -> Gaps | None:
-        ranks = RankedGaps(mdp, rank)
-        if rank.rank:
-            ranks.follow()
-            return None
-        optimal = optimal_solution(mdp, solution)
-        _check_plain(optimal.horizon)
-        is_plain = has_solution or tie_tolerance is not None
-        result = _summed(mdp, optimal, tie_tolerance, ranks) if is_plain else resolved_gaps(mdp, optimal, ranks=ranks)
-        ranks.end()
-        return result
-
-    return cast(Any, together(processes, program, capacity))
-
-
-def _check_plain(horizon: int | None) -> None:
-    if horizon is not None:
-        raise ParameterError(f"gaps: the horizon is {horizon}; several processes take none: expected processes=1")
-
-
-def _told_by_first(rank: Rank, value: bool) -> bool:
-    return bool(rank.broadcast(np.array([value]) if rank.rank == 0 else None, np.zeros(0, np.bool_))[0])
-
-
-def _summed(mdp: TabularMDP, solution: Solution, tie_tolerance: float | None, ranks: RankedGaps | None = None) -> Gaps:
+def _summed(mdp: TabularMDP, solution: Solution, tie_tolerance: float | None) -> Gaps:
     error = _error(mdp, solution)
     tolerance = _tolerance(solution, tie_tolerance, error)
-    rule = TieRule(tolerance, error, tie_tolerance is not None)
-    ties = UnresolvedTies(mdp, *rule)
-    if ranks is None:
-        added = GapSums()
-        for part in weighted_gaps(mdp, solution):
-            ties.look_at(part, *added.add(part, tolerance, error))
-        unresolved = ties.unresolved(weighted_gaps(mdp, solution))
-    else:
-        added, small, equal, alike = ranks.totals(solution, rule)
-        unresolved = ties.unresolved_of_ranges(small, equal, alike, weighted_gaps(mdp, solution))
-    return _gaps_of(mdp, solution, rule, added, ties.small, unresolved)
-
-
-def _gaps_of(mdp: TabularMDP, solution: Solution, rule: TieRule, added: GapSums, small: int, unresolved: int) -> Gaps:
+    ties, added = UnresolvedTies(mdp, tolerance, error, tie_tolerance is not None), _Sums()
+    for part in weighted_gaps(mdp, solution):
+        ties.look_at(part, *added.add(part, tolerance, error))
+    unresolved = ties.unresolved(weighted_gaps(mdp, solution))
     total, low, high, regularized = added.sums[0].tolist()
     count, bins = int(added.counts[0]), np.flatnonzero(added.histogram)
     first, last = (int(bins[0]), int(bins[-1])) if bins.size else (0, -1)
@@ -415,10 +344,32 @@ def _gaps_of(mdp: TabularMDP, solution: Solution, rule: TieRule, added: GapSums,
         count=count,
         ties=added.num_rows * mdp.num_actions - count,
         unresolved=unresolved,
-        small=small,
+        small=ties.small,
         histogram=added.histogram[first : last + 1].copy(),
         edges=10.0 ** ((np.arange(first, last + 2) - kernels.BIN_OF_ONE) / 4),
-        tie_tolerance=rule.tolerance,
-        error=rule.error,
-        conventions=_conventions(mdp, solution, rule.tolerance),
+        tie_tolerance=tolerance,
+        error=error,
+        conventions=_conventions(mdp, solution, tolerance),
     )
+
+
+class _Sums:
+    """What is added up of the gaps of states, a block at a time; the arrays are those of `kernels.gaps`.
+
+    Attributes:
+        minimal: the smallest gap above the tolerance. num_rows: how many rows count.
+    """
+
+    def __init__(self) -> None:
+        self.sums, self.counts = kernels.empty_sums(), kernels.empty_counts()
+        self.histogram = kernels.empty_histogram()
+        self.minimal, self.num_rows = math.inf, 0
+
+    def add(self, part: GapBlock, tolerance: float, error: float) -> tuple[int, int]:
+        """Add a block. Returns how many of its ties are small, and how many equal."""
+        previous = self.counts.copy()
+        arguments = (tolerance, error, REGULARIZER, self.sums, self.counts, self.histogram)
+        self.minimal = kernels.add_up(part.gap, part.weight, part.counted, self.minimal, *arguments)
+        self.num_rows += int(part.counted.sum())
+        small, equal = (self.counts - previous)[1:].tolist()
+        return small, equal

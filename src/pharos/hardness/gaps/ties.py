@@ -109,12 +109,10 @@ class UnresolvedTies:
         equal: gaps that are computed as 0, beyond the first of a state.
     """
 
-    def __init__(self, mdp: TabularMDP, tolerance: float, error: float, is_definition: bool, is_part: bool = False):
-        """is_part: whether blocks are some of the MDP's, which the second proof says nothing about."""
+    def __init__(self, mdp: TabularMDP, tolerance: float, error: float, is_definition: bool):
         self.mdp, self.tolerance, self.error, self.is_definition = mdp, tolerance, error, is_definition
         self.small = self.equal = 0
         self.proof = TieProof(mdp)
-        self.proof.holds &= not is_part
 
     def look_at(self, part: GapBlock, small: int, equal: int) -> None:
         """Take up the ties of a block: how many are small, and how many equal."""
@@ -126,7 +124,7 @@ class UnresolvedTies:
             return
         self.small += small
         self.equal += equal
-        if not self.small and self.proof.holds:  # not so of parts, whose values have other rows
+        if not self.small and self.proof.holds:
             own = part.step.own[part.states[0] : part.states[-1] + 1] if part.is_whole else part.step.own[part.states]
             self.proof.look_at(part.number, own, part.rewards, part.following, part.gap, part.counted)
 
@@ -136,21 +134,9 @@ class UnresolvedTies:
             return self.small
         if self.small or not self.equal:
             return self.small + self.equal
-        return self.equal - sum(self.alike(part) for part in parts)
+        return self.equal - sum(self._alike(part) for part in parts)
 
-    def unresolved_of_ranges(self, small: int, equal: int, alike: int, parts: Iterator[GapBlock]) -> int:
-        """The same, where ranges have counted: small ones, equal ones, and how many of these are proven in them."""
-        self.small, self.equal = small, equal
-        if self.is_definition:
-            return small
-        if small or equal == alike:
-            return small + equal if small else 0
-        if self.proof.holds:
-            for part in parts:
-                self.look_at(part, 0, 0)
-        return 0 if self.proof.holds else equal - alike
-
-    def alike(self, part: GapBlock) -> int:
+    def _alike(self, part: GapBlock) -> int:
         """Equal gaps of a block between actions that have the same outcomes."""
         if part.scale == 0.0:
             return 0
