@@ -76,28 +76,6 @@ class Interval:
         return f"[{self.lower:.10g}, {self.upper:.10g}]"
 
 
-def interval_of_search(
-    largest: int, is_whole: bool, method: str, spending: "BudgetClock", conventions: Mapping[str, Any]
-) -> Interval:
-    """The eccentricity of the node that one search started from, in steps.
-
-    Args:
-        largest: the largest distance that was found. is_whole: whether every node was; else the eccentricity is
-            infinite.
-    """
-    value = float(largest) if is_whole else math.inf
-    return Interval(
-        value,
-        value,
-        True,
-        finite_part=value if is_whole else 0.0,
-        searches=1,
-        method=method,
-        conventions=conventions,
-        seconds=spending.seconds,
-    )
-
-
 @dataclass(frozen=True)
 class Certified:
     """A number and what is proven of it.

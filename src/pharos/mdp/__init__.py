@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from pharos.mdp.arguments import require_mdp
     from pharos.mdp.bisimulation import Minimization, minimize
     from pharos.mdp.chance import Chance, lazy_actions, random_actions, sticky_actions
-    from pharos.mdp.dynamics import BellmanEquation, Dynamics, Outcomes, PolicyStep, split
+    from pharos.mdp.dynamics import BellmanEquation, Dynamics, Outcomes, PolicyStep
     from pharos.mdp.lazy import Lazy
     from pharos.mdp.matrices import Matrices
     from pharos.mdp.outcome_table import OutcomeTable
@@ -55,7 +55,6 @@ _FILES = {
     "runs_between": "runs",
     "runs_of": "runs",
     "shares_of": "runs",
-    "split": "dynamics",
     "sticky_actions": "chance",
     "require_mdp": "arguments",
 }
@@ -93,7 +92,6 @@ __all__ = [
     "runs_between",
     "runs_of",
     "shares_of",
-    "split",
     "sticky_actions",
 ]
 

@@ -81,21 +81,6 @@ class Halo:
         if self._received is not None:
             into[...] = self._received
 
-    def give_back(self, values: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Send values of the halo (H, ...) to the ranks that have the rows. Returns (rows, values) from each that reads
-        rows of this one.
-        """
-        received = []
-        for source, rows in enumerate(self.wanted):
-            if len(rows):
-                received.append((rows, np.empty((len(rows), *values.shape[1:]), values.dtype)))
-                self._rank.receive(source, received[-1][1])
-        for to, part in enumerate(self.of_rank):
-            if part.stop > part.start:
-                self._rank.send(to, values[part])
-        self._rank.finish()
-        return received
-
     def _send(self, values: np.ndarray, start: int, stop: int) -> None:
         for to, rows in enumerate(self.wanted):
             first, last = np.searchsorted(rows, [start, stop])

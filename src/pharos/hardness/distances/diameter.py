@@ -8,13 +8,11 @@ where it does not close (Then et al. 2014), and an argument of ours for spaces t
 import math
 import os
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 
 from pharos.errors import ParameterError, UndefinedMeasure
 from pharos.hardness.distances.lean_sweep import lean_diameter, lean_eccentricity, needs_more_than_memory
-from pharos.hardness.distances.ranked_search import ranked_eccentricity
 from pharos.hardness.distances.sum_sweep import SumSweep
 from pharos.hardness.distances.transition_graph import Graph
 from pharos.hardness.hitting.stochastic_diameter import stochastic_diameter
@@ -81,7 +79,6 @@ def start_eccentricity(
     restart: bool = True,
     tolerance: float = 1e-6,
     budget: Budget | float | None = None,
-    processes: int | str = 1,
 ) -> float:
     """Return the largest least expected number of steps from the start to a state: the paper's (1), read literally.
 
@@ -91,8 +88,6 @@ def start_eccentricity(
         restart: as in `diameter`; without chance and with one start state it makes no difference.
         tolerance: relative accuracy under chance, and with several start states; else it is counted.
         budget: seconds (300 by default), or a `Budget`, under chance and with several start states.
-        processes: without chance and with one start state, as many that share the search, see `value_iteration`; under
-            MPI all get the result.
     Returns:
         Steps; infinite where some state cannot be reached from some start state. An expectation comes as its upper
         bound, proven to lie within `tolerance`.
@@ -103,8 +98,7 @@ def start_eccentricity(
         one stochastic shortest path problem for each target that bounds do not rule out.
     Source: the pharos paper, equation 1.
     """
-    options: dict[str, Any] = {"restart": restart, "tolerance": tolerance, "budget": budget, "processes": processes}
-    interval = start_eccentricity_interval(mdp, **options)
+    interval = start_eccentricity_interval(mdp, restart=restart, tolerance=tolerance, budget=budget)
     if not interval.exact:
         raise UndefinedMeasure(
             f"start_eccentricity: between {interval.lower:.6g} and {interval.upper:.6g}; {interval.note}"
@@ -119,21 +113,14 @@ def start_eccentricity_interval(
     restart: bool = True,
     tolerance: float = 1e-6,
     budget: Budget | float | None = None,
-    processes: int | str = 1,
 ) -> Interval:
     """Return `start_eccentricity` as an `Interval`: exact, or what is proven within the budget. Arguments: the same."""
     _check_tolerance(tolerance)
     spending = BudgetClock(Budget.of(budget), None)
     graph = Graph.of(mdp, restart)
     if graph is None:
-        if processes != 1:
-            raise ParameterError(f"{mdp}: has chance, under which one process searches; expected processes=1")
         return stochastic_start_eccentricity(mdp, restart, tolerance, spending)
     starts = mdp.start_states[mdp.start_probabilities > 0]
-    if processes != 1:
-        if len(starts) > 1:
-            raise ParameterError(f"{mdp}: has {len(starts)} start states; expected processes=1")
-        return ranked_eccentricity(graph, int(starts[0]), processes, spending, conventions_of(mdp, restart))
     if len(starts) == 1 and needs_more_than_memory(graph):
         return lean_eccentricity(graph, int(starts[0]), spending, conventions_of(mdp, restart))
     weights = mdp.start_probabilities[mdp.start_probabilities > 0]

@@ -6,6 +6,7 @@ that memory has no room for are mapped files; bounds may be in files that outliv
 the search in progress is all that is lost.
 """
 
+import math
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -16,7 +17,7 @@ import numpy as np
 from pharos.hardness.distances.kept_bounds import KeptBounds
 from pharos.hardness.distances.sum_sweep import SumSweep
 from pharos.hardness.distances.transition_graph import Graph
-from pharos.hardness.interval import BudgetClock, Interval, interval_of_search
+from pharos.hardness.interval import BudgetClock, Interval
 from pharos.kernels import distance_sweeps
 from pharos.system.large_arrays import large_zeros, ranges_from_the_end
 from pharos.system.memory import available_memory
@@ -58,8 +59,18 @@ def lean_eccentricity(graph: Graph, source: int, spending: BudgetClock, conventi
         lambda dtype: LeanGraph(graph, dtype).search_forward(source, large_zeros((graph.num_nodes,), dtype))
     )
     spending.searches += 1
-    method = "a breadth-first search, by sweeps over the table"
-    return interval_of_search(largest, reach == graph.num_nodes, method, spending, conventions)
+    is_whole = reach == graph.num_nodes
+    value = float(largest) if is_whole else math.inf
+    return Interval(
+        value,
+        value,
+        True,
+        finite_part=value if is_whole else 0.0,
+        searches=1,
+        method="a breadth-first search, by sweeps over the table",
+        conventions=conventions,
+        seconds=spending.seconds,
+    )
 
 
 def _in_two_bytes_or_four(result: Callable[[Any], Result]) -> Result:
