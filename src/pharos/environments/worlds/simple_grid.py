@@ -61,7 +61,7 @@ class SimpleGrid(Environment):
     paper_instances = tuple(INSTANCES)
     hyperparameters = {
         # Returns of three steps: without them one seed in five, with vectors, stays with the decoy of 8x8
-        # (docs/agents.md).
+        # (docs/evidence/agents.md).
         "dqn": {
             "default": {
                 "gamma": 0.95,
