@@ -417,6 +417,7 @@ def test_render_draws_in_the_terminal(pharos):
         (["build"], "Missing argument"),
         (["bild", "breakout"], "No such command 'bild'"),
         (["build", "breakout", "--fast"], "No such option"),
+        (["build", "breakout", "--shards", "/disk"], "--shards is gone: files stay in one folder"),
         (["render", "breakout", "--observation", "humane"], "did you mean 'human'?"),
         (["render", "breakout", "--out", "a.jpg"], "expected a file name that ends in"),
         (["render", "breakout", "--out", "nowhere/a.png"], "there is no folder"),

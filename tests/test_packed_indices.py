@@ -2,7 +2,6 @@
 
 import contextlib
 import json
-import os
 import shutil
 import tempfile
 from dataclasses import replace
@@ -25,7 +24,7 @@ from pharos.mdp import OutcomeTable, Table, lazy_actions, random_actions, sticky
 from pharos.solvers import evaluate_policy, uniform_value, value_iteration, worst_value
 from pharos.state_space import files as writing
 from pharos.state_space import manifest as manifests
-from pharos.state_space import search, shards
+from pharos.state_space import search
 from pharos.system import large_arrays, packed_indices
 from pharos.system.packed_indices import INT40, PACKED, PackedIndices, blocks_of, holds_end
 from strategies import deterministic_mdps, outcome_mdps
@@ -416,21 +415,6 @@ def test_steps_through_a_space_are_the_same(world, spaces):
                 one.reset()
         walks.append(np.concatenate([np.ravel(each) for each in walk]))
     assert same(*walks)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("world", (WORLDS["breakout"], replace(WORLDS["ragged"], num_positions=6000)), ids=str)
-def test_shards_may_part_an_index(world, tmp_path, monkeypatch):
-    monkeypatch.setattr(search, "INT32_STATES", 0)
-    monkeypatch.setattr(shards, "BORDER", os.sysconf("SC_PAGESIZE"))
-    whole = build(world, tmp_path / "whole")
-    folder = shutil.copytree(whole.folder, tmp_path / "space")
-    space = build(world, folder, shards=[tmp_path / f"disk-{k}" for k in range(3)])
-    sizes = [(tmp_path / f"disk-{k}" / "successors40.bin").stat().st_size for k in range(3)]
-    assert sizes[0] % 5 and min(sizes)
-    for one, other in zip(space.dynamics.arrays().values(), whole.dynamics.arrays().values(), strict=True):
-        assert same(one, other)
-    assert same(value_iteration(space.mdp(0.9)).v, value_iteration(whole.mdp(0.9)).v)
 
 
 @pytest.mark.long

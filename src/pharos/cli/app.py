@@ -37,6 +37,10 @@ from pharos.errors import DivergenceError, ParameterError, PharosError
 from pharos.system.installation import conflict
 
 EXIT_FAILED, EXIT_USAGE, EXIT_INTERRUPTED = 1, 2, 130
+# Options that went, by the command that had them, and what it says of them
+REMOVED = {
+    "pharos build --shards": "--shards is gone: files stay in one folder, which a volume may spread over several disks",
+}
 # What NumPy says of an array that no machine can hold, by a ValueError
 NO_ARRAY = ("array is too big", "Maximum allowed dimension exceeded")
 
@@ -92,7 +96,8 @@ def _exit_code(error: Exception) -> int | None:
     if type(error).__name__ == "Abort":
         return EXIT_INTERRUPTED
     if hasattr(error, "format_message"):  # of typer, wherever its exceptions live in this version
-        complain(f"{error.format_message()} (see `{_command_of(error)} --help`)")
+        option = f"{_command_of(error)} {getattr(error, 'option_name', None)}"
+        complain(f"{REMOVED.get(option) or error.format_message()} (see `{_command_of(error)} --help`)")
         return EXIT_USAGE
     return None
 

@@ -39,12 +39,6 @@ def build(
     memory: Memory = None,
     workers: Workers = None,
     processes: Processes = "1",
-    shards: Annotated[
-        list[Path] | None,
-        typer.Option(
-            "--shards", metavar="FOLDER", help="Once for each folder that gets a range of the finished files."
-        ),
-    ] = None,
     max_states: MaxStates = None,
     json: Json = False,
 ) -> None:
@@ -64,7 +58,6 @@ def build(
         workers=workers,
         processes=ranks,
         max_states=max_states,
-        shards=shards or (),
     )
     seconds = watch.seconds
     rate, peak, bytes_on_disk = space.num_states / seconds, peak_memory_bytes(), bytes_of(space.folder)

@@ -9,7 +9,6 @@ import hashlib
 import json
 import os
 import warnings
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +18,7 @@ from pharos.state_space.files import lock
 from pharos.state_space.manifest import ARRAYS, MANIFEST, PARTS, read_manifest
 from pharos.state_space.plan import Plan
 from pharos.state_space.progress import Progress, reporter
-from pharos.state_space.shards import SHARDS, check_files, shard
+from pharos.state_space.shards import SHARDS, check_files
 from pharos.state_space.store import StateSpace, load
 from pharos.system import memory as machine
 from pharos.system import paths, storage
@@ -42,7 +41,6 @@ def build(
     processes: int | str = 1,
     progress: Progress | bool | None = None,
     checkpoint_seconds: float = CHECKPOINT_SECONDS,
-    shards: Sequence[str | os.PathLike] = (),
     wait: bool | None = None,
 ) -> StateSpace:
     """Enumerate the states of `env` that can be reached from its start states, and their transitions.
@@ -63,8 +61,6 @@ def build(
             (`memory` is that of each).
         progress: None for a bar on a terminal; False for silence; or a function that gets a BuildProgress now and then.
         checkpoint_seconds: at most this much work is lost when the process is killed.
-        shards: folders, on other disks for example, that the files are moved to once they are finished, each a range of
-            them; the reader maps the ranges as one file.
         wait: where another process is building in the folder, wait for it, with a warning; None: in the user's cache,
             which nobody has named.
     Returns:
@@ -97,9 +93,6 @@ def build(
     with crew_of(processes, plan, memory) as crew:
         hold = _waiting if (folder is None if wait is None else wait) else lock
         was_there = crew.is_first and _build(plan, path, crew, options, progress, hold)
-        if crew.is_first and shards:
-            with lock(path):
-                shard(path, read_manifest(path) or {}, [Path(each) for each in shards])
     return load(path, verify=was_there, environment=env)
 
 

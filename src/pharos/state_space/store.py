@@ -33,7 +33,7 @@ from pharos.state_space.manifest import (
 )
 from pharos.state_space.outcome_checks import check_outcome_rules, check_outcomes, outcomes_to_check
 from pharos.state_space.plan import Plan
-from pharos.state_space.shards import blocks_of_ranges, check_files, mapped, ranges_of
+from pharos.state_space.shards import blocks_of, check_files, mapped, parts_of
 from pharos.state_space.stored_outcomes import StoredOutcomes
 from pharos.system.packed_indices import Indices, dtype_of, from_stored
 
@@ -260,7 +260,7 @@ class StateSpace:
     def verify(self) -> None:
         """Read every file once and compare it with its checksums; StateSpaceCorrupted where one differs."""
         for name, entry in self.manifest["arrays"].items():
-            blocks = blocks_of_ranges(ranges_of(self.folder, self.manifest, name), CHECKSUM_BYTES)
+            blocks = blocks_of(parts_of(self.folder, self.manifest, name), CHECKSUM_BYTES)
             for number, (expected, block) in enumerate(
                 itertools.zip_longest(entry["checksums"], blocks, fillvalue=b"")
             ):
@@ -271,7 +271,7 @@ class StateSpace:
                     )
 
     def _map(self, name: str, dtype: str | np.dtype, shape: tuple[int, ...]) -> np.ndarray:
-        return mapped(ranges_of(self.folder, self.manifest, name), dtype)[: math.prod(shape)].reshape(shape)
+        return mapped(parts_of(self.folder, self.manifest, name), dtype)[: math.prod(shape)].reshape(shape)
 
     def _check_index(self, i: int) -> None:
         if not 0 <= i < self.num_states:

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pharos.state_space.manifest import CODES, OFFSETS, PALETTE, PROBABILITIES, successors_name
-from pharos.state_space.shards import mapped, ranges_of
+from pharos.state_space.shards import mapped, parts_of
 from pharos.system.packed_indices import Indices, dtype_of, from_stored
 
 OutcomesOfState = list[tuple[np.ndarray, np.ndarray]]
@@ -49,7 +49,7 @@ class StoredOutcomes(NamedTuple):
         def array(name: str) -> np.ndarray | None:
             if name not in arrays:
                 return None
-            return mapped(ranges_of(folder, manifest, name), dtype_of(arrays[name]["dtype"])).reshape(shapes[name])
+            return mapped(parts_of(folder, manifest, name), dtype_of(arrays[name]["dtype"])).reshape(shapes[name])
 
         successors = array(successors_name(arrays))
         assert successors is not None
