@@ -18,7 +18,6 @@ search = importlib.import_module("pharos.state_space.search")
 table = importlib.import_module("pharos.state_space.table")
 rules = importlib.import_module("pharos.rules.rules")
 stepping = importlib.import_module("pharos.rules.stepping")
-rules_traced = importlib.import_module("pharos.rules.traced")
 
 
 def build(env, folder, **options) -> pharos.StateSpace:
@@ -93,11 +92,8 @@ def test_files_do_not_depend_on_where_the_table_is(tmp_path, undisturbed, small_
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("traced", (True, False))
-def test_files_do_not_depend_on_the_engine(traced, tmp_path, undisturbed, monkeypatch):
+def test_files_do_not_depend_on_the_engine(tmp_path, undisturbed, monkeypatch):
     monkeypatch.setattr(rules, "compiled_or_none", lambda *_: None)
-    if not traced:
-        monkeypatch.setattr(rules_traced.TracedRules, "branches", lambda self, states: None)
     space = build(WORLD, tmp_path / "space", workers=2)
     assert files_of(space.folder) == undisturbed
     interpreted = space.mdp().rewards
@@ -204,15 +200,13 @@ WRONG = (
 )
 
 
-@pytest.mark.parametrize("engine", ("compiled", "threads", "traced", "interpreted"))
+@pytest.mark.parametrize("engine", ("compiled", "threads", "interpreted"))
 @pytest.mark.parametrize(("broken", "expected"), WRONG)
 def test_a_rule_that_breaks_the_contract_is_named_with_its_outcome(broken, expected, engine, tmp_path, monkeypatch):
     if engine == "threads":
         monkeypatch.setattr(search, "WIDE", 1)
     elif engine != "compiled":
         monkeypatch.setattr(rules, "compiled_or_none", lambda *_: None)
-    if engine == "interpreted":
-        monkeypatch.setattr(rules_traced.TracedRules, "branches", lambda self, states: None)
     env = Dice(broken=broken)
     with pytest.raises(RuleError) as error:
         build(env, tmp_path / "space", workers=2)

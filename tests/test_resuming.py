@@ -399,9 +399,8 @@ def test_a_rule_that_fails_is_blamed_with_the_table_on_disk(tmp_path, little_mem
 
 @pytest.fixture
 def interpreted(monkeypatch):
-    """Rules that are neither compiled nor traced: each state is asked."""
+    """Rules that are not compiled: each state is asked."""
     monkeypatch.setattr("pharos.rules.rules.compiled_or_none", lambda *args: None)
-    monkeypatch.setattr("pharos.rules.traced.TracedRules.branches", lambda self, states: None)
 
 
 @pytest.mark.slow

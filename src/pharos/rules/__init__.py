@@ -1,4 +1,4 @@
-"""The rules of an environment at three speeds: compiled, traced and interpreted. `rules_of(env)` gives the fastest.
+"""The rules of an environment at two speeds: compiled and interpreted. `rules_of(env)` gives the faster one that can.
 
 Only what loads no Numba is imported at once; the rest is when it is asked for.
 """

@@ -1,13 +1,13 @@
 """The rules of one environment, behind one interface: `rules_of(env)`.
 
-Three engines run them, the first that can:
+Two engines run them, the first that can:
 
     compiled     by Numba, inside of the loops that search, step and draw (compiled.py)
-    traced       in Python, once for each way through a rule (traced.py)
-    interpreted  in Python, state by state (interpreted.py, stepping.py)
+    interpreted  in Python, state by state; while building, in as many processes as there are workers (interpreted.py,
+                 stepping.py)
 
 Here stands, once, what happens where Numba cannot compile a rule: one warning for each class of environments and use,
-and the next engine. Whatever the engine, a rule that fails is a RuleError that names the state and the action.
+and the other engine. Whatever the engine, a rule that fails is a RuleError that names the state and the action.
 """
 
 import contextlib
@@ -176,18 +176,18 @@ class Rules:
         compiled = compiled_or_none(CompiledExploration, self.env, self.layout)
         if compiled is not None:
             return compiled
-        from pharos.rules.traced import TracedExploration  # which few need: its kernels take milliseconds to load
+        from pharos.rules.interpreted import InterpretedExploration  # which few need
 
-        return TracedExploration(self.env, self.layout, self._workers)
+        return InterpretedExploration(self.env, self.layout, self._workers)
 
     @cached_property
     def rewards(self) -> Rewards:
         compiled = compiled_or_none(CompiledRewards, self.env, self.layout)
         if compiled is not None:
             return compiled
-        from pharos.rules.traced import TracedRewards
+        from pharos.rules.interpreted import InterpretedRewards
 
-        return TracedRewards(self.env, self.layout)
+        return InterpretedRewards(self.env, self.layout)
 
     @cached_property
     def ages(self) -> Ages:
@@ -255,7 +255,8 @@ def compiled_or_none(engine: Callable[..., Engine], env: Environment, *arguments
 
 def not_compiled(reason: str) -> str:
     """The sentence that says so."""
-    return f"Numba cannot compile its rules, so they run interpreted, up to 100 times slower: {reason}"
+    how = "interpreted, by all workers of a build, up to 100 times slower"
+    return f"Numba cannot compile its rules, so they run {how}: {reason}"
 
 
 def _reason(engine: Callable[..., Engine], env: Environment, *arguments: Any) -> tuple[Engine | None, str]:
