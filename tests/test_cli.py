@@ -198,6 +198,19 @@ def test_list_says_type_range_default_and_meaning(answer):
     assert answer("list", "freeway")["parameters"]["directions"]["values"] == "integers, each 1 (right) or -1 (left)"
 
 
+def test_a_list_in_a_pipe_has_no_trailing_blanks(pharos):
+    lines = pharos("list").stdout.splitlines()
+    assert len(lines) > 20 and [line for line in lines if line != line.rstrip()] == []
+
+
+def test_help_is_a_verb_and_shows_no_type_beside_flags(pharos):
+    for words in (["help"], ["help", "train"], ["study", "run", "-h"], []):
+        shown = pharos(*words)
+        assert shown.exit_code == 0 and "<bool>" not in shown.stdout
+    assert "pharos train" in pharos("help", "train").stdout
+    assert pharos("help", "nothing").exit_code == 2
+
+
 def test_an_unknown_environment_gets_the_classes_and_the_verb_that_lists_them(pharos):
     done = pharos("build", "QbertNoFrameskip-v4")
     assert (done.exit_code, done.stdout) == (2, "")

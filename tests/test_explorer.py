@@ -4,6 +4,7 @@ import contextlib
 import http.client
 import json
 import socket
+import time
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -18,6 +19,7 @@ from pharos.explorer import Exploration, Explorer, Learnt, exploration_of, page,
 from pharos.explorer.maps import heat_map, quantities, quantity
 from pharos.explorer.pages import contents
 from pharos.explorer.picture import Pictures
+from pharos.explorer.server import MOST_CONNECTIONS
 from pharos.explorer.states import NumberedStates, axes_of
 from pharos.mdp import TabularMDP
 
@@ -294,6 +296,30 @@ def test_no_path_leads_to_a_file(served, path):
 @pytest.mark.parametrize("method", ["POST", "PUT", "DELETE", "OPTIONS", "PATCH"])
 def test_other_methods_are_refused(served, method):
     assert ask(served, urlsplit(served.url).path, method)[0] == 405
+
+
+@pytest.mark.parametrize("origin", ["http://[", "null", "http://evil.example", "https://[::1", "\u00e9"])
+def test_an_origin_that_is_no_address_is_answered(served, origin):
+    assert ask(served, urlsplit(served.url).path, Origin=origin.encode("latin-1"))[0] == 403
+
+
+def test_a_target_that_is_no_address_is_answered(served):
+    assert ask(served, "http://[")[0] == 400
+
+
+def test_one_connection_too_many_is_closed_at_once_and_the_next_is_answered(served):
+    at = ("127.0.0.1", urlsplit(served.url).port)
+    http_server = served._server._http
+    with contextlib.ExitStack() as stack:
+        for _ in range(MOST_CONNECTIONS):
+            stack.enter_context(socket.create_connection(at, timeout=20))
+        while http_server.places._value:
+            time.sleep(0.01)
+        extra = stack.enter_context(socket.create_connection(at, timeout=20))
+        assert extra.recv(1) == b""
+    while http_server.places._value < MOST_CONNECTIONS:
+        time.sleep(0.01)
+    assert ask(served, urlsplit(served.url).path)[0] == 200
 
 
 def test_another_pages_script_is_refused(served):

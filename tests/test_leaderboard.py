@@ -348,7 +348,7 @@ def test_claims_that_cannot_be_true_do_not_hold(entry, file):
     assert not leaderboard.verify(changed(entry, file, claim=reaches)).objections
 
 
-@pytest.mark.parametrize("text", ["\u3164", "A\u2800", "a" + "\u0301" * 9])
+@pytest.mark.parametrize("text", ["\u3164", "A\u2800", "A\u034f", "\ufe0f", " ", "a" + "\u0301" * 9])
 def test_authors_whom_nobody_would_see_are_refused(entry, file, text):
     with pytest.raises(FileFormatError, match=r"printed as nothing|more than 4 accents"):
         leaderboard.read(changed(entry, file, author=text))

@@ -158,6 +158,12 @@ def test_matrices_that_are_no_mdp_get_a_clear_error(P, R, message):
         TabularMDP.from_matrices(P, R)
 
 
+def test_arrays_in_the_place_of_dynamics_are_told_where_they_go():
+    for arrays in ([[[0, 1]], [[1, 0]]], np.array([[1], [0]])):
+        with pytest.raises(TypeError, match=r"TabularMDP\.from_matrices\(P, R, gamma=0\.99\)"):
+            TabularMDP(arrays, [[0.0], [0.0]], gamma=0.9)
+
+
 def test_other_rewards_leave_terminal_states_without_any():
     mdp = TabularMDP.from_arrays([[1], [-1]], [[1.0], [0.0]])
     assert mdp.with_rewards([[2.0], [0.0]]).rewards.tolist() == [[2.0], [0.0]]

@@ -58,8 +58,9 @@ def test_the_names_of_the_contract_are_there(module, names):
         assert hasattr(importlib.import_module(module), name), name
 
 
-def test_every_announced_name_is_listed():
-    assert set(pharos.__all__) <= set(dir(pharos))
+def test_what_is_listed_is_what_is_announced():
+    assert dir(pharos) == sorted(pharos.__all__)
+    assert [name for name in dir(pharos) if not hasattr(pharos, name)] == []
 
 
 def test_a_name_that_does_not_exist_is_an_attribute_error():

@@ -321,6 +321,18 @@ def test_yaml_that_cannot_be_read_is_a_line(text, tmp_path):
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("text", ["gamma: 0.9", "frozen_lake: {learning_rate: 0.1}", "default: 3"])
+def test_yaml_whose_levels_are_missing_is_refused_not_ignored(text, tmp_path):
+    (tmp_path / "own.yaml").write_text(f"q_learning: {{{text}}}")
+    with pytest.raises(ParameterError, match="expected agent, then class, then observation"):
+        train("q_learning", "frozen_lake/4x4", steps=10, hyperparameters=tmp_path / "own.yaml")
+
+
+def test_options_of_a_network_are_a_mapping():
+    with pytest.raises(ParameterError, match=r"'dqn': policy_kwargs is '\{net_arch: \[8\]\}'; expected a mapping"):
+        train("dqn", "frozen_lake/4x4", steps=10, hyperparameters={"policy_kwargs": "{net_arch: [8]}"})
+
+
 def test_a_network_that_no_machine_holds_is_a_line():
     with pytest.raises(MemoryError, match=r"the network of 'dqn': net_arch is \[1000000000000\]"):
         train("dqn", "frozen_lake/4x4", steps=10, hyperparameters={"net_arch": [10**12]})

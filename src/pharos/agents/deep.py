@@ -135,6 +135,9 @@ def make_model(
 
     torch.set_num_threads(1)
     options = {key: value for key, value in hyperparameters.items() if key not in ("n_envs", "n_timesteps", "policy")}
+    if not isinstance(options.get("policy_kwargs", {}), Mapping):
+        wrong = options["policy_kwargs"]
+        raise ParameterError(f"agent {_title(agent)!r}: policy_kwargs is {wrong!r}; expected a mapping")
     network = {
         "features_extractor_class": extractor(env.observation_space),
         "net_arch": options.pop("net_arch", [FEATURES]),

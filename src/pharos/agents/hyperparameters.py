@@ -52,7 +52,14 @@ def _read(path: Path) -> dict[str, Any]:
         raise ParameterError(f"{path}: cannot be read: its brackets are nested too deeply") from None
     except (OSError, yaml.YAMLError, ValueError) as error:
         raise ParameterError(f"{path}: cannot be read: {' '.join(str(error).split())[:300]}") from error
-    levels = [table, *(table.values() if isinstance(table, dict) else [])]
-    if not all(isinstance(level, dict) for level in levels):
+    if not _nests(table, 3):
         raise ParameterError(f"{path}: expected agent, then class, then observation, each with names and values")
     return table
+
+
+def _nests(table: Any, levels: int) -> bool:
+    """Whether it is a mapping of so many levels above hyperparameters; those of "default" have none."""
+    return isinstance(table, dict) and all(
+        levels == 0 or each is None or _nests(each, 0 if name == "default" else levels - 1)
+        for name, each in table.items()
+    )

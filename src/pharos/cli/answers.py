@@ -47,12 +47,26 @@ def _plain(value: Any) -> Any:
 
 
 def console(*, stderr: bool = False) -> "Console":
-    """A Rich console; wide where nobody looks, so that a pipe gets whole lines."""
+    """A Rich console; outside a terminal 160 columns wide, so that a pipe gets whole lines, without trailing blanks."""
     from rich.console import Console
 
     stream = sys.stderr if stderr else sys.stdout
-    width = None if stream.isatty() or "COLUMNS" in os.environ else 160
-    return Console(emoji=False, stderr=stderr, width=width, highlight=False)
+    file = None if stream.isatty() else _Trimmed(stream)
+    width = None if file is None or "COLUMNS" in os.environ else 160
+    return Console(emoji=False, stderr=stderr, width=width, highlight=False, file=file)  # type: ignore[arg-type]
+
+
+class _Trimmed:
+    """A stream whose lines lose the blanks at their ends: Rich fills the cells of its tables."""
+
+    def __init__(self, stream: Any):
+        self.stream = stream
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.stream, name)
+
+    def write(self, text: str) -> int:
+        return self.stream.write(re.sub(r" +(?=\n)", "", text))
 
 
 @contextlib.contextmanager

@@ -51,8 +51,14 @@ class _Group(TyperGroup):
     def main(self, *args: Any, **options: Any) -> Any:
         options["standalone_mode"] = False
         options["prog_name"] = "pharos"
+        arguments = args[0] if args else options.pop("args", None)
+        words = list(sys.argv[1:] if arguments is None else arguments)
+        if words[:1] == ["help"]:
+            words = [*words[1:], "--help"]
+        if len(words) < 2 or not {"-h", "--help"}.isdisjoint(words):
+            _hide_types_of_flags(self)
         try:
-            code = super().main(*args, **options)
+            code = super().main(words, **options)
             sys.stdout.flush()
         except Exception as error:
             code = _exit_code(error)
@@ -70,6 +76,15 @@ class _Group(TyperGroup):
         except EOFError as error:  # which would be taken for the keyboard's, and said to be an interruption
             kernels = Path(__file__).parents[1] / "kernels" / "__pycache__"
             raise PharosError(f"a file ended too early ({error}); if it is compiled code, delete {kernels}") from error
+
+
+def _hide_types_of_flags(command: Any) -> None:
+    """Help shows no <bool> beside options that take no value."""
+    for option in command.get_params(typer.Context(command, help_option_names=["-h", "--help"])):
+        if getattr(option, "is_flag", False):
+            option.metavar = ""
+    for each in getattr(command, "commands", {}).values():
+        _hide_types_of_flags(each)
 
 
 def _exit_code(error: Exception) -> int | None:

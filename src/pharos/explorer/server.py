@@ -24,6 +24,7 @@ HOST = "127.0.0.1"
 NAMES = (HOST, "localhost")  # that a Host header may have
 LONGEST_QUERY = 8192  # characters
 SECONDS = 30  # of waiting for a request
+MOST_CONNECTIONS = 64  # at once; a thread each
 
 
 class Server:
@@ -132,6 +133,23 @@ class _Http(ThreadingHTTPServer):
     daemon_threads = True
     owner: Server
 
+    def __init__(self, *address: Any):
+        self.places = threading.BoundedSemaphore(MOST_CONNECTIONS)
+        super().__init__(*address)
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Give the connection a thread; one too many is closed at once."""
+        if self.places.acquire(blocking=False):
+            super().process_request(request, client_address)
+        else:
+            self.shutdown_request(request)
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            self.places.release()
+
     def handle_error(self, request: Any, client_address: Any) -> None:
         """A browser that went away in the middle of an answer is no error."""
 
@@ -177,9 +195,12 @@ class _Handler(BaseHTTPRequestHandler):
         if len(hosts) != 1 or hosts[0].lower() not in owner.hosts:
             return _said(HTTPStatus.MISDIRECTED_REQUEST, "this server answers to its own address alone")
         origin = self.headers.get("Origin")
-        if origin is not None and urlsplit(origin).netloc.lower() not in owner.hosts:
+        if origin is not None and origin.lower().removeprefix("http://") not in owner.hosts:
             return _said(HTTPStatus.FORBIDDEN, "this server answers to its own page alone")
-        parts = urlsplit(self.path)
+        try:
+            parts = urlsplit(self.path)
+        except ValueError:
+            return _said(HTTPStatus.BAD_REQUEST, "what was asked for is no address")
         token, _, rest = parts.path.removeprefix("/").partition("/")
         if not hmac.compare_digest(token.encode(), owner.token.encode()):
             return _said(HTTPStatus.FORBIDDEN, "the address lacks the token that `pharos explore` printed")

@@ -35,8 +35,8 @@ LARGEST_HEADER = 1 << 22
 LARGEST_FILE = 1 << 30
 LONGEST_TEXT = 2000
 SHOWN = ("name", "author", "note")
-INVISIBLE = "\u115f\u1160\u2800\u3164\uffa0"
-"""Printable, and nothing to see: fillers of Hangul and the empty pattern of Braille."""
+INVISIBLE = "\u034f\u115f\u1160\u17b4\u17b5\u180b\u180c\u180d\u180f\u2800\u3164\uffa0"
+"""Printable, and nothing to see: joiners, selectors, fillers of Hangul and the empty pattern of Braille."""
 MOST_MARKS = 4
 _METADATA, _RECORD, _ARRAYS = "__metadata__", "pharos", "arrays"
 _AGAIN = "fetch it again, or ask for it again"
@@ -276,10 +276,10 @@ def _check_shown(text: str, name: str) -> None:
     """Refuse what a page shows as nothing, or as a heap of accents."""
     if len(text) > LONGEST_TEXT:
         raise ValueError(f"its {name} has {len(text):,} characters; expected at most {LONGEST_TEXT:,}")
-    if any(character in INVISIBLE for character in text):
+    kinds = [unicodedata.category(character)[0] for character in unicodedata.normalize("NFC", text)]
+    if any(character in INVISIBLE for character in text) or (kinds and not set(kinds) & set("LNPS")):
         raise ValueError(f"its {name} has characters that are printed as nothing")
-    marks = [unicodedata.category(character).startswith("M") for character in unicodedata.normalize("NFC", text)]
-    if "1" * (MOST_MARKS + 1) in "".join("01"[mark] for mark in marks):
+    if "M" * (MOST_MARKS + 1) in "".join(kinds):
         raise ValueError(f"its {name} has more than {MOST_MARKS} accents on one character")
 
 

@@ -68,6 +68,15 @@ class TabularMDP:
     staying: Callable[[], Rewards] | None = None
     environment: Any = None
 
+    def __new__(cls, dynamics: Any = None, *_: Any, **__: Any) -> "TabularMDP":
+        if isinstance(dynamics, np.ndarray | list | tuple):
+            raise TypeError(
+                "TabularMDP takes dynamics, not arrays; probabilities P and rewards R go to "
+                "TabularMDP.from_matrices(P, R, gamma=0.99), next states to TabularMDP.from_arrays, "
+                "outcomes to TabularMDP.from_outcomes"
+            )
+        return super().__new__(cls)
+
     def __post_init__(self) -> None:
         check_gamma(self.gamma)
         check_horizon(self.horizon)
