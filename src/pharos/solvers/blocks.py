@@ -18,16 +18,8 @@ from collections.abc import Callable
 import numpy as np
 
 from pharos.mdp import TabularMDP
-from pharos.solvers.convergence import Endless
-from pharos.solvers.fixed_point import (
-    SETTLING,
-    Backup,
-    FixedPoint,
-    check_tolerance,
-    fixed_point,
-    imprecise,
-    largest_of,
-)
+from pharos.solvers.convergence import Convergence
+from pharos.solvers.fixed_point import Backup, FixedPoint, fixed_point, largest_of
 
 MOST_BLOCKS = 4096
 # Sweeps of a range at most before the next one; fewer once they change it by a tenth of what the first one did.
@@ -57,13 +49,11 @@ def blocked_fixed_point(
         PrecisionError: floats cannot reach the tolerance.
     """
     mdp = backup.mdp
-    check_tolerance(mdp, backup, tolerance)
+    convergence = Convergence(mdp, backup, tolerance, progress)
     x = backup.zeros() if x is None else x
     cuts = [mdp.num_states * i // blocks for i in range(blocks + 1)]
     moved = np.full((blocks, blocks), math.inf)  # by how much range b has changed, at most, since range c was swept
-    rounds, sweeps, since, least, endless = 0, 0.0, 0, math.inf, Endless()
-    patience = SETTLING + math.ceil(1 / (1 - backup.factor))
-    largest = largest_of(x)
+    sweeps, largest = 0.0, largest_of(x)
     while True:
         for c in range(blocks - 1, -1, -1):
             if _bound(backup, moved[c], largest) <= tolerance:
@@ -74,19 +64,12 @@ def blocked_fixed_point(
             moved[:, c] = np.nextafter(moved[:, c] + total, math.inf)
             moved[c] = 0.0
             moved[c, c] = last
-        rounds += 1
         largest = largest_of(x)
-        bound = max(_bound(backup, each, largest) for each in moved)
-        if progress is not None:
-            progress(rounds, bound)
-        if bound <= tolerance:
-            return FixedPoint(x, bound, math.ceil(sweeps))
-        if math.isfinite(bound) and endless.after(bound, tolerance):
+        if convergence.is_met(max(_bound(backup, each, largest) for each in moved)):
+            return FixedPoint(x, convergence.bound, math.ceil(sweeps))
+        if convergence.is_endless():
             return fixed_point(mdp, backup.select, tolerance, progress, x, backup.threads, backup.dtype)
-        if bound < 0.9 * least:
-            least, since = bound, rounds
-        if rounds - since > patience or not math.isfinite(bound):
-            raise imprecise(mdp, min(least, bound), tolerance, backup.is_single)
+        convergence.check(True, backup.patience)
 
 
 def _swept(

@@ -1,8 +1,17 @@
-"""How many sweeps are left and what they cost: what solvers weigh against an attempt at something else."""
+"""When sweeps have converged, or will not; how many are left, and what they cost."""
 
 import math
+from collections.abc import Callable
+from typing import TYPE_CHECKING
 
+from pharos.errors import PrecisionError
 from pharos.mdp import TabularMDP
+
+if TYPE_CHECKING:
+    from pharos.solvers.fixed_point import Backup
+
+# Sweeps that gain nothing, from values that only rounding still moves, until it is clear that it stops them.
+SETTLING = 64
 
 # Operations that calling a sweep costs, however few states there are.
 CALL = 5000
@@ -28,22 +37,75 @@ def sweeps_left(change: float, factor: float, tolerance: float, gamma: float) ->
     return math.log(max(change / (tolerance * (1 - gamma)), 1.0)) / -math.log(factor)
 
 
-class Endless:
-    """Whether sweeps alone would go on for ever: near gamma = 1 on cycles, or where rounding moves values about."""
+class Convergence:
+    """Sweeps, or rounds of them, until their proven bound meets the tolerance.
 
-    def __init__(self) -> None:
+    Attributes:
+        sweeps: so far. bound: after the last one. least: the smallest so far, but for gains of less than a tenth.
+        in_vain: sweeps since then.
+    """
+
+    def __init__(
+        self,
+        mdp: TabularMDP,
+        backup: "Backup",
+        tolerance: float,
+        progress: Callable[[int, float], None] | None = None,
+    ):
+        """
+        Raises:
+            PrecisionError: rounding errors alone are beyond the tolerance.
+        """
+        self.mdp, self.is_single, self.tolerance, self.progress = mdp, backup.is_single, tolerance, progress
+        self.sweeps, self.in_vain, self.least = 0, 0, math.inf
+        self.bound = backup.rounding(0.0) / (1 - backup.factor) if backup.factor < 1 else math.inf
+        if not self.bound <= tolerance:
+            raise imprecise(mdp, self.bound, tolerance, self.is_single)
         self._bounds: list[float] = []
 
-    def after(self, bound: float, tolerance: float) -> bool:
-        """After a sweep, or a round of them, with this bound: whether 10,000 more would not reach the tolerance."""
-        self._bounds.append(bound)
+    def is_met(self, bound: float) -> bool:
+        """Whether the bound after one more sweep meets the tolerance."""
+        self.sweeps, self.bound, self.in_vain = self.sweeps + 1, bound, self.in_vain + 1
+        if self.progress is not None:
+            self.progress(self.sweeps, bound)
+        if bound < 0.9 * self.least:
+            self.least, self.in_vain = bound, 0
+        return bound <= self.tolerance
+
+    def is_endless(self) -> bool:
+        """Whether 10,000 sweeps more would not do: near gamma = 1 on cycles, or where rounding moves values about.
+
+        To be asked after every sweep.
+        """
+        self._bounds.append(self.bound)
         count = len(self._bounds)
-        if count < _LOOK:
+        if count < _LOOK or not math.isfinite(self.bound):
             return False
-        factor = (bound / self._bounds[count // 2]) ** (2 / count)
-        return not factor < 1 or math.log(bound / tolerance) > _ENDLESS * -math.log(factor)
+        factor = (self.bound / self._bounds[count // 2]) ** (2 / count)
+        return not factor < 1 or math.log(self.bound / self.tolerance) > _ENDLESS * -math.log(factor)
+
+    def check(self, is_moving: bool, patience: float) -> None:
+        """PrecisionError unless sweeps move values by more than rounding does, and have gained within `patience`."""
+        if not math.isfinite(self.bound):
+            raise imprecise(self.mdp, self.bound, self.tolerance, self.is_single)
+        if not is_moving or self.in_vain > patience:
+            raise imprecise(self.mdp, min(self.least, self.bound), self.tolerance, self.is_single)
 
 
 def operations(mdp: TabularMDP, sweeps: float) -> float:
     """Operations that so many sweeps take."""
     return sweeps * (CALL + 4.0 * mdp.num_states * mdp.width * mdp.num_actions)
+
+
+def imprecise(mdp: TabularMDP, bound: float, tolerance: float, is_single: bool = False) -> PrecisionError:
+    """The error where floats of 64 bits, or of 32 where values are stored in these, do not reach the tolerance."""
+    bits, end, advice = (32, "3.4e38", "use float64, ") if is_single else (64, "1.8e308", "")
+    if not math.isfinite(bound):
+        return PrecisionError(
+            f"{mdp}: {bits}-bit floats give no bound at gamma = {mdp.gamma!r}: values pass {end}, or probabilities sum "
+            "to 1 / gamma or more; lower gamma or the rewards"
+        )
+    return PrecisionError(
+        f"{mdp}: {bits}-bit floats reach a bound of {bound:.2g} at gamma = {mdp.gamma!r}; asked for {tolerance:.2g}: "
+        f"{advice}raise the tolerance or lower gamma"
+    )

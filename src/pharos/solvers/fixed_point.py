@@ -29,13 +29,11 @@ import numpy as np
 from pharos.errors import DivergenceError, PrecisionError
 from pharos.mdp import BellmanEquation, Part, Selection, TabularMDP
 from pharos.solvers.components import ComponentSolver
-from pharos.solvers.convergence import Endless
+from pharos.solvers.convergence import SETTLING, Convergence, imprecise
 from pharos.solvers.policy_iteration import PolicyIteration
 from pharos.system.large_arrays import large_zeros
 
 _UNIT = 2.0**-53
-# Sweeps that gain nothing, after values of the best policy were found, until it is clear that rounding stops them.
-SETTLING = 64
 # Half a unit in the last place of 32 bits, for numbers from 1 to 2, and for the smallest ones.
 _UNIT32, _LEAST32 = 2.0**-24, 2.0**-150
 # Entries of x that are looked at in one go.
@@ -86,6 +84,11 @@ class Backup:
         executed = chance.chosen * mass + chance.previous + chance.uniform
         is_exact = mass == 1.0 and dynamics.mass == 1.0 and not chance.is_sticky and not chance.is_random
         return self.mdp.gamma * (1.0 if is_exact else max(1.0, executed * dynamics.mass) * (1 + 8 * _UNIT))
+
+    @property
+    def patience(self) -> float:
+        """Sweeps that would gain a factor of 2.7, but for rounding, and some."""
+        return SETTLING + math.ceil(1 / (1 - self.factor))
 
     def zeros(self) -> np.ndarray:
         """(S + 1, W); mapped from a file where memory has little room for it."""
@@ -162,65 +165,48 @@ def fixed_point(
     backup = Backup(mdp, select, threads, dtype)
     if mdp.gamma == 1.0 or mdp.age is not None:
         return _in_one_pass(backup, tolerance, progress, x)
-    rho = backup.factor
-    check_tolerance(mdp, backup, tolerance)
+    convergence = Convergence(mdp, backup, tolerance, progress)
+    x = backup.zeros() if x is None else x
     if backup.is_single:
-        return _in_single(backup, tolerance, progress, backup.zeros() if x is None else x)
-    x, sweeps = backup.zeros() if x is None else x, 0
-    components, better, least, since = ComponentSolver(mdp, select), PolicyIteration(mdp, select), math.inf, 0
-    largest = largest_of(x)
+        return _in_single(backup, convergence, x)
+    rho, largest = backup.factor, largest_of(x)
+    components, better = ComponentSolver(mdp, select), PolicyIteration(mdp, select)
     while True:
         change = backup.sweep(x)
-        sweeps += 1
         largest += change  # at most that: the entries are read where it matters, which costs a third of a sweep
         if better.is_exact or not rho * change > max(backup.rounding(largest + change), tolerance * (1 - rho)):
             largest = largest_of(x)
         rounding = backup.rounding(largest + change)
-        bound = backup.bound(change, rounding)
-        if progress is not None:
-            progress(sweeps, bound)
-        if bound <= tolerance:
-            return FixedPoint(x, bound, sweeps)
-        if bound < 0.9 * least:
-            least, since = bound, sweeps
+        if convergence.is_met(backup.bound(change, rounding)):
+            return FixedPoint(x, convergence.bound, convergence.sweeps)
         # x is exact up to rounding, also where values are infinite; or sweeps move rounding errors about
-        if not rho * change > rounding or (better.is_exact and sweeps - since > SETTLING):
-            raise imprecise(mdp, least if better.is_exact else bound, tolerance)
-        if components.is_worth_it(sweeps, change, tolerance) and components.improve(x, tolerance):
+        convergence.check(rho * change > rounding, SETTLING if better.is_exact else math.inf)
+        if components.is_worth_it(convergence.sweeps, change, tolerance) and components.improve(x, tolerance):
             largest = largest_of(x)
-        elif better.is_worth_it(sweeps, change, tolerance):
+        elif better.is_worth_it(convergence.sweeps, change, tolerance):
             better.improve(x, tolerance)
             largest = largest_of(x)
 
 
-def _in_single(
-    backup: Backup, tolerance: float, progress: Callable[[int, float], None] | None, x: np.ndarray
-) -> FixedPoint:
+def _in_single(backup: Backup, convergence: Convergence, x: np.ndarray) -> FixedPoint:
     """The same for values of 32 bits, by sweeps alone; by those of 64 bits, which are stored then, where these would
     not end: near gamma = 1 rounding to 32 bits adds up over 1 / (1 - gamma) sweeps."""
-    mdp, rho, sweeps, least, since, endless = backup.mdp, backup.factor, 0, math.inf, 0, Endless()
-    patience = SETTLING + math.ceil(1 / (1 - rho))  # sweeps that gain a factor of 2.7, but for rounding
+    tolerance = convergence.tolerance
     while True:
-        shift, sweeps = backup.sweep(x), sweeps + 1
+        shift = backup.sweep(x)
         largest = largest_of(x)
         change = backup.changed(shift, largest)
-        bound = backup.bound(change, backup.rounding(backup.size(largest + change)))
-        if progress is not None:
-            progress(sweeps, bound)
-        if bound <= tolerance:
-            return FixedPoint(x, bound, sweeps)
-        if bound < 0.9 * least:
-            least, since = bound, sweeps
-        if math.isfinite(bound) and endless.after(bound, tolerance):
-            result = fixed_point(mdp, backup.select, tolerance, progress, None, backup.threads)
+        if convergence.is_met(backup.bound(change, backup.rounding(backup.size(largest + change)))):
+            return FixedPoint(x, convergence.bound, convergence.sweeps)
+        if convergence.is_endless():
+            result = fixed_point(backup.mdp, backup.select, tolerance, convergence.progress, None, backup.threads)
             with np.errstate(over="ignore"):
                 x[:] = result.x
             bound = (result.bound + backup.stored(largest_of(result.x))) * MARGIN
             if not bound <= tolerance:
-                raise imprecise(mdp, bound, tolerance, is_single=True)
-            return FixedPoint(x, bound, sweeps + result.sweeps)
-        if shift == 0.0 or sweeps - since > patience or not math.isfinite(bound):
-            raise imprecise(mdp, min(least, bound), tolerance, is_single=True)
+                raise imprecise(backup.mdp, bound, tolerance, is_single=True)
+            return FixedPoint(x, bound, convergence.sweeps + result.sweeps)
+        convergence.check(shift != 0.0, backup.patience)
 
 
 def backward_induction(
@@ -313,24 +299,3 @@ def bound_of_steps(mdp: TabularMDP, horizon: int, bound: float, largest: float) 
             f"{mdp}: the values of {horizon} steps pass 1.8e308, the largest 64-bit float; use smaller rewards"
         )
     return bound * MARGIN
-
-
-def check_tolerance(mdp: TabularMDP, backup: Backup, tolerance: float) -> None:
-    """Raise PrecisionError where rounding errors alone are beyond the tolerance."""
-    least = backup.rounding(0.0) / (1 - backup.factor) if backup.factor < 1 else math.inf
-    if not least <= tolerance:
-        raise imprecise(mdp, least, tolerance, backup.is_single)
-
-
-def imprecise(mdp: TabularMDP, bound: float, tolerance: float, is_single: bool = False) -> PrecisionError:
-    """The error where floats of 64 bits, or of 32 where values are stored in these, do not reach the tolerance."""
-    bits, end, advice = (32, "3.4e38", "use float64, ") if is_single else (64, "1.8e308", "")
-    if not math.isfinite(bound):
-        return PrecisionError(
-            f"{mdp}: {bits}-bit floats give no bound at gamma = {mdp.gamma!r}: values pass {end}, or probabilities sum "
-            "to 1 / gamma or more; lower gamma or the rewards"
-        )
-    return PrecisionError(
-        f"{mdp}: {bits}-bit floats reach a bound of {bound:.2g} at gamma = {mdp.gamma!r}; asked for {tolerance:.2g}: "
-        f"{advice}raise the tolerance or lower gamma"
-    )

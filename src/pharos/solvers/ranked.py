@@ -19,7 +19,6 @@ that others read before the rest 240, 231 and 284, and a halo that is one sweep 
 All ranks run the same loop and see the same numbers, so they need nobody who tells them when to stop.
 """
 
-import math
 from collections.abc import Callable
 from functools import cached_property
 
@@ -29,7 +28,8 @@ from pharos.errors import ParameterError
 from pharos.mdp import Part, Selection, TabularMDP, runs_between, runs_of, shares_of
 from pharos.ranks import Halo, Rank, check_ranks, cuts_of
 from pharos.solvers.checkpoint import Checkpoint
-from pharos.solvers.fixed_point import SETTLING, Backup, bound_of_steps, check_tolerance, imprecise, largest_of
+from pharos.solvers.convergence import Convergence
+from pharos.solvers.fixed_point import Backup, bound_of_steps, largest_of
 from pharos.system.workers import usable_workers
 
 _ROWS = 1 << 20  # of values that a rank sends to the first in one exchange
@@ -185,28 +185,20 @@ def ranked_fixed_point(
             f"{mdp}: gamma is 1 and there is no horizon, which several processes cannot solve; "
             "expected processes=1, a horizon, or gamma < 1"
         )
-    check_tolerance(mdp, backup.backup, tolerance)
-    sweeps = checkpoint.start(backup)
-    patience = SETTLING + math.ceil(math.log(0.5) / math.log(rho)) if rho > 0 else SETTLING
-    least, since = math.inf, sweeps
+    of_first = progress if backup.rank.rank == 0 else None
+    convergence = Convergence(mdp, backup.backup, tolerance, of_first)
+    convergence.sweeps = checkpoint.start(backup)
     while True:
         change = backup.plain_sweep() if jacobi else backup.sweep()
-        sweeps += 1
         largest = largest_of(backup.x[: len(backup.part)])
         numbers = backup.share(change, largest, checkpoint.is_due(backup))
         change, largest, is_due = map(float, numbers.max(axis=0))
         rounding = backup.backup.rounding(largest + change)
-        bound = backup.backup.bound(change, rounding)
-        if progress is not None and backup.rank.rank == 0:
-            progress(sweeps, bound)
-        if bound <= tolerance:
-            return bound, sweeps
-        if bound < 0.9 * least:
-            least, since = bound, sweeps
-        if not rho * change > rounding or sweeps - since > patience:
-            raise imprecise(mdp, min(least, bound), tolerance)
+        if convergence.is_met(backup.backup.bound(change, rounding)):
+            return convergence.bound, convergence.sweeps
+        convergence.check(rho * change > rounding, backup.backup.patience)
         if is_due:
-            checkpoint.keep(backup, sweeps)
+            checkpoint.keep(backup, convergence.sweeps)
 
 
 def ranked_induction(

@@ -12,9 +12,12 @@ from pharos.solvers.blocks import MOST_BLOCKS, blocked_fixed_point, can_be_swept
 from pharos.solvers.distributed import DistributedOptions, shared_solution
 from pharos.solvers.fixed_point import Backup, backward_induction, fixed_point
 from pharos.solvers.solution import Solution
-from pharos.solvers.stored_values import kept_values
 from pharos.system.compiling import Stopwatch
+from pharos.system.kept_arrays import kept_array
 from pharos.system.workers import usable_workers
+
+# Rows of values in a file that are read in one go.
+_ROWS = 1 << 22
 
 
 @require_mdp
@@ -150,7 +153,7 @@ def solution_of(
     watch = Stopwatch()
     steps = None
     if horizon is None:
-        x = None if values is None else kept_values(values, (mdp.num_states + 1, mdp.width), dtype)
+        x = None if values is None else _kept_values(values, (mdp.num_states + 1, mdp.width), dtype)
         if blocks > 1 and can_be_swept_by_blocks(mdp):
             result = blocked_fixed_point(
                 Backup(mdp, select, usable_workers(threads), dtype), tolerance, blocks, progress, x
@@ -165,6 +168,25 @@ def solution_of(
     if steps is not None:
         steps = steps[:, :-1] if mdp.is_sticky else steps[:, :-1, 0]
     return Solution(mdp, result.bound, result.sweeps, watch.seconds, horizon, select, result.x, following, steps)
+
+
+def _kept_values(path: str | os.PathLike, shape: tuple[int, int], dtype: Any = np.float64) -> np.ndarray:
+    """(S + 1, W) mapped from a file of NumPy (.npy): what is there, or zeros in a new one.
+
+    A bound holds from any values on (see fixed_point.py), so a file left in the middle of a sweep is a good start.
+    Values that are not finite count as 0, and so does the last row, which is the end.
+
+    Raises:
+        FileFormatError: the file holds something else. FolderLocked: its values are in use. ParameterError:
+        the file cannot be made.
+    """
+    x = kept_array(path, shape, dtype)
+    for start in range(0, len(x), _ROWS):
+        block = x[start : start + _ROWS]
+        if not np.isfinite(block).all():
+            block[~np.isfinite(block)] = 0.0
+    x[-1] = 0.0
+    return x
 
 
 def check_tolerance(tolerance: float) -> None:
