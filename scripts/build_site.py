@@ -54,7 +54,7 @@ def stage() -> Path:
     for section in generated.values():
         pages |= section
     pages |= site_pages.explorer()
-    pages["explorer.md"] = str(pages["explorer.md"]).replace(site_pages.MARK, site_pages.FRAME)
+    pages |= {name: site_pages.live(name, str(pages[name])) for name in site_pages.LIVE}
     for name, content in pages.items():
         data = content.read_bytes() if isinstance(content, Path) else content
         put(STAGED / name, data.encode() if isinstance(data, str) else data)

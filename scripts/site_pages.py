@@ -16,7 +16,6 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import pharos
-from pharos import explorer as explorers
 from pharos.cli.list import list_, rules_of
 from pharos.environments import classes, make
 from pharos.interaction.registration import ids_of
@@ -61,12 +60,10 @@ NOT_COMPUTED = {  # instance -> why its values are not there
         for target, chance in ((512, 0.736774), (1024, 0.011338))
     },
 }
-LIVE = "assets/explorer/frozen_lake.html"
-FRAME = (
-    f'<iframe src="{LIVE}" title="Explorer of a slippery lake" loading="lazy" style="width: 100%; height: 52rem; '
-    f'border: 1px solid var(--md-default-fg-color--lightest); border-radius: .4rem"></iframe>\n\n'
-    f"[Open it alone]({LIVE})"
-)
+LIVE = {  # page -> the explorer that it shows
+    "explorer.md": ("assets/explorer/frozen_lake.html", "Explorer of a slippery lake", "52rem"),
+    "index.md": ("assets/explorer/frozen_lake-8x8.html", "Explorer of frozen_lake/8x8", "36rem"),
+}
 MARK = "<!-- The site has it live here: scripts/site_pages.py, explorer. -->"
 POLICIES = ("optimal", "uniform", "worst")
 VALUES = (
@@ -313,11 +310,21 @@ def versions(cls) -> list[str]:
 
 
 def explorer() -> dict[str, str | bytes]:
-    """The explorer of a small lake, with what Q-learning has learnt there too soon, as one file; and its frame."""
+    """Explorers as files: a small lake with what Q-learning has learnt there too soon, and the lake of the home page."""
     with tempfile.TemporaryDirectory() as folder:
         run = pharos.train("q_learning", make("frozen_lake", slippery=True), steps=4000, seed=3, out=f"{folder}/run")
-        world = explorers.exploration_of(run.folder, title="frozen_lake/4x4 slippery=true")
-    return {LIVE: explorers.page(world, explorers.contents(world))}
+        pages: dict[str, str | bytes] = {}
+        for page, target in (("explorer.md", run.folder), ("index.md", "frozen_lake/8x8")):
+            file = pharos.explore(target, out=f"{folder}/page.html")
+            pages[LIVE[page][0]] = Path(file).read_bytes()
+    return pages
+
+
+def live(page: str, text: str) -> str:
+    """A page with its explorer in the place of the mark."""
+    file, title, height = LIVE[page]
+    frame = f'<iframe src="{file}" title="{title}" loading="lazy" class="live" style="height: {height}"></iframe>'
+    return text.replace(MARK, f"{frame}\n\n[Open it alone]({file})")
 
 
 def reference() -> dict[str, str]:

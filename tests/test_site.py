@@ -1,6 +1,7 @@
 """The documentation site: pages say what is so, links lead somewhere, tutorials run; `make docs` builds it strictly."""
 
 import contextlib
+import dataclasses
 import importlib
 import io
 import json
@@ -163,6 +164,18 @@ def test_counts_of_the_site_are_those_of_the_docs_and_of_what_was_enumerated(scr
         assert f"{states:,}" in (DOCS / page).read_text(), name
         assert stored[name].get("num_states", states) == states, name
         assert stored[name].get("more_than", 0) < states, name
+
+
+def test_worlds_on_the_page_for_newcomers_are_there():
+    """Code in the right columns: an instance or a class, with parameters that it has."""
+    spans = re.findall(r"`([a-z0-9_]+(?:/[\w-]+)?)((?: \w+=[\w.]+)*)`", (DOCS / "coming-from.md").read_text())
+    worlds = {entry.name for entry in BUILT_IN}
+    checked = [(name, words) for name, words in spans if name.split("/")[0] in worlds]
+    assert len(checked) > 30
+    for name, words in checked:
+        assert name in worlds or name in named_instances(), name
+        fields = {field.name for field in dataclasses.fields(class_called(name.split("/")[0]))}
+        assert set(re.findall(r"(\w+)=", words)) <= fields, (name, words)
 
 
 def test_the_reference_has_every_published_name_once(scripts):
