@@ -14,7 +14,7 @@ import numpy as np
 import pharos
 from pharos import drawing
 from pharos.environments import start_distribution
-from pharos.observations import observe, render
+from pharos.observations import render
 from pharos.system.wording import many
 
 DOCS = Path(__file__).parents[1] / "docs"
@@ -73,7 +73,6 @@ FRAMES_PER_SECOND = {  # others: 12
     **{"river_swim": 4, "catch": 6, "memory_chain": 2, "umbrella_chain": 6, "discounting_chain": 6},
 }
 FRAMES = 90
-NUMBERS = 8  # of a vector
 GAMMA = 0.99
 
 
@@ -143,31 +142,11 @@ def shown(env, state):
     )
 
 
-def numbers(env, space, state):
-    """The observations that are numbers, in a sentence."""
-    states = np.array([state])
-    vector, one_hot = observe(env, "vector"), observe(env, "one_hot")
-    parts = [f"`{name}` {value:.2f}" for name, value in zip(vector.names, vector(states)[0], strict=True)]
-    shown = ", ".join(parts[:NUMBERS]) + (", ..." if len(parts) > NUMBERS else "")
-    ones = int(one_hot(states)[0].sum())
-    return (
-        f"`vector`, {len(parts)} numbers: {shown}. `one_hot`: {len(one_hot.names):,} bits, {ones} of them set. "
-        f"`index`: {space.index(state):,}. `hash`: {word_of(env, states)}."
-    )
-
-
-def word_of(env, states):
-    """The word of a state, in groups of eight bits."""
-    bits = "".join(map(str, observe(env, "hash")(states)[0]))
-    return f"`{' '.join(bits[i : i + 8] for i in range(0, len(bits), 8))}`"
-
-
 HEAD = """# Gallery
 
-Made by `python scripts/gallery.py`. In each row, from the left: the drawing for people, the complex image at
-its natural size and at 84 x 84 pixels, and the planes of the simple image, one for each layer; below it, the
-observations that are numbers. What agents learnt, at play beside the optimal policy and a random one:
-[large-runs.md](large-runs.md).
+Made by `python scripts/gallery.py`. In each row, from the left: the drawing for people, the complex image at its
+natural size and at 84 x 84 pixels, and the planes of the simple image, one for each layer. What agents learnt, at play
+beside the optimal policy and a random one: [large-runs.md](large-runs.md).
 """
 
 
@@ -179,15 +158,15 @@ def section(cls):
         state = drawing.episode(env, policy, env.initial_states()[0][0], steps=steps)[-1][0]
         file = file_of(name, ".png")
         drawing.save_png(file, shown(env, state))
-        space = pharos.build(env)
-        lines += [f"`{name}`, {space.num_states:,} states, after {many(steps, 'step')} of the optimal policy:", ""]
-        lines += [f"![{name}](gallery/{file.name})", "", numbers(env, space, state), ""]
+        states = pharos.build(env).num_states
+        lines += [f"`{name}`, {states:,} states, after {many(steps, 'step')} of the optimal policy:"]
+        lines += [f"![{name}](gallery/{file.name})", ""]
     for name in PLAYED[cls].split(", "):
         env, policy = (unturned if cls == "game_2048" else optimal)(name)
         pictures = [render(env, state, "complex_image", size="natural") for state in played(env, policy, cls)]
         file = file_of(name, ".gif")
         drawing.save_gif(file, pictures, frames_per_second=FRAMES_PER_SECOND.get(cls, 12), at_least=160)
-        lines += [f"The optimal policy of `{name}`:", "", f"![{name}](gallery/{file.name})", ""]
+        lines += [f"The optimal policy of `{name}`:", f"![{name}](gallery/{file.name})", ""]
     return "\n".join(lines)
 
 

@@ -285,7 +285,7 @@ def instances(cls, stored: Mapping[str, dict]) -> list[str]:
 
 def observations(section: str) -> str:
     """The pictures of the gallery: what people and agents see."""
-    text = re.sub(r"^The optimal policy of .*\n\n!\[.*\n", "", section, flags=re.MULTILINE)
+    text = re.sub(r"^The optimal policy of .*\n!\[.*\n", "", section, flags=re.MULTILINE)
     text = text.strip().partition("\n\n")[2].replace("](gallery/", "](../gallery/")
     if not text.strip():
         return "The observations of every class: [observations](../observations.md)."
@@ -310,7 +310,7 @@ def versions(cls) -> list[str]:
 
 
 def explorer() -> dict[str, str | bytes]:
-    """Explorers as files: a small lake with what Q-learning has learnt there too soon, and the lake of the home page."""
+    """Explorers as files: a small lake with what Q-learning has learnt there too soon; the lake of the home page."""
     with tempfile.TemporaryDirectory() as folder:
         run = pharos.train("q_learning", make("frozen_lake", slippery=True), steps=4000, seed=3, out=f"{folder}/run")
         pages: dict[str, str | bytes] = {}
