@@ -5,13 +5,13 @@ defaults.py has those of each agent; a class of environments declares what suits
 """
 
 from collections.abc import Mapping
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 from pharos.agents.defaults import DEFAULTS
 from pharos.environments import class_called
 from pharos.errors import MissingExtra, ParameterError
+from pharos.system.storage import check_regular
 
 
 def hyperparameters(
@@ -32,34 +32,34 @@ def hyperparameters(
         default = DEFAULTS.get(agent)
         by_observation = declaring.hyperparameters.get(agent, {}) if declaring else {}
     else:
-        entries = _read(table).get(agent, {})
-        default, by_observation = entries.get("default"), entries.get(environment, {})
+        entries = _read(table).get(agent) or {}
+        default, by_observation = entries.get("default"), entries.get(environment) or {}
     result: dict[str, Any] = {}
     for part in (default, by_observation.get("default"), by_observation.get(observation), given):
         result.update(part or {})
     return result
 
 
-@cache
 def _read(path: Path) -> dict[str, Any]:
     try:
         import yaml
     except ImportError as error:
         raise MissingExtra("reading hyperparameters", "pyyaml", "study") from error
     try:
+        check_regular(path)
         table = yaml.safe_load(path.read_text(encoding="utf-8"))
     except RecursionError:
         raise ParameterError(f"{path}: cannot be read: its brackets are nested too deeply") from None
     except (OSError, yaml.YAMLError, ValueError) as error:
         raise ParameterError(f"{path}: cannot be read: {' '.join(str(error).split())[:300]}") from error
-    if not _nests(table, 3):
+    if not _is_table(table, 4):
         raise ParameterError(f"{path}: expected agent, then class, then observation, each with names and values")
     return table
 
 
-def _nests(table: Any, levels: int) -> bool:
-    """Whether it is a mapping of so many levels above hyperparameters; those of "default" have none."""
-    return isinstance(table, dict) and all(
-        levels == 0 or each is None or _nests(each, 0 if name == "default" else levels - 1)
-        for name, each in table.items()
-    )
+def _is_table(entry: Any, levels: int) -> bool:
+    """Whether names lead to names, so many levels deep; a default has one level, and what is empty none."""
+    if not isinstance(entry, dict) or not all(isinstance(name, str) for name in entry):
+        return False
+    below = entry.items() if levels > 1 else ()
+    return all(part is None or _is_table(part, 1 if name == "default" else levels - 1) for name, part in below)

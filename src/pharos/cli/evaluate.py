@@ -232,5 +232,5 @@ def read_policy(name: str, *, trust: bool = False) -> Given:
             return Given(np.load(path, allow_pickle=False))
         with np.load(path, allow_pickle=False) as arrays:
             return Given(arrays["policy"])
-    except (ValueError, KeyError, EOFError) as error:
+    except Exception as error:  # headers of arrays are read as Python
         raise FileFormatError(f"{path}: {error}; expected an array of actions (S,) or probabilities (S, A)") from error

@@ -108,7 +108,7 @@ def _table(run: Path) -> dict[str, np.ndarray]:
     """The greedy policy, in as few bytes as its actions take."""
     try:
         table = np.load(run / "policy.npy", allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
+    except Exception as error:  # the header is read as Python
         raise ResultCorrupted(f"{run / 'policy.npy'}: cannot be read: {error}") from None
     whole = table.astype(np.int64)
     return {POLICY: whole.astype(np.min_scalar_type(int(whole.max(initial=0)))) if (whole == table).all() else table}

@@ -107,7 +107,7 @@ def check_lengths(folder: Path, manifest: dict[str, Any]) -> None:
     """StateSpaceCorrupted where a file is missing or shorter than what was committed."""
     for name, entry in manifest["arrays"].items():
         path = folder / name
-        length = path.stat().st_size if path.exists() else None
+        length = path.stat().st_size if path.is_file() else None
         if length is None or length < entry["bytes"] or (manifest["complete"] and length != entry["bytes"]):
             raise StateSpaceCorrupted(
                 f"{path}: expected {entry['bytes']} bytes, found {'no such file' if length is None else length}: "
@@ -251,5 +251,5 @@ def _checked_size(name: str, entry: dict[str, Any]) -> int:
 
 def _whole(value: Any, name: str, least: int) -> int:
     if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= 2**63:
-        raise ValueError(f"{name} is {value!r}; expected a whole number of at least {least}")
+        raise ValueError(f"{name} is {repr(value)[:200]}; expected a whole number of at least {least}")
     return value

@@ -40,6 +40,7 @@ from pharos.system.packed_indices import Indices, dtype_of, from_stored
 if TYPE_CHECKING:
     from pharos.mdp import Dynamics, TabularMDP
 
+LONGEST = 500  # characters of what a manifest says, in a message
 _BLOCK = 1 << 16  # states whose ages are asked for at a time
 
 
@@ -334,16 +335,16 @@ def _environment_of(folder: Path, manifest: dict[str, Any]) -> Environment | Non
         return None
     try:
         env = cls(**{name: as_tuples(value) for name, value in manifest["parameters"].items()})
+        identity = Plan(env).identity
     except Exception as error:  # whatever a class does with parameters that are none of its own
         raise StateSpaceMismatch(
             f"{folder}: its parameters are not those of this pharos' {manifest['environment']}: "
-            f"{' '.join(str(error).split())}; build again"
+            f"{' '.join(str(error).split())[:LONGEST]}; build again"
         ) from error
-    identity = Plan(env).identity
     for key in ("rules_version", "parameters", "actions", "outcomes", "layout", "start"):
         if identity.get(key) != manifest.get(key):
             raise StateSpaceMismatch(
-                f"{folder}: {key} of {env.name} is {manifest.get(key)} in the folder and {identity.get(key)} in this "
-                "pharos; build again"
+                f"{folder}: {key} of {env.name} is {str(manifest.get(key))[:LONGEST]} in the folder and "
+                f"{identity.get(key)} in this pharos; build again"
             )
     return env

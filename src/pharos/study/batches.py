@@ -74,7 +74,7 @@ class Batches:
         batches = []
         for file in self.folder.glob("*/batch.json"):
             with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
-                batches.append(frozenset(json.loads(file.read_text(encoding="utf-8"))["ids"]))
+                batches.append(frozenset(storage.read_json(file)["ids"]))
         return batches
 
     def unit(self, run: Run, pending: "deque[tuple[float, Run]]") -> tuple[Run, ...]:
@@ -155,7 +155,7 @@ class Batches:
         ids = {run.id for run in unit}
         for file in self.folder.glob("*/batch.json"):
             with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
-                if ids & set(json.loads(file.read_text(encoding="utf-8"))["ids"]):
+                if ids & set(storage.read_json(file)["ids"]):
                     shutil.rmtree(file.parent, ignore_errors=True)
         self.stored = {id: others for id, others in self.stored.items() if not others & ids}
 

@@ -1,7 +1,6 @@
 """How far a study is, told by the files in its folder."""
 
 import contextlib
-import json
 import os
 import socket
 import time
@@ -22,7 +21,7 @@ from pharos.study.specification import (
     study_folder,
     study_name,
 )
-from pharos.system.storage import replace_file
+from pharos.system.storage import read_json, replace_file
 from pharos.system.wording import many
 
 
@@ -118,8 +117,8 @@ def status(source: Source, folder: str | os.PathLike | None = None) -> Status:
         finished += record is not None and record["status"] == _worker.FINISHED
     running, remaining = 0, None
     for file in sorted(place.glob("status*.json")):
-        with contextlib.suppress(ValueError, OSError, KeyError, TypeError):
-            said = json.loads(file.read_text(encoding="utf-8"))
+        with contextlib.suppress(ValueError, OSError, KeyError, TypeError, OverflowError):
+            said = read_json(file)
             if _lives(said):
                 running += said["running"]
                 if said["remaining"] is not None:
@@ -163,4 +162,4 @@ def claim(study: Specification, folder: Path) -> None:
     import yaml
 
     text = yaml.safe_dump(study.model_dump(mode="json", exclude_unset=True), sort_keys=False, width=120)
-    replace_file(file, text)
+    replace_file(file, text, devices=False)

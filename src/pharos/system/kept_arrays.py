@@ -37,6 +37,7 @@ def kept_array(path: str | os.PathLike, shape: tuple[int, ...], dtype: Any, what
     try:
         if not path.exists():
             _make(path, shape, dtype)
+        storage.check_regular(path)
         with open(path, "r+b") as file, _locked(path, file, what) as claim:
             offset = _checked_offset(path, file, shape, dtype, what)
             mapping = mmap.mmap(file.fileno(), 0)  # it holds the lock, too
@@ -75,7 +76,7 @@ def _checked_offset(path: Path, file: BinaryIO, shape: tuple[int, ...], dtype: n
     try:
         np.lib.format.read_magic(file)
         file_shape, is_fortran, file_dtype = np.lib.format.read_array_header_1_0(file)
-    except ValueError as error:
+    except Exception as error:  # the header is read as Python
         raise FileFormatError(f"{path}: is no file of {what}; choose another name, or delete it") from error
     offset = file.tell()
     whole = offset + dtype.itemsize * int(np.prod(shape, dtype=np.int64)) == os.path.getsize(path)

@@ -47,21 +47,23 @@ _LEFTOVER_SECONDS = 86400.0
 
 
 @contextlib.contextmanager
-def replacing(path: str | os.PathLike, *, durable: bool = True) -> Iterator[BinaryIO]:
+def replacing(path: str | os.PathLike, *, durable: bool = True, devices: bool = True) -> Iterator[BinaryIO]:
     """Open a file for writing that takes the place of `path` when the block ends, and never where it raises.
 
     Args:
         path: where a symbolic link stands, the file it leads to is replaced; what is no file (a pipe, a device) is
-            written to.
+            written to, or, without `devices`, replaced.
         durable: the new file is on the disk before it has its name, and the name before this returns.
     Raises:
         OSError: the file cannot be written; an older one of that name is then as it was.
     """
-    if _is_special(Path(path)):
+    path = Path(path)
+    is_special = _is_special(path)
+    if is_special and devices:
         with open(path, "wb") as file:
             yield file
         return
-    path = Path(os.path.realpath(path))
+    path = path if is_special else Path(os.path.realpath(path))
     temporary = temporary_path(path)
     try:
         with open(temporary, "xb") as file:
@@ -81,15 +83,15 @@ def replacing(path: str | os.PathLike, *, durable: bool = True) -> Iterator[Bina
             temporary.unlink(missing_ok=True)
 
 
-def replace_file(path: str | os.PathLike, data: bytes | str, *, durable: bool = True) -> None:
+def replace_file(path: str | os.PathLike, data: bytes | str, *, durable: bool = True, devices: bool = True) -> None:
     """Replace a file by these bytes, or by this text in UTF-8, in one step; see `replacing`."""
-    with replacing(path, durable=durable) as file:
+    with replacing(path, durable=durable, devices=devices) as file:
         file.write(data.encode() if isinstance(data, str) else data)
 
 
 def replace_json(path: str | os.PathLike, value: Any, *, durable: bool = True) -> None:
-    """Replace a file by a value in JSON (see `json_text`), in one step."""
-    replace_file(path, json_text(value) + "\n", durable=durable)
+    """Replace a file by a value in JSON (see `json_text`), in one step; what is no file there too."""
+    replace_file(path, json_text(value) + "\n", durable=durable, devices=False)
 
 
 def replace_array(path: str | os.PathLike, array: Any) -> None:
@@ -230,6 +232,8 @@ def lock(folder: Path, error: type[PharosError] = FolderLocked, activity: str = 
     """
     path = folder / LOCK
     try:
+        if path.exists():
+            check_regular(path)
         file = open(path, "a+")  # noqa: SIM115
     except OSError as problem:
         raise ParameterError(f"{folder}: cannot be written to: {problem.strerror}; choose another folder") from problem

@@ -8,7 +8,6 @@ goes on from its last checkpoint to the bytes that it gives undisturbed. What is
 that fails is said to have failed, and the others go on.
 """
 
-import json
 from collections import defaultdict
 from collections.abc import Hashable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -16,6 +15,7 @@ from typing import Any
 
 from pharos.errors import FileFormatError, ParameterError, PharosError
 from pharos.policies import is_small_table
+from pharos.system.storage import read_json
 from pharos.training.batch_run import Batch
 from pharos.training.config import RunConfig
 from pharos.training.run_folder import TrainingResult, finished_result
@@ -176,7 +176,7 @@ class _Work(TrainingJobs):
             return
         for folder in sorted(self.checkpoints.glob("*")):
             try:
-                stored = json.loads((folder / "batch.json").read_text(encoding="utf-8"))
+                stored = read_json(folder / "batch.json")
                 configs = [RunConfig.from_dict(entry) for entry in stored["configs"]]
             except (OSError, ValueError, KeyError, TypeError, PharosError):
                 continue

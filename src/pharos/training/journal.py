@@ -6,7 +6,7 @@ import time
 from pathlib import Path
 
 from pharos.errors import FileFormatError, FolderLocked
-from pharos.system.storage import lock
+from pharos.system.storage import check_regular, lock
 
 WAIT_SECONDS = 0.005
 
@@ -42,9 +42,12 @@ def mend_journal(path: Path) -> None:
         FileFormatError: another line is no JSON.
     """
     try:
+        check_regular(path)
         data = path.read_bytes()
     except FileNotFoundError:
         return
+    except OSError as error:
+        raise FileFormatError(f"{path}: cannot be read: {error.strerror}; delete the folder and search again") from None
     lines = data.splitlines(keepends=True)
     for number, line in enumerate(lines, start=1):
         if _is_whole(line):
@@ -58,5 +61,5 @@ def mend_journal(path: Path) -> None:
 def _is_whole(line: bytes) -> bool:
     try:
         return line.endswith(b"\n") and isinstance(json.loads(line), dict)
-    except ValueError:
+    except (ValueError, RecursionError):
         return False

@@ -45,7 +45,7 @@ def load_agent(folder: str | os.PathLike, *, trust: bool = False) -> tuple[Task,
         try:
             check_regular(folder / "policy.npy")
             return task, np.load(folder / "policy.npy", allow_pickle=False)
-        except (OSError, ValueError, EOFError) as error:
+        except Exception as error:  # the header is read as Python
             raise FileFormatError(f"{folder / 'policy.npy'}: cannot be read: {error}") from error
     from pharos.training.learners import Deep
 

@@ -12,11 +12,12 @@ from typing import Any, Protocol
 
 from pharos.environments import class_called
 from pharos.errors import FileFormatError, ParameterError
-from pharos.system.storage import digest_of_bytes, digest_of_file, sync
+from pharos.system.storage import digest_of_bytes, digest_of_file, read_json, sync
 from pharos.training import results as _results
 from pharos.training.config import RunConfig, run_id
 
 CHECKPOINT_SECONDS = 10.0
+ANEW = "delete the folder to start anew"
 # Writing checkpoints takes at most this share of the time
 SHARE_OF_TIME = 0.05
 
@@ -143,15 +144,16 @@ class Checkpoint:
         """
         for folder in (self.folder, self.folder.with_name(f"{self.folder.name}.old")):
             try:
-                record = json.loads((folder / "curve.json").read_text())
-            except (FileNotFoundError, ValueError):
+                record = read_json(folder / "curve.json", advice=ANEW)
+            except FileNotFoundError:
                 continue
+            if not isinstance(record, dict):
+                record = {"id": self.id, "digest": ""}
             if record.get("id") == self.id:
                 digest = record.pop("digest", None)  # which an older pharos did not write
                 if digest is not None and (digest != _digest(record) or record["files"] != _digests(folder)):
                     raise FileFormatError(
-                        f"{folder}: cannot be resumed from: it was changed after it was written; "
-                        f"delete the folder to start anew"
+                        f"{folder}: cannot be resumed from: it was changed after it was written; {ANEW}"
                     )
                 learner.load(folder)
                 return record["rows"], record["seconds"]

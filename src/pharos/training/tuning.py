@@ -327,12 +327,12 @@ def _claim(folder: Path, config: Mapping[str, Any]) -> None:
     """Make the folder; ParameterError where another search lies there."""
     folder.mkdir(parents=True, exist_ok=True)
     try:
-        record = json.loads((folder / "tuning.json").read_text(encoding="utf-8"))["config"]
+        record = storage.read_json(folder / "tuning.json")["config"]
+        different = [key for key in config if record.get(key) != config[key]]
     except FileNotFoundError:
         return
-    except (ValueError, KeyError, TypeError):
+    except (ValueError, KeyError, TypeError, AttributeError):
         raise ParameterError(f"{folder}/tuning.json: is not the record of a search; choose another folder") from None
-    different = [key for key in config if record.get(key) != config[key]]
     if different:
         raise ParameterError(f"{folder}: holds a search with another {', '.join(different)}; choose another folder")
 
@@ -363,7 +363,7 @@ def _write(folder: Path, search: _Search, study: Any) -> None:
         text = head + yaml.safe_dump(
             {search.agent: {search.environment: {search.observation_name: best}}}, sort_keys=False
         )
-        storage.replace_file(folder / "hyperparameters.yaml", text)
+        storage.replace_file(folder / "hyperparameters.yaml", text, devices=False)
     storage.replace_json(folder / "tuning.json", record)
 
 
