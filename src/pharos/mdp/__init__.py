@@ -19,7 +19,14 @@ if TYPE_CHECKING:
     from pharos.mdp.rewards import Rewards
     from pharos.mdp.runs import count_of, runs_between, runs_of, shares_of
     from pharos.mdp.selection import BEST, WORST, Extreme, PolicyTable, Selection, chosen_mass, mass_of
-    from pharos.mdp.space_rewards import ranged_rewards, rewards_of_outcomes, rewards_of_space, rewards_of_staying
+    from pharos.mdp.space_rewards import (
+        PaidOutcomes,
+        paid_outcomes,
+        ranged_rewards,
+        rewards_of_outcomes,
+        rewards_of_space,
+        rewards_of_staying,
+    )
     from pharos.mdp.table import Table
     from pharos.mdp.tabular import TabularMDP
 
@@ -35,6 +42,7 @@ _FILES = {
     "Minimization": "bisimulation",
     "OutcomeTable": "outcome_table",
     "Outcomes": "dynamics",
+    "PaidOutcomes": "space_rewards",
     "Part": "part",
     "PolicyStep": "dynamics",
     "PolicyTable": "selection",
@@ -47,6 +55,7 @@ _FILES = {
     "mass_of": "selection",
     "lazy_actions": "chance",
     "minimize": "bisimulation",
+    "paid_outcomes": "space_rewards",
     "random_actions": "chance",
     "ranged_rewards": "space_rewards",
     "rewards_of_outcomes": "space_rewards",
@@ -71,6 +80,7 @@ __all__ = [
     "Minimization",
     "OutcomeTable",
     "Outcomes",
+    "PaidOutcomes",
     "Part",
     "PolicyStep",
     "PolicyTable",
@@ -83,6 +93,7 @@ __all__ = [
     "lazy_actions",
     "mass_of",
     "minimize",
+    "paid_outcomes",
     "random_actions",
     "ranged_rewards",
     "require_mdp",
