@@ -28,6 +28,7 @@ from pharos.hardness.representation.kernel_spectrum import (
 from pharos.hardness.representation.mean_field import LearningCurve, Rollouts, Schedule
 from pharos.hardness.representation.policy_regret import kernel_policy_regret
 from pharos.hardness.representation.representation import Representation
+from pharos.hardness.representation.sampled_regret import SampledRegret, Sampling, sampled_regret
 from pharos.hardness.visitation.covering import Covering, covering
 from pharos.hardness.visitation.exploration_time import ExplorationTime, exploration_time
 from pharos.hardness.visitation.mismatch import distribution_mismatch
@@ -58,6 +59,8 @@ __all__ = [
     "Result",
     "ReturnDistribution",
     "Rollouts",
+    "SampledRegret",
+    "Sampling",
     "Schedule",
     "Spectral",
     "StationaryHorizon",
@@ -86,6 +89,7 @@ __all__ = [
     "report",
     "return_distribution",
     "run_gorp",
+    "sampled_regret",
     "start_eccentricity",
     "start_eccentricity_interval",
     "stationary_effective_horizon",

@@ -19,6 +19,7 @@ from pharos.hardness.representation.kernel_spectrum import (
     kernel_sample_complexity,
 )
 from pharos.hardness.representation.policy_regret import kernel_policy_regret
+from pharos.hardness.representation.sampled_regret import sampled_regret
 from pharos.hardness.visitation.covering import covering
 from pharos.hardness.visitation.exploration_time import exploration_time
 from pharos.hardness.visitation.mismatch import distribution_mismatch
@@ -207,6 +208,17 @@ register(
     definition="mean over learning of (V* - V of the greedy policy) / (V* - V of uniform play) of expected Q-learning "
     "in the tangent kernel of the agent's network; as played; and both of tabular Q-learning",
     source="pharos; after Sirignano and Spiliopoulos (2019)",
+    complexity="representation",
+    version=1,
+    depends="representation",
+    on_request=True,
+)
+register(
+    "sampled_regret",
+    lambda problem: _of_learner(sampled_regret, problem, sampling=problem.sampling),
+    definition="mean over learning of (V* - V of the greedy policy) / (V* - V of uniform play) of Q-learning from "
+    "drawn transitions in the tangent kernel of the agent's network and in its root; and that of a table",
+    source="pharos; after Mnih et al. (2015)",
     complexity="representation",
     version=1,
     depends="representation",

@@ -12,6 +12,7 @@ from pharos.hardness.gaps.gaps import Gaps, resolved_gaps, solved
 from pharos.hardness.interval import Budget, Progress
 from pharos.hardness.representation.mean_field import Rollouts, Schedule
 from pharos.hardness.representation.representation import Representation
+from pharos.hardness.representation.sampled_regret import Sampling
 from pharos.mdp import TabularMDP
 from pharos.solvers import Solution, value_iteration
 
@@ -30,6 +31,7 @@ class Problem:
         representation: what the agent's network makes of the states, for measures that need one; or None.
         schedule: of the idealised learner.
         rollouts: of the idealised actor-critic; None: those of `Rollouts`.
+        sampling: of the learner that draws; None: that of `Sampling`.
         folder: where optimal values and bounds of searches are kept while they are computed; None: in memory.
     """
 
@@ -42,6 +44,7 @@ class Problem:
     representation: Representation | None = None
     schedule: Schedule = field(default_factory=Schedule)
     rollouts: Rollouts | None = None
+    sampling: Sampling | None = None
     folder: Path | None = None
 
     @cached_property

@@ -14,6 +14,7 @@ from pharos.hardness.interval import Budget, Certificate, Certified, certificate
 from pharos.hardness.registry import Measure, Problem, chosen
 from pharos.hardness.representation.mean_field import Rollouts, Schedule
 from pharos.hardness.representation.representation import Representation
+from pharos.hardness.representation.sampled_regret import Sampling
 from pharos.hardness.results_file import ResultsFile
 from pharos.mdp import TabularMDP, require_mdp
 from pharos.system.compiling import Stopwatch
@@ -121,6 +122,7 @@ def report(
     representation: Representation | None = None,
     schedule: Schedule | None = None,
     rollouts: Rollouts | None = None,
+    sampling: Sampling | None = None,
     folder: str | os.PathLike | None = None,
 ) -> Report:
     """Measure how hard an MDP is.
@@ -139,7 +141,8 @@ def report(
         progress: called with the name of the running measure and a line on how far it is.
         representation: what the agent's network makes of the states, `pharos.observations.representation`; with one,
             measures of it are part of the report.
-        schedule: of the idealised learner that these have; rollouts: of the actor-critic.
+        schedule: of the idealised learner that these have; rollouts: of the actor-critic; sampling: of the
+            one that draws.
         folder: for optimal values (`optimal.npy`, which `value_iteration(..., values=)` knows as well) and for the
             bounds of a diameter while they are computed, in place of memory: the same call goes on from them where one
             was killed, or a budget spent. None: memory, or where that has little room files without a name.
@@ -158,7 +161,7 @@ def report(
         )
     wanted = chosen(measures, representation is not None)
     schedule = schedule or Schedule()
-    options = (representation, schedule, rollouts, None if folder is None else Path(folder))
+    options = (representation, schedule, rollouts, sampling, None if folder is None else Path(folder))
     problem = Problem(mdp, horizon, tolerance, restart, Budget.of(budget), progress, *options)
     conventions = _conventions(problem)
     file = ResultsFile(mdp, conventions) if keep else None
@@ -239,6 +242,8 @@ def _conventions(problem: Problem) -> dict[str, Any]:
     )
     if representation is not None and problem.rollouts is not None:
         represented["rollouts"] = problem.rollouts.to_dict()
+    if representation is not None and problem.sampling is not None:
+        represented["sampling"] = asdict(problem.sampling)
     return {
         **represented,
         "gamma": float(mdp.gamma),

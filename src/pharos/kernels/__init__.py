@@ -43,6 +43,7 @@ __all__ = [
     "philox",
     "refinement",
     "replacement",
+    "sampled_learning",
     "stepping",
     "symmetric",
     "symmetry",

@@ -57,6 +57,10 @@ class KernelOperator:
         """
         raise NotImplementedError
 
+    def parts(self, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(K (C, C), F (C, 0), diagonal (0,)), or K = F F' + diag as ((0, 0), F (C, m), (C,)); all float32."""
+        raise NotImplementedError
+
     def descended(self, weights: np.ndarray, error: np.ndarray, rate: float, steps: int) -> np.ndarray:
         """What gradient descent adds to Q in `steps` steps Q += rate K (weights (target - Q)), from error = target - Q.
 
@@ -87,6 +91,9 @@ class Identity(KernelOperator):
     def largest_eigenvalue(self, weights: np.ndarray, vector: np.ndarray) -> float:
         return float(weights.max())
 
+    def parts(self, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        return np.empty((0, 0), np.float32), np.empty((count, 0), np.float32), np.ones(count, np.float32)
+
 
 class Exact(KernelOperator):
     """The kernel itself, 4 C^2 bytes."""
@@ -103,6 +110,9 @@ class Exact(KernelOperator):
         out = np.empty_like(rows)
         symmetric.product(self.matrix, rows, out)
         return out.T
+
+    def parts(self, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        return self.matrix, np.empty((count, 0), np.float32), np.empty(0, np.float32)
 
     def preconditioned(self, weights: np.ndarray) -> None:
         root = np.sqrt(weights)[:, None]
@@ -134,6 +144,9 @@ class Landmarks(KernelOperator):
     def __call__(self, z: np.ndarray) -> np.ndarray:
         z = z.astype(np.float32)
         return self.features @ (self.features.T @ z) + self.diagonal * z
+
+    def parts(self, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        return np.empty((0, 0), np.float32), self.features, np.ascontiguousarray(self.diagonal[:, 0])
 
     def preconditioned(self, weights: np.ndarray) -> None:
         """Of the features and of the diagonal, each for itself."""

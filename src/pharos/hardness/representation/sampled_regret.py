@@ -1,0 +1,325 @@
+"""The regret of Q-learning in the kernel of an agent's network that draws what the agent draws.
+
+The learner of `kernel_regret` with a walk in the place of expected visits, a replay memory and minibatches in the place
+of expected targets, and rewards as they are paid: what a DQN loses by luck, this one loses, too.
+"""
+
+import copy
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+
+from pharos.errors import ParameterError
+from pharos.hardness.representation.kernel_operator import Exact, Identity, KernelOperator, Landmarks
+from pharos.hardness.representation.mean_field import MARGIN, WORST_GREEDY, Learner, Schedule, greedy_policy
+from pharos.hardness.representation.representation import LANDMARKS, Grouped, Representation
+from pharos.hardness.visitation.standard_occupancy import drawn, standard_occupancy
+from pharos.mdp import TabularMDP, paid_outcomes, require_mdp
+from pharos.solvers import Solution
+
+MOST_EXACT = 2048
+"""Different observations up to which the kernel is a matrix, whose root takes C^3 operations; beyond, by landmarks."""
+LOOKS = 30
+"""Evaluations at equal distances, beside the one before the first step."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sampling:
+    """What the sampled learner draws.
+
+    Attributes:
+        walks: independent ones, of which the mean is taken.
+        batch_size: transitions of a gradient step.
+        buffer_size: transitions that are remembered.
+        reward_noise: standard deviation of normal noise on what is paid; the regret is of what is earned.
+        seed: of the first walk; the others have the next ones.
+    """
+
+    walks: int = 3
+    batch_size: int = 32
+    buffer_size: int = 1_000_000
+    reward_noise: float = 0.0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("walks", "batch_size", "buffer_size"):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
+                raise ParameterError(f"sampling: {name} is {value!r}; expected a whole number, at least 1")
+        if not (math.isfinite(self.reward_noise) and self.reward_noise >= 0):
+            raise ParameterError(f"sampling: reward_noise is {self.reward_noise!r}; expected at least 0")
+        if isinstance(self.seed, bool) or not isinstance(self.seed, int | np.integer) or self.seed < 0:
+            raise ParameterError(f"sampling: seed is {self.seed!r}; expected a whole number, at least 0")
+
+
+@dataclass(frozen=True, eq=False)
+class SampledCurve:
+    """Normalised regret of the greedy policies of several walks: 0 optimal, 1 uniform play.
+
+    Attributes:
+        steps: (J,) at which walks were evaluated.
+        greedy: (walks, J).
+    """
+
+    steps: np.ndarray
+    greedy: np.ndarray
+
+    @property
+    def walks(self) -> np.ndarray:
+        """(walks,) the mean over evaluations of each; a policy counts at most WORST_GREEDY."""
+        return np.minimum(self.greedy, WORST_GREEDY).mean(axis=1)
+
+    @property
+    def mean(self) -> float:
+        """Mean over walks."""
+        return float(self.walks.mean())
+
+    @property
+    def deviation(self) -> float:
+        """Standard deviation of one walk; NaN of a single one."""
+        return float(self.walks.std(ddof=1)) if len(self.greedy) > 1 else math.nan
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able: steps, and mean over walks."""
+        return {"steps": self.steps.tolist(), "greedy": np.round(self.greedy.mean(axis=0), 6).tolist()}
+
+
+@dataclass(frozen=True, eq=False)
+class SampledRegret:
+    """Regret of the sampled learner by plain descent, by rescaled gradients, and without a kernel.
+
+    Attributes:
+        descent: gradients as they are. adam: gradients rescaled as by full-matrix Adam where all observations are
+            equally frequent. tabular: with the identity in the place of the kernel, on the states themselves.
+        observations: different ones that it learns from; states: that can be met and are not terminal.
+        landmarks: of the approximation; None: the kernel is exact.
+        estimated_error: half of the landmarks change the value by that much: an estimate, not a bound; 0 where exact.
+        conventions: schedule, sampling, episode, observation and network.
+    """
+
+    descent: SampledCurve
+    adam: SampledCurve
+    tabular: SampledCurve
+    observations: int
+    states: int
+    landmarks: int | None = None
+    estimated_error: float = 0.0
+    conventions: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def value(self) -> float:
+        """Mean of both forms of descent and of all walks."""
+        return (self.descent.mean + self.adam.mean) / 2
+
+    @property
+    def deviation(self) -> float:
+        """Standard deviation of a walk's value, both forms from the same seed; NaN of a single walk."""
+        values = (self.descent.walks + self.adam.walks) / 2
+        return float(values.std(ddof=1)) if len(values) > 1 else math.nan
+
+    @property
+    def note(self) -> str:
+        """What is random, and what is approximate."""
+        count = len(self.descent.greedy)
+        text = f"sampled_regret: a mean over {count} walks, one of which deviates by {self.deviation:.2g}"
+        if count == 1:
+            text = "sampled_regret: of a single walk"
+        if self.landmarks is None:
+            return text
+        return (
+            f"{text}; by {self.landmarks} landmarks of {self.observations:,} observations; half of them change it by "
+            f"{self.estimated_error:.2g}, which is an estimate of the error and no bound"
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able; without the deviation where there is a single walk."""
+        deviation = {} if math.isnan(self.deviation) else {"deviation": self.deviation}
+        return {
+            "value": self.value,
+            **deviation,
+            "descent": self.descent.mean,
+            "adam": self.adam.mean,
+            "tabular": self.tabular.mean,
+            "observations": self.observations,
+            "states": self.states,
+            "landmarks": self.landmarks,
+            "estimated_error": self.estimated_error,
+            "conventions": dict(self.conventions),
+            "curve": self.descent.to_dict(),
+            "adam_curve": self.adam.to_dict(),
+            "tabular_curve": self.tabular.to_dict(),
+        }
+
+    def __str__(self) -> str:
+        return f"{self.value:.4g}; a table without generalisation: {self.tabular.mean:.4g}"
+
+
+@require_mdp
+def sampled_regret(
+    mdp: TabularMDP,
+    representation: Representation,
+    *,
+    schedule: Schedule | None = None,
+    sampling: Sampling | None = None,
+    solution: Solution | None = None,
+    horizon: int | None = None,
+) -> SampledRegret:
+    """Return the regret of Q-learning in the tangent kernel of a network, learnt from drawn transitions.
+
+    A walk is epsilon-greedy in Q, from Q = 0, over episodes of T steps. After `schedule.learning_starts` steps it takes
+    `schedule.gradient_steps` gradient steps in each `schedule.period` steps, each on a minibatch B of what it
+    remembers, drawn with replacement:
+
+        y_i = r_i + gamma max_a Q'(s'_i, a), without the second term where the episode ended;   Q' of the period's start
+        Q(., a) += eta / |B| sum_i [a_i = a] (y_i - Q(s_i, a_i)) K(., s_i)
+
+    eta is the largest step that is stable in expectation (`kernel_regret`, with the visits so far), or the largest that
+    the minibatch bears, 1 / max_i mean_j [a_i = a_j] |K(s_i, s_j)|, if that is smaller: no learning rate. The value of
+    a walk is the mean over 31 evaluations at equal distances of (V* - V of the greedy policy) / (V* - V of uniform
+    play). The measure is the mean over walks and over two kernels: K, and the root of K, which is what full-matrix Adam
+    makes of K where all observations are equally frequent.
+
+    Args:
+        representation: the kernel; see `pharos.observations.representation`.
+        schedule: None: that of `Schedule`; its optimizer does not count, as both forms are computed.
+        sampling: None: that of `Sampling`.
+        solution: the optimal values of `mdp`, where they are known.
+        horizon: steps of an episode that the learner sees; None: the MDP's, else the time limit.
+    Returns:
+        A SampledRegret. With the identity for a kernel it is tabular Q-learning with a replay memory. Rewards are those
+        of drawn outcomes where the MDP is of an environment, else expected ones. The same seed gives the same number.
+    Raises:
+        UndefinedMeasure: there is neither a horizon nor a time limit; or uniform play is optimal.
+        ParameterError: the representation is of other states, or its kernel does not fit into memory.
+    Cost: a walk takes O(steps |B| C / 4) for C different observations, and 31 values; C^3 once for the root of K.
+        Beyond MOST_EXACT observations landmarks, whose walks take no longer for more of them. 24 bytes a step.
+    Source: pharos; Mnih et al. (2015) for what is drawn.
+    """
+    representation.check(mdp.num_states)
+    episode = representation.episode(mdp.horizon if horizon is None else horizon, "sampled_regret")
+    schedule, sampling = schedule or Schedule(), sampling or Sampling()
+    learner = SampledLearner(mdp, schedule, sampling, episode, solution)
+    observations = Grouped(representation.classes, learner.numbers[learner.states])
+    states = Grouped(np.arange(mdp.num_states), learner.numbers[learner.states])
+    landmarks, observed = representation.landmarks, observations.representatives
+    if landmarks is None and len(observations) > MOST_EXACT:
+        landmarks = LANDMARKS
+    error = 0.0
+    if not landmarks or landmarks >= len(observations):
+        landmarks = None
+        descent, adam = learner.both(observations, Exact(representation.kernel, observed))
+    else:
+        standard = standard_occupancy(mdp, schedule.gamma, episode)
+        weights = observations.sums(standard.states[learner.numbers[learner.states]])
+        chosen = observed[drawn(weights, landmarks)]
+        (descent, adam), half = (
+            learner.both(observations, Landmarks(representation.kernel, observed, some))
+            for some in (chosen, chosen[: landmarks // 2])
+        )
+        error = abs(descent.mean + adam.mean - half[0].mean - half[1].mean) / 2
+    of_schedule = {name: value for name, value in asdict(schedule).items() if name != "optimizer"}
+    conventions = {
+        "schedule": of_schedule,
+        "sampling": asdict(sampling),
+        "episode": learner.episode,
+        "gamma": float(mdp.gamma),
+        "horizon": mdp.horizon,
+        "step_size": f"1 / ({MARGIN} largest eigenvalue of K diag(max_a d)), at most what a minibatch bears",
+        "clipped": {"greedy": WORST_GREEDY},
+        **representation.conventions,
+    }
+    return SampledRegret(
+        descent=descent,
+        adam=adam,
+        tabular=learner.curve_of_walks(states, Identity()),
+        observations=len(observations),
+        states=len(learner.states),
+        landmarks=landmarks,
+        estimated_error=error,
+        conventions=conventions,
+    )
+
+
+class SampledLearner(Learner):
+    """An MDP, and learners that walk on it."""
+
+    measure = "sampled_regret"
+
+    def __init__(
+        self, mdp: TabularMDP, schedule: Schedule, sampling: Sampling, episode: int, solution: Solution | None = None
+    ):
+        super().__init__(mdp, schedule, episode, solution)
+        self.sampling, self._all = sampling, mdp
+        which, states, rewards, probabilities = paid_outcomes(mdp)
+        offsets = np.searchsorted(which, np.arange(mdp.num_states * mdp.num_actions + 1))
+        cumulative = np.cumsum(probabilities)
+        begin = np.append(0.0, cumulative)[offsets[:-1]]
+        likely = (cumulative - begin[which]) / np.add.reduceat(probabilities, offsets[:-1])[which]
+        ends = np.where(states == mdp.num_states, -1, states)
+        self._outcomes = offsets, ends, np.asarray(rewards, np.float64), likely
+        self._cumulative = np.cumsum(mdp.start_probabilities)
+        self._cumulative[-1] = 1.0
+
+    def both(self, observations: Grouped, operator: KernelOperator) -> tuple[SampledCurve, SampledCurve]:
+        """With a kernel, and with its root."""
+        root = copy.copy(operator)  # whose arrays are replaced, not changed
+        root.preconditioned(np.full(len(observations), 1 / len(observations)))
+        return self.curve_of_walks(observations, operator), self.curve_of_walks(observations, root)
+
+    def curve_of_walks(self, observations: Grouped, operator: KernelOperator) -> SampledCurve:
+        """The regret of all walks, with a kernel over the observations."""
+        steps = np.unique(np.round(np.linspace(0, self.schedule.steps, LOOKS + 1)).astype(np.int64))
+        seeds = range(self.sampling.seed, self.sampling.seed + self.sampling.walks)
+        walks = (self.walk(observations, operator, steps, seed) for seed in seeds)
+        return SampledCurve(steps, np.array([[self._regret_of(q, observations) for q in walk] for walk in walks]))
+
+    def _regret_of(self, q: np.ndarray, observations: Grouped) -> float:
+        """Regret of the policy that is greedy in values (C, A)."""
+        return self.regret(self.value(greedy_policy(q)[observations.groups]))
+
+    def walk(
+        self, observations: Grouped, operator: KernelOperator, looks: np.ndarray, seed: int
+    ) -> Iterator[np.ndarray]:
+        """Yield the learnt values (C, A) of one walk at each of the steps `looks`, ascending."""
+        from pharos.kernels import sampled_learning as kernels
+
+        schedule, sampling, mdp = self.schedule, self.sampling, self._all
+        count, num_actions = len(observations), mdp.num_actions
+        group = np.full(mdp.num_states, -1, np.int64)
+        group[self.numbers[self.states]] = observations.groups
+        kernel = operator.parts(count)
+        learnt = np.zeros((num_actions, count)), np.zeros((num_actions, kernel[1].shape[1]))
+        target = tuple(each.copy() for each in learnt)
+        size = min(sampling.buffer_size, schedule.steps)
+        memory = *(np.zeros(size, np.int64) for _ in range(3)), np.zeros(size)
+        visits, place = np.zeros((count, num_actions)), np.array([-1, -1, 0, 0], np.int64)
+        words = np.random.SeedSequence(seed, spawn_key=(2,)).generate_state(2, np.uint64)
+        word, noise = words[:1].copy(), (float(sampling.reward_noise), words[1:].copy())
+        numbers = (
+            *(schedule.gamma, schedule.exploration_initial_eps, schedule.exploration_final_eps),
+            schedule.exploration_fraction * schedule.steps,
+            *(int(schedule.learning_starts), int(schedule.gradient_steps), int(schedule.period), sampling.batch_size),
+        )
+        chance = (*mdp.chance.triple[:2], float(mdp.chance.first_chosen))
+        vector, largest_step = np.full((count, 1), count**-0.5), 0.0
+        stops = np.unique([*looks, *range(0, schedule.steps, schedule.period)])
+        for step, following in zip(stops, [*stops[1:], schedule.steps], strict=True):
+            if step in looks:
+                values = np.empty((count, num_actions))
+                kernels.values(kernel, learnt, values)
+                yield values
+            if step % schedule.period == 0 and step + schedule.period > schedule.learning_starts:
+                for old, new in zip(target, learnt, strict=True):
+                    old[:] = new
+                weights = visits.max(axis=1, keepdims=True) / max(step, 1)
+                largest = operator.largest_eigenvalue(weights, vector) if step else 0.0
+                largest_step = 1 / (MARGIN * largest) if largest > 0 else math.inf
+            kernels.learn(
+                *(self._outcomes, np.asarray(mdp.terminal, np.bool_), group),
+                *(np.asarray(mdp.start_states, np.int64), self._cumulative, (chance[0], chance[1], 0.0, chance[2])),
+                *(self.episode, kernel, learnt, target, memory, visits, place, word, noise, numbers),
+                *(largest_step, int(following - step)),
+            )
