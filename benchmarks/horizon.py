@@ -43,7 +43,7 @@ def small():
         lambda: (hardness.effective_horizon(mdp), hardness.covering(mdp), hardness.effective_horizon(sticky)),
         10,
     )
-    for methods in (hardness.gorp_bound.__kwdefaults__["methods"], ("exact", "bennett")):
+    for methods in (hardness.gorp_bound.__kwdefaults__["methods"], ("exact", "bernstein")):
         _, found = timed(
             f"KeyCorridor, tight bound by {', '.join(methods)}",
             lambda methods=methods: hardness.gorp_bound(mdp, methods=methods),

@@ -155,7 +155,7 @@ register(
     definition="1 + log_A m, m samples with which greedy over random policy fails with probability <= 1/2",
     source="Laidlaw, Russell and Dragan (2023), appendix C",
     complexity="planning",
-    version=1,
+    version=2,
     depends="episodes",
     on_request=True,
 )

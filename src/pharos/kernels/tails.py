@@ -54,29 +54,3 @@ def bernstein(means, widths, m, lower, upper):
                         least *= 1 - _below(low - means[row, b], m, widths[row, b], variances[b])
                 lower[row, a] += least
                 upper[row, a] += most
-
-
-@njit(cache=True, nogil=True)
-def _normal(x, mean, deviation):
-    if deviation == 0 or math.isinf(x):
-        return 1.0 if x >= mean else 0.0
-    return 0.5 * math.erfc((mean - x) / deviation / math.sqrt(2.0))
-
-
-@njit(cache=True, nogil=True)
-def berry_esseen(means, deviations, errors, lows, highs, lower, upper):
-    """Means that are normal up to `errors` in their distribution function (N, n); lows, highs (N, n, 100) enclose the
-    parts."""
-    n = means.shape[1]
-    for row in range(len(means)):
-        for a in range(n):
-            lower[row, a] = upper[row, a] = 0.0
-            for part in range(PARTS):
-                least = most = 1 / PARTS
-                for b in range(n):
-                    if b != a:
-                        mean, deviation, error = means[row, b], deviations[row, b], errors[row, b]
-                        most *= min(1.0, _normal(highs[row, a, part], mean, deviation) + error)
-                        least *= max(0.0, _normal(lows[row, a, part] - 1e-8, mean, deviation) - error)
-                lower[row, a] += least
-                upper[row, a] += most

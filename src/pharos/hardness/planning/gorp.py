@@ -8,21 +8,21 @@ most 1/2.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from pharos.errors import ParameterError, UndefinedMeasure
-from pharos.hardness.planning.gorp_tails import Tails, knapsack, sequences_of
-from pharos.hardness.planning.return_distribution import central_moments
 from pharos.hardness.planning.steps import TIE, FiniteHorizonValues, check_returns, steps_of
 from pharos.mdp import TabularMDP, require_mdp
 from pharos.system.wording import many
 
-METHODS = ("binomial", "berry_esseen", "bernstein", "bennett", "exact")
-MOST_SAMPLES = 10**100
+METHODS = ("binomial", "bernstein", "exact")
+MOST_SAMPLES, MOST_BINOMIAL = 10**100, 10**6
+MOST_SEQUENCES = 100  # of which `bernstein` compares each with each
+PARTS = 100  # of equal probability, into which BRIDGE cuts distributions
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class GorpBound:
 
 @require_mdp
 def gorp_bound(
-    mdp: TabularMDP, *, horizon: int | None = None, max_k: int = 1, methods: Sequence[str] = METHODS[:4]
+    mdp: TabularMDP, *, horizon: int | None = None, max_k: int = 1, methods: Sequence[str] = METHODS[:2]
 ) -> GorpBound:
     """Return a bound on the samples that GORP needs to act optimally through an episode with probability 1/2.
 
@@ -80,16 +80,15 @@ def gorp_bound(
         max_k: k = 1, ..., max_k are tried.
         methods: of `binomial` (as BRIDGE has it: k = 1, returns 0 or R, m up to 10^6; 100 cells by quantiles, without
             the outcome that all samples are 0, which is given to every sequence only in so far as the bounds do not add
-            up to 1), `berry_esseen` (with the moments of the return distribution) and `bernstein`, both for up to 100
-            sequences, `bennett`; `exact` (returns 0 or R, any k, m up to 10^6: the probabilities themselves).
-            The first four are BRIDGE's, and the default. With `exact` instead of `binomial` the bound is proven, and
-            far smaller.
+            up to 1), `bernstein` (up to 100 sequences) and `exact` (returns 0 or R, any k, m up to 10^6: the
+            probabilities themselves). The first two are the default, and give the effective horizons that BRIDGE
+            published. With `exact` instead of `binomial` the bound is proven, and far smaller.
     Raises:
         UndefinedMeasure: the MDP has chance or several outcomes: GORP's sequences of actions then lead nowhere in
             particular.
         ParameterError: an option is wrong. PrecisionError: returns may pass 1e150.
     Cost: for each of about 15 values of m a pass over the nodes that optimal play can meet, A^2k 100 tails for each.
-        KeyCorridor (168 states, T = 100, k = 1) takes 20 s; only `exact` and `bennett` 4 s.
+        KeyCorridor (168 states, T = 100, k = 1) takes 20 s.
     Source: Laidlaw, Russell and Dragan (2023), "Bridging RL theory and practice with the effective horizon", appendix
         C.
     """
@@ -243,9 +242,6 @@ class Search:
         rewards = self.tree.rewards
         self.two_valued = most > 0 and bool(((rewards == 0) | (rewards == most)).all())
         self.scale = most if self.two_valued else 1.0
-        self.moments = None
-        if "berry_esseen" in methods:
-            self.moments = [each[:, self.tree.underlying] for each in central_moments(mdp, steps)]
 
     def samples(self, k: int) -> tuple[int | None, float]:
         if (self.tree.num_actions**k) > 10**6:
@@ -280,12 +276,112 @@ class Search:
 
     def _worst_case(self, nodes: np.ndarray, t: int, f: np.ndarray, m: int, k: int) -> np.ndarray:
         """(n,): F_t of nodes, the smallest over all methods."""
-        tails = Tails(self, nodes, t, k)
-        each = np.repeat(f, tails.mean.shape[1] // f.shape[1], axis=1)
+        mean, best, worst = self._returns(nodes, t, k)
+        each = np.repeat(f, mean.shape[1] // f.shape[1], axis=1)
+        is_counted = self.two_valued and m <= MOST_BINOMIAL
+        applies = {"binomial": is_counted and k == 1, "exact": is_counted, "bernstein": mean.shape[1] <= MOST_SEQUENCES}
         least, result = f.min(axis=1), f.max(axis=1)
-        for name in reversed(self.methods):  # the cheap ones first
+        for name in sorted(name for name in self.methods if applies[name]):  # bernstein may spare the others
             todo = result - least > 1e-9
-            tail = getattr(tails, name)(m, todo) if todo.any() else None
-            if tail is not None:
-                result[todo] = np.minimum(result[todo], knapsack(tail[0], tail[1], each[todo]))
+            if not todo.any():
+                break
+            if name == "bernstein":
+                bounds = _bernstein(m, mean[todo], best[todo], worst[todo])
+            else:
+                rows = (mean[todo] / self.scale).clip(0, 1)
+                bounds = _by_rows(_binomial if name == "binomial" else _exact, m, rows)
+            result[todo] = np.minimum(result[todo], knapsack(*bounds, each[todo]))
         return result
+
+    def _returns(self, nodes: np.ndarray, t: int, k: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Mean, largest and smallest return of each sequence, (n, A^k), continued at random, optimally, as badly as
+        possible."""
+        tree = self.tree
+        assert tree.table is not None
+        sequences = sequences_of(tree.num_actions, k)
+        paid, at = np.zeros((len(nodes), len(sequences))), np.repeat(nodes[:, None], len(sequences), axis=1)
+        last = min(k, tree.steps - t)
+        for i in range(last - 1):
+            paid += tree.rewards[at, sequences[:, i]]
+            at = tree.table[at, sequences[:, i]]
+        final, then = sequences[:, last - 1], t + last - 1
+        return (
+            paid + tree.explored[then, at, final],
+            paid + tree.best[then, at, final],
+            paid + tree.worst[then, at, final],
+        )
+
+
+def sequences_of(num_actions: int, k: int) -> np.ndarray:
+    """(A^k, k): all sequences of k actions, in order."""
+    return np.stack(np.meshgrid(*[np.arange(num_actions)] * k, indexing="ij"), axis=-1).reshape(-1, k)
+
+
+def knapsack(lower: np.ndarray, upper: np.ndarray, f: np.ndarray) -> np.ndarray:
+    """(n,): the largest sum of p f with lower <= p <= upper and sum of p = 1."""
+    lacking = np.maximum(0, 1 - upper.sum(axis=1, keepdims=True))
+    upper = np.minimum(1, upper + lacking)
+    order = np.argsort(-f, axis=1, kind="stable")
+    lower, upper, f = (np.take_along_axis(each, order, axis=1) for each in (lower, upper, f))
+    room = np.maximum(0, 1 - lower.sum(axis=1))
+    before = np.cumsum(upper - lower, axis=1) - (upper - lower)
+    more = np.clip(room[:, None] - before, 0, upper - lower)
+    return np.minimum(((lower + more) * f).sum(axis=1), f.max(axis=1))
+
+
+# Bounds (lower, upper), each (n, A^k), on the probability that a sequence has the best mean return of m samples -------
+
+
+def _bernstein(m: int, mean: np.ndarray, best: np.ndarray, worst: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    from pharos.kernels import tails
+
+    lower, upper = np.empty_like(mean), np.maximum(0, (best - mean) * (mean - worst))
+    tails.bernstein(mean, best - worst, float(m), lower, upper)
+    return lower, upper
+
+
+def _by_rows(
+    bounds: Callable[[int, np.ndarray], tuple[np.ndarray, np.ndarray]], m: int, p: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Bounds from the probabilities p (n, A^k) that one sample is R and not 0, once for rows that are the same."""
+    rows, place = np.unique(p, axis=0, return_inverse=True)
+    lower, upper = (np.array(each) for each in zip(*(bounds(m, row) for row in rows), strict=True))
+    return lower[place.ravel()], upper[place.ravel()]
+
+
+def _binomial(m: int, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Cells between quantiles, as BRIDGE cuts them: by the normal distribution from m = 30, without outcome 0."""
+    from scipy.special import bdtr, ndtri
+
+    levels = np.arange(PARTS + 1) / PARTS
+    lower, upper = np.empty_like(p), np.empty_like(p)
+    for own in np.unique(p):
+        if m < 30:
+            edges = (bdtr(np.arange(m + 1.0), m, own) < levels[:, None]).sum(axis=1).clip(0, m).astype(float)
+        else:
+            deviation = math.sqrt(m * own * (1 - own))
+            edges = np.floor((m * own + deviation * ndtri(levels) if deviation > 0 else np.full(1, m * own)).clip(0, m))
+        distribution = bdtr(np.unique(edges)[:, None], m, p)  # (cells, A^k): each ends where it is counted
+        same = p == own
+        mass = np.diff(distribution[:, same.argmax()])
+        distribution[:, same.argmax()] = 1.0
+        others = distribution.prod(axis=1)
+        lower[same], upper[same] = mass @ others[:-1], mass @ others[1:]
+    return lower, upper
+
+
+def _exact(m: int, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A sequence wins with x successes if those before it have less, and those after it no more."""
+    from scipy.special import bdtr
+
+    deviation = np.sqrt(m * p * (1 - p))
+    low = np.floor((m * p - 9 * deviation - 9).max()).clip(0, m)
+    high = np.ceil((m * p + 9 * deviation + 9).max()).clip(0, m)
+    x = np.arange(low - 1, high + 1)
+    cdf = np.where(x[:, None] < 0, 0.0, bdtr(np.maximum(x, 0)[:, None], m, p))  # (X, A^k)
+    no_more, less = cdf[1:], cdf[:-1]
+    before, behind = np.ones_like(less), np.ones_like(less)
+    np.cumprod(less[:, :-1], axis=1, out=before[:, 1:])
+    behind[:, :-1] = np.cumprod(no_more[:, :0:-1], axis=1)[:, ::-1]
+    lower = ((no_more - less) * before * behind).sum(axis=0)
+    return lower, lower + cdf[0].prod() + (1 - cdf[-1]).sum()

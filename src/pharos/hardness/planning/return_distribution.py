@@ -81,21 +81,6 @@ def return_distribution(mdp: TabularMDP, policy: Any = None, *, horizon: int | N
     return ReturnDistribution(returns[is_possible], mass[is_possible], conventions)
 
 
-def central_moments(mdp: TabularMDP, steps: int) -> tuple[np.ndarray, np.ndarray]:
-    """(T, S + 1) variance and third absolute central moment of the return to come under uniform play, at t = 0, ...
-
-    State S is the end. Not under sticky actions.
-    """
-    variance, third = (np.zeros((steps, mdp.num_states + 1)) for _ in range(2))
-    for t, (support, values, _) in zip(range(steps - 1, -1, -1), _backward(mdp, None, steps), strict=True):
-        mean = values[:, 0] @ support
-        for i in range(len(support)):
-            apart = np.abs(support[i] - mean)
-            variance[t] += values[:, 0, i] * apart**2
-            third[t] += values[:, 0, i] * apart**3
-    return variance, third
-
-
 def _backward(mdp: TabularMDP, policy: Any, steps: int) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray | None]]:
     """For t = T - 1, ..., 0: the possible returns (K,), and their probabilities.
 
