@@ -18,6 +18,7 @@ from urllib.parse import unquote, urlsplit
 
 import yaml
 
+import cli_page
 import site_pages
 
 ROOT = Path(__file__).parents[1]
@@ -54,7 +55,9 @@ def stage() -> Path:
     for section in generated.values():
         pages |= section
     pages |= site_pages.explorer()
+    pages["cli.md"] = str(pages["cli.md"]).replace(cli_page.MARK, cli_page.tables())
     pages |= {name: site_pages.live(name, str(pages[name])) for name in site_pages.LIVE}
+    pages["index.md"] = f"---\nhide: [navigation, toc]\n---\n\n{pages['index.md']}"
     for name, content in pages.items():
         data = content.read_bytes() if isinstance(content, Path) else content
         put(STAGED / name, data.encode() if isinstance(data, str) else data)
