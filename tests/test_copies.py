@@ -8,9 +8,9 @@ import pytest
 from pharos import solvers
 from pharos.agents.batched import make_batch
 from pharos.mdp import TabularMDP, lazy_actions, random_actions, sticky_actions
-from pharos.policies import Evaluation, TableAnswers, is_small_table, table_values, whole_values
+from pharos.policies import Evaluation, TableAnswers, is_small_table, table_values
 from pharos.training import ChanceSetting, RunConfig, TaskCache, evaluate_agent
-from pharos.training.joint_evaluation import values_together
+from pharos.training.evaluation import values_together
 
 SETTING = {"steps": 300, "horizon": 16, "evaluation_interval": 100, "engine": "batched"}
 
@@ -68,9 +68,9 @@ def test_tables_are_worth_together_what_they_are_worth_alone(chance, monkeypatch
     tables = list(np.random.default_rng(2).integers(mdp.num_actions, size=(5, mdp.num_states)))
     solutions = [solvers.evaluate_policy(mdp, table) for table in tables]
     wanted = [Evaluation(each.value_at_start, True, each.error_bound, mdp.num_states) for each in solutions]
-    assert whole_values(mdp, tables) == wanted
-    monkeypatch.setattr("pharos.policies.copies.MOST_TOGETHER", 2 * 9 * mdp.width)
-    assert whole_values(mdp, tables) == wanted
+    assert table_values(mdp, tables) == wanted
+    monkeypatch.setattr("pharos.policies.value.MOST_TOGETHER", 2 * 9 * mdp.width)
+    assert table_values(mdp, tables) == wanted
     assert len({each.value for each in wanted}) == 5
 
 
@@ -78,7 +78,7 @@ def test_many_copies_are_taken_in_groups(monkeypatch):
     mdp = sticky_actions(mdp_of(5), 0.25)
     policies = policies_of(mdp, 7)
     whole = table_values(mdp, policies)
-    monkeypatch.setattr("pharos.policies.copies.MOST_TOGETHER", 3 * 9 * 4)
+    monkeypatch.setattr("pharos.policies.value.MOST_TOGETHER", 3 * 9 * 4)
     assert table_values(mdp, policies) == whole
 
 

@@ -11,7 +11,7 @@ import pharos
 from pharos import evaluate_policy as evaluate_policy_of_any_kind
 from pharos.errors import ParameterError
 from pharos.mdp import TabularMDP
-from pharos.policies import TableAnswers, evaluate_seeing
+from pharos.policies import TableAnswers, policy_value
 from pharos.policies.estimation import _half_width
 from pharos.solvers import evaluate_policy
 from strategies import small_mdps
@@ -38,7 +38,7 @@ def test_an_estimate_on_a_general_mdp_holds_the_value(seed):
     matrix = 0.9 * rng.dirichlet(np.ones(4), (4, 2))
     mdp = TabularMDP.from_matrices(matrix, rng.random((4, 2)), gamma=1.0, horizon=5)
     table = np.full((4, 2), 0.5)
-    estimate = evaluate_seeing(table, mdp, None, lambda: (0.0, 5.0), max_states=0, episodes=2000, seed=seed)
+    estimate = policy_value(table, mdp, None, lambda: (0.0, 5.0), max_states=0, episodes=2000, seed=seed)
     assert not estimate.exact and estimate.episodes == 2000
     assert abs(estimate.value - evaluate_policy(mdp, table).value_at_start) <= estimate.error_bound
 

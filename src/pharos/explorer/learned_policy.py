@@ -8,8 +8,8 @@ import numpy as np
 
 from pharos.errors import ParameterError
 from pharos.mdp import TabularMDP
-from pharos.policies import PolicyAnswers, PolicyLike, Sight, TabularAgent, evaluate_observing
-from pharos.solvers import Solution, evaluate_policy
+from pharos.policies import PolicyAnswers, PolicyLike, Sight, TabularAgent, evaluate_policy
+from pharos.solvers import Solution
 from pharos.state_space import StateSpace
 
 OPTIMAL, UNIFORM, LEARNT = "optimal", "uniform", "learnt"  # the policies, by name
@@ -49,7 +49,7 @@ class Learnt:
         width = mdp.num_actions + 1 if mdp.is_sticky else 1
         options = {"observation": self.observation, "observation_options": self.observation_options}
         if sight.frames > 1 or mdp.num_states * width > ASKED_EVERYWHERE or (self.previous_action and width == 1):
-            return evaluate_observing(mdp, policy, **options, previous_action=self.previous_action)
+            return evaluate_policy(mdp, policy, **options, previous_action=self.previous_action)
         answers = PolicyAnswers(policy, mdp, sight)
         table = answers.of(np.arange(mdp.num_states * width))
         return evaluate_policy(mdp, table.reshape(mdp.num_states, width, -1) if mdp.is_sticky else table)

@@ -1,13 +1,10 @@
 """Training: an agent trained on a task, its policies evaluated exactly, and the result written down."""
 
-from pharos.training.batch import train_configs
-from pharos.training.bootstrap import bootstrap_interval
+from pharos.solvers import ReferenceValues, cumulative_expected_regret, regret
+from pharos.training.batch import Progress, steps_in_seconds, train_configs
 from pharos.training.config import ENGINES, ChanceSetting, Horizon, RunConfig, run_id
+from pharos.training.curve import RegretCurve, bootstrap_interval
 from pharos.training.evaluation import Evaluation, evaluate_agent
-from pharos.training.loading import load_agent
-from pharos.training.many_seeds import train_many
-from pharos.training.pace import steps_in_seconds
-from pharos.training.regret import ReferenceValues, RegretCurve, cumulative_expected_regret, regret
 from pharos.training.results import (
     check_agent,
     digest_of_curve,
@@ -19,13 +16,11 @@ from pharos.training.results import (
     write_record,
     write_table,
 )
-from pharos.training.run_folder import TrainingResult
-from pharos.training.search_space import SPACES
+from pharos.training.run_folder import TrainingResult, load_agent
 from pharos.training.task import Task, TaskValues
 from pharos.training.task_cache import FailedRun, TaskCache
-from pharos.training.train import train, train_config
-from pharos.training.training_jobs import Progress
-from pharos.training.tuning import TuningResult, tune
+from pharos.training.train import train, train_config, train_many
+from pharos.training.tuning import SPACES, TuningResult, tune
 
 __all__ = [
     "ENGINES",

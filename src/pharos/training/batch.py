@@ -1,26 +1,65 @@
-"""Many runs at once: configurations that fit together are trained as one program by the batched engine.
+"""Training: runs that fit together learn under one loop, with the exact value of each policy at chosen steps.
 
-    FOLDER/                      of each run, as `train` leaves it: run.json, curve.parquet, agent/
-    CHECKPOINTS/BATCH/           while a batch is trained: arrays of all its runs, their configurations and curves
+    FOLDER/                      of each run: run.json, curve.parquet, and what was learnt
+    FOLDER/checkpoint/           of a run that learns alone, while it is trained
+    CHECKPOINTS/BATCH/           of runs that learn together: all of them, their configurations and curves
 
-A run does not depend on who else is in its batch, so nothing does on how runs are grouped, and a batch that was killed
-goes on from its last checkpoint to the bytes that it gives undisturbed. What is finished is not trained again; a run
-that fails is said to have failed, and the others go on.
+A run alone is a batch of one. A run does not depend on who else is in its batch, so nothing does on how runs are
+grouped, and what was killed goes on from its last checkpoint to the bytes that it gives undisturbed. What is finished
+is not trained again; a run that fails is said to have failed, and the others go on.
 """
 
+import contextlib
+import shutil
+import time
+import warnings
 from collections import defaultdict
-from collections.abc import Hashable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from pharos.errors import FileFormatError, ParameterError, PharosError
+from pharos.agents import hyperparameters as hyperparameters_of
+from pharos.errors import FileFormatError, FolderLocked, ParameterError, PharosError
 from pharos.policies import is_small_table
-from pharos.system.storage import read_json
-from pharos.training.batch_run import Batch
+from pharos.system import compiling
+from pharos.system.storage import CLAIM, LOCK, digest_of_json, lock, read_json, remove_leftovers, replace_json
+from pharos.system.wording import many
+from pharos.training import results as _results
 from pharos.training.config import RunConfig
-from pharos.training.run_folder import TrainingResult, finished_result
-from pharos.training.task_cache import FailedRun, Member, TaskCache
-from pharos.training.training_jobs import CallbackError, Tell, TrainingJobs
+from pharos.training.evaluation import values_together
+from pharos.training.learners import Learner, make_learner
+from pharos.training.run_folder import Checkpoint, Record, TrainingResult, finished_result
+from pharos.training.task import Task
+from pharos.training.task_cache import FailedRun, Member, TaskCache, in_one_line
+
+# What a member is begun anew from, where its batch is halved.
+BEGINNING = ("place", "config", "folder", "task", "hyperparameters", "run", "key")
+EARLY = 100  # steps before DQN learns, where its pace is measured
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far the runs of `train_configs` are, told after each evaluation.
+
+    Attributes:
+        done, total: environment steps of all runs together.
+        rows: of the curves, by the place of the run among the configurations; of this evaluation alone.
+        finished, failed: numbers of runs.
+    """
+
+    done: int
+    total: int
+    rows: Mapping[int, Mapping[str, Any]]
+    finished: int
+    failed: int
+
+
+ProgressCallback = Callable[[Progress], None]
+
+
+class CallbackError(BaseException):
+    """What the caller's own function raised, which is not an error of a run."""
 
 
 def train_configs(
@@ -28,7 +67,7 @@ def train_configs(
     folders: Sequence[Path] | None = None,
     *,
     checkpoints: Path | None = None,
-    progress: Tell | None = None,
+    progress: ProgressCallback | None = None,
     members: TaskCache | None = None,
     device: str | None = None,
     lane: int | None = None,
@@ -56,9 +95,7 @@ def train_configs(
         raise ParameterError(f"device is {device!r}, and the members are for {members.device!r}; expected one device")
     _check_device(members.device)
     made = [config if isinstance(config, RunConfig) else RunConfig.from_dict(config) for config in configs]
-    work = _Work(made, folders, checkpoints, progress, members, lane)
-    work.run()
-    return [work.results[place] for place in range(len(made))]
+    return TrainingJobs(made, folders, checkpoints, progress, members, lane).run()
 
 
 def _check_device(device: str) -> None:
@@ -73,111 +110,375 @@ def _check_device(device: str) -> None:
         raise ParameterError(f"device is {device!r}, which torch does not have here: {reason}; try cpu") from None
 
 
-class _Work(TrainingJobs):
-    """The runs of one call: which train alone, which together, one batch after the other."""
+class TrainingJobs:
+    """The runs of one call, by their place among the configurations: which train alone, and which together.
 
-    def run(self) -> None:
-        """Everything."""
+    Args:
+        raises: whether errors of runs are raised, instead of being recorded as a FailedRun.
+        tensorboard: whether TensorBoard's logs are written into the folder of a run.
+    Attributes:
+        results: of the runs that have ended, by place.
+        done, total: environment steps of all runs together.
+        reasons: why batches were halved, each told once.
+    """
+
+    def __init__(
+        self,
+        configs: Sequence[RunConfig],
+        folders: Sequence[Path] | None,
+        checkpoints: Path | None,
+        progress: ProgressCallback | None,
+        members: TaskCache,
+        lane: int | None = None,
+        *,
+        raises: bool = False,
+        tensorboard: bool = False,
+    ):
+        self.configs, self.checkpoints, self.progress, self.members = configs, checkpoints, progress, members
+        self.folders = [None] * len(configs) if folders is None else [Path(folder) for folder in folders]
+        self.lane, self.raises, self.tensorboard = lane, raises, tensorboard
+        self.results: dict[int, TrainingResult | FailedRun] = {}
+        self.total, self.done = sum(config.steps for config in configs), 0
+        self.reasons: set[str] = set()
+
+    def run(self) -> list[TrainingResult | FailedRun]:
+        """Train all; their results in order."""
+        for group in self._groups():
+            TrainingGroup(self, group).train()
+        if self.checkpoints is not None and self.checkpoints.is_dir() and not any(self.checkpoints.iterdir()):
+            self.checkpoints.rmdir()
+        return [self.results[place] for place in range(len(self.configs))]
+
+    def fail(self, place: int, error: Exception) -> None:
+        """A run could not begin."""
+        if self.raises:
+            raise error
+        config, folder = self.configs[place], self.folders[place]
+        self.results[place] = FailedRun(config.to_dict(), folder, error)
+        self.done += config.steps
+        if folder is not None and not (folder / _results.RECORD).exists():
+            folder.mkdir(parents=True, exist_ok=True)
+            Record(folder, config, config.hyperparameters).write("failed", error=in_one_line(error))
+
+    def report(self, rows: Mapping[int, Mapping[str, Any]], done: int) -> None:
+        """Tell the caller; what that raises is not an error of the runs."""
+        if self.progress is None:
+            return
+        failed = sum(isinstance(each, FailedRun) for each in self.results.values())
+        try:
+            self.progress(Progress(done, self.total, rows, len(self.results) - failed, failed))
+        except BaseException as error:
+            raise CallbackError(error) from error
+
+    # Groups ----------------------------------------------------------------------------------------------------------
+
+    def _groups(self) -> Iterator[list[Member]]:
+        """Yield runs that train alone; then batches restored from checkpoints, and the rest by what fits together."""
         alone, waiting = [], {}
         for place, config in enumerate(self.configs):
-            if self._is_finished(place, config):
+            try:
+                folder = self.folders[place]
+                done = None if folder is None else finished_result(folder, config)
+            except (ParameterError, FileFormatError) as error:
+                self.fail(place, error)
+                continue
+            if done is not None:
+                self.results[place] = done
                 self.done += config.steps
-            elif config.engine == "batched" or self._is_table(place, config):
+            elif config.engine == "batched" or self._is_shared_table(place, config):
                 waiting[place] = config
             else:
                 alone.append(place)
         for place in alone:
-            self._alone(place)
-        if waiting:
-            for group in self._groups(waiting):
-                Batch(self, group).train()
-            if self.checkpoints is not None and self.checkpoints.is_dir() and not any(self.checkpoints.iterdir()):
-                self.checkpoints.rmdir()
-
-    def _is_table(self, place: int, config: RunConfig) -> bool:
-        """Whether it learns a table that is evaluated with others: of few states, and not half learnt alone."""
-        if not config.is_tabular or len(self.configs) == 1:
-            return False
-        folder = self.folder(place)
-        try:
-            return is_small_table(self.members.task(config).mdp) and not (folder and (folder / "checkpoint").exists())
-        except Exception:  # what is wrong with it, it is told alone
-            return False
-
-    def _is_finished(self, place: int, config: RunConfig) -> bool:
-        folder = self.folder(place)
-        try:
-            done = None if folder is None else finished_result(folder, config)
-        except (ParameterError, FileFormatError) as error:
-            self.results[place] = FailedRun(config.to_dict(), folder, error)
-            return True
-        if done is not None:
-            self.results[place] = done
-        return done is not None
-
-    def _alone(self, place: int) -> None:
-        """A run that has no batch: a table, or a model of Stable-Baselines3."""
-        from pharos.training.train import train_task
-
-        config, folder, before = self.configs[place], self.folder(place), self.done
-
-        def progress(done: int, _steps: int, row: Mapping[str, Any]) -> None:
-            self.report({place: row}, before + done)
-
-        try:
-            algorithm = config.algorithm(trust=self.members.trust, strict=self.members.strict)
-            self.results[place] = train_task(
-                config, self.members.task(config), folder, progress=progress, algorithm=algorithm
-            )
-        except CallbackError as stop:
-            raise stop.args[0] from None
-        except Exception as error:
-            self.fail(place, error)
-        self.done = before + config.steps
-
-    # Groups ----------------------------------------------------------------------------------------------------------
-
-    def _groups(self, waiting: dict[int, RunConfig]) -> Iterator[list[Member]]:
-        """Those of checkpoints as they were, then the rest, by what fits together."""
-        by_id = {config.id: place for place, config in waiting.items()}
-        for ids, configs in self._stored_batches():
-            if not any(id in by_id for id in ids):
-                continue
-            try:
-                group = [
-                    self.members.member(by_id.get(id), config, self._folder_of(by_id.get(id)))
-                    for id, config in zip(ids, configs, strict=True)
-                ]
-            except Exception:  # what is wrong with a run is found below, where it fails alone
-                continue
-            for id in ids:
-                if id in by_id:
-                    del waiting[by_id.pop(id)]
-            yield group
+            if (member := self._member(place, is_alone=True)) is not None:
+                yield [member]
+        yield from self._stored_groups(waiting)
         groups: dict[Hashable, list[Member]] = defaultdict(list)
-        for place, config in waiting.items():
-            try:
-                member = self.members.member(place, config, self.folder(place))
-            except Exception as error:
-                self.fail(place, error)
-                self.done += config.steps
-                continue
-            groups[member.key].append(member)
+        for place in waiting:
+            if (member := self._member(place)) is not None:
+                groups[member.key].append(member)
         for group in groups.values():
             width = self.lane or len(group)
             for first in range(0, len(group), width):
                 yield group[first : first + width]
 
-    def _folder_of(self, place: int | None) -> Path | None:
-        return None if place is None else self.folder(place)
+    def _is_shared_table(self, place: int, config: RunConfig) -> bool:
+        """Whether it learns a table that is evaluated with others: of few states, and not half learnt alone."""
+        if not config.is_tabular or len(self.configs) == 1:
+            return False
+        folder = self.folders[place]
+        try:
+            return is_small_table(self.members.task(config).mdp) and not (folder and (folder / "checkpoint").exists())
+        except Exception:  # what is wrong with it, it is told alone
+            return False
 
-    def _stored_batches(self) -> Iterator[tuple[list[str], list[RunConfig]]]:
-        if self.checkpoints is None:
-            return
-        for folder in sorted(self.checkpoints.glob("*")):
-            try:
-                stored = read_json(folder / "batch.json")
-                configs = [RunConfig.from_dict(entry) for entry in stored["configs"]]
-            except (OSError, ValueError, KeyError, TypeError, PharosError):
+    def _member(self, place: int, *, is_alone: bool = False) -> Member | None:
+        try:
+            return self.members.member(place, self.configs[place], self.folders[place], is_alone=is_alone)
+        except Exception as error:
+            self.fail(place, error)
+            return None
+
+    def _stored_groups(self, waiting: dict[int, RunConfig]) -> Iterator[list[Member]]:
+        """Batches of checkpoints, with the runs that they had, which are taken from `waiting`."""
+        by_id = {config.id: place for place, config in waiting.items()}
+        for configs in self._stored_batches():
+            places = [by_id.get(config.id) for config in configs]
+            if all(place is None for place in places):
                 continue
-            yield [config.id for config in configs], configs
+            try:
+                group = [
+                    self.members.member(place, config, None if place is None else self.folders[place])
+                    for place, config in zip(places, configs, strict=True)
+                ]
+            except Exception:  # what is wrong with a run is found later, where it fails alone
+                continue
+            for config in configs:
+                if config.id in by_id:
+                    del waiting[by_id.pop(config.id)]
+            yield group
+
+    def _stored_batches(self) -> Iterator[list[RunConfig]]:
+        for folder in [] if self.checkpoints is None else sorted(self.checkpoints.glob("*")):
+            with contextlib.suppress(OSError, ValueError, KeyError, TypeError, PharosError):
+                stored = read_json(folder / "batch.json")
+                yield [RunConfig.from_dict(entry) for entry in stored["configs"]]
+
+
+class TrainingGroup:
+    """Runs under one loop: trained, evaluated, resumed, and brought into their folders."""
+
+    def __init__(self, jobs: TrainingJobs, group: list[Member]):
+        self.jobs, self.group, self.config, self.is_alone = jobs, group, group[0].config, group[0].is_alone
+        self.learner: Any = None
+        self.has_begun = self.holds = False  # whether runs are marked as running; whether checkpoints are this batch's
+        self.held = contextlib.ExitStack()  # the folder of checkpoints, or that of a run alone
+
+    def train(self) -> None:
+        """All of it; in halves where it needs too much memory, or where one run ends the program."""
+        before = self.jobs.done
+        with self.held:
+            try:
+                self._train()
+                return
+            except CallbackError as stop:
+                (said,) = stop.args
+                if self.jobs.raises and self.is_alone and isinstance(said, Exception):
+                    self.group[0].fail(said)
+                raise said from None
+            except Exception as error:
+                self.learner, failure = None, error
+                self._remove_checkpoint()
+        if len(self.group) == 1:
+            self._fail(failure)
+            return
+        middle = len(self.group) // 2
+        reason = "out of memory" if _is_memory(failure) else in_one_line(failure)
+        if reason not in self.jobs.reasons:
+            self.jobs.reasons.add(reason)
+            warnings.warn(
+                f"{reason}: {many(len(self.group), 'run')} at once; goes on with {many(middle, 'run')} at once",
+                stacklevel=2,
+            )
+        self.jobs.done = before
+        for part in (self.group[:middle], self.group[middle:]):
+            fresh = [Member(*(getattr(each, name) for name in BEGINNING)) for each in part]
+            TrainingGroup(self.jobs, fresh).train()
+
+    def _train(self) -> None:
+        began, compiled = time.perf_counter(), compiling.seconds()
+        first = self.group[0]
+        if self.is_alone and self._is_finished():
+            return
+        logs = first.folder / "tensorboard" if self.jobs.tensorboard and first.folder is not None else None
+        self.learner = make_learner(self.group, self.jobs.members.device, logs)
+        checkpoint = self._checkpoint()
+        if checkpoint is not None:
+            entries, spent = checkpoint.restore(self.learner) or ([], 0.0)
+            if self.is_alone:
+                first.curve.rows = entries
+            else:
+                for member, entry in zip(self.group, entries, strict=False):
+                    member.curve.rows = entry["rows"]
+                    member.error = None if entry["error"] is None else PharosError(entry["error"])
+            began -= spent
+        for member in self.group:
+            if member.folder is not None:
+                member.folder.mkdir(parents=True, exist_ok=True)
+            member.record.write("running")
+        self.has_begun = True
+        self._learn(checkpoint, began)
+        self._publish(time.perf_counter() - began, compiling.seconds() - compiled)
+
+    # Files -----------------------------------------------------------------------------------------------------------
+
+    @property
+    def _folder(self) -> Path | None:
+        """Where the checkpoints of a batch are."""
+        if self.is_alone or self.jobs.checkpoints is None:
+            return None
+        return self.jobs.checkpoints / digest_of_json([member.config.id for member in self.group])[:16]
+
+    def _is_finished(self) -> bool:
+        """Hold the folder of a run alone; whether another process has finished it meanwhile."""
+        folder, place = self.group[0].folder, self.group[0].place
+        if folder is None or place is None:
+            return False
+        folder.mkdir(parents=True, exist_ok=True)
+        self.held.enter_context(lock(folder, FolderLocked, "training"))
+        for name in (_results.RECORD, _results.CURVE, "policy.npy", "regret.png"):  # of a process that was killed
+            remove_leftovers(folder / name)
+        done = finished_result(folder, self.config)
+        if done is not None:
+            self.jobs.results[place] = done
+            self.jobs.done += self.config.steps
+        return done is not None
+
+    def _checkpoint(self) -> Checkpoint | None:
+        """None where there is no folder, or where another process trains the same batch."""
+        if self.is_alone:
+            folder = self.group[0].folder
+            return None if folder is None else Checkpoint(folder / "checkpoint", self.config.id)
+        folder = self._folder
+        if folder is None:
+            return None
+        folder.mkdir(parents=True, exist_ok=True)
+        try:
+            self.held.enter_context(lock(folder, FolderLocked, "training"))
+        except FolderLocked:
+            return None
+        configs = [member.config for member in self.group]
+        entry = {"ids": [each.id for each in configs], "configs": [each.to_dict() for each in configs]}
+        replace_json(folder / "batch.json", entry)
+        self.holds = True
+        return Checkpoint(folder / "checkpoint", folder.name)
+
+    def _remove_checkpoint(self) -> None:
+        if self.holds and self._folder is not None:
+            shutil.rmtree(self._folder, ignore_errors=True)
+
+    # Learning --------------------------------------------------------------------------------------------------------
+
+    def _learn(self, checkpoint: Checkpoint | None, began: float) -> None:
+        """Learn from the last row of the curves on, with evaluations at each point."""
+        steps, interval = self.config.steps, self.config.evaluation_interval
+        count, before = sum(member.place is not None for member in self.group), self.jobs.done
+        if not any(member.curve.rows for member in self.group):
+            self._evaluate(0)
+        start = max(member.curve.rows[-1]["step"] for member in self.group if member.curve.rows)
+        points = [point for point in [*range(interval, steps, interval), steps] if point > start]
+
+        def save(step: int) -> None:
+            if checkpoint is None or step == steps:
+                return
+            curves: list[Any] = [
+                {"rows": member.curve.rows, "error": member.error and in_one_line(member.error)}
+                for member in self.group
+            ]
+            entries = curves[0]["rows"] if self.is_alone else curves
+            checkpoint.save(self.learner, entries, time.perf_counter() - began)
+
+        def at_point(step: int) -> Mapping[str, Any] | None:
+            rows = self._evaluate(step)
+            if not self.is_alone:
+                save(step)
+            places = {place: row for i, row in rows.items() if (place := self.group[i].place) is not None}
+            self.jobs.report(places, before + step * count)
+            if self.is_alone:
+                save(step)
+            return rows.get(0)
+
+        if points:
+            self.learner.learn(points, at_point)
+        self.jobs.done = before + steps * count
+
+    def _evaluate(self, step: int) -> dict[int, dict[str, Any]]:
+        """A row for each run that has not failed, by its place in the group."""
+        rows, values = {}, {} if self.is_alone else values_together(self.learner, self.group)
+        episodes, returns = self.learner.episodes, self.learner.returns
+        for i, member in enumerate(self.group):
+            if member.error is not None:
+                continue
+            policy = self.learner.policy(i)
+            try:
+                rows[i] = member.curve.add(step, int(episodes[i]), float(returns[i]), policy, values.get(i))
+            except Exception as error:
+                member.fail(error)
+        if all(member.error is not None for member in self.group):
+            raise self.group[0].error or PharosError("no run is left")
+        return rows
+
+    def _publish(self, seconds: float, compiled: float) -> None:
+        """What each run leaves; its seconds are its share of those of the batch."""
+        size = {"runs": len(self.group), "seconds": seconds, "device": self.jobs.members.device}
+        share = seconds - compiled if self.is_alone else seconds / len(self.group)
+        entries = {"compiling_seconds": compiled} if self.is_alone else {"batch": size}
+        for i, member in enumerate(self.group):
+            if member.place is None:
+                continue
+            config, folder, curve = member.config.to_dict(), member.folder, member.curve.rows
+            if member.error is not None:
+                self.jobs.results[member.place] = FailedRun(config, folder, member.error)
+                continue
+            result = member.curve.result()
+            if folder is not None:
+                self.learner.publish(i, folder)
+                _results.write_curve(folder, curve)
+                member.record.write("finished", seconds=share, **entries, result=result)
+            rows = [{name: row[name] for name in _results.COLUMNS} for row in curve]
+            self.jobs.results[member.place] = TrainingResult(
+                config, result, rows, self.learner.policy(i), folder, share
+            )
+        self._remove_checkpoint()
+        if self.is_alone and (folder := self.group[0].folder) is not None:
+            for leftover in folder.glob("checkpoint*"):  # of kills in the middle of replacing one, too
+                shutil.rmtree(leftover, ignore_errors=True)
+            for name in (LOCK, CLAIM):  # whoever waits for it finds a finished run
+                (folder / name).unlink(missing_ok=True)
+
+    def _fail(self, error: Exception) -> None:
+        """The only run has failed."""
+        (member,) = self.group
+        if member.place is None:
+            return
+        if self.is_alone and not self.has_begun:
+            self.jobs.fail(member.place, error)
+            return
+        if member.error is None:
+            member.fail(error)
+        if self.jobs.raises:
+            raise error
+        self.jobs.results[member.place] = FailedRun(member.config.to_dict(), member.folder, error)
+        self.jobs.done += member.config.steps
+
+
+def _is_memory(error: BaseException) -> bool:
+    """Whether memory was not enough, in the words of Python, torch on the processor, or torch on a GPU."""
+    words = str(error).lower()
+    return isinstance(error, MemoryError) or "out of memory" in words or "can't allocate memory" in words
+
+
+def steps_in_seconds(config: RunConfig, task: Task, warm: int, measured: int, together: int = 1) -> tuple[float, Any]:
+    """The seconds that `measured` steps take after `warm` ones, without evaluations, and the policy by then.
+
+    Args:
+        task: of the configuration.
+        together: runs of the batched engine that take these steps at once, with other seeds.
+    """
+    chosen = hyperparameters_of(config.agent, config.environment, config.observation, config.hyperparameters)
+    if "learning_starts" in chosen:
+        chosen["learning_starts"] = min(EARLY, chosen["learning_starts"])
+    short = replace(config, steps=warm + measured, hyperparameters=chosen)
+    members = TaskCache(trust=True, strict=True)
+    members.adopt(short, task)
+    learner: Learner = make_learner(
+        [members.member(i, replace(short, seed=short.seed + i), None) for i in range(together)]
+    )
+    times: list[float] = []
+
+    def at_point(_: int) -> dict[str, float]:
+        times.append(time.perf_counter())
+        return {"value": 0.0, "expected_regret": 0.0, "mean_return": 0.0}
+
+    learner.learn([warm, warm + measured], at_point)
+    return times[1] - times[0], learner.policy(0)

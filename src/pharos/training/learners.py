@@ -1,92 +1,167 @@
-"""What learns in a run: the table of Q-learning, or a model of Stable-Baselines3; each can be stored and resumed."""
+"""What learns: N >= 1 runs under one loop, each as it is alone; all of it can be stored and resumed.
+
+`Tables` of Q-learning, `Networks` of the batched engine, or one model of Stable-Baselines3 (`Deep`).
+"""
 
 import contextlib
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from pharos.agents import QLearning, check_hyperparameters, make_model
+from pharos.agents import QLearning, check_hyperparameters, joined_states, make_model, state_of
 from pharos.errors import FileFormatError
 from pharos.policies import DeepPolicy
 from pharos.training import results
-from pharos.training.config import RunConfig
 from pharos.training.task import Task
 
-AtPoint = Callable[[int, int, float], dict[str, Any]]
-"""at_point(steps, finished episodes, sum of their returns) -> row of the curve."""
+if TYPE_CHECKING:
+    from pharos.training.task_cache import Member
+
+AtPoint = Callable[[int], Mapping[str, Any] | None]
+"""at_point(steps) -> row of the curve of the first run, which TensorBoard shows."""
 
 
 class Learner(Protocol):
-    """What a run needs of an agent that learns."""
+    """N runs that learn.
 
-    agent: Any
+    Attributes:
+        episodes: (N,) int64, finished ones; returns: (N,) float64, the sums of their returns.
+    """
 
-    def learn(self, points: list[int], at_point: AtPoint) -> None:
-        """Learn until the last of `points`, and call `at_point` at each."""
+    @property
+    def episodes(self) -> np.ndarray: ...
+
+    @property
+    def returns(self) -> np.ndarray: ...
+
+    def learn(self, points: Sequence[int], at_point: AtPoint) -> None:
+        """Go on until the last of `points`, and call `at_point` at each."""
+
+    def policy(self, i: int) -> Any:
+        """What run i has learnt, as `evaluate_agent` takes it."""
+
+    def greedy_actions(self, places: Sequence[int]) -> dict[int, np.ndarray] | None:
+        """(S,) actions of each of some runs whose policies are tables of states; None where none is."""
 
     def save(self, folder: Path) -> None:
-        """Write what `load` needs."""
+        """Write what `load` needs to go on."""
 
     def load(self, folder: Path) -> None:
-        """Go on from what `save` wrote."""
+        """Go on from what `save` wrote. FileFormatError: it cannot be read."""
 
-    def publish(self, folder: Path) -> None:
-        """Write what was learnt into the folder of the run, as `load_agent` reads it."""
+    def publish(self, i: int, folder: Path) -> None:
+        """Write what run i has learnt into its folder, as `load_agent` reads it."""
 
 
-def make_learner(
-    config: RunConfig,
-    algorithm: str | type,
-    task: Task,
-    hyperparameters: dict[str, Any],
-    tensorboard: Path | None = None,
-) -> Learner:
-    """The learner of a run, with all its hyperparameters; `algorithm` as `RunConfig.algorithm` gives it."""
+def make_learner(members: "Sequence[Member]", device: str = "cpu", logs: Path | None = None) -> Learner:
+    """The learner of runs that fit together.
+
+    Args:
+        device: of networks of the batched engine.
+        logs: folder for those of TensorBoard, of Stable-Baselines3.
+    """
+    config, task = members[0].config, members[0].task
     if config.is_tabular:
-        return Tabular(task, hyperparameters, config.steps, config.seed)
-    logs = None if tensorboard is None else str(tensorboard)
-    return Deep(algorithm, task, hyperparameters, config.steps, config.seed, logs)
+        return Tables([member.run for member in members])
+    if config.engine == "batched":
+        from pharos.agents.batched import make_batch
+
+        return Networks(make_batch(config.agent, [member.run for member in members], device=device))
+    (member,) = members
+    where = None if logs is None else str(logs)
+    return Deep(member.run, task, member.hyperparameters, config.steps, config.seed, where)
 
 
-class Tabular:
-    """Q-learning."""
+class _Arrays:
+    """A learner whose `state` is a dictionary of arrays."""
 
-    def __init__(self, task: Task, hyperparameters: dict[str, Any], steps: int, seed: int):
-        self.agent = QLearning(
-            task.mdp,
-            total_steps=steps,
-            seed=seed,
-            time_limit=task.time_limit,
-            reward_noise=task.reward_noise,
-            reward_delay=task.reward_delay,
-            **hyperparameters,
-        )
-
-    def learn(self, points: list[int], at_point: AtPoint) -> None:
-        """As `Learner` says."""
-        for point in points:
-            self.agent.learn(point - self.agent.steps)
-            at_point(self.agent.steps, self.agent.episodes, self.agent.sum_of_returns)
+    file = "batch.npz"
 
     def save(self, folder: Path) -> None:
-        """Plain arrays."""
-        np.savez(folder / "q_learning.npz", **self.agent.state())  # type: ignore[arg-type]
+        np.savez(folder / self.file, **self.state())  # type: ignore[attr-defined]
 
     def load(self, folder: Path) -> None:
-        """From plain arrays."""
-        with _said_to_be_damaged(folder), np.load(folder / "q_learning.npz", allow_pickle=False) as stored:
-            self.agent.restore({name: stored[name] for name in stored.files})
+        with _said_to_be_damaged(folder), np.load(folder / self.file, allow_pickle=False) as stored:
+            self.restore({name: stored[name] for name in stored.files})  # type: ignore[attr-defined]
 
-    def publish(self, folder: Path) -> None:
+
+class Tables(_Arrays):
+    """Tables of Q-learning."""
+
+    def __init__(self, makers: Sequence[Callable[[], QLearning]]):
+        self.tables = [make() for make in makers]
+        if len(makers) == 1:
+            (table,) = self.tables
+            self.file, self.state, self.restore = "q_learning.npz", table.state, table.restore  # type: ignore[method-assign]
+
+    @property
+    def episodes(self) -> np.ndarray:
+        return np.array([table.episodes for table in self.tables], np.int64)
+
+    @property
+    def returns(self) -> np.ndarray:
+        return np.array([table.sum_of_returns for table in self.tables])
+
+    def learn(self, points: Sequence[int], at_point: AtPoint) -> None:
+        for point in points:
+            for table in self.tables:
+                table.learn(point - table.steps)
+            at_point(point)
+
+    def policy(self, i: int) -> QLearning:
+        return self.tables[i]
+
+    def greedy_actions(self, places: Sequence[int]) -> dict[int, np.ndarray]:
+        """(S,) actions; runs that look back at the previous action are left out."""
+        tables = {i: self.tables[i].policy_table() for i in places}
+        return {i: table for i, table in tables.items() if table.ndim == 1}
+
+    def state(self) -> dict[str, np.ndarray]:
+        return joined_states(table.state() for table in self.tables)
+
+    def restore(self, state: dict[str, np.ndarray]) -> None:
+        for i, table in enumerate(self.tables):
+            table.restore(state_of(state, i))
+
+    def publish(self, i: int, folder: Path) -> None:
         """The greedy policy, as policy.npy."""
-        results.write_policy(folder, self.agent.policy_table())
+        results.write_policy(folder, self.tables[i].policy_table())
+
+
+class Networks(_Arrays):
+    """A batch of the batched engine."""
+
+    def __init__(self, batch: Any):
+        self.batch = batch
+        self.learn, self.policy, self.best_actions = batch.learn, batch.policy, batch.best_actions
+        self.greedy_actions, self.state, self.restore = batch.greedy_actions, batch.state, batch.restore
+
+    @property
+    def episodes(self) -> np.ndarray:
+        return self.batch.episodes  # type: ignore[no-any-return]
+
+    @property
+    def returns(self) -> np.ndarray:
+        return self.batch.returns  # type: ignore[no-any-return]
+
+    def publish(self, i: int, folder: Path) -> None:
+        """The network, as `Deep` reads it, with the names of parameters in the policy of Stable-Baselines3."""
+        import torch
+
+        place = folder / results.AGENT
+        place.mkdir(parents=True, exist_ok=True)
+        parameters = self.batch.parameters(i).items()
+        policy = {name: torch.from_numpy(np.ascontiguousarray(values)) for name, values in parameters}
+        torch.save({"policy": policy}, place / "parameters.pt")
+        counters = {"num_timesteps": int(self.batch.steps), "episodes": int(self.episodes[i])}
+        (place / "model.json").write_text(json.dumps({"counters": counters, "returns": float(self.returns[i])}))
 
 
 class Deep:
-    """A model of Stable-Baselines3."""
+    """A model of Stable-Baselines3, the only run of its program."""
 
     def __init__(
         self,
@@ -95,24 +170,62 @@ class Deep:
         hyperparameters: dict[str, Any],
         steps: int,
         seed: int,
-        tensorboard: str | None,
+        tensorboard: str | None = None,
     ):
         check_hyperparameters(agent, hyperparameters)
-        self.task, self.steps = task, steps
-        env = vector_environment(task, int(hyperparameters.get("n_envs", 1)), seed)
-        self.env = env
-        self.model = make_model(agent, env, hyperparameters, seed=seed, tensorboard=tensorboard)
+        self.gamma, self.steps = task.gamma, steps
+        self.env = vector_environment(task, int(hyperparameters.get("n_envs", 1)), seed)
+        self.model = make_model(agent, self.env, hyperparameters, seed=seed, tensorboard=tensorboard)
         self.agent = DeepPolicy(self.model)
         self.finished = (0, 0.0)  # episodes, and the sum of their returns
 
-    def learn(self, points: list[int], at_point: AtPoint) -> None:
-        """As `Learner` says."""
-        from pharos.training.callback import AtPoints
+    @property
+    def episodes(self) -> np.ndarray:
+        return np.array([self.finished[0]])
 
-        callback = AtPoints(points, at_point, self.task.gamma, self.finished, lambda: self.env.earned)
-        callback.counted_by(self)
-        self.model.learn(self.steps - self.model.num_timesteps, callback=callback, reset_num_timesteps=False)
-        callback.at_the_end()
+    @property
+    def returns(self) -> np.ndarray:
+        return np.array([self.finished[1]])
+
+    def policy(self, i: int) -> DeepPolicy:
+        return self.agent
+
+    def greedy_actions(self, places: Sequence[int]) -> None:
+        return None
+
+    def learn(self, points: Sequence[int], at_point: AtPoint) -> None:
+        """As `Learner` says; the last point comes after the last update.
+
+        Algorithms that learn from whole rollouts, such as PPO, take the steps of their last rollout although fewer are
+        left; episodes that end after the last point are not counted.
+        """
+        model, last, waiting = self.model, points[-1], list(points)
+        running, discount = np.zeros(self.env.num_envs), np.ones(self.env.num_envs)
+
+        def call(due: Sequence[int]) -> None:
+            step = max(point for point in due if point <= model.num_timesteps)
+            waiting[:] = [point for point in waiting if point > step]
+            row = at_point(step) or {}
+            for name in ("value", "expected_regret", "mean_return"):
+                model.logger.record(f"pharos/{name}", row[name])
+            if step == last:
+                model.logger.dump(model.num_timesteps)
+
+        def after_step(local: dict[str, Any], _: Any) -> bool:
+            if model.num_timesteps > last:
+                return True
+            running[:] += discount * self.env.earned
+            discount[:] *= self.gamma
+            for i in np.flatnonzero(local["dones"]):
+                self.finished = (self.finished[0] + 1, self.finished[1] + float(running[i]))
+                running[i], discount[i] = 0.0, 1.0
+            if len(waiting) > 1 and model.num_timesteps >= waiting[0]:
+                call(waiting[:-1])
+            return True
+
+        model.learn(self.steps - model.num_timesteps, callback=after_step, reset_num_timesteps=False)
+        if waiting:
+            call(waiting)
 
     def save(self, folder: Path) -> None:
         """Tensors (torch's own format, read back with weights_only), arrays and JSON."""
@@ -150,26 +263,9 @@ class Deep:
                     _restore_buffer(buffer, arrays)
         model.set_random_seed(model.seed + model.num_timesteps)
 
-    def publish(self, folder: Path) -> None:
+    def publish(self, i: int, folder: Path) -> None:
         """The network, in the folder agent."""
-        self.save(folder / "agent")
-
-
-def publish_network(folder: Path, parameters: dict[str, np.ndarray], counters: dict[str, int], returns: float) -> None:
-    """Write a network of the batched engine into the folder of its run, as `Deep` reads it.
-
-    Args:
-        parameters: by their names in the policy of Stable-Baselines3.
-        counters: num_timesteps and episodes.
-        returns: the sum over episodes.
-    """
-    import torch
-
-    place = folder / results.AGENT
-    place.mkdir(parents=True, exist_ok=True)
-    policy = {name: torch.from_numpy(np.ascontiguousarray(values)) for name, values in parameters.items()}
-    torch.save({"policy": policy}, place / "parameters.pt")
-    (place / "model.json").write_text(json.dumps({"counters": counters, "returns": returns}))
+        self.save(folder / results.AGENT)
 
 
 @contextlib.contextmanager

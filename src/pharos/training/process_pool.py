@@ -15,11 +15,10 @@ from pharos.agents.batched import lane_width
 from pharos.errors import FileFormatError, ParameterError, PharosError
 from pharos.system.workers import check_guard, without_interrupts, without_main
 from pharos.training import results as _results
-from pharos.training.batch import train_configs
+from pharos.training.batch import Progress, ProgressCallback, train_configs
 from pharos.training.config import RunConfig
 from pharos.training.run_folder import TrainingResult, finished_result
 from pharos.training.task_cache import FailedRun, TaskCache
-from pharos.training.training_jobs import Progress, Tell
 
 
 def parts_of(configs: Sequence[RunConfig], workers: int, device: str = "cpu") -> list[list[int]]:
@@ -39,7 +38,7 @@ def train_parts(
     *,
     checkpoints: Path | None,
     device: str,
-    progress: Tell | None,
+    progress: ProgressCallback | None,
 ) -> list[TrainingResult | FailedRun]:
     """As `train_configs`, each part in a process of its own, which ends with this one."""
     context = multiprocessing.get_context("spawn")

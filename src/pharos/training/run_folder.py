@@ -1,4 +1,4 @@
-"""The folder of a run while it is trained: its record, its checkpoints, and the result where it is finished."""
+"""The folder of a run: record and checkpoints while it is trained; result and agent once it is finished."""
 
 import json
 import math
@@ -10,11 +10,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
+import numpy as np
+
 from pharos.environments import class_called
-from pharos.errors import FileFormatError, ParameterError
-from pharos.system.storage import digest_of_bytes, digest_of_file, read_json, sync
+from pharos.errors import FileFormatError, ParameterError, UntrustedCode
+from pharos.system.storage import check_regular, digest_of_bytes, digest_of_file, read_json, sync
 from pharos.training import results as _results
 from pharos.training.config import RunConfig, run_id
+from pharos.training.task import Task
 
 CHECKPOINT_SECONDS = 10.0
 ANEW = "delete the folder to start anew"
@@ -158,3 +161,44 @@ class Checkpoint:
                 learner.load(folder)
                 return record["rows"], record["seconds"]
         return None
+
+
+def load_agent(folder: str | os.PathLike, *, trust: bool = False) -> tuple[Task, Any]:
+    """The task of a finished run, and what it learnt, as `evaluate_agent` and `pharos.evaluate_policy` take it.
+
+    Args:
+        trust: whether code that the run names may be imported: an environment, observation or agent of its own. What
+            this process has imported already, such as the environment that a command names, needs no trust.
+    Returns:
+        The task, and (S,) actions of tabular agents, else the policy of the model.
+    Raises:
+        FileFormatError: the folder holds no finished run. ResultCorrupted: its files were cut short or changed.
+        UntrustedCode: the run names code, and is not trusted.
+        MissingExtra: Stable-Baselines3 is not installed.
+    """
+    folder = Path(folder)
+    record = _results.read_record(folder)
+    if record.get("status") != "finished":
+        raise FileFormatError(
+            f"{folder}: the run is {record.get('status')}; the same command that began it finishes it"
+        )
+    _results.check_agent(folder)
+    try:
+        config = RunConfig.from_dict(record["config"])
+        task = config.task(trust=trust)
+        agent = config.algorithm(trust=trust)
+    except UntrustedCode as error:
+        raise UntrustedCode(f"{folder / 'run.json'}: {error}") from error
+    except FileFormatError as error:
+        raise FileFormatError(f"{folder / 'run.json'}: {error}") from error
+    if config.is_tabular:
+        try:
+            check_regular(folder / "policy.npy")
+            return task, np.load(folder / "policy.npy", allow_pickle=False)
+        except Exception as error:  # the header is read as Python
+            raise FileFormatError(f"{folder / 'policy.npy'}: cannot be read: {error}") from error
+    from pharos.training.learners import Deep
+
+    learner = Deep(agent, task, record["hyperparameters"], config.steps, config.seed, None)
+    learner.load(folder / "agent")
+    return task, learner.agent

@@ -12,10 +12,9 @@ from pharos.environments import Environment, make
 from pharos.errors import ParameterError
 from pharos.mdp import TabularMDP
 from pharos.policies import ReachableRows, Sight, reachable_rows
-from pharos.solvers import Solution, uniform_value, value_iteration, worst_value
+from pharos.solvers import ReferenceValues, Solution, uniform_value, value_iteration, worst_value
 from pharos.state_space import StateSpace, build
 from pharos.training.config import ChanceSetting, Horizon
-from pharos.training.regret import ReferenceValues
 
 TAIL = 1e-9  # part of a discounted return that is not looked at
 

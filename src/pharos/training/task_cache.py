@@ -1,4 +1,4 @@
-"""Runs that are to be trained together: each with its task, what it sees, and its hyperparameters, checked."""
+"""Runs before they are trained: each with its task, what it sees, and its hyperparameters, checked."""
 
 import json
 from collections.abc import Callable, Hashable, Sequence
@@ -6,12 +6,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from pharos.agents import check_hyperparameters
+from pharos.agents import QLearning, check_hyperparameters
 from pharos.agents import hyperparameters as hyperparameters_of
 from pharos.errors import ParameterError, PharosError
 from pharos.training.config import RunConfig
 from pharos.training.curve import Curve
-from pharos.training.learners import Tabular
 from pharos.training.run_folder import Record
 from pharos.training.task import Task, TaskValues
 
@@ -43,10 +42,13 @@ def in_one_line(error: BaseException) -> str:
 
 @dataclass(eq=False)
 class Member:
-    """A run that waits for its batch, or is in it.
+    """A run that waits for its learner, or is learnt.
 
     Attributes:
         place: among the configurations; None for a run of a checkpoint that nobody asks for.
+        run: what its learner is made of: a BatchRun, a function that makes a table, or an algorithm.
+        key: runs with equal keys can be trained together.
+        is_alone: whether it has checkpoints in its own folder, and holds that.
     """
 
     place: int | None
@@ -56,6 +58,7 @@ class Member:
     hyperparameters: dict[str, Any]
     run: Any
     key: Hashable
+    is_alone: bool = False
     error: Exception | None = None
     curve: Curve = field(init=False)
 
@@ -115,17 +118,35 @@ class TaskCache:
         )
         return world
 
-    def member(self, place: int | None, config: RunConfig, folder: Path | None) -> Member:
+    def member(self, place: int | None, config: RunConfig, folder: Path | None, *, is_alone: bool = False) -> Member:
         """A run, ready to be grouped.
 
         Raises:
             ParameterError: a hyperparameter is wrong, or the engine lacks it.
         """
-        if config.is_tabular:
-            return self._table(place, config, folder)
+        chosen = hyperparameters_of(config.agent, config.environment, config.observation, config.hyperparameters)
+        key: Hashable = (config.agent, config.steps, config.evaluation_interval)
+        if config.engine != "batched":
+            algorithm, task = config.algorithm(trust=self.trust, strict=self.strict), self.task(config)
+
+            def table() -> QLearning:
+                limit, noise, delay = task.time_limit, task.reward_noise, task.reward_delay
+                return QLearning(
+                    task.mdp,
+                    total_steps=config.steps,
+                    seed=config.seed,
+                    time_limit=limit,
+                    reward_noise=noise,
+                    reward_delay=delay,
+                    **chosen,
+                )
+
+            if config.is_tabular and not is_alone:
+                table()  # what is wrong is said before others are concerned
+            make = table if config.is_tabular else algorithm
+            return Member(place, config, folder, task, chosen, make, key, is_alone)
         from pharos.agents.batched import BatchRun, ObservationSource, group_key, supports
 
-        chosen = hyperparameters_of(config.agent, config.environment, config.observation, config.hyperparameters)
         check_hyperparameters(config.agent, chosen)
         lacking = supports(config.agent, chosen)
         if lacking is not None:
@@ -146,21 +167,7 @@ class TaskCache:
             reward_noise=chance.reward_noise,
             reward_delay=chance.reward_delay,
         )
-        key = (config.agent, config.steps, config.evaluation_interval, group_key(config.agent, run, self.device))
-        return Member(place, config, folder, task, chosen, run, key)
-
-    def _table(self, place: int | None, config: RunConfig, folder: Path | None) -> Member:
-        """A run of Q-learning, which a batch makes; that it can be made is seen before."""
-        chosen = hyperparameters_of(config.agent, config.environment, config.observation, config.hyperparameters)
-        task = self.task(config)
-
-        def make() -> Any:
-            return Tabular(task, chosen, config.steps, config.seed).agent
-
-        make()
-        return Member(
-            place, config, folder, task, chosen, make, (config.agent, config.steps, config.evaluation_interval)
-        )
+        return Member(place, config, folder, task, chosen, run, (key, group_key(config.agent, run, self.device)))
 
     def _once(self, what: str, config: RunConfig, names: Sequence[str], make: Callable[[], Any]) -> Any:
         entry = config.to_dict()

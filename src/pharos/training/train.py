@@ -10,27 +10,23 @@ same curve file.
 """
 
 import os
-import shutil
-import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from pharos.agents import agent_kind
 from pharos.agents import hyperparameters as hyperparameters_of
 from pharos.environments import Environment, make
-from pharos.errors import FolderLocked, ParameterError
+from pharos.errors import AllRunsFailed, ParameterError
 from pharos.observations import own_observation
-from pharos.system import compiling
-from pharos.system.storage import CLAIM, LOCK, lock, remove_leftovers
-from pharos.training import results as _results
-from pharos.training.config import RunConfig
-from pharos.training.curve import Curve
-from pharos.training.learners import Learner, make_learner
-from pharos.training.run_folder import Checkpoint, Record, TrainingResult, finished_result
+from pharos.training.batch import Progress, ProgressCallback, TrainingJobs, train_configs
+from pharos.training.config import ChanceSetting, RunConfig
+from pharos.training.process_pool import parts_of, train_parts
+from pharos.training.run_folder import TrainingResult
 from pharos.training.task import Task, TaskValues
+from pharos.training.task_cache import FailedRun, TaskCache
 
-Progress = Callable[[int, int, Mapping[str, Any]], None]
+RunProgress = Callable[[int, int, Mapping[str, Any]], None]
 
 
 def train(
@@ -53,7 +49,7 @@ def train(
     engine: str = "sb3",
     out: str | os.PathLike | None = None,
     tensorboard: bool = False,
-    progress: Progress | None = None,
+    progress: RunProgress | None = None,
     **parameters: Any,
 ) -> TrainingResult:
     """Train an agent, and measure the exact regret of its policy as it learns.
@@ -81,83 +77,81 @@ def train(
             suggested.
         MissingExtra: Stable-Baselines3 is not installed.
     """
-    task = task_for(
-        agent,
-        environment,
-        parameters,
-        observation=observation,
-        observation_options=observation_options,
-        sticky=sticky,
-        random=random,
-        lazy=lazy,
-        reward_noise=reward_noise,
-        reward_delay=reward_delay,
-        gamma=gamma,
-        horizon=horizon,
-    )
-    return train_on(
-        task,
-        agent,
-        steps=steps,
-        seed=seed,
-        evaluation_interval=evaluation_interval,
-        hyperparameters=hyperparameters,
-        engine=engine,
-        out=out,
-        tensorboard=tensorboard,
-        progress=progress,
-    )
+    task, (config,) = _runs([seed], **locals())
+    members = TaskCache()
+    members.adopt(config, task)
+    return _train(config, members, None if out is None else Path(out), progress, tensorboard)
 
 
-def task_for(
-    agent: str, environment: Environment | str, parameters: Mapping[str, Any], *, observation: str, **setting: Any
-) -> Task:
-    """The task of an agent that asks for an observation, which tables do not get; `setting` as `train` takes it."""
-    sight = agent_kind(agent).observation(observation)
-    options = dict(setting.pop("observation_options") or {})
-    made = make(environment, **parameters) if isinstance(environment, str) else environment
-    return Task(made, observation=own_observation(sight) or sight, observation_options=options, **setting)
-
-
-def train_on(
-    task: Task,
+def train_many(
     agent: str,
+    environment: Environment | str,
     *,
+    seeds: Iterable[int],
     steps: int,
-    seed: int = 0,
+    observation: str = "vector",
+    observation_options: Mapping[str, Any] | None = None,
+    sticky: float = 0.0,
+    random: float = 0.0,
+    lazy: float = 0.0,
+    reward_noise: float = 0.0,
+    reward_delay: int = 0,
+    gamma: float = 1.0,
+    horizon: int | str | None = "default",
     evaluation_interval: int | None = None,
     hyperparameters: Mapping[str, Any] | str | os.PathLike | None = None,
-    engine: str = "sb3",
+    engine: str = "batched",
+    device: str = "cpu",
+    workers: int = 1,
     out: str | os.PathLike | None = None,
-    tensorboard: bool = False,
-    progress: Progress | None = None,
-) -> TrainingResult:
-    """As `train`, on a task, which is built and solved once for all runs on it."""
-    config = RunConfig.of_task(
-        task,
-        agent,
-        steps=steps,
-        seed=seed,
-        evaluation_interval=evaluation_interval,
-        hyperparameters=given_hyperparameters(agent, task, hyperparameters),
-        engine=engine,
-    )
-    return train_task(config, task, None if out is None else Path(out), tensorboard, progress)
+    progress: ProgressCallback | None = None,
+    **parameters: Any,
+) -> list[TrainingResult | FailedRun]:
+    """Train an agent once for each seed, and measure the exact regret of its policies as they learn.
 
-
-def given_hyperparameters(
-    agent: str, task: Task, source: Mapping[str, Any] | str | os.PathLike | None
-) -> Mapping[str, Any] | None:
-    """Those of a mapping, or of a YAML file for this agent and task."""
-    if source is None or isinstance(source, Mapping):
-        return source
-    return hyperparameters_of(agent, task.env.name, str(task.observation), table=Path(source))
+    Args:
+        seeds: of the runs, each another.
+        engine: "batched", all runs as one program (dqn, ppo, and q_learning one after the other); or "sb3", one after
+            the other.
+        device: of the batched engine: "cpu" or "cuda".
+        workers: processes that share whole lanes of the batched engine, where there is a folder for results. Results do
+            not depend on it.
+        out: a folder, in which each run has its own, seed-0 and so on; None: nothing is written. Finished runs there
+            are returned, and what was killed goes on from its last checkpoint.
+        progress: called after each evaluation.
+        others: as for `train`.
+    Returns:
+        The result of each run in the order of the seeds; a run that failed says why, and does not stop the others.
+    Raises:
+        ParameterError: no seed, or one twice; or as `train`. AllRunsFailed: none has a result.
+    """
+    options = locals()
+    numbers = [int(seed) for seed in seeds]
+    if not numbers or len(set(numbers)) != len(numbers):
+        raise ParameterError(f"seeds are {numbers}; expected at least one, each once")
+    task, configs = _runs(numbers, **options)
+    folder = None if out is None else Path(out)
+    folders = None if folder is None else [folder / f"seed-{seed}" for seed in numbers]
+    checkpoints = None if folder is None else folder / "checkpoints"
+    parts = parts_of(configs, workers, device)
+    if folders is not None and len(parts) > 1:
+        results = train_parts(configs, folders, parts, checkpoints=checkpoints, device=device, progress=progress)
+    else:
+        members = TaskCache(device=device)
+        members.adopt(configs[0], task)
+        results = train_configs(configs, folders, checkpoints=checkpoints, progress=progress, members=members)
+    failed = {
+        f"seed {seed}": end.error for seed, end in zip(numbers, results, strict=True) if isinstance(end, FailedRun)
+    }
+    if len(failed) == len(numbers):
+        raise AllRunsFailed("train_many" if folder is None else folder, failed, results)
+    return results
 
 
 def train_config(
     config: RunConfig | Mapping[str, Any],
     folder: str | os.PathLike,
-    progress: Progress | None = None,
+    progress: RunProgress | None = None,
     *,
     values: TaskValues | None = None,
     trust: bool = False,
@@ -175,129 +169,68 @@ def train_config(
     """
     if not isinstance(config, RunConfig):
         config = RunConfig.from_dict(config)
-    task, algorithm = config.task(values, trust=trust, strict=strict), config.algorithm(trust=trust, strict=strict)
-    return train_task(config, task, Path(folder), False, progress, algorithm)
+    members = TaskCache(lambda _: values, trust=trust, strict=strict)
+    return _train(config, members, Path(folder), progress)
 
 
-# One run --------------------------------------------------------------------------------------------------------------
-
-
-def train_task(
+def _train(
     config: RunConfig,
-    task: Task,
+    members: TaskCache,
     folder: Path | None,
+    progress: RunProgress | None,
     tensorboard: bool = False,
-    progress: Progress | None = None,
-    algorithm: str | type | None = None,
 ) -> TrainingResult:
-    """As `train_config`, on a task that is made already; with `algorithm` as `RunConfig.algorithm` gives it."""
+    """A single run, whose errors are raised."""
+    if tensorboard and config.engine == "batched":
+        raise ParameterError("TensorBoard's logs are those of Stable-Baselines3; expected the engine sb3, or none")
     if tensorboard and (folder is None or config.is_tabular):
         raise ParameterError(
             f"TensorBoard's logs were asked for, with {config.agent} and {'a' if folder else 'no'} folder for results; "
             f"expected an algorithm of Stable-Baselines3 and a folder (out)"
         )
-    if config.engine == "batched":
-        return _as_a_batch(config, task, folder, tensorboard, progress)
-    if folder is None:
-        return _train(config, task, None, tensorboard, progress, algorithm)
-    if (done := finished_result(folder, config)) is not None:
-        return done
-    folder.mkdir(parents=True, exist_ok=True)
-    with lock(folder, FolderLocked, "training"):
-        for name in (_results.RECORD, _results.CURVE, "policy.npy", "regret.png"):  # of a process that was killed
-            remove_leftovers(folder / name)
-        result = _train(config, task, folder, tensorboard, progress, algorithm)
-        for name in (LOCK, CLAIM):  # whoever waits for it finds a finished run
-            (folder / name).unlink(missing_ok=True)
-    return result
 
-
-def _train(
-    config: RunConfig,
-    task: Task,
-    folder: Path | None,
-    tensorboard: bool,
-    progress: Progress | None,
-    algorithm: str | type | None,
-) -> TrainingResult:
-    """A run that nobody else is at."""
-    began, compiled = time.perf_counter(), compiling.seconds()
-    if folder is not None and (done := finished_result(folder, config)) is not None:
-        return done
-    chosen = hyperparameters_of(config.agent, config.environment, config.observation, config.hyperparameters)
-    logs = folder / "tensorboard" if folder is not None and tensorboard else None
-    learner = make_learner(config, algorithm or config.algorithm(), task, chosen, logs)
-    curve, checkpoint = Curve(task), None
-    if folder is not None:
-        checkpoint = Checkpoint(folder / "checkpoint", config.id)
-        curve.rows, spent = checkpoint.restore(learner) or ([], 0.0)
-        began -= spent
-    record = Record(folder, config, chosen)
-    record.write("running")
-    _learn(learner, curve, config, progress, checkpoint, record, began)
-    compiled = compiling.seconds() - compiled
-    seconds = time.perf_counter() - began - compiled
-    result = curve.result()
-    if folder is not None:
-        learner.publish(folder)
-        _results.write_curve(folder, curve.rows)
-        record.write("finished", seconds=seconds, compiling_seconds=compiled, result=result)
-        for leftover in folder.glob("checkpoint*"):  # of kills in the middle of replacing one, too
-            shutil.rmtree(leftover, ignore_errors=True)
-    rows = [{name: row[name] for name in _results.COLUMNS} for row in curve.rows]
-    return TrainingResult(config.to_dict(), result, rows, learner.agent, folder, seconds)
-
-
-def _as_a_batch(
-    config: RunConfig, task: Task, folder: Path | None, tensorboard: bool, progress: Progress | None
-) -> TrainingResult:
-    """A single run of the batched engine: a batch of one."""
-    from pharos.training.batch import train_configs
-    from pharos.training.task_cache import FailedRun, TaskCache
-
-    if tensorboard:
-        raise ParameterError("TensorBoard's logs are those of Stable-Baselines3; expected the engine sb3, or none")
-    members = TaskCache()
-    members.adopt(config, task)
-
-    def tell(now: Any) -> None:
+    def tell(now: Progress) -> None:
         if progress is not None and 0 in now.rows:
             progress(now.rows[0]["step"], config.steps, now.rows[0])
 
     folders, checkpoints = (None, None) if folder is None else ([folder], folder / "checkpoints")
-    (end,) = train_configs([config], folders, checkpoints=checkpoints, progress=tell, members=members)
-    if isinstance(end, FailedRun):
-        raise end.exception
+    jobs = TrainingJobs([config], folders, checkpoints, tell, members, raises=True, tensorboard=tensorboard)
+    (end,) = jobs.run()
+    assert isinstance(end, TrainingResult)
     return end
 
 
-def _learn(
-    learner: Learner,
-    curve: Curve,
-    config: RunConfig,
-    progress: Progress | None,
-    checkpoint: Checkpoint | None,
-    record: Record,
-    began: float,
-) -> None:
-    """Learn from the last row of the curve on, with an evaluation at each point; `began`: when the run did."""
-    if not curve.rows:
-        curve.add(0, 0, 0.0, learner.agent)
-    start, steps, interval = curve.rows[-1]["step"], config.steps, config.evaluation_interval
-    points = [point for point in [*range(interval, steps, interval), steps] if point > start]
+# What is trained ------------------------------------------------------------------------------------------------------
 
-    def at_point(step: int, episodes: int, returns: float) -> dict[str, Any]:
-        row = curve.add(step, episodes, returns, learner.agent)
-        if progress is not None:
-            progress(step, steps, row)
-        if checkpoint is not None and step < steps:
-            checkpoint.save(learner, curve.rows, time.perf_counter() - began)
-        return row
 
-    if not points:
-        return
-    try:
-        learner.learn(points, at_point)
-    except Exception as error:
-        record.write("failed", error=f"{type(error).__name__}: {' '.join(str(error).split())}")
-        raise
+def _runs(
+    numbers: Sequence[int],
+    *,
+    agent: str,
+    environment: Environment | str,
+    parameters: Mapping[str, Any],
+    steps: int,
+    evaluation_interval: int | None,
+    hyperparameters: Mapping[str, Any] | str | os.PathLike | None,
+    engine: str,
+    **options: Any,
+) -> tuple[Task, list[RunConfig]]:
+    """The task, and the configuration of a run with each of the seeds; `options` as `train` takes them."""
+    names = ("observation", "observation_options", "gamma", "horizon", *ChanceSetting().options)
+    task = task_for(agent, environment, parameters, **{name: options[name] for name in names})
+    if hyperparameters is not None and not isinstance(hyperparameters, Mapping):
+        hyperparameters = hyperparameters_of(agent, task.env.name, str(task.observation), table=Path(hyperparameters))
+    setting: dict[str, Any] = {"steps": steps, "evaluation_interval": evaluation_interval, "engine": engine}
+    return task, [
+        RunConfig.of_task(task, agent, seed=number, hyperparameters=hyperparameters, **setting) for number in numbers
+    ]
+
+
+def task_for(
+    agent: str, environment: Environment | str, parameters: Mapping[str, Any], *, observation: str, **setting: Any
+) -> Task:
+    """The task of an agent that asks for an observation, which tables do not get; `setting` as `train` takes it."""
+    sight = agent_kind(agent).observation(observation)
+    options = dict(setting.pop("observation_options") or {})
+    made = make(environment, **parameters) if isinstance(environment, str) else environment
+    return Task(made, observation=own_observation(sight) or sight, observation_options=options, **setting)

@@ -13,6 +13,7 @@ table says now, so that the best is never worse than that on the instances and s
 Source: Bergstra et al. (2011), Algorithms for hyper-parameter optimization; Akiba et al. (2019), Optuna.
 """
 
+import inspect
 import json
 import math
 import os
@@ -24,7 +25,7 @@ from typing import Any
 
 import numpy as np
 
-from pharos.agents import agent_kind
+from pharos.agents import Q_LEARNING_DEFAULTS, agent_kind, algorithm
 from pharos.agents import hyperparameters as hyperparameters_of
 from pharos.environments import Environment, make
 from pharos.errors import FileFormatError, MissingExtra, ParameterError
@@ -32,16 +33,51 @@ from pharos.observations import own_observation
 from pharos.system import storage
 from pharos.system.wording import many
 from pharos.training import results as _results
-from pharos.training.batch import train_configs
+from pharos.training.batch import Progress, train_configs
 from pharos.training.config import ChanceSetting, RunConfig
 from pharos.training.journal import JournalLock, mend_journal
-from pharos.training.search_space import allows, checked_space, default_value, suggested_value
 from pharos.training.task import Task
 from pharos.training.task_cache import FailedRun, TaskCache
-from pharos.training.train import train_on
-from pharos.training.training_jobs import Progress
 
 EVALUATIONS = 20  # of a run
+SPACES: dict[str, dict[str, tuple[Any, ...]]] = {
+    "q_learning": {
+        "learning_rate": ("log", 0.01, 1.0),
+        "visits_exponent": ("one of", 0.0, 0.6, 0.8),
+        "gamma": ("one of", 0.95, 0.99, 0.999),
+        "initial_q": ("one of", 0.0, 0.5, 1.0, 2.0),
+        "exploration_final_eps": ("linear", 0.0, 0.1),
+        "exploration_fraction": ("linear", 0.01, 0.5),
+    },
+    "dqn": {
+        "learning_rate": ("log", 5e-5, 2e-3),
+        "batch_size": ("one of", 32, 64, 128),
+        "gamma": ("one of", 0.95, 0.98, 0.99, 0.995),
+        "n_steps": ("one of", 1, 3, 5),
+        "train_freq": ("one of", 1, 4, 8),
+        "learning_starts": ("one of", 200, 1000, 5000),
+        "target_update_interval": ("one of", 100, 500, 1000, 2500),
+        "exploration_fraction": ("linear", 0.05, 0.5),
+        "exploration_final_eps": ("linear", 0.01, 0.1),
+    },
+    "ppo": {
+        "learning_rate": ("log", 5e-5, 2e-3),
+        "n_steps": ("one of", 16, 32, 64, 128, 256),
+        "n_epochs": ("one of", 4, 8),
+        "gamma": ("one of", 0.95, 0.98, 0.99, 0.995),
+        "gae_lambda": ("linear", 0.8, 1.0),
+        "ent_coef": ("log", 1e-4, 0.1),
+        "clip_range": ("one of", 0.1, 0.2, 0.3),
+    },
+    "a2c": {
+        "learning_rate": ("log", 5e-5, 5e-3),
+        "n_steps": ("one of", 5, 16, 32),
+        "gamma": ("one of", 0.95, 0.98, 0.99, 0.995),
+        "gae_lambda": ("linear", 0.8, 1.0),
+        "ent_coef": ("log", 1e-4, 0.1),
+    },
+}
+"""What is searched for each agent: between two bounds on a logarithmic or a linear scale, or one of some values."""
 
 
 @dataclass(frozen=True)
@@ -121,7 +157,7 @@ def tune(
         environment=_class_of(instances),
         observation=observation,
         kinds=_checked_chances(chances, sticky, random),
-        space=checked_space(agent, space),
+        space=_checked_space(agent, space),
         seeds=seeds,
         steps=steps,
         search_seed=search_seed,
@@ -222,19 +258,24 @@ class _Search:
 
     def score(self, trial: Any, pruned: type[Exception]) -> float:
         """The mean normalised regret of evaluations after the first, over all runs; `pruned` is raised on the way."""
-        chosen = {key: suggested_value(trial, key, choices) for key, choices in self.space.items()}
-        if self.engine == "batched":
-            return self._score_of_a_batch(trial, pruned, chosen)
+        chosen = {key: _suggested_value(trial, key, choices) for key, choices in self.space.items()}
+        configs: list[RunConfig] = []
         regrets: list[float] = []
+        for task, options in self._runs(chosen):
+            config = RunConfig.of_task(task, self.agent, **options, engine=self.engine)
+            self._members.adopt(config, task)
+            configs.append(config)
 
-        def progress(_done: int, _steps: int, row: Mapping[str, Any]) -> None:
-            regrets.append(row["normalized_regret"])
+        def progress(now: Progress) -> None:
+            regrets.extend(row["normalized_regret"] for row in now.rows.values())
             trial.report(sum(regrets) / len(regrets), len(regrets))
             if trial.should_prune():
                 raise pruned
 
-        for task, options in self._runs(chosen):
-            train_on(task, self.agent, **options, progress=progress)
+        for group in [configs] if self.engine == "batched" else [[config] for config in configs]:
+            for end in train_configs(group, progress=progress, members=self._members):
+                if isinstance(end, FailedRun):
+                    raise end.exception
         return sum(regrets) / len(regrets)
 
     def _runs(self, chosen: Mapping[str, Any]) -> Iterator[tuple[Task, dict[str, Any]]]:
@@ -249,25 +290,48 @@ class _Search:
     def _members(self) -> TaskCache:
         return TaskCache()
 
-    def _score_of_a_batch(self, trial: Any, pruned: type[Exception], chosen: Mapping[str, Any]) -> float:
-        """As `score`, of all runs at once: the mean so far is that of all of them at the same step."""
-        configs = []
-        for task, options in self._runs(chosen):
-            config = RunConfig.of_task(task, self.agent, **options, engine=self.engine)
-            self._members.adopt(config, task)
-            configs.append(config)
-        regrets: list[float] = []
 
-        def progress(now: Progress) -> None:
-            regrets.extend(row["normalized_regret"] for row in now.rows.values())
-            trial.report(sum(regrets) / len(regrets), len(regrets))
-            if trial.should_prune():
-                raise pruned
+def _checked_space(agent: str, space: Mapping[str, Sequence[Any]] | None) -> dict[str, tuple[Any, ...]]:
+    """`space`, or that of the agent in SPACES; ParameterError where there is none, or an entry is wrong."""
+    searched = space if space is not None else SPACES.get(agent)
+    if not searched:
+        raise ParameterError(
+            f"agent {agent!r} has no space to search; expected one of {', '.join(SPACES)}, or give `space`, such as "
+            f"{{'learning_rate': ('log', 0.0001, 0.01)}}"
+        )
+    for name, choices in searched.items():
+        kind, *values = choices
+        ranged = kind in ("log", "linear") and len(values) == 2 and 0 <= values[0] < values[1]
+        if not (ranged and (kind == "linear" or values[0] > 0)) and not (kind == "one of" and values):
+            raise ParameterError(
+                f"space: {name} is {tuple(choices)!r}; expected ('log', low, high), ('linear', low, high) "
+                f"or ('one of', value, ...)"
+            )
+    return {name: tuple(choices) for name, choices in searched.items()}
 
-        for end in train_configs(configs, progress=progress, members=self._members):
-            if isinstance(end, FailedRun):
-                raise end.exception
-        return sum(regrets) / len(regrets)
+
+def _suggested_value(trial: Any, name: str, choices: tuple[Any, ...]) -> Any:
+    """The value that Optuna's trial takes."""
+    kind, *values = choices
+    if kind == "one of":
+        return trial.suggest_categorical(name, values)
+    return trial.suggest_float(name, *values, log=kind == "log")
+
+
+def _default_value(agent: str, name: str) -> Any:
+    """What the agent itself takes for a hyperparameter that the table leaves out; None: it says nothing."""
+    if agent_kind(agent).is_tabular:
+        return Q_LEARNING_DEFAULTS.get(name)
+    parameter = inspect.signature(algorithm(agent)).parameters.get(name)
+    return None if parameter is None or parameter.default is parameter.empty else parameter.default
+
+
+def _allows(choices: tuple[Any, ...], value: Any) -> bool:
+    """Whether a value lies in the part of the space that `choices` describe."""
+    kind, *values = choices
+    if kind == "one of":
+        return value in values
+    return isinstance(value, int | float) and values[0] <= value <= values[1]
 
 
 def _opened(optuna: Any, search: _Search, folder: Path | None, trials: int) -> Any:
@@ -290,8 +354,8 @@ def _opened(optuna: Any, search: _Search, folder: Path | None, trials: int) -> A
             f"and search again"
         ) from error
     if not _trials(study) and all(trial.state.name != "WAITING" for trial in study.trials):
-        before = {key: search.table.get(key, default_value(search.agent, key)) for key in search.space}
-        study.enqueue_trial({key: value for key, value in before.items() if allows(search.space[key], value)})
+        before = {key: search.table.get(key, _default_value(search.agent, key)) for key in search.space}
+        study.enqueue_trial({key: value for key, value in before.items() if _allows(search.space[key], value)})
     return study
 
 

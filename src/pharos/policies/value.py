@@ -1,28 +1,34 @@
-"""The exact value of a policy: it is asked in the states that it reaches, and evaluated there.
+"""The value of a policy: it is asked in the states that it reaches, and evaluated there.
 
-A deterministic policy in a deterministic game of a million states reaches some hundred of them; under chance it may
-reach many, and beyond a limit the value is estimated from simulated episodes instead, and the answer says so.
+`evaluate_policy` gives the values of all states, `policy_value` that of the start; `table_values` and `walk_values`
+give the latter of many policies at once, to the same bits. A deterministic policy in a deterministic game of a million
+states reaches some hundred of them; under chance it may reach many, and beyond a limit the value is estimated from
+simulated episodes instead, and the answer says so.
 """
 
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from pharos import solvers
 from pharos.errors import DivergenceError, ParameterError
-from pharos.mdp import PolicyTable, TabularMDP, require_mdp
+from pharos.mdp import PolicyTable, Rewards, Table, TabularMDP, require_mdp
 from pharos.policies.estimation import estimate
 from pharos.policies.histories import answers_of
 from pharos.policies.policy import Model, Policy, PolicyLike, TabularAgent
 from pharos.policies.query import PolicyAnswers, QueriedPolicy, ReachableRows, Sight, TableAnswers
 from pharos.solvers import Solution
 from pharos.state_space import load
+from pharos.system.packed_indices import as_array
 
 # Part of a discounted value that is left out: of states that the policy reaches after so many steps.
 TAIL = 1e-9
+MOST_ROWS = 1 << 16  # pairs of a state and what came before, so that all of them may be reached by many policies
+MOST_TOGETHER = 1 << 18  # of the policies that are evaluated at once
+_UNIT = 2.0**-53
 
 
 @dataclass(frozen=True)
@@ -45,7 +51,7 @@ class Evaluation:
     episodes: int = 0
 
 
-def evaluate_seeing(
+def policy_value(
     policy: PolicyLike,
     mdp: TabularMDP,
     sight: Callable[[], Sight],
@@ -130,7 +136,7 @@ def evaluate_policy(
         if processes != 1:
             raise ParameterError("a policy that sees observations is evaluated by one process; expected processes=1")
         timed = mdp if horizon is None else mdp.with_horizon(horizon)
-        return evaluate_observing(timed, policy, tolerance, observation=observation or "vector", **seeing)
+        return _solution_of_reached(timed, policy, tolerance, observation=observation or "vector", **seeing)
     if seeing:
         raise ParameterError(f"{', '.join(seeing)} given for a policy that sees no observations; name the observation")
     return solvers.evaluate_policy(mdp, policy, tolerance, horizon=horizon, processes=processes)
@@ -154,7 +160,7 @@ class ReachedSolution(Solution):
         return self.start
 
 
-def evaluate_observing(
+def _solution_of_reached(
     mdp: TabularMDP,
     policy: PolicyLike,
     tolerance: float = 1e-6,
@@ -164,7 +170,7 @@ def evaluate_observing(
     previous_action: bool = False,
     deterministic: bool = False,
 ) -> ReachedSolution:
-    """Evaluate a policy that sees observations; `training.evaluate_agent` also gives estimates.
+    """Values of a policy that sees observations; `training.evaluate_agent` also gives estimates.
 
     Raises:
         ParameterError: the MDP was not made from a state space of an environment, the policy is none for its
@@ -248,3 +254,118 @@ def steps_that_matter(mdp: TabularMDP) -> tuple[int, float]:
         return 1, largest * mdp.gamma
     steps = max(1, math.ceil(math.log(TAIL / largest) / math.log(mdp.gamma)))
     return steps, largest * mdp.gamma**steps
+
+
+# Many policies at once ------------------------------------------------------------------------------------------------
+
+
+def is_small_table(mdp: TabularMDP) -> bool:
+    """Whether policies of the MDP can be evaluated together: it has a horizon, few states, and one next state each."""
+    is_small = mdp.horizon is not None and _rows(mdp) <= MOST_ROWS and not mdp.laziness
+    return is_small and mdp.dynamics.deterministic_table() is not None
+
+
+def table_values(mdp: TabularMDP, policies: Sequence[np.ndarray]) -> list[Evaluation]:
+    """The values from the start of N policies of an MDP of which `is_small_table` holds.
+
+    They are evaluated as one policy of as many copies of the MDP: to the bits that `policy_value` gives.
+
+    Args:
+        policies: (S,) actions each, evaluated in all states; or (S, A) probabilities, evaluated where they get to.
+    Cost: one backward induction for all, in some groups where they are large.
+    """
+    size, evaluations = max(1, MOST_TOGETHER // _rows(mdp)), []
+    for first in range(0, len(policies), size):
+        group = policies[first : first + size]
+        number, states = len(group), mdp.num_states
+        joined, copies = np.concatenate(group), _copies(mdp, len(group))
+        part, counts = np.repeat(np.arange(number), states), [states] * number
+        if joined.ndim > 1:
+            answers = TableAnswers(joined, copies)
+            answers.reach(None, mdp.horizon)
+            rows = answers.rows
+            part = (np.unique(rows // answers.width) if mdp.is_sticky else rows) // states
+            counts = np.bincount(rows // (answers.width * states), minlength=number).tolist()
+            copies, joined = answers.reached_mdp()
+        values = solvers.evaluate_apart(copies, joined, part, mdp.start_probabilities)
+        evaluations += [Evaluation(value, True, bound, n) for (value, bound), n in zip(values, counts, strict=True)]
+    return evaluations
+
+
+def _rows(mdp: TabularMDP) -> int:
+    """Pairs of a state and, where that matters, a previous action."""
+    return mdp.num_states * (mdp.num_actions + 1 if mdp.is_sticky else 1)
+
+
+def _copies(mdp: TabularMDP, number: int) -> TabularMDP:
+    """The MDP beside itself: state s of copy i has the number i S + s."""
+    table, rewards = np.asarray(mdp.dynamics.deterministic_table(), np.int64), mdp.reward_table
+    first = np.arange(number) * mdp.num_states
+    following = np.where(table < 0, -1, table + first[:, None, None]).reshape(-1, mdp.num_actions)
+    return replace(
+        mdp,
+        dynamics=Table(following),
+        reward_table=Rewards(np.tile(rewards.table, (number, 1)), rewards.palette),
+        terminal=np.tile(np.asarray(mdp.terminal), number),
+        start_states=(mdp.start_states + first[:, None]).ravel(),
+        start_probabilities=np.tile(mdp.start_probabilities / number, number),
+        folder=None,
+        age=None,
+        staying=None,
+    )
+
+
+def is_walk(mdp: TabularMDP) -> bool:
+    """Whether a deterministic policy always meets the same states: one start, no chance."""
+    is_chosen = mdp.chance.triple[0] == 1.0 and not mdp.laziness
+    return is_chosen and len(mdp.start_states) == 1 and mdp.dynamics.deterministic_table() is not None
+
+
+def walk_values(
+    mdps: Sequence[TabularMDP], act: Callable[[np.ndarray], np.ndarray], *, frames: int = 1
+) -> list[Evaluation]:
+    """The values of N deterministic policies from the start, exact, each in its own MDP of which `is_walk` holds.
+
+    Such a policy meets one state after the other, so that to ask it alone costs a call for each; here all are asked
+    together.
+
+    Args:
+        act: (N,) states -> (N,) actions, of the policies in their states; those whose episode is over are asked about
+            their last state.
+        frames: k, how many states the policies see. If more than one, `act` gets histories (N, k): the last k states of
+            the episode, the oldest first, of which the first one stands for those before it.
+    Cost: the longest episode times a call of `act`.
+    """
+    worlds = {
+        id(mdp): (as_array(mdp.dynamics.deterministic_table()), np.asarray(mdp.terminal), mdp.reward_table)
+        for mdp in mdps
+    }
+    members = {key: np.array([i for i, mdp in enumerate(mdps) if id(mdp) == key]) for key in worlds}
+    ahead = [steps_that_matter(mdp) for mdp in mdps]
+    state = np.array([mdp.start_states[0] for mdp in mdps], np.int64)
+    history = np.repeat(state[:, None], frames, axis=1)
+    limits, gammas = np.array([steps for steps, _ in ahead]), np.array([mdp.gamma for mdp in mdps])
+    is_over = np.array([bool(mdp.terminal[s]) for mdp, s in zip(mdps, state, strict=True)])
+    value, size, discount = np.zeros(len(mdps)), np.zeros(len(mdps)), np.ones(len(mdps))
+    path: list[np.ndarray] = []
+    while not (is_over := is_over | (len(path) >= limits)).all():
+        path.append(np.where(is_over[:, None], -1, history))
+        actions = act(state if frames == 1 else history)
+        for key, (table, terminal, rewards) in worlds.items():
+            i = members[key][~is_over[members[key]]]
+            s, a = state[i], actions[i]
+            following, entries = table[s, a], rewards.table[s, a]
+            reward = discount[i] * (rewards.palette[entries] if len(rewards.palette) else entries)
+            value[i] += reward
+            size[i] += np.abs(reward)
+            is_over[i] = (following < 0) | terminal[following]
+            state[i] = np.where(following < 0, s, following)
+        history = np.concatenate([history[:, 1:], state[:, None]], axis=1)
+        discount *= gammas
+    bounds = [tail for _, tail in ahead] + 2 * _UNIT * (len(path) + 1) * size
+    met = [
+        len(np.unique(column[column[:, 0] >= 0], axis=None if frames == 1 else 0))
+        for column in np.array(path, np.int64).reshape(-1, len(mdps), frames).swapaxes(0, 1)
+    ]
+    parts = zip(value.tolist(), bounds.tolist(), met, strict=True)
+    return [Evaluation(each, True, bound, states) for each, bound, states in parts]
