@@ -42,7 +42,6 @@ __all__ = [
     "paths",
     "philox",
     "refinement",
-    "replacement",
     "sampled_learning",
     "stepping",
     "symmetric",

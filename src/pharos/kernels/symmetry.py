@@ -2,8 +2,6 @@
 
 from numba import njit
 
-UNKNOWN = -2  # an entry of a table that agrees with any other
-
 
 @njit(cache=True, nogil=True)
 def symmetry(next_states, ends, start, s, t, image, preimage, queue):
@@ -29,8 +27,6 @@ def symmetry(next_states, ends, start, s, t, image, preimage, queue):
         for a in range(num_actions):
             v, y = next_states[u, a], next_states[x, a]
             if v < 0 or y < 0:
-                if v == UNKNOWN or y == UNKNOWN:
-                    continue
                 if v != y:
                     return False, tail
                 restarts = start >= 0

@@ -123,11 +123,6 @@ def rows_of(indices: Indices, start: int, stop: int) -> Indices:
     return indices.rows(start, stop) if isinstance(indices, PackedIndices) else indices[start:stop]
 
 
-def copy_of(indices: Indices) -> Indices:
-    """The same in memory, of the same width."""
-    return PackedIndices(np.array(indices.packed)) if isinstance(indices, PackedIndices) else np.array(indices)
-
-
 def room_for_indices(shape: tuple[int, ...], num_states: int) -> Indices:
     """An array to write to, of the least bytes that can number so many states: int32, or packed."""
     return np.empty(shape, np.int32) if num_states <= INT32_STATES else PackedIndices.empty(shape)

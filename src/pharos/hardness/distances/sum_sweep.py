@@ -11,7 +11,6 @@ import numpy as np
 from pharos.hardness.distances.hidden_clock import HiddenClock
 from pharos.hardness.distances.layers import WIDE, Layers
 from pharos.hardness.distances.orbits import orbits
-from pharos.hardness.distances.restored import largest_distances, restored
 from pharos.hardness.distances.transition_graph import Graph
 from pharos.hardness.interval import Budget, BudgetClock, Interval
 from pharos.kernels import clocks, dense_search, graph, many_searches
@@ -61,8 +60,7 @@ class SumSweep:
         if isinstance(clock, Interval):
             return clock
         self._search_in_step()
-        if not self._search_orbits():
-            self._search_restored()
+        self._search_orbits()
         self._sweep()
         upper = self._upper()
         if upper > self.best:
@@ -228,47 +226,21 @@ class SumSweep:
 
     # Symmetries -------------------------------------------------------------------------------------------------------
 
-    def _search_orbits(self) -> bool:
-        """Where symmetries leave few orbits of states, the exact out(v) of all, by a search from one of each; whether
-        there are symmetries."""
+    def _search_orbits(self) -> None:
+        """Where symmetries leave few orbits of states, the exact out(v) of all, by a search from one of each."""
         graph = self.graph
         orbit = orbits(graph.next_states, graph.ends, graph.start, graph.pivot, lambda: self.spending.is_over)
         if orbit is None:
-            return False
+            return
         representatives = np.flatnonzero(orbit == np.arange(len(orbit)))
         if len(representatives) > _FEW_ORBITS:
-            return True
+            return
         for v in representatives:
             if self.spending.is_over:
-                return True
+                return
             self._search_out(int(v))
             self.out_upper[: len(orbit)][orbit == v] = self.out_upper[v]
         self.method = f"searches from one state of each of {len(representatives)} orbits of symmetries"
-        return True
-
-    def _search_restored(self) -> None:
-        """Where the only end hides symmetries, upper bounds on out(v), as `pharos.hardness.distances.restored` says."""
-        graph = self.graph
-        if graph.start < 0 or graph.has_end:
-            return
-        space = restored(graph.next_states, graph.ends, graph.pivot, lambda: self.spending.is_over)
-        if space is None:
-            return
-        representatives = np.flatnonzero(space.orbit == np.arange(graph.num_nodes))
-        if len(representatives) > _FEW_ORBITS:
-            return
-        bounds = largest_distances(space, representatives)
-        if bounds is None:
-            return
-        self.spending.searches += len(bounds)
-        for v, bound in zip(representatives, bounds, strict=True):
-            alike = space.orbit == v
-            alike[space.end] = False
-            self.out_upper[alike] = np.minimum(self.out_upper[alike], bound)
-        self._search_out(space.end)
-        self.method = (
-            f"detours from one of each of {len(representatives)} kinds of states that the end alone tells apart"
-        )
 
     # Clocks -----------------------------------------------------------------------------------------------------------
 
