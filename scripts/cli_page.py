@@ -43,7 +43,7 @@ def tables() -> str:
         lines += ["| option | meaning |", "|---|---|", *(f"| {_names(each)} | {_meaning(each)} |" for each in options)]
         lines += ["", "| key of `--json` | meaning |", "|---|---|"]
         for key in keys_of[name]:
-            sometimes = " *(in some answers)*" if key.endswith("*") else ""
+            sometimes = ", *in some answers*" if key.endswith("*") else ""
             lines.append(f"| `{key.rstrip('*')}` | {meaning[key.rstrip('*')]}{sometimes} |")
         lines.append("")
     return "\n".join(lines)

@@ -285,8 +285,8 @@ def instances(cls, stored: Mapping[str, dict]) -> list[str]:
 
 def observations(section: str) -> str:
     """The pictures of the gallery: what people and agents see."""
-    text = re.sub(r"^The optimal policy of .*\n!\[.*\n", "", section, flags=re.MULTILINE)
-    text = text.strip().partition("\n\n")[2].replace("](gallery/", "](../gallery/")
+    text = re.sub(r"^The optimal policy of .*\n", "", section, flags=re.MULTILINE)
+    text = text.strip().replace("](gallery/", "](../gallery/")
     if not text.strip():
         return "The observations of every class: [observations](../observations.md)."
     about = (
