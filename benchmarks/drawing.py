@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pharos.training.search_space import suggested_value
+from pharos.training.tuning import suggested_value
 
 
 class Drawn:

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pharos
 from pharos import hardness, importers
-from pharos.hardness.planning.effective_horizon import TIE, _compiled, _Steps, _vectorized
+from pharos.hardness.planning.effective_horizon import TIE, FiniteHorizonValues, _compiled, _vectorized
 from pharos.hardness.planning.large_horizon import LargeHorizon
 from pharos.mdp import sticky_actions
 
@@ -51,7 +51,9 @@ def small():
         )
         print(f"  {found}")
     lake = pharos.build(pharos.make("frozen_lake", size=40, seed=0)).mdp(gamma=1.0)
-    slow, _ = timed(f"lake of {lake.num_states} states, T = 200, vectorized", lambda: _vectorized(_Steps(lake, 200)))
+    slow, _ = timed(
+        f"lake of {lake.num_states} states, T = 200, vectorized", lambda: _vectorized(FiniteHorizonValues(lake, 200))
+    )
     fast, _ = timed(
         f"lake of {lake.num_states} states, T = 200, compiled", lambda: _compiled(LargeHorizon(lake, 200, TIE))
     )

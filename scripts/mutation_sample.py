@@ -254,7 +254,7 @@ def tested(tree: Path, names: str, arguments: argparse.Namespace) -> tuple[str, 
     """("killed", test), ("timeout", "") or ("survived", "") of the tests, each file once, in their order."""
     for kept in (Path(os.environ["PHAROS_CACHE_DIR"]) / "spaces").glob("*"):
         shutil.rmtree(kept)  # measures are kept in the folders of spaces; compiled rules hold none of what is mutated
-    files = [f"tests/{name}.py" for name in dict.fromkeys(names.split())]
+    files = [next(str(path) for path in (tree / "tests").rglob(f"{name}.py")) for name in dict.fromkeys(names.split())]
     command = [arguments.python, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "--tb=no", *files]
     environment = {**os.environ, "PYTHONPATH": str(tree / "src"), "PYTHONDONTWRITEBYTECODE": "1"}
     process = subprocess.Popen(

@@ -7,7 +7,7 @@ import numpy as np
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-import naive_mdp
+from naive import mdp as naive_mdp
 from pharos.mdp import OutcomeTable, TabularMDP, lazy_actions, random_actions, sticky_actions
 
 probabilities = st.sampled_from([0.0, 0.1, 0.25, 0.5, 1.0])

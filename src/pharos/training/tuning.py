@@ -258,7 +258,7 @@ class _Search:
 
     def score(self, trial: Any, pruned: type[Exception]) -> float:
         """The mean normalised regret of evaluations after the first, over all runs; `pruned` is raised on the way."""
-        chosen = {key: _suggested_value(trial, key, choices) for key, choices in self.space.items()}
+        chosen = {key: suggested_value(trial, key, choices) for key, choices in self.space.items()}
         configs: list[RunConfig] = []
         regrets: list[float] = []
         for task, options in self._runs(chosen):
@@ -310,7 +310,7 @@ def _checked_space(agent: str, space: Mapping[str, Sequence[Any]] | None) -> dic
     return {name: tuple(choices) for name, choices in searched.items()}
 
 
-def _suggested_value(trial: Any, name: str, choices: tuple[Any, ...]) -> Any:
+def suggested_value(trial: Any, name: str, choices: tuple[Any, ...]) -> Any:
     """The value that Optuna's trial takes."""
     kind, *values = choices
     if kind == "one of":

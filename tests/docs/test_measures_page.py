@@ -1,0 +1,33 @@
+"""docs/hardness-measures.md has an entry for every measure of a report, and its witnesses exist."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from pharos import hardness
+
+ROOT = Path(__file__).parents[2]
+PAGE = (ROOT / "docs" / "hardness-measures.md").read_text()
+ENTRIES = dict(re.findall(r"^### (\w+)\n(.*?)(?=^##|\Z)", PAGE, re.MULTILINE | re.DOTALL))
+BUILT_IN = [name for name, measure in hardness.measures().items() if measure.version is not None]
+
+
+@pytest.mark.parametrize("name", BUILT_IN)
+def test_every_measure_has_definition_source_cost_and_witness(name):
+    entry = ENTRIES[name]
+    for part in ("**Source.**", "**Witness.**"):
+        assert part in entry
+    assert hardness.measures()[name].definition
+    assert hardness.measures()[name].source
+
+
+def test_the_page_describes_no_measure_that_is_not_there():
+    assert set(ENTRIES) == set(BUILT_IN)
+
+
+def test_witnesses_are_files_of_tests():
+    named = re.findall(r"`(tests/[\w/]+\.py)`", PAGE)
+    assert named
+    for name in named:
+        assert "def test_" in (ROOT / name).read_text(), name

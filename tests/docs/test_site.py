@@ -1,0 +1,205 @@
+"""The documentation site: pages say what is so, links lead somewhere, tutorials run; `make docs` builds it strictly."""
+
+import contextlib
+import dataclasses
+import importlib
+import io
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from pharos.environments import class_called, named_instances
+from pharos.environments.built_in import BUILT_IN
+
+ROOT = Path(__file__).parents[2]
+DOCS, SCRIPTS = ROOT / "docs", ROOT / "scripts"
+BLOCK = re.compile(r"^```python\n(.*?)^```\n(?:```text\n(.*?)^```\n)?", re.MULTILINE | re.DOTALL)
+TUTORIALS = sorted((DOCS / "tutorials").glob("*.ipynb"))
+LONG = ("3-study", "4-own-observation-and-agent", "5-own-loop")
+
+
+@pytest.fixture(scope="module")
+def scripts():
+    """Imports a script."""
+    sys.path.insert(0, str(SCRIPTS))
+    yield importlib.import_module
+    sys.path.remove(str(SCRIPTS))
+
+
+def links_of(text):
+    """Targets in the prose of a page."""
+    prose = re.sub(r"^```.*?^```$|`[^`\n]*`", "", text, flags=re.MULTILINE | re.DOTALL)
+    return re.findall(r"\]\(([^)\s]+)\)", prose) + re.findall(r'src="([^"]+)"', prose)
+
+
+def anchors_of(text):
+    """What a page can be entered at: its headings, as the site and code hosts number them."""
+    titles = re.findall(r"^#+ (.*)$", text, re.MULTILINE)
+    plain = [re.sub(r"`|\*|\[|\]\([^)]*\)", "", title).lower() for title in titles]
+    return {re.sub(r"[^\w\- ]", "", title).replace(" ", "-") for title in plain}
+
+
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(DOCS.rglob("*.md"))]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_links_of_pages_lead_somewhere(page):
+    for link in links_of(page.read_text()):
+        path, _, anchor = link.partition("#")
+        if "://" in path or path.startswith("mailto:"):
+            continue
+        target = page.parent / path if path else page
+        assert target.exists(), link
+        if anchor and target.suffix == ".md":
+            assert anchor in anchors_of(target.read_text()), link
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["start.md", "how-to.md"])
+def test_the_code_of_pages_prints_what_they_say(name):
+    namespace, compared = {}, 0
+    for code, expected in BLOCK.findall((DOCS / name).read_text()):
+        with contextlib.redirect_stdout(io.StringIO()) as printed:
+            exec(compile(code, name, "exec"), namespace)
+        assert printed.getvalue() == expected
+        compared += bool(expected)
+    assert compared >= 3
+
+
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(path.stem, marks=pytest.mark.long if path.stem in LONG else pytest.mark.slow) for path in TUTORIALS],
+)
+def test_tutorials_print_what_they_show(name):
+    done = subprocess.run(
+        [sys.executable, str(SCRIPTS / "notebooks.py"), "--check", name],
+        **{"capture_output": True, "text": True, "timeout": 900, "env": {**os.environ, "MPLBACKEND": "agg"}},
+    )
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("path", TUTORIALS, ids=lambda path: path.stem)
+def test_tutorials_run_as_scripts(path, tmp_path):
+    """Saved as a file, without a guard, they print what the notebooks show."""
+    cells = [cell for cell in json.loads(path.read_text())["cells"] if cell["cell_type"] == "code"]
+    (tmp_path / "script.py").write_text("\n\n".join("".join(cell["source"]) for cell in cells))
+    done = subprocess.run(
+        [sys.executable, "script.py"],
+        **{"cwd": tmp_path, "capture_output": True, "text": True, "timeout": 900},
+        env={**os.environ, "MPLBACKEND": "agg"},
+    )
+    assert done.returncode == 0 and "Traceback" not in done.stderr, done.stderr
+    shown = [output for cell in cells for output in cell["outputs"] if output.get("name") == "stdout"]
+    assert done.stdout == "".join("".join(output["text"]) for output in shown)
+
+
+def test_there_are_tutorials_and_all_have_been_executed():
+    assert len(TUTORIALS) >= 5
+    for path in TUTORIALS:
+        notebook = json.loads(path.read_text())
+        assert notebook["nbformat"] == 4
+        counts = [cell["execution_count"] for cell in notebook["cells"] if cell["cell_type"] == "code"]
+        assert counts == list(range(1, len(counts) + 1)), path.name
+
+
+def test_stored_numbers_of_environments_are_of_todays_rules(scripts):
+    numbers = scripts("environment_numbers")
+    stored = json.loads(numbers.FILE.read_text())
+    for name, entry in stored.items():
+        assert name in named_instances(), f"{name}: python scripts/environment_numbers.py"
+        for part, value in numbers.key_of(name).items():
+            assert entry[part] == value, f"{name}: python scripts/environment_numbers.py {name}"
+    for name in ("simple_grid/4x4-decoy", "frozen_lake/4x4"):
+        assert numbers.numbers_of(name, 1000) == stored[name]
+
+
+def test_every_named_instance_has_values_or_a_reason_why_not(scripts):
+    stored = json.loads((DOCS / "environments.json").read_text())
+    without = {name for name in named_instances() if "discounted" not in stored.get(name, {})}
+    assert without == set(scripts("site_pages").NOT_COMPUTED)
+    assert all(stored[name]["more_than"] for name in without)
+
+
+def test_stored_values_are_in_order():
+    for name, entry in json.loads((DOCS / "environments.json").read_text()).items():
+        for kind in ("discounted", "episode"):
+            if kind in entry:
+                value = entry[kind]
+                assert value["worst"] <= value["uniform"] + 2e-6 <= value["optimal"] + 4e-6, name
+
+
+def test_every_environment_has_a_page(scripts):
+    pages = scripts("site_pages").environments({})
+    for name in (entry.name for entry in BUILT_IN):
+        cls = class_called(name)
+        page = pages[f"environments/{name}.md"]
+        for heading in ("Rules", "Parameters", "Named instances", "What agents see", "Versions"):
+            assert f"\n## {heading}\n" in page, (name, heading)
+        assert page.count("\n| **") >= 3, name
+        for instance in cls.instances:
+            assert f"| `{name}/{instance}` |" in page
+        assert f"{name}.html" in pages["environments/index.md"]
+
+
+@pytest.mark.slow
+def test_no_cell_of_the_numbers_is_empty_and_what_was_not_enumerated_says_so(scripts):
+    pages = scripts("site_pages").environments({})
+    for page in pages.values():
+        for line in page.partition("## Named instances")[2].partition("\n## ")[0].splitlines():
+            assert not line.startswith("|") or all(cell.strip() for cell in line.split("|")[1:-1]), line
+    values = pages["environments/values.md"]
+    stored = json.loads((DOCS / "environments.json").read_text())
+    assert all(values.count(f"[`{name}`]") == 1 for name in stored)
+
+
+def test_counts_of_the_site_are_those_of_the_docs_and_of_what_was_enumerated(scripts):
+    stored = json.loads((DOCS / "environments.json").read_text())
+    for name, (states, page) in scripts("site_pages").COUNTED.items():
+        assert f"{states:,}" in (DOCS / page).read_text(), name
+        assert stored[name].get("num_states", states) == states, name
+        assert stored[name].get("more_than", 0) < states, name
+
+
+def test_worlds_on_the_page_for_newcomers_are_there():
+    """Code in the right columns: an instance or a class, with parameters that it has."""
+    spans = re.findall(r"`([a-z0-9_]+(?:/[\w-]+)?)((?: \w+=[\w.]+)*)`", (DOCS / "coming-from.md").read_text())
+    worlds = {entry.name for entry in BUILT_IN}
+    checked = [(name, words) for name, words in spans if name.split("/")[0] in worlds]
+    assert len(checked) > 30
+    for name, words in checked:
+        assert name in worlds or name in named_instances(), name
+        fields = {field.name for field in dataclasses.fields(class_called(name.split("/")[0]))}
+        assert set(re.findall(r"(\w+)=", words)) <= fields, (name, words)
+
+
+def test_the_reference_has_every_published_name_once(scripts):
+    pages = scripts("site_pages").reference()
+    text = "\n".join(pages.values())
+    homes = re.findall(r"^::: (\S+)$", text, re.MULTILINE)
+    assert len(homes) == len(set(homes)) > 150
+    assert "heading: pharos.value_iteration" in pages["api/pharos.md"]
+
+
+def test_faults_of_a_built_site_are_found(scripts, tmp_path):
+    (tmp_path / "there.html").write_text('<h1 id="top"></h1>')
+    page = tmp_path / "page.html"
+    page.write_text('<a href="there.html#top"></a><img src="data:,x"><a href="https://elsewhere.org"></a>')
+    faults = scripts("build_site").faults
+    assert faults(tmp_path) == []
+    wrongs = ('<a href="gone.html">', '<a href="there.html#gone">', '<script src="https://elsewhere.org/x.js">')
+    run_together = ("<p>one of\n- <code>this</code>;\n- that</p>", "<p>Error ├── Lost</p>", "V<em>(s) - Q</em>(s)")
+    for wrong in (*wrongs, *run_together):
+        page.write_text(wrong)
+        assert len(faults(tmp_path)) == 1, wrong
+
+
+def test_a_list_right_below_a_paragraph_is_one_on_the_site(scripts):
+    text = "One of\n- this;\n  and more\n- that.\n\n```\na\n- b\n```\n\n- c\n"
+    staged = scripts("build_site").relinked(text, Path("docs/a.md"), "a.md")
+    assert staged == text.replace("of\n-", "of\n\n-")

@@ -1,0 +1,163 @@
+"""Sokoban: rules against sets of cells, solutions by hand and by breadth-first search, levels of files and of seeds."""
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import pharos
+from naive import environments as naive
+from pharos.drawing import text_drawing
+from pharos.errors import ParameterError
+
+pytestmark = pytest.mark.long  # with each class compiled and walked through in full
+
+# Levels with a solution by hand: the steps by their first letters
+SOLVED_BY_HAND = {"corridor": "rrr", "corner": "rdldr", "two-rooms": "rrrurd"}
+# Least steps, and states within reach
+FACTS = {
+    "corridor": (3, 6),
+    "corner": (5, 66),
+    "two-rooms": (6, 273),
+    "pillar": (19, 2889),
+    "random-1": (8, 374),
+    "random-2": (11, 3432),
+}
+BOXOBAN = """; 0
+##########
+##########
+#     ####
+# $.. ####
+#  #    ##
+#@ # $  ##
+# $   # ##
+#  .#$. ##
+##########
+##########
+
+; 7
+##########
+##.   .###
+# $ $ @###
+##########
+"""
+
+
+@given(st.integers(0, 200), st.integers(1, 3), st.lists(st.sampled_from(["up", "right", "down", "left"]), max_size=60))
+@settings(max_examples=60, deadline=None)
+def test_boxes_are_pushed_like_those_of_its_twin(seed, boxes, actions):
+    env = pharos.make("sokoban", seed=seed, boxes=boxes)
+    state, twin = tuple(env.initial_state()), naive.Sokoban(env.text)
+    for name in actions:
+        following = env.next_state(state, env.actions.index(name))
+        reward, terminated = twin.step(name)
+        placed = frozenset(tuple(env.cells[i].tolist()) for i, is_box in enumerate(following[2:]) if is_box)
+        assert (following[:2], placed) == twin.state()
+        assert env.reward(state, 0, following) == pytest.approx(reward, abs=1e-12)
+        assert env.is_terminal(following) == terminated
+        state = following
+        if terminated:
+            return
+
+
+@pytest.mark.parametrize("level", SOLVED_BY_HAND)
+def test_a_level_is_solved_by_hand(level):
+    env, total = pharos.make(f"sokoban/{level}"), 0.0
+    state = env.initial_state()
+    for letter in SOLVED_BY_HAND[level]:
+        assert not env.is_terminal(state)
+        action = "urdl".index(letter)
+        following = env.next_state(state, action)
+        total += env.reward(state, action, following)
+        state = following
+    assert env.is_terminal(state)
+    assert total == pytest.approx(10 + len(env.targets) - 0.1 * len(SOLVED_BY_HAND[level]))
+
+
+@pytest.mark.parametrize("level", FACTS)
+def test_the_optimal_return_is_that_of_a_shortest_solution(level):
+    """10 and 1 for each box that is not on a target at the start, less 0.1 a step; boxes that change places are one
+    state."""
+    env = pharos.make(f"sokoban/{level}")
+    assert naive.Sokoban(env.text).solution() == FACTS[level]
+    steps, states = FACTS[level]
+    assert len(SOLVED_BY_HAND.get(level, [0] * steps)) == steps
+    space = pharos.build(env, progress=False)
+    assert space.num_states == states
+    solution = pharos.value_iteration(space.mdp(gamma=1.0), horizon=env.max_episode_steps)
+    assert solution.value_at_start == pytest.approx(10 + env.text.count("$") - 0.1 * steps, abs=1e-9)
+
+
+@pytest.mark.slow
+def test_the_storehouse_takes_36_steps():
+    space = pharos.build(pharos.make("sokoban/storehouse"), progress=False)
+    assert space.num_states == 1_601_116
+    solution = pharos.value_iteration(space.mdp(gamma=1.0), horizon=space.environment.max_episode_steps)
+    assert solution.value_at_start == pytest.approx(10 + 4 - 3.6)
+
+
+def test_levels_are_read_from_a_file_of_boxoban(tmp_path):
+    file = tmp_path / "000.txt"
+    file.write_text(BOXOBAN)
+    env = pharos.make("sokoban", level=str(file))
+    assert env == pharos.make("sokoban", level=f"{file}:0")
+    assert text_drawing(env, env.initial_state()).splitlines()[2:8] == [
+        "#.....####",
+        "#.$xx.####",
+        "#..#....##",
+        "#@.#.$..##",
+        "#.$...#.##",
+        "#..x#$x.##",
+    ]
+    assert env.floor.shape == (10, 10) and len(env.cells) == 34
+    seventh = pharos.make("sokoban", level=f"{file}:7")
+    assert seventh.level == "##########/##.---.###/#-$-$-@###/##########"
+    assert pharos.make("sokoban", **seventh.parameters) == seventh
+    with pytest.raises(ParameterError, match="the file has no level 3"):
+        pharos.make("sokoban", level=f"{file}:3")
+
+
+def test_levels_without_headings_are_counted_from_0(tmp_path):
+    file = tmp_path / "mine.txt"
+    file.write_text("Two of mine\n\n#####\n#@$.#\n#####\n\n  ####\n###  #\n#@ $.#\n######\n")
+    assert pharos.make("sokoban", level=f"{file}:0").level == "#####/#@$.#/#####"
+    assert pharos.make("sokoban", level=f"{file}:1").level == "--####/###--#/#@-$.#/######"
+    assert len(pharos.make("sokoban", level=f"{file}:1").cells) == 6
+
+
+def test_a_level_without_walls_around_it_ends_at_its_edge():
+    env = pharos.make("sokoban", level="@$.")
+    state = env.initial_state()
+    assert [env.next_state(state, action) for action in (0, 2, 3)] == [state] * 3
+    assert env.is_terminal(env.next_state(state, 1))
+
+
+def test_random_levels_can_be_solved_and_are_the_same_on_every_machine():
+    levels = {pharos.make("sokoban", seed=seed).text for seed in range(12)}
+    assert len(levels) == 12
+    for level in sorted(levels)[:6]:
+        assert naive.Sokoban(level).solution()[0]
+    assert pharos.make("sokoban", seed=2).text == "#######/#@-#-.#/#-.$--#/#--$--#/#-#---#/#--##-#/#######"
+
+
+@pytest.mark.parametrize(
+    ("parameters", "words"),
+    [
+        ({"level": "#@$.#", "seed": 1}, "level was given with seed"),
+        ({"boxes": 3}, "no effect without a seed"),
+        ({"level": "no_such_file.txt"}, "neither a level nor a file"),
+        ({"level": 3}, "neither a level nor a file"),
+        ({"level": ""}, "expected rows of the letters"),
+        ({"level": "#@$.#/#@--#"}, "2 players, 1 boxes, 1 targets"),
+        ({"level": "#@$$.#"}, "1 players, 2 boxes, 1 targets"),
+        ({"level": "#@-#"}, "0 boxes, 0 targets"),
+        ({"level": "@-*"}, "all boxes are on targets"),
+        ({"level": "@-#$."}, "out of reach"),
+        ({"seed": 1, "boxes": 20}, "none of 1000 random levels"),
+        ({"seed": 1, "height": 3}, "height=3; expected an integer of at least 4"),
+    ],
+)
+def test_a_wrong_parameter_is_named_with_what_was_expected(parameters, words):
+    with pytest.raises(ParameterError) as error:
+        pharos.make("sokoban", **parameters)
+    assert words in str(error.value)
+    assert "\n" not in str(error.value)

@@ -1,0 +1,314 @@
+"""What executing actions does: every question has one answer, however the transitions are stored."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from naive import mdp as naive_mdp
+from pharos.mdp import (
+    BEST,
+    WORST,
+    BellmanEquation,
+    Chance,
+    Dynamics,
+    Matrices,
+    Outcomes,
+    PolicyStep,
+    PolicyTable,
+    Table,
+    TabularMDP,
+    random_actions,
+    sticky_actions,
+)
+from pharos.solvers import evaluate_policy, uniform_value, value_iteration, worst_value
+from strategies import (
+    as_outcome_tables,
+    deterministic_mdps,
+    general_mdps,
+    lazy_mdps,
+    outcome_mdps,
+    probabilities,
+    small_mdps,
+    with_chance,
+)
+
+often = settings(max_examples=80, deadline=None)
+
+
+class Listed(Dynamics):
+    """A third representation, written in a test: lists of outcomes, and nothing but what `Dynamics` asks for."""
+
+    def __init__(self, lists, num_states, num_actions):
+        self.lists, self.num_states, self.num_actions = lists, num_states, num_actions
+        self.operations, self.mass = 10, 1.0 + 1e-12
+        self.is_deterministic = False
+        self.has_ends = any(t == num_states for row in lists for t, _ in row)
+
+    @classmethod
+    def of(cls, mdp):
+        lists = [
+            [(t if t >= 0 else mdp.num_states, p) for t, p in naive_mdp.outcomes(mdp, s, a) if p > 1e-12]
+            for s in range(mdp.num_states)
+            for a in range(mdp.num_actions)
+        ]
+        return cls(lists, mdp.num_states, mdp.num_actions)
+
+    def expected(self, x, states=slice(None)):
+        x = x[:, None] if x.ndim == 1 else x
+        rows = np.arange(self.num_states)[states]
+        result = np.zeros((len(rows), self.num_actions, *x.shape[2:]))
+        for i, s in enumerate(rows):
+            for a in range(self.num_actions):
+                for t, p in self.lists[s * self.num_actions + a]:
+                    result[i, a] += p * x[t, a if x.shape[1] > 1 else 0]
+        return result
+
+    def pushed(self, mass, width=1):
+        after = np.zeros((self.num_states + 1, width))
+        for i, row in enumerate(self.lists):
+            s, a = divmod(i, self.num_actions)
+            for t, p in row:
+                after[t, a if width > 1 else 0] += p * mass[s, a]
+        return after[:-1]
+
+    def outcomes(self, states, actions):
+        rows = [
+            (i, t, p)
+            for i, (s, a) in enumerate(zip(states, actions, strict=True))
+            for t, p in self.lists[s * self.num_actions + a]
+        ]
+        which, following, weights = zip(*rows, strict=True) if rows else ((), (), ())
+        return Outcomes(np.array(which, int), np.array(following, int), np.array(weights, float))
+
+    def restricted_to(self, states):
+        raise NotImplementedError
+
+    def merged(self, classes, representatives):
+        raise NotImplementedError
+
+    def arrays(self):
+        raise NotImplementedError
+
+
+def as_matrices(mdp):
+    """The same MDP, stored as a matrix."""
+    size, num_actions = mdp.num_states, mdp.num_actions
+    P = np.zeros((size, num_actions, size))
+    for s in range(size):
+        for a in range(num_actions):
+            for t, p in naive_mdp.outcomes(mdp, s, a):
+                if t >= 0:
+                    P[s, a, t] += p
+    from scipy import sparse
+
+    return Matrices(sparse.csr_matrix(P.reshape(size * num_actions, size)), num_actions)
+
+
+def representations(mdp):
+    return [mdp.dynamics, as_matrices(mdp), Listed.of(mdp), *as_outcome_tables(mdp)]
+
+
+def same(answers):
+    for answer in answers[1:]:
+        np.testing.assert_allclose(answer, answers[0], atol=1e-12)
+
+
+@pytest.mark.slow
+@often
+@given(st.one_of(small_mdps(), outcome_mdps(), lazy_mdps()), st.integers(0, 2**32))
+def test_every_representation_gives_the_same_answers(mdp, seed):
+    rng = np.random.default_rng(seed)
+    size, num_actions = mdp.num_states, mdp.num_actions
+    all_of_them = representations(mdp)
+    values, by_action = rng.normal(size=size + 1), rng.normal(size=(size + 1, num_actions))
+    several = rng.normal(size=(size + 1, num_actions, 3))
+    states = np.flatnonzero(rng.random(size) < 0.7)
+    mass = rng.random((size, num_actions)) * (rng.random((size, num_actions)) < 0.5)
+    same([each.expected(values) for each in all_of_them])
+    same([each.expected(values, states) for each in all_of_them])
+    same([each.expected(by_action) for each in all_of_them])
+    same([each.expected(several) for each in all_of_them])
+    same([each.expected(several, states) for each in all_of_them])
+    same([each.largest(values) for each in all_of_them])
+    same([each.smallest(values, states) for each in all_of_them])
+    same([each.pushed(mass) for each in all_of_them])
+    same([each.pushed(mass, num_actions) for each in all_of_them])
+    same([each.arrivals(states) for each in all_of_them])
+    same([each.matrix().toarray() for each in all_of_them])
+    same([each.leads_to(0) for each in all_of_them])
+    assert len({tuple(each.successors_of(states).tolist()) for each in all_of_them}) == 1
+    assert len({each.has_ends for each in all_of_them}) == 1
+    live = rng.random(size) < 0.6
+    assert len({each.longest_path(live) for each in all_of_them}) == 1
+    for steps in (None, 0, 1, 3):
+        same([each.reachable(mdp.starts, steps) for each in all_of_them])
+    adjoint = (mass * mdp.dynamics.expected(np.append(values[:-1], 0.0))).sum()
+    assert (mdp.dynamics.pushed(mass)[:, 0] * values[:-1]).sum() == pytest.approx(adjoint)
+
+
+@pytest.mark.long
+@often
+@given(st.one_of(small_mdps(), with_chance(outcome_mdps()), lazy_mdps()), st.integers(0, 2**32))
+def test_compiled_backups_and_moves_are_those_of_the_formulas(mdp, seed):
+    rng = np.random.default_rng(seed)
+    looks_back = mdp.is_sticky and seed % 2 == 0
+    shape = (mdp.num_states, mdp.num_actions + 1) if looks_back else (mdp.num_states,)
+    policy = PolicyTable.of(mdp, rng.dirichlet(np.ones(mdp.num_actions), shape))
+    x = rng.normal(size=(mdp.num_states + 1, mdp.width))
+    x[-1] = 0
+    for select in (BEST, WORST, policy):
+        equation = BellmanEquation(mdp.reward_table, mdp.gamma, mdp.chance, select)
+        fast, slow = np.empty_like(x), np.empty_like(x)
+        mdp.dynamics.backup(equation, x, fast)
+        Dynamics.backup(Listed.of(mdp), equation, x, slow)
+        np.testing.assert_allclose(fast, slow, atol=1e-12)
+        swept = x.copy()
+        assert Dynamics.sweep(Listed.of(mdp), equation, swept) == np.abs(slow - x).max()
+        assert (swept == slow).all()
+    live = ~np.asarray(mdp.terminal)
+    for play, width in (
+        (PolicyStep(live, policy.later, mdp.chance), mdp.width),
+        (PolicyStep(live, policy.first, mdp.chance.first), 1),
+    ):
+        now = rng.random((mdp.num_states, width))
+        fast, slow = (np.empty((mdp.num_states, mdp.width)) for _ in range(2))
+        assert mdp.dynamics.move(play, now, fast) == pytest.approx(Dynamics.move(Listed.of(mdp), play, now, slow))
+        np.testing.assert_allclose(fast, slow, atol=1e-12)
+    play = PolicyStep(live, policy.later, mdp.chance)
+    fast, slow = (np.zeros((mdp.num_states, mdp.width)) for _ in range(2))
+    fast[mdp.starts] = slow[mdp.starts] = 1.0
+    fast[~live] = slow[~live] = 0.0
+    mdp.dynamics.support(play, fast)
+    Dynamics.support(Listed.of(mdp), play, slow)
+    assert ((fast > 0) == (slow > 0))[live].all()
+
+
+@pytest.mark.long
+@often
+@given(st.one_of(small_mdps(), lazy_mdps()))
+def test_solvers_take_any_representation(mdp):
+    from dataclasses import replace
+
+    other = replace(mdp, dynamics=Listed.of(mdp))
+    for solve in (
+        value_iteration,
+        worst_value,
+        uniform_value,
+        lambda m: evaluate_policy(m, np.zeros(m.num_states, int)),
+    ):
+        one, two = solve(mdp), solve(other)
+        assert np.abs(one.v - two.v).max() <= one.error_bound + two.error_bound
+
+
+@often
+@given(deterministic_mdps())
+def test_a_matrix_with_one_outcome_each_is_deterministic(mdp):
+    dynamics = as_matrices(mdp)
+    assert dynamics.is_deterministic
+    assert (dynamics.deterministic_table() == mdp.next_states).all()
+
+
+def test_a_matrix_with_several_outcomes_is_not_deterministic():
+    mdp = TabularMDP.from_matrices(np.full((2, 1, 2), 0.5), np.ones((2, 1)))
+    assert not mdp.is_deterministic
+    assert mdp.dynamics.deterministic_table() is None
+
+
+@often
+@given(general_mdps(), st.integers(0, 2**32))
+def test_sampled_next_states_are_possible_ones_and_about_as_frequent(mdp, seed):
+    states = np.zeros(2000, int)
+    actions = np.full(2000, mdp.num_actions - 1)
+    found = mdp.dynamics.sample(states, actions, np.random.default_rng(seed))
+    expected = dict(naive_mdp.outcomes(mdp, 0, mdp.num_actions - 1))
+    for state, p in expected.items():
+        assert abs((found == state).mean() - p) < 0.08
+    assert set(found.tolist()) <= set(expected)
+
+
+@pytest.mark.slow
+@often
+@given(st.one_of(small_mdps(), lazy_mdps()))
+def test_pairs_that_can_be_met_are_those_of_the_explicit_matrices(mdp):
+    P, _, start = naive_mdp.augmented(mdp)
+    ended = np.append(np.repeat(np.asarray(mdp.terminal), mdp.num_actions + 1), True)
+    reached, later = start > 0, np.zeros(len(start), bool)
+    for _ in range(len(start)):
+        following = (P[reached & ~ended] > 1e-12).any(axis=(0, 1)) if (reached & ~ended).any() else later & False
+        later |= following
+        reached = reached | following
+    expected = later[:-1].reshape(mdp.num_states, mdp.num_actions + 1)[:, :-1]
+    assert (mdp.pairs_within() == expected).all()
+
+
+def test_where_every_action_is_repeated_only_first_actions_go_on():
+    mdp = sticky_actions(TabularMDP.from_arrays([[1, 2], [2, 0], [0, 1]], np.zeros((3, 2))), 1.0)
+    one_way = TabularMDP.from_arrays([[1, 3], [2, 0], [2, 2], [3, 3]], np.zeros((4, 2)))
+    assert mdp.pairs_within().all()
+    assert sticky_actions(one_way, 1.0).pairs_within().tolist() == [[0, 0], [1, 0], [1, 0], [0, 1]]
+    assert sticky_actions(one_way, 0.5).pairs_within().tolist() == [[0, 1], [1, 0], [1, 1], [1, 1]]
+    assert sticky_actions(one_way, 1.0).pairs_within(1).tolist() == [[0, 0], [1, 0], [0, 0], [0, 1]]
+
+
+@pytest.mark.parametrize(
+    ("steps", "pairs"),
+    [
+        (0, [[0, 0], [0, 0], [0, 0], [0, 0]]),
+        (1, [[0, 0], [1, 0], [0, 0], [0, 1]]),
+        (2, [[0, 1], [1, 0], [1, 0], [1, 1]]),
+        (3, [[0, 1], [1, 0], [1, 1], [1, 1]]),
+    ],
+)
+def test_pairs_within_some_steps_end_with_those_of_the_last_step(steps, pairs):
+    one_way = TabularMDP.from_arrays([[1, 3], [2, 0], [2, 2], [3, 3]], np.zeros((4, 2)))
+    assert sticky_actions(one_way, 0.5).pairs_within(steps).tolist() == pairs
+
+
+@often
+@given(probabilities, probabilities, st.integers(0, 2**32))
+def test_weights_draws_and_adjoints_of_chance_agree(sticky, random, seed):
+    rng = np.random.default_rng(seed)
+    chance, num_actions = Chance.of(sticky, random), 3
+    mdp = random_actions(sticky_actions(TabularMDP.from_arrays([[0, 0, 0]], np.zeros((1, 3))), sticky), random)
+    assert mdp.chance == chance
+    previous = np.array([0, 1, 2, num_actions])
+    chosen = rng.dirichlet(np.ones(num_actions), 4)
+    weights = chance.weights(chosen, previous)
+    np.testing.assert_allclose(weights.sum(axis=1), 1.0)
+    q = rng.normal(size=(4, num_actions))
+    np.testing.assert_allclose((chance.chosen_values(q, previous) * chosen).sum(axis=1), (weights * q).sum(axis=1))
+    for b in range(4):
+        actions = rng.choice(num_actions, 3000, p=chosen[b])
+        drawn = chance.draw(actions, np.full(3000, previous[b]), num_actions, rng)
+        np.testing.assert_allclose(np.bincount(drawn, minlength=3) / 3000, weights[b], atol=0.06)
+    if chance.is_sticky:
+        mass, later = rng.random((2, num_actions)), rng.dirichlet(np.ones(num_actions), 2)
+        values = rng.normal(size=(2, num_actions))
+        executed = chance.executed(mass, later * mass.sum(axis=1, keepdims=True))
+        of_choice = chance.choice(values, (later * values).sum(axis=1, keepdims=True))
+        assert (executed * values).sum() == pytest.approx((mass * of_choice).sum())
+
+
+@settings(max_examples=30, deadline=None)
+@given(small_mdps())
+def test_an_action_leads_to_a_state_where_its_probability_is_not_zero(mdp):
+    possible = np.zeros((mdp.num_states, mdp.num_actions, mdp.num_states + 1), bool)
+    for s, a in np.ndindex(possible.shape[:2]):
+        for t, p in naive_mdp.outcomes(mdp, s, a):
+            possible[s, a, t] |= p > 1e-12
+    for state in range(mdp.num_states + 1):
+        assert (mdp.dynamics.leads_to(state) == possible[:, :, state]).all()
+
+
+def test_what_a_row_lacks_to_1_by_rounding_leads_nowhere():
+    dynamics = TabularMDP.from_matrices(np.full((1, 1, 1), 1 - 2.0**-53), [[0.0]]).dynamics
+    assert not dynamics.has_ends
+    assert (dynamics.leads_to(0).tolist(), dynamics.leads_to(1).tolist()) == ([[True]], [[False]])
+
+
+def test_a_table_keeps_the_index_type_of_what_is_left():
+    table = Table(np.array([[1, 2], [2, -1], [0, 0]], np.int32))
+    assert table.restricted_to(np.array([0, 1])).next_states.tolist() == [[1, 0], [1, -1]]
+    assert table.merged(np.array([0, 0, 1]), np.array([0, 2])).next_states.tolist() == [[0, 1], [0, 0]]
+    assert table.restricted_to(np.array([0, 1])).next_states.dtype == np.int32

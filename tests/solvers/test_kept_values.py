@@ -1,0 +1,306 @@
+"""Values in files: the same as in memory, to the last bit, with bounds that hold from whatever a file holds."""
+
+import errno
+import importlib
+import io
+import itertools
+import multiprocessing
+import os
+import signal
+import tempfile
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from naive import exact as naive_exact
+from pharos import hardness
+from pharos.errors import FileFormatError, FolderLocked, ParameterError, PrecisionError
+from pharos.mdp import BEST, TabularMDP
+from pharos.solvers import uniform_value, value_iteration
+from pharos.solvers.blocks import blocked_fixed_point
+from pharos.solvers.fixed_point import Backup, largest_of
+from pharos.system import kept_arrays
+from strategies import small_mdps
+
+memory_map = importlib.import_module("pharos.system.large_arrays")
+
+
+def ring(size: int = 400, gamma: float = 0.99) -> TabularMDP:
+    """On by one or by two; the last state pays 1 and leads to the first: a sweep carries values once around."""
+    state = np.arange(size)
+    table = np.stack([(state + 1) % size, (state + 2) % size], axis=1)
+    rewards = np.zeros((size, 2))
+    rewards[-1, 0] = 1.0
+    return TabularMDP.from_arrays(table, rewards, gamma=gamma)
+
+
+@pytest.fixture
+def no_memory(monkeypatch):
+    """Whatever is large is in a mapped file, and nothing is small."""
+    monkeypatch.setattr(memory_map, "SMALL", 0)
+    monkeypatch.setattr(memory_map.machine, "available_memory", lambda: 0)
+
+
+def test_large_zeros_are_a_file_without_a_name_where_memory_has_no_room(tmp_path, monkeypatch, no_memory):
+    monkeypatch.setenv("PHAROS_CACHE_DIR", str(tmp_path / "cache"))
+    array = memory_map.large_zeros((3, 5), np.float64)
+    assert array.shape == (3, 5) and not array.any() and not array.flags.owndata
+    array[:] = np.arange(15).reshape(3, 5)
+    assert array.sum() == 105 and list((tmp_path / "cache").iterdir()) == []
+
+
+class RecordingFile(io.BytesIO):
+    """A file in memory that keeps the sizes of what is written."""
+
+    def __init__(self):
+        super().__init__()
+        self.sizes = []
+
+    def write(self, data):
+        self.sizes.append(len(data))
+        return super().write(data)
+
+
+def test_zeros_are_written_in_blocks_where_the_system_cannot_take_their_room(monkeypatch):
+    monkeypatch.delattr(os, "posix_fallocate", raising=False)
+    monkeypatch.setattr(memory_map, "_BLOCK", 64)
+    file = RecordingFile()
+    file.write(b"header")
+    memory_map.append_zeros(file, 150)
+    assert file.getvalue() == b"header" + bytes(150) and file.sizes == [6, 64, 64, 22]
+
+
+def test_values_in_files_are_those_in_memory_to_the_last_bit(tmp_path, monkeypatch):
+    mdp = ring()
+    expected = value_iteration(mdp)
+    kept = value_iteration(mdp, values=tmp_path / "values.npy")
+    assert (kept.x == expected.x).all() and kept.sweeps == expected.sweeps and kept.error_bound == expected.error_bound
+    assert (np.load(tmp_path / "values.npy", mmap_mode="r") == expected.x).all()
+    monkeypatch.setattr(memory_map, "SMALL", 0)
+    monkeypatch.setattr(memory_map.machine, "available_memory", lambda: 0)
+    assert (value_iteration(mdp).x == expected.x).all()
+
+
+@pytest.mark.long
+def test_gaps_with_values_in_files_are_those_in_memory_to_the_last_bit(tmp_path, monkeypatch):
+    mdp = ring()
+    expected = hardness.gaps(mdp)
+    monkeypatch.setattr(memory_map, "SMALL", 0)
+    monkeypatch.setattr(memory_map.machine, "available_memory", lambda: 0)
+    assert hardness.gaps(mdp).to_dict() == expected.to_dict()
+    names = ["sum_of_reciprocal_gaps", "minimal_gap"]
+    kept = hardness.report(mdp, names, folder=tmp_path)
+    assert kept[names[0]].value == expected.sum_of_reciprocals and kept[names[1]].value == expected.minimal
+    assert kept[names[0]].certificate.lower == expected.lower and kept[names[0]].certificate.upper == expected.upper
+
+
+@pytest.mark.long
+@settings(max_examples=40, deadline=None)
+@given(small_mdps())
+def test_values_settled_in_their_file_have_the_gaps_of_a_copy(tmp_path_factory, mdp):
+    names = ["sum_of_reciprocal_gaps", "sum_of_reciprocal_gaps_regularized", "minimal_gap"]
+    alone, folder = hardness.report(mdp, names), tmp_path_factory.mktemp("values")
+    kept = hardness.report(mdp, names, folder=folder)
+    again = hardness.report(mdp, names, folder=folder)  # from values that are settled
+    for name in names:
+        assert kept[name].value == alone[name].value and kept[name].certificate == alone[name].certificate
+        for ours, other in itertools.permutations((alone[name].certificate, again[name].certificate)):
+            assert ours.lower is None or other.upper is None or ours.lower <= other.upper
+
+
+def test_a_solve_goes_on_from_the_values_of_one_that_stopped(tmp_path):
+    mdp, path = ring(), tmp_path / "values.npy"
+    whole = value_iteration(mdp)
+    with pytest.raises(KeyboardInterrupt):
+        value_iteration(
+            mdp, values=path, progress=lambda sweeps, bound: _stop() if sweeps == whole.sweeps - 2 else None
+        )
+    resumed = value_iteration(mdp, values=path)
+    assert resumed.sweeps <= 2 and resumed.error_bound <= 1e-6 and (resumed.x == whole.x).all()
+    del resumed
+    assert value_iteration(mdp, values=path).sweeps == 1  # what is solved is solved
+
+
+def _stop():
+    raise KeyboardInterrupt
+
+
+@pytest.mark.long
+@settings(max_examples=60, deadline=None)
+@given(small_mdps(), st.integers(0, 2**32))
+def test_bounds_hold_from_whatever_a_file_holds(tmp_path_factory, mdp, seed):
+    path = tmp_path_factory.mktemp("any") / "values.npy"
+    rng = np.random.default_rng(seed)
+    anything = rng.choice([0.0, 1.0, -3.5, 1e6, np.nan, np.inf, 1e-300], (mdp.num_states + 1, mdp.width))
+    np.save(path, anything)
+    solution = value_iteration(mdp, values=path)
+    assert naive_exact.largest_error(solution.v, naive_exact.extreme_values(mdp)) <= solution.error_bound <= 1e-6
+
+
+@pytest.mark.long
+def test_a_killed_solve_leaves_values_to_go_on_from(tmp_path):
+    mdp, path = ring(20_000, 0.9999), tmp_path / "values.npy"
+    uniform_value(mdp, values=tmp_path / "compiled.npy", tolerance=1e3)  # compiles, before the child is forked
+    process = multiprocessing.get_context("fork").Process(target=_killed_in_sweep, args=(mdp, path, 5))
+    process.start()
+    process.join()
+    assert process.exitcode == -signal.SIGKILL
+    left = np.load(path)
+    assert np.isfinite(left).all() and left.any()
+    fresh = uniform_value(mdp, tolerance=1e-10)
+    resumed = uniform_value(mdp, tolerance=1e-10, values=path)
+    assert resumed.sweeps < fresh.sweeps
+    assert (abs(resumed.v - fresh.v) <= resumed.error_bound + fresh.error_bound).all()
+
+
+def _killed_in_sweep(mdp, path, last):
+    uniform_value(
+        mdp, 1e-10, values=path, progress=lambda n, _: os.kill(os.getpid(), signal.SIGKILL) if n == last else None
+    )
+
+
+@pytest.mark.parametrize("answer", [None, errno.ENOLCK, errno.ENOSYS])
+def test_a_file_of_values_is_for_one_solve_of_one_mdp_at_a_time(tmp_path, monkeypatch, answer):
+    """Where the file system has no locks, too: a claim stands for one, and goes with the values."""
+    if answer is not None:
+
+        def refuse(*_):
+            raise OSError(answer, os.strerror(answer))
+
+        monkeypatch.setattr(kept_arrays.fcntl, "flock", refuse)
+    path = tmp_path / "values.npy"
+    solution = value_iteration(ring(), values=path)
+    with pytest.raises(FolderLocked, match=r"in use|is using values there"):
+        value_iteration(ring(), values=path)
+    assert solution.v[-1] > 0
+    assert (tmp_path / "values.npy.claim").exists() == (answer is not None)
+    del solution
+    assert [file.name for file in tmp_path.iterdir()] == ["values.npy"]
+    with pytest.raises(
+        FileFormatError, match=r"holds float64 of shape \(401, 1\); expected float64 of shape \(11, 1\)"
+    ):
+        value_iteration(ring(10), values=path)
+    path.write_bytes(b"something else")
+    with pytest.raises(FileFormatError, match="is no file of values"):
+        value_iteration(ring(), values=path)
+    with pytest.raises(ParameterError, match="without a horizon"):
+        value_iteration(ring(), values=tmp_path / "other.npy", horizon=3)
+    with pytest.raises(ParameterError, match="cannot be used for values"):
+        value_iteration(ring(), values=tmp_path)
+
+
+@pytest.mark.parametrize("threads", (2, 3))
+def test_threads_share_a_sweep_and_the_bound_holds(threads):
+    mdp = ring()
+    alone, shared = value_iteration(mdp), value_iteration(mdp, threads=threads)
+    assert shared.error_bound <= 1e-6
+    assert (abs(shared.v - alone.v) <= shared.error_bound + alone.error_bound).all()
+
+
+@pytest.mark.long
+@settings(max_examples=60, deadline=None)
+@given(small_mdps(), st.integers(2, 9))
+def test_bounds_hold_whatever_the_threads(mdp, threads):
+    solution = value_iteration(mdp, threads=threads)
+    assert naive_exact.largest_error(solution.v, naive_exact.extreme_values(mdp)) <= solution.error_bound <= 1e-6
+
+
+@pytest.mark.long
+@settings(max_examples=100, deadline=None)
+@given(small_mdps(), st.sampled_from((1.0, -3e4, 1e-12, 0.1)), st.booleans())
+def test_bounds_of_values_of_32_bits_count_what_is_lost(mdp, scale, is_kept):
+    mdp = mdp.with_rewards(mdp.rewards * scale)
+    tolerance = 4e-7 * abs(scale) / (1 - mdp.gamma) ** 2 + 1e-40
+    with tempfile.TemporaryDirectory() as folder:
+        path = os.path.join(folder, "values.npy") if is_kept else None
+        solution = value_iteration(mdp, tolerance, values=path, dtype="float32")
+        assert solution.x.dtype == np.float32
+        truth = naive_exact.extreme_values(mdp)
+        assert naive_exact.largest_error(solution.v, truth) <= solution.error_bound <= tolerance
+        del solution
+
+
+@pytest.mark.long
+def test_values_of_32_bits_take_half_of_the_file_and_refuse_what_they_cannot_reach(tmp_path):
+    mdp, path = ring(), tmp_path / "values.npy"
+    double = value_iteration(mdp)
+    single = value_iteration(mdp, 1e-3, values=path, dtype="float32")
+    assert np.abs(single.v - double.v).max() <= single.error_bound + double.error_bound
+    assert path.stat().st_size - 128 == single.x.nbytes == double.x.nbytes // 2 and single.q.dtype == np.float64
+    del single
+    with pytest.raises(PrecisionError, match=r"32-bit floats reach a bound of .*use float64"):
+        value_iteration(mdp, 1e-9, dtype="float32")
+    with pytest.raises(FileFormatError, match="holds float32 of shape"):
+        value_iteration(mdp, values=path)
+
+
+def test_values_of_32_bits_are_for_one_process_and_no_horizon():
+    mdp = ring()
+    for wrong in ({"horizon": 3}, {"processes": 2}, {"jacobi": True}):
+        with pytest.raises(ParameterError, match="one process and no horizon"):
+            value_iteration(mdp, dtype="float32", **wrong)
+    with pytest.raises(ParameterError, match="expected 'float64' or 'float32'"):
+        value_iteration(mdp, dtype="float16")
+
+
+@pytest.mark.long
+@settings(max_examples=150, deadline=None)
+@given(small_mdps(), st.integers(2, 7), st.sampled_from(("float64", "float32")), st.integers(1, 3))
+def test_bounds_hold_whatever_the_blocks(mdp, blocks, dtype, threads):
+    tolerance = 1e-6 if dtype == "float64" else 1e-6 / (1 - mdp.gamma) ** 2
+    solution = value_iteration(mdp, tolerance, blocks=blocks, dtype=dtype, threads=threads)
+    truth = naive_exact.extreme_values(mdp)
+    assert naive_exact.largest_error(solution.v, truth) <= solution.error_bound <= tolerance
+
+
+@pytest.mark.long
+def test_the_largest_residual_proves_the_bound_of_blocks(tmp_path):
+    mdp, bounds = ring(3000, 0.999), []
+
+    def look(rounds, bound):
+        bounds.append(bound)
+
+    solution = value_iteration(mdp, 1e-3, blocks=5, progress=look, values=tmp_path / "values.npy")
+    x = solution.x[:, 0].copy()
+    residual = np.abs((mdp.rewards + mdp.gamma * x[mdp.next_states]).max(axis=1) - x[:-1]).max()
+    assert residual / (1 - mdp.gamma) <= solution.error_bound == bounds[-1] <= 1e-3 < bounds[-2]
+    del solution
+    assert value_iteration(mdp, 1e-3, blocks=5, values=tmp_path / "values.npy").sweeps == 1
+
+
+class Recorded(Backup):
+    """A backup that knows how much its sweeps have changed."""
+
+    changes: tuple = ()
+
+    def sweep(self, x, part=None):
+        self.changes = (*self.changes, super().sweep(x, part))
+        return self.changes[-1]
+
+
+@pytest.mark.long
+def test_the_bound_of_one_block_is_that_of_its_last_sweep():
+    """(rho d + e) / (1 - rho), with one margin for rounding, and not two."""
+    backup = Recorded(ring(), BEST)
+    x, bound, _ = blocked_fixed_point(backup, 1e-3, 1)
+    change = backup.changes[-1]
+    assert bound == backup.bound(change, backup.rounding(largest_of(x) + change))
+    assert bound <= (0.99 * change + backup.rounding(largest_of(x) + change)) / 0.01 * (1 + 2.0**-39)
+
+
+def test_a_number_of_blocks_that_cannot_be_is_one_line():
+    for wrong in (0, -1, 1.5, 5000, None):
+        with pytest.raises(ParameterError, match="expected a whole number from 1 to 4096"):
+            value_iteration(ring(), blocks=wrong)
+
+
+def test_rows_that_fill_memory_are_all_swept_and_stay_what_they_are(tmp_path, monkeypatch, no_memory):
+    monkeypatch.setattr(memory_map, "RANGE", 1000)
+    rows = np.arange(30_000, dtype=np.int32).reshape(-1, 3)
+    rows.tofile(tmp_path / "rows.bin")
+    mapped = np.memmap(tmp_path / "rows.bin", np.int32, "r", shape=rows.shape)
+    ranges = list(memory_map.ranges_from_the_end(mapped, 100, len(rows)))
+    assert ranges[0] == (9000, 10_000) and ranges[-1] == (100, 1000)
+    assert all(start == stop for (start, _), (_, stop) in itertools.pairwise(ranges)) and (mapped == rows).all()

@@ -1,0 +1,147 @@
+"""Studies with `engine: batched`: what fits together is trained together, and nothing else changes."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections import deque
+from pathlib import Path
+
+import pytest
+
+import fake_batches
+import fake_training
+from pharos import study
+from pharos.agents.batched import lane_width
+from pharos.errors import ParameterError
+from pharos.study.batches import Batches
+from pharos.training import read_record
+
+TESTS = Path(__file__).parents[1]
+
+
+def specification(seeds=3, engine="batched", **block):
+    block = {"environments": ["frozen_lake/4x4"], "agents": ["dqn"], "seeds": seeds} | block
+    return study.specification({"name": "fake", "steps": 100, "evaluations": 10, "engine": engine, "blocks": [block]})
+
+
+@pytest.fixture
+def sizes(tmp_path, monkeypatch):
+    """How many runs each batch had."""
+    path = tmp_path / "sizes"
+    path.touch()
+    monkeypatch.setenv("PHAROS_FAKE_BATCHES", str(path))
+    return lambda: sorted(map(int, path.read_text().split()))
+
+
+def run(spec, folder, **options):
+    return study.run(spec, folder, runner=fake_training.train, batch_runner=fake_batches.train, workers=2, **options)
+
+
+@pytest.mark.slow
+def test_what_fits_together_is_trained_together(tmp_path, sizes):
+    spec = specification(
+        environments=["frozen_lake/4x4", "frozen_lake/8x8"],
+        chance=["plain", {"random": 0.1}],
+        agents=["dqn", "q_learning"],
+    )
+    end = run(spec, tmp_path / "out")
+    assert (end.total, end.finished, end.failed, end.running) == (24, 24, 0, 0)
+    assert sizes() == [12, 12]  # both lakes and chances share the shape of vectors; tables are another batch
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["runs", "status.json", "study.yaml"]
+    assert run(spec, tmp_path / "out").finished == 24 and sizes() == [12, 12]
+    images = specification(observations=["vector", "simple_image"])
+    run(images, tmp_path / "images")
+    assert sizes() == [3, 3, 12, 12]
+
+
+def test_more_runs_than_a_lane_are_several_batches(tmp_path, sizes):
+    assert run(specification(seeds=lane_width(is_image=False) + 2), tmp_path).finished == lane_width(is_image=False) + 2
+    assert sizes() == [2, lane_width(is_image=False)]
+
+
+def test_batches_are_larger_where_networks_are_not_on_the_processor(tmp_path):
+    run = specification(seeds=1).runs[0]
+    assert (Batches(tmp_path).width(run), Batches(tmp_path, "cuda").width(run)) == (lane_width(is_image=False), 256)
+
+
+def test_the_engine_is_said_for_the_study_for_a_block_and_for_an_agent():
+    agents = {"agents": ["dqn", "ppo", "q_learning"], "seeds": 1}
+
+    def engines(**said):
+        return [(each.engine, each.configuration.engine) for each in specification(**agents, **said).runs]
+
+    batched, alone, table = ("batched", "batched"), ("sb3", "sb3"), ("batched", "sb3")
+    assert engines() == [batched, batched, table]
+    assert engines(engine={"ppo": "batched"}) == [alone, batched, alone]
+    block = {"environments": ["frozen_lake/4x4"], **agents, "engine": {"dqn": "batched"}}
+    spec = study.specification({"name": "one", "blocks": [block]})
+    assert [each.engine for each in spec.runs] == ["batched", "sb3", "sb3"]
+    with pytest.raises(ParameterError, match=r"agent 'a2c': .* write engine: {dqn: batched} for some agents only"):
+        specification(agents=["a2c"])
+    with pytest.raises(ParameterError, match="unknown engine 'batch'; did you mean 'batched'"):
+        specification(engine="batch")
+    with pytest.raises(ParameterError, match="engine: unknown agent 'dqm'; did you mean 'dqn'"):
+        specification(engine={"dqm": "batched"})
+
+
+def test_ids_without_an_engine_are_those_of_before():
+    (usual,) = specification(seeds=1, engine="sb3").runs
+    (batched,) = specification(seeds=1).runs
+    assert "engine" not in usual.config and batched.config["engine"] == "batched" and usual.id != batched.id
+    tables = [specification(seeds=1, engine=engine, agents=["q_learning"]).runs[0] for engine in ("sb3", "batched")]
+    assert tables[0].id == tables[1].id
+
+
+def test_a_run_that_fails_in_a_batch_fails_alone(tmp_path, sizes, monkeypatch):
+    monkeypatch.setenv("PHAROS_FAKE_FAIL", "1")
+    spec = specification()
+    end = run(spec, tmp_path / "out")
+    assert (end.finished, end.failed) == (2, 1)
+    (failed,) = end.errors
+    assert end.errors[failed] == "this seed fails on purpose"
+    assert (tmp_path / "out" / "runs" / failed / "log.txt").exists()
+    assert run(spec, tmp_path / "out").failed == 1 and len(sizes()) == 1
+    assert run(spec, tmp_path / "out", retry_failed=True).failed == 1 and sizes() == [1, 3]
+
+
+@pytest.mark.slow
+def test_a_batch_that_is_killed_too_often_goes_on_in_halves(tmp_path, sizes, monkeypatch):
+    monkeypatch.setenv("PHAROS_FAKE_MOST", "2")
+    end = run(specification(seeds=4), tmp_path / "out")
+    assert (end.finished, end.failed) == (4, 0)
+    assert sizes() == [2, 2, 4, 4, 4]
+
+
+@pytest.mark.slow
+def test_a_runner_that_is_killed_leaves_nothing_half_done(tmp_path, sizes):
+    code = (
+        "import sys; sys.path.insert(0, sys.argv[1])\n"
+        "if __name__ == '__main__':\n"
+        "    from test_study_batches import run, specification\n"
+        "    run(specification(seeds=6), sys.argv[2])"
+    )
+    script = tmp_path / "script.py"
+    script.write_text(code)
+    environment = {**os.environ, "PHAROS_FAKE_SECONDS": "0.1"}
+    process = subprocess.Popen([sys.executable, str(script), str(TESTS), str(tmp_path / "out")], env=environment)
+    while not sizes():
+        time.sleep(0.05)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    end = run(specification(seeds=6), tmp_path / "out")
+    assert (end.finished, end.failed) == (6, 0)
+    assert all(read_record(path)["status"] == "finished" for path in (tmp_path / "out" / "runs").iterdir())
+
+
+def test_the_papers_instances_share_batches_where_shapes_and_numbers_of_states_allow_it():
+    paper = study.specification("paper").model_dump(mode="json", exclude_unset=True)
+    runs = study.specification({**paper, "engine": "batched"}).runs
+    batches, pending = Batches(Path("nowhere")), deque((0.0, run) for run in runs)
+    units = []
+    while pending:
+        units.append(batches.unit(pending.popleft()[1], pending))
+    assert sum(map(len, units)) == len(runs) == 2100 and min(map(len, units)) >= 6
+    for unit in units:
+        assert len({batches.key(run) for run in unit}) == 1 and len(unit) <= batches.width(unit[0])
