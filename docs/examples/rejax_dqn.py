@@ -40,4 +40,4 @@ for seed in range(SEEDS):
     parameters = jax.tree.map(lambda leaf, seed=seed: leaf[seed], states.q_ts.params)
     policy = np.asarray(agent.agent.apply(parameters, everything).argmax(axis=1))
     value = pharos.evaluate_policy(mdp, policy).value_at_start
-    print(f"seed {seed}: V = {value:.4f}, V* = {best:.4f}, normalized regret {(best - value) / (best - uniform):.4f}")
+    print(f"seed {seed}: V = {value:.4f}, V* = {best:.4f}, normalised regret {(best - value) / (best - uniform):.4f}")

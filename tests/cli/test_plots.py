@@ -110,7 +110,7 @@ def test_drawing_leaves_the_settings_of_matplotlib_alone(folders):
 def test_regret_that_cannot_be_normalised_is_drawn_in_units_of_return(tmp_path, monkeypatch):
     run = train("q_learning", "simple_grid", height=1, width=2, horizon=1, steps=200, out=tmp_path / "run")
     left, _ = plots.regret([run.folder]).axes
-    assert left.get_ylabel() == "normalized regret"
+    assert left.get_ylabel() == "normalised regret"
     curve = read_curve(run.folder)
     curve["normalized_regret"] = np.nan  # as where playing at random is optimal
     monkeypatch.setattr(importlib.import_module("pharos.plots.regret"), "read_curve", lambda folder: curve)

@@ -257,6 +257,8 @@ def test_the_page_ranks_what_was_computed_and_escapes_what_it_shows(entry, tmp_p
         assert wrong not in page.replace("http-equiv", "")
     assert page.count("<script>") == 1 and "&lt;img src=x" in page and "A. Turing" not in page
     assert "script-src 'sha256-" in page
+    identity = made.verified[0].entry.id  # the whole of it would be cut off at the edge of the card
+    assert f'title="{identity}, seed 0,' in page and f">{identity[:8]}</td>" in page and f">{identity}<" not in page
     with pytest.raises(ParameterError, match="expected a folder with entries"):
         leaderboard.board(tmp_path / "nothing", tmp_path / "board.html")
 

@@ -217,7 +217,7 @@ def test_agreement_has_fishers_interval():
     low, high = expected.confidence_interval()
     wide = cells.pivot_table(index=["instance", "chance", "observation"], columns="agent", values="normalized_regret")
     assert row.evidence.startswith(
-        f"of returns {low:.2f} to {high:.2f} (95 %, 96 cells); of normalized regret r = "
+        f"of returns {low:.2f} to {high:.2f} (95 %, 96 cells); of normalised regret r = "
         f"{stats.pearsonr(wide['dqn'], wide['ppo'])[0]:.2f};"
     )
     assert row.verdict == ("agrees" if high >= 0.81 else "disagrees")

@@ -144,7 +144,7 @@ def test_the_command_answers_in_json_and_train_takes_its_file(tmp_path):
 
 def test_the_command_prints_a_table_and_refuses_wrong_words():
     options = ("--agent", "q_learning", "--steps", 500)
-    assert "mean normalized regret" in run("tune", LAKE, *options, "--trials", 1).stdout
+    assert "mean normalised regret" in run("tune", LAKE, *options, "--trials", 1).stdout
     assert run("tune", LAKE, *options, "--seeds", "one").exit_code == 2
     assert run("tune", LAKE, *options, "--search", "gamma").exit_code == 2
     assert run("tune", LAKE, *options, "--chance", "often").exit_code == 2

@@ -142,7 +142,7 @@ def evaluate(
         [
             ("value at the start", f"{value:.8g}"),
             ("regret", f"{answer['regret']:.8g}"),
-            ("normalized regret", "-" if math.isnan(relative) else f"{relative:.6g}  (0: optimal, 1: uniform)"),
+            ("normalised regret", "-" if math.isnan(relative) else f"{relative:.6g}  (0: optimal, 1: uniform)"),
             ("relative to worst", "-" if math.isnan(against_worst) else f"{against_worst:.6g}  (0: optimal, 1: worst)"),
             ("optimal, uniform, worst", f"{best:.8g}, {uniform:.8g}, {worst:.8g}"),
             ("error at most", f"{max(each.error_bound for each in values.values()):.2g}{_estimated(worth)}{rounding}"),

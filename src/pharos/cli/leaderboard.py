@@ -8,7 +8,7 @@ import typer
 from pharos.cli.answers import complain, console, print_facts, print_json, progress_bar, progress_line, size_text
 from pharos.cli.options import Json, Trust
 from pharos.errors import ParameterError
-from pharos.system.wording import many
+from pharos.system.wording import in_words, many
 
 if TYPE_CHECKING:
     from pharos.leaderboard import Verdict
@@ -135,9 +135,7 @@ def _print(verdict: "Verdict") -> None:
         table.add_column(title, justify="left" if not title else "right")
     for check in verdict.checks:
         numbers = (f"{number:.8g}" for number in (check.claimed, check.found))
-        table.add_row(
-            check.name.replace("_", " "), *numbers, f"{check.within:.1e}", "holds" if check.holds else "FAILS"
-        )
+        table.add_row(in_words(check.name), *numbers, f"{check.within:.1e}", "holds" if check.holds else "FAILS")
     entry, to = verdict.entry, console()
     to.print(
         f"[bold]{escape(str(verdict.file))}[/bold]  {escape(entry.name)}: {escape(entry.config.agent)} on "

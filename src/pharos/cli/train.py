@@ -14,7 +14,7 @@ from pharos.cli.options import Json, Lazy, Parameters, Random, Sticky, TargetArg
 from pharos.cli.target import parse_environment
 from pharos.errors import AllRunsFailed, ParameterError
 from pharos.system import compiling
-from pharos.system.wording import many
+from pharos.system.wording import in_words, many
 
 if TYPE_CHECKING:
     from pharos.environments import Environment
@@ -194,7 +194,7 @@ def _facts_of_many(
     facts: list[tuple[str, object]] = []
     for name, quartiles in spread.items():
         low, middle, high = quartiles or (math.nan,) * 3
-        facts.append((name.replace("_", " "), f"median {middle:.4g}, quartiles {low:.4g} to {high:.4g}"))
+        facts.append((in_words(name), f"median {middle:.4g}, quartiles {low:.4g} to {high:.4g}"))
     if results:
         some = next(iter(results.values())).result
         best = sum(run.result["final_regret"] < 1e-6 for run in results.values())
@@ -236,7 +236,7 @@ def _facts(run: "TrainingResult", steps: int, chance: str) -> list[tuple[str, ob
         ("final value", f"{result['final_value']:.6g}  (optimal {best:.6g}, uniform {uniform:.6g})"),
         ("final regret", f"{result['final_regret']:.6g}"),
         ("cumulative regret", f"{learnt:.6g} of the learnt policies, {played:.6g} as played"),
-        ("normalized regret", shown),
+        ("normalised regret", shown),
         ("mean return", f"{result['mean_return']:.6g} over {many(result['episodes'], 'episode')}"),
         ("values", "exact" if result["exact"] else "some are estimates, see exact in curve.parquet"),
         ("chance", chance),

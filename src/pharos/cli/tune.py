@@ -92,7 +92,7 @@ def tune(
     }
     first = "-" if result.first_score is None else f"{result.first_score:.4g}"
     facts: list[tuple[str, object]] = [
-        ("score", f"{result.score:.4g}  (mean normalized regret; with the table's hyperparameters {first})"),
+        ("score", f"{result.score:.4g}  (mean normalised regret; with the table's hyperparameters {first})"),
         ("trials", ", ".join(f"{number} {word}" for word, number in count.items() if number)),
         *result.hyperparameters.items(),
     ]

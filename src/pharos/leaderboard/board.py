@@ -29,6 +29,7 @@ from pharos.leaderboard.verification import (
 from pharos.observations import title as observation_title
 from pharos.system import storage
 from pharos.system.templates import templates
+from pharos.system.wording import in_words
 from pharos.training import TaskValues
 
 LONGEST_REASON = 400
@@ -78,7 +79,7 @@ COLUMNS = (
     ("steps", "n"),
     ("value", "n"),
     ("regret", "n"),
-    ("normalized", "n"),
+    ("normalised", "n"),
     ("certainty", "s"),
     ("while learning", "n"),
     ("run", "s"),
@@ -164,7 +165,7 @@ def reason(error: Exception) -> str:
 def why_not(verdict: Verdict) -> str:
     """Why a claim does not hold, in a line."""
     wrong = [
-        f"{check.name.replace('_', ' ')} is {check.found:.8g}, the entry claims {check.claimed:.8g}"
+        f"{in_words(check.name)} is {check.found:.8g}, the entry claims {check.claimed:.8g}"
         for check in verdict.checks
         if not check.holds
     ]
@@ -199,6 +200,7 @@ def _row(rank: int, verdict: Verdict) -> list[Cell]:
     learning = entry.training.get("normalized_regret")
     learning = learning if isinstance(learning, int | float) and math.isfinite(learning) else math.nan
     observation = observation_title(config.observation, config.observation_options)
+    made_by = f"{entry.id}, seed {config.seed}, pharos {entry.versions.get('pharos', 'unknown')}"
     certainty = "exact" if verdict.exact else f"estimated ± {verdict.error_bound:.2g}"
     return [
         _number(rank, "d"),
@@ -214,7 +216,7 @@ def _row(rank: int, verdict: Verdict) -> list[Cell]:
         else Cell("–"),
         Cell(certainty, certainty),
         _number(learning, ".4g") if math.isfinite(learning) else Cell("–"),
-        Cell(entry.id, entry.id, f"seed {config.seed}, pharos {entry.versions.get('pharos', 'unknown')}"),
+        Cell(entry.id[:8], entry.id, made_by),
     ]
 
 

@@ -1,4 +1,4 @@
-"""Vectors: every component of the state, normalized by its declared range; one-hot; the number of the state."""
+"""Vectors: every component of the state, normalised by its declared range; one-hot; the number of the state."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any

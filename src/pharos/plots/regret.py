@@ -13,6 +13,7 @@ from pharos.environments import as_tuples, class_called, make
 from pharos.errors import ParameterError
 from pharos.observations import title
 from pharos.plots.style import COLORS, INK, figure, styled, thousands
+from pharos.system.wording import in_words
 from pharos.training import bootstrap_interval, read_curve, read_record
 
 if TYPE_CHECKING:
@@ -34,7 +35,7 @@ def regret(
 ) -> "Figure":
     """Draw the regret of runs over their steps; runs that differ in the seed alone are one line with an interval.
 
-    Left, the normalized expected regret of the policy learnt so far: 0 is optimal, 1 is playing at random (in units of
+    Left, the normalised expected regret of the policy learnt so far: 0 is optimal, 1 is playing at random (in units of
     return where playing at random is optimal in one of the tasks). Right, the cumulative realised regret of all
     episodes played, exploration included; a dotted line is what playing at random would have cost in as many episodes.
 
@@ -64,7 +65,7 @@ def regret(
         right.plot(steps, random, ":", color=color, linewidth=1.2)
     if relative:
         left.axhline(1, color=INK, linewidth=0.8, linestyle=":")
-    left.set(title="policy learnt so far", xlabel="steps", ylabel=column.replace("_", " "))
+    left.set(title="policy learnt so far", xlabel="steps", ylabel=in_words(column))
     left.set_ylim(bottom=min(0.0, left.get_ylim()[0]))
     right.set(title="all episodes played", xlabel="steps", ylabel="cumulative realised regret")
     for axis in (left, right):

@@ -10,6 +10,7 @@ from scipy.linalg import helmert
 
 from pharos.study.analysis import IMAGE, VECTOR, Models, agreement, paper_agreement
 from pharos.study.regression import Fit, r_squared
+from pharos.system.wording import in_words
 from pharos.training import bootstrap_interval
 
 if TYPE_CHECKING:
@@ -303,6 +304,6 @@ def _agreement(cells: "pd.DataFrame") -> dict[str, Any]:
     evidence = f"of returns {lower:.2f} to {upper:.2f} (95 %, {number} cells)"
     for regret in ("normalized_regret", "cumulative_regret"):
         if (other := agreement(cells, regret)) is not None:
-            evidence += f"; of {regret.replace('_', ' ')} r = {other[0]:.2f}"
+            evidence += f"; of {in_words(regret)} r = {other[0]:.2f}"
     power = _power_of_error(math.atanh(_PRINTED_AGREEMENT), 1 / math.sqrt(number - 3))
     return _row(finding, "all", paper, f"r = {r:.2f}", evidence, math.nan, verdict, power)

@@ -9,6 +9,7 @@ import numpy as np
 from pharos.agents import TABULAR_OBSERVATION
 from pharos.study.analysis import IMAGE, VECTOR, Models
 from pharos.study.curves import agent_name, title
+from pharos.system.wording import in_words
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -63,7 +64,7 @@ def hardness_table(measured: "pd.DataFrame") -> str:
     names = [name for name in measured.columns if name not in ("environment", "instance", "chance", "notes")]
     texts = measured[["instance", "chance"]].map(escape)
     numbers = measured[names].map(lambda x: "--" if x is None or not np.isfinite(x) else f"{x:.6g}")
-    table = texts.join(numbers).rename(columns=lambda name: escape(name.replace("_", " ")))
+    table = texts.join(numbers).rename(columns=lambda name: escape(in_words(name)))
     return _latex(table, "ll" + "r" * len(names), is_indexed=False)
 
 

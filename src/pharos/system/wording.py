@@ -1,6 +1,11 @@
-"""How messages say numbers."""
+"""How messages say numbers and names."""
 
 
 def many(count: int, one: str, several: str | None = None) -> str:
     """A count and its noun: "1 run", "1,200 runs", "2 classes"."""
     return f"{count:,} {one if count == 1 else several or one + 's'}"
+
+
+def in_words(name: str) -> str:
+    """A name as prose spells it: `normalized_regret` is "normalised regret"."""
+    return name.replace("_", " ").replace("normalized", "normalised")

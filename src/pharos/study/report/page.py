@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pharos.system.templates import templates
+from pharos.system.wording import in_words
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -87,7 +88,7 @@ def table(data: "pd.DataFrame", caption: str = "", *, digits: int = 3) -> Table:
         is_number = data[name].dtype.kind in "fiu"
         longest = data[name].astype(str).str.len().max() if len(data) else 0
         kind = "n" if is_number else "s" if longest <= SHORT else "t"
-        columns.append(Column(str(name).replace("_", " "), kind))
+        columns.append(Column(in_words(str(name)), kind))
         digits_of.append(0 if is_number and _is_whole(data[name].to_numpy(float)) else digits)
     rows = [
         [_cell(value, places) for value, places in zip(line, digits_of, strict=True)]

@@ -12,7 +12,7 @@ from pharos.study.predictions import Foretold
 from pharos.study.report.page import Figures, image, table
 from pharos.study.report.results import Results
 from pharos.study.report.section import Section
-from pharos.system.wording import many
+from pharos.system.wording import in_words, many
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -191,7 +191,7 @@ def _mixed(rows: "pd.DataFrame") -> Any:
 
 
 def _name(row: Mapping[str, Any]) -> str:
-    return f"{str(row['predictor']).replace('_', ' ')}{', baseline' if row['baseline'] else ''}"
+    return f"{in_words(str(row['predictor']))}{', baseline' if row['baseline'] else ''}"
 
 
 def _with_interval(rows: "pd.DataFrame", name: str) -> list[str]:
