@@ -431,6 +431,7 @@ def test_render_draws_in_the_terminal(pharos):
         (["bild", "breakout"], "No such command 'bild'"),
         (["build", "breakout", "--fast"], "No such option"),
         (["build", "breakout", "--shards", "/disk"], "--shards is gone: files stay in one folder"),
+        (["solve", "breakout", "--jacobi"], "--jacobi is gone: values of any --processes are within --tolerance"),
         (["render", "breakout", "--observation", "humane"], "did you mean 'human'?"),
         (["render", "breakout", "--out", "a.jpg"], "expected a file name that ends in"),
         (["render", "breakout", "--out", "nowhere/a.png"], "there is no folder"),

@@ -24,7 +24,6 @@ from pharos.solvers import checkpoint as checkpoints
 from pharos.solvers import distributed as sharing
 from pharos.solvers import evaluate_policy, ranked, uniform_value, value_iteration
 from pharos.solvers.distributed import DistributedOptions, shared_solution
-from pharos.solvers.fixed_point import Backup
 from rank_threads import Killed, fails_at, out_of_order, threads
 from strategies import FEW, deterministic_mdps, hard_mdps, lazy_mdps, outcome_mdps, small_mdps
 
@@ -70,12 +69,8 @@ def test_values_by_ranks_are_within_the_bounds(mdp, size, select, seed):
         rng = np.random.default_rng(seed)
         select = PolicyTable.of(mdp, rng.dirichlet(np.ones(mdp.num_actions), mdp.num_states))
     size = min(size, mdp.num_states)
-    alone = solved(mdp, 1, select=select, tolerance=tolerance, jacobi=True)
-    shared = solved(mdp, size, select=select, tolerance=tolerance)
+    alone, shared = (solved(mdp, ranks, select=select, tolerance=tolerance) for ranks in (1, size))
     assert np.abs(shared.x - alone.x).max() <= alone.error_bound + shared.error_bound
-    plain = solved(mdp, size, select=select, tolerance=tolerance, jacobi=True)
-    assert (plain.x == alone.x).all()
-    assert (plain.error_bound, plain.sweeps) == (alone.error_bound, alone.sweeps)
 
 
 @pytest.mark.long
@@ -88,21 +83,6 @@ def test_values_of_a_horizon_are_the_same_bits(mdp, size, horizon):
     assert (shared.next_x == alone.next_x).all()
     if not isinstance(mdp.dynamics, Matrices):  # whose parts are tables of outcomes, which count operations otherwise
         assert shared.error_bound == alone.error_bound
-
-
-@pytest.mark.long
-@settings(max_examples=30, deadline=None)
-@given(mdp=MANY, size=st.integers(2, 5))
-def test_jacobi_sweeps_are_backups_of_the_whole(mdp, size):
-    """The loop of one process, written down again: x = T x until the same bound."""
-    mdp = mdp.with_gamma(min(mdp.gamma, 0.8)).with_horizon(None)
-    tolerance = 1e-4 * max(1.0, np.abs(mdp.rewards).max())
-    shared = solved(mdp, min(size, mdp.num_states), tolerance=tolerance, jacobi=True)
-    backup = Backup(mdp, BEST)
-    x = backup.zeros()
-    for _ in range(shared.sweeps):
-        x = backup(x)
-    assert (shared.x == x).all()
 
 
 @pytest.mark.long
@@ -121,9 +101,9 @@ def test_ranks_compute_the_rewards_of_their_ranges(sticky, tmp_path):
     space = pharos.build(pharos.make("breakout", height=7, columns=5, brick_rows=1), tmp_path, progress=False)
     mdp = pharos.sticky_actions(space.mdp(0.5), sticky)
     ranged = pharos.sticky_actions(space.mdp(0.5, by_range=True), sticky)
-    shared = solved(ranged, 3, jacobi=True)
+    shared = solved(ranged, 3, horizon=30)
     assert ranged.reward_table.whole is None
-    alone = solved(mdp, 1, jacobi=True)
+    alone = solved(mdp, 1, horizon=30)
     assert (shared.x == alone.x).all()
     assert shared.value_at_start == alone.value_at_start
     assert (ranged.rewards == mdp.rewards).all()
@@ -158,11 +138,10 @@ def test_neither_ranges_nor_the_order_of_arrival_change_a_bit(mdp, seed, draws, 
     options = {"select": select, "tolerance": 1e-6 * max(1.0, np.abs(mdp.rewards).max())}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(ranked, "_GAP", gap)
-        for more in ({"jacobi": True}, {"horizon": 7}):
-            alone = solved(mdp, 1, **options, **more)
-            shared = solved(mdp, size, cuts=cuts, disturb=late, **options, **more)
-            assert (shared.x == alone.x).all() and (shared.next_x == alone.next_x).all()
-            assert (shared.error_bound, shared.sweeps) == (alone.error_bound, alone.sweeps)
+        alone = solved(mdp, 1, horizon=7, **options)
+        shared = solved(mdp, size, cuts=cuts, disturb=late, horizon=7, **options)
+        assert (shared.x == alone.x).all() and (shared.next_x == alone.next_x).all()
+        assert (shared.error_bound, shared.sweeps) == (alone.error_bound, alone.sweeps)
         soon, shared = (solved(mdp, size, cuts=cuts, disturb=each, **options) for each in (lambda rank: None, late))
         assert (shared.x == soon.x).all() and shared.sweeps == soon.sweeps
 
@@ -230,18 +209,19 @@ def test_sweeps_that_gain_nothing_end(monkeypatch):
     seed=st.integers(0, 2**32),
 )
 def test_solving_goes_on_whoever_failed_and_however_many_go_on(size, who, number, then, horizon, mdp, seed):
-    whole = solved(mdp, 1, horizon=horizon, jacobi=True)
+    whole = solved(mdp, 1, horizon=horizon)
     with tempfile.TemporaryDirectory() as folder:
-        options = {"horizon": horizon, "jacobi": True, "checkpoint": folder, "checkpoint_seconds": -1.0}
+        options = {"horizon": horizon, "checkpoint": folder, "checkpoint_seconds": -1.0}
         with contextlib.suppress(Killed, RankFailed), pytest.MonkeyPatch.context() as patch:
             patch.setattr(checkpoints, "_SHARE", 0)
             late, fails = out_of_order(seed), fails_at(who % size, number)
             solved(mdp, size, disturb=lambda rank: (fails(rank), late(rank)), **options)
         result = solved(mdp, then, **options)
         assert not list(Path(folder).iterdir())
-    assert (result.x == whole.x).all()
-    assert (result.next_x == whole.next_x).all()
-    assert (result.error_bound, result.sweeps) == (whole.error_bound, whole.sweeps)
+    assert np.abs(result.x - whole.x).max() <= result.error_bound + whole.error_bound
+    if horizon is not None:
+        assert (result.x == whole.x).all() and (result.next_x == whole.next_x).all()
+        assert (result.error_bound, result.sweeps) == (whole.error_bound, whole.sweeps)
 
 
 @pytest.mark.long
@@ -298,7 +278,7 @@ def test_a_full_disk_ends_no_solving(tmp_path, monkeypatch):
 @pytest.mark.long
 def test_three_processes_solve_and_go_on_after_a_kill(tmp_path, monkeypatch):
     mdp = chain(20_000)
-    alone = value_iteration(mdp, jacobi=True)
+    alone = value_iteration(mdp, horizon=80)
     monkeypatch.setattr(checkpoints, "_SHARE", 0)
     monkeypatch.setattr(checkpoints, "SECONDS", -1.0)
     monkeypatch.setattr(DistributedOptions, "checkpoint_seconds", -1.0)
@@ -312,12 +292,12 @@ def test_three_processes_solve_and_go_on_after_a_kill(tmp_path, monkeypatch):
 
     monkeypatch.setattr(ranked.RankedBackup, "plain_sweep", dies)
     with pytest.raises(RankFailed, match=r"rank 2 of 3 died \(exit code -9\); the same command resumes"):
-        shared_solution(mdp, BEST, 1e-6, None, DistributedOptions(3, True, tmp_path, -1.0))
+        shared_solution(mdp, BEST, 1e-6, 80, DistributedOptions(3, tmp_path, -1.0))
     assert len(list(tmp_path.iterdir())) == 1
     monkeypatch.setattr(ranked.RankedBackup, "plain_sweep", sweep)
     first = []
     result = shared_solution(
-        mdp, BEST, 1e-6, None, DistributedOptions(2, True, tmp_path, -1.0), lambda sweeps, _: first.append(sweeps)
+        mdp, BEST, 1e-6, 80, DistributedOptions(2, tmp_path, -1.0), lambda sweeps, _: first.append(sweeps)
     )
     assert first[0] > 10
     assert (result.x == alone.x).all()
@@ -336,20 +316,21 @@ def run(tmp_path, *arguments, ranks_of_mpi=0):
 @pytest.mark.long
 @pytest.mark.parametrize("chance", [[], ["--sticky", "0.25"], ["--random", "0.1", "--horizon", "30"]])
 @pytest.mark.parametrize("launcher", ["processes", "mpi"])
-def test_the_command_writes_the_same_file(launcher, chance, tmp_path):
+def test_the_command_writes_the_same_values(launcher, chance, tmp_path):
     if launcher == "mpi" and MPIEXEC is None:
         pytest.skip("needs the extra mpi")
     more = {"ranks_of_mpi": 3} if launcher == "mpi" else {}
     many = ["--processes", "3"] if launcher == "processes" else []
-    alone = run(tmp_path, *WORLD, *chance, "--jacobi", "--out", tmp_path / "alone.npz", "--json")
-    shared = run(tmp_path, *WORLD, *chance, "--jacobi", *many, "--out", tmp_path / "shared.npz", "--json", **more)
+    alone = run(tmp_path, *WORLD, *chance, "--out", tmp_path / "alone.npz", "--json")
+    shared = run(tmp_path, *WORLD, *chance, *many, "--out", tmp_path / "shared.npz", "--json", **more)
     assert shared.returncode == 0, shared.stderr
     answers = [json.loads(each.stdout) for each in (alone, shared)]
-    for key in ("value_at_start", "uniform_value_at_start", "error_bound", "sweeps"):
-        assert answers[0][key] == answers[1][key]
+    error = 0.0 if "--horizon" in chance else sum(answer["error_bound"] for answer in answers)
+    for key in ("value_at_start", "uniform_value_at_start"):
+        assert abs(answers[0][key] - answers[1][key]) <= error
     with np.load(tmp_path / "alone.npz") as one, np.load(tmp_path / "shared.npz") as other:
         assert set(one) == set(other)
-        assert all((one[name] == other[name]).all() for name in one)
+        assert np.abs(one["v"] - other["v"]).max() <= error
 
 
 @pytest.mark.long

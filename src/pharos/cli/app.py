@@ -40,6 +40,7 @@ EXIT_FAILED, EXIT_USAGE, EXIT_INTERRUPTED = 1, 2, 130
 # Options that went, by the command that had them, and what it says of them
 REMOVED = {
     "pharos build --shards": "--shards is gone: files stay in one folder, which a volume may spread over several disks",
+    "pharos solve --jacobi": "--jacobi is gone: values of any --processes are within --tolerance, which may be lower",
 }
 # What NumPy says of an array that no machine can hold, by a ValueError
 NO_ARRAY = ("array is too big", "Maximum allowed dimension exceeded")

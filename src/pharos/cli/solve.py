@@ -76,10 +76,6 @@ def solve(
     memory: Memory = None,
     workers: Workers = None,
     processes: Processes = "1",
-    jacobi: Annotated[
-        bool,
-        typer.Option("--jacobi", help="Many more sweeps, and values whose bits do not depend on --processes."),
-    ] = False,
     max_states: MaxStates = None,
     json: Json = False,
 ) -> None:
@@ -94,7 +90,7 @@ def solve(
     from pharos.system import paths
 
     checkpoint = (values or paths.cache_directory() / "values") if ranks != 1 else None
-    sharing: dict[str, Any] = {"processes": ranks, "jacobi": jacobi, "checkpoint": checkpoint}
+    sharing: dict[str, Any] = {"processes": ranks, "checkpoint": checkpoint}
     sharing |= {"dtype": dtype, "blocks": blocks}
     suffix = ".npy" if dtype == "float64" else f"-{dtype}.npy"
     with progress_line("solving") as report:

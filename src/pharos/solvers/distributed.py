@@ -24,13 +24,11 @@ class DistributedOptions:
 
     Attributes:
         processes: of this machine; or "mpi": those that `mpiexec` has started, all of which make the call.
-        jacobi: whether sweeps are not in place.
         checkpoint: a folder for the values so far; None to keep none.
         checkpoint_seconds: between two of them.
     """
 
     processes: int | str = 1
-    jacobi: bool = False
     checkpoint: str | os.PathLike | None = None
     checkpoint_seconds: float = SECONDS
 
@@ -40,7 +38,7 @@ class DistributedOptions:
     @property
     def is_wanted(self) -> bool:
         """Whether this is anything else than one process as ever."""
-        return self.processes != 1 or self.jacobi or self.checkpoint is not None
+        return self.processes != 1 or self.checkpoint is not None
 
 
 def shared_solution(
@@ -56,7 +54,7 @@ def shared_solution(
     processes = sharing.processes
     if processes != "mpi":
         check_ranks(mdp.num_states, int(processes))
-    _warm(mdp, select, sharing.jacobi or horizon is not None)
+    _warm(mdp, select, horizon is not None)
     folder = None if sharing.checkpoint is None else Path(sharing.checkpoint)
     if folder is not None and folder.exists() and not folder.is_dir():
         raise ParameterError(f"checkpoint {folder}: is a file; expected a folder")
@@ -66,7 +64,7 @@ def shared_solution(
         checkpoint = Checkpoint(folder, what, sharing.checkpoint_seconds)
         backup = RankedBackup(mdp, select, rank)
         if horizon is None:
-            bound, sweeps = ranked_fixed_point(backup, tolerance, sharing.jacobi, checkpoint, progress)
+            bound, sweeps = ranked_fixed_point(backup, tolerance, checkpoint, progress)
             following = x = backup.gathered(backup.x)
         else:
             sweeps = horizon

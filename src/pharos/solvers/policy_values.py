@@ -23,7 +23,6 @@ def evaluate_policy(
     *,
     horizon: int | None = None,
     processes: int | str = 1,
-    jacobi: bool = False,
     checkpoint: str | os.PathLike | None = None,
 ) -> Solution:
     """The values of a policy over states; `pharos.evaluate_policy` also takes policies that see observations.
@@ -37,7 +36,7 @@ def evaluate_policy(
             function from an array of state indices to either; or an agent with such a `policy_table()`.
         tolerance: every value is within this of the true one, proven.
         horizon: number of steps to go, instead of the MDP's own.
-        processes, jacobi, checkpoint: as `value_iteration` takes them.
+        processes, checkpoint: as `value_iteration` takes them.
     Returns:
         A Solution of kind "policy". A deterministic policy on a deterministic MDP is evaluated on its functional graph,
         in O(S), exactly up to rounding, whatever the tolerance.
@@ -53,7 +52,7 @@ def evaluate_policy(
         policy = policy.policy_table()
     watch = Stopwatch()
     select = PolicyTable.of(mdp, policy)
-    sharing = DistributedOptions(processes, jacobi, checkpoint)
+    sharing = DistributedOptions(processes, checkpoint)
     if select.actions is not None and mdp.is_deterministic and horizon is None and not sharing.is_wanted:
         return _on_its_graph(mdp, select, watch)
     return solution_of(mdp, select, tolerance, horizon, sharing=sharing)

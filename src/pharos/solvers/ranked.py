@@ -6,13 +6,13 @@ every new entry is a backup of entries that are old or already new, which is all
 asks for: it holds with the largest change of all. Values cross the border of a range once a sweep, so there are more
 sweeps than in one process: a Breakout of 2.4 million states takes 33 in one, 38 in two, 55 in four, 111 in sixteen.
 
-Jacobi sweeps, not in place, and those of a horizon are the same to the last bit whatever the number of ranks: each
-state is backed up by one rank, from the same values in the same order.
+Sweeps of a horizon are not in place, and the same to the last bit whatever the number of ranks: each state is backed up
+by one rank, from the same values in the same order.
 
-Messages travel while ranks sweep. A Jacobi sweep begins with the states that others read, sends them, and goes on with
-the rest. In place the order is what makes sweeps few, and must stay: along it values come from the halo to the states
-that others read in a single sweep. So what others read of the high states of a range, all but its lowest eighth, is
-sent once these are done, and the rest in the end, which changes no value. Any other order hides more and costs sweeps:
+Messages travel while ranks sweep. A sweep of a horizon begins with the states that others read, sends them, and goes on
+with the rest. In place the order is what makes sweeps few, and must stay: along it values come from the halo to the
+states that others read in a single sweep. So what others read of the high states of a range, all but its lowest eighth,
+is sent once these are done, and the rest in the end, which changes no value. Other orders hide more, for more sweeps:
 on that Breakout in 2, 4 and 16 ranks the states that read no halo before the others take 89, 212 and 278, the states
 that others read before the rest 240, 231 and 284, and a halo that is one sweep older 49, 96 and 208.
 
@@ -49,8 +49,8 @@ class RankedBackup:
 
     Attributes:
         part: the states of this rank. backup: T on them; its factor and its rounding are those of the whole MDP.
-        x: (n + H + 1, W) values, see mdp/part.py. previous: those before the last sweep that was not in place.
-        first: (R, 2) runs of its states that a Jacobi sweep begins with: those that others read, and between them.
+        x: (n + H + 1, W) values, see mdp/part.py. previous: those before the last sweep of a horizon.
+        first: (R, 2) runs of its states that sweeps of a horizon begin with: those that others read, and between them.
     """
 
     def __init__(self, mdp: TabularMDP, select: Selection, rank: Rank):
@@ -89,10 +89,10 @@ class RankedBackup:
         halo.send_low(x)
         return change
 
-    def plain_sweep(self) -> float:
-        """The same, not in place."""
-        halo, x, new, own = self._halo, self.x, self.previous, len(self.part)
-        change, dynamics, equation = 0.0, self.part.dynamics, self.backup.equation
+    def plain_sweep(self) -> None:
+        """Replace them not in place, and keep those before as `previous`."""
+        halo, x, new = self._halo, self.x, self.previous
+        dynamics, equation = self.part.dynamics, self.backup.equation
         halo.receive(new)
         with np.errstate(over="ignore", invalid="ignore"):
             dynamics.backup(equation, x, new, self.first)
@@ -100,11 +100,7 @@ class RankedBackup:
             for runs in self._rest:
                 dynamics.backup(equation, x, new, runs)
                 self.rank.progress()
-            for start in range(0, own, _ROWS):
-                rows = slice(start, min(start + _ROWS, own))
-                change = _larger(change, np.abs(new[rows] - x[rows]).max(initial=0.0))
         self.x, self.previous = new, x
-        return change
 
     def share(self, *numbers: float) -> np.ndarray:
         """Get the values of the halo after a sweep. Returns (P, K), the numbers of each rank."""
@@ -170,7 +166,6 @@ def _mixed(numbers: np.ndarray) -> np.ndarray:
 def ranked_fixed_point(
     backup: RankedBackup,
     tolerance: float,
-    jacobi: bool,
     checkpoint: Checkpoint,
     progress: Callable[[int, float], None] | None,
 ) -> tuple[float, int]:
@@ -189,7 +184,7 @@ def ranked_fixed_point(
     convergence = Convergence(mdp, backup.backup, tolerance, of_first)
     convergence.sweeps = checkpoint.start(backup)
     while True:
-        change = backup.plain_sweep() if jacobi else backup.sweep()
+        change = backup.sweep()
         largest = largest_of(backup.x[: len(backup.part)])
         numbers = backup.share(change, largest, checkpoint.is_due(backup))
         change, largest, is_due = map(float, numbers.max(axis=0))

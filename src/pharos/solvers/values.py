@@ -30,7 +30,6 @@ def value_iteration(
     progress: Callable[[int, float], None] | None = None,
     values: str | os.PathLike | None = None,
     processes: int | str = 1,
-    jacobi: bool = False,
     checkpoint: str | os.PathLike | None = None,
     threads: int = 1,
     dtype: Any = "float64",
@@ -50,8 +49,6 @@ def value_iteration(
         values: a file (.npy) that holds the values while they are computed, in place of memory, and afterwards; what
             it holds already is where the sweeps begin, so that a solve that was killed goes on. None: memory, or
             where that has little room a file without a name.
-        jacobi: sweeps that are not in place, many times as many: their values are the same to the last bit whatever the
-            number of processes. Those of a horizon are so anyway.
         dtype: "float32" stores values in half of the memory; the bound counts what that costs, so that a tolerance
             below 1.2e-7 max |V| / (1 - gamma) is out of reach. For one process, and no horizon.
         blocks: ranges of states that are swept one after another, each some times in a row and as long as its own bound
@@ -61,7 +58,7 @@ def value_iteration(
         Cost only:
         processes: of this machine, each of which sweeps a range of the states; or "mpi": those that `mpiexec` has
             started, all of which make this call; the first gets the Solution, the others None. Values depend on it
-            within the tolerance.
+            within the tolerance; those of a horizon do not.
         checkpoint: a folder for the values so far, once a minute, so that the same call goes on where one was killed,
             with any number of processes.
         threads: that share the states of a sweep in this process, where no action is sticky and transitions are in
@@ -80,7 +77,7 @@ def value_iteration(
         action) times actions are up to 2 million (up to 500 MB then), or nodes are up to 3000.
     Source: Bellman (1957); in place: Puterman (1994), section 6.3.3; the sticky equation: the pharos paper, appendix A.
     """
-    sharing = DistributedOptions(processes, jacobi, checkpoint)
+    sharing = DistributedOptions(processes, checkpoint)
     storage: dict[str, Any] = {"values": values, "threads": threads, "dtype": dtype, "blocks": blocks}
     return solution_of(mdp, BEST, tolerance, horizon, keep_all, progress, sharing=sharing, **storage)
 
@@ -92,11 +89,10 @@ def worst_value(
     *,
     horizon: int | None = None,
     processes: int | str = 1,
-    jacobi: bool = False,
     checkpoint: str | os.PathLike | None = None,
 ) -> Solution:
     """The values of the worst policy: as `value_iteration`, minimising."""
-    return solution_of(mdp, WORST, tolerance, horizon, sharing=DistributedOptions(processes, jacobi, checkpoint))
+    return solution_of(mdp, WORST, tolerance, horizon, sharing=DistributedOptions(processes, checkpoint))
 
 
 @require_mdp
@@ -108,7 +104,6 @@ def uniform_value(
     progress: Callable[[int, float], None] | None = None,
     values: str | os.PathLike | None = None,
     processes: int | str = 1,
-    jacobi: bool = False,
     checkpoint: str | os.PathLike | None = None,
     threads: int = 1,
     dtype: Any = "float64",
@@ -118,7 +113,7 @@ def uniform_value(
 
     The arguments are those of `value_iteration`.
     """
-    sharing = DistributedOptions(processes, jacobi, checkpoint)
+    sharing = DistributedOptions(processes, checkpoint)
     mdp = random_actions(mdp, 1.0)
     storage: dict[str, Any] = {"values": values, "threads": threads, "dtype": dtype, "blocks": blocks}
     return solution_of(mdp, BEST, tolerance, horizon, progress=progress, sharing=sharing, **storage)
