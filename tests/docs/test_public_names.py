@@ -3,6 +3,7 @@
 import ast
 import functools
 import importlib
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -12,6 +13,8 @@ import pytest
 import pharos
 
 SOURCE = Path(pharos.__file__).parent
+ROOT = Path(__file__).parents[2]
+PACKAGES = sorted(path.parent.name for path in SOURCE.glob("*/__init__.py"))
 
 CONTRACT = (
     ("pharos", "make list_environments check_environment Environment build load StateSpace"),
@@ -115,7 +118,7 @@ def test_nobody_imports_another_packages_modules():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("package", sorted(path.parent.name for path in SOURCE.glob("*/__init__.py")))
+@pytest.mark.parametrize("package", PACKAGES)
 def test_a_package_has_what_it_announces(package):
     module = importlib.import_module(f"pharos.{package}")
     files = {path.stem for path in (SOURCE / package).glob("*.py")}
@@ -186,11 +189,55 @@ def test_an_import_is_seen_however_it_is_written(line, expected):
 
 @functools.cache
 def announced(package: str) -> frozenset[str]:
-    """`__all__` of a package of pharos, read from its text; of a single module every name."""
+    """Names of a package for users (`__all__`) and for other packages (`_shared`), read from its text."""
     file = SOURCE / package / "__init__.py"
-    if not file.exists():
-        return frozenset()
-    for node in ast.parse(file.read_text()).body:
-        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "__all__":
-            return frozenset(ast.literal_eval(node.value))
-    return frozenset()
+    return frozenset().union(*lists_of(file.read_text()).values()) if file.exists() else frozenset()
+
+
+def lists_of(text: str) -> dict[str, list[str]]:
+    """`__all__` of a package, and its second list: words in a string."""
+    lists = {"__all__": [], "_shared": []}
+    for node in ast.parse(text).body:
+        if isinstance(node, ast.Assign) and (name := ast.unparse(node.targets[0])) in lists:
+            value = ast.literal_eval(node.value)
+            lists[name] = value.split() if isinstance(value, str) else value
+    return lists
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_what_a_package_imports_of_its_own_is_on_one_of_its_lists(package):
+    text = (SOURCE / package / "__init__.py").read_text()
+    imported = [
+        alias.asname or alias.name
+        for node in ast.walk(ast.parse(text))
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("pharos.")
+        for alias in node.names
+        if node.module != "pharos.system" and not (alias.asname or "").startswith("_")
+    ]
+    public, shared = lists_of(text).values()
+    assert set(imported) <= {*public, *shared} and shared == sorted(shared) and not {*public} & {*shared}
+    assert package in WITHOUT_FACADE or public or shared
+
+
+def test_what_pages_for_users_name_is_public():
+    """`hardness.diameter(` and `from pharos.training import Task` in a page: both are in `__all__`."""
+    folders = [ROOT / "docs" / folder for folder in (".", "tutorials", "examples", "studies", "tuning")]
+    pages = [ROOT / "README.md", *(path for folder in folders for path in folder.glob("*.*"))]
+    hidden, seen = set(), 0
+    for page in pages:
+        if page.suffix not in (".md", ".ipynb", ".py") or page.name == "how-it-works.md":
+            continue
+        for package, name in names_in(page.read_text()):
+            public, shared = lists_of((SOURCE / package / "__init__.py").read_text()).values()
+            seen += name in public
+            if name in shared:
+                hidden.add(f"{page.name}: {package}.{name}")
+    assert not hidden and seen > 50
+
+
+def names_in(text: str) -> list[tuple[str, str]]:
+    """(package, name) of what a page takes from packages of pharos, in code of any language."""
+    found = [each for each in re.findall(r"\b(\w+)\.(\w+)\b", text) if each[0] in PACKAGES]
+    for package, names in re.findall(r"from pharos\.(\w+) import ([\w, ]+)", text):
+        found += [(package, name.split()[0]) for name in names.split(",") if package in PACKAGES]
+    return found

@@ -11,21 +11,10 @@ from pharos.agents.q_learning import QLearning
 from pharos.agents.states import joined_states, state_of
 
 __all__ = [
-    "AGENTS",
-    "BATCHED",
-    "Q_LEARNING_DEFAULTS",
-    "TABULAR_OBSERVATION",
-    "AgentKind",
     "QLearning",
-    "agent_kind",
-    "agent_source",
-    "algorithm",
-    "batched",
-    "check_hyperparameters",
-    "extractor",
     "hyperparameters",
-    "is_known",
-    "joined_states",
-    "make_model",
-    "state_of",
 ]
+_shared = """
+    AGENTS AgentKind BATCHED Q_LEARNING_DEFAULTS TABULAR_OBSERVATION agent_kind agent_source algorithm batched
+    check_hyperparameters extractor is_known joined_states make_model state_of
+"""

@@ -6,4 +6,7 @@ parameters are wrong; 1 where it failed; 130 where it was interrupted; with one 
 
 from pharos.cli.app import app, main
 
-__all__ = ["app", "main"]
+__all__ = [
+    "app",
+    "main",
+]

@@ -44,29 +44,17 @@ _FILES = {
 
 __all__ = [
     "GROUNDS",
-    "INK",
-    "NIGHT",
     "SHAPES",
-    "Window",
-    "check_state",
-    "color_of",
-    "colored_text",
     "episode",
-    "glyph_of",
-    "ground_of",
     "human",
     "image",
-    "inside",
-    "planes_of",
     "save_gif",
     "save_png",
-    "scenery_of",
-    "shade",
-    "shape_of",
-    "sprite_of",
-    "sprite_pixels",
     "text_drawing",
-    "tile",
 ]
+_shared = """
+    INK NIGHT Window check_state color_of colored_text glyph_of ground_of inside planes_of scenery_of shade shape_of
+    sprite_of sprite_pixels tile
+"""
 
 __getattr__ = lazy.attributes(__name__, _FILES)

@@ -93,17 +93,14 @@ _FILES = {
 }
 
 __all__ = [
-    "BUILT_IN",
     "CELL",
     "CELLS",
     "VALUED_CELLS",
     "Blackjack",
     "Breakout",
-    "BuiltIn",
     "Catch",
     "CliffWalking",
     "Color",
-    "Components",
     "CornerGrid",
     "DeepSea",
     "DiscountingChain",
@@ -133,22 +130,16 @@ __all__ = [
     "State",
     "Taxi",
     "UmbrellaChain",
-    "as_tuples",
-    "class_called",
-    "class_of",
     "classes",
-    "declared_parameters",
-    "imported",
-    "integers",
     "list_environments",
     "make",
     "named_instances",
-    "on_registration",
-    "one_of",
     "parameter",
     "register",
-    "source_of",
-    "start_distribution",
 ]
+_shared = """
+    BUILT_IN BuiltIn Components as_tuples class_called class_of declared_parameters imported integers
+    on_registration one_of source_of start_distribution
+"""
 
 __getattr__ = lazy.attributes(__name__, _FILES)

@@ -31,18 +31,10 @@ _FILES = {
 }
 
 __all__ = [
-    "ARROWS",
-    "Exploration",
-    "Explorer",
-    "Learnt",
-    "Server",
-    "contents",
-    "exploration_of",
     "explore",
-    "keys_of",
-    "open_browser",
-    "page",
-    "write",
 ]
+_shared = """
+    ARROWS Exploration Explorer Learnt Server contents exploration_of keys_of open_browser page write
+"""
 
 __getattr__ = lazy.attributes(__name__, _FILES)

@@ -4,4 +4,8 @@ from pharos.exporters.bridge import bridge
 from pharos.exporters.drn import drn
 from pharos.exporters.gymnasium import gym_p
 
-__all__ = ["bridge", "drn", "gym_p"]
+__all__ = [
+    "bridge",
+    "drn",
+    "gym_p",
+]

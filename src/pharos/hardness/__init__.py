@@ -5,7 +5,7 @@ Visitation complexity: `diameter`, `start_eccentricity`, `covering`. Estimation 
 `report`; one of your own: `register`.
 """
 
-from pharos.hardness import built_in as _built_in  # noqa: F401  (registers the measures; the order of a report)
+from pharos.hardness import built_in as _built_in  # registers the measures; the order of a report
 from pharos.hardness.distances.colosseum import colosseum_diameter
 from pharos.hardness.distances.diameter import diameter, start_eccentricity, start_eccentricity_interval
 from pharos.hardness.gaps.action_gap import ActionGapRegularity, action_gap_regularity
@@ -38,7 +38,6 @@ from pharos.hardness.visitation.occupancy import Occupancy, discounted_visits, o
 __all__ = [
     "ActionGapRegularity",
     "Budget",
-    "Certificate",
     "Certified",
     "Covering",
     "EffectiveHorizon",
@@ -53,7 +52,6 @@ __all__ = [
     "MixingTime",
     "Occupancy",
     "Problem",
-    "Progress",
     "Report",
     "Representation",
     "Result",
@@ -66,11 +64,9 @@ __all__ = [
     "StationaryHorizon",
     "action_gap_regularity",
     "aliasing_floor",
-    "chosen",
     "colosseum_diameter",
     "covering",
     "diameter",
-    "discounted_visits",
     "distribution_mismatch",
     "effective_horizon",
     "environmental_value_norm",
@@ -95,3 +91,6 @@ __all__ = [
     "stationary_effective_horizon",
     "sum_of_reciprocal_gaps",
 ]
+_shared = """
+    Certificate Progress chosen discounted_visits
+"""

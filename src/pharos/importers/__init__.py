@@ -10,20 +10,19 @@ from pharos.importers.minigrid import minigrid, minigrid_grids, minigrid_recordi
 from pharos.importers.storm import storm, storm_recording
 
 __all__ = [
-    "Outcomes",
     "bridge",
     "bridge_screens",
     "environment",
     "gymnasium",
     "gymnasium_outcomes",
-    "has_screens",
-    "is_folder",
     "load",
     "matrices",
     "minigrid",
     "minigrid_grids",
-    "minigrid_recording",
     "save",
     "storm",
     "storm_recording",
 ]
+_shared = """
+    Outcomes has_screens is_folder minigrid_recording
+"""

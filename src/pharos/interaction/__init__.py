@@ -31,16 +31,14 @@ _FILES = {
 
 __all__ = [
     "GymEnv",
-    "Interaction",
     "SB3VecEnv",
-    "Simulator",
     "VectorEnv",
-    "ids_of",
     "make_sb3_vec",
     "make_vec",
-    "register_class",
-    "split_options",
     "to_gymnax",
 ]
+_shared = """
+    Interaction Simulator ids_of register_class split_options
+"""
 
 __getattr__ = lazy.attributes(__name__, _FILES)

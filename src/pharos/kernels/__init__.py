@@ -11,44 +11,9 @@ compiling.prepare(Path(__file__).parent)
 
 from pharos.kernels import packed_indices  # noqa: E402  (it loads Numba, which reads where to keep compiled code)
 
-__all__ = [
-    "batched_learning",
-    "batched_rollouts",
-    "batched_worlds",
-    "bellman",
-    "clocks",
-    "components",
-    "dense_search",
-    "disk_table",
-    "distance_sweeps",
-    "elimination",
-    "gaps",
-    "graph",
-    "hash_table",
-    "hitting",
-    "horizon",
-    "key_owner",
-    "krylov",
-    "landmarks",
-    "learning",
-    "many_searches",
-    "observation_kernels",
-    "occupancy",
-    "outcomes",
-    "packed_indices",
-    "packing",
-    "palettes",
-    "partition",
-    "paths",
-    "philox",
-    "refinement",
-    "sampled_learning",
-    "stepping",
-    "symmetric",
-    "symmetry",
-    "tails",
-    "tangent",
-    "ties",
-    "travel",
-    "vicinity",
-]
+_shared = """
+    batched_learning batched_rollouts batched_worlds bellman clocks components dense_search disk_table
+    distance_sweeps elimination gaps graph hash_table hitting horizon key_owner krylov landmarks learning
+    many_searches observation_kernels occupancy outcomes packed_indices packing palettes partition paths philox
+    refinement sampled_learning stepping symmetric symmetry tails tangent ties travel vicinity
+"""

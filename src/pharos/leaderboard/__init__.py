@@ -5,4 +5,15 @@ from pharos.leaderboard.entry import Claim, Entry, read
 from pharos.leaderboard.submission import submit
 from pharos.leaderboard.verification import Check, Verdict, verify
 
-__all__ = ["Check", "Claim", "Entry", "Verdict", "board", "read", "reason", "submit", "verify"]
+__all__ = [
+    "Claim",
+    "Entry",
+    "Verdict",
+    "board",
+    "read",
+    "submit",
+    "verify",
+]
+_shared = """
+    Check reason
+"""

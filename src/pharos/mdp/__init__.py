@@ -69,41 +69,20 @@ _FILES = {
 }
 
 __all__ = [
-    "BEST",
-    "WORST",
-    "BellmanEquation",
     "Chance",
-    "Dynamics",
-    "Extreme",
-    "Lazy",
-    "Matrices",
     "Minimization",
-    "OutcomeTable",
-    "Outcomes",
     "PaidOutcomes",
-    "Part",
-    "PolicyStep",
-    "PolicyTable",
-    "Rewards",
-    "Selection",
-    "Table",
     "TabularMDP",
-    "chosen_mass",
-    "count_of",
     "lazy_actions",
-    "mass_of",
     "minimize",
     "paid_outcomes",
     "random_actions",
-    "ranged_rewards",
-    "require_mdp",
-    "rewards_of_outcomes",
-    "rewards_of_space",
-    "rewards_of_staying",
-    "runs_between",
-    "runs_of",
-    "shares_of",
     "sticky_actions",
 ]
+_shared = """
+    BEST BellmanEquation Dynamics Extreme Lazy Matrices OutcomeTable Outcomes Part PolicyStep PolicyTable Rewards
+    Selection Table WORST chosen_mass count_of mass_of ranged_rewards require_mdp rewards_of_outcomes
+    rewards_of_space rewards_of_staying runs_between runs_of shares_of
+"""
 
 __getattr__ = lazy.attributes(__name__, _FILES)

@@ -67,43 +67,24 @@ _FILES = {
 }
 
 __all__ = [
-    "NO_ACTION",
-    "RENDERERS",
     "Aliasing",
-    "ComplexImage",
-    "FunctionObservation",
-    "Hash",
-    "Index",
     "MemorylessLoss",
     "Network",
     "Observation",
-    "ObservationInContext",
-    "OneHot",
-    "OwnObservation",
-    "SimpleImage",
-    "Vector",
     "aliasing",
-    "counted",
-    "default_network",
     "empirical_ntk",
     "history_aliasing",
-    "imported",
-    "in_blocks",
     "memoryless_loss",
-    "names",
-    "network_inputs",
     "ntk",
     "observation_classes",
-    "observation_of",
     "observe",
-    "own_observation",
     "register",
-    "registered",
-    "render",
-    "renderers",
     "representation",
-    "tangent_kernel",
-    "title",
 ]
+_shared = """
+    ComplexImage FunctionObservation Hash Index NO_ACTION ObservationInContext OneHot OwnObservation RENDERERS
+    SimpleImage Vector counted default_network imported in_blocks names network_inputs observation_of
+    own_observation registered render renderers tangent_kernel title
+"""
 
 __getattr__ = lazy.attributes(__name__, _FILES)

@@ -11,4 +11,12 @@ from pharos.plots.policies import policies
 from pharos.plots.regret import regret
 from pharos.plots.style import save
 
-__all__ = ["growth", "hardness_plane", "policies", "regret", "save", "states_by_depth", "value_map"]
+__all__ = [
+    "growth",
+    "hardness_plane",
+    "policies",
+    "regret",
+    "save",
+    "states_by_depth",
+    "value_map",
+]

@@ -14,24 +14,12 @@ from pharos.policies.value import (
 )
 
 __all__ = [
-    "DeepPolicy",
     "Evaluation",
-    "Model",
     "Policy",
-    "PolicyAnswers",
     "PolicyLike",
-    "QueriedPolicy",
-    "ReachableRows",
-    "ReachedSolution",
-    "Sight",
-    "TableAnswers",
-    "TabularAgent",
     "evaluate_policy",
-    "is_small_table",
-    "is_walk",
-    "policy_function",
-    "policy_value",
-    "reachable_rows",
-    "table_values",
-    "walk_values",
 ]
+_shared = """
+    DeepPolicy Model PolicyAnswers QueriedPolicy ReachableRows ReachedSolution Sight TableAnswers TabularAgent
+    is_small_table is_walk policy_function policy_value reachable_rows table_values walk_values
+"""

@@ -7,16 +7,6 @@ from pharos.ranks.processes import processes
 from pharos.ranks.rank import Rank, RankFailed
 from pharos.ranks.together import check_number, check_ranks, together
 
-__all__ = [
-    "Halo",
-    "Rank",
-    "RankFailed",
-    "check_number",
-    "check_ranks",
-    "cuts_of",
-    "launched",
-    "loop",
-    "mpi_rank",
-    "processes",
-    "together",
-]
+_shared = """
+    Halo Rank RankFailed check_number check_ranks cuts_of launched loop mpi_rank processes together
+"""

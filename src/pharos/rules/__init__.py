@@ -28,21 +28,9 @@ _LAZY = {
     "rules_of": "rules",
 }
 
-__all__ = [
-    "CompiledDrawing",
-    "CompiledExploration",
-    "CompiledMotion",
-    "InterpretedStepping",
-    "Layout",
-    "Rules",
-    "fingerprint_of_rules",
-    "layout_of",
-    "not_compiled",
-    "pack",
-    "reason_of",
-    "refused_reward",
-    "rules_of",
-    "unpack",
-]
+_shared = """
+    CompiledDrawing CompiledExploration CompiledMotion InterpretedStepping Layout Rules fingerprint_of_rules
+    layout_of not_compiled pack reason_of refused_reward rules_of unpack
+"""
 
 __getattr__ = lazy.attributes(__name__, _LAZY)

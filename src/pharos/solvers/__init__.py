@@ -6,15 +6,12 @@ from pharos.solvers.solution import Solution
 from pharos.solvers.values import uniform_value, value_iteration, worst_value
 
 __all__ = [
-    "ReferenceValues",
     "Solution",
-    "cumulative_expected_regret",
-    "evaluate_apart",
     "evaluate_policy",
-    "regret",
-    "regret_scale",
-    "uniform_policy",
     "uniform_value",
     "value_iteration",
     "worst_value",
 ]
+_shared = """
+    ReferenceValues cumulative_expected_regret evaluate_apart regret regret_scale uniform_policy
+"""

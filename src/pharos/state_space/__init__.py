@@ -9,8 +9,8 @@ __all__ = [
     "BuildProgress",
     "StateSpace",
     "build",
-    "cached_folder",
-    "is_of_state_space",
     "load",
-    "read_manifest",
 ]
+_shared = """
+    cached_folder is_of_state_space read_manifest
+"""

@@ -28,16 +28,11 @@ from pharos.study.tables import cells, curves, hardness_table, paper_instance, t
 from pharos.training import run_id
 
 __all__ = [
-    "LOGGERS",
-    "POLICY_PREDICTORS",
-    "PREDICTORS",
     "Comparison",
     "Estimate",
     "Fit",
-    "Forecast",
     "Models",
     "Run",
-    "RunLog",
     "Specification",
     "Status",
     "StudyReport",
@@ -51,25 +46,15 @@ __all__ = [
     "fit_models",
     "hardness_table",
     "interquartile_mean",
-    "intervals",
-    "leave_one_class_out_r_squared",
     "log",
     "mean_curve",
     "models",
-    "opened",
     "outcomes",
     "pack",
-    "paper_agreement",
-    "paper_instance",
-    "paper_regressions",
-    "paper_returns",
     "predict",
     "presets",
-    "read_predictions",
     "report",
     "run",
-    "run_id",
-    "run_on_ray",
     "specification",
     "status",
     "stratified_interval",
@@ -77,5 +62,9 @@ __all__ = [
     "table",
     "unpack",
     "validation",
-    "write_predictions",
 ]
+_shared = """
+    Forecast LOGGERS POLICY_PREDICTORS PREDICTORS RunLog intervals leave_one_class_out_r_squared opened
+    paper_agreement paper_instance paper_regressions paper_returns read_predictions run_id run_on_ray
+    write_predictions
+"""

@@ -23,40 +23,26 @@ from pharos.training.train import train, train_config, train_many
 from pharos.training.tuning import SPACES, TuningResult, tune
 
 __all__ = [
-    "ENGINES",
-    "SPACES",
     "ChanceSetting",
     "Evaluation",
-    "FailedRun",
     "Horizon",
-    "Progress",
     "ReferenceValues",
     "RegretCurve",
     "RunConfig",
     "Task",
-    "TaskCache",
-    "TaskValues",
     "TrainingResult",
     "TuningResult",
-    "bootstrap_interval",
-    "check_agent",
     "cumulative_expected_regret",
-    "digest_of_curve",
     "evaluate_agent",
     "load_agent",
-    "read_curve",
-    "read_curve_table",
-    "read_record",
-    "read_rows",
-    "read_table",
     "regret",
-    "run_id",
-    "steps_in_seconds",
     "train",
     "train_config",
     "train_configs",
     "train_many",
     "tune",
-    "write_record",
-    "write_table",
 ]
+_shared = """
+    ENGINES FailedRun Progress SPACES TaskCache TaskValues bootstrap_interval check_agent digest_of_curve read_curve
+    read_curve_table read_record read_rows read_table run_id steps_in_seconds write_record write_table
+"""
