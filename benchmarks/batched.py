@@ -72,7 +72,7 @@ def speed(contestant, seconds: float, unit: int) -> float:
     return done * contestant.runs / (time.process_time() - began)
 
 
-def work(agent: str, task: Task, options: dict, lane) -> float:
+def work(agent: str, options: dict, lane) -> float:
     """FLOP of an agent-step by the networks: 2 a weight and sample forwards, 4 backwards (2 in the first layer)."""
     forward = first = 0.0
     for each in lane.network.parameters.shapes:
@@ -125,7 +125,7 @@ class Case:
         self.name, self.runs = f"{agent} {observation}{f' x{frames}' if frames > 1 else ''}", RUNS[observation]
         self.unit = options["n_envs"] * options["n_steps"] if agent == "ppo" else 200
         self.pair = [kind(agent, task, options, self.runs) for kind in (Alone, Together)]
-        self.flop = work(agent, task, options, self.pair[1].batch.lanes[0])
+        self.flop = work(agent, options, self.pair[1].batch.lanes[0])
         warm = max(2 * self.unit, options.get("learning_starts", 0) + 200)
         for contestant in self.pair:
             contestant.learn(-(-warm // self.unit) * self.unit)

@@ -47,7 +47,7 @@ def stage() -> Path:
         if name not in pages:
             pages[name] = relinked((ROOT / source).read_text(encoding="utf-8"), Path(source), name)
     generated = {
-        "environments": site_pages.environments(files),
+        "environments": site_pages.environments(),
         "api": site_pages.reference(),
         "tutorials": site_pages.tutorials(DOCS / "tutorials"),
         "decisions": site_pages.decisions(DOCS / "decisions"),

@@ -101,7 +101,7 @@ PACKAGES = {  # page of the reference -> (title, module)
 # Environments ---------------------------------------------------------------------------------------------------------
 
 
-def environments(files: Mapping[str, Path]) -> dict[str, str]:
+def environments() -> dict[str, str]:
     """A page for each class, and one that shows them all."""
     stored = json.loads((DOCS / "environments.json").read_text())
     gallery = sections_of((DOCS / "gallery.md").read_text())
@@ -338,7 +338,7 @@ def reference() -> dict[str, str]:
         entries, worlds = [], []
         for name in published(module):
             value = getattr(module, name)
-            home = home_of(value, module_name, name)
+            home = home_of(value)
             if home is None:
                 continue
             if value in pages_of_classes:
@@ -365,7 +365,7 @@ def published(module) -> list[str]:
     return [name for name in names if not name.startswith("_") and not inspect.ismodule(getattr(module, name))]
 
 
-def home_of(value, module_name: str, name: str) -> str | None:
+def home_of(value) -> str | None:
     """Where a function or class is defined; None for values."""
     value = inspect.unwrap(value) if callable(value) else value
     if not (inspect.isclass(value) or inspect.isfunction(value)):

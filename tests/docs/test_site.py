@@ -135,7 +135,7 @@ def test_stored_values_are_in_order():
 
 
 def test_every_environment_has_a_page(scripts):
-    pages = scripts("site_pages").environments({})
+    pages = scripts("site_pages").environments()
     for name in (entry.name for entry in BUILT_IN):
         cls = class_called(name)
         page = pages[f"environments/{name}.md"]
@@ -149,7 +149,7 @@ def test_every_environment_has_a_page(scripts):
 
 @pytest.mark.slow
 def test_no_cell_of_the_numbers_is_empty_and_what_was_not_enumerated_says_so(scripts):
-    pages = scripts("site_pages").environments({})
+    pages = scripts("site_pages").environments()
     for page in pages.values():
         for line in page.partition("## Named instances")[2].partition("\n## ")[0].splitlines():
             assert not line.startswith("|") or all(cell.strip() for cell in line.split("|")[1:-1]), line

@@ -44,6 +44,13 @@ def test_no_package_outgrows_its_limit(size):
     assert not limits().keys() - lines.keys(), "the page has limits of packages that are gone"
 
 
+@pytest.mark.slow
+def test_annotations_that_are_plain_any_become_fewer(size):
+    count = sum(size.plain_any(size.tree_of(path)) for paths in size.files_of(ROOT).values() for path in paths)
+    limit = int(re.search(r"At most (\d+) annotations are plain `Any`", PAGE.read_text())[1])
+    assert limit / ROOM <= count <= limit, f"{count} plain `Any`: give a type, or lower the limit of {PAGE.name}"
+
+
 def test_a_package_may_outgrow_its_limit_by_a_twentieth():
     assert not outgrown({"mdp": 105}, {"mdp": 100})
     assert outgrown({"mdp": 106}, {"mdp": 100}) == [

@@ -60,7 +60,7 @@ class Explorer:
         return f"Explorer({self.exploration.title}, {self.url})"
 
 
-def explore(
+def explore(  # noqa: PLR0913
     target: str | os.PathLike | Environment | StateSpace | TabularMDP,
     *,
     policy: PolicyLike | None = None,

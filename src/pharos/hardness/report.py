@@ -109,7 +109,7 @@ class Report:
 
 
 @require_mdp
-def report(
+def report(  # noqa: PLR0913
     mdp: TabularMDP,
     measures: str | Iterable[str] | None = None,
     *,

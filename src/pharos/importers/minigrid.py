@@ -4,7 +4,7 @@ Source: Chevalier-Boisvert et al. (2023), "Minigrid & Miniworld".
 """
 
 import io
-import pickle
+import pickle  # noqa: TID251  (to copy an environment of the caller)
 from collections.abc import Iterator, Sequence
 from typing import Any
 

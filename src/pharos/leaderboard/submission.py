@@ -124,7 +124,7 @@ def _network(run: Path) -> dict[str, np.ndarray]:
         raise MissingExtra("reading what a network has learnt", "torch", "agents") from error
     file = run / "agent" / "parameters.pt"
     try:
-        stored: dict[str, Any] = torch.load(file, weights_only=True, map_location="cpu")["policy"]
+        stored: dict[str, Any] = torch.load(file, weights_only=True, map_location="cpu")["policy"]  # noqa: TID251
         return {name: tensor.numpy() for name, tensor in sorted(stored.items())}
     except Exception as error:  # torch has many
         raise ResultCorrupted(f"{file}: cannot be read: {' '.join(str(error).split())[:200]}") from None

@@ -6,7 +6,7 @@ is noticed by a checksum: a damaged file is deleted, and the kernel is compiled 
 
 import contextlib
 import hashlib
-import pickle
+import pickle  # noqa: TID251  (a folder that is private to its user)
 import sys
 from pathlib import Path
 from typing import Any

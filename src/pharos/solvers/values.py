@@ -21,7 +21,7 @@ _ROWS = 1 << 22
 
 
 @require_mdp
-def value_iteration(
+def value_iteration(  # noqa: PLR0913
     mdp: TabularMDP,
     tolerance: float = 1e-6,
     *,
@@ -119,7 +119,7 @@ def uniform_value(
     return solution_of(mdp, BEST, tolerance, horizon, progress=progress, sharing=sharing, **storage)
 
 
-def solution_of(
+def solution_of(  # noqa: PLR0913
     mdp: TabularMDP,
     select: Selection,
     tolerance: float,

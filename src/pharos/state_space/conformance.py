@@ -86,7 +86,7 @@ def check_environment(env: Environment, *, max_states: int = 1000, seed: int = 0
             check.drawing(state)
     compiled = _check_compiled(env, check, states, notes)
     if complete:
-        _check_built(env, check, states, notes)
+        _check_built(env, check, states)
     _note_unseen_values(env, states, complete, notes)
     return Conformance(
         environment=str(env),
@@ -262,7 +262,7 @@ def _check_compiled_drawings(check: InterpretedCheck, states: list[State], notes
             )
 
 
-def _check_built(env: Environment, check: InterpretedCheck, states: list[State], notes: list[str]) -> None:
+def _check_built(env: Environment, check: InterpretedCheck, states: list[State]) -> None:
     """Build the state space and compare it with the states found: same numbers, terminal states absorbing."""
     from pharos.state_space import build
 

@@ -66,7 +66,7 @@ def shard_of(runs: Sequence[Run], shard: str | tuple[int, int] | None) -> tuple[
     return tuple(runs[part - 1 :: parts])
 
 
-def run(
+def run(  # noqa: PLR0913
     source: Source,
     folder: str | os.PathLike | None = None,
     *,

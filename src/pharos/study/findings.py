@@ -258,7 +258,7 @@ def _vectors_explained_better(models: Models, resamples: int) -> dict[str, Any]:
         return _nothing(finding, "all", paper, f"{len(tasks)} tasks with both; needs 10")
     vectors, images = (np.array([fit.tasks.index(task) for task in tasks]) for fit in (vector, image))
 
-    def difference(drawn: np.ndarray, axis: int) -> np.ndarray:
+    def difference(drawn: np.ndarray, axis: int) -> np.ndarray:  # noqa: ARG001  (SciPy gives it, always the last)
         draws = drawn.astype(int).reshape(-1, drawn.shape[-1])
         values = [_r_squared(vector, vectors[draw]) - _r_squared(image, images[draw]) for draw in draws]
         return np.nan_to_num(np.array(values)).reshape(drawn.shape[:-1])

@@ -247,7 +247,7 @@ class Deep:
 
         model = self.model
         with _said_to_be_damaged(folder):
-            parameters = torch.load(folder / "parameters.pt", weights_only=True)
+            parameters = torch.load(folder / "parameters.pt", weights_only=True)  # noqa: TID251
             if set(parameters) == {"policy"}:  # of the batched engine: what was learnt, without an optimiser
                 model.policy.load_state_dict(parameters["policy"])
             else:

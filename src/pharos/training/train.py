@@ -29,7 +29,7 @@ from pharos.training.task_cache import FailedRun, TaskCache
 RunProgress = Callable[[int, int, Mapping[str, Any]], None]
 
 
-def train(
+def train(  # noqa: PLR0913
     agent: str,
     environment: Environment | str,
     *,
@@ -83,7 +83,7 @@ def train(
     return _train(config, members, None if out is None else Path(out), progress, tensorboard)
 
 
-def train_many(
+def train_many(  # noqa: PLR0913
     agent: str,
     environment: Environment | str,
     *,

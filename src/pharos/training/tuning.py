@@ -104,7 +104,7 @@ class TuningResult:
     folder: Path | None
 
 
-def tune(
+def tune(  # noqa: PLR0913
     agent: str,
     environments: Environment | str | Sequence[Environment | str],
     *,

@@ -248,7 +248,7 @@ def gaps_of_states(
 ) -> tuple[Iterator[tuple[np.ndarray, np.ndarray]], float, dict[str, Any]]:
     """(blocks of (gap (N, A), weight (N,): how often each row counts, 0 for none), tie tolerance, conventions)."""
     solution = optimal_solution(mdp, solution)
-    tolerance = _tolerance(solution, tie_tolerance, _error(mdp, solution))
+    tolerance = _tolerance(tie_tolerance, _error(mdp, solution))
     blocks = ((part.gap, part.counted) for part in weighted_gaps(mdp, solution))
     return blocks, tolerance, _conventions(mdp, solution, tolerance)
 
@@ -306,7 +306,7 @@ def _error(mdp: TabularMDP, solution: Solution) -> float:
     return error * steps * (1 + steps) if reward else error
 
 
-def _tolerance(solution: Solution, tie_tolerance: float | None, error: float) -> float:
+def _tolerance(tie_tolerance: float | None, error: float) -> float:
     tolerance = max(np.finfo(float).tiny, ERRORS_PER_TIE / 2 * error) if tie_tolerance is None else tie_tolerance
     if not (isinstance(tolerance, int | float | np.floating) and math.isfinite(tolerance) and tolerance > error):
         raise PrecisionError(
@@ -327,7 +327,7 @@ def _conventions(mdp: TabularMDP, solution: Solution, tolerance: float) -> dict[
 
 def _summed(mdp: TabularMDP, solution: Solution, tie_tolerance: float | None) -> Gaps:
     error = _error(mdp, solution)
-    tolerance = _tolerance(solution, tie_tolerance, error)
+    tolerance = _tolerance(tie_tolerance, error)
     ties, added = UnresolvedTies(mdp, tolerance, error, tie_tolerance is not None), _Sums()
     for part in weighted_gaps(mdp, solution):
         ties.look_at(part, *added.add(part, tolerance, error))

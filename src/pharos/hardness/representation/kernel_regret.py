@@ -102,7 +102,7 @@ def kernel_regret(
     schedule: Schedule | None = None,
     solution: Solution | None = None,
     horizon: int | None = None,
-    progress: Callable[[str], None] | None = None,
+    progress: Callable[[str], None] | None = None,  # noqa: ARG001  (learners of a report have one signature)
 ) -> KernelRegret:
     """Return the expected regret of Q-learning in the tangent kernel of a network.
 
