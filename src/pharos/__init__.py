@@ -46,6 +46,7 @@ _HOMES = {
     "to_gymnax": "pharos.interaction",
     "train": "pharos.training",
     "train_many": "pharos.training",
+    "predict": "pharos.validation",
     "explore": "pharos.explorer",
     "PharosError": "pharos.errors",
 }
@@ -70,6 +71,7 @@ _PACKAGES = (
     "policies",
     "agents",
     "training",
+    "validation",
     "leaderboard",
     "plots",
     "study",

@@ -38,7 +38,18 @@ ORDER = (
     ),
     *("state_space", "mdp", "solvers"),
     *("hardness", "importers", "exporters", "observations", "interaction", "policies", "agents", "training"),
-    *("experiments", "leaderboard", "plots", "study", "sb3_env", "bisimulation", "explorer", "cli", "__main__"),
+    *(
+        "experiments",
+        "validation",
+        "leaderboard",
+        "plots",
+        "study",
+        "sb3_env",
+        "bisimulation",
+        "explorer",
+        "cli",
+        "__main__",
+    ),
 )
 
 # Its modules are its names: each is a part of its own.

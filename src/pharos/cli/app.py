@@ -22,6 +22,7 @@ from pharos.cli import (
     observations,
     play,
     plot,
+    predict,
     render,
     solve,
     study,
@@ -155,6 +156,7 @@ app.command("build")(build.build)
 app.command("count")(count.count)
 app.command("solve")(solve.solve)
 app.command("hardness")(hardness.hardness)
+app.command("predict")(predict.predict)
 app.command("evaluate")(evaluate.evaluate)
 app.command("observations")(observations.observations)
 app.command("render")(render.render)

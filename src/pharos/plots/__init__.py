@@ -8,15 +8,8 @@ from pharos.plots.grid import value_map
 from pharos.plots.growth import growth, states_by_depth
 from pharos.plots.plane import hardness_plane
 from pharos.plots.policies import policies
+from pharos.plots.predictions import predictions
 from pharos.plots.regret import regret
 from pharos.plots.style import save
 
-__all__ = [
-    "growth",
-    "hardness_plane",
-    "policies",
-    "regret",
-    "save",
-    "states_by_depth",
-    "value_map",
-]
+__all__ = ["growth", "hardness_plane", "policies", "predictions", "regret", "save", "states_by_depth", "value_map"]

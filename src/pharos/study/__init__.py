@@ -19,13 +19,14 @@ from pharos.study.forecast import Forecast
 from pharos.study.leave_one_class_out import outcomes, validation
 from pharos.study.logs import LOGGERS, RunLog, log
 from pharos.study.paper import paper_regressions, paper_returns
-from pharos.study.predictions import POLICY_PREDICTORS, PREDICTORS, predict, read_predictions, write_predictions
+from pharos.study.predictions import predict, read_predictions, write_predictions
 from pharos.study.regression import Fit, aggregate_r_squared, fit, fit_models, leave_one_class_out_r_squared
 from pharos.study.report import StudyReport, report
 from pharos.study.specification import presets, specification
 from pharos.study.statistics import Estimate, interquartile_mean, stratified_interval
 from pharos.study.tables import cells, curves, hardness_table, paper_instance, table
 from pharos.training import run_id
+from pharos.validation import POLICY_PREDICTORS, PREDICTORS
 
 __all__ = [
     "Comparison",

@@ -14,9 +14,9 @@ from pharos.errors import ParameterError
 from pharos.solvers import regret_scale
 from pharos.study import cross_validation as _held_out
 from pharos.study.mixed_models import mixed_fit
-from pharos.study.predictions import POLICY_PREDICTORS, PREDICTORS
 from pharos.study.tables import CELL
 from pharos.study.within_mdps import Pairs
+from pharos.validation import POLICY_PREDICTORS, PREDICTORS, SAMPLED_PREDICTORS
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -28,7 +28,11 @@ OUTCOMES = {
     "cumulative": "cumulative regret of the training episodes, logarithm",
 }
 ABSOLUTE = "cumulative"  # in units of reward: judged only beside what random play would lose
-LINEAR = tuple(name for name in (*PREDICTORS, *POLICY_PREDICTORS) if "regret" in name or name == "aliasing_floor")
+LINEAR = tuple(
+    name
+    for name in (*PREDICTORS, *SAMPLED_PREDICTORS, *POLICY_PREDICTORS)
+    if "regret" in name or name == "aliasing_floor"
+)
 """Predictors that enter as they are; the others as logarithms."""
 TENTH = 0.1
 RESAMPLES = 1000
@@ -122,7 +126,7 @@ def validation(
     predictions: "pd.DataFrame | None",
     cells: "pd.DataFrame",
     *,
-    predictors: Sequence[str] = (*PREDICTORS, *POLICY_PREDICTORS),
+    predictors: Sequence[str] = (*PREDICTORS, SAMPLED_PREDICTORS[0], *POLICY_PREDICTORS),
     measures: "pd.DataFrame | None" = None,
     least_classes: int = 3,
     permutations: int = PERMUTATIONS,

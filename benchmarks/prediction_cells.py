@@ -1,0 +1,212 @@
+"""The published cells that `pharos predict` is calibrated on: predicted anew, beside the regret of their runs.
+
+    python benchmarks/prediction_cells.py compute --out cells.csv [--block NAME ...]
+    python benchmarks/prediction_cells.py judge [--cells cells.csv] [--resamples 1000]
+    python benchmarks/prediction_cells.py draw [--cells cells.csv] [--picture docs/images/sealed.png]
+
+`compute` reads the packed runs of docs/studies (twelve development classes: hardness-dev; fourteen sealed ones:
+sealed-1) and computes the primary predictor of each cell, `sampled_regret` of a DQN; that of a PPO is in the files of
+predictions. A row that is there already is not computed again. `judge` prints how well predictions agree with runs, by
+set and agent: number of cells, R2 of classes left out after a line, Spearman's rank correlation, the share of pairs of
+observations that are ordered rightly, R2 without a fit, half the width of the 80 % interval and the share of classes
+left out that it covers; in brackets 95 % intervals over classes drawn anew. Classes weigh alike. `draw` draws predicted
+against observed regret of the sealed classes.
+"""
+
+import argparse
+import csv
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from pharos import study
+from pharos.study.tables import CELL
+from pharos.training import RunConfig
+from pharos.validation import PRIMARY, Published
+from pharos.validation.learners import primary_regret
+from pharos.validation.published import FILE
+
+STUDIES = Path(__file__).parents[1] / "docs" / "studies"
+DEV = STUDIES / "hardness-dev"
+# name -> (specification, packed runs, predictions that hold the primary predictor of a PPO)
+BLOCKS = {
+    "sealed-1": (STUDIES / "sealed-1" / "report.yaml", None, None),
+    "dev-main": (DEV / "main-dqn.yaml", DEV / "main-dqn-runs.parquet", None),
+    "dev-random": (DEV / "random-dqn.yaml", DEV / "random-dqn-runs.parquet", None),
+    "dev-long": (DEV / "long-dqn.yaml", DEV / "long-dqn-runs.parquet", None),
+    "dev-long-ppo": (
+        DEV / "long-ppo.yaml", DEV / "long-ppo-runs.parquet", DEV / "long-ppo-clipped-predictions.parquet",
+    ),
+    "dev-long-random-ppo": (
+        DEV / "long-random-ppo.yaml", DEV / "long-random-ppo-runs.parquet", DEV / "long-random-ppo-predictions.parquet",
+    ),
+}  # fmt: skip
+COLUMNS = ("study", *CELL, "steps", "states", "predicted", "observed", "seeds")
+
+
+def observed_of(block, specification, runs):
+    """CELL -> (mean greedy regret, seeds) of the runs that are finished."""
+    if runs is None:  # of the sealed set, whose table of cells is kept
+        cells = pd.read_csv(STUDIES / "sealed-1" / "cells.csv")
+    else:
+        with tempfile.TemporaryDirectory() as folder:
+            study.unpack(runs, Path(folder) / "runs", into=specification)
+            table = study.table(specification, Path(folder) / "runs")
+            cells = study.outcomes(table, study.curves(specification, Path(folder) / "runs"))
+            cells = cells.merge(table.groupby(CELL).size().rename("seeds").reset_index(), on=CELL)
+    return {
+        tuple(row[name] for name in CELL): row for row in cells.to_dict("records") if row["greedy"] == row["greedy"]
+    }
+
+
+def compute(out, blocks):
+    done = set()
+    if out.exists():
+        with out.open(newline="") as file:
+            done = {tuple(row[name] for name in ("study", *CELL)) for row in csv.DictReader(file)}
+    with out.open("a", newline="") as file:
+        writer = csv.DictWriter(file, COLUMNS)
+        if not done:
+            writer.writeheader()
+        for block in blocks:
+            specification, runs, predictions = BLOCKS[block]
+            cells = observed_of(block, specification, runs)
+            told = {}
+            if predictions is not None:
+                frame, _ = study.read_predictions(predictions)
+                told = {tuple(row[name] for name in CELL): row for row in frame.to_dict("records")}
+            for run in study.specification(specification, trust=True).runs:
+                key = tuple(run.cell.values())
+                cell = {**run.cell, "agent": run.config["agent"]}  # without the name of its hyperparameters
+                name = (block, *cell.values())
+                if key not in cells or name in done:
+                    continue
+                done.add(name)
+                value, states = regret_of(run, cells[key], told.get(key))
+                if value == value:
+                    row = {"steps": run.config["steps"], "states": int(states), "predicted": round(value, 6)}
+                    row |= {"observed": round(cells[key]["greedy"], 6), "seeds": int(cells[key]["seeds"])}
+                    writer.writerow({"study": block, **cell, **row})
+                    file.flush()
+
+
+def regret_of(run, cell, told):
+    """The primary predictor of a cell, and its number of states."""
+    known = {**cell, **(told or {})}
+    name = PRIMARY[run.config["agent"]]
+    if name in known:
+        return float(known[name]), known["num_states"]
+    task = RunConfig.from_dict(run.config).task(trust=True, strict=True)
+    regret, _ = primary_regret(run.config, task)
+    return regret.value, task.mdp.num_states
+
+
+def judge(file, resamples):
+    frame = pd.read_csv(file)
+    sealed = frame["study"] == "sealed-1"
+    for agent in PRIMARY:
+        for name, chosen in (
+            ("twelve of development", ~sealed),
+            ("fourteen sealed", sealed),
+            ("all 26", sealed | True),
+        ):
+            cells = frame[(frame["agent"] == agent) & chosen]
+            if len(cells):
+                print(f"| {name} | {agent.upper()} | {len(cells)} | {said_of(cells, resamples)} |")
+
+
+def said_of(cells, resamples):
+    """The columns of a row of the table: of the cells, with intervals over classes drawn anew."""
+    rng, known = np.random.default_rng(0), of(cells)
+    names = np.unique(known.classes)
+    samples = []
+    for _ in range(resamples):
+        drawn = [cells[cells["environment"] == name].assign(environment=f"{name} {n}", study=f"{name} {n}")
+                 for n, name in enumerate(rng.choice(names, len(names)))]  # fmt: skip
+        samples.append(statistics(of(pd.concat(drawn))))
+    low, high = np.nanquantile(samples, [0.025, 0.975], axis=0)
+    r_squared, rho, unfitted, pairs = (
+        f"{value:.2f} ({a:.2f} to {b:.2f})" for value, a, b in zip(statistics(known), low, high, strict=True)
+    )
+    width = f"± {known.half_width():.2f} | {known.coverage():.2f}"
+    return f"{r_squared} | {rho} | {pairs} of {len(known.pairs[0])} | {unfitted} | {width}"
+
+
+def draw(file, picture):
+    """Predicted against observed on the sealed classes, a panel for each agent."""
+    from pharos.plots import save
+    from pharos.plots.style import COLORS, GRID, figure, styled
+
+    @styled
+    def panels():
+        frame = pd.read_csv(file)
+        drawn, axes = figure(1, 2, (3.4, 3.3))
+        for axis, agent in zip(axes[0], PRIMARY, strict=True):
+            cells = frame[(frame["agent"] == agent) & (frame["study"] == "sealed-1")]
+            axis.plot([0, 1.8], [0, 1.8], color=GRID, zorder=0)
+            for number, (name, some) in enumerate(cells.groupby(cells["observation"].str.split("[(,]").str[0])):
+                label = name.replace("_", " ")
+                axis.scatter(
+                    some["predicted"], some["observed"], 14, COLORS[number], label=label, alpha=0.8, linewidth=0
+                )
+            axis.set(
+                xlim=(0, 1.8), ylim=(0, 1.8), xlabel="predicted regret", title=f"{agent.upper()}, {len(cells)} cells"
+            )
+        axes[0, 0].set_ylabel("observed regret")
+        axes[0, 0].legend(loc="upper left", handletextpad=0.2)
+        return drawn
+
+    print(save(panels(), picture))
+
+
+def of(cells):
+    mdps = cells["study"] + " " + cells["instance"] + " " + cells["chance"]
+    numbers = (cells[name].to_numpy(float) for name in ("predicted", "observed", "states", "steps"))
+    return Published(cells["environment"].to_numpy(str), mdps.to_numpy(str), *numbers)
+
+
+def statistics(known):
+    """(R2 of classes left out, rank correlation, R2 without a fit, share of pairs in order)."""
+    from scipy.stats import spearmanr
+
+    x, y, classes = known.predicted, known.observed, known.classes
+    counts = {name: np.sum(classes == name) for name in np.unique(classes)}
+    weights = np.array([1 / counts[name] for name in classes])
+    told = np.empty(len(y))
+    for name in counts:
+        use = classes != name
+        slope, level = np.polyfit(x[use], y[use], 1, w=np.sqrt(weights[use]))
+        told[~use] = level + slope * x[~use]
+    mean = np.average(y, weights=weights)
+    total = np.sum(weights * (y - mean) ** 2)
+    first, second, apart = known.pairs
+    right = 0.5 + 0.5 * np.sign(x[first] - x[second]) * np.sign(apart)
+    return (
+        1 - np.sum(weights * (y - told) ** 2) / total,
+        spearmanr(x.round(9), y.round(9)).statistic,
+        1 - np.sum(weights * (y - x) ** 2) / total,
+        right.mean() if len(right) else np.nan,
+    )
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("task", choices=("compute", "judge", "draw"))
+    parser.add_argument("--out", type=Path, default=FILE)
+    parser.add_argument("--cells", type=Path, default=FILE)
+    parser.add_argument("--block", action="append", choices=[*BLOCKS])
+    parser.add_argument("--resamples", type=int, default=1000)
+    parser.add_argument("--picture", type=Path, default=STUDIES.parent / "images" / "sealed.png")
+    arguments = parser.parse_args()
+    if arguments.task == "compute":
+        compute(arguments.out, arguments.block or [*BLOCKS])
+    elif arguments.task == "judge":
+        judge(arguments.cells, arguments.resamples)
+    else:
+        draw(arguments.cells, arguments.picture)
+
+
+if __name__ == "__main__":
+    main()

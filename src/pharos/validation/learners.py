@@ -1,0 +1,280 @@
+"""The idealised learner of a run: an agent's network as a kernel, and its schedule, from the run's configuration."""
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pharos.errors import ParameterError, PharosError
+from pharos.training import RunConfig
+
+if TYPE_CHECKING:
+    from pharos.hardness import Rollouts, Sampling, Schedule
+    from pharos.mdp import TabularMDP
+    from pharos.training import Task
+
+MEASURES = ("kernel_regret", "kernel_learning_time", "kernel_sample_complexity", "aliasing_floor", "exploration_time")
+PREDICTORS = (
+    *("kernel_regret", "kernel_regret_played", "adam_regret", "adam_regret_played"),
+    *("tabular_regret", "tabular_regret_played"),
+    *("kernel_learning_time", "kernel_sample_complexity", "aliasing_floor", "exploration_time", "num_states"),
+)
+"""Columns of predictions, numbers; the larger, the harder. `adam_regret` is kernel regret with `optimizer="adam"`."""
+POLICY_PREDICTORS = (
+    *("policy_regret", "policy_regret_played", "policy_tabular_regret"),
+    *("policy_regret_evaluated", "clipped_regret", "clipped_regret_evaluated"),
+)
+"""Columns beside them where an agent is an actor-critic: `kernel_policy_regret`, as played, of a table, as evaluated;
+and of PPO with its clipping, of the most probable actions and as evaluated."""
+SAMPLED_PREDICTORS = ("sampled_regret", "sampled_deviation", "sampled_descent", "sampled_adam", "sampled_tabular")
+"""Columns beside them of a DQN: the sampled learner, one walk's deviation, its two kernels, and a table's."""
+PRIMARY: Mapping[str, str] = {"dqn": "sampled_regret", "ppo": "clipped_regret_evaluated"}
+"""The predictor that stands for each agent, named on twelve development classes and fourteen sealed ones together."""
+POLICY_CURVES = ("policy_curve", "clipped_curve")
+ACTOR_CRITICS: Mapping[str, Mapping[str, Any]] = {
+    "ppo": {"gae_lambda": 0.95, "clip_range": 0.2},
+    "a2c": {"gae_lambda": 1.0, "clip_range": None},
+}
+"""Agents that learn as actor-critics, and what their hyperparameters are where they are not said."""
+CURVE_POINTS = 40
+
+
+def predicted(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Return PREDICTORS of a run, SAMPLED_PREDICTORS of a DQN, POLICY_PREDICTORS of an actor-critic, and their curves.
+
+    Args:
+        config: of a run of a study that was read already, so that code which it names is trusted.
+    Returns:
+        Numbers, NaN where there is none and `notes` says why; `network`, `estimated_error`, `curve`, `adam_curve`.
+    """
+    from pharos.hardness import report
+
+    numbers: dict[str, Any] = dict.fromkeys(PREDICTORS, math.nan)
+    row = {**numbers, "network": "", "estimated_error": math.nan, "curve": "", "adam_curve": "", "notes": ""}
+    try:
+        task = RunConfig.from_dict(config).task(trust=True, strict=True)
+        name, initialisation = network_of(config, task)
+        options = _options(task, name, initialisation)
+        schedule = schedule_of(config)
+        measures = report(task.mdp, MEASURES, schedule=schedule, **options)
+        rescaled = report(task.mdp, ["kernel_regret"], schedule=replace(schedule, optimizer="adam"), **options)
+        if config["agent"] in ACTOR_CRITICS:
+            row |= _of_policy(config, task.mdp, options)
+        if config["agent"] == "dqn":
+            row |= _of_walks(config, task.mdp, options)
+    except PharosError as error:
+        return {**row, "notes": str(error)}
+    row |= {"num_states": float(task.mdp.num_states), "network": f"{name}, {initialisation}"}
+    regret = measures["kernel_regret"].value
+    if regret is not None:
+        row |= {"kernel_regret": regret["value"], "kernel_regret_played": regret["played"]}
+        row |= {"tabular_regret": regret["tabular"], "tabular_regret_played": regret["tabular_played"]}
+        row |= {"estimated_error": regret["estimated_error"], "curve": _curve(regret)}
+    regret = rescaled["kernel_regret"].value
+    if regret is not None:
+        row |= {"adam_regret": regret["value"], "adam_regret_played": regret["played"], "adam_curve": _curve(regret)}
+    for measure in MEASURES[1:]:
+        value = measures[measure].value
+        if value is not None:
+            row[measure] = float(value["value"] if isinstance(value, Mapping) else value)
+    notes = (result.undefined or result.certificate.note for result in measures.results.values())
+    return {**row, "notes": "; ".join(note for note in notes if note)}
+
+
+def _options(task: "Task", network: Any, initialisation: str, landmarks: int | None = None) -> dict[str, Any]:
+    """What `pharos.hardness.report` needs of a task to measure what a network makes of its observation."""
+    from pharos.observations import representation
+
+    features = representation(
+        *(task.space, task.observation, network),
+        **{"initialisation": initialisation, "landmarks": landmarks, **dict(task.observation_options)},
+    )
+    return {"horizon": task.time_limit, "representation": features}
+
+
+def _of_walks(config: Mapping[str, Any], mdp: "TabularMDP", options: Mapping[str, Any]) -> dict[str, Any]:
+    """SAMPLED_PREDICTORS, of the learner that draws what the agent draws."""
+    from pharos.hardness import report
+
+    name = "sampled_regret"
+    value = report(mdp, [name], schedule=schedule_of(config), sampling=sampling_of(config), **options)[name].value
+    numbers = dict.fromkeys(SAMPLED_PREDICTORS, math.nan)
+    if value is not None:
+        parts = (value["value"], value.get("deviation", math.nan), value["descent"], value["adam"], value["tabular"])
+        numbers |= dict(zip(SAMPLED_PREDICTORS, parts, strict=True))
+    return numbers
+
+
+def sampling_of(config: Mapping[str, Any]) -> "Sampling":
+    """What a DQN draws, by its hyperparameters and the noise of its rewards."""
+    from pharos.hardness import Sampling
+
+    own, noise = config["hyperparameters"], config["chance"].get("reward_noise", 0.0)
+    sizes = {name: int(own[name]) for name in ("batch_size", "buffer_size") if name in own}
+    return Sampling(reward_noise=float(noise), **sizes)
+
+
+@dataclass(frozen=True)
+class PrimaryRegret:
+    """The predictor that stands for an agent.
+
+    Attributes:
+        value: normalised regret, 0 optimal and 1 uniform play. deviation: of one walk; NaN where nothing is drawn.
+        tabular: of the same learner with a table of the states in the place of the network.
+        estimated_error: what half of the landmarks change; 0 where the kernel is exact. note: what is random in it.
+    """
+
+    value: float
+    deviation: float
+    tabular: float
+    estimated_error: float
+    note: str
+
+
+def primary_regret(
+    config: Mapping[str, Any], task: "Task", network: Any = None, landmarks: int | None = None
+) -> tuple[PrimaryRegret, str]:
+    """Return the regret of a run's idealised learner by PRIMARY, and the name of the network.
+
+    Args:
+        config: of the run. task: its task.
+        network: as `pharos.observations.representation` takes it; None: the agent's own, with its `net_arch`.
+    Raises:
+        ParameterError: the agent has no such learner, the network does not fit, or the kernel is too large.
+        UndefinedMeasure: no policy beats uniform play.
+    """
+    from pharos.errors import UndefinedMeasure
+    from pharos.hardness import report
+
+    agent = config["agent"]
+    name, initialisation = network_of(config, task)
+    if network is not None:
+        name = f"{network}+tanh" if isinstance(network, str) and agent != "dqn" and _is_named(network) else network
+    options = _options(task, name, initialisation, landmarks)
+    if agent == "dqn":
+        measure = "sampled_regret"
+        options |= {"schedule": schedule_of(config), "sampling": sampling_of(config)}
+    else:
+        measure, (rollouts, clip_range) = "kernel_policy_regret", rollouts_of(config)
+        options |= {"schedule": _steps_and_discount(config), "rollouts": replace(rollouts, clip_range=clip_range)}
+    result = report(task.mdp, [measure], **options)[measure]
+    if result.value is None:
+        raise UndefinedMeasure(result.undefined or f"{measure} is undefined")
+    value = result.value
+    regret = PrimaryRegret(
+        value["value"] if agent == "dqn" else _evaluated(value),
+        value.get("deviation", math.nan),
+        value["tabular"],
+        value["estimated_error"],
+        result.certificate.note or "",
+    )
+    return regret, str(options["representation"].conventions["network"])
+
+
+def _is_named(network: str) -> bool:
+    """Whether a network is one of pharos' names, and none of a file or module."""
+    from pharos.system.sources import is_reference
+
+    return not is_reference(network) and "+tanh" not in network
+
+
+def _steps_and_discount(config: Mapping[str, Any]) -> "Schedule":
+    from pharos.hardness import Schedule
+
+    return Schedule(steps=config["steps"], gamma=config["hyperparameters"].get("gamma", Schedule.gamma))
+
+
+def _of_policy(config: Mapping[str, Any], mdp: "TabularMDP", options: Mapping[str, Any]) -> dict[str, Any]:
+    """POLICY_PREDICTORS and POLICY_CURVES, of the idealised actor-critic with the rollouts and steps of the agent."""
+    from pharos.hardness import report
+
+    name, (rollouts, clip_range) = "kernel_policy_regret", rollouts_of(config)
+    schedule = _steps_and_discount(config)
+
+    def learnt(rollouts: "Rollouts") -> Any:
+        return report(mdp, [name], schedule=schedule, rollouts=rollouts, **options)[name].value
+
+    regret = learnt(rollouts)
+    clipped = None if clip_range is None else learnt(replace(rollouts, clip_range=clip_range))
+    row = {**dict.fromkeys(POLICY_PREDICTORS, math.nan), **dict.fromkeys(POLICY_CURVES, "")}
+    if regret is not None:
+        numbers = (regret["value"], regret["played"], regret["tabular"], _evaluated(regret))
+        row |= {**dict(zip(POLICY_PREDICTORS, numbers, strict=False)), "policy_curve": _curve(regret)}
+    if clipped is not None:
+        row |= {"clipped_regret": clipped["value"], "clipped_regret_evaluated": _evaluated(clipped)}
+        row["clipped_curve"] = _curve(clipped, "played")
+    return row
+
+
+def rollouts_of(config: Mapping[str, Any]) -> tuple["Rollouts", float | None]:
+    """Those of an actor-critic, without clipping; and how far its agent clips."""
+    from pharos.hardness import Rollouts
+
+    own = {**ACTOR_CRITICS[config["agent"]], **config["hyperparameters"]}
+    steps = int(own["n_steps"]) * int(own.get("n_envs", 1))
+    minibatches = math.ceil(steps / int(own["batch_size"])) if own.get("batch_size") else 1
+    gradient_steps = minibatches * int(own.get("n_epochs", 1))
+    return Rollouts(steps=steps, gradient_steps=gradient_steps, gae_lambda=own["gae_lambda"]), own["clip_range"]
+
+
+def _evaluated(regret: Mapping[str, Any]) -> float:
+    """`LearningCurve.mean_evaluated`, which results that were kept before it was there do not have."""
+    from pharos.hardness import LearningCurve
+
+    return LearningCurve(**{name: np.asarray(values) for name, values in regret["curve"].items()}).mean_evaluated
+
+
+def _curve(regret: Mapping[str, Any], of: str = "greedy") -> str:
+    """Steps and regret of the idealised learner, of at most CURVE_POINTS of its phases, as JSON."""
+    steps, regrets = regret["curve"]["steps"], regret["curve"][of]
+    every = max(1, math.ceil(len(steps) / CURVE_POINTS))
+    return json.dumps(
+        [[int(step), round(value, 4)] for step, value in zip(steps[::every], regrets[::every], strict=True)]
+    )
+
+
+def network_of(config: Mapping[str, Any], task: Any) -> tuple[str, str]:
+    """The name and the initialisation of the network of an agent of pharos."""
+    from pharos.observations import default_network, observe
+
+    observation = observe(task.env, task.observation, state_space=task.space, **dict(task.observation_options))
+    name, hidden = default_network(observation.space), _hidden_layers(config["hyperparameters"])
+    if hidden != [128]:
+        name = "-".join([name.removesuffix("x2"), *(["128"] if "mlp" not in name else []), *map(str, hidden)])
+    return (name, "pytorch") if config["agent"] == "dqn" else (f"{name}+tanh", "sb3")
+
+
+def _hidden_layers(hyperparameters: Mapping[str, Any]) -> list[int]:
+    """Units of the layers after the features, the same for policy and value.
+
+    Raises:
+        ParameterError: they differ, or the network is not of the kind that has a closed form.
+    """
+    own = dict(hyperparameters.get("policy_kwargs") or {})
+    layers = own.pop("net_arch", hyperparameters.get("net_arch", [128]))
+    if own:
+        raise ParameterError(f"policy_kwargs has {min(own)!r}; only net_arch may differ for predictions")
+    if isinstance(layers, Mapping):
+        if layers.get("pi") != layers.get("vf"):
+            raise ParameterError(f"net_arch is {dict(layers)}; predictions need the same layers for policy and value")
+        layers = layers.get("pi") or []
+    return list(layers)
+
+
+def schedule_of(config: Mapping[str, Any]) -> "Schedule":
+    """That of a DQN by its hyperparameters; of others the steps alone."""
+    from pharos.hardness import Schedule
+
+    hyperparameters = config["hyperparameters"]
+    if config["agent"] != "dqn":
+        return Schedule(steps=config["steps"])
+    same = ("learning_starts", "exploration_initial_eps", "exploration_final_eps", "exploration_fraction", "gamma")
+    options = {name: hyperparameters[name] for name in same if name in hyperparameters}
+    period, every = int(hyperparameters.get("target_update_interval", 250)), hyperparameters.get("train_freq", 4)
+    every = every if isinstance(every, int) else 4
+    copies = int(hyperparameters.get("gradient_steps", 1))
+    steps = max(1, round(period * (copies / every if copies > 0 else 1.0)))
+    return Schedule(steps=config["steps"], period=period, gradient_steps=steps, **options)

@@ -1,0 +1,280 @@
+"""How hard a world is for an agent behind an observation, before anything is trained: regret, interval, order."""
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from pharos.environments import Environment, make
+from pharos.errors import ParameterError
+from pharos.validation.learners import PRIMARY, primary_regret
+from pharos.validation.published import LEVEL, Published, published
+
+LEAST_RIGHT = 0.75
+"""Share of published pairs of an order below which it is too close to call."""
+MOST_STATES = 100_000
+"""States beyond which a prediction is refused: its walks evaluate a policy of all states 31 times each."""
+
+
+@dataclass(frozen=True)
+class PredictedRegret:
+    """What is predicted of an agent with one network behind one observation.
+
+    Attributes:
+        observation: what the agent sees, with its options. network: name of the network.
+        value: normalised regret of the learnt policies, a mean over training: 0 optimal, 1 uniform play.
+        low, high: ends of the interval that held LEVEL of the published cells, at least 0.
+        deviation: standard deviation of one walk of the idealised learner; NaN where nothing is drawn.
+        tabular: of the same learner with a table of the states in the place of the network.
+        note: what is random or approximate in the value.
+    """
+
+    observation: str
+    network: str
+    value: float
+    low: float
+    high: float
+    deviation: float
+    tabular: float
+    note: str = ""
+
+    @property
+    def label(self) -> str:
+        """Observation and network."""
+        return f"{self.observation}, {self.network}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able."""
+        numbers = {"value": self.value, "low": self.low, "high": self.high, "tabular": self.tabular}
+        deviation = None if math.isnan(self.deviation) else self.deviation
+        return {
+            "observation": self.observation, "network": self.network, **numbers, "deviation": deviation,
+            "note": self.note,
+        }  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Order:
+    """Which of two cells is predicted to be easier, and how often such an order was right.
+
+    Attributes:
+        easier, harder: labels. difference: of the predicted regrets.
+        right, pairs: of the published pairs whose predictions differ about as much.
+    """
+
+    easier: str
+    harder: str
+    difference: float
+    right: int
+    pairs: int
+
+    @property
+    def is_called(self) -> bool:
+        """Whether published pairs of that difference were ordered rightly often enough."""
+        return self.pairs > 0 and self.difference >= 0.05 and self.right / self.pairs >= LEAST_RIGHT
+
+    def __str__(self) -> str:
+        share = f"right in {self.right} of {self.pairs} such pairs"
+        if self.is_called:
+            return f"{self.easier} is easier than {self.harder}: {share}"
+        return f"{self.easier} or {self.harder}: too close to call ({share})"
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able."""
+        return {**vars(self), "called": self.is_called, "text": str(self)}
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Predicted regrets of one instance.
+
+    Attributes:
+        environment, chance, agent, steps: what they are about. states: number of states.
+        predictor: name of the measure that stands for the agent.
+        cells: one for each observation and network, in the order in which they were asked for.
+        half_width: half of the interval that held LEVEL of the published cells; coverage: the share that such intervals
+            held of classes left out; published_cells, published_classes: numbers of both.
+        warnings: where the instance lies outside of what was tested.
+        hyperparameters: of the agent.
+    """
+
+    environment: str
+    chance: str
+    agent: str
+    steps: int
+    states: int
+    predictor: str
+    cells: Sequence[PredictedRegret]
+    half_width: float
+    coverage: float
+    published_cells: int
+    published_classes: int
+    warnings: Sequence[str] = ()
+    hyperparameters: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def orders(self) -> list[Order]:
+        """Each cell beside the easiest one; the easiest is named first."""
+        known, ranked = published(self.agent), sorted(self.cells, key=lambda cell: cell.value)
+        easiest, orders = ranked[0], []
+        for cell in ranked[1:]:
+            difference, (easier, harder) = cell.value - easiest.value, self._names(easiest, cell)
+            orders.append(Order(easier, harder, difference, *known.ordered(difference)))
+        return orders
+
+    def _names(self, first: PredictedRegret, second: PredictedRegret) -> tuple[str, str]:
+        """What tells two cells apart."""
+        if first.observation == second.observation:
+            return first.network, second.network
+        is_named_by_both = len(self.cells) > len({cell.observation for cell in self.cells})
+        return (first.label, second.label) if is_named_by_both else (first.observation, second.observation)
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able."""
+        return {
+            **vars(self),
+            "cells": [cell.to_dict() for cell in self.cells],
+            "orders": [order.to_dict() for order in self.orders],
+            "level": LEVEL,
+            "warnings": list(self.warnings),
+            "hyperparameters": dict(self.hyperparameters),
+        }
+
+    def __str__(self) -> str:
+        lines = [f"{cell.label}: {cell.value:.2f} ({cell.low:.2f} to {cell.high:.2f})" for cell in self.cells]
+        return "\n".join([*lines, *map(str, self.orders), *self.warnings])
+
+
+def predict(
+    environment: Environment | str,
+    observations: "str | Iterable[str | tuple[str, Mapping[str, Any]]]" = "vector",
+    *,
+    agent: str = "dqn",
+    networks: "str | Callable[..., Any] | Iterable[Any] | None" = None,
+    steps: int = 30_000,
+    sticky: float = 0.0,
+    random: float = 0.0,
+    lazy: float = 0.0,
+    reward_noise: float = 0.0,
+    horizon: int | str | None = "default",
+    hyperparameters: Mapping[str, Any] | None = None,
+    landmarks: int | None = None,
+    progress: Callable[[str], None] | None = None,
+    **parameters: Any,
+) -> Prediction:
+    """Predict the regret of an agent behind each of some observations, before anything is trained.
+
+    The agent's network is replaced by its tangent kernel, and the agent by an idealised one that learns in it with the
+    same schedule: `sampled_regret` for a DQN, `kernel_policy_regret` with PPO's clipping, as it is evaluated, for a
+    PPO. How far that agrees with runs was tested on classes that nobody had used (docs/prediction.md).
+
+    Args:
+        environment: a name, with its `parameters` as keywords, or an Environment, such as one's own or
+            `pharos.importers.environment(mdp)`.
+        observations: names as for `pharos.observe`, alone or with their options: ("hash", {"bits": 64}).
+        agent: "dqn" or "ppo".
+        networks: as for `pharos.observations.representation`, such as "mlp64x2" or a function of an input's shape that
+            returns a torch.nn.Module; several: each with each observation. None: the agent's own.
+        steps: of training.
+        sticky, random, lazy, reward_noise, horizon: as for `pharos.train`; chance of acting, and noise in what is paid.
+        hyperparameters: of the agent, before those that `pharos.train` takes.
+        landmarks: as for `representation`.
+        progress: called with what is being done.
+    Returns:
+        A Prediction, whose cells have a value and an interval, and whose orders say which is easier.
+    Raises:
+        ParameterError: no such agent, observation or network, or more than MOST_STATES states.
+        UndefinedMeasure: no policy beats uniform play, so that regret has no scale.
+    Cost: seconds for each cell of a thousand states; see `sampled_regret` and `kernel_policy_regret`. Measures are kept
+        beside the state space.
+    """
+    from pharos.agents import hyperparameters as hyperparameters_of
+    from pharos.training import ChanceSetting, RunConfig, Task
+
+    known = published(agent)
+    env = make(environment, **parameters) if isinstance(environment, str) else environment
+    if isinstance(steps, bool) or not isinstance(steps, int) or steps < 1:
+        raise ParameterError(f"steps is {steps!r}; expected a whole number of at least 1")
+    chance = ChanceSetting(sticky, random, lazy, reward_noise)
+    width, cells, states, own = known.half_width(), [], 0, dict(hyperparameters or {})
+    for name, options in _observations(observations):
+        task = Task.of(env, **chance.options, observation=name, observation_options=options, horizon=horizon)
+        states = _checked_states(task.space.num_states, env)
+        chosen = hyperparameters_of(agent, env.name, str(task.observation), own)
+        config = RunConfig.of_task(task, agent, steps=steps, hyperparameters=chosen).to_dict()
+        _check_steps(config)
+        for network in _several(networks):
+            title = f"{name}({', '.join(f'{key}={value}' for key, value in options.items())})" if options else name
+            if progress is not None:
+                progress(f"predicting {agent} behind {title}")
+            regret, network_name = primary_regret(config, task, network, landmarks)
+            ends = max(0.0, regret.value - width), regret.value + width
+            cells.append(
+                PredictedRegret(title, network_name, regret.value, *ends, regret.deviation, regret.tabular, regret.note)
+            )
+    if not cells:
+        raise ParameterError("no observation to predict for; give at least one, such as 'vector'")
+    return Prediction(
+        environment=str(env),
+        chance=str(chance) if chance else "of the world" if env.has_chance else "plain",
+        agent=agent,
+        steps=steps,
+        states=states,
+        predictor=PRIMARY[agent],
+        cells=tuple(cells),
+        half_width=width,
+        coverage=known.coverage(),
+        published_cells=len(known.predicted),
+        published_classes=len(set(known.classes)),
+        warnings=tuple(_warnings(known, states, steps, chance)),
+        hyperparameters=chosen,
+    )
+
+
+def _observations(observations: Any) -> list[tuple[str, dict[str, Any]]]:
+    """Names with their options."""
+    is_pair = isinstance(observations, tuple) and len(observations) == 2 and isinstance(observations[1], Mapping)
+    if isinstance(observations, str) or is_pair:
+        observations = [observations]
+    return [(each, {}) if isinstance(each, str) else (each[0], dict(each[1])) for each in observations]
+
+
+def _several(networks: Any) -> list[Any]:
+    if networks is None or isinstance(networks, str) or callable(networks):
+        return [networks]
+    return list(networks)
+
+
+def _checked_states(states: int, env: Environment) -> int:
+    if states > MOST_STATES:
+        raise ParameterError(
+            f"{env} has {states:,} states; predictions are made for at most {MOST_STATES:,}: choose a smaller instance "
+            f"of the class, whose representation is as hard"
+        )
+    return states
+
+
+def _check_steps(config: Mapping[str, Any]) -> None:
+    """Refuse a training that ends before anything is learnt."""
+    own, steps = config["hyperparameters"], config["steps"]
+    if config["agent"] == "dqn":
+        least, what = int(own.get("learning_starts", 0)) + 1, "learning begins"
+    else:
+        least, what = int(own["n_steps"]) * int(own.get("n_envs", 1)), "the first rollout ends"
+    if steps < least:
+        raise ParameterError(f"steps is {steps}, but {what} after {least - 1:,} steps; expected at least {least:,}")
+
+
+def _warnings(known: Published, states: int, steps: int, chance: Any) -> Iterable[str]:
+    """Where the instance lies outside of the published cells."""
+    low, high = int(known.states.min()), int(known.states.max())
+    if not low <= states <= high:
+        yield f"{states:,} states: tested were {low:,} to {high:,}, so the interval is not calibrated here"
+    low, high = int(known.steps.min()), int(known.steps.max())
+    if not low <= steps <= high:
+        yield f"{steps:,} steps: tested were {low:,} to {high:,}, so the interval is not calibrated here"
+    untested = [name for name in ("sticky", "lazy", "reward_noise") if getattr(chance, name)]
+    if chance.random > 0.1:
+        untested.append("random above 0.1")
+    if untested:
+        yield f"{', '.join(untested)}: not among the tested cells, so the interval is not calibrated here"

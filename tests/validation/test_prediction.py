@@ -1,0 +1,216 @@
+"""`pharos.predict`: the measure that it names, an interval that holds what it promises, and the order in words."""
+
+import json
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import pharos
+from pharos import hardness, importers
+from pharos.cli import app
+from pharos.errors import ParameterError, UndefinedMeasure
+from pharos.observations import representation
+from pharos.validation import PRIMARY, Published, prediction, published
+from pharos.validation.prediction import Order
+
+SHORT = {"learning_starts": 100, "target_update_interval": 100, "batch_size": 8}
+OPTIONS = {"steps": 1000, "hyperparameters": SHORT}
+
+
+def cells(predicted, observed, classes, mdps=None):
+    predicted, observed = np.array(predicted, float), np.array(observed, float)
+    mdps = np.array([str(n) for n in range(len(predicted))] if mdps is None else mdps)
+    return Published(np.array(classes), mdps, predicted, observed, np.ones(len(predicted)), np.ones(len(predicted)))
+
+
+def naive_half_width(known, level, but=None):
+    """The smallest error such that classes, each weighing the same, have enough of their cells within it."""
+    names = [name for name in sorted(set(known.classes)) if name != but]
+    errors = {name: np.abs(known.observed - known.predicted)[known.classes == name] for name in names}
+    aim = min(1.0, level * (len(names) + 1) / len(names))
+    for width in sorted(np.concatenate([*errors.values()])):
+        if np.mean([np.mean(errors[name] <= width) for name in names]) >= aim - 1e-12:
+            return width
+    raise AssertionError
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_half_widths_are_those_of_the_definition(seed):
+    rng = np.random.default_rng(seed)
+    classes = rng.choice(list("abcdefgh"), 40)
+    known = cells(rng.random(40), rng.random(40), classes)
+    for level in (0.5, 0.8, 0.95):
+        assert known.half_width(level) == naive_half_width(known, level)
+        assert known.half_width(level, classes[0]) == naive_half_width(known, level, classes[0])
+    inside = [
+        np.mean(np.abs(known.observed - known.predicted)[classes == name] <= naive_half_width(known, 0.8, name))
+        for name in sorted(set(classes))
+    ]
+    assert known.coverage(0.8) == pytest.approx(np.mean(inside), abs=1e-12)
+
+
+def test_a_class_that_is_drawn_as_the_others_is_covered():
+    covered = []
+    for seed in range(400):
+        rng = np.random.default_rng(seed)
+        spread = rng.gamma(2.0, 0.1, 21)  # of each class its own
+        classes = np.repeat(np.arange(21), 5).astype(str)
+        known = cells(np.zeros(105), rng.normal(0, np.repeat(spread, 5)), classes)
+        width = known.half_width(0.8, "20")
+        covered.append(np.mean(np.abs(known.observed)[classes == "20"] <= width))
+    assert 0.79 <= np.mean(covered) <= 0.86  # 400 classes: a standard error of 0.015
+
+
+def test_orders_are_counted_among_clear_pairs_of_one_mdp():
+    known = cells([0.1, 0.25, 0.9, 0.1, 0.24], [0.1, 0.3, 0.05, 0.1, 0.12], list("aaabb"), list("xxxyy"))
+    assert known.ordered(0.15) == (1, 1)  # 0.1 and 0.25; those of y are observed to be alike
+    assert known.ordered(-0.15) == (1, 1)
+    assert known.ordered(0.7) == (0, 1)  # 0.25 and 0.9; 0.1 and 0.9 are observed to be alike
+    assert known.ordered(0.01) == (0, 0)
+
+
+@pytest.mark.parametrize("agent", PRIMARY)
+def test_published_cells_are_of_many_classes_and_sets(agent):
+    known = published(agent)
+    assert len(set(known.classes)) >= 26
+    assert len(known.predicted) >= 190
+    assert np.isfinite([known.predicted, known.observed, known.states, known.steps]).all()
+    assert 0.74 <= known.coverage() <= 0.88
+    right, pairs = known.ordered(1.0)
+    assert right / pairs > 0.9  # what the words rest on
+
+
+def test_agents_without_published_runs_are_refused():
+    with pytest.raises(ParameterError, match="agent 'a2c': no published runs to calibrate on; expected one of"):
+        pharos.predict("river_swim", agent="a2c")
+
+
+@pytest.mark.slow
+def test_a_dqn_is_predicted_by_the_sampled_learner_with_its_schedule():
+    answer = pharos.predict("river_swim", ["vector", ("hash", {"bits": 8})], length=5, sticky=0.1, **OPTIONS)
+    space = pharos.build(pharos.make("river_swim", length=5))
+    schedule = hardness.Schedule(
+        steps=1000, learning_starts=100, period=100, gradient_steps=25, gamma=0.99, exploration_fraction=0.5
+    )
+    for cell, options in zip(
+        answer.cells, ({"observation": "vector"}, {"observation": "hash", "bits": 8}), strict=True
+    ):
+        mdp = pharos.sticky_actions(space.mdp(gamma=1.0).with_horizon(space.environment.max_episode_steps), 0.1)
+        expected = hardness.sampled_regret(
+            mdp,
+            representation(space, **options),
+            schedule=schedule,
+            sampling=hardness.Sampling(batch_size=8, buffer_size=50_000),
+        )
+        assert cell.value == expected.value
+        assert cell.tabular == expected.tabular.mean
+        assert (cell.low, cell.high) == (max(0.0, cell.value - answer.half_width), cell.value + answer.half_width)
+    assert answer.half_width == published("dqn").half_width()
+    assert [cell.observation for cell in answer.cells] == ["vector", "hash(bits=8)"]
+    assert answer.predictor == "sampled_regret" and answer.states == 5
+    assert any("sticky" in warning for warning in answer.warnings)
+    assert any("1,000 steps" in warning for warning in answer.warnings)
+
+
+@pytest.mark.slow
+def test_a_ppo_is_predicted_as_it_is_evaluated():
+    answer = pharos.predict("river_swim", agent="ppo", steps=2048, length=5)
+    space = pharos.build(pharos.make("river_swim", length=5))
+    expected = hardness.kernel_policy_regret(
+        space.mdp(gamma=1.0).with_horizon(space.environment.max_episode_steps),
+        representation(space, "vector", "mlp128x2+tanh", initialisation="sb3"),
+        schedule=hardness.Schedule(steps=2048, gamma=0.99),
+        rollouts=hardness.Rollouts(steps=512, gradient_steps=16, gae_lambda=0.95, clip_range=0.2),
+    )
+    assert answer.cells[0].value == pytest.approx(expected.curve.mean_evaluated, abs=1e-6)  # kept curves have 6 digits
+    assert answer.cells[0].network == "mlp128x2+tanh"
+    assert np.isnan(answer.cells[0].deviation)
+
+
+@pytest.mark.slow
+def test_noise_of_rewards_makes_it_harder_to_learn():
+    quiet, loud = (
+        pharos.predict("deep_sea", size=4, steps=3000, hyperparameters=SHORT, reward_noise=noise).cells[0].tabular
+        for noise in (0.0, 50.0)
+    )
+    assert loud > quiet + 0.2
+
+
+@pytest.mark.slow
+def test_imported_tables_are_predicted(tmp_path, monkeypatch):
+    monkeypatch.setenv("PHAROS_CACHE_DIR", str(tmp_path))
+    mdp = pharos.TabularMDP.from_arrays([[1, 0], [1, 0]], [[0.0, 0.1], [1.0, 0.0]], gamma=0.9, horizon=20)
+    table = pharos.predict(importers.environment(mdp), "one_hot", **OPTIONS)
+    assert table.states == 2 and 0 <= table.cells[0].value <= 2
+
+
+@pytest.mark.slow
+def test_networks_of_ones_own_are_predicted():
+    import torch
+
+    own = pharos.predict(
+        "river_swim", length=5, networks=["mlp8", lambda shape: torch.nn.Linear(int(np.prod(shape)), 1)], **OPTIONS
+    )
+    assert len(own.cells) == 2 and own.cells[0].network == "mlp8" != own.cells[1].network
+
+
+def test_orders_are_told_in_words():
+    assert str(Order("vector", "hash", 0.3, 19, 20)) == "vector is easier than hash: right in 19 of 20 such pairs"
+    assert (
+        str(Order("vector", "hash", 0.02, 9, 10)) == "vector or hash: too close to call (right in 9 of 10 such pairs)"
+    )
+    assert "too close" in str(Order("vector", "hash", 0.3, 5, 10))
+    assert "too close" in str(Order("vector", "hash", 0.3, 0, 0))
+
+
+def test_what_cannot_be_predicted_is_one_line(monkeypatch):
+    with pytest.raises(ParameterError, match="steps is 500, but learning begins after 1,000 steps; expected at least"):
+        pharos.predict("river_swim", steps=500)
+    with pytest.raises(ParameterError, match="steps is 500, but the first rollout ends after 511 steps"):
+        pharos.predict("river_swim", steps=500, agent="ppo")
+    with pytest.raises(ParameterError, match="no observation to predict for"):
+        pharos.predict("river_swim", [])
+    monkeypatch.setattr(prediction, "MOST_STATES", 4)
+    with pytest.raises(ParameterError, match="has 5 states; predictions are made for at most 4: choose a smaller"):
+        pharos.predict("river_swim", length=5)
+
+
+def test_a_world_where_nothing_can_be_learnt_has_no_prediction(tmp_path, monkeypatch):
+    monkeypatch.setenv("PHAROS_CACHE_DIR", str(tmp_path))
+    mdp = pharos.TabularMDP.from_arrays([[1, 1], [0, 0]], [[1.0, 1.0], [0.0, 0.0]], gamma=0.9, horizon=20)
+    with pytest.raises(UndefinedMeasure, match="uniform"):
+        pharos.predict(importers.environment(mdp), "one_hot", **OPTIONS)
+
+
+def run(*words):
+    return CliRunner().invoke(app, [*words])
+
+
+@pytest.mark.slow
+def test_the_command_answers_in_json_and_in_words_and_draws(tmp_path):
+    words = ["predict", "river_swim", "length=5", "--observation", "vector", "--observation", "hash,bits=8"]
+    words += ["--steps", "1000", *(f"--set={name}={value}" for name, value in SHORT.items())]
+    answer = json.loads(run(*words, "--json", "--plot", str(tmp_path / "bars.svg")).stdout)
+    assert [cell["observation"] for cell in answer["cells"]] == ["vector", "hash(bits=8)"]
+    assert answer["orders"][0]["text"] and answer["level"] == 0.8
+    assert "hash(bits=8)" in (tmp_path / "bars.svg").read_text() or (tmp_path / "bars.svg").stat().st_size > 1000
+    said = run(*words)
+    assert said.exit_code == 0
+    assert "0 is optimal, 1 is uniform play" in said.stdout and "80 % interval" in said.stdout
+    assert any(word in said.stdout for word in ("is easier than", "too close to call"))
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--observation", "hash,bits"], "expected NAME or NAME,OPTION=VALUE"),
+        (["--agent", "sarsa"], "agent 'sarsa': no published runs"),
+        (["--network", "mlp0"], "mlp0"),
+        (["--plot", "bars.txt"], "--plot"),
+    ],
+)
+def test_wrong_options_are_named(words, message):
+    done = run("predict", "river_swim", "length=5", "--steps", "1000", "--set", "learning_starts=100", *words)
+    assert isinstance(done.exception, ParameterError) or done.exit_code == 2
+    assert message in str(done.exception) + done.output
