@@ -13,6 +13,7 @@ from pharos.agents import hyperparameters
 from pharos.cli import app
 from pharos.errors import FileFormatError, ParameterError, ResultCorrupted
 from pharos.study import POLICY_PREDICTORS, predictions, read_predictions, specification, validation, write_predictions
+from pharos.validation import learners
 
 SPEC = {
     "name": "tiny",
@@ -59,7 +60,7 @@ def test_an_actor_critic_is_idealised_with_the_rollouts_and_the_lambda_of_its_ag
     monkeypatch.setattr(hardness, "report", report)
     for agent in ("ppo", "a2c"):  # A2C of Stable-Baselines3 has a lambda of 1
         own = hyperparameters(agent, "simple_grid", "vector")
-        predictions._of_policy({"agent": agent, "steps": 1000, "hyperparameters": own}, None, {})
+        learners._of_policy({"agent": agent, "steps": 1000, "hyperparameters": own}, None, {})
     assert rollouts == [
         hardness.Rollouts(steps=512, gradient_steps=16, gae_lambda=0.95),
         hardness.Rollouts(steps=512, gradient_steps=16, gae_lambda=0.95, clip_range=0.2),  # as A2C has not
@@ -69,7 +70,7 @@ def test_an_actor_critic_is_idealised_with_the_rollouts_and_the_lambda_of_its_ag
 
 def test_the_layers_of_a_network_are_those_of_its_hyperparameters():
     """Wherever Stable-Baselines3 takes them from; another network has no prediction instead of that of the default."""
-    layers = predictions._hidden_layers
+    layers = learners._hidden_layers
     assert layers({}) == [128]
     assert layers({"net_arch": [64, 32]}) == layers({"policy_kwargs": {"net_arch": [64, 32]}}) == [64, 32]
     assert layers({"net_arch": {"pi": [64], "vf": [64]}}) == [64]

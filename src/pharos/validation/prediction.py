@@ -115,11 +115,11 @@ class Prediction:
     @property
     def orders(self) -> list[Order]:
         """Each cell beside the easiest one; the easiest is named first."""
-        known, ranked = published(self.agent), sorted(self.cells, key=lambda cell: cell.value)
+        calibration, ranked = published(self.agent), sorted(self.cells, key=lambda cell: cell.value)
         easiest, orders = ranked[0], []
         for cell in ranked[1:]:
             difference, (easier, harder) = cell.value - easiest.value, self._names(easiest, cell)
-            orders.append(Order(easier, harder, difference, *known.ordered(difference)))
+            orders.append(Order(easier, harder, difference, *calibration.ordered(difference)))
         return orders
 
     def _names(self, first: PredictedRegret, second: PredictedRegret) -> tuple[str, str]:
@@ -191,12 +191,12 @@ def predict(
     from pharos.agents import hyperparameters as hyperparameters_of
     from pharos.training import ChanceSetting, RunConfig, Task
 
-    known = published(agent)
+    calibration = published(agent)
     env = make(environment, **parameters) if isinstance(environment, str) else environment
     if isinstance(steps, bool) or not isinstance(steps, int) or steps < 1:
         raise ParameterError(f"steps is {steps!r}; expected a whole number of at least 1")
     chance = ChanceSetting(sticky, random, lazy, reward_noise)
-    width, cells, states, own = known.half_width(), [], 0, dict(hyperparameters or {})
+    width, cells, states, own = calibration.half_width(), [], 0, dict(hyperparameters or {})
     for name, options in _observations(observations):
         task = Task.of(env, **chance.options, observation=name, observation_options=options, horizon=horizon)
         states = _checked_states(task.space.num_states, env)
@@ -223,10 +223,10 @@ def predict(
         predictor=PRIMARY[agent],
         cells=tuple(cells),
         half_width=width,
-        coverage=known.coverage(),
-        published_cells=len(known.predicted),
-        published_classes=len(set(known.classes)),
-        warnings=tuple(_warnings(known, states, steps, chance)),
+        coverage=calibration.coverage(),
+        published_cells=len(calibration.predicted),
+        published_classes=len(set(calibration.classes)),
+        warnings=tuple(_warnings(calibration, states, steps, chance)),
         hyperparameters=chosen,
     )
 
@@ -265,12 +265,12 @@ def _check_steps(config: Mapping[str, Any]) -> None:
         raise ParameterError(f"steps is {steps}, but {what} after {least - 1:,} steps; expected at least {least:,}")
 
 
-def _warnings(known: Published, states: int, steps: int, chance: Any) -> Iterable[str]:
+def _warnings(calibration: Published, states: int, steps: int, chance: Any) -> Iterable[str]:
     """Where the instance lies outside of the published cells."""
-    low, high = int(known.states.min()), int(known.states.max())
+    low, high = int(calibration.states.min()), int(calibration.states.max())
     if not low <= states <= high:
         yield f"{states:,} states: tested were {low:,} to {high:,}, so the interval is not calibrated here"
-    low, high = int(known.steps.min()), int(known.steps.max())
+    low, high = int(calibration.steps.min()), int(calibration.steps.max())
     if not low <= steps <= high:
         yield f"{steps:,} steps: tested were {low:,} to {high:,}, so the interval is not calibrated here"
     untested = [name for name in ("sticky", "lazy", "reward_noise") if getattr(chance, name)]
