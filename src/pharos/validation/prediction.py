@@ -145,7 +145,7 @@ class Prediction:
         return "\n".join([*lines, *map(str, self.orders), *self.warnings])
 
 
-def predict(
+def predict(  # noqa: PLR0913
     environment: Environment | str,
     observations: "str | Iterable[str | tuple[str, Mapping[str, Any]]]" = "vector",
     *,
