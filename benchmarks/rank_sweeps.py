@@ -2,7 +2,7 @@
 
     python benchmarks/rank_sweeps.py [TARGET] [--processes 2 3] [--rounds 5] [--before OTHER/src] [--shares 16]
 
-Each round solves in processes of its own: in place until 1e-6 is proven, and 40 steps of a horizon, which are not in
+Each round solves under `mpiexec`: in place until 1e-6 is proven, and 40 steps of a horizon, which are not in
 place. Prints medians over rounds of the median milliseconds between two sweeps, and of the ratio of pairs. `--shares P`
 prints for P ranges which part of the rows reads no halo, which is read by no other range, and how much is sent early.
 """
@@ -22,8 +22,8 @@ import numpy as np
 HERE = Path(__file__).resolve().parent.parent / "src"
 
 
-def times(target, processes):
-    """Seconds between two sweeps, in place and not."""
+def times(target):
+    """Seconds between two sweeps, in place and not, at a rank of MPI."""
     import pharos
 
     mdp = pharos.build(target, progress=False).mdp(0.99)
@@ -31,9 +31,9 @@ def times(target, processes):
     for name, options in (("in place", {}), ("not in place", {"horizon": 40})):
         moments = []
         pharos.value_iteration(
-            mdp, processes=processes, progress=lambda *_, to=moments: to.append(time.perf_counter()), **options
+            mdp, processes="mpi", progress=lambda *_, to=moments: to.append(time.perf_counter()), **options
         )
-        results[name] = statistics.median(np.diff(moments))
+        results[name] = statistics.median(np.diff(moments)) if len(moments) > 1 else None  # the first rank reports
     return results
 
 
@@ -70,10 +70,13 @@ def main():
     parser.add_argument("--processes", type=int, nargs="*", default=[2, 3])
     parser.add_argument("--before", help="another version's src folder")
     parser.add_argument("--shares", type=int)
-    parser.add_argument("--once", type=int, help=argparse.SUPPRESS)
+    parser.add_argument("--once", action="store_true", help=argparse.SUPPRESS)
+    parser.add_argument("--mpiexec", default=str(Path(sys.executable).parent / "mpiexec"))
     options = parser.parse_args()
-    if options.once is not None:
-        print(json.dumps(times(options.target, options.once)))
+    if options.once:
+        results = times(options.target)
+        if None not in results.values():
+            print(json.dumps(results))
         return
     if options.shares:
         shares(options.target, options.shares)
@@ -83,7 +86,7 @@ def main():
     for _ in range(options.rounds):
         for processes in options.processes:
             for source, path in sources.items():
-                command = [sys.executable, __file__, options.target, "--once", str(processes)]
+                command = [options.mpiexec, "-n", str(processes), sys.executable, __file__, options.target, "--once"]
                 environment = {**os.environ, "PYTHONPATH": path}
                 done = subprocess.run(command, check=True, capture_output=True, text=True, env=environment)
                 for way, seconds in json.loads(done.stdout).items():

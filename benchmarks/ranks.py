@@ -1,6 +1,6 @@
 """What several processes cost and bring: building by one thread, two threads, and two or three processes, in one run.
 
-    python benchmarks/ranks.py [TARGET] [--rounds 3] [--processes 2 3] [--mpiexec mpiexec]
+    python benchmarks/ranks.py [TARGET] [--rounds 3] [--processes 2 3]
 
 Each round builds the space anew in every way, in processes of their own, and compares the files. Prints the median of
 seconds and of processor seconds of all processes, and their ratio to one thread's.
@@ -35,20 +35,17 @@ def main():
     parser.add_argument("target", nargs="*", default=["breakout", "height=14", "columns=8", "brick_rows=3"])
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--processes", type=int, nargs="*", default=[2, 3])
-    parser.add_argument("--mpiexec", default=str(Path(sys.executable).parent / "mpiexec"))
     options = parser.parse_args()
     pharos = [sys.executable, "-m", "pharos", "build", *options.target, "--json", "--out"]
-    ways = {"one thread": ([], ["--workers", "1"]), "threads": ([], [])}
+    ways = {"one thread": ["--workers", "1"], "threads": []}
     for number in options.processes:
-        ways[f"{number} processes"] = ([], ["--processes", str(number)])
-        if os.path.exists(options.mpiexec):
-            ways[f"{number} ranks of MPI"] = ([options.mpiexec, "-n", str(number)], [])
+        ways[f"{number} processes"] = ["--processes", str(number)]
     results = {way: [] for way in ways}
     with tempfile.TemporaryDirectory(dir=os.environ.get("PHAROS_CACHE_DIR")) as folder:
         for _ in range(options.rounds):
-            for way, (launcher, arguments) in ways.items():
+            for way, arguments in ways.items():
                 out = Path(folder) / way.replace(" ", "-")
-                results[way].append(measure([*launcher, *pharos, str(out), *arguments]))
+                results[way].append(measure([*pharos, str(out), *arguments]))
                 first = Path(folder) / "one-thread"
                 names = sorted(path.name for path in first.iterdir())
                 assert filecmp.cmpfiles(first, out, names, shallow=False)[0] == names, way

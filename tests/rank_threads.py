@@ -1,13 +1,106 @@
-"""Ranks that are threads of the test: their exchanges are measured, and they can be made to fail or to be late."""
+"""Ranks that are threads of the test, which can be made to fail or to be late."""
 
 import contextlib
 import random
+import threading
 import time
+from collections import defaultdict, deque
 
 import numpy as np
 import pytest
 
-from pharos import ranks
+from pharos.ranks import Rank, RankFailed
+from pharos.ranks.rank import Alone, error_of, text_of
+
+
+class _Room:
+    """What the threads share."""
+
+    def __init__(self, size):
+        self.barrier = threading.Barrier(size)
+        self.sent = [()] * size
+        self.failure = None
+        self.mail = defaultdict(deque)  # by (from, to)
+        self.news = threading.Condition()  # of mail, and of the end
+        self.is_over = False
+
+
+class _Thread(Rank):
+    def __init__(self, rank, size, room):
+        self.rank, self.size, self.neighbors, self._room = rank, size, size, room
+        self._expected = []
+
+    def exchange(self, parts):
+        self._room.sent[self.rank] = parts
+        self._wait()
+        received = [self._room.sent[rank][self.rank].copy() for rank in range(self.size)]
+        self._wait()
+        return received
+
+    def _wait(self):
+        try:
+            self._room.barrier.wait()
+        except threading.BrokenBarrierError:
+            raise self._failure() from None
+
+    def _failure(self):
+        rank, text = self._room.failure or (0, "RankFailed\nthe others have ended")
+        return error_of(text, rank)
+
+    def send(self, to, array):
+        with self._room.news:
+            self._room.mail[self.rank, to].append(array.copy())
+            self._room.news.notify_all()
+
+    def receive(self, source, into):
+        self._expected.append((source, into))
+
+    def finish(self):
+        room = self._room
+        for source, into in self._expected:
+            with room.news:
+                box = room.mail[source, self.rank]
+                room.news.wait_for(lambda box=box: box or room.is_over)
+                if not box:
+                    raise self._failure()
+                array = box.popleft()
+            assert (array.shape, array.dtype) == (into.shape, into.dtype)
+            into[...] = array
+        self._expected.clear()
+
+    def fail(self, error):
+        if self._room.failure is None and not isinstance(error, RankFailed):
+            self._room.failure = self.rank, text_of(error)
+        with self._room.news:
+            self._room.is_over = True
+            self._room.news.notify_all()
+        self._room.barrier.abort()
+
+
+@contextlib.contextmanager
+def loop(size, answer):
+    """Rank 0, while threads run `answer` as the others."""
+    room = _Room(size)
+    here = _Thread(0, size, room)
+
+    def run(rank):
+        there = _Thread(rank, size, room)
+        try:
+            answer(there)
+        except BaseException as error:
+            there.fail(error)
+
+    threads = [threading.Thread(target=run, args=(rank,), daemon=True) for rank in range(1, size)]
+    for thread in threads:
+        thread.start()
+    try:
+        yield here
+    except BaseException as error:
+        here.fail(error)
+        raise
+    finally:
+        for thread in threads:
+            thread.join()
 
 
 class Killed(Exception):
@@ -77,39 +170,27 @@ def out_of_order(seed):
     return disturb
 
 
-def aligned(array):
-    return max(1, -(-array.nbytes // 64)) * 64
-
-
 @contextlib.contextmanager
-def threads(module, disturb=lambda rank: None):
-    """What a module runs by several processes runs in threads; none sends more at a time than the module said."""
+def threads(module, size, disturb=lambda rank: None):
+    """A module's programs of "mpi" run in `size` threads; none sends nothing, or anything to itself."""
 
-    def together(size, program, capacity):
+    def run_spmd(processes, program):
         def run(rank):
-            exchange, send, finish, sizes = rank.exchange, rank.send, rank.finish, []
-
-            def bounded(parts):
-                assert sum(-(-part.nbytes // 64) * 64 for part in parts) + 64 + 16 * size <= capacity
-                return exchange(parts)
+            send = rank.send
 
             def sent(to, array):
-                sizes.append(aligned(array))
-                assert sum(sizes) <= capacity
                 assert array.size and to != rank.rank
                 send(to, np.array(array))
 
-            def finished():
-                sizes.clear()
-                finish()
-
-            rank.exchange, rank.send, rank.finish = bounded, sent, finished
+            rank.send = sent
             disturb(rank)
             return program(rank)
 
-        with ranks.loop(size, run) as rank:
+        if processes != "mpi":
+            return run(Alone())
+        with loop(size, run) as rank:
             return run(rank)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(module, "together", together)
+        patch.setattr(module, "run_spmd", run_spmd)
         yield

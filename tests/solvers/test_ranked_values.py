@@ -5,7 +5,6 @@ import itertools
 import json
 import os
 import shutil
-import signal
 import subprocess
 import sys
 import tempfile
@@ -42,10 +41,10 @@ def chain(num_states=300, gamma=0.9):
 
 
 def solved(mdp, size, *, select=BEST, tolerance=1e-6, horizon=None, disturb=lambda rank: None, cuts=None, **options):
-    with threads(sharing, disturb), pytest.MonkeyPatch.context() as patch:
+    with threads(sharing, size, disturb), pytest.MonkeyPatch.context() as patch:
         if cuts is not None:
             patch.setattr(ranked, "cuts_of", lambda num_rows, ranks: np.array(cuts))
-        return shared_solution(mdp, select, tolerance, horizon, DistributedOptions(size, **options))
+        return shared_solution(mdp, select, tolerance, horizon, DistributedOptions("mpi", **options))
 
 
 # The same values ------------------------------------------------------------------------------------------------------
@@ -90,8 +89,8 @@ def test_evaluation_and_the_uniform_policy_are_shared(monkeypatch):
     mdp, policy = chain(), np.arange(300) % 2
     for function in (lambda **more: evaluate_policy(mdp, policy, **more), lambda **more: uniform_value(mdp, **more)):
         alone = function()
-        with threads(sharing):
-            shared = function(processes=3)
+        with threads(sharing, 3):
+            shared = function(processes="mpi")
         assert np.abs(shared.v - alone.v).max() <= alone.error_bound + shared.error_bound
 
 
@@ -176,13 +175,14 @@ def test_sweeps_in_place_keep_the_order_of_the_states(mdp, seed, data):
 def test_what_processes_cannot_do_is_said():
     mdp = chain(5)
     with pytest.raises(ParameterError, match=r"6 processes for 5 states; expected at most one for each state"):
-        value_iteration(mdp, processes=6)
-    with pytest.raises(ParameterError, match=r"expected a whole number from 1 to 1024, or 'mpi'"):
-        value_iteration(mdp, processes=0)
+        solved(mdp, 6)
+    for wrong in (0, 2, True, "many"):
+        with pytest.raises(ParameterError, match="expected 1, or 'mpi' in a program that `mpiexec"):
+            value_iteration(mdp, processes=wrong)
     with pytest.raises(ParameterError, match="expected processes=1, a horizon, or gamma < 1"):
         solved(mdp.with_gamma(1.0), 2)
     with pytest.raises(ParameterError, match="keep the last step alone"):
-        value_iteration(mdp, processes=2, horizon=3, keep_all=True)
+        value_iteration(mdp, processes="mpi", horizon=3, keep_all=True)
     with pytest.raises(PrecisionError, match="raise the tolerance or lower gamma"):
         solved(mdp, 2, tolerance=1e-17)
 
@@ -235,9 +235,9 @@ def test_a_checkpoint_is_of_one_question(tmp_path, monkeypatch):
     paid = np.ones((300, 2)) * (np.arange(300) < 299)[:, None]
     for mdp in (chain(), chain(gamma=0.8), chain().with_rewards(paid)):
         done = []
-        with threads(sharing):
+        with threads(sharing, 3):
             report = lambda sweeps, _, done=done: done.append(sweeps)  # noqa: E731
-            value_iteration(mdp, processes=3, checkpoint=tmp_path, progress=report)
+            value_iteration(mdp, processes="mpi", checkpoint=tmp_path, progress=report)
         first.append(done[0])
         if len(first) == 1:
             assert not file.exists()  # it was answered
@@ -276,31 +276,44 @@ def test_a_full_disk_ends_no_solving(tmp_path, monkeypatch):
 
 
 @pytest.mark.long
-def test_three_processes_solve_and_go_on_after_a_kill(tmp_path, monkeypatch):
-    mdp = chain(20_000)
-    alone = value_iteration(mdp, horizon=80)
-    monkeypatch.setattr(checkpoints, "_SHARE", 0)
-    monkeypatch.setattr(checkpoints, "SECONDS", -1.0)
-    monkeypatch.setattr(DistributedOptions, "checkpoint_seconds", -1.0)
-    sweep, sweeps = ranked.RankedBackup.plain_sweep, []
+@pytest.mark.skipif(MPIEXEC is None, reason="needs the extra mpi")
+def test_three_ranks_solve_and_go_on_after_a_kill(tmp_path):
+    alone = solved(chain(20_000), 1, horizon=80)
+    stopped = ranks_of_mpi(3, SOLVE, tmp_path, "40")
+    assert stopped.returncode != 0 and len(list(tmp_path.glob("values/*.values"))) == 1
+    finished = ranks_of_mpi(2, SOLVE, tmp_path, "0")
+    assert finished.returncode == 0, finished.stderr
+    assert int((tmp_path / "first.txt").read_text()) > 10
+    assert (np.load(tmp_path / "x.npy") == alone.x).all()
 
-    def dies(backup):
-        sweeps.append(0)
-        if backup.rank.rank == 2 and len(sweeps) == 40:
-            os.kill(os.getpid(), signal.SIGKILL)
-        return sweep(backup)
 
-    monkeypatch.setattr(ranked.RankedBackup, "plain_sweep", dies)
-    with pytest.raises(RankFailed, match=r"rank 2 of 3 died \(exit code -9\); the same command resumes"):
-        shared_solution(mdp, BEST, 1e-6, 80, DistributedOptions(3, tmp_path, -1.0))
-    assert len(list(tmp_path.iterdir())) == 1
-    monkeypatch.setattr(ranked.RankedBackup, "plain_sweep", sweep)
-    first = []
-    result = shared_solution(
-        mdp, BEST, 1e-6, 80, DistributedOptions(2, tmp_path, -1.0), lambda sweeps, _: first.append(sweeps)
-    )
-    assert first[0] > 10
-    assert (result.x == alone.x).all()
+# The third rank kills itself in a sweep; the first writes the values, and how many sweeps it began with.
+SOLVE = """
+import os, pathlib, signal, sys
+import numpy as np
+from pharos.mdp import BEST
+from pharos.solvers import checkpoint, distributed, ranked
+from test_ranked_values import chain
+folder, last, sweeps, first = pathlib.Path(sys.argv[1]), int(sys.argv[2]), [], []
+sweep, checkpoint._SHARE = ranked.RankedBackup.plain_sweep, 0
+def dies(backup):
+    sweeps.append(0)
+    if backup.rank.rank == 2 and len(sweeps) == last:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return sweep(backup)
+ranked.RankedBackup.plain_sweep = dies
+options = distributed.DistributedOptions("mpi", folder / "values", -1.0)
+solution = distributed.shared_solution(chain(20_000), BEST, 1e-6, 80, options, lambda sweeps, _: first.append(sweeps))
+if solution is not None:
+    np.save(folder / "x.npy", solution.x)
+    (folder / "first.txt").write_text(str(first[0]))
+"""
+
+
+def ranks_of_mpi(size, program, *arguments):
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    command = [MPIEXEC, "-n", str(size), sys.executable, "-c", program, *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=500, env=environment)
 
 
 WORLD = ["breakout", "height=7", "columns=5", "brick_rows=1", "--gamma", "0.5"]
@@ -316,32 +329,21 @@ def run(tmp_path, *arguments, ranks_of_mpi=0):
 @pytest.mark.long
 @pytest.mark.parametrize("chance", [[], ["--sticky", "0.25"], ["--random", "0.1", "--horizon", "30"]])
 @pytest.mark.parametrize("launcher", ["processes", "mpi"])
+@pytest.mark.skipif(MPIEXEC is None, reason="needs the extra mpi")
 def test_the_command_writes_the_same_values(launcher, chance, tmp_path):
-    if launcher == "mpi" and MPIEXEC is None:
-        pytest.skip("needs the extra mpi")
     more = {"ranks_of_mpi": 3} if launcher == "mpi" else {}
     many = ["--processes", "3"] if launcher == "processes" else []
     alone = run(tmp_path, *WORLD, *chance, "--out", tmp_path / "alone.npz", "--json")
     shared = run(tmp_path, *WORLD, *chance, *many, "--out", tmp_path / "shared.npz", "--json", **more)
     assert shared.returncode == 0, shared.stderr
     answers = [json.loads(each.stdout) for each in (alone, shared)]
+    assert answers[1]["processes"] == (3 if launcher == "processes" else "mpi")
     error = 0.0 if "--horizon" in chance else sum(answer["error_bound"] for answer in answers)
     for key in ("value_at_start", "uniform_value_at_start"):
         assert abs(answers[0][key] - answers[1][key]) <= error
     with np.load(tmp_path / "alone.npz") as one, np.load(tmp_path / "shared.npz") as other:
         assert set(one) == set(other)
         assert np.abs(one["v"] - other["v"]).max() <= error
-
-
-@pytest.mark.long
-@pytest.mark.skipif(MPIEXEC is None, reason="needs the extra mpi")
-def test_ranks_of_mpi_sweep_in_place_as_processes_do(tmp_path):
-    by_mpi = run(tmp_path, *WORLD, "--out", tmp_path / "mpi.npz", "--json", ranks_of_mpi=3)
-    forked = run(tmp_path, *WORLD, "--processes", "3", "--out", tmp_path / "forked.npz", "--json")
-    assert by_mpi.returncode == 0, by_mpi.stderr
-    assert json.loads(by_mpi.stdout)["sweeps"] == json.loads(forked.stdout)["sweeps"]
-    with np.load(tmp_path / "mpi.npz") as one, np.load(tmp_path / "forked.npz") as other:
-        assert all((one[name] == other[name]).all() for name in one)
 
 
 @pytest.mark.long

@@ -5,7 +5,6 @@ import functools
 import itertools
 import os
 import shutil
-import signal
 import subprocess
 import sys
 import tempfile
@@ -19,17 +18,15 @@ from test_resuming import build, files_of
 
 import pharos
 from chance_worlds import ChanceWorld
-from pharos import ranks
-from pharos.errors import ParameterError, RuleError, StateSpaceError, StateSpaceTooLarge
+from pharos.errors import MissingExtra, ParameterError, RuleError, StateSpaceError, StateSpaceTooLarge
 from pharos.kernels import key_owner
-from pharos.ranks import RankFailed
-from pharos.state_space import build_processes as crew
+from pharos.ranks import Halo, RankFailed, cuts_of, mpi, run_spmd
 from pharos.state_space import ranked_search, ranked_table, search
 from pharos.state_space.files import lock
 from pharos.state_space.plan import Plan
 from pharos.state_space.progress import reporter
 from pharos.state_space.search import Options, journal_of
-from rank_threads import Killed, fails_at
+from rank_threads import Killed, fails_at, loop
 
 WORLDS = {
     "lake": pharos.make("frozen_lake/8x8"),
@@ -60,7 +57,7 @@ def build_by_threads(env, folder, size, *, wide=0, rows=64, disturb=lambda rank:
         patch.setattr(ranked_table, "ROWS", rows)
         patch.setattr(search, "CHUNK", 8 * rows)
         manifest = pharos.state_space.read_manifest(folder)
-        with ranks.loop(size, answer) as rank:
+        with loop(size, answer) as rank:
             disturb(rank)
             ranked_search.RankedSearch(plan, journal_of(folder, plan), options, report, rank, wide).run(manifest)
             ranked_table.end(rank)
@@ -193,7 +190,7 @@ def echo(rank):
     assert rank.broadcast(np.array([7]) if rank.rank == 0 else None, np.zeros(1, np.int64)).tolist() == [7]
     every = [np.array([rank.rank])] * rank.size
     assert rank.scatter(every if rank.rank == 0 else None, every[0]).tolist() == [0]
-    assert [part.tolist() for part in rank.gather_all(np.array([rank.rank]))] == [[each] for each in range(rank.size)]
+    assert [part.tolist() for part in rank.allgather(np.array([rank.rank]))] == [[each] for each in range(rank.size)]
     gathered = [part.tolist() for part in rank.gather(np.array([rank.rank]))]
     assert gathered == [[each] if rank.rank == 0 else [] for each in range(rank.size)]
 
@@ -216,25 +213,25 @@ def tell(rank):
         for (source, i), into in places.items():
             assert (into == 100 * turn + 10 * source + i).all()
         if turn % 3 == 0:
-            assert rank.numbers_of_all(turn, rank.rank).tolist() == [[turn, each] for each in range(rank.size)]
+            assert rank.allgather_numbers(turn, rank.rank).tolist() == [[turn, each] for each in range(rank.size)]
 
 
-def by_processes(size, answer):
-    return ranks.processes(size, answer, 1 << 12)
-
-
-@pytest.mark.parametrize("among", [ranks.loop, by_processes])
 @pytest.mark.parametrize("size", [1, 3])
-def test_what_is_sent_arrives(among, size):
-    with among(size, echo) as rank:
+def test_what_is_sent_arrives(size):
+    with loop(size, echo) as rank:
         echo(rank)
 
 
-@pytest.mark.parametrize("among", [ranks.loop, by_processes])
 @pytest.mark.parametrize("size", [1, 3])
-def test_messages_arrive_in_their_order(among, size):
-    with among(size, tell) as rank:
+def test_messages_arrive_in_their_order(size):
+    with loop(size, tell) as rank:
         tell(rank)
+
+
+def test_one_process_needs_no_mpi():
+    run_spmd(1, echo)
+    with pytest.raises(RuleError, match=r"^a rule failed$"):
+        run_spmd(1, lambda rank: fail_on_purpose(rank, 0))
 
 
 def fail_while_others_wait(rank):
@@ -244,23 +241,22 @@ def fail_while_others_wait(rank):
         raise RuleError("a rule failed")
     rank.send((rank.rank - 1) % rank.size, np.ones(1))
     rank.finish()
-    rank.numbers_of_all(1.0)
+    rank.allgather_numbers(1.0)
 
 
-@pytest.mark.parametrize("among", [ranks.loop, by_processes])
-def test_who_waits_for_a_message_is_told_of_a_failure(among):
-    with pytest.raises(RuleError, match=r"^a rule failed$"), among(3, fail_while_others_wait) as rank:
+def test_who_waits_for_a_message_is_told_of_a_failure():
+    with pytest.raises(RuleError, match=r"^a rule failed$"), loop(3, fail_while_others_wait) as rank:
         fail_while_others_wait(rank)
 
 
 # Each rank writes a file of its own: mpiexec joins what ranks print wherever it reads, in the middle of lines too.
 PROGRAM = """
 import os, pathlib, sys
-from pharos.ranks import together
-from test_ranks import fail_while_others_wait, tell
-program = {"tell": tell, "fail": fail_while_others_wait}[sys.argv[1]]
+from pharos.ranks import run_spmd
+from test_ranks import echo, fail_on_purpose, fail_while_others_wait, tell
+program = {"echo": echo, "tell": tell, "fail": fail_while_others_wait, "give up": fail_on_purpose}[sys.argv[1]]
 try:
-    together("mpi", program, 0)
+    run_spmd("mpi", program)
     line = "told"
 except Exception as error:
     line = f"{type(error).__name__}: {error}"
@@ -269,7 +265,10 @@ pathlib.Path(sys.argv[2], str(os.getpid())).write_text(line)
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("what, line", [("tell", "told"), ("fail", "RuleError: a rule failed")])
+@pytest.mark.parametrize(
+    "what, line",
+    [("echo", "told"), ("tell", "told"), ("fail", "RuleError: a rule failed"), ("give up", "RuleError: a rule failed")],
+)
 @pytest.mark.skipif(shutil.which("mpiexec", path=Path(sys.executable).parent) is None, reason="needs the extra mpi")
 def test_ranks_of_mpi_send_messages(what, line, tmp_path):
     command = [Path(sys.executable).parent / "mpiexec", "-n", "3", sys.executable, "-c", PROGRAM, what, tmp_path]
@@ -278,88 +277,36 @@ def test_ranks_of_mpi_send_messages(what, line, tmp_path):
     assert [said.read_text() for said in tmp_path.iterdir()] == [line] * 3, done.stderr
 
 
-def die_while_others_wait(rank):
-    rank.receive((rank.rank + 1) % rank.size, np.zeros(1))
-    if rank.rank == 2:
-        os.kill(os.getpid(), signal.SIGKILL)
-    rank.send((rank.rank - 1) % rank.size, np.ones(1))
-    rank.finish()
-    rank.numbers_of_all(1.0)
-
-
-def test_a_process_killed_before_it_sent_is_one_line():
-    with (
-        pytest.raises(RankFailed, match=r"rank 2 of 3 died \(exit code -9\); the same command resumes"),
-        by_processes(3, die_while_others_wait) as rank,
-    ):
-        die_while_others_wait(rank)
-
-
-def fail_on_purpose(rank):
+def fail_on_purpose(rank, who=1):
     rank.exchange([np.zeros(1)] * rank.size)
-    if rank.rank == 1:
+    if rank.rank == who:
         raise RuleError("a rule failed")
     rank.exchange([np.zeros(1)] * rank.size)
 
 
-@pytest.mark.parametrize("among", [ranks.loop, by_processes])
-def test_the_first_raises_the_error_of_another(among):
-    with pytest.raises(RuleError, match=r"^a rule failed$"), among(3, fail_on_purpose) as rank:
+def test_the_first_raises_the_error_of_another():
+    with pytest.raises(RuleError, match=r"^a rule failed$"), loop(3, fail_on_purpose) as rank:
         fail_on_purpose(rank)
-
-
-def die(rank):
-    rank.exchange([np.zeros(1)] * rank.size)
-    if rank.rank == 2:
-        os.kill(os.getpid(), signal.SIGKILL)
-    rank.exchange([np.zeros(1)] * rank.size)
-
-
-def test_a_killed_process_is_one_line():
-    with (
-        pytest.raises(RankFailed, match=r"rank 2 of 3 died \(exit code -9\); the same command resumes"),
-        by_processes(3, die) as rank,
-    ):
-        die(rank)
-
-
-def test_an_exchange_that_is_too_large_is_refused():
-    with pytest.raises(ParameterError, match="expected at most 4096"), by_processes(2, die) as rank:
-        rank.exchange([np.zeros(4096)] * 2)
 
 
 # Processes and MPI ----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.long
-def test_forked_processes_write_the_same_files_and_go_on_after_a_kill(tmp_path, monkeypatch):
-    monkeypatch.setattr(ranked_search, "WIDE", 0)
-    monkeypatch.setattr(ranked_search.RankedSearch.__init__, "__defaults__", (0,))
-    monkeypatch.setattr(ranked_table, "ROWS", 64)
-    answer = crew.answer
-
-    def dies(plan, rank, memory):
-        fails = fails_at(2, 900)
-        fails(rank)
-        try:
-            answer(plan, rank, memory)
-        except Killed:
-            os.kill(os.getpid(), signal.SIGKILL)
-
-    monkeypatch.setattr(crew, "answer", dies)
-    with pytest.raises(RankFailed, match="rank 2 of 3 died"):
-        pharos.build(WORLDS["breakout"], tmp_path / "space", processes=3, progress=False)
-    stopped = pharos.state_space.read_manifest(tmp_path / "space")
-    assert not stopped["complete"] and stopped["num_expanded"] > 0
-    monkeypatch.setattr(crew, "answer", answer)
-    pharos.build(WORLDS["breakout"], tmp_path / "space", processes=3, progress=False)
-    assert files_of(tmp_path / "space") == expected("breakout")
-
-
-@pytest.mark.parametrize("size", [0, -1, 2.5, True, "many", 10**6])
+@pytest.mark.parametrize("size", [0, -1, 2.5, True, "many", 8])
 def test_numbers_of_processes_that_mean_nothing_are_refused(size, tmp_path):
-    with pytest.raises(ParameterError, match="expected a whole number from 1 to 1024, or 'mpi'"):
+    with pytest.raises(ParameterError, match=r"expected 1, or 'mpi' in a program that `mpiexec -n 8 python PROGRAM`"):
         pharos.build("frozen_lake/4x4", tmp_path / "space", processes=size)
+
+
+def test_a_command_that_cannot_be_started_by_mpiexec_is_one_line(monkeypatch):
+    monkeypatch.setenv("PHAROS_STARTED", "3")
+    monkeypatch.setattr(mpi.shutil, "which", lambda *_, **__: "mpiexec")
+    monkeypatch.setattr(mpi.importlib.util, "find_spec", lambda name: name)
+    with pytest.raises(ParameterError, match=r"write mpiexec -n 3 pharos \.\.\., with --processes mpi"):
+        mpi.start_under_mpiexec(3)
+    monkeypatch.setattr(mpi.shutil, "which", lambda *_, **__: None)
+    with pytest.raises(MissingExtra, match=r"--processes 3 needs mpi4py .*pharos-rl\[mpi\]"):
+        mpi.start_under_mpiexec(3)
 
 
 def test_a_rank_of_mpi_that_fails_tells_the_others(monkeypatch):
@@ -373,43 +320,62 @@ def test_a_rank_of_mpi_that_fails_tells_the_others(monkeypatch):
         raise RuleError("a rule failed")
 
     second = Second()
-    monkeypatch.setattr(crew, "mpi_rank", lambda: second)
-    monkeypatch.setattr(crew, "answer", fails)
-    with pytest.raises(RuleError), crew.crew_of("mpi", None, None):
+    monkeypatch.setattr(ranked_table, "mpi_rank", lambda: second)
+    monkeypatch.setattr(ranked_table, "answer", fails)
+    with pytest.raises(RuleError), ranked_table.rank_of_build(None, None):
         pass
     assert str(second.told) == "a rule failed"
 
 
 @pytest.mark.long
 @pytest.mark.skipif(shutil.which("mpiexec", path=Path(sys.executable).parent) is None, reason="needs the extra mpi")
-def test_ranks_of_mpi_write_the_same_files(tmp_path):
-    at_once = "from pharos.state_space import ranked_search as search; search.RankedSearch.__init__.__defaults__ = (0,)"
-    command = [sys.executable, "-c", f"{at_once}; from pharos.cli import main; main()", "build"]
-    world = ["breakout", "height=7", "columns=5", "brick_rows=1", "--out", tmp_path / "space"]
+def test_ranks_of_mpi_write_the_same_files_and_go_on_after_a_kill(tmp_path):
+    world = ["breakout", "height=7", "columns=5", "brick_rows=1", "--out", tmp_path / "space", "--processes", "3"]
 
-    def run(*more):
-        mpiexec = [Path(sys.executable).parent / "mpiexec", "-n", "3"]
-        return subprocess.run([*mpiexec, *command, *world, *more], capture_output=True, text=True, timeout=500)
+    def run(*more, last=0):
+        command = [sys.executable, "-c", BUILD, "build", *world, *more]
+        environment = {**os.environ, "LAST_EXCHANGE": str(last)}
+        return subprocess.run(command, capture_output=True, text=True, timeout=500, env=environment)
 
     stopped = run("--max-states", "1000")
     assert stopped.returncode == 1
     assert [line.count("max_states") for line in stopped.stderr.splitlines() if line.startswith("pharos:")] == [1]
+    assert run(last=40).returncode != 0
+    assert not pharos.state_space.read_manifest(tmp_path / "space")["complete"]
     finished = run()
     assert finished.returncode == 0, finished.stderr
     assert finished.stdout.count("states/s") == 1
     assert files_of(tmp_path / "space") == expected("breakout")
 
 
+# Ranks build in small blocks from the first state on; the third kills itself at an exchange.
+BUILD = """
+import os, signal
+from pharos.cli import main
+from pharos.ranks import mpi
+from pharos.state_space import ranked_search, ranked_table
+ranked_search.RankedSearch.__init__.__defaults__, ranked_table.ROWS = (0,), 64
+exchange, exchanges = mpi._Mpi.exchange, []
+def dies(rank, parts):
+    exchanges.append(0)
+    if rank.rank == 2 and len(exchanges) == int(os.environ["LAST_EXCHANGE"]):
+        os.kill(os.getpid(), signal.SIGKILL)
+    return exchange(rank, parts)
+mpi._Mpi.exchange = dies
+main()
+"""
+
+
 def test_each_rank_knows_which_of_its_rows_the_others_read():
-    cuts = ranks.cuts_of(20, 3)
+    cuts = cuts_of(20, 3)
     assert cuts.tolist() == [0, 6, 13, 20]
     rows = [np.array([6, 7, 19]), np.array([0, 13]), np.array([5])]  # outside of each range
     halos = {}
 
     def make(rank):
-        halos[rank.rank] = ranks.Halo(rank, rows[rank.rank], cuts)
+        halos[rank.rank] = Halo(rank, rows[rank.rank], cuts)
 
-    with ranks.loop(3, make) as rank:
+    with loop(3, make) as rank:
         make(rank)
     for reader, owner in np.ndindex(3, 3):
         read = rows[reader][halos[reader].of_rank[owner]]

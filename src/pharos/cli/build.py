@@ -22,7 +22,7 @@ from pharos.cli.options import (
     Processes,
     TargetArgument,
     Workers,
-    parse_size,
+    memory_of,
     ranks_of,
 )
 from pharos.cli.target import parse_environment
@@ -48,7 +48,7 @@ def build(
 
     ranks = ranks_of(processes)
     env = parse_environment(environment, parameters)
-    limit = parse_size(memory)
+    limit = memory_of(memory, processes)
     was_there = _is_there(out or cached_folder(env))
     watch = Stopwatch()
     space = state_space.build(

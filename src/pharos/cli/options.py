@@ -64,7 +64,7 @@ Processes = Annotated[
     typer.Option(
         "--processes",
         metavar="N|mpi",
-        help="Processes that share the work and the memory; under mpiexec: those that it has started.",
+        help="Processes that share the work and the memory, by MPI; under mpiexec: those that it has started.",
     ),
 ]
 Gamma = Annotated[
@@ -119,6 +119,7 @@ def parse_value(text: str) -> Any:
     return text
 
 
+_MOST_PROCESSES = 1024  # of a machine that anybody may mean
 _UNITS = {"": 1, "K": 10**3, "M": 10**6, "G": 10**9, "T": 10**12, "KI": 2**10, "MI": 2**20, "GI": 2**30, "TI": 2**40}
 
 
@@ -158,27 +159,35 @@ def discount(gamma: float | None, horizon: int | None) -> float:
     return 0.99 if horizon is None else 1.0
 
 
-def build_options(memory: str | None, workers: int | None, max_states: int | None) -> dict[str, Any]:
+def build_options(
+    memory: str | None, workers: int | None, max_states: int | None, processes: str = "1"
+) -> dict[str, Any]:
     """What `build` takes, of --memory, --workers and --max-states."""
-    return {"memory": parse_size(memory), "workers": workers, "max_states": max_states}
+    return {"memory": memory_of(memory, processes), "workers": workers, "max_states": max_states}
 
 
 def ranks_of(processes: str) -> int | str:
-    """The value of --processes; "mpi" in a process that a launcher has started with others. All but the first of them
-    are silent from here on.
+    """1, or "mpi" in a process that a launcher has started with others; all but the first of them are silent from here
+    on. A number above 1 starts this command once more, by `mpiexec`.
     """
-    from pharos.ranks import launched, mpi_rank
+    from pharos.ranks import launched, mpi_rank, start_under_mpiexec
 
     rank, size = launched()
+    if processes != "mpi" and not (processes.isdigit() and 1 <= int(processes) <= _MOST_PROCESSES):
+        raise typer.BadParameter(f"--processes {processes}: expected a number from 1 to {_MOST_PROCESSES}, or mpi")
+    if size == 1 and processes not in ("1", "mpi"):
+        start_under_mpiexec(int(processes))
     if processes == "mpi" and size == 1:  # a launcher that says nothing to its processes
         rank = mpi_rank().rank
     if rank > 0:  # the first one speaks for all
         sys.stdout = sys.stderr = open(os.devnull, "w")  # noqa: SIM115
-    if size > 1 or processes == "mpi":
-        return "mpi"
-    if not processes.isdigit():
-        raise typer.BadParameter(f"--processes {processes}: expected a number, or mpi")
-    return int(processes)
+    return "mpi" if size > 1 or processes == "mpi" else 1
+
+
+def memory_of(memory: str | None, processes: str) -> int | None:
+    """Bytes of --memory that a process has, where --processes N share them."""
+    size = parse_size(memory)
+    return size // int(processes) if size is not None and processes.isdigit() else size
 
 
 def check_format(path: Path, suffixes: Sequence[str], option: str = "--out") -> str:

@@ -83,7 +83,7 @@ def solve(
     ranks = ranks_of(processes)
     if out is not None:
         check_format(out, (".npz", ".npy"))
-    building = build_options(memory, workers, max_states)
+    building = build_options(memory, workers, max_states, processes)
     chance: dict[str, Any] = {"sticky": sticky, "random": random, "lazy": lazy}
     mdp = parse_target(target, parameters).mdp(gamma=gamma, horizon=horizon, **chance, **building, processes=ranks)
     from pharos.solvers import uniform_value, value_iteration
@@ -112,7 +112,12 @@ def solve(
         return
     if out is not None:
         save(out, solution)
-    options = {**chance, "tolerance": tolerance, "dtype": dtype, "processes": ranks}
+    options = {
+        **chance,
+        "tolerance": tolerance,
+        "dtype": dtype,
+        "processes": int(processes) if processes.isdigit() and processes != "1" else ranks,
+    }
     if json:
         print_json(_answer(solution, uniform, options, out))
     else:

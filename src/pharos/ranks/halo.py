@@ -43,7 +43,7 @@ class Halo:
     def __len__(self) -> int:
         return len(self.rows)
 
-    def is_wanted(self, num_rows: int) -> np.ndarray:
+    def is_boundary(self, num_rows: int) -> np.ndarray:
         """(n,) bool: whether some other rank reads a row of this one."""
         result = np.zeros(num_rows, np.bool_)
         for rows in self.wanted:

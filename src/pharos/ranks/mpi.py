@@ -1,14 +1,17 @@
-"""Ranks that `mpiexec` has started (extra `mpi`: mpi4py)."""
+"""Ranks that `mpiexec` has started (extra `mpi`: mpi4py), and how one program runs on all of them."""
 
+import importlib.util
 import os
+import shutil
+import sys
 import time
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, NoReturn, TypeVar
 
 import numpy as np
 
 from pharos.errors import MissingExtra, ParameterError
-from pharos.ranks.rank import NUMBERS, Rank, error_of, text_of
+from pharos.ranks.rank import NUMBERS, Alone, Rank, error_of, text_of
 
 # (rank, size) as launchers tell their processes: MPICH's and Intel's, Open MPI's, MVAPICH's.
 _LAUNCHERS = (
@@ -19,6 +22,61 @@ _LAUNCHERS = (
 _FAILED = -1
 _VALUES, _NOTICE = 0, 1  # tags of messages
 _LOOKS = 100  # at messages that have not come before others get the processor
+_STARTED = "PHAROS_STARTED"  # variable of processes that pharos itself has started under mpiexec
+
+T = TypeVar("T")
+
+
+def check_processes(processes: int | str) -> None:
+    """ParameterError unless it is 1, or "mpi"."""
+    if processes != "mpi" and (processes != 1 or isinstance(processes, bool)):
+        raise ParameterError(
+            f"processes is {processes!r}; expected 1, or 'mpi' in a program that `mpiexec -n 8 python PROGRAM` starts; "
+            "`pharos build` and `pharos solve` take --processes 8"
+        )
+
+
+def check_ranks(num_states: int, ranks: int) -> None:
+    """Raise ParameterError where there are more ranks than states."""
+    if ranks > max(num_states, 1):
+        raise ParameterError(f"{ranks} processes for {num_states} states; expected at most one for each state")
+
+
+def run_spmd(processes: int | str, program: Callable[[Rank], T]) -> T:
+    """Return what `program(rank)` returns at this rank, while the others run it, too.
+
+    Args:
+        processes: 1 for this process alone; or "mpi", those that `mpiexec` has started, all of which make this call.
+    Raises:
+        Whatever the program raises on any of them.
+    """
+    check_processes(processes)
+    rank = mpi_rank() if processes == "mpi" else Alone()
+    try:
+        return program(rank)
+    except BaseException as error:
+        rank.fail(error)
+        raise
+
+
+def start_under_mpiexec(size: int) -> NoReturn:
+    """Replace this process by `mpiexec`, which starts the same program `size` times.
+
+    Raises:
+        MissingExtra: there is no mpi4py, or no `mpiexec` beside this Python or in PATH. ParameterError: this process
+        has been started so already, and does not know its number.
+    """
+    beside = os.path.dirname(sys.executable)
+    launcher = shutil.which("mpiexec", path=beside) or shutil.which("mpiexec")
+    if launcher is None or importlib.util.find_spec("mpi4py") is None:
+        raise MissingExtra(f"--processes {size}", "mpi4py and an MPI library with mpiexec", "mpi")
+    if _STARTED in os.environ:
+        raise ParameterError(
+            f"{launcher}: tells processes neither their number nor how many there are; "
+            f"write mpiexec -n {size} pharos ..., with --processes mpi"
+        )
+    os.environ[_STARTED] = str(size)
+    os.execv(launcher, [launcher, "-n", str(size), sys.executable, *sys.orig_argv[1:]])
 
 
 def launched() -> tuple[int, int]:
@@ -40,7 +98,7 @@ def mpi_rank() -> Rank:
     try:
         from mpi4py import MPI
     except ImportError:
-        raise MissingExtra("building under mpiexec", "mpi4py and an MPI library", "mpi") from None
+        raise MissingExtra("running under mpiexec", "mpi4py and an MPI library", "mpi") from None
     except RuntimeError as error:  # mpi4py is there, and no library
         reason = str(error).partition("\n")[0]
         raise ParameterError(
@@ -76,7 +134,7 @@ class _Mpi(Rank):
         self._world.Alltoallv([sent, rows * width], [into, received * width])
         return np.split(into, np.cumsum(received)[:-1])
 
-    def numbers_of_all(self, *numbers: float) -> np.ndarray:
+    def allgather_numbers(self, *numbers: float) -> np.ndarray:
         self._counts(np.zeros(self.size, np.int64), numbers)
         return self._numbers[:, : len(numbers)]
 

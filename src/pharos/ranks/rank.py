@@ -1,11 +1,7 @@
 """Rank: one of several processes that run the same program, and exchange arrays.
 
 Rank 0 is the one that the user sees: it alone reads and writes files, reports and raises the errors of all. The others
-run a function that answers it. Three ways of running them differ in `exchange` and in how messages go from one to one:
-
-    loop        threads of one process, for tests
-    processes   forked processes of one machine, through shared memory
-    mpi_rank    what `mpiexec -n P` started, on one machine or on many
+run a function that answers it. MPI carries what they exchange (mpi.py); tests run ranks as threads.
 """
 
 from abc import ABC, abstractmethod
@@ -75,7 +71,7 @@ class Rank(ABC):
 
     @abstractmethod
     def fail(self, error: BaseException) -> None:
-        """Tell the others, who wait in an exchange or for a message, or come to one, that this rank gives up."""
+        """Abort: every exchange and message of the other ranks, pending or later, raises."""
 
     def scatter(self, parts: Sequence[np.ndarray] | None, like: np.ndarray) -> np.ndarray:
         """Rank 0 sends parts[q] to each rank q, which gets it; `like` is an array of that type for the others."""
@@ -99,13 +95,34 @@ class Rank(ABC):
         """At rank 0 what each rank gave, in their order; elsewhere empty arrays."""
         return self.exchange([array if rank == 0 else array[:0] for rank in range(self.size)])
 
-    def gather_all(self, array: np.ndarray) -> list[np.ndarray]:
+    def allgather(self, array: np.ndarray) -> list[np.ndarray]:
         """What each rank gave, in their order, at all of them."""
         return self.exchange([array] * self.size)
 
-    def numbers_of_all(self, *numbers: float) -> np.ndarray:
+    def allgather_numbers(self, *numbers: float) -> np.ndarray:
         """(P, K) float64: a few numbers (at most `NUMBERS`) of each rank, at all of them."""
-        return np.array(self.gather_all(np.array(numbers, np.float64)))
+        return np.array(self.allgather(np.array(numbers, np.float64)))
+
+
+class Alone(Rank):
+    """The only rank."""
+
+    rank, size, neighbors = 0, 1, 1
+
+    def exchange(self, parts: Sequence[np.ndarray]) -> list[np.ndarray]:
+        return [part.copy() for part in parts]
+
+    def send(self, to: int, array: np.ndarray) -> None:
+        raise ValueError("there is no other rank")
+
+    def receive(self, source: int, into: np.ndarray) -> None:
+        raise ValueError("there is no other rank")
+
+    def finish(self) -> None:
+        """Nothing is on its way."""
+
+    def fail(self, error: BaseException) -> None:
+        """Nobody waits."""
 
 
 def text_of(error: BaseException) -> str:

@@ -9,11 +9,10 @@ from typing import Any, cast
 import numpy as np
 
 from pharos.errors import ParameterError
-from pharos.mdp import Part, Selection, TabularMDP
-from pharos.ranks import Rank, check_number, check_ranks, together
+from pharos.mdp import Selection, TabularMDP
+from pharos.ranks import Rank, check_processes, run_spmd
 from pharos.solvers.checkpoint import SECONDS, Checkpoint
-from pharos.solvers.fixed_point import Backup
-from pharos.solvers.ranked import RankedBackup, capacity_of, ranked_fixed_point, ranked_induction
+from pharos.solvers.ranked import RankedBackup, ranked_fixed_point, ranked_induction
 from pharos.solvers.solution import Solution
 from pharos.system.compiling import Stopwatch
 
@@ -23,7 +22,7 @@ class DistributedOptions:
     """Who sweeps, and how.
 
     Attributes:
-        processes: of this machine; or "mpi": those that `mpiexec` has started, all of which make the call.
+        processes: 1; or "mpi": those that `mpiexec` has started, all of which make the call.
         checkpoint: a folder for the values so far; None to keep none.
         checkpoint_seconds: between two of them.
     """
@@ -33,7 +32,7 @@ class DistributedOptions:
     checkpoint_seconds: float = SECONDS
 
     def __post_init__(self) -> None:
-        check_number(self.processes)
+        check_processes(self.processes)
 
     @property
     def is_wanted(self) -> bool:
@@ -51,10 +50,6 @@ def shared_solution(
 ) -> Solution:
     """The values of what is chosen, by several processes. Under MPI the first gets them, and the others None."""
     watch = Stopwatch()
-    processes = sharing.processes
-    if processes != "mpi":
-        check_ranks(mdp.num_states, int(processes))
-    _warm(mdp, select, horizon is not None)
     folder = None if sharing.checkpoint is None else Path(sharing.checkpoint)
     if folder is not None and folder.exists() and not folder.is_dir():
         raise ParameterError(f"checkpoint {folder}: is a file; expected a folder")
@@ -73,18 +68,8 @@ def shared_solution(
         checkpoint.finish(backup)
         return None if x is None or following is None else (bound, sweeps, x, following)
 
-    answer = together(processes, program, capacity_of(mdp, processes if isinstance(processes, int) else 1))
+    answer = run_spmd(sharing.processes, program)
     if answer is None:
         return cast(Any, None)
     bound, sweeps, x, following = answer
     return Solution(mdp, bound, sweeps, watch.seconds, horizon, select, x, following)
-
-
-def _warm(mdp: TabularMDP, select: Selection, is_plain: bool) -> None:
-    """Compile what ranks run, once, before they are forked."""
-    part = Part.of(mdp, 0, min(mdp.num_states, 2))
-    backup, x = Backup(part, part.selection(select)), part.zeros()
-    if is_plain:
-        part.dynamics.backup(backup.equation, x, np.empty_like(x), np.array([[0, len(part)]]))
-    else:
-        backup.sweep(x)

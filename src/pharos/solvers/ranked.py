@@ -39,11 +39,6 @@ _LOOKS = 8  # how often in a sweep of a large range messages are looked after
 _MIX = (0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB)  # of splitmix64
 
 
-def capacity_of(mdp: TabularMDP, ranks: int) -> int:
-    """Bytes that a rank sends in an exchange, at most: a range of values to each, and a few numbers."""
-    return ((mdp.num_states // ranks + 1) * mdp.width * 8 + 256) * ranks
-
-
 class RankedBackup:
     """One rank's part of the backup T of an MDP, and of what is chosen in its states.
 
@@ -61,10 +56,10 @@ class RankedBackup:
         self.part.dynamics.workers = max(1, usable_workers(None) // rank.neighbors)
         self.backup = backup = Backup(self.part, self.part.selection(select))
         numbers = np.array([backup.factor, backup.operations, backup.largest_reward])
-        factor, operations, largest = np.max(rank.gather_all(numbers), axis=0)
+        factor, operations, largest = np.max(rank.allgather(numbers), axis=0)
         backup.factor, backup.operations, backup.largest_reward = float(factor), int(operations), float(largest)
         self._halo = Halo(rank, self.part.halo, self.cuts)
-        self.first = runs_of(self._halo.is_wanted(len(self.part)), _GAP)
+        self.first = runs_of(self._halo.is_boundary(len(self.part)), _GAP)
         pieces = min(_LOOKS, 1 + (len(self.part) >> 16)) if rank.needs_progress else 1
         self._rest = shares_of(runs_between(self.first, len(self.part)), pieces)
         self._high = shares_of(np.array([[self._halo.low, len(self.part)]]), pieces)[::-1]
@@ -104,7 +99,7 @@ class RankedBackup:
 
     def share(self, *numbers: float) -> np.ndarray:
         """Get the values of the halo after a sweep. Returns (P, K), the numbers of each rank."""
-        every = self.rank.numbers_of_all(*numbers)  # while messages travel
+        every = self.rank.allgather_numbers(*numbers)  # while messages travel
         self._halo.finish(self.x[len(self.part) : -1])
         return every
 
@@ -145,7 +140,7 @@ class RankedBackup:
                 )
                 place = place + np.uint64(2) * np.arange(bits.shape[1], dtype=np.uint64) + np.uint64(kind)
                 total += int(np.add.reduce(_mixed(bits ^ _mixed(place)), axis=None, dtype=np.uint64))
-        totals = self.rank.gather_all(np.array([total % 2**64], np.uint64))
+        totals = self.rank.allgather(np.array([total % 2**64], np.uint64))
         return f"{sum(int(each[0]) for each in totals) % 2**64:016x}"
 
 

@@ -56,8 +56,8 @@ def value_iteration(  # noqa: PLR0913
             range at a time. Where gamma is below 1 and transitions are in arrays; else it does not matter.
 
         Cost only:
-        processes: of this machine, each of which sweeps a range of the states; or "mpi": those that `mpiexec` has
-            started, all of which make this call; the first gets the Solution, the others None. Values depend on it
+        processes: 1; or "mpi": those that `mpiexec` has started, all of which make this call, and sweep a range of the
+            states each; the first gets the Solution, the others None. Values depend on it
             within the tolerance; those of a horizon do not.
         checkpoint: a folder for the values so far, once a minute, so that the same call goes on where one was killed,
             with any number of processes.
@@ -68,7 +68,7 @@ def value_iteration(  # noqa: PLR0913
     Raises:
         DivergenceError: gamma is 1, there is no horizon, and the value may be infinite.
         PrecisionError: 64-bit floats cannot reach the tolerance, or hold the values.
-        ParameterError: several processes, and gamma = 1 without a horizon. RankFailed: a process died.
+        ParameterError: several processes, and gamma = 1 without a horizon. RankFailed: another rank failed.
     Cost: O(S A) a sweep, 0.5 to 2 ns for each state and action on game graphs; memory 8 bytes a state (8 A under sticky
         actions). Where gamma is so near 1 that sweeps would be many: strongly connected components one after another
         where none has half of the states (48 bytes a state); policy iteration, on the graph of the policy where nothing

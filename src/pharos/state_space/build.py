@@ -5,6 +5,7 @@ the only other memory (table.py). The search (search.py) expands states and numb
 (journal.py) appends what it finds to files and commits them.
 """
 
+import contextlib
 import hashlib
 import json
 import os
@@ -24,7 +25,7 @@ from pharos.system import memory as machine
 from pharos.system import paths, storage
 
 if TYPE_CHECKING:
-    from pharos.state_space.build_processes import BuildProcesses
+    from pharos.ranks import Rank
     from pharos.state_space.search import Options
 
 OUR_FILES = (*ARRAYS, *PARTS.values(), SHARDS, MANIFEST + ".tmp", storage.LOCK, storage.CLAIM)
@@ -56,9 +57,9 @@ def build(
             a file without a name in `folder` of 23 to 46 bytes a state (11 to 23 more for each further word), which is
             gone in the end.
         workers: threads, or processes where rules are interpreted; None for all processors.
-        processes: of this machine, that share the work and the table of states, which has to fit in memory then;
-            or "mpi": those that `mpiexec` has started, all of which make this call with a folder that all of them see
-            (`memory` is that of each).
+        processes: 1; or "mpi": those that `mpiexec` has started, all of which make this call with a folder that all of
+            them see, and share the work and the table of states, which has to fit in memory then (`memory` is that of
+            each).
         progress: None for a bar on a terminal; False for silence; or a function that gets a BuildProgress now and then.
         checkpoint_seconds: at most this much work is lost when the process is killed.
         wait: where another process is building in the folder, wait for it, with a warning; None: in the user's cache,
@@ -74,7 +75,8 @@ def build(
         docs/evidence/performance.md.
     Source: the pharos paper, appendix A, Algorithm 1 (whose successors are stored under the wrong index there).
     """
-    from pharos.state_space.build_processes import crew_of  # loads Numba
+    from pharos.ranks import check_processes
+    from pharos.state_space.ranked_table import rank_of_build  # loads Numba
     from pharos.state_space.search import Options
 
     if isinstance(env, str):
@@ -87,21 +89,23 @@ def build(
         raise ParameterError(f"max_states is {max_states}; expected at least 1")
     if memory is not None and memory < machine.LEAST_MEMORY:
         raise ParameterError(f"memory is {memory} bytes; expected at least 16 MiB")
+    check_processes(processes)
     plan = Plan(env)
     path = Path(folder) if folder is not None else folder_of(plan)
     options = Options(max_states, memory, workers, checkpoint_seconds)
-    with crew_of(processes, plan, memory) as crew:
+    with rank_of_build(plan, memory) if processes == "mpi" else contextlib.nullcontext() as rank:
         hold = _waiting if (folder is None if wait is None else wait) else lock
-        was_there = crew.is_first and _build(plan, path, crew, options, progress, hold)
+        was_there = (rank is None or rank.rank == 0) and _build(plan, path, rank, options, progress, hold)
     return load(path, verify=was_there, environment=env)
 
 
 def _build(
-    plan: Plan, path: Path, crew: "BuildProcesses", options: "Options", progress: Progress | bool | None, hold: Any
+    plan: Plan, path: Path, rank: "Rank | None", options: "Options", progress: Progress | bool | None, hold: Any
 ) -> bool:
     """Make the folder hold the finished state space; returns whether it did before."""
     from pharos.state_space.outcome_journal import remove_parts
-    from pharos.state_space.search import check_size, journal_of
+    from pharos.state_space.ranked_search import RankedSearch
+    from pharos.state_space.search import Search, check_size, journal_of
 
     manifest = _manifest_of(plan, path)
     if manifest is not None and manifest["complete"]:
@@ -116,8 +120,8 @@ def _build(
     with hold(path), reporter(progress, plan.env) as report:
         manifest = _manifest_of(plan, path)  # it may have grown while we waited
         if manifest is None or not manifest["complete"]:
-            with crew.search(plan, journal_of(path, plan), options, report) as search:
-                search.run(manifest)
+            search = plan, journal_of(path, plan), options, report
+            (Search(*search) if rank is None else RankedSearch(*search, rank)).run(manifest)
     return False
 
 

@@ -14,12 +14,15 @@ states whose hash falls to it (kernels/key_owner.py).
 So numbers, and all files, are the same whatever the number of ranks. Rank 0 hands out states and collects rows.
 """
 
+import contextlib
+from collections.abc import Iterator
+
 import numpy as np
 
 from pharos.environments import Environment
 from pharos.errors import StateSpaceError
 from pharos.kernels import key_owner
-from pharos.ranks import Rank, loop
+from pharos.ranks import Rank, mpi_rank
 from pharos.rules import rules_of
 from pharos.state_space.plan import Plan
 from pharos.state_space.table import Block, MemoryTable
@@ -36,12 +39,6 @@ _NOTHING = np.full(1 << 16, -1, np.int32)  # a table that holds nothing, where t
 def rows_of_rank(plan: Plan) -> int:
     """Rows that a rank expands in a superstep, at most: a multiple of 8."""
     return min(ROWS, max(8, SUCCESSORS // plan.branches // 8 * 8))
-
-
-def bytes_of_exchange(plan: Plan) -> int:
-    """Bytes that a rank sends in an exchange, at most, those for each rank aligned."""
-    candidates = rows_of_rank(plan) * max(plan.branches, plan.layout.num_words)
-    return candidates * 8 * (plan.layout.num_words + 1) + (1 << 16)
 
 
 class Owner:
@@ -194,7 +191,7 @@ class RankedTable:
         is_new = np.zeros(size, bool)
         for each in wins:
             is_new[each] = True
-        counts_of_new = rank.gather_all(np.array([np.count_nonzero(is_new)]))
+        counts_of_new = rank.allgather(np.array([np.count_nonzero(is_new)]))
         numbers = count + int(sum(each[0] for each in counts_of_new[: rank.rank])) + np.cumsum(is_new) - 1
         owner.numbers[fresh[by_place]] = np.concatenate(rank.exchange([numbers[each] for each in wins]))
         lengths = np.cumsum([len(each) for each in candidates])[:-1]
@@ -227,9 +224,16 @@ def answer(plan: Plan, rank: Rank, memory: int | None) -> None:
         table.close()
 
 
-def warm(plan: Plan) -> None:
-    """Compile what ranks run, once, before they are forked."""
-    with loop(1, lambda rank: None) as rank:
-        table = RankedTable(plan, rank, None)
-        table.expand(np.empty((0, table.num_words), np.uint64), 0, 0)
-        table.close()
+@contextlib.contextmanager
+def rank_of_build(plan: Plan, memory: int | None) -> Iterator[Rank]:
+    """This process among those of `mpiexec`; all but the first have done their part when they get theirs."""
+    rank = mpi_rank()
+    try:
+        if rank.rank > 0:
+            answer(plan, rank, memory)
+        yield rank
+        if rank.rank == 0:
+            end(rank)
+    except BaseException as error:
+        rank.fail(error)
+        raise
