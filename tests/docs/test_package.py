@@ -163,6 +163,27 @@ def test_an_installation_and_a_home_that_cannot_be_written_to(tmp_path):
     assert not list(tmp_path.glob("pharos-*"))
 
 
+@pytest.mark.long
+def test_commands_run_in_an_installation_that_is_mounted_to_be_read(tmp_path):
+    """In a mount namespace of its own, where this user may make one; without a home."""
+    mounted = ["unshare", "-m", "bash", "-c", 'mount --bind "$0" "$0" && mount -o remount,ro,bind "$0" && exec "$@"']
+    mounted.append(str(Path(pharos.__file__).parents[1]))
+    if shutil.which("unshare") is None or subprocess.run([*mounted, "true"], capture_output=True).returncode:
+        pytest.skip("no mount namespace for this user")
+    there = {name: value for name, value in os.environ.items() if not name.startswith(("NUMBA", "XDG"))}
+    there |= {"HOME": "/proc/nohome", "PHAROS_CACHE_DIR": str(tmp_path / "cache"), "MPLBACKEND": "agg"}
+    lake = "frozen_lake/4x4"
+    (tmp_path / "own.yaml").write_text(f"name: own\nsteps: 100\nblocks: [{{environments: [{lake}], agents: [q_learning]}}]")
+    for words in (
+        *(f"solve {lake}", f"hardness {lake} --measures diameter", f"train {lake} --steps 100 --out run"),
+        *(f"evaluate {lake} --policy run", "submit run --out entry.safetensors", "verify entry.safetensors"),
+        *("study run own.yaml --workers 1", "study status own.yaml"),
+    ):
+        command = [*mounted, sys.executable, "-m", "pharos", *words.split()]
+        done = subprocess.run(command, env=there, cwd=tmp_path, capture_output=True, text=True)
+        assert done.returncode == 0 and "Traceback" not in done.stderr, (words, done.stderr)
+
+
 @pytest.mark.parametrize("folder", ["benchmarks", "scripts"])
 def test_scripts_import_what_is_there(folder):
     absent = []

@@ -97,9 +97,10 @@ def fit(rows: "pd.DataFrame", model: str, subset: str, predictors: Sequence[str]
     terms, columns, dropped = _independent(rows, predictors)
     needed = columns + 2
     if len(rows) < needed:
+        what = f"{many(columns - 1, 'predictor')}" if columns > 1 else "mean, as no predictor varies"
         raise ParameterError(
-            f"the {model} model of {subset} has {many(len(rows), 'row')}; needs at least {needed} for its "
-            f"{many(columns - 1, 'predictor')}: run more instances or fewer predictors"
+            f"the {model} model of {subset} has {many(len(rows), 'row')}; needs at least {needed} for its {what}: run "
+            f"more instances or fewer predictors"
         )
     if np.ptp(rows["regret"]) == 0:
         raise ParameterError(

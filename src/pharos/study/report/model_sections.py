@@ -15,9 +15,12 @@ from pharos.system.wording import many
 
 
 def models_section(results: Results, figures: Figures, left_out: list[str]) -> Section | None:
-    """The models of regret by hardness; None for tabular agents, which have none: `left_out` says so."""
+    """The models of regret by hardness; None where there are none: `left_out` says why."""
     if not results.agents:
         left_out.append("Hardness and regret: tabular agents, which see the state itself, have no models.")
+        return None
+    if not results.has_models:
+        left_out.append(f"Hardness and regret: {results.models[0].notes[0]}.")
         return None
     return Section.of(
         "Hardness and regret", "models", parts=[_models_of(models, results, figures) for models in results.models]

@@ -64,7 +64,16 @@ class Results:
         notes = list(self.damaged.values())
         if not self.agents:
             notes.append(f"{_listed(self.runs)} the index of the state: models are of agents that see observations")
-        return list(dict.fromkeys([*notes, *(note for each in self.models for note in each.notes)]))
+        elif not self.has_models:
+            notes.append(f"no models of hardness: {self.models[0].notes[0]}")
+        else:
+            notes += [note for each in self.models for note in each.notes]
+        return list(dict.fromkeys(notes))
+
+    @property
+    def has_models(self) -> bool:
+        """Whether there are enough cells, and enough differs between them, for any model of regret by hardness."""
+        return any(each.fits for each in self.models)
 
 
 def results_of(study: Specification, place: Path, progress: Callable[[str], None] = lambda _: None) -> Results:
