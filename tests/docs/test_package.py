@@ -173,7 +173,9 @@ def test_commands_run_in_an_installation_that_is_mounted_to_be_read(tmp_path):
     there = {name: value for name, value in os.environ.items() if not name.startswith(("NUMBA", "XDG"))}
     there |= {"HOME": "/proc/nohome", "PHAROS_CACHE_DIR": str(tmp_path / "cache"), "MPLBACKEND": "agg"}
     lake = "frozen_lake/4x4"
-    (tmp_path / "own.yaml").write_text(f"name: own\nsteps: 100\nblocks: [{{environments: [{lake}], agents: [q_learning]}}]")
+    (tmp_path / "own.yaml").write_text(
+        f"name: own\nsteps: 100\nblocks: [{{environments: [{lake}], agents: [q_learning]}}]"
+    )
     for words in (
         *(f"solve {lake}", f"hardness {lake} --measures diameter", f"train {lake} --steps 100 --out run"),
         *(f"evaluate {lake} --policy run", "submit run --out entry.safetensors", "verify entry.safetensors"),

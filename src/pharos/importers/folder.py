@@ -1,6 +1,7 @@
 """Imported MDPs kept in folders: plain .npy arrays, and a manifest with checksums and a digest that is written last."""
 
 import os
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -9,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pharos.environments import Environment, make
-from pharos.errors import FileFormatError, ParameterError
+from pharos.errors import FileFormatError, FolderLocked, ParameterError
 from pharos.mdp import OutcomeTable, TabularMDP
 from pharos.system import mdp_files, paths, storage
 from pharos.system.mdp_files import (
@@ -43,6 +44,7 @@ class Outcomes(NamedTuple):
 IMAGE, GRID, VECTOR = "image", "grid", "vector"
 OBSERVED = {IMAGE: 4, GRID: 4, VECTOR: 2}
 """Kinds of observations that a source may show -> dimensions of their array."""
+FOREIGN = ": is not empty and holds no imported MDP; choose another folder"
 
 
 def save(
@@ -60,6 +62,7 @@ def save(
 
     Args:
         folder: made where it is not there; an MDP that lies there is replaced, file by file and the manifest last.
+            Where another process writes it at the moment, that one is waited for, with a warning.
         source: where the MDP comes from, for people.
         actions: names of the actions; None: their numbers.
         time_limit: steps after which training cuts an episode off where the MDP has no horizon; None: 1,000.
@@ -76,30 +79,42 @@ def save(
     paid = {} if outcomes is None else _checked_outcomes(mdp, outcomes)
     folder = Path(folder)
     _check_without_chance(mdp)
-    if folder.is_dir() and any(folder.iterdir()) and not is_folder(folder):
-        raise ParameterError(f"{folder}: is not empty and holds no imported MDP; choose another folder")
+    if _is_foreign(folder) and not (folder / storage.LOCK).exists():  # else another process may have begun there
+        raise ParameterError(f"{folder}{FOREIGN}")
     folder.mkdir(parents=True, exist_ok=True)
     shown = {} if observations is None else {OBSERVATIONS: np.asarray(observations)}
     arrays = _arrays_of(mdp) | shown | paid
     version = mdp_files.PAID_VERSION if paid else mdp_files.OBSERVED_VERSION if shown else mdp_files.VERSION
-    checksums = {}
-    for name, array in arrays.items():
-        path = folder / f"{name}.npy"
-        storage.replace_array(path, array)
-        checksums[name] = storage.digest_of_file(path)
-    manifest = {
-        "format": FORMAT,
-        "format_version": version,
-        "source": source,
-        "num_states": mdp.num_states,
-        "num_actions": mdp.num_actions,
-        "gamma": mdp.gamma,
-        "horizon": None if mdp.horizon is None else int(mdp.horizon),
-        "arrays": checksums,
-        **description,
-    }
-    storage.replace_json(folder / MANIFEST, storage.sealed(manifest))
+    with storage.waiting_lock(folder, FolderLocked, "importing", _warn):
+        if _is_foreign(folder):
+            raise ParameterError(f"{folder}{FOREIGN}")
+        checksums = {}
+        for name, array in arrays.items():
+            path = folder / f"{name}.npy"
+            storage.replace_array(path, array)
+            checksums[name] = storage.digest_of_file(path)
+        manifest = {
+            "format": FORMAT,
+            "format_version": version,
+            "source": source,
+            "num_states": mdp.num_states,
+            "num_actions": mdp.num_actions,
+            "gamma": mdp.gamma,
+            "horizon": None if mdp.horizon is None else int(mdp.horizon),
+            "arrays": checksums,
+            **description,
+        }
+        storage.replace_json(folder / MANIFEST, storage.sealed(manifest))
     return folder
+
+
+def _is_foreign(folder: Path) -> bool:
+    names = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
+    return bool(names - {storage.LOCK, storage.CLAIM}) and not is_folder(folder)
+
+
+def _warn(text: str) -> None:
+    warnings.warn(text, RuntimeWarning, stacklevel=4)
 
 
 def _checked_outcomes(mdp: TabularMDP, outcomes: Outcomes) -> dict[str, np.ndarray]:
