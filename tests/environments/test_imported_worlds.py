@@ -215,9 +215,11 @@ def test_what_was_learnt_on_a_folder_is_evaluated_on_it(folders, tmp_path):
     listed = json.loads(run("observations", folders["matrices"], "--json").stdout)["observations"]
     assert listed[-1]["observation"] == "recorded" and listed[-1]["num_observations"] == 4
     answer = json.loads(run("evaluate", folders["matrices"], "--policy", tmp_path / "run", "--json").stdout)
-    mdp = in_every_form()["matrices"]
+    config = learnt["config"]  # the run's own setting, not that of the table
+    assert (answer["gamma"], answer["horizon"]) == (config["gamma"], config["horizon"]) != (0.9, None)
+    mdp = in_every_form()["matrices"].with_gamma(config["gamma"]).with_horizon(config["horizon"])
     assert answer["optimal_value_at_start"] == pytest.approx(pharos.value_iteration(mdp).value_at_start, abs=2e-6)
-    assert (answer["gamma"], answer["horizon"]) == (0.9, None)
+    assert answer["regret"] == pytest.approx(learnt["final_regret"], abs=4e-6)
     words = ("evaluate", folders["matrices"], "--policy", tmp_path / "run", "--gamma", 1, "--horizon", 20, "--json")
     assert json.loads(run(*words).stdout)["regret"] == pytest.approx(learnt["final_regret"], abs=4e-6)
 

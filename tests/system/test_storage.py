@@ -181,6 +181,17 @@ def test_one_process_holds_a_folder_until_it_ends(locks, tmp_path):
     assert names(tmp_path) == ["lock"] and (tmp_path / "lock").read_text() == ""
 
 
+def test_a_lock_that_its_holder_has_removed_holds_nothing(tmp_path, monkeypatch):
+    """Another process may hold the new one of that name."""
+    usual = storage.fcntl.flock
+    monkeypatch.setattr(storage.fcntl, "flock", lambda file, how: (tmp_path / "lock").unlink() or usual(file, how))
+    with pytest.raises(FolderLocked), storage.lock(tmp_path):
+        raise AssertionError
+    monkeypatch.undo()
+    with storage.lock(tmp_path):
+        assert names(tmp_path) == ["lock"]
+
+
 def test_a_process_that_is_killed_holds_nothing(locks, tmp_path):
     ready, release = fork.Event(), fork.Event()
     process = fork.Process(target=_hold, args=(tmp_path, ready, release))

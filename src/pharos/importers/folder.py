@@ -79,7 +79,8 @@ def save(
     paid = {} if outcomes is None else _checked_outcomes(mdp, outcomes)
     folder = Path(folder)
     _check_without_chance(mdp)
-    if _is_foreign(folder) and not (folder / storage.LOCK).exists():  # else another process may have begun there
+    # Asked again, as another process may have begun there, or ended, in between
+    if _is_foreign(folder) and not (folder / storage.LOCK).exists() and _is_foreign(folder):
         raise ParameterError(f"{folder}{FOREIGN}")
     folder.mkdir(parents=True, exist_ok=True)
     shown = {} if observations is None else {OBSERVATIONS: np.asarray(observations)}
@@ -105,6 +106,7 @@ def save(
             **description,
         }
         storage.replace_json(folder / MANIFEST, storage.sealed(manifest))
+        (folder / storage.LOCK).unlink()  # whoever waits for it replaces what is whole
     return folder
 
 

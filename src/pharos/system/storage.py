@@ -242,6 +242,8 @@ def lock(folder: Path, error: type[PharosError] = FolderLocked, activity: str = 
             with claim(folder / CLAIM, error, activity):
                 yield
             return
+        if not _is_at(path, file):  # who held it has removed it, and another may hold a new one
+            raise error(_held(folder, "", activity))
         file.truncate(0)
         with contextlib.suppress(OSError):  # a full disk: the name of the holder is a courtesy
             os.write(file.fileno(), _holder().encode())
@@ -249,6 +251,13 @@ def lock(folder: Path, error: type[PharosError] = FolderLocked, activity: str = 
             yield
         finally:
             file.truncate(0)
+
+
+def _is_at(path: Path, file: Any) -> bool:
+    try:
+        return os.path.samestat(path.stat(), os.fstat(file.fileno()))
+    except FileNotFoundError:
+        return False
 
 
 def waiting_lock(
