@@ -14,7 +14,7 @@ import numpy as np
 
 import pharos
 from pharos.hardness.distances.transition_graph import Graph
-from pharos.hardness.planning.expanded import choices_of
+from pharos.mdp import ExpandedMDP
 
 SMALL = {
     "frozen_lake 100": ("frozen_lake", {"size": 100, "seed": 0}),
@@ -65,7 +65,7 @@ def iterated(choices, target, tolerance=1e-6):
 def chancy(size, seed):
     lake = mdp_of("frozen_lake", {"size": size, "seed": seed})
     mdp = pharos.random_actions(lake, 0.2)
-    choices = choices_of(mdp, True)
+    choices = ExpandedMDP.of(mdp, True)
     targets = np.linspace(0, choices.num_targets - 1, SAMPLE).astype(int)
     began = time.perf_counter()
     for target in targets:

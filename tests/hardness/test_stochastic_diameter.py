@@ -18,9 +18,8 @@ from pharos.hardness.hitting.hitting_times import HittingTimes
 from pharos.hardness.hitting.stochastic_diameter import _Diameter
 from pharos.hardness.hitting.travel import HubBounds
 from pharos.hardness.interval import Budget, BudgetClock
-from pharos.hardness.planning.expanded import choices_of
 from pharos.kernels import hitting
-from pharos.mdp import TabularMDP, random_actions, sticky_actions
+from pharos.mdp import ExpandedMDP, TabularMDP, random_actions, sticky_actions
 from strategies import deterministic_mdps, general_mdps, outcome_mdps
 
 some = st.sampled_from([0.0, 0.25, 0.5])
@@ -240,7 +239,7 @@ def test_progress_shows_bounds_that_squeeze():
 
 @pytest.mark.parametrize(("enough", "seconds"), [(math.inf, 300), (0.0, 0)])
 def test_a_target_that_is_not_the_farthest_or_beyond_the_budget_costs_no_linear_system(enough, seconds, monkeypatch):
-    problem = HittingTimes(choices_of(ring(50, 0.9), restart=True))
+    problem = HittingTimes(ExpandedMDP.of(ring(50, 0.9), restart=True))
     monkeypatch.setattr(problem, "_factored", lambda _: pytest.fail("solves a linear system"))
     j, count, _ = problem.open(0)
     bounds = problem.solve(j, count, 1e-12, enough, BudgetClock(hardness.Budget(seconds=seconds), None))
@@ -250,7 +249,7 @@ def test_a_target_that_is_not_the_farthest_or_beyond_the_budget_costs_no_linear_
 def test_the_farthest_target_so_far_makes_the_guess_for_the_next():
     """Every step of a lazy ring takes ten."""
     mdp = ring(20, 0.9)
-    search = _Diameter(mdp, True, choices_of(mdp, restart=True), 1e-6, BudgetClock(hardness.Budget(), None))
+    search = _Diameter(mdp, True, ExpandedMDP.of(mdp, restart=True), 1e-6, BudgetClock(hardness.Budget(), None))
     search.interval({})
     assert search.targets.initial_scale == pytest.approx(10, rel=1e-3)
 
@@ -314,7 +313,7 @@ def test_residuals_count_their_rounding():
     """Of any J, one float a node or the sum of two, in exact fractions; probabilities are multiples of 2^-20."""
     rng = np.random.default_rng(0)
     matrix = rng.multinomial(2**20, np.full(6, 1 / 6), (6, 2)) / 2**20
-    times = HittingTimes(choices_of(TabularMDP.from_matrices(matrix, np.zeros((6, 2))), restart=False))
+    times = HittingTimes(ExpandedMDP.of(TabularMDP.from_matrices(matrix, np.zeros((6, 2))), restart=False))
     count, size = times.distances(0), len(times.goal)
     arguments = (*times.arrays, times.goal, times.order, count)
 
@@ -387,7 +386,7 @@ def many_starts(size, starts, slips):
 
 
 def test_states_in_which_episodes_end_are_one_unknown_of_linear_systems():
-    choices = choices_of(many_starts(40, 10, 0.2), True)
+    choices = ExpandedMDP.of(many_starts(40, 10, 0.2), True)
     targets = HittingTimes(choices)
     for target in (3, 25):
         j, count, _ = targets.open(target)
@@ -429,7 +428,7 @@ def test_one_hub_bounds_a_world_with_slips_and_settles_how_far_the_start_is_from
 def test_hitting_times_of_random_graphs_take_sweeps_where_factors_would_fill_in(monkeypatch):
     rng = np.random.default_rng(0)
     successors, chances = rng.integers(0, 3000, (3000, 2, 3)), rng.dirichlet(np.ones(3), (3000, 2))
-    targets = HittingTimes(choices_of(TabularMDP.from_outcomes(successors, chances, np.zeros((3000, 2))), True))
+    targets = HittingTimes(ExpandedMDP.of(TabularMDP.from_outcomes(successors, chances, np.zeros((3000, 2))), True))
     monkeypatch.setattr(HittingTimes, "_factored", None)
     j, count, _ = targets.open(7)
     bounds = targets.solve(j, count, 1e-6, 0.0, BudgetClock(hardness.Budget(), None))
@@ -453,7 +452,7 @@ def test_attempts_that_fail_a_million_times_take_few_sweeps():
     cells = np.arange(20)
     successors = np.stack([np.minimum(cells + 1, 19), np.zeros(20, int)], axis=1)[:, None, :]
     mdp = TabularMDP.from_outcomes(successors, np.full((20, 1, 2), 0.5), np.zeros((20, 1)))
-    targets = HittingTimes(choices_of(mdp, restart=True))
+    targets = HittingTimes(ExpandedMDP.of(mdp, restart=True))
     j, count, _ = targets.open(19)
     bounds = targets.sweep(j, count, 400, 0.0, BudgetClock(Budget(), None))
     assert bounds.lower <= 2**20 - 2 <= bounds.upper

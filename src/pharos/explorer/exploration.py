@@ -99,17 +99,14 @@ class Exploration:
         if name == UNIFORM:
             return np.full(chosen.shape, 1 / self.mdp.num_actions)
         if name == LEARNT:
-            before = np.full(len(states), self.mdp.num_actions) if previous is None else np.full(len(states), previous)
-            return probabilities(self.solutions[LEARNT], states, before)
+            return probabilities(self.solutions[LEARNT], states, self._before(states, previous))
         return np.eye(self.mdp.num_actions)[self.best_actions(chosen)]
 
     def best_actions(self, chosen: np.ndarray) -> np.ndarray:
         """(N,) the first of the actions whose values (N, A) are within the tie tolerance of the best."""
         return (chosen >= chosen.max(axis=1, keepdims=True) - self.tie_tolerance).argmax(axis=1)
 
-    def _before(self, states: np.ndarray, previous: int | None) -> np.ndarray | None:
-        if not self.mdp.is_sticky:
-            return None
+    def _before(self, states: np.ndarray, previous: int | None) -> np.ndarray:
         return np.full(len(states), self.mdp.num_actions if previous is None else previous)
 
     @cached_property
@@ -175,10 +172,8 @@ class Exploration:
 
     def _executed(self, previous: int | None) -> np.ndarray:
         """(A, A) the probability that each action is executed, of choosing each."""
-        before = None
-        if self.mdp.is_sticky:
-            before = np.full(self.mdp.num_actions, self.mdp.num_actions if previous is None else previous)
-        return self.mdp.chance.weights(np.eye(self.mdp.num_actions), before)
+        choices = np.eye(self.mdp.num_actions)
+        return self.mdp.chance.weights(choices, self._before(choices, previous))
 
     def _outcomes(self, state: int, executed: np.ndarray) -> list[list[Any]]:
         """(state, previous, probability, reward) of what may follow, the likeliest first; executed (A,) chances."""

@@ -46,13 +46,13 @@ class Learnt:
         if space is None or space.environment is None:
             raise ParameterError("a policy of observations needs an environment that is known; give it as a table")
         sight = Sight(space, space.environment, self.observation, dict(self.observation_options), self.previous_action)
-        width = mdp.num_actions + 1 if mdp.is_sticky else 1
+        width = mdp.policy_width
         options = {"observation": self.observation, "observation_options": self.observation_options}
         if sight.frames > 1 or mdp.num_states * width > ASKED_EVERYWHERE or (self.previous_action and width == 1):
             return evaluate_policy(mdp, policy, **options, previous_action=self.previous_action)
         answers = PolicyAnswers(policy, mdp, sight)
         table = answers.of(np.arange(mdp.num_states * width))
-        return evaluate_policy(mdp, table.reshape(mdp.num_states, width, -1) if mdp.is_sticky else table)
+        return evaluate_policy(mdp, table.reshape(mdp.num_states, width, -1) if width > 1 else table)
 
 
 def probabilities(solution: Solution, states: np.ndarray, previous: np.ndarray) -> np.ndarray:

@@ -75,7 +75,7 @@ def contents(world: Exploration) -> dict[str, Any]:
     mdp = world.mdp
     check_size(mdp, world.title)
     states = np.arange(mdp.num_states)
-    before: list[int | None] = [None, *range(mdp.num_actions)] if mdp.is_sticky else [None]
+    before: list[int | None] = [None, *range(mdp.policy_width - 1)]
     positions = {
         _place(state, previous): world.position(state, previous)
         for state in range(mdp.num_states)
@@ -88,7 +88,7 @@ def contents(world: Exploration) -> dict[str, Any]:
 
 def check_size(mdp: TabularMDP, title: str) -> None:
     """ParameterError where a page of its own does not hold all positions of an MDP."""
-    width = mdp.num_actions + 1 if mdp.is_sticky else 1
+    width = mdp.policy_width
     if mdp.num_states * width > MOST_POSITIONS:
         raise ParameterError(
             f"{title}: has {mdp.num_states * width:,} "

@@ -96,8 +96,7 @@ class Problem:
 
     @property
     def _is_small(self) -> bool:
-        width = self.mdp.num_actions if self.mdp.is_sticky else 1
-        return self.mdp.num_states * width * ((self.mdp.horizon or 0) + 1) * 8 <= 2**30
+        return self.mdp.num_states * self.mdp.width * ((self.mdp.horizon or 0) + 1) * 8 <= 2**30
 
 
 @dataclass(frozen=True)

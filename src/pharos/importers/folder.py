@@ -186,7 +186,7 @@ def environment(mdp: TabularMDP | str | os.PathLike) -> Environment:
 
 
 def _check_without_chance(mdp: TabularMDP) -> None:
-    if mdp.is_sticky or mdp.is_random or mdp.laziness:
+    if not mdp.chance.is_none or mdp.laziness:
         raise ParameterError(
             "an MDP is kept without sticky or random actions, and without lazy ones; add them when it is loaded"
         )

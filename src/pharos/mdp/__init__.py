@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from pharos.mdp.bisimulation import Minimization, minimize
     from pharos.mdp.chance import Chance, lazy_actions, random_actions, sticky_actions
     from pharos.mdp.dynamics import BellmanEquation, Dynamics, Outcomes, PolicyStep
+    from pharos.mdp.expanded import ExpandedMDP, executed_actions, nodes_of_outcomes, outcomes_of
     from pharos.mdp.lazy import Lazy
     from pharos.mdp.matrices import Matrices
     from pharos.mdp.outcome_table import OutcomeTable
@@ -36,6 +37,10 @@ _FILES = {
     "BellmanEquation": "dynamics",
     "Chance": "chance",
     "Dynamics": "dynamics",
+    "ExpandedMDP": "expanded",
+    "executed_actions": "expanded",
+    "nodes_of_outcomes": "expanded",
+    "outcomes_of": "expanded",
     "Extreme": "selection",
     "Lazy": "lazy",
     "Matrices": "matrices",
@@ -80,9 +85,10 @@ __all__ = [
     "sticky_actions",
 ]
 _shared = """
-    BEST BellmanEquation Dynamics Extreme Lazy Matrices OutcomeTable Outcomes Part PolicyStep PolicyTable Rewards
-    Selection Table WORST chosen_mass count_of mass_of ranged_rewards require_mdp rewards_of_outcomes
-    rewards_of_space rewards_of_staying runs_between runs_of shares_of
+    BEST BellmanEquation Dynamics ExpandedMDP Extreme Lazy Matrices OutcomeTable Outcomes Part PolicyStep
+    PolicyTable Rewards Selection Table WORST chosen_mass count_of executed_actions mass_of nodes_of_outcomes
+    outcomes_of ranged_rewards require_mdp rewards_of_outcomes rewards_of_space rewards_of_staying runs_between
+    runs_of shares_of
 """
 
 __getattr__ = lazy.attributes(__name__, _FILES)

@@ -65,7 +65,7 @@ class Chance:
     @property
     def is_none(self) -> bool:
         """Whether the chosen action is always executed."""
-        return self.chosen == 1.0 and self.first_chosen == 1.0
+        return not (self.is_sticky or self.is_random)
 
     @property
     def is_sticky(self) -> bool:
@@ -118,12 +118,12 @@ class Chance:
 
         Args:
             q: (N, A), the values of executing each action.
-            previous: (N,) previously executed actions, A where there is none; None: none anywhere that matters.
+            previous: (N,) previously executed actions, A where there is none; it matters under sticky actions alone.
             mean: (N, 1), the mean of q over actions, where it was added up already.
         """
         mean = q.mean(axis=1, keepdims=True) if mean is None else mean
         later = self.chosen * q + self.uniform * mean if self.is_random else self.chosen * q
-        if previous is None:
+        if previous is None or not self.is_sticky:
             return later
         is_first = (previous == q.shape[1])[:, None]
         repeated = q[np.arange(len(q)), np.minimum(previous, q.shape[1] - 1)][:, None]
@@ -147,11 +147,11 @@ class Chance:
 
         Args:
             chosen: (N, A), the probabilities of choosing each action.
-            previous: (N,) previously executed actions, A where there is none; None: none anywhere that matters.
+            previous: (N,) previously executed actions, A where there is none; it matters under sticky actions alone.
         """
         num_actions = chosen.shape[1]
         later = self.chosen * chosen + self.uniform / num_actions
-        if previous is None:
+        if previous is None or not self.is_sticky:
             return later
         later = later + self.previous * (np.asarray(previous)[:, None] == np.arange(num_actions))
         is_first = (np.asarray(previous) == num_actions)[:, None]

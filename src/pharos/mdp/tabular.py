@@ -282,9 +282,23 @@ class TabularMDP:
         return self.chance.width(self.num_actions)
 
     @property
+    def policy_width(self) -> int:
+        """Choices of a policy in each state: A + 1 under sticky actions, by the previous action, none last; else 1."""
+        return self.num_actions + 1 if self.is_sticky else 1
+
+    @property
+    def nodes(self) -> str:
+        """The name of what values and choices belong to."""
+        return "pairs (state, previously executed action)" if self.is_sticky else "states"
+
+    def without_width(self, x: np.ndarray) -> np.ndarray:
+        """Values (..., W) as users get them: under sticky actions as they are, else without the last axis."""
+        return x if self.is_sticky else x[..., 0]
+
+    @property
     def is_deterministic(self) -> bool:
         """Whether every choice has one outcome."""
-        return self.dynamics.is_deterministic and not self.is_sticky and not self.is_random
+        return self.dynamics.is_deterministic and self.chance.is_none
 
     @property
     def has_ends(self) -> bool:

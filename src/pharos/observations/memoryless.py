@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from pharos.errors import ParameterError
-from pharos.mdp import TabularMDP
+from pharos.mdp import TabularMDP, executed_actions
 from pharos.solvers import Solution, evaluate_policy, value_iteration
 
 TOLERANCE = 1e-7
@@ -129,15 +129,13 @@ class _Search:
     @cached_property
     def chosen(self) -> tuple[Any, np.ndarray]:
         """What choosing an action does, random actions included: (S A, S) probabilities, (S, A) rewards."""
-        from scipy import sparse
-
-        mdp, actions = self.mdp, self.mdp.num_actions
+        mdp, choices = self.mdp, np.eye(self.mdp.num_actions)
         matrix, rewards = mdp.dynamics.matrix()[:, : mdp.num_states], mdp.rewards
         if not mdp.is_random:
             return matrix, rewards
-        executed = mdp.chance.weights(np.eye(actions), None)
-        mixed = sparse.kron(sparse.identity(mdp.num_states), sparse.csr_matrix(executed), format="csr") @ matrix
-        return sparse.csr_matrix(mixed), rewards @ executed.T
+        owner = np.repeat(np.arange(mdp.num_states), mdp.num_actions)
+        mixed = executed_actions(mdp, np.tile(choices, (mdp.num_states, 1)), owner, np.zeros_like(owner)) @ matrix
+        return mixed, rewards @ mdp.chance.weights(choices).T
 
     def rounded(self, solution: Solution, fixed: np.ndarray) -> tuple[float, int]:
         """(value at the start of a memoryless policy near the solution; the observation to branch on, -1: none).

@@ -47,8 +47,7 @@ class QueriedHistories(PolicyAnswers):
 
     def reach(self, max_rows: int | None = None, steps: int | None = None) -> bool:
         """As of `QueriedPolicy`; under sticky actions a history is looked at once with each previous action."""
-        mdp, num_actions = self.mdp, self.num_actions
-        width = num_actions + 1 if mdp.is_sticky else 1
+        mdp, width = self.mdp, self.mdp.policy_width
         frontier = np.unique(self.start_rows()) * width + (width - 1)
         met, level = set(frontier.tolist()), 0
         while frontier.size and (steps is None or level < steps):
@@ -57,14 +56,14 @@ class QueriedHistories(PolicyAnswers):
             probabilities = self.of(rows)
             if max_rows is not None and len(self.rows) > max_rows:
                 return False
-            weights = mdp.chance.weights(probabilities, previous if mdp.is_sticky else None)
+            weights = mdp.chance.weights(probabilities, previous)
             which, actions = np.nonzero(weights > 0)
             outcomes = mdp.dynamics.outcomes(self.states_of(rows[which]), actions)
             live = outcomes.states < mdp.num_states
             live[live] = ~np.asarray(mdp.terminal)[outcomes.states[live]]
             origin = outcomes.which[live]
             after = self.next_rows(rows[which[origin]], actions[origin], outcomes.states[live])
-            pairs = np.unique(after * width + (actions[origin] if mdp.is_sticky else 0))
+            pairs = np.unique(after * width + (actions[origin] if width > 1 else 0))
             frontier = np.array([pair for pair in pairs.tolist() if pair not in met], np.int64)
             met.update(frontier.tolist())
         return True

@@ -294,7 +294,7 @@ def table_values(mdp: TabularMDP, policies: Sequence[np.ndarray]) -> list[Evalua
 
 def _rows(mdp: TabularMDP) -> int:
     """Pairs of a state and, where that matters, a previous action."""
-    return mdp.num_states * (mdp.num_actions + 1 if mdp.is_sticky else 1)
+    return mdp.num_states * mdp.policy_width
 
 
 def _copies(mdp: TabularMDP, number: int) -> TabularMDP:

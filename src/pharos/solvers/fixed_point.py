@@ -82,7 +82,7 @@ class Backup:
         """Of the contraction, where probabilities of choosing sum to at most `mass`."""
         chance, dynamics = self.mdp.chance, self.mdp.dynamics
         executed = chance.chosen * mass + chance.previous + chance.uniform
-        is_exact = mass == 1.0 and dynamics.mass == 1.0 and not chance.is_sticky and not chance.is_random
+        is_exact = mass == 1.0 and dynamics.mass == 1.0 and chance.is_none
         return self.mdp.gamma * (1.0 if is_exact else max(1.0, executed * dynamics.mass) * (1 + 8 * _UNIT))
 
     @property

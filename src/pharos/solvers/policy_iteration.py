@@ -13,7 +13,15 @@ import math
 import numpy as np
 
 from pharos.kernels import bellman, krylov
-from pharos.mdp import BellmanEquation, PolicyTable, Rewards, Selection, TabularMDP
+from pharos.mdp import (
+    BellmanEquation,
+    PolicyTable,
+    Rewards,
+    Selection,
+    TabularMDP,
+    executed_actions,
+    nodes_of_outcomes,
+)
 from pharos.solvers.convergence import SETTLED, operations, shrinking, sweeps_left
 from pharos.solvers.linear_systems import bicgstab, solution_of_system
 from pharos.system.memory import available_memory
@@ -220,20 +228,9 @@ def linear_values(mdp: TabularMDP, policy: PolicyTable, guess: np.ndarray) -> np
 
     states, actions, width = mdp.num_states, mdp.num_actions, mdp.width
     nodes = states * width
-    # weights: (S W, S A), the probability that being in (s, b) executes a
     chosen = np.broadcast_to(policy.later, (states, width, actions)).reshape(nodes, actions)
-    previous = np.tile(np.arange(width), states) if mdp.is_sticky else None
-    executed = mdp.chance.weights(chosen, previous)
-    columns = np.repeat(np.arange(states), width)[:, None] * actions + np.arange(actions)
-    weights = sparse.csr_matrix(
-        (executed.ravel(), columns.ravel(), np.arange(nodes + 1) * actions), shape=(nodes, states * actions)
-    )
-    weights.eliminate_zeros()
-    outcomes = mdp.dynamics.matrix().tocoo()
-    inside = outcomes.col < states
-    row, column = outcomes.row[inside], outcomes.col[inside].astype(np.int64)
-    following = column * width + (row % actions if width > 1 else 0)
-    moves = sparse.csr_matrix((outcomes.data[inside], (row, following)), shape=(states * actions, nodes))
+    weights = executed_actions(mdp, chosen, np.repeat(np.arange(states), width), np.tile(np.arange(width), states))
+    moves = nodes_of_outcomes(mdp.dynamics.matrix()[:, :states], actions, width)
     system = sparse.identity(nodes, format="csr") - mdp.gamma * (weights @ moves)
     paid = weights @ mdp.rewards.ravel()
     return solution_of_system(system, paid, guess.reshape(nodes)).reshape(states, width)

@@ -55,7 +55,7 @@ class Solution:
     @property
     def v(self) -> np.ndarray:
         """(S,) values; (S, A) under sticky actions."""
-        return self.x[:-1] if self.mdp.is_sticky else self.x[:-1, 0]
+        return self.mdp.without_width(self.x[:-1])
 
     @property
     def q(self) -> np.ndarray:

@@ -161,7 +161,7 @@ def solution_of(  # noqa: PLR0913
     else:
         result, following, steps = backward_induction(mdp, select, horizon, keep_all)
     if steps is not None:
-        steps = steps[:, :-1] if mdp.is_sticky else steps[:, :-1, 0]
+        steps = mdp.without_width(steps[:, :-1])
     return Solution(mdp, result.bound, result.sweeps, watch.seconds, horizon, select, result.x, following, steps)
 
 

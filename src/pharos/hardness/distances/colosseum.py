@@ -5,8 +5,7 @@ from typing import Any
 import numpy as np
 
 from pharos.errors import ParameterError
-from pharos.hardness.planning.expanded import choices_of
-from pharos.mdp import TabularMDP, require_mdp
+from pharos.mdp import ExpandedMDP, TabularMDP, require_mdp
 
 _BLOCK = 256  # targets at a time
 
@@ -34,7 +33,7 @@ def colosseum_diameter(mdp: TabularMDP, *, horizon: int | None = None) -> float:
     horizon = mdp.horizon if horizon is None else horizon
     if isinstance(horizon, bool) or not isinstance(horizon, int | np.integer) or horizon < 1:
         raise ParameterError(f"horizon is {horizon!r}; expected an integer of at least 1, here or in the MDP")
-    choices = choices_of(mdp, False)
+    choices = ExpandedMDP.of(mdp, False)
     size, num_actions = len(choices.underlying), choices.num_actions
     rho = np.zeros(size)
     for node, probability in choices.starts:

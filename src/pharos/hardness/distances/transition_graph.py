@@ -34,7 +34,7 @@ class Graph:
     @staticmethod
     def of(mdp: TabularMDP, restart: bool) -> "Graph | None":
         """The graph of `mdp`; None where a choice or a restart has several outcomes."""
-        if mdp.is_sticky or mdp.is_random:
+        if not mdp.chance.is_none:
             return None
         table = mdp.dynamics.deterministic_table()
         if table is None:

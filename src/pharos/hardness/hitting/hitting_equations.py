@@ -7,8 +7,8 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
-from pharos.hardness.planning.expanded import ExpandedMDP
 from pharos.kernels import hitting
+from pharos.mdp import ExpandedMDP
 
 
 @dataclass(frozen=True)

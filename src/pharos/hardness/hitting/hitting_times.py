@@ -40,8 +40,8 @@ import numpy as np
 from pharos.hardness.hitting.hitting_bounds import PRODUCT, Bounds, added, certified
 from pharos.hardness.hitting.hitting_equations import Factors, factors_of, without_common
 from pharos.hardness.interval import BudgetClock
-from pharos.hardness.planning.expanded import ExpandedMDP
 from pharos.kernels import hitting
+from pharos.mdp import ExpandedMDP
 
 # Sweeps before a policy is evaluated by a linear solve: as many as cost about as much as one.
 SWEEPS = 40

@@ -19,8 +19,7 @@ import numpy as np
 from pharos.hardness.hitting.hitting_times import HittingTimes
 from pharos.hardness.hitting.travel import HubBounds
 from pharos.hardness.interval import BudgetClock, Interval, conventions_of
-from pharos.hardness.planning.expanded import ExpandedMDP, choices_of
-from pharos.mdp import TabularMDP
+from pharos.mdp import ExpandedMDP, TabularMDP
 from pharos.system.workers import usable_workers
 
 # Most targets that threads look at before they learn of a larger hitting time: a target may be looked at in vain that
@@ -50,7 +49,7 @@ CRUDE = 1.01
 
 def stochastic_diameter(mdp: TabularMDP, restart: bool, tolerance: float, spending: BudgetClock) -> Interval:
     """The diameter of an MDP with chance: exact up to `tolerance`, or the interval proven by budget and floats."""
-    choices = choices_of(mdp, restart)
+    choices = ExpandedMDP.of(mdp, restart)
     conventions = {**conventions_of(mdp, restart), "nodes": len(choices.underlying), "sticky_pairs": mdp.is_sticky}
     return _Diameter(mdp, restart, choices, tolerance, spending).interval(conventions)
 

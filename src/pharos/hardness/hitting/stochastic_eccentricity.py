@@ -12,9 +12,8 @@ from pharos.hardness.hitting.hitting_times import SWEEPS, HittingTimes
 from pharos.hardness.hitting.stochastic_diameter import CRUDE, RULED_OUT, TRIAL, shortened
 from pharos.hardness.hitting.travel import HubBounds
 from pharos.hardness.interval import BudgetClock, Interval, conventions_of
-from pharos.hardness.planning.expanded import ExpandedMDP, choices_of
 from pharos.kernels.hitting import UNIT
-from pharos.mdp import TabularMDP
+from pharos.mdp import ExpandedMDP, TabularMDP
 
 
 def stochastic_start_eccentricity(mdp: TabularMDP, restart: bool, tolerance: float, spending: BudgetClock) -> Interval:
@@ -57,7 +56,7 @@ class _Eccentricity:
 
     def __init__(self, mdp: TabularMDP, restart: bool, tolerance: float, spending: BudgetClock):
         self.tolerance, self.spending = tolerance, spending
-        self.choices: ExpandedMDP = choices_of(mdp, restart)
+        self.choices: ExpandedMDP = ExpandedMDP.of(mdp, restart)
         self.targets = HittingTimes(self.choices)
         self.nodes = np.array([node for node, _ in self.choices.starts])
         self.weights = np.array([weight for _, weight in self.choices.starts])

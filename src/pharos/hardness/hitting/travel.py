@@ -39,9 +39,8 @@ from functools import cached_property
 
 import numpy as np
 
-from pharos.hardness.planning.expanded import outcomes_of
 from pharos.kernels import travel, vicinity
-from pharos.mdp import TabularMDP
+from pharos.mdp import TabularMDP, outcomes_of
 from pharos.system.workers import usable_workers
 
 # Nodes around each state among which ways back are looked for: a few steps in all directions of a grid.
@@ -86,7 +85,7 @@ class HubBounds:
         owner = np.repeat(np.arange(len(first) - 1), np.diff(first))
         self._num_actions = num_actions
         self._steps = -1, np.empty(0, np.int32)  # a hub, and those from it to each node
-        self._fixed = (self._outcomes, owner, weights, num_actions if mdp.is_sticky else 0)
+        self._fixed = (self._outcomes, owner, weights, mdp.policy_width - 1)
         self._threads = usable_workers(None) if len(node) > SMALL else 1
         with ThreadPoolExecutor(self._threads) as pool:
             self._find_ways_back(owner, pool)

@@ -90,7 +90,7 @@ def effective_horizon(mdp: TabularMDP, *, horizon: int | None = None, tight: int
         "gamma": 1.0,
         "exploration": "uniform",
         "tie_tolerance": TIE,
-        "states": "pairs (state, previously executed action)" if mdp.is_sticky else "states",
+        "states": mdp.nodes,
     }
     return EffectiveHorizon(**parts, tight=bound, conventions=conventions)
 

@@ -13,10 +13,9 @@ import numpy as np
 
 from pharos.errors import ParameterError, PrecisionError, UndefinedMeasure
 from pharos.hardness.gaps.gaps import optimal_solution, solved
-from pharos.hardness.planning.expanded import ExpandedMDP, choices_of, reachable
 from pharos.hardness.planning.look_ahead import LookAhead
 from pharos.hardness.planning.steps import expected_rewards, single_outcomes
-from pharos.mdp import TabularMDP, require_mdp
+from pharos.mdp import ExpandedMDP, TabularMDP, require_mdp
 from pharos.solvers import Solution, uniform_value, value_iteration, worst_value
 
 
@@ -122,7 +121,7 @@ def stationary_effective_horizon(
         "exploration": "uniform",
         "tie_tolerance": tie,
         "slack": slack,
-        "states": "pairs (state, previously executed action)" if mdp.is_sticky else "states",
+        "states": mdp.nodes,
     }
     return StationaryHorizon(best, k_min, window, ks, ms, gaps, variances, conventions)
 
@@ -179,7 +178,7 @@ class _Nodes:
         if mdp.is_deterministic:
             choices, self.table = _states_and_the_end(mdp)
         else:
-            choices = reachable(choices_of(mdp, restart=False))
+            choices = ExpandedMDP.of(mdp, restart=False).reachable()
             self.table = single_outcomes(choices.matrix, len(choices.underlying), mdp.num_actions)
         self.num_nodes = len(choices.underlying)
         self.matrix = choices.matrix

@@ -10,8 +10,7 @@ import numpy as np
 from scipy import sparse
 
 from pharos.errors import ParameterError, PrecisionError, UndefinedMeasure
-from pharos.hardness.planning.expanded import choices_of
-from pharos.mdp import TabularMDP
+from pharos.mdp import ExpandedMDP, TabularMDP
 
 # In units of return: an action is optimal if its value is within this of the best (theirs).
 TIE = 1e-4
@@ -51,14 +50,14 @@ class FiniteHorizonValues:
     """
 
     def __init__(self, mdp: TabularMDP, steps: int):
-        size = (mdp.num_states + 1) * (mdp.num_actions + 1 if mdp.is_sticky else 1)
+        size = (mdp.num_states + 1) * mdp.policy_width
         needed = 40 * steps * size * mdp.num_actions
         if needed > MEMORY:
             raise UndefinedMeasure(
                 f"effective_horizon: {steps} steps of the {size} nodes that they can meet need {needed / 2**30:.1f} "
                 f"GiB, more than {MEMORY / 2**30:.0f}; a smaller horizon or instance would define it"
             )
-        choices = choices_of(mdp, restart=False)
+        choices = ExpandedMDP.of(mdp, restart=False)
         self.matrix, self.num_actions, self.steps = choices.matrix, mdp.num_actions, steps
         self.underlying, self.num_nodes = choices.underlying, len(choices.underlying)
         self.starts = choices.starts
@@ -153,4 +152,4 @@ def expected_rewards(mdp: TabularMDP, choices: Any) -> np.ndarray:
     paid[:-1][np.asarray(mdp.terminal)] = 0.0
     executed = paid[np.minimum(choices.underlying, mdp.num_states)]
     mean = mean_of_actions(executed)[:, None]
-    return mdp.chance.chosen_values(executed, choices.previous if mdp.is_sticky else None, mean)
+    return mdp.chance.chosen_values(executed, choices.previous, mean)

@@ -9,8 +9,7 @@ from scipy import sparse
 from scipy.sparse import csgraph
 
 from pharos.errors import ParameterError, UndefinedMeasure
-from pharos.hardness.planning.expanded import choices_of, reachable
-from pharos.mdp import PolicyTable, TabularMDP, require_mdp
+from pharos.mdp import ExpandedMDP, PolicyTable, TabularMDP, require_mdp
 
 MOST_NODES = 4096
 ROUNDING = 1e-12  # of a distance, that a tie with epsilon is one
@@ -74,7 +73,7 @@ def mixing_time(
         raise ParameterError(f"epsilon is {epsilon!r}; expected a number between 0 and 1/2")
     if mdp.num_states > 100 * MOST_NODES:  # too many to be written out, even if few can be reached
         raise UndefinedMeasure(_too_many(mdp.num_states))
-    choices = reachable(choices_of(mdp, restart))
+    choices = ExpandedMDP.of(mdp, restart).reachable()
     size = len(choices.underlying)
     if size > MOST_NODES:
         raise UndefinedMeasure(_too_many(size))

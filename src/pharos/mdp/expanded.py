@@ -14,7 +14,7 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse import csgraph
 
-from pharos.mdp import TabularMDP
+from pharos.mdp.tabular import TabularMDP
 
 
 @dataclass
@@ -95,41 +95,84 @@ class ExpandedMDP:
         exponent = -steps * math.log(float(data[first].min()))
         return steps * math.exp(exponent) if exponent < 690 else math.inf
 
-
-def choices_of(mdp: TabularMDP, restart: bool) -> ExpandedMDP:
-    """The MDP written out, with the restart convention."""
-    num_states, num_actions = mdp.num_states, mdp.num_actions
-    terminal = np.asarray(mdp.terminal)
-    executed, ends = outcomes_of(mdp, terminal)  # (S A, S + ends): outcome of executing an action in a live state
-    size = num_states + ends
-    states = np.arange(size)
-    live = np.zeros(size, np.bool_)
-    live[:num_states] = ~terminal
-    chance = mdp.chance
-    if mdp.is_sticky:
-        # node s (A + 1) + b, b = A: no previous action
-        width = num_actions + 1
+    @staticmethod
+    def of(mdp: TabularMDP, restart: bool) -> "ExpandedMDP":
+        """The MDP written out; restart: an action in a terminal state leads back to the start."""
+        num_states, num_actions = mdp.num_states, mdp.num_actions
+        width = mdp.policy_width  # node s (A + 1) + b, b = A: no previous action
+        terminal = np.asarray(mdp.terminal)
+        executed, ends = outcomes_of(mdp, terminal)  # (S A, S + ends): outcome of executing an action in a live state
+        size = num_states + ends
         nodes = size * width
-        coo = executed.tocoo()
-        arrived = coo.col * width + coo.row % num_actions
-        outcome = sparse.csr_matrix((coo.data, (coo.row, arrived)), shape=(num_states * num_actions, nodes))
-        owner, previous = np.repeat(states, width), np.tile(np.arange(width), size)
-    else:
-        width, nodes = 1, size
-        outcome, owner, previous = executed, states, np.full(size, -1)
-    starts = [
-        (int(s) * width + (num_actions if width > 1 else 0), float(p))
-        for s, p in zip(mdp.start_states, mdp.start_probabilities, strict=True)
-        if p > 0
-    ]
-    weights = _weights(chance, (num_states, num_actions), owner, previous, live[owner])
-    matrix = weights @ outcome
-    matrix = matrix + _restarts(owner, live, starts, num_actions, nodes, restart)
-    matrix = sparse.csr_matrix(matrix)
-    matrix.sum_duplicates()
-    alike = ~live[owner] if restart and len(starts) > 1 else np.zeros(nodes, np.bool_)
-    choices = ExpandedMDP(matrix, owner, previous, starts, num_actions, size, alike)
-    return reachable(choices) if mdp.is_sticky else choices
+        live = np.zeros(size, np.bool_)
+        live[:num_states] = ~terminal
+        owner, previous = np.repeat(np.arange(size), width), np.tile(np.arange(width), size) - (width == 1)
+        starts = [
+            (int(s) * width + width - 1, float(p))
+            for s, p in zip(mdp.start_states, mdp.start_probabilities, strict=True)
+            if p > 0
+        ]
+        node = np.flatnonzero(live[owner])
+        choice, chooser = np.tile(np.eye(num_actions), (node.size, 1)), np.repeat(node, num_actions)
+        weights = executed_actions(mdp, choice, owner[chooser], previous[chooser])
+        counts = np.zeros((nodes, num_actions), np.int64)
+        counts[node] = np.diff(weights.indptr).reshape(-1, num_actions)
+        weights = sparse.csr_matrix(
+            (weights.data, weights.indices, np.append(0, counts.cumsum())), shape=(counts.size, weights.shape[1])
+        )
+        matrix = weights @ nodes_of_outcomes(executed, num_actions, width)
+        matrix = sparse.csr_matrix(matrix + _restarts(owner, live, starts, num_actions, nodes, restart))
+        matrix.sum_duplicates()
+        alike = ~live[owner] if restart and len(starts) > 1 else np.zeros(nodes, np.bool_)
+        choices = ExpandedMDP(matrix, owner, previous, starts, num_actions, size, alike)
+        return choices.reachable() if width > 1 else choices
+
+    def reachable(self) -> "ExpandedMDP":
+        """The nodes that can be reached from the start, by whatever is chosen."""
+        first, previous = self.reversed
+        size = len(self.underlying)
+        graph = sparse.csr_matrix((np.ones(len(previous), np.int8), previous, first), shape=(size, size)).T.tocsr()
+        is_reached = np.zeros(size, np.bool_)
+        for node, _ in self.starts:
+            is_reached[csgraph.breadth_first_order(graph, node, return_predecessors=False)] = True
+        nodes = np.flatnonzero(is_reached)
+        place = np.full(size, -1)
+        place[nodes] = np.arange(nodes.size)
+        rows = (nodes[:, None] * self.num_actions + np.arange(self.num_actions)).ravel()
+        matrix = sparse.csr_matrix(self.matrix[rows][:, nodes])
+        starts = [(int(place[node]), p) for node, p in self.starts]
+        return ExpandedMDP(
+            matrix,
+            self.underlying[nodes],
+            self.previous[nodes],
+            starts,
+            self.num_actions,
+            self.num_targets,
+            self.alike[nodes],
+        )
+
+
+def executed_actions(mdp: TabularMDP, chosen: np.ndarray, owner: np.ndarray, previous: np.ndarray) -> Any:
+    """(N, S A) CSR: the probability that each action is executed in the state of a node.
+
+    Args:
+        chosen: (N, A) probabilities of choosing each action. owner: (N,) states. previous: (N,) as of `Chance.weights`.
+    """
+    nodes, num_actions = chosen.shape
+    columns = owner[:, None] * num_actions + np.arange(num_actions)
+    entries = mdp.chance.weights(chosen, previous).ravel(), columns.ravel(), np.arange(nodes + 1) * num_actions
+    matrix = sparse.csr_matrix(entries, shape=(nodes, mdp.num_states * num_actions))
+    matrix.eliminate_zeros()
+    return matrix
+
+
+def nodes_of_outcomes(outcomes: Any, num_actions: int, width: int) -> Any:
+    """(S A, E W) CSR of outcomes (S A, E): each leads to the node of its state and of the action that was executed."""
+    if width == 1:
+        return outcomes
+    coo = outcomes.tocoo()
+    nodes = coo.col.astype(np.int64) * width + coo.row % num_actions
+    return sparse.csr_matrix((coo.data, (coo.row, nodes)), shape=(outcomes.shape[0], outcomes.shape[1] * width))
 
 
 def outcomes_of(mdp: TabularMDP, terminal: np.ndarray) -> tuple[Any, bool]:
@@ -141,21 +184,6 @@ def outcomes_of(mdp: TabularMDP, terminal: np.ndarray) -> tuple[Any, bool]:
             (matrix.data, matrix.indices, matrix.indptr), shape=(matrix.shape[0], mdp.num_states)
         )
     return matrix, ends
-
-
-def _weights(chance: Any, shape: tuple[int, int], owner: np.ndarray, previous: np.ndarray, live: np.ndarray) -> Any:
-    """(N A, S A): the probability that choosing a in a node executes x in its state.
-
-    previous (N,): A for none, -1 where it does not matter.
-    """
-    num_states, num_actions = shape
-    node = np.flatnonzero(live)
-    choice = np.tile(np.eye(num_actions), (node.size, 1))
-    data = chance.weights(choice, np.repeat(previous[node], num_actions))
-    n, x = np.nonzero(data)
-    rows = (node[:, None] * num_actions + np.arange(num_actions)).ravel()[n]
-    columns = np.repeat(owner[node], num_actions)[n] * num_actions + x
-    return sparse.csr_matrix((data[n, x], (rows, columns)), shape=(owner.size * num_actions, num_states * num_actions))
 
 
 def _restarts(
@@ -172,28 +200,3 @@ def _restarts(
         columns = np.repeat(ended, num_actions)
         data = np.ones(rows.size)
     return sparse.csr_matrix((data, (rows, columns)), shape=(nodes * num_actions, nodes))
-
-
-def reachable(choices: ExpandedMDP) -> ExpandedMDP:
-    """The nodes that can be reached from the start, by whatever is chosen."""
-    first, previous = choices.reversed
-    size = len(choices.underlying)
-    graph = sparse.csr_matrix((np.ones(len(previous), np.int8), previous, first), shape=(size, size)).T.tocsr()
-    is_reached = np.zeros(size, np.bool_)
-    for node, _ in choices.starts:
-        is_reached[csgraph.breadth_first_order(graph, node, return_predecessors=False)] = True
-    nodes = np.flatnonzero(is_reached)
-    place = np.full(size, -1)
-    place[nodes] = np.arange(nodes.size)
-    rows = (nodes[:, None] * choices.num_actions + np.arange(choices.num_actions)).ravel()
-    matrix = sparse.csr_matrix(choices.matrix[rows][:, nodes])
-    starts = [(int(place[node]), p) for node, p in choices.starts]
-    return ExpandedMDP(
-        matrix,
-        choices.underlying[nodes],
-        choices.previous[nodes],
-        starts,
-        choices.num_actions,
-        choices.num_targets,
-        choices.alike[nodes],
-    )
