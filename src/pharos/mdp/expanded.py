@@ -8,7 +8,6 @@ any previous action.
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from scipy import sparse
@@ -31,7 +30,7 @@ class ExpandedMDP:
             in which episodes end, where a restart leads to one of several start states.
     """
 
-    matrix: Any
+    matrix: sparse.csr_matrix
     underlying: np.ndarray
     previous: np.ndarray
     starts: list[tuple[int, float]]
@@ -152,7 +151,7 @@ class ExpandedMDP:
         )
 
 
-def executed_actions(mdp: TabularMDP, chosen: np.ndarray, owner: np.ndarray, previous: np.ndarray) -> Any:
+def executed_actions(mdp: TabularMDP, chosen: np.ndarray, owner: np.ndarray, previous: np.ndarray) -> sparse.csr_matrix:
     """(N, S A) CSR: the probability that each action is executed in the state of a node.
 
     Args:
@@ -166,7 +165,7 @@ def executed_actions(mdp: TabularMDP, chosen: np.ndarray, owner: np.ndarray, pre
     return matrix
 
 
-def nodes_of_outcomes(outcomes: Any, num_actions: int, width: int) -> Any:
+def nodes_of_outcomes(outcomes: sparse.csr_matrix, num_actions: int, width: int) -> sparse.csr_matrix:
     """(S A, E W) CSR of outcomes (S A, E): each leads to the node of its state and of the action that was executed."""
     if width == 1:
         return outcomes
@@ -175,7 +174,7 @@ def nodes_of_outcomes(outcomes: Any, num_actions: int, width: int) -> Any:
     return sparse.csr_matrix((coo.data, (coo.row, nodes)), shape=(outcomes.shape[0], outcomes.shape[1] * width))
 
 
-def outcomes_of(mdp: TabularMDP, terminal: np.ndarray) -> tuple[Any, bool]:
+def outcomes_of(mdp: TabularMDP, terminal: np.ndarray) -> tuple[sparse.csr_matrix, bool]:
     """(S A, S + 1 or S) outcomes of executing actions, rows of terminal states empty; whether the end is among them."""
     matrix = mdp.dynamics.matrix(~terminal)
     ends = bool((matrix.indices == mdp.num_states).any())
@@ -188,7 +187,7 @@ def outcomes_of(mdp: TabularMDP, terminal: np.ndarray) -> tuple[Any, bool]:
 
 def _restarts(
     owner: np.ndarray, live: np.ndarray, starts: list[tuple[int, float]], num_actions: int, nodes: int, restart: bool
-) -> Any:
+) -> sparse.csr_matrix:
     """(N A, N): what terminal states and the end lead to."""
     ended = np.flatnonzero(~live[owner])
     if restart:
