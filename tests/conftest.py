@@ -19,6 +19,10 @@ from hypothesis import settings
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+from pharos.system import compiling
+
+compiling.SMALL = 0  # tests are small, and of compiled code; those of tests/kernels/test_interpreted.py are not
+
 settings.register_profile("fixed", derandomize=True)
 settings.register_profile("explore", derandomize=False)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "fixed"))

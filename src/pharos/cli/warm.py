@@ -9,6 +9,7 @@ from pharos.cli.answers import print_facts, print_json, progress_line
 from pharos.cli.options import Json, Random, Sticky, complete_target
 from pharos.cli.target import parse_target
 from pharos.errors import StateSpaceTooLarge
+from pharos.system import compiling
 from pharos.system.compiling import Stopwatch
 from pharos.system.wording import many
 
@@ -48,6 +49,7 @@ def warm(
         environments = [make(name, **parameters) for name, parameters in USUAL]
     seconds: dict[str, float] = {}
     watch = Stopwatch()
+    compiling.SMALL = 0  # as if all of it were large
     with progress_line("compiling") as tell:
         for env in environments:
             tell(str(env))

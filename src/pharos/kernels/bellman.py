@@ -10,8 +10,8 @@ largest change of an entry.
 
 import numpy as np
 from numba import njit, types, uint64
-from numba.extending import overload
 
+from pharos.kernels.interpreted import interpreted_first, overload
 from pharos.kernels.outcomes import expectation, expectation_of_pair, fetch_values, size_of
 from pharos.kernels.paths import state_at
 
@@ -73,6 +73,7 @@ def _backup_of(transitions, table, palette, gamma, uniform, choice, v, actions, 
     return of_policy
 
 
+@interpreted_first()
 @njit(cache=True, nogil=True)
 def optimal_sweep(transitions, table, palette, gamma, uniform, choice, v, actions, order, start, stop):
     """v[s] = (1 - uniform) q(s, what is chosen) + uniform mean_a q(s, a), in place, for places [start, stop)."""
@@ -87,6 +88,7 @@ def optimal_sweep(transitions, table, palette, gamma, uniform, choice, v, action
     return change
 
 
+@interpreted_first()
 @njit(cache=True, nogil=True)
 def optimal_backup(transitions, table, palette, gamma, uniform, choice, v, out, actions, runs):
     """out[s] = the backup of v for s of some runs (R, 2), not in place: what threads and ranks share, and horizons
@@ -127,6 +129,7 @@ def _chosen_of(choice, q, actions, s):
     return extreme
 
 
+@interpreted_first()
 @njit(cache=True, nogil=True)
 def sticky_sweep(transitions, table, palette, gamma, weights, choice, v, actions, q, order, start, stop):
     """v[s, b] = chosen q(s, what is chosen) + previous q(s, b) + uniform mean_a q(s, a), in place.
@@ -148,6 +151,7 @@ def sticky_sweep(transitions, table, palette, gamma, weights, choice, v, actions
     return change
 
 
+@interpreted_first()
 @njit(cache=True, nogil=True)
 def sticky_backup(transitions, table, palette, gamma, weights, choice, v, out, actions, runs):
     """out[s, b] = the backup of v for s of some runs (R, 2), not in place."""
@@ -164,6 +168,7 @@ def sticky_backup(transitions, table, palette, gamma, weights, choice, v, out, a
                 out[uint64(s), b] = shared + previous * q[b]
 
 
+@interpreted_first()
 @njit(cache=True, nogil=True)
 def policy_sweep(transitions, table, palette, gamma, chosen, uniform, policy, v, order, start, stop):
     """v[s] = sum_a (chosen policy[s, a] + uniform / A) q(s, a), in place; policy (S, A): probabilities of choosing."""
@@ -181,6 +186,7 @@ def policy_sweep(transitions, table, palette, gamma, chosen, uniform, policy, v,
     return change
 
 
+@interpreted_first()
 @njit(cache=True, nogil=True)
 def sticky_policy_sweep(transitions, table, palette, gamma, weights, policy, v, q, order, start, stop):
     """v[s, b] = sum_a (chosen policy[s, b, a] + uniform / A) q(s, a) + previous q(s, b), in place.
@@ -208,6 +214,7 @@ def sticky_policy_sweep(transitions, table, palette, gamma, weights, policy, v, 
     return change
 
 
+@interpreted_first()
 @njit(cache=True, nogil=True)
 def chain_values(successor, reward, gamma, v, order):
     """Exact values on the graph of a deterministic policy: successor (S,), -1 ends; reward (S,); v gets the values.

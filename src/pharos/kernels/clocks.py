@@ -3,7 +3,10 @@
 import numpy as np
 from numba import njit
 
+from pharos.kernels.interpreted import interpreted_first
 
+
+@interpreted_first()
 @njit(cache=True, nogil=True)
 def period(next_states, ends, start, level, has_end):
     """Greatest common divisor of level(u) + 1 - level(v) over all edges (u, v), that is, of the lengths of all cycles.

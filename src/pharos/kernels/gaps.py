@@ -8,6 +8,8 @@ import math
 import numpy as np
 from numba import njit
 
+from pharos.kernels.interpreted import interpreted_first
+
 # Bin b of a histogram holds 10^((b - BIN_OF_ONE) / 4) <= gap < 10^((b + 1 - BIN_OF_ONE) / 4), for all floats.
 BIN_OF_ONE = 1300
 _BINS = 2 * BIN_OF_ONE
@@ -31,6 +33,7 @@ def empty_histogram() -> np.ndarray:
     return np.zeros(_BINS, np.int64)
 
 
+@interpreted_first()
 @njit(cache=True, nogil=True)
 def differences(rewards, following, gamma):
     """(N, A): the largest r + gamma x of a row, less each; rewards r, following x (N, A)."""
@@ -46,6 +49,7 @@ def differences(rewards, following, gamma):
     return gap
 
 
+@interpreted_first("gap")
 @njit(cache=True, nogil=True, error_model="numpy")
 def add_up(gap, weight, counted, minimal, tolerance, error, regularizer, sums, counts, histogram):
     """Add the gaps of a block to sums, counts and histogram: regularized ones as often as weight (N,) says, others as

@@ -11,9 +11,11 @@ nodes found, in the order of their distance.
 import numpy as np
 from numba import njit
 
+from pharos.kernels.interpreted import interpreted_first
 from pharos.kernels.outcomes import outcome, outcomes_of, size_of
 
 
+@interpreted_first()
 @njit(cache=True, nogil=True)
 def search_forward(next_states, ends, start, source, distance, queue):
     """distance[v] = steps from `source` to v. Returns (nodes found, largest distance, sum of distances)."""
@@ -45,6 +47,7 @@ def search_forward(next_states, ends, start, source, distance, queue):
     return tail, distance[queue[tail - 1]], total
 
 
+@interpreted_first()
 @njit(cache=True, nogil=True)
 def search_backward(first, previous, restarting, start, source, distance, queue):
     """distance[v] = steps from v to `source`. Returns (nodes found, largest distance, sum of distances).
@@ -77,6 +80,7 @@ def search_backward(first, previous, restarting, start, source, distance, queue)
     return tail, distance[queue[tail - 1]], total
 
 
+@interpreted_first()
 @njit(cache=True, nogil=True)
 def count_predecessors(next_states, ends, first):
     """first[v + 1] = distinct predecessors of v other than v, by rows that are followed. `first` is zero before."""
@@ -90,6 +94,7 @@ def count_predecessors(next_states, ends, first):
                 first[(num_states if v < 0 else v) + 1] += 1
 
 
+@interpreted_first()
 @njit(cache=True, nogil=True)
 def fill_predecessors(next_states, ends, first, previous):
     """previous[first[v] : first[v + 1]] = predecessors of v. `first` comes shifted by one place and leaves in place."""
@@ -131,6 +136,7 @@ def reversed_graph(next_states, ends, num_nodes):
     return first[:-1], previous
 
 
+@interpreted_first()
 @njit(cache=True, nogil=True)
 def bound_eccentricities(from_pivot, to_pivot, out_pivot, in_pivot, out_lower, out_upper, in_lower, in_upper):
     """Tighten the bounds of all eccentricities from a search in both directions from one pivot p.
@@ -146,6 +152,7 @@ def bound_eccentricities(from_pivot, to_pivot, out_pivot, in_pivot, out_lower, o
         in_upper[v] = min(in_upper[v], away + in_pivot)
 
 
+@interpreted_first()
 @njit(cache=True, nogil=True)
 def raise_lower(distance, lower):
     """lower[v] = max(lower[v], distance[v])."""
@@ -153,6 +160,7 @@ def raise_lower(distance, lower):
         lower[v] = max(lower[v], distance[v])
 
 
+@interpreted_first()
 @njit(cache=True, nogil=True)
 def open_eccentricities(out_lower, out_upper, in_lower, in_upper, best):
     """Whose eccentricity may exceed `best`, and where to search next.
@@ -187,6 +195,7 @@ def open_eccentricities(out_lower, out_upper, in_lower, in_upper, best):
     return num_out, num_in, far_out, far_in, middle
 
 
+@interpreted_first("n")
 @njit(cache=True, nogil=True)
 def onwards(transitions, nodes, n, following, is_visited):
     """States that nodes[:n] lead to and that were not seen before; returns how many. is_visited (S,) bool."""

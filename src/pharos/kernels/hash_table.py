@@ -12,6 +12,8 @@ from llvmlite import ir
 from numba import int64, njit, types, uint64
 from numba.core import cgutils
 
+from pharos.kernels.interpreted import in_python, interpreted_first
+
 intrinsic: Any = numba.extending.intrinsic  # whose types would hide those of the functions that it makes
 _BATCH = 32
 
@@ -21,6 +23,7 @@ _BATCH = 32
 FIRST, COUNT, LEVEL_END, DEPTH, FAULT = range(5)
 
 
+@in_python(lambda array, index: None)
 @intrinsic
 def prefetch(typing_context, array, index):
     """Ask the processor to fetch array[index] (first axis, C order), which will be read soon."""
@@ -44,6 +47,7 @@ def _entry(context, builder, array_type, array, index):
     return builder.gep(array.data, [index])
 
 
+@in_python(lambda table, slot: int(table[slot]))
 @intrinsic
 def entry_at(typing_context, table, slot):
     """table[slot], which another thread may be writing; what it wrote before is seen as well (an acquiring load)."""
@@ -56,6 +60,7 @@ def entry_at(typing_context, table, slot):
     return types.int64(table, types.int64), codegen
 
 
+@in_python(lambda table, slot, index: table.__setitem__(slot, index))
 @intrinsic
 def publish(typing_context, table, slot, index):
     """table[slot] = index, after everything written before (a releasing store), for threads that read `entry_at`."""
@@ -94,6 +99,7 @@ def hash_of_row(states, i):
     return h
 
 
+@interpreted_first("count")
 @njit(cache=True, nogil=True)
 def fill(table, states, count):
     """Put states [0, count), all different, into an empty table (every slot -1)."""
@@ -157,6 +163,7 @@ def fill_more(table, states, indices):
         table[slot] = index
 
 
+@interpreted_first("keys")
 @njit(cache=True, nogil=True)
 def find(table, states, keys, out):
     """out[j] = index of keys[j] among the states, or -1. keys (N, W) uint64."""
@@ -176,6 +183,7 @@ def find(table, states, keys, out):
             slot = slot + 1 if slot + 1 < capacity else 0
 
 
+@interpreted_first("keys")
 @njit(cache=True, nogil=True)
 def slots_of(keys, capacity, out):
     """out[j] = the slot from which to search for keys[j]."""
@@ -183,6 +191,7 @@ def slots_of(keys, capacity, out):
         out[j] = slot_of(hash_of_row(keys, j), capacity)
 
 
+@interpreted_first("keys")
 @njit(cache=True, nogil=True)
 def insert_missing(table, states, keys, indices, successors, progress):
     """Number the successors that threads did not find, in order; the serial half of a wide frontier.

@@ -9,6 +9,7 @@ uniform).
 import numpy as np
 from numba import njit
 
+from pharos.kernels.interpreted import interpreted_first
 from pharos.kernels.outcomes import outcome, outcomes_of, size_of
 
 
@@ -42,6 +43,7 @@ def _execute(policy, weights, now, s, mass, executed):
         executed[a] = p
 
 
+@interpreted_first()
 @njit(cache=True, nogil=True)
 def push(transitions, live, policy, weights, now, after):
     """after = the distribution one step later, without what has ended.
@@ -72,6 +74,7 @@ def push(transitions, live, policy, weights, now, after):
     return total
 
 
+@interpreted_first()
 @njit(cache=True, nogil=True)
 def settle(transitions, live, policy, weights, gamma, least, waiting, visits):
     """Count what waits in a state as a visit, and let it go on; from the first state to the last, in place.

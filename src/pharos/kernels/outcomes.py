@@ -17,9 +17,9 @@ their indices are unsigned, as signed ones would be asked at each read whether t
 
 import numpy as np
 from numba import njit, types, uint64
-from numba.extending import overload
 
 from pharos.kernels.hash_table import prefetch
+from pharos.kernels.interpreted import interpreted_first, overload
 from pharos.kernels.packed_indices import PackedIndicesType
 
 # The largest K that the compiler is told.
@@ -198,6 +198,7 @@ def _fetch_values(transitions, v, actions, s):
     return each_action
 
 
+@interpreted_first("states")
 @njit(cache=True, nogil=True)
 def expected(transitions, x, states, out):
     """out[i, a] = the mean of x (S + 1, W, M) over what (states[i], a) leads to; W = A by executed action, or 1.
@@ -215,6 +216,7 @@ def expected(transitions, x, states, out):
                         out[i, a, m] += p * x[t, a if by_action else 0, m]
 
 
+@interpreted_first()
 @njit(cache=True, nogil=True)
 def pushed(transitions, mass, out):
     """out (S, W) += where the mass (S, A) of executed actions goes, without what ends."""
@@ -228,6 +230,7 @@ def pushed(transitions, mass, out):
                         out[t, a if by_action else 0] += p * mass[s, a]
 
 
+@interpreted_first("states")
 @njit(cache=True, nogil=True)
 def largest(transitions, x, states, sign, out):
     """out[i, a] = the largest (sign 1) or smallest (-1) of x (S + 1,) over what (states[i], a) may lead to."""
@@ -239,6 +242,7 @@ def largest(transitions, x, states, sign, out):
             out[i, a] = sign * best
 
 
+@interpreted_first("states")
 @njit(cache=True, nogil=True)
 def arrive(transitions, states, out):
     """out[t, a] = True where executing a in some of these states may lead to t."""
@@ -274,6 +278,7 @@ def draw(transitions, states, actions, u, out):
         out[i] = drawn(transitions, states[i], actions[i], u[i])
 
 
+@interpreted_first()
 @njit(cache=True, nogil=True)
 def have_one_outcome(transitions):
     """Whether every (s, a) has one outcome, of probability 1."""

@@ -5,7 +5,10 @@ component.
 import numpy as np
 from numba import njit
 
+from pharos.kernels.interpreted import interpreted_first
 
+
+@interpreted_first("states")
 @njit(cache=True, nogil=True)
 def pack_rows(word, shift, low, states, packed):
     """packed (N, W) uint64 |= states (N, D) int64, component i in bits from shift[i] of word[i].
@@ -17,6 +20,7 @@ def pack_rows(word, shift, low, states, packed):
             packed[n, word[i]] |= np.uint64(states[n, i] - low[i]) << shift[i]
 
 
+@interpreted_first("states")
 @njit(cache=True, nogil=True)
 def unpack_rows(word, shift, mask, low, packed, states):
     """states (N, D) int64 = components of packed (N, W); the inverse of `pack_rows`."""

@@ -6,8 +6,8 @@ An order is (S,) states, or None for that of their numbers. Source: Kahn (1962),
 
 import numpy as np
 from numba import njit, types
-from numba.extending import overload
 
+from pharos.kernels.interpreted import interpreted_first, overload
 from pharos.kernels.outcomes import outcome, outcomes_of, size_of
 
 
@@ -22,6 +22,7 @@ def _state_at(order, i):
     return lambda order, i: order[i]
 
 
+@interpreted_first()
 @njit(cache=True, nogil=True)
 def is_increasing(transitions, live, age):
     """(s, a, t) of the first transition of a live state s to a state t whose age (S,) is not larger, or (-1, -1, -1).
@@ -39,6 +40,7 @@ def is_increasing(transitions, live, age):
     return -1, -1, -1
 
 
+@interpreted_first()
 @njit(cache=True, nogil=True)
 def topological_order(transitions, live):
     """The order; where there is a cycle, it lacks the states of the cycle and all that they lead to.
@@ -77,6 +79,7 @@ def topological_order(transitions, live):
     return order[:tail]
 
 
+@interpreted_first()
 @njit(cache=True, nogil=True)
 def longest_path(transitions, live, order):
     """Edges of the longest path of states in such an order. Cost: one pass over the transitions; 4 bytes a state."""

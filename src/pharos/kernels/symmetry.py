@@ -2,7 +2,10 @@
 
 from numba import njit
 
+from pharos.kernels.interpreted import interpreted_first
 
+
+@interpreted_first("queue")
 @njit(cache=True, nogil=True)
 def symmetry(next_states, ends, start, s, t, image, preimage, queue):
     """Find the map f with f(s) = t and f(next_states[u, a]) = next_states[f(u), a]; there is at most one.
@@ -38,6 +41,7 @@ def symmetry(next_states, ends, start, s, t, image, preimage, queue):
     return tail == num_states and (not restarts or image[start] == start + 1), tail
 
 
+@interpreted_first("steps")
 @njit(cache=True, nogil=True)
 def forget(image, preimage, queue, steps):
     """Zero again, where `symmetry` wrote."""

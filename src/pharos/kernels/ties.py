@@ -9,9 +9,12 @@ of two.
 import numpy as np
 from numba import njit
 
+from pharos.kernels.interpreted import interpreted_first
+
 FREE = -1  # the bits of a NaN, which no value is
 
 
+@interpreted_first("gap")
 @njit(cache=True, nogil=True)
 def extend(own, rewards, following, gap, counted, begin, places, filled):
     """Map own[i, b] to (rewards, following) of the best actions, and where there are several b to those of b as well.
@@ -47,6 +50,7 @@ def extend(own, rewards, following, gap, counted, begin, places, filled):
     return len(gap), filled
 
 
+@interpreted_first()
 @njit(cache=True, nogil=True)
 def refill(old_places, places):
     """Put one map into a larger one."""

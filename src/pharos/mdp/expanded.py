@@ -10,8 +10,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy import sparse
-from scipy.sparse import csgraph
+import scipy  # whose `sparse` is loaded where it is used
 
 from pharos.mdp.tabular import TabularMDP
 
@@ -30,7 +29,7 @@ class ExpandedMDP:
             in which episodes end, where a restart leads to one of several start states.
     """
 
-    matrix: sparse.csr_matrix
+    matrix: scipy.sparse.csr_matrix
     underlying: np.ndarray
     previous: np.ndarray
     starts: list[tuple[int, float]]
@@ -43,7 +42,7 @@ class ExpandedMDP:
         """(first, previous) of the graph of all transitions that some choice may take."""
         size = len(self.underlying)
         rows = np.repeat(np.arange(size * self.num_actions) // self.num_actions, np.diff(self.matrix.indptr))
-        graph = sparse.csr_matrix((np.ones(len(rows), np.int8), (self.matrix.indices, rows)), shape=(size, size))
+        graph = scipy.sparse.csr_matrix((np.ones(len(rows), np.int8), (self.matrix.indices, rows)), shape=(size, size))
         return graph.indptr, graph.indices
 
     @cached_property
@@ -51,8 +50,8 @@ class ExpandedMDP:
         """(N,) its recurrent class, nodes that lead to each other and to no others, from 0 on; -1: none."""
         first, previous = self.reversed
         size = len(self.underlying)
-        graph = sparse.csr_matrix((np.ones(len(previous), np.int8), previous, first), shape=(size, size))
-        number, component = csgraph.connected_components(graph, connection="strong")
+        graph = scipy.sparse.csr_matrix((np.ones(len(previous), np.int8), previous, first), shape=(size, size))
+        number, component = scipy.sparse.csgraph.connected_components(graph, connection="strong")
         into = np.repeat(np.arange(size), np.diff(first))
         leaves = component[previous] != component[into]
         is_recurrent = np.ones(number, np.bool_)
@@ -81,15 +80,15 @@ class ExpandedMDP:
         home = int(self._recurrent_class.argmax())
         size = len(self.underlying)
         coo = self.matrix.tocoo()
-        best = sparse.coo_matrix((coo.data, (coo.row // self.num_actions, coo.col)), shape=(size, size))
+        best = scipy.sparse.coo_matrix((coo.data, (coo.row // self.num_actions, coo.col)), shape=(size, size))
         order = np.lexsort((-best.data, best.col, best.row))
         row, col, data = best.row[order], best.col[order], best.data[order]
         first = np.ones(len(row), np.bool_)
         first[1:] = (row[1:] != row[:-1]) | (col[1:] != col[:-1])
-        graph = sparse.csr_matrix((np.ones(int(first.sum())), (row[first], col[first])), shape=(size, size))
+        graph = scipy.sparse.csr_matrix((np.ones(int(first.sum())), (row[first], col[first])), shape=(size, size))
         steps = 0
         for each in (graph, graph.T.tocsr()):
-            distances = csgraph.dijkstra(each, indices=home, unweighted=True)
+            distances = scipy.sparse.csgraph.dijkstra(each, indices=home, unweighted=True)
             steps += int(distances[np.isfinite(distances)].max())
         exponent = -steps * math.log(float(data[first].min()))
         return steps * math.exp(exponent) if exponent < 690 else math.inf
@@ -116,11 +115,11 @@ class ExpandedMDP:
         weights = executed_actions(mdp, choice, owner[chooser], previous[chooser])
         counts = np.zeros((nodes, num_actions), np.int64)
         counts[node] = np.diff(weights.indptr).reshape(-1, num_actions)
-        weights = sparse.csr_matrix(
+        weights = scipy.sparse.csr_matrix(
             (weights.data, weights.indices, np.append(0, counts.cumsum())), shape=(counts.size, weights.shape[1])
         )
         matrix = weights @ nodes_of_outcomes(executed, num_actions, width)
-        matrix = sparse.csr_matrix(matrix + _restarts(owner, live, starts, num_actions, nodes, restart))
+        matrix = scipy.sparse.csr_matrix(matrix + _restarts(owner, live, starts, num_actions, nodes, restart))
         matrix.sum_duplicates()
         alike = ~live[owner] if restart and len(starts) > 1 else np.zeros(nodes, np.bool_)
         choices = ExpandedMDP(matrix, owner, previous, starts, num_actions, size, alike)
@@ -130,15 +129,17 @@ class ExpandedMDP:
         """The nodes that can be reached from the start, by whatever is chosen."""
         first, previous = self.reversed
         size = len(self.underlying)
-        graph = sparse.csr_matrix((np.ones(len(previous), np.int8), previous, first), shape=(size, size)).T.tocsr()
+        graph = scipy.sparse.csr_matrix(
+            (np.ones(len(previous), np.int8), previous, first), shape=(size, size)
+        ).T.tocsr()
         is_reached = np.zeros(size, np.bool_)
         for node, _ in self.starts:
-            is_reached[csgraph.breadth_first_order(graph, node, return_predecessors=False)] = True
+            is_reached[scipy.sparse.csgraph.breadth_first_order(graph, node, return_predecessors=False)] = True
         nodes = np.flatnonzero(is_reached)
         place = np.full(size, -1)
         place[nodes] = np.arange(nodes.size)
         rows = (nodes[:, None] * self.num_actions + np.arange(self.num_actions)).ravel()
-        matrix = sparse.csr_matrix(self.matrix[rows][:, nodes])
+        matrix = scipy.sparse.csr_matrix(self.matrix[rows][:, nodes])
         starts = [(int(place[node]), p) for node, p in self.starts]
         return ExpandedMDP(
             matrix,
@@ -151,7 +152,9 @@ class ExpandedMDP:
         )
 
 
-def executed_actions(mdp: TabularMDP, chosen: np.ndarray, owner: np.ndarray, previous: np.ndarray) -> sparse.csr_matrix:
+def executed_actions(
+    mdp: TabularMDP, chosen: np.ndarray, owner: np.ndarray, previous: np.ndarray
+) -> scipy.sparse.csr_matrix:
     """(N, S A) CSR: the probability that each action is executed in the state of a node.
 
     Args:
@@ -160,26 +163,26 @@ def executed_actions(mdp: TabularMDP, chosen: np.ndarray, owner: np.ndarray, pre
     nodes, num_actions = chosen.shape
     columns = owner[:, None] * num_actions + np.arange(num_actions)
     entries = mdp.chance.weights(chosen, previous).ravel(), columns.ravel(), np.arange(nodes + 1) * num_actions
-    matrix = sparse.csr_matrix(entries, shape=(nodes, mdp.num_states * num_actions))
+    matrix = scipy.sparse.csr_matrix(entries, shape=(nodes, mdp.num_states * num_actions))
     matrix.eliminate_zeros()
     return matrix
 
 
-def nodes_of_outcomes(outcomes: sparse.csr_matrix, num_actions: int, width: int) -> sparse.csr_matrix:
+def nodes_of_outcomes(outcomes: scipy.sparse.csr_matrix, num_actions: int, width: int) -> scipy.sparse.csr_matrix:
     """(S A, E W) CSR of outcomes (S A, E): each leads to the node of its state and of the action that was executed."""
     if width == 1:
         return outcomes
     coo = outcomes.tocoo()
     nodes = coo.col.astype(np.int64) * width + coo.row % num_actions
-    return sparse.csr_matrix((coo.data, (coo.row, nodes)), shape=(outcomes.shape[0], outcomes.shape[1] * width))
+    return scipy.sparse.csr_matrix((coo.data, (coo.row, nodes)), shape=(outcomes.shape[0], outcomes.shape[1] * width))
 
 
-def outcomes_of(mdp: TabularMDP, terminal: np.ndarray) -> tuple[sparse.csr_matrix, bool]:
+def outcomes_of(mdp: TabularMDP, terminal: np.ndarray) -> tuple[scipy.sparse.csr_matrix, bool]:
     """(S A, S + 1 or S) outcomes of executing actions, rows of terminal states empty; whether the end is among them."""
     matrix = mdp.dynamics.matrix(~terminal)
     ends = bool((matrix.indices == mdp.num_states).any())
     if not ends:
-        matrix = sparse.csr_matrix(
+        matrix = scipy.sparse.csr_matrix(
             (matrix.data, matrix.indices, matrix.indptr), shape=(matrix.shape[0], mdp.num_states)
         )
     return matrix, ends
@@ -187,7 +190,7 @@ def outcomes_of(mdp: TabularMDP, terminal: np.ndarray) -> tuple[sparse.csr_matri
 
 def _restarts(
     owner: np.ndarray, live: np.ndarray, starts: list[tuple[int, float]], num_actions: int, nodes: int, restart: bool
-) -> sparse.csr_matrix:
+) -> scipy.sparse.csr_matrix:
     """(N A, N): what terminal states and the end lead to."""
     ended = np.flatnonzero(~live[owner])
     if restart:
@@ -198,4 +201,4 @@ def _restarts(
         rows = (ended[:, None] * num_actions + np.arange(num_actions)).ravel()
         columns = np.repeat(ended, num_actions)
         data = np.ones(rows.size)
-    return sparse.csr_matrix((data, (rows, columns)), shape=(nodes * num_actions, nodes))
+    return scipy.sparse.csr_matrix((data, (rows, columns)), shape=(nodes * num_actions, nodes))

@@ -74,7 +74,7 @@ def rewards_of_staying(space: "StateSpace", reward: Callable | None = None) -> "
 
     assert space.environment is not None
     env = space.environment if reward is None else _with_reward(space.environment, reward)
-    rules, num_actions = rules_of(env).rewards, space.num_actions
+    rules, num_actions = rules_of(env).rewards_of(space.num_states), space.num_actions
 
     def blocks() -> Iterator[tuple[int, np.ndarray]]:
         for start in range(0, space.num_states, _ROWS):
@@ -122,7 +122,7 @@ def rewards_of_outcomes(space: "StateSpace") -> np.ndarray:
     from pharos.rules import rules_of
 
     assert space.environment is not None
-    rules, num_actions = rules_of(space.environment).rewards, space.num_actions
+    rules, num_actions = rules_of(space.environment).rewards_of(space.num_states), space.num_actions
     blocks = [np.empty(0)]
     for start in range(0, space.num_states, _ROWS):
         stop = min(start + _ROWS, space.num_states)
@@ -224,7 +224,7 @@ def _blocks(
     """(start, rewards of the states from start on), in order, of the states [first, last)."""
     from pharos.rules import rules_of
 
-    rules = rules_of(env).rewards
+    rules = rules_of(env).rewards_of(space.num_states)
     end = space.num_states if last is None else last
     starts = range(first, end, _ROWS)
     states, terminal = space.packed_states, space.terminal

@@ -31,6 +31,7 @@ from pharos.rules.compiled import (
 )
 from pharos.rules.compiler import reason_of
 from pharos.rules.layout import Layout, layout_of
+from pharos.system import compiling
 from pharos.system.packed_indices import Indices
 
 Engine = TypeVar("Engine")
@@ -179,6 +180,20 @@ class Rules:
         from pharos.rules.interpreted import InterpretedExploration  # which few need
 
         return InterpretedExploration(self.env, self.layout, self._workers)
+
+    @cached_property
+    def first_exploration(self) -> Exploration:
+        """Interpreted, for the first states, which are all of a small space."""
+        from pharos.rules.interpreted import InterpretedExploration
+
+        return InterpretedExploration(self.env, self.layout)
+
+    def rewards_of(self, num_states: int) -> Rewards:
+        """For so many states in all: those of a few are interpreted."""
+        from pharos.rules.interpreted import InterpretedRewards
+
+        is_small = num_states * self.env.num_actions * self.env.outcomes < compiling.SMALL // 4
+        return InterpretedRewards(self.env, self.layout) if is_small else self.rewards
 
     @cached_property
     def rewards(self) -> Rewards:

@@ -22,6 +22,7 @@ from pharos.state_space.outcome_journal import OutcomeJournal
 from pharos.state_space.plan import Plan
 from pharos.state_space.progress import BuildProgress, Progress
 from pharos.state_space.table import Block, MemoryTable, SpilledTable
+from pharos.system import compiling
 from pharos.system import memory as machine
 from pharos.system.packed_indices import INT32_STATES, INT40_STATES
 from pharos.system.workers import usable_workers
@@ -75,10 +76,10 @@ class Search:
         self.env: Environment = plan.env
         self.branches, self.num_words = plan.branches, plan.layout.num_words
         self.workers = usable_workers(options.workers)
-        self.rules = rules_of(plan.env, workers=self.workers).exploration
-        self.threads = self.rules.threads(self.workers)
-        most = CHUNK_OUTCOMES if plan.env.has_chance else CHUNK_SUCCESSORS
-        self.chunk = min(CHUNK, max(8, most // self.branches // 8 * 8))
+        self._rules = rules_of(plan.env, workers=self.workers)
+        self.rules, self.threads = self._rules.first_exploration, 1
+        # the first chunk is all of a small space
+        self.chunk = min(CHUNK, compiling.SMALL // 4 // self.branches // 8 * 8)
         self.position = Position()
         margin = 32 * self.branches + len(self.plan.starts[0])
         self.table = MemoryTable(self.num_words, margin, options.memory)
@@ -97,6 +98,8 @@ class Search:
                 if self.in_memory:
                     self._grow_table(pool)
                 while self.position.first < self.position.count:
+                    if self.position.first or not self.chunk or not self.in_memory:
+                        self._compile()
                     if self.in_memory:
                         self._expand_chunk(pool)
                     else:
@@ -113,6 +116,14 @@ class Search:
             self.spilled = None
             self.table.release()
         self._report(finished=True)
+
+    def _compile(self) -> None:
+        """Go on with compiled rules, by larger chunks."""
+        if self.rules is self._rules.first_exploration:
+            self.rules = self._rules.exploration
+            self.threads = self.rules.threads(self.workers)
+            most = CHUNK_OUTCOMES if self.env.has_chance else CHUNK_SUCCESSORS
+            self.chunk, self._blocks = min(CHUNK, max(8, most // self.branches // 8 * 8)), []
 
     @property
     def in_memory(self) -> bool:

@@ -6,10 +6,12 @@
 import contextlib
 import os
 import stat
+import sys
 import tempfile
 import threading
 import time
 import warnings
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -18,8 +20,13 @@ from pharos.errors import ParameterError
 from pharos.system import paths
 from pharos.system.paths import compiled_folders
 
+SMALL = 1 << 16
+"""Entries below which rules and kernels are interpreted, as compiling takes longer (benchmarks/startup.py); 0: none."""
+
 _lock = threading.Lock()
 _total, _running, _began = 0.0, 0, 0.0
+is_told = False
+"""Whether a line on the terminal has told that this process compiles, or need not, as the command does it itself."""
 
 
 def seconds() -> float:
@@ -88,6 +95,7 @@ def _listen() -> None:
                 if not _running:
                     _began = time.perf_counter()
                 _running += 1
+            _tell(event.data["dispatcher"].py_func)
 
         def on_end(self, event: Any) -> None:
             global _running, _total
@@ -97,6 +105,14 @@ def _listen() -> None:
                     _total += time.perf_counter() - _began
 
     event.register("numba:compile", Compiling())
+
+
+def _tell(function: Callable) -> None:
+    """Why the first call takes some seconds, once, on a terminal."""
+    global is_told
+    if not is_told and function.__module__.startswith("pharos.") and sys.stderr is not None and sys.stderr.isatty():
+        is_told = True
+        print("pharos: compiling, some seconds; kept for the next time", file=sys.stderr, flush=True)
 
 
 @cache

@@ -4,8 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy import sparse
-from scipy.sparse.linalg import splu
+import scipy  # whose `sparse` is loaded where it is used
 
 from pharos.kernels import hitting
 from pharos.mdp import ExpandedMDP
@@ -34,14 +33,16 @@ def factors_of(choices: ExpandedMDP, policy: np.ndarray, inner: np.ndarray) -> F
     place = np.full(len(policy), first.size)  # what leads elsewhere is left out of the equations
     place[inner] = unknown
     solved = inner[first]
-    rows = sparse.csr_matrix(choices.matrix[solved * choices.num_actions + policy[solved]])
+    rows = scipy.sparse.csr_matrix(choices.matrix[solved * choices.num_actions + policy[solved]])
     row, column = np.repeat(np.arange(first.size), np.diff(rows.indptr)), place[rows.indices]
     data = np.where(row == column, 0.0, rows.data)
     leaving = np.bincount(row, data, first.size)
     inside = column < first.size
-    matrix = sparse.coo_matrix((data[inside], (row[inside], column[inside])), shape=(first.size, first.size))
+    matrix = scipy.sparse.coo_matrix((data[inside], (row[inside], column[inside])), shape=(first.size, first.size))
     try:
-        return Factors(splu(sparse.csc_matrix(sparse.diags(leaving) - matrix)), first, unknown)
+        return Factors(
+            scipy.sparse.linalg.splu(scipy.sparse.csc_matrix(scipy.sparse.diags(leaving) - matrix)), first, unknown
+        )
     except RuntimeError:  # singular
         return None
 

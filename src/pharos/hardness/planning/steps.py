@@ -7,7 +7,7 @@ executed action) and the starts without one. Source: Laidlaw, Russell and Dragan
 from typing import Any
 
 import numpy as np
-from scipy import sparse
+import scipy  # whose `sparse` is loaded where it is used
 
 from pharos.errors import ParameterError, PrecisionError, UndefinedMeasure
 from pharos.mdp import ExpandedMDP, TabularMDP
@@ -63,7 +63,7 @@ class FiniteHorizonValues:
         self.starts = choices.starts
         self.rewards = expected_rewards(mdp, choices)
         self.table = single_outcomes(self.matrix, self.num_nodes, self.num_actions)
-        self.support = sparse.csr_matrix(
+        self.support = scipy.sparse.csr_matrix(
             (np.ones(self.matrix.nnz, np.float32), self.matrix.indices, self.matrix.indptr), shape=self.matrix.shape
         )
         shape = (steps, self.num_nodes, self.num_actions)

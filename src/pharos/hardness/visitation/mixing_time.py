@@ -5,8 +5,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from scipy import sparse
-from scipy.sparse import csgraph
+import scipy  # whose `sparse` is loaded where it is used
 
 from pharos.errors import ParameterError, UndefinedMeasure
 from pharos.mdp import ExpandedMDP, PolicyTable, TabularMDP, require_mdp
@@ -80,17 +79,17 @@ def mixing_time(
     table = PolicyTable.of(mdp, policy)
     inside = np.minimum(choices.underlying, mdp.num_states - 1)
     actions = table.probabilities[inside, choices.previous if table.looks_back else 0]
-    chain = sparse.csr_matrix(choices.matrix.multiply(actions.reshape(-1, 1)))
-    owner = sparse.csr_matrix(
+    chain = scipy.sparse.csr_matrix(choices.matrix.multiply(actions.reshape(-1, 1)))
+    owner = scipy.sparse.csr_matrix(
         (np.ones(chain.shape[0]), (np.repeat(np.arange(size), mdp.num_actions), np.arange(chain.shape[0])))
     )
-    chain = sparse.csr_matrix(owner @ chain)
+    chain = scipy.sparse.csr_matrix(owner @ chain)
     if mdp.is_sticky:
         chain = _merged(chain, choices.underlying, np.append(np.asarray(mdp.terminal), True))
         size = chain.shape[0]
     chain.eliminate_zeros()
     if lazy:
-        chain = sparse.csr_matrix((chain + sparse.identity(size)) / 2)
+        chain = scipy.sparse.csr_matrix((chain + scipy.sparse.identity(size)) / 2)
     conventions = {
         "epsilon": float(epsilon),
         "restart": restart,
@@ -109,8 +108,8 @@ def _merged(chain: Any, underlying: np.ndarray, ended: np.ndarray) -> Any:
     """The chain in which an episode that has ended does not remember the previous action."""
     label = np.where(ended[underlying], underlying, len(ended) + np.arange(len(underlying)))
     _, first, place = np.unique(label, return_index=True, return_inverse=True)
-    members = sparse.csr_matrix((np.ones(len(place)), (np.arange(len(place)), place)))
-    return sparse.csr_matrix(chain[first] @ members)
+    members = scipy.sparse.csr_matrix((np.ones(len(place)), (np.arange(len(place)), place)))
+    return scipy.sparse.csr_matrix(chain[first] @ members)
 
 
 def _too_many(nodes: int) -> str:
@@ -122,7 +121,7 @@ def _too_many(nodes: int) -> str:
 
 def _period(chain: Any) -> int:
     """The period of the recurrent class; 0 where there are several."""
-    count, labels = csgraph.connected_components(chain, directed=True, connection="strong")
+    count, labels = scipy.sparse.csgraph.connected_components(chain, directed=True, connection="strong")
     rows, columns = chain.nonzero()
     leaves = np.zeros(count, np.bool_)
     leaves[labels[rows][labels[rows] != labels[columns]]] = True
@@ -131,7 +130,7 @@ def _period(chain: Any) -> int:
         return 0
     members = np.flatnonzero(labels == closed[0])
     inner = chain[members][:, members]
-    order, before = csgraph.breadth_first_order(inner, 0)
+    order, before = scipy.sparse.csgraph.breadth_first_order(inner, 0)
     level = np.zeros(len(members), np.int64)
     for node in order[1:]:
         level[node] = level[before[node]] + 1

@@ -1,0 +1,123 @@
+"""Kernels in Python for little work, which is done long before a kernel is compiled, with the same results.
+
+`interpreted_first` makes a kernel count the entries that its calls read. As long as they are few, and the kernel is not
+compiled, Python runs its text, and that of what it calls: the same operations on the same numbers, so the same bits.
+(NumPy adds 1 to 32-bit integers in 32 bits and Numba in 64; few entries do not come that far.)
+"""
+
+from collections.abc import Callable
+from functools import cache
+from types import FunctionType
+from typing import Any
+
+import numba
+import numba.extending
+import numpy as np
+from numba.core.registry import CPUDispatcher
+
+from pharos.system import compiling
+
+_overloads: dict[Any, Callable] = {}  # a function without a body -> its body for the types of arguments
+_intrinsics: dict[Any, Callable] = {}  # an intrinsic -> the same in Python
+
+
+def overload(function: Callable, **options: Any) -> Callable:
+    """`numba.extending.overload`, also for Python."""
+
+    def decorate(choose: Callable) -> Callable:
+        _overloads[function] = choose
+        return numba.extending.overload(function, **options)(choose)
+
+    return decorate
+
+
+def in_python(meaning: Callable) -> Callable:
+    """Decorator of an intrinsic: the same in Python."""
+
+    def decorate(intrinsic: Any) -> Any:
+        _intrinsics[intrinsic] = meaning
+        return intrinsic
+
+    return decorate
+
+
+def interpreted_first(*counted: str) -> Callable:
+    """Decorator of a kernel: interpreted until its calls have counted `compiling.SMALL` entries.
+
+    Args:
+        counted: arguments whose entries count, a whole number as so many; none: all arrays. The work of a call must not
+            grow faster.
+    """
+
+    def decorate(kernel: Any) -> Any:
+        compiled = kernel._compile_for_args  # asked for the function to call with types that are not compiled yet
+        names = kernel.py_func.__code__.co_varnames
+        places = [names.index(name) for name in counted]
+        count = 0
+
+        def compiled_or_interpreted(*arguments: Any) -> Any:
+            nonlocal count
+            read = [arguments[i] for i in places] or [each for each in arguments if not isinstance(each, int)]
+            count += sum(map(_entries, read))
+            return quiet if count < compiling.SMALL else compiled(*arguments)
+
+        def quiet(*arguments: Any) -> Any:
+            with np.errstate(all="ignore"):  # hashes wrap around, and 1 / 0 is infinite
+                return _as_python(interpreted(kernel)(*arguments))
+
+        kernel._compile_for_args = compiled_or_interpreted
+        return kernel
+
+    return decorate
+
+
+def _as_python(result: Any) -> Any:
+    """A compiled kernel returns numbers of Python."""
+    if isinstance(result, tuple):
+        return tuple(map(_as_python, result))
+    return result.item() if isinstance(result, np.generic) else result
+
+
+def _entries(argument: Any) -> int:
+    if isinstance(argument, tuple):
+        return sum(getattr(each, "size", 0) for each in argument)
+    return int(argument) if isinstance(argument, int | np.integer) else getattr(argument, "size", 0)
+
+
+@cache
+def interpreted(called: Any) -> Callable:
+    """A kernel, or what kernels call, in Python."""
+    if called in _intrinsics:
+        return _intrinsics[called]
+    return _chosen(_overloads[called]) if called in _overloads else _in_python(called.py_func)
+
+
+def _in_python(function: FunctionType) -> Callable:
+    """The function, and what it calls, in Python."""
+    names = {name: function.__globals__.get(name) for name in function.__code__.co_names}
+    called = {
+        name: interpreted(value)
+        for name, value in names.items()
+        if callable(value) and (isinstance(value, CPUDispatcher) or value in _overloads or value in _intrinsics)
+    }
+    text = (function.__code__, {**function.__globals__, **called}, function.__name__, function.__defaults__)
+    return FunctionType(*text, function.__closure__)
+
+
+def _chosen(choose: Callable) -> Callable:
+    """The body that an overload has for the arguments of each call."""
+    bodies: dict[Any, Callable] = {}
+
+    def call(*arguments: Any) -> Any:
+        types = _types(arguments)
+        if types not in bodies:
+            bodies[types] = _in_python(choose(*map(numba.typeof, arguments)))
+        return bodies[types](*arguments)
+
+    return call
+
+
+def _types(argument: Any) -> Any:
+    if isinstance(argument, tuple):
+        return tuple(map(_types, argument))
+    return type(argument), getattr(argument, "dtype", None), getattr(argument, "ndim", 0)
