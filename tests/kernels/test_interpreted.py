@@ -5,6 +5,7 @@ import importlib
 import json
 import os
 import pickle
+import pkgutil
 import subprocess
 import sys
 from pathlib import Path
@@ -52,7 +53,9 @@ def digest(data):
 
 def compiled_kernels():
     """Those that may be interpreted, and are compiled for some types."""
-    modules = [importlib.import_module(f"pharos.kernels.{name}") for name in kernels.__all__]
+    modules = [
+        importlib.import_module(f"pharos.kernels.{each.name}") for each in pkgutil.iter_modules(kernels.__path__)
+    ]
     found = {name: value for module in modules for name, value in vars(module).items()}
     return [
         name

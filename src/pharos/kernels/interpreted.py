@@ -8,7 +8,7 @@ compiled, Python runs its text, and that of what it calls: the same operations o
 from collections.abc import Callable
 from functools import cache
 from types import FunctionType
-from typing import Any
+from typing import TypeVar
 
 import numba
 import numba.extending
@@ -17,11 +17,13 @@ from numba.core.registry import CPUDispatcher
 
 from pharos.system import compiling
 
-_overloads: dict[Any, Callable] = {}  # a function without a body -> its body for the types of arguments
-_intrinsics: dict[Any, Callable] = {}  # an intrinsic -> the same in Python
+Intrinsic = TypeVar("Intrinsic", bound=Callable)
+
+_overloads: dict[Callable, Callable] = {}  # a function without a body -> its body for the types of arguments
+_intrinsics: dict[Callable, Callable] = {}  # an intrinsic -> the same in Python
 
 
-def overload(function: Callable, **options: Any) -> Callable:
+def overload(function: Callable, **options: object) -> Callable:
     """`numba.extending.overload`, also for Python."""
 
     def decorate(choose: Callable) -> Callable:
@@ -34,7 +36,7 @@ def overload(function: Callable, **options: Any) -> Callable:
 def in_python(meaning: Callable) -> Callable:
     """Decorator of an intrinsic: the same in Python."""
 
-    def decorate(intrinsic: Any) -> Any:
+    def decorate(intrinsic: Intrinsic) -> Intrinsic:
         _intrinsics[intrinsic] = meaning
         return intrinsic
 
@@ -49,19 +51,19 @@ def interpreted_first(*counted: str) -> Callable:
             grow faster.
     """
 
-    def decorate(kernel: Any) -> Any:
+    def decorate(kernel: CPUDispatcher) -> CPUDispatcher:
         compiled = kernel._compile_for_args  # asked for the function to call with types that are not compiled yet
         names = kernel.py_func.__code__.co_varnames
         places = [names.index(name) for name in counted]
         count = 0
 
-        def compiled_or_interpreted(*arguments: Any) -> Any:
+        def compiled_or_interpreted(*arguments: object) -> object:
             nonlocal count
             read = [arguments[i] for i in places] or [each for each in arguments if not isinstance(each, int)]
             count += sum(map(_entries, read))
             return quiet if count < compiling.SMALL else compiled(*arguments)
 
-        def quiet(*arguments: Any) -> Any:
+        def quiet(*arguments: object) -> object:
             with np.errstate(all="ignore"):  # hashes wrap around, and 1 / 0 is infinite
                 return _as_python(interpreted(kernel)(*arguments))
 
@@ -71,21 +73,21 @@ def interpreted_first(*counted: str) -> Callable:
     return decorate
 
 
-def _as_python(result: Any) -> Any:
+def _as_python(result: object) -> object:
     """A compiled kernel returns numbers of Python."""
     if isinstance(result, tuple):
         return tuple(map(_as_python, result))
     return result.item() if isinstance(result, np.generic) else result
 
 
-def _entries(argument: Any) -> int:
+def _entries(argument: object) -> int:
     if isinstance(argument, tuple):
         return sum(getattr(each, "size", 0) for each in argument)
     return int(argument) if isinstance(argument, int | np.integer) else getattr(argument, "size", 0)
 
 
 @cache
-def interpreted(called: Any) -> Callable:
+def interpreted(called: Callable) -> Callable:
     """A kernel, or what kernels call, in Python."""
     if called in _intrinsics:
         return _intrinsics[called]
@@ -106,9 +108,9 @@ def _in_python(function: FunctionType) -> Callable:
 
 def _chosen(choose: Callable) -> Callable:
     """The body that an overload has for the arguments of each call."""
-    bodies: dict[Any, Callable] = {}
+    bodies: dict[tuple, Callable] = {}
 
-    def call(*arguments: Any) -> Any:
+    def call(*arguments: object) -> object:
         types = _types(arguments)
         if types not in bodies:
             bodies[types] = _in_python(choose(*map(numba.typeof, arguments)))
@@ -117,7 +119,7 @@ def _chosen(choose: Callable) -> Callable:
     return call
 
 
-def _types(argument: Any) -> Any:
+def _types(argument: object) -> tuple:
     if isinstance(argument, tuple):
         return tuple(map(_types, argument))
     return type(argument), getattr(argument, "dtype", None), getattr(argument, "ndim", 0)
