@@ -11,7 +11,7 @@ import itertools
 import math
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -51,36 +51,110 @@ def stochastic_diameter(mdp: TabularMDP, restart: bool, tolerance: float, spendi
     """The diameter of an MDP with chance: exact up to `tolerance`, or the interval proven by budget and floats."""
     choices = ExpandedMDP.of(mdp, restart)
     conventions = {**conventions_of(mdp, restart), "nodes": len(choices.underlying), "sticky_pairs": mdp.is_sticky}
-    return _Diameter(mdp, restart, choices, tolerance, spending).interval(conventions)
+    return _Diameter(mdp, restart, choices, tolerance, spending).run(conventions)
 
 
-class _Diameter:
-    """Bounds of the largest hitting time of every target, tightened until none may exceed the largest that is proven.
+class TargetBounds:
+    """Bounds of a time to each target, tightened until none may exceed the largest that is proven.
 
     Attributes:
-        upper: (targets,) of the largest hitting time of each; -inf where it is settled.
-        lower: the largest hitting time that is proven, of pairs that are surely connected.
-        settled_upper: the largest upper bound of settled targets.
+        farther: the words for a target that may exceed it.
+        upper: (targets,) of the time to each; -inf where it is settled.
+        lower: the largest time that is proven. settled_upper: the largest upper bound of settled targets.
         limited: targets whose bounds are as close as floats allow, and no closer than the tolerance.
     """
+
+    farther: str
 
     def __init__(self, mdp: TabularMDP, restart: bool, choices: ExpandedMDP, tolerance: float, spending: BudgetClock):
         self.mdp, self.restart, self.choices = mdp, restart, choices
         self.tolerance, self.spending = tolerance, spending
         self.targets = HittingTimes(choices)
+        self.upper = np.full(choices.num_targets, math.inf)
+        self.lower = self.settled_upper = 0.0
+        self.limited = 0
+        self._travel: HubBounds | None = None
+        self._first: tuple[float, np.ndarray, np.ndarray] | None = None
+        self._is_short = False
+
+    def to_hub(self, times: np.ndarray) -> float:
+        """The time to a hub, of upper bounds (nodes,) of its hitting times."""
+        return float(times.max())
+
+    def report(self) -> None:
+        """Report how far the bounds are."""
+
+    @property
+    def num_open(self) -> int:
+        """Targets that may exceed what is proven."""
+        return int(np.count_nonzero(self.upper > -math.inf))
+
+    def bound_others(self, hub: int, times: np.ndarray) -> None:
+        """Bound all targets by way of one whose hitting times are bounded by `times` (nodes,)."""
+        if self._travel is None:
+            self._travel = HubBounds(self.mdp, self.restart)
+        by_state = np.zeros(self.choices.num_targets)
+        np.maximum.at(by_state, self.choices.underlying, times)
+        to_hub, away = self.to_hub(times), self._travel.times_from(hub, by_state)
+        if self._first is None:  # the start, to which all that fails comes back
+            self._first = to_hub, by_state, away
+        np.minimum(self.upper, to_hub + away, out=self.upper)
+
+    def shorten(self) -> None:
+        """Shorten the bounds by way of the start, once, as long as this narrows them."""
+        if self._first is None or self._travel is None or self._is_short:
+            return
+        (to_hub, times, away), self._is_short = self._first, True
+        for shorter in shortened(self._travel, times, away, self.spending):
+            np.minimum(self.upper, to_hub + shorter, out=self.upper)
+            self.drop()
+            self.report()
+
+    def drop(self) -> None:
+        """Settle the targets that cannot exceed what is proven."""
+        self.upper[self.upper <= self.lower] = -math.inf
+
+    def interval(self, lower: float, upper: float, is_infinite: bool, conventions: dict[str, Any]) -> Interval:
+        """What is proven, from bounds of what is finite."""
+        left = self.num_open
+        exact = is_infinite or (not left and math.isfinite(upper) and upper - lower <= 2 * self.tolerance * upper)
+        note = ""
+        if left:
+            note = f"budget spent: {left} of {self.choices.num_targets} targets {self.farther}"
+        elif not exact and self.limited:
+            note = f"hitting times are so large that 64-bit floats prove no closer bounds of {self.limited} targets"
+        elif not exact:
+            note = "budget spent before the bounds of the last targets met"
+        return Interval(
+            math.inf if is_infinite else lower,
+            math.inf if is_infinite else upper,
+            exact,
+            finite_part=lower,
+            tolerance=self.tolerance,
+            searches=self.spending.searches,
+            method="a stochastic shortest path problem for each target, bounds from residuals",
+            conventions=conventions,
+            note=note,
+            seconds=self.spending.seconds,
+        )
+
+
+class _Diameter(TargetBounds):
+    """Bounds of the largest hitting time of every target, of pairs that are surely connected."""
+
+    farther = "may have a larger hitting time"
+
+    def __init__(self, mdp: TabularMDP, restart: bool, choices: ExpandedMDP, tolerance: float, spending: BudgetClock):
+        super().__init__(mdp, restart, choices, tolerance, spending)
         self.threads = [self.targets, *(self.targets.for_another_thread() for _ in range(usable_workers(None) - 1))]
         has_nodes = np.diff(self.targets.edges) > 0
         self.many = len(choices.underlying) * choices.num_targets > MANY
         crude = math.inf if self.many else choices.crude_upper * CRUDE
         self.upper = np.where(has_nodes, crude, -math.inf)
-        self.lower = self.settled_upper = 0.0
-        self.limited = 0
         # States that cannot be reached at all are unreachable from all others.
         self.unreachable = int(np.count_nonzero(~has_nodes)) * (choices.num_targets - 1)
-        self._travel: HubBounds | None = None
-        self._start: tuple[np.ndarray, np.ndarray] | None = None
 
-    def interval(self, conventions: dict[str, Any]) -> Interval:
+    def run(self, conventions: dict[str, Any]) -> Interval:
         """Look at targets until the bounds meet, or the budget ends."""
         connected = self.choices.is_connected
         with ThreadPoolExecutor(len(self.threads)) as pool:
@@ -90,40 +164,18 @@ class _Diameter:
             if not self.many:  # else, where not connected: it is infinite, and that is all that can be said
                 for batch in self._promising():
                     self._look_at(batch, pool, bounding=False)
-        left = self._num_open
-        lower, upper = self.lower, self._upper()
-        exact = not left and math.isfinite(upper) and upper - lower <= 2 * self.tolerance * upper
-        note = "" if exact else self._why_not_exact(left)
-        if self.unreachable or not connected:
-            lower = upper = math.inf
-            exact = not left
-            note = note if left else ""
-        self.spending.report(lower, upper, left, now=True)
-        return Interval(
-            lower,
-            upper,
-            exact,
+        left, is_infinite = self.num_open, bool(self.unreachable) or not connected
+        result = self.interval(self.lower, self._upper(), is_infinite, conventions)
+        self.spending.report(result.lower, result.upper, left, now=True)
+        return replace(
+            result,
+            exact=not left if is_infinite else result.exact,
             unreachable_pairs=int(self.unreachable),
-            finite_part=self.lower,
             counted=not left,
-            tolerance=self.tolerance,
-            searches=self.spending.searches,
-            method="a stochastic shortest path problem for each target, bounds from residuals",
-            conventions=conventions,
-            note=note,
-            seconds=self.spending.seconds,
         )
 
-    def _why_not_exact(self, left: int) -> str:
-        if left:
-            return f"budget spent: {left} of {self.choices.num_targets} targets may have a larger hitting time"
-        if self.limited:
-            return f"hitting times are so large that 64-bit floats prove no closer bounds of {self.limited} targets"
-        return "budget spent before the bounds of the last targets met"
-
-    @property
-    def _num_open(self) -> int:
-        return int(np.count_nonzero(self.upper > -math.inf))
+    def report(self) -> None:
+        self.spending.report(self.lower, self._upper(), self.num_open)
 
     def _upper(self) -> float:
         return float(max(self.settled_upper, self.lower, self.upper.max()))
@@ -147,16 +199,16 @@ class _Diameter:
         """
         batch = [int(self.choices.underlying[self.choices.starts[0][0]])]
         apart = self.choices.num_targets // 64 + 1
-        trial, left_before = TRIAL, self._num_open
+        trial, left_before = TRIAL, self.num_open
         while batch and not self.spending.is_over:
             yield batch
             if self.spending.searches >= FIRST and (self.many or self._upper() > APART * self.lower):
-                self._shorten()
+                self.shorten()
             if not self.many and self.spending.searches >= trial:
-                if left_before - self._num_open < min(RULED_OUT * TRIAL, left_before / 2):
-                    self._shorten()
+                if left_before - self.num_open < min(RULED_OUT * TRIAL, left_before / 2):
+                    self.shorten()
                     return
-                trial, left_before = self.spending.searches + TRIAL, self._num_open
+                trial, left_before = self.spending.searches + TRIAL, self.num_open
             widest = int(self.upper.argmax())
             others = self.upper.copy()
             others[max(0, widest - apart) : widest + apart] = -math.inf  # neighbours bound each other
@@ -184,34 +236,12 @@ class _Diameter:
             self.unreachable += look.unreachable
             self.upper[look.target] = -math.inf
             if look.times is not None:
-                self._bound_others(look.target, look.times)
-        self.upper[self.upper <= self.lower] = -math.inf
+                self.bound_others(look.target, look.times)
+        self.drop()
         self.spending.searches += len(batch)
         for own in threads:
             own.initial_scale = self.targets.initial_scale
-        self.spending.report(self.lower, self._upper(), self._num_open)
-
-    def _bound_others(self, hub: int, times: np.ndarray) -> None:
-        """Bound all targets by upper bounds (nodes,) of the hitting times of a solved one."""
-        is_first = self._travel is None  # of the start, to which all that fails comes back
-        if self._travel is None:
-            self._travel = HubBounds(self.mdp, self.restart)
-        by_state = np.zeros(self.choices.num_targets)
-        np.maximum.at(by_state, self.choices.underlying, times)
-        away = self._travel.times_from(hub, by_state)
-        if is_first:
-            self._start = by_state, away
-        np.minimum(self.upper, float(by_state.max()) + away, out=self.upper)
-
-    def _shorten(self) -> None:
-        """Shorten the bounds by way of the start, once, as long as this narrows them."""
-        if self._start is None or self._travel is None:
-            return
-        (times, away), self._start = self._start, None
-        for shorter in shortened(self._travel, times, away, self.spending):
-            np.minimum(self.upper, float(times.max()) + shorter, out=self.upper)
-            self.upper[self.upper <= self.lower] = -math.inf
-            self.spending.report(self.lower, self._upper(), self._num_open)
+        self.report()
 
 
 def shortened(travel: HubBounds, times: np.ndarray, away: np.ndarray, spending: BudgetClock) -> Iterator[np.ndarray]:
