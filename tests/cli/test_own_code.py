@@ -506,3 +506,59 @@ def test_a_script_that_defines_a_class_needs_a_guard_and_says_so(guard, said, tm
     done = subprocess.run(line, cwd=tmp_path, capture_output=True, text=True, timeout=300, env=dict(os.environ))
     assert done.returncode == 0 and done.stdout.startswith(said) and "Traceback" not in done.stderr, done.stderr
     assert done.stdout.count("\n") == 1
+
+
+ONCE = """
+from dataclasses import dataclass
+from pharos import Environment
+
+@dataclass(frozen=True, kw_only=True)
+class Once(Environment):
+    name, actions, version, max_episode_steps = "once", ("left", "right"), 1, 10
+    def variables(self): return {"over": range(2)}
+    def initial_state(self): return (0,)
+    def transition(self, state, action, out): out[0] = 1
+    def is_terminal(self, state): return state[0] == 1
+    def reward(self, state, action, next_state): return 1.0
+"""
+
+
+def run_in(folder, *words):
+    command = [sys.executable, "-m", "pharos", *words]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True)
+
+
+@pytest.mark.long
+def test_count_and_show_tell_where_no_policy_beats_uniform_play(tmp_path, monkeypatch):
+    """All actions of the one state end the episode and pay the same."""
+    monkeypatch.setenv("PHAROS_CACHE_DIR", str(tmp_path / "cache"))
+    monkeypatch.setenv("COLUMNS", "160")
+    (tmp_path / "mine.py").write_text(ONCE)
+    said = run_in(tmp_path, "count", "mine.py:Once").stdout
+    assert said.startswith("mine.py:Once: 2 states") and ", no policy beats uniform play" in said
+    (tmp_path / "mine.py").write_text(ONCE.replace("return 1.0", "return float(action)"))
+    said = run_in(tmp_path, "count", "mine.py:Once").stdout
+    assert said.startswith("mine.py:Once: 2 states") and "uniform play" not in said
+    (tmp_path / "mine.py").write_text(ONCE)
+    block = {"environments": ["mine.py:Once", "cliff_walking/4x12-slippery"], "agents": ["q_learning"]}
+    spec = {"name": "own", "steps": 100, "seeds": 1, "blocks": [{**block, "chance": ["plain", {"random": 0.1}]}]}
+    (tmp_path / "own.yaml").write_text(json.dumps(spec))
+    before = run_in(tmp_path, "study", "show", "own.yaml").stdout
+    assert "of the world, of the world and random 0.1  q_learning" in before and "plain, random 0.1 " in before
+    assert "no scale" not in before  # nothing is solved in order to show a grid
+    assert run_in(tmp_path, "study", "run", "own.yaml", "--workers", "1").returncode == 0
+    after = run_in(tmp_path, "study", "show", "own.yaml").stdout.splitlines()
+    assert [line for line in after if "no scale" in line] == [
+        f"mine.py:Once, chance {chance}: V* is that of uniform play, so regret has no scale"
+        for chance in ("plain", "random 0.1")
+    ]
+
+
+@pytest.mark.slow
+def test_a_class_that_is_no_dataclass_is_a_line(tmp_path):
+    (tmp_path / "mine.py").write_text(ONCE.replace("@dataclass(frozen=True, kw_only=True)\n", ""))
+    done = run_in(tmp_path, "count", "mine.py:Once")
+    assert (done.returncode, done.stderr) == (
+        2,
+        "pharos: Once is no dataclass; expected @dataclass(frozen=True, kw_only=True) above it\n",
+    )

@@ -435,6 +435,20 @@ def test_an_environment_that_cannot_be_drawn_is_noted():
     assert report.notes == ("it declares no layers: it cannot be drawn, and has no image observations",)
 
 
+def test_rewards_that_no_action_changes_are_noted():
+    report = pharos.check_environment(corridor(reward=lambda self, state, action, next_state: 0.0))
+    assert report.notes[0] == "no policy beats another: at discount 0.99, V* is the value of uniform play"
+
+
+def test_attributes_that_can_change_are_noted_where_rules_read_them():
+    reward = lambda self, state, action, next_state: float(self.prizes[next_state[0]])  # noqa: E731
+    notes = pharos.check_environment(corridor(prizes=[0, 0, 0, 0, 1], reward=reward)).notes
+    assert "rules read prizes, a list, which can change after states were enumerated; expected a tuple" in notes
+    assert not any(
+        "prizes" in note for note in pharos.check_environment(corridor(prizes=(0, 0, 0, 0, 1), reward=reward)).notes
+    )
+
+
 def test_episodes_that_end_before_they_begin_are_noted():
     report = pharos.check_environment(corridor(initial_state=lambda self: (4,)))
     assert report.notes[0].startswith("every start state is terminal")

@@ -213,6 +213,7 @@ def test_the_command_line_predicts_and_reports(tmp_path):
     predictions = tmp_path / "predictions.parquet"
     done = CliRunner().invoke(app, ["study", "predict", str(file), "--out", str(predictions), "--json"])
     assert json.loads(done.stdout)["cells"] == 3
+    assert done.stderr.count("pharos: predicting ") == 3  # no terminal: a line each, as it takes minutes
     where = ["--out", str(tmp_path / "results")]
     assert CliRunner().invoke(app, ["study", "run", str(file), *where]).exit_code == 0
     done = CliRunner().invoke(app, ["study", "report", str(file), *where, "--predictions", str(predictions)])

@@ -112,6 +112,15 @@ def test_predicting_an_unseen_class_is_perfect_where_classes_do_not_differ():
     assert leave_one_class_out_r_squared(table) == pytest.approx(1)
 
 
+@pytest.mark.parametrize("seed", range(30))  # in some of them 1 - leverage is below 0 by rounding, in others above
+def test_a_row_that_alone_determines_a_coefficient_has_no_influence_and_no_warning(seed):
+    rng = np.random.default_rng(seed)
+    alone = np.arange(9) == 4
+    rows = pd.DataFrame({"regret": rng.random(9), "diameter": 1 + rng.random(9), "gaps": np.where(alone, 5.0, 1.0)})
+    found = fit(rows, "single", "all", ["diameter", "gaps"])
+    assert (np.isnan(found.influence) == alone).all()
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

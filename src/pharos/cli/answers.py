@@ -70,10 +70,14 @@ class _Trimmed:
 
 
 @contextlib.contextmanager
-def progress_line(what: str) -> Iterator[Callable[[str], None]]:
-    """Report progress in a line on standard error, on a terminal; removed at the end."""
+def progress_line(what: str, *, logged: bool = False) -> Iterator[Callable[[str], None]]:
+    """Report progress in a line on standard error, on a terminal; removed at the end.
+
+    Args:
+        logged: whether each text is a line of its own elsewhere, as in a log; else nothing is written there.
+    """
     if not sys.stderr.isatty():
-        yield lambda _: None
+        yield lambda text: print(f"pharos: {text}", file=sys.stderr, flush=True) if logged else None
         return
     from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 

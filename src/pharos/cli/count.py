@@ -1,5 +1,6 @@
 """pharos count: how many states there are, in one line."""
 
+import math
 import shutil
 import tempfile
 from pathlib import Path
@@ -15,6 +16,8 @@ from pharos.system.wording import many
 if TYPE_CHECKING:
     from pharos.mdp import TabularMDP
     from pharos.state_space import StateSpace
+
+SMALL = 10_000  # states, so that solving takes no time
 
 
 def count(
@@ -34,6 +37,7 @@ def count(
             raise StateSpaceTooLarge(f"{target}: has {counted['num_states']:,} states; expected at most {max_states:,}")
     else:
         counted = _counts_of_space(goal, memory=parse_size(memory), workers=workers, max_states=max_states)
+    has_regret = counted.pop("has_regret", True)
     answer: dict[str, Any] = {
         "target": target,
         **counted,
@@ -49,6 +53,7 @@ def count(
         f"{' '.join((target, *(parameters or ())))}: {many(answer['num_states'], 'state')} "
         f"({answer['num_terminal_states']:,} terminal{extra}), {many(answer['num_actions'], 'action')}, "
         f"{many(answer['num_transitions'], 'transition')}, depth {answer['depth']:,}, {answer['seconds']:.2f} s"
+        + ("" if has_regret else ", no policy beats uniform play")
         + "".join(f", compiling {how_long}" for _, how_long in compiling_fact())
     )
 
@@ -91,7 +96,17 @@ def counts_of(space: "StateSpace") -> dict[str, int]:
         "num_actions": space.num_actions,
         "num_transitions": rows - space.num_terminal_states * space.num_actions,
         "depth": space.depth,
+        "has_regret": space.num_states > SMALL or _has_regret(space.mdp(gamma=0.99)),
     }
+
+
+def _has_regret(mdp: "TabularMDP") -> bool:
+    """Whether some policy is better than uniform play."""
+    from pharos.solvers import regret_scale, uniform_value, value_iteration
+
+    optimal, uniform = value_iteration(mdp), uniform_value(mdp)
+    error = max(optimal.error_bound, uniform.error_bound)
+    return not math.isnan(regret_scale(optimal.value_at_start, uniform.value_at_start, error))
 
 
 def counts_of_table(mdp: "TabularMDP") -> dict[str, int]:

@@ -37,12 +37,13 @@ Environments = Annotated[
 ]
 EXIT_FAILED = 1
 LINE_SECONDS = 30.0
+MOST_TASKS = 500  # whose values are looked up
 
 
 @app.command("show")
 def show(spec: SpecArgument, environments: Environments = None, trust: Trust = False, json: Json = False) -> None:
     """Print the grid: which instances, chances, observations and agents, and how many runs."""
-    from pharos.study import specification
+    from pharos.study import has_regret, specification
 
     study = specification(spec, trust=trust or None, environments=environments)
     runs = study.runs
@@ -54,10 +55,12 @@ def show(spec: SpecArgument, environments: Environments = None, trust: Trust = F
     from rich.table import Table
 
     groups: dict[tuple, dict[str, dict]] = {}
+    tasks = {(run.instance, run.chance): run for run in runs}
+    chances = {task: run.chance_in_words for task, run in tasks.items()}
     for run in runs:
         config = run.config
         group = groups.setdefault((run.instance, config["steps"]), {"chance": {}, "agent": {}, "observation": {}})
-        group["chance"][run.chance] = None
+        group["chance"][chances[run.instance, run.chance]] = None
         group["agent"][config["agent"]] = None
         group["observation"][title(config["observation"], config["observation_options"])] = None
     counts = Counter((run.instance, run.config["steps"]) for run in runs)
@@ -72,6 +75,9 @@ def show(spec: SpecArgument, environments: Environments = None, trust: Trust = F
     to = console()
     to.print(f"[bold]{escape(study.name)}[/bold]  {escape(study.description)}", soft_wrap=True)
     to.print(table)
+    for (instance, _), run in tasks.items():
+        if len(tasks) <= MOST_TASKS and not has_regret(run.config):
+            to.print(escape(f"{instance}, chance {run.chance}: V* is that of uniform play, so regret has no scale"))
     to.print(f"{many(len(runs), 'run')}, {many(sum(_steps(runs)), 'step')}", style="dim")
 
 
@@ -291,7 +297,7 @@ def predict(
     from pharos import study
 
     opened, place = study.opened(spec, None, trust=trust or None, environments=environments)
-    with progress_line("predicting") as tell:
+    with progress_line("predicting", logged=True) as tell:
         predictions = study.predict(opened, place, progress=tell)
     said = study.write_predictions(opened, predictions, to)
     missing = int(predictions["kernel_regret"].isna().sum())

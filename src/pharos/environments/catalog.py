@@ -56,7 +56,9 @@ def make(name: str, **parameters: Any) -> Environment:
         cls, slash = imported(name), ""
         class_name = cls.name
     defaults: Mapping[str, Any] = cls.instances[instance] if slash else {}
-    names = {field.name for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
+    if not dataclasses.is_dataclass(cls):
+        raise ParameterError(f"{cls.__name__} is no dataclass; expected @dataclass(frozen=True, kw_only=True) above it")
+    names = {field.name for field in dataclasses.fields(cls)}
     for parameter in parameters:
         if parameter in cls.foreign_parameters:
             raise ParameterError(

@@ -5,7 +5,7 @@ Only what loads no Numba is imported at once; the rest is when it is asked for.
 
 from typing import TYPE_CHECKING
 
-from pharos.rules.fingerprint import fingerprint_of_rules
+from pharos.rules.fingerprint import fingerprint_of_rules, mutable_attributes
 from pharos.rules.layout import Layout, layout_of, pack, unpack
 from pharos.system import lazy
 
@@ -30,7 +30,7 @@ _LAZY = {
 
 _shared = """
     CompiledDrawing CompiledExploration CompiledMotion InterpretedStepping Layout Rules fingerprint_of_rules
-    layout_of not_compiled pack reason_of refused_reward rules_of unpack
+    layout_of mutable_attributes not_compiled pack reason_of refused_reward rules_of unpack
 """
 
 __getattr__ = lazy.attributes(__name__, _LAZY)

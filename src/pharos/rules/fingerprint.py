@@ -40,6 +40,12 @@ def fingerprint_of_rules(env: Any, rules: Iterable[str]) -> str:
     return hashlib.sha256(repr(parts).encode()).hexdigest()
 
 
+def mutable_attributes(env: Any, rules: Iterable[str]) -> list[str]:
+    """Names of attributes of `env` that these rules mention, and whose content can be changed after they were read."""
+    names = mentioned_names((getattr(type(env), rule) for rule in rules), type(env))
+    return sorted(n for n in names if isinstance(getattr(env, n, None), list | dict | set | bytearray))
+
+
 def mentioned_names(functions: Iterable[Any], owner: type | None = None) -> set[str]:
     """Names of attributes and globals in these functions, in those that they call by a global name, and in methods of
     `owner`.

@@ -17,12 +17,14 @@ import numpy as np
 
 from pharos.environments import Environment, State, start_distribution
 from pharos.errors import ParameterError, RuleError
-from pharos.rules import pack, unpack
+from pharos.rules import mutable_attributes, pack, unpack
 from pharos.state_space.declarations import check_declarations, check_layers
 from pharos.state_space.guarded_rules import SUM_TOLERANCE, InterpretedCheck
 
 if TYPE_CHECKING:
     from pharos.rules import Rules
+
+RULES = ("transition", "is_terminal", "reward", "draw", "probability", "age", "draw_motion")
 
 
 @dataclass(frozen=True)
@@ -87,6 +89,11 @@ def check_environment(env: Environment, *, max_states: int = 1000, seed: int = 0
     compiled = _check_compiled(env, check, states, notes)
     if complete:
         _check_built(env, check, states)
+        if check.transitions and not _has_choice(check, states):
+            notes.append("no policy beats another: at discount 0.99, V* is the value of uniform play")
+    for name in mutable_attributes(env, RULES):
+        kind = type(getattr(env, name)).__name__
+        notes.append(f"rules read {name}, a {kind}, which can change after states were enumerated; expected a tuple")
     _note_unseen_values(env, states, complete, notes)
     return Conformance(
         environment=str(env),
@@ -128,6 +135,20 @@ def _some_states(env: Environment, check: InterpretedCheck, max_states: int, see
             successors = [check.transitions[state, *branch] for branch in check.branches(state)]
             stack += rng.sample(successors, len(successors))
     return list(chosen), False
+
+
+def _has_choice(check: InterpretedCheck, states: list[State], gamma: float = 0.99) -> bool:
+    """Whether some action, in some state, has another value than the rest, uniform play following."""
+    number = {state: i for i, state in enumerate(states)}
+    num_actions = check.env.num_actions
+    rows = np.array([number[state] * num_actions + action for state, action, _ in check.transitions], np.int64)
+    successors = np.array([number[state] for state in check.transitions.values()], np.int64)
+    likely, rewards = (np.array([*each.values()]) for each in (check.probabilities, check.rewards))
+    matrix = np.eye(len(states))
+    np.add.at(matrix, (rows // num_actions, successors), -gamma * likely / num_actions)
+    v = np.linalg.solve(matrix, np.bincount(rows // num_actions, likely * rewards / num_actions, len(states)))
+    q = np.bincount(rows, likely * (rewards + gamma * v[successors]), len(states) * num_actions)
+    return bool((np.ptp(q.reshape(-1, num_actions), axis=1) > 1e-9 * np.abs(q).max()).any())
 
 
 def _check_again(check: InterpretedCheck, states: list[State], seed: int) -> None:

@@ -25,6 +25,7 @@ from pharos.study.report import StudyReport, report
 from pharos.study.specification import presets, specification
 from pharos.study.statistics import Estimate, interquartile_mean, stratified_interval
 from pharos.study.tables import cells, curves, hardness_table, paper_instance, table
+from pharos.study.values import has_regret
 from pharos.training import run_id
 from pharos.validation import POLICY_PREDICTORS, PREDICTORS
 
@@ -65,7 +66,7 @@ __all__ = [
     "validation",
 ]
 _shared = """
-    Forecast LOGGERS POLICY_PREDICTORS PREDICTORS RunLog intervals leave_one_class_out_r_squared opened
+    Forecast LOGGERS POLICY_PREDICTORS PREDICTORS RunLog has_regret intervals leave_one_class_out_r_squared opened
     paper_agreement paper_instance paper_regressions paper_returns read_predictions run_id run_on_ray
     write_predictions
 """

@@ -89,6 +89,13 @@ class Run:
         return str(self.configuration.chance)
 
     @property
+    def chance_in_words(self) -> str:
+        """For people: also "of the world", where the rules have chance."""
+        if not self.configuration.task(trust=True).env.has_chance:
+            return self.chance
+        return f"of the world and {self.chance}" if self.configuration.chance else "of the world"
+
+    @property
     def kind(self) -> tuple[str, str, str, str]:
         """Class of environment, agent, observation, engine: runs of a kind take about as long for each step."""
         config = self.configuration

@@ -40,9 +40,8 @@ class Fit:
         coefficients: one row a predictor: estimate, standard error, p-value, lower and upper end of its 95 % interval.
         dropped: predictors left out because they are constant or a linear combination of the others.
         condition_number: of the standardised predictors.
-        fitted, actual: one entry a row; influence: Cook's distances; classes: of environments; tasks: instance and
-            chance;
-        observations: what the agent saw.
+        fitted, actual: one entry a row; influence: Cook's distances, NaN where a row alone determines a coefficient;
+            classes: of environments; tasks: instance and chance; observations: what the agent saw.
         design: (rows, predictors), as they entered, in the order of `coefficients`.
     """
 
@@ -110,6 +109,8 @@ def fit(rows: "pd.DataFrame", model: str, subset: str, predictors: Sequence[str]
     formula = "regret ~ " + (" + ".join(terms) if terms else "1")
     result = smf.ols(formula, rows).fit()
     influence = result.get_influence()
+    with np.errstate(divide="ignore", invalid="ignore"):  # of rows that are alone in determining a coefficient
+        distances = np.where(influence.hat_matrix_diag < 1 - 1e-9, influence.cooks_distance[0], np.nan)
     actual = rows["regret"].to_numpy(float)
     tasks = _tasks(rows)
     errors = _errors_without_the_task(np.asarray(result.model.exog, float), np.asarray(result.resid), tasks)
@@ -126,7 +127,7 @@ def fit(rows: "pd.DataFrame", model: str, subset: str, predictors: Sequence[str]
         condition_number=_condition_number(result.model.exog),
         fitted=np.asarray(result.fittedvalues),
         actual=actual,
-        influence=np.asarray(influence.cooks_distance[0]),
+        influence=distances,
         classes=tuple(map(str, rows["environment"])) if "environment" in rows else (),
         tasks=tasks,
         observations=tuple(map(str, rows["observation"])) if "observation" in rows else (),

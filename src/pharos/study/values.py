@@ -5,12 +5,14 @@ instance again for each run would take longer than some training.
 """
 
 import json
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pharos.environments import start_distribution
 from pharos.errors import FileFormatError
+from pharos.solvers import ReferenceValues
 from pharos.system.paths import cache_directory
 from pharos.system.storage import is_intact, read_json, replace_json, sealed
 from pharos.training import RunConfig
@@ -47,6 +49,12 @@ def stored_values(config: Mapping[str, Any]) -> dict[str, Any] | None:
     if not isinstance(stored, dict) or not is_intact(stored) or stored.get("task") != _key(config):
         return None
     return stored.get("values")
+
+
+def has_regret(config: Mapping[str, Any]) -> bool:
+    """False where the stored values of the task say that no policy is better than uniform play."""
+    values = stored_values(config)
+    return values is None or not math.isnan(ReferenceValues(**values["reference"]).spread())
 
 
 def _file(config: Mapping[str, Any]) -> Path:
