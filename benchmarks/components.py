@@ -13,7 +13,7 @@ import numpy as np
 
 import pharos
 from pharos.mdp import TabularMDP
-from pharos.solvers.components import ComponentSolver
+from pharos.solvers.fixed_point import ComponentSolver
 from pharos.solvers.policy_iteration import PolicyIteration
 
 SLIP = np.array([0.8, 0.1, 0.1])

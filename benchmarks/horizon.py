@@ -16,8 +16,7 @@ from pathlib import Path
 
 import pharos
 from pharos import hardness, importers
-from pharos.hardness.planning.effective_horizon import TIE, FiniteHorizonValues, _compiled, _vectorized
-from pharos.hardness.planning.large_horizon import LargeHorizon
+from pharos.hardness.planning.effective_horizon import TIE, FiniteHorizonValues, LargeHorizon, _compiled, _vectorized
 from pharos.mdp import sticky_actions
 
 CORRIDOR = Path(__file__).parents[1] / "tests" / "data" / "bridge" / "key-corridor-s3r1.npz"

@@ -26,7 +26,7 @@ from pharos.study.tables import CELL
 from pharos.training import RunConfig
 from pharos.validation import PRIMARY, Published
 from pharos.validation.learners import primary_regret
-from pharos.validation.published import FILE
+from pharos.validation.prediction import FILE
 
 STUDIES = Path(__file__).parents[1] / "docs" / "studies"
 DEV = STUDIES / "hardness-dev"

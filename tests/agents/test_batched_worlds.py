@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import kstest
 
 from pharos.agents.batched import BatchRun, ObservationSource, make_batch, observed
-from pharos.agents.batched.batched_episodes import BatchedEpisodes
+from pharos.agents.batched.lane import BatchedEpisodes
 from pharos.environments import make
 from pharos.interaction import Interaction
 from pharos.interaction.reward_channel import RewardChannel

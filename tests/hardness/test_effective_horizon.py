@@ -14,8 +14,7 @@ import pharos
 from naive.horizon import analysis
 from pharos import hardness
 from pharos.errors import ParameterError, PrecisionError, UndefinedMeasure
-from pharos.hardness.planning.effective_horizon import _compiled, _vectorized
-from pharos.hardness.planning.large_horizon import LargeHorizon
+from pharos.hardness.planning.effective_horizon import LargeHorizon, _compiled, _vectorized
 from pharos.hardness.planning.steps import TIE, FiniteHorizonValues
 from pharos.mdp import TabularMDP, random_actions, sticky_actions
 from strategies import FEW, deterministic_mdps, general_mdps, outcome_mdps

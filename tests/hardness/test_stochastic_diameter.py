@@ -13,8 +13,7 @@ import pharos
 from naive import hitting as naive_hitting
 from pharos import hardness
 from pharos.errors import UndefinedMeasure
-from pharos.hardness.hitting.hitting_bounds import Bounds
-from pharos.hardness.hitting.hitting_times import HittingTimes
+from pharos.hardness.hitting.hitting_times import Bounds, HittingTimes
 from pharos.hardness.hitting.stochastic_diameter import _Diameter
 from pharos.hardness.hitting.travel import HubBounds
 from pharos.hardness.interval import Budget, BudgetClock

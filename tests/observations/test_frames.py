@@ -16,8 +16,9 @@ from pharos.errors import ParameterError
 from pharos.interaction import GymEnv, make_sb3_vec, make_vec
 from pharos.mdp import PolicyTable
 from pharos.observations import aliasing, history_aliasing, observation_classes, observe
-from pharos.policies import Evaluation, estimation
+from pharos.policies import Evaluation
 from pharos.policies.histories import QueriedHistories
+from pharos.policies.value import estimate
 from pharos.training import Task, evaluate_agent
 
 BREAKOUT = pharos.make("breakout", height=6, columns=3, brick_rows=1)
@@ -162,7 +163,7 @@ def test_beyond_a_limit_the_value_is_estimated_over_histories():
     assert abs(exact.value - estimated.value) <= estimated.error_bound
     answers = QueriedHistories(policy, task.mdp, task.sight)
     low, high = task.return_range
-    value, width = estimation.estimate(answers, (low, high), 20_000, np.random.default_rng(0))
+    value, width = estimate(answers, (low, high), 20_000, np.random.default_rng(0))
     assert abs(value - exact.value) <= width
 
 

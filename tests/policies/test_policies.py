@@ -12,7 +12,7 @@ from pharos import evaluate_policy as evaluate_policy_of_any_kind
 from pharos.errors import ParameterError
 from pharos.mdp import TabularMDP
 from pharos.policies import TableAnswers, policy_value
-from pharos.policies.estimation import _half_width
+from pharos.policies.value import _half_width
 from pharos.solvers import evaluate_policy
 from strategies import small_mdps
 

@@ -8,8 +8,8 @@ from scipy.sparse import csgraph, csr_matrix
 
 from benchmark_modules import benchmark
 from pharos.mdp import Table
-from pharos.solvers import components, value_iteration, worst_value
-from pharos.solvers.components import ComponentSolver
+from pharos.solvers import fixed_point, value_iteration, worst_value
+from pharos.solvers.fixed_point import ComponentSolver
 from strategies import small_mdps
 
 pytestmark = pytest.mark.long
@@ -68,7 +68,7 @@ def always(patched):
         done.append(improve(self, x, tolerance))
         return done[-1]
 
-    patched.setattr(components, "LEAST", 1)
+    patched.setattr(fixed_point, "LEAST", 1)
     patched.setattr(ComponentSolver, "is_worth_it", lambda self, sweeps, *_: sweeps == 2 and self._is_known)
     patched.setattr(ComponentSolver, "improve", improved)
     return done

@@ -19,8 +19,8 @@ from pharos import hardness
 from pharos.errors import FileFormatError, FolderLocked, ParameterError, PrecisionError
 from pharos.mdp import BEST, TabularMDP
 from pharos.solvers import uniform_value, value_iteration
-from pharos.solvers.blocks import blocked_fixed_point
 from pharos.solvers.fixed_point import Backup, largest_of
+from pharos.solvers.values import blocked_fixed_point
 from pharos.system import kept_arrays
 from strategies import small_mdps
 

@@ -21,7 +21,7 @@ from chance_worlds import ChanceWorld
 from pharos.errors import MissingExtra, ParameterError, RuleError, StateSpaceError, StateSpaceTooLarge
 from pharos.kernels import key_owner
 from pharos.ranks import Halo, RankFailed, cuts_of, mpi, run_spmd
-from pharos.state_space import ranked_search, ranked_table, search
+from pharos.state_space import ranked_table, search
 from pharos.state_space.files import lock
 from pharos.state_space.plan import Plan
 from pharos.state_space.progress import reporter
@@ -59,7 +59,7 @@ def build_by_threads(env, folder, size, *, wide=0, rows=64, disturb=lambda rank:
         manifest = pharos.state_space.read_manifest(folder)
         with loop(size, answer) as rank:
             disturb(rank)
-            ranked_search.RankedSearch(plan, journal_of(folder, plan), options, report, rank, wide).run(manifest)
+            ranked_table.RankedSearch(plan, journal_of(folder, plan), options, report, rank, wide).run(manifest)
             ranked_table.end(rank)
     return folder
 
@@ -353,8 +353,8 @@ BUILD = """
 import os, signal
 from pharos.cli import main
 from pharos.ranks import mpi
-from pharos.state_space import ranked_search, ranked_table
-ranked_search.RankedSearch.__init__.__defaults__, ranked_table.ROWS = (0,), 64
+from pharos.state_space import ranked_table
+ranked_table.RankedSearch.__init__.__defaults__, ranked_table.ROWS = (0,), 64
 exchange, exchanges = mpi._Mpi.exchange, []
 def dies(rank, parts):
     exchanges.append(0)

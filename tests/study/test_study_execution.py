@@ -15,7 +15,7 @@ import fake_training
 from pharos import study
 from pharos.errors import AllRunsFailed, ParameterError, PharosError
 from pharos.study import execution as _execution
-from pharos.study import prebuild as preparing
+from pharos.study import execution as preparing
 from pharos.study import worker as _worker
 from pharos.study.execution import shard_of
 

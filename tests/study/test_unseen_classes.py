@@ -8,7 +8,7 @@ from scipy.stats import rankdata
 from pharos import study
 from pharos.errors import ParameterError
 from pharos.study import cross_validation as held_out
-from pharos.study import mixed_models, predictions, within_mdps
+from pharos.study import leave_one_class_out, predictions
 from pharos.study.predictions import Foretold
 from pharos.study.specification import specification
 from pharos.study.tables import CELL
@@ -147,7 +147,7 @@ def test_pairs_of_observations_of_one_mdp_are_compared():
             if mdps[i] == mdps[j] and abs(y[i] - y[j]) > 0.05:
                 number += 1
                 right += (x[i] > x[j]) == (y[i] > y[j])
-    pairs = within_mdps.Pairs.of(y, mdps)
+    pairs = leave_one_class_out.Pairs.of(y, mdps)
     assert (len(pairs.first), pairs.agreement(x)) == (number, right / number)
     assert pairs.agreement(np.zeros(24)) == 0.5
 
@@ -158,7 +158,7 @@ def test_the_ceiling_of_agreement_is_that_of_a_predictor_that_knows_expectations
     truth, noise = rng.uniform(0, 5, 8000), rng.uniform(0.2, 1.5, 8000)
     y = truth + rng.normal(size=8000) * np.sqrt(noise)
     signs = np.sign(y[::2] - y[1::2])
-    some = within_mdps.Pairs(np.arange(0, 8000, 2), np.arange(1, 8000, 2), signs)
+    some = leave_one_class_out.Pairs(np.arange(0, 8000, 2), np.arange(1, 8000, 2), signs)
     assert 0.7 < some.agreement(truth) < 0.9
     assert some.ceiling(y, noise) == pytest.approx(some.agreement(truth), abs=0.04)
     assert some.ceiling(y, np.zeros(8000)) == 1.0
@@ -169,7 +169,7 @@ def test_a_class_whose_instances_agree_counts_once():
     """One class, two observations: whatever the number of its instances, two names for them, so p is never small."""
     mdps = np.repeat(np.arange(20), 2)
     x = np.tile([0.0, 1.0], 20)
-    pairs = within_mdps.Pairs.of(x, mdps)
+    pairs = leave_one_class_out.Pairs.of(x, mdps)
     shuffled = pairs.permuted(x, np.zeros(40, int), mdps, ["vector", "image"] * 20, 200, 0)
     assert set(shuffled) == {0.0, 1.0}
     assert 0.4 < held_out.p_of(pairs.agreement(x), shuffled) < 0.6
@@ -183,7 +183,7 @@ def test_mixed_models_find_the_slope_that_was_simulated_and_agree_with_least_squ
     x = rng.normal(size=180) + rng.normal(size=12)[classes]
     z = (x - x.mean()) / x.std()
     y = 0.5 * z + rng.normal(size=12)[classes] + 0.5 * rng.normal(size=36)[mdps] + 0.3 * rng.normal(size=180)
-    fit = mixed_models.mixed_fit(x, y, classes, mdps)
+    fit = leave_one_class_out.mixed_fit(x, y, classes, mdps)
     assert abs(fit.slope - 0.5) < 3 * fit.error
     assert fit.p_value < 1e-4
     same_class, same_mdp = np.equal.outer(classes, classes), np.equal.outer(mdps, mdps)
@@ -192,7 +192,7 @@ def test_mixed_models_find_the_slope_that_was_simulated_and_agree_with_least_squ
     weighted = np.linalg.solve(covariance, design)
     assert fit.slope == pytest.approx(np.linalg.solve(design.T @ weighted, weighted.T @ y)[1], rel=1e-4)
     assert fit.error == pytest.approx(np.sqrt(np.linalg.inv(design.T @ weighted)[1, 1]), rel=1e-3)
-    assert mixed_models.mixed_fit(x[:30], y[:30], classes[:30], mdps[:30]) is None  # two classes
+    assert leave_one_class_out.mixed_fit(x[:30], y[:30], classes[:30], mdps[:30]) is None  # two classes
 
 
 def test_outcomes_are_means_over_evaluations_with_their_noise_over_seeds():

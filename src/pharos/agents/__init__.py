@@ -3,9 +3,20 @@ trains them on a task.
 """
 
 from pharos.agents import batched
-from pharos.agents.deep import algorithm, check_hyperparameters, extractor, make_model
+from pharos.agents.deep import (
+    AGENTS,
+    BATCHED,
+    TABULAR_OBSERVATION,
+    AgentKind,
+    agent_kind,
+    agent_source,
+    algorithm,
+    check_hyperparameters,
+    extractor,
+    is_known,
+    make_model,
+)
 from pharos.agents.hyperparameters import hyperparameters
-from pharos.agents.kinds import AGENTS, BATCHED, TABULAR_OBSERVATION, AgentKind, agent_kind, agent_source, is_known
 from pharos.agents.q_learning import DEFAULTS as Q_LEARNING_DEFAULTS
 from pharos.agents.q_learning import QLearning
 from pharos.agents.states import joined_states, state_of

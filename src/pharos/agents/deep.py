@@ -3,6 +3,10 @@
 Vectors go through one hidden layer, images through one convolution and one hidden layer (the network of MinAtar: Young
 and Tian, 2019), both to 128 features; then follows one hidden layer. So a difference between observations is one
 between representations, not between networks (the pharos paper, section 4.2).
+
+What each agent is: tabular or a network, and how figures call it.
+
+Feature extractors: one for vectors, one for images, with as many features.
 """
 
 import importlib
@@ -10,14 +14,19 @@ import inspect
 import math
 import sys
 from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
+from gymnasium import spaces
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from torch import nn
 
-from pharos.agents.kinds import AGENTS, agent_source, is_known
 from pharos.errors import MissingExtra, ParameterError, UnknownName
 from pharos.policies import DeepPolicy
-from pharos.system.sources import load
+from pharos.system.sources import Source, find, is_reference, load
 
 __all__ = ["ALGORITHMS", "DeepPolicy", "algorithm", "check_hyperparameters", "extractor", "make_model"]
 
@@ -110,8 +119,6 @@ def extractor(space: Any) -> type:
     """The class of feature extractor for an observation space."""
     from stable_baselines3.common.torch_layers import CombinedExtractor
 
-    from pharos.agents.networks import SmallCNN, SmallMLP
-
     if hasattr(space, "spaces"):
         return CombinedExtractor
     return SmallCNN if len(space.shape) == 3 and space.dtype == np.uint8 else SmallMLP
@@ -168,3 +175,124 @@ def make_model(
         formats: list[KVWriter] = [HumanOutputFormat(sys.stdout)] if options.get("verbose") else []
         model.set_logger(Logger(folder=None, output_formats=formats))
     return model
+
+
+# Kinds ----------------------------------------------------------------------------------------------------------------
+
+
+TABULAR_OBSERVATION = "index"
+"""What tabular agents see."""
+
+
+@dataclass(frozen=True)
+class AgentKind:
+    """What the rest of pharos needs to know of an agent before it exists.
+
+    Attributes:
+        name: as `train` takes it.
+        title: as figures and tables write it.
+        is_tabular: whether it learns a table over the states, whose index it sees; else a network over observations.
+    """
+
+    name: str
+    title: str
+    is_tabular: bool = False
+
+    def observation(self, requested: str) -> str:
+        """The observation that it gets where `requested` was asked for: tables see the index of the state."""
+        return TABULAR_OBSERVATION if self.is_tabular else requested
+
+
+AGENTS = {
+    kind.name: kind
+    for kind in (
+        AgentKind("q_learning", "tabular Q-learning", is_tabular=True),
+        AgentKind("dqn", "DQN"),
+        AgentKind("ppo", "PPO"),
+        AgentKind("a2c", "A2C"),
+    )
+}
+"""The agents that have a name. Any other algorithm for Stable-Baselines3 is named by its class, `module:Class`."""
+
+
+BATCHED = ("dqn", "ppo")
+"""The networks that the batched engine trains, many runs as one program."""
+
+
+def agent_kind(name: str) -> AgentKind:
+    """What the agent called `name` is; a class of an algorithm for Stable-Baselines3 is a network."""
+    return AGENTS.get(name) or AgentKind(name, name.rpartition(":")[2])
+
+
+LIBRARIES = ("stable_baselines3", "sb3_contrib")
+"""Their algorithms are known by name: they need no trust, and no source in the configuration of a run."""
+
+
+def is_known(name: str) -> bool:
+    """Whether an agent comes with pharos or with one of LIBRARIES, so that it is not code of the user's own."""
+    return not is_reference(name) or name.partition(":")[0].split(".")[0] in LIBRARIES
+
+
+def agent_source(name: str, folder: str | Path | None = None, *, check: bool = True) -> Source | None:
+    """Where an agent of the user's own is; None for all others.
+
+    Args:
+        folder: relative files and modules are looked for there first; None: in the current directory.
+        check: whether it is imported, to see that it is a class.
+    Raises:
+        ParameterError: it cannot be imported, or is no class.
+    """
+    if is_known(name):
+        return None
+    source = find(name, folder)
+    if check and not isinstance(load(source), type):
+        raise ParameterError(
+            f"{name!r}: found {load(source)!r}; expected the class of an algorithm for Stable-Baselines3"
+        )
+    return source
+
+
+# Networks -------------------------------------------------------------------------------------------------------------
+
+
+NATURE = 36  # pixels from which the strides of Mnih et al. (2015) fit
+
+
+class SmallMLP(BaseFeaturesExtractor):
+    """One hidden layer over the flattened observation."""
+
+    def __init__(self, observation_space: spaces.Space, features_dim: int = 128):
+        super().__init__(observation_space, features_dim)
+        size = int(spaces.utils.flatdim(observation_space))
+        self.layers = nn.Sequential(nn.Flatten(), nn.Linear(size, features_dim), nn.ReLU())
+
+    def forward(self, observations: torch.Tensor) -> torch.Tensor:
+        """(N, ...) -> (N, features)."""
+        return self.layers(observations)
+
+
+class SmallCNN(BaseFeaturesExtractor):
+    """16 filters of 3 x 3, stride 1 (MinAtar); from 36 pixels on, the three convolutions of Mnih et al. (2015)."""
+
+    def __init__(self, observation_space: spaces.Box, features_dim: int = 128):
+        super().__init__(observation_space, features_dim)
+        channels, height, width = observation_space.shape
+        if min(height, width) < NATURE:
+            convolutions = [nn.Conv2d(channels, 16, 3, padding=1), nn.ReLU()]
+        else:
+            convolutions = [
+                nn.Conv2d(channels, 32, 8, stride=4),
+                nn.ReLU(),
+                nn.Conv2d(32, 64, 4, stride=2),
+                nn.ReLU(),
+                nn.Conv2d(64, 64, 3),
+                nn.ReLU(),
+            ]
+        self.convolutions = nn.Sequential(*convolutions, nn.Flatten())
+        with torch.no_grad():
+            size = self.convolutions(torch.zeros(1, channels, height, width)).shape[1]
+        self.layers = nn.Sequential(self.convolutions, nn.Linear(size, features_dim), nn.ReLU())
+
+    def forward(self, observations: torch.Tensor) -> torch.Tensor:
+        """(N, C, H, W) in [0, 1] -> (N, features)."""
+        return self.layers(observations)

@@ -15,7 +15,6 @@ from pharos.cli import (
     count,
     evaluate,
     explore,
-    export,
     hardness,
     import_,
     leaderboard,
@@ -171,7 +170,7 @@ app.command("board")(leaderboard.board)
 app.command("warm")(warm.warm)
 app.add_typer(plot.app, name="plot")
 app.add_typer(study.app, name="study")
-app.command("export")(export.export)
+app.command("export")(import_.export)
 app.add_typer(import_.app, name="import")
 app.add_typer(cache.app, name="cache")
 

@@ -8,15 +8,26 @@ from typing import TYPE_CHECKING
 from pharos.system import lazy
 
 if TYPE_CHECKING:
-    from pharos.drawing.pictures import INK, NIGHT, episode, human, image, save_gif, save_png
+    from pharos.drawing.pictures import (
+        GROUNDS,
+        INK,
+        NIGHT,
+        episode,
+        ground_of,
+        human,
+        image,
+        inside,
+        save_gif,
+        save_png,
+        scenery_of,
+    )
     from pharos.drawing.planes import check_state, planes_of
-    from pharos.drawing.scenery import GROUNDS, ground_of, inside, scenery_of
     from pharos.drawing.shapes import SHAPES, color_of, glyph_of, shade, shape_of, sprite_of, sprite_pixels, tile
     from pharos.drawing.text import colored_text, text_drawing
     from pharos.drawing.window import Window
 
 _FILES = {
-    "GROUNDS": "scenery",
+    "GROUNDS": "pictures",
     "INK": "pictures",
     "NIGHT": "pictures",
     "SHAPES": "shapes",
@@ -26,14 +37,14 @@ _FILES = {
     "colored_text": "text",
     "episode": "pictures",
     "glyph_of": "shapes",
-    "ground_of": "scenery",
+    "ground_of": "pictures",
     "human": "pictures",
     "image": "pictures",
-    "inside": "scenery",
+    "inside": "pictures",
     "planes_of": "planes",
     "save_gif": "pictures",
     "save_png": "pictures",
-    "scenery_of": "scenery",
+    "scenery_of": "pictures",
     "shade": "shapes",
     "shape_of": "shapes",
     "sprite_of": "shapes",

@@ -65,7 +65,7 @@ class Environment:
         instances: dict             name -> parameters: `make("breakout/12x8x1")` and "pharos/Breakout-12x8x1-v0"
         paper_instances: tuple      those of them that stand in the tables of the pharos paper, in their order
         hyperparameters: dict       agent -> observation, or "default" for all -> values that suit the class; they go
-                                    before those of agents/defaults.py
+                                    before those of agents/hyperparameters.py
         foreign_parameters: dict    name that other libraries have -> what to do here instead; for the error message
         motion_layers: dict         how each plane of `draw_motion` looks; an attribute or a property
         first_version: int          the `version` that the Gymnasium id pharos/ClassName-v0 stands for

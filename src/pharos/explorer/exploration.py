@@ -2,24 +2,91 @@
 
 Answers are plain dictionaries, ready for JSON; numbers that JSON cannot say are None. A position is a state and, under
 sticky actions, the action executed before; there is none before the first step.
+
+Which key does which action, for whoever plays: in the terminal and in the page.
+
+How often policies are in states, and what they lose there.
+
+The drawing of a state for a page: what is in which cell, and once for all how each thing looks.
+
+A page composes the drawing itself, so a state costs some numbers, not a picture. It looks as `drawing.human` draws it.
 """
 
+import base64
+import io
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from pharos.environments import Environment
+from pharos.drawing import NIGHT, ground_of, image, planes_of, tile
+from pharos.environments import Environment, Layer, State
 from pharos.errors import ParameterError
-from pharos.explorer.keys import keys_of
 from pharos.explorer.layers import Layers
 from pharos.explorer.learned_policy import LEARNT, OPTIMAL, UNIFORM, Learnt, probabilities
-from pharos.explorer.picture import Pictures
 from pharos.explorer.states import NumberedStates, SpaceStates, States
-from pharos.explorer.visits import Visits
+from pharos.hardness import discounted_visits, occupancy
 from pharos.mdp import TabularMDP
 from pharos.solvers import Solution, uniform_value, value_iteration
 from pharos.state_space import StateSpace
+
+
+class Visits:
+    """How often policies are in states, discounted, from the start: d(s) = sum over t of gamma^t P(s_t = s)."""
+
+    def __init__(self, exploration: "Exploration"):
+        self.exploration, self._known = exploration, dict[str, np.ndarray]()
+
+    def pairs(self, policy: str) -> np.ndarray:
+        """(S, A) visits of a state in which the policy chooses an action."""
+        mdp = self.exploration.mdp
+        table = self._table(policy)
+        if mdp.is_sticky:
+            return occupancy(mdp, table).visits
+        visits = self.of(policy)
+        if table is None:
+            return np.repeat(visits[:, None] / mdp.num_actions, mdp.num_actions, axis=1)
+        return visits[:, None] * (np.eye(mdp.num_actions)[table] if table.ndim == 1 else table)
+
+    def of(self, policy: str) -> np.ndarray:
+        """(S,) visits of states; kept for the next time."""
+        if policy not in self._known:
+            self._known[policy] = discounted_visits(self.exploration.mdp, self._table(policy))[0]
+        return self._known[policy]
+
+    def losses(self, policy: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(S,) each: what is lost in states, visits, and the action chosen most.
+
+            loss(s) = sum over a of visits(s, a) gap(s, a), which sums to V* minus the value of the policy at the start
+
+        Source: the performance difference lemma, Kakade and Langford (2002).
+        """
+        world = self.exploration
+        mdp, pairs = world.mdp, self.pairs(policy)
+        states = np.flatnonzero(pairs.any(axis=1))
+        executed = world.solutions[OPTIMAL].q_of(states)
+        gaps = executed.max(axis=1, keepdims=True) - executed
+        lost = np.zeros(mdp.num_states)
+        lost[states] = mdp.chance.chosen * (pairs[states] * gaps).sum(axis=1)
+        if mdp.is_sticky:  # the first step, which has no action before
+            first = np.flatnonzero(mdp.start_probabilities > 0)
+            starts, weights = mdp.start_states[first], mdp.start_probabilities[first]
+            q = world.solutions[OPTIMAL].q_of(starts)
+            chances = world.chances(policy, starts, world.chosen_values(OPTIMAL, starts))
+            more = (mdp.chance.first_chosen - mdp.chance.chosen) * chances * (q.max(axis=1, keepdims=True) - q)
+            np.add.at(lost, starts, weights * more.sum(axis=1) * ~mdp.terminal[starts])
+        visits = pairs.sum(axis=1)
+        return lost, visits, pairs.argmax(axis=1)
+
+    def _table(self, policy: str) -> np.ndarray | None:
+        """The policy as solvers take it; None for the uniform one. Where it was not asked, it does anything."""
+        if policy == UNIFORM:
+            return None
+        table = np.asarray(self.exploration.solutions[policy].policy)
+        if table.dtype.kind != "f" or not np.isnan(table).any():
+            return table
+        return np.where(np.isnan(table), 1 / self.exploration.mdp.num_actions, table)
+
 
 LONGEST_PATH = 2_000  # steps that are shown
 MOST_STARTS = 100  # start states that are listed
@@ -360,3 +427,113 @@ class Exploration:
 def number(value: Any) -> float | None:
     """A float; None where it is not a number."""
     return float(value) if np.isfinite(value) else None
+
+
+# Keys -----------------------------------------------------------------------------------------------------------------
+
+
+ARROWS = {"up": "w", "left": "a", "down": "s", "right": "d"}  # action -> letter
+
+
+def keys_of(actions: tuple[str, ...]) -> dict[str, int]:
+    """Key -> action: arrows and w a s d for directions, space for staying, and the digits for all."""
+    keys: dict[str, int] = {}
+    for number, action in enumerate(actions):
+        if number < 9:
+            keys[str(number + 1)] = number
+        direction = next(
+            (name for name in ARROWS if action.lower() == name or action.lower().endswith(f" {name}")), None
+        )
+        if direction is not None:
+            keys.setdefault(direction, number)
+            keys.setdefault(ARROWS[direction], number)
+        elif action.lower() in ("stay", "noop", "wait", "fire", "none"):
+            keys.setdefault("space", number)
+    return keys
+
+
+# Picture --------------------------------------------------------------------------------------------------------------
+
+
+CELLS = (8, 16, 24, 32, 48, 64)  # pixels of a cell
+LONGEST = 720  # pixels of the longer side of a drawing, where cells are not smaller than CELLS[0] for it
+
+
+class Pictures:
+    """Draws the states of an environment; where that is not possible, `fault` says why, in one line.
+
+    Attributes:
+        kit: what all drawings are composed of, for the page; None where the states cannot be drawn.
+        fault: why they cannot; "" where they can.
+    """
+
+    def __init__(self, env: Environment | None, start: State | None):
+        self.env, self.kit, self.fault = env, None, ""
+        if env is None or start is None:
+            self.fault = "There is no drawing: the MDP came without an environment."
+            return
+        try:
+            self.kit = kit_of(env) if env.picture(start) is None else {}
+            if not self.kit:
+                return
+            planes_of(env, start)
+        except Exception as error:  # whatever a class of one's own does when it is to be drawn
+            self.kit, self.fault = None, f"There is no drawing: {' '.join(str(error).split()) or type(error).__name__}"
+
+    def of(self, state: State) -> dict[str, Any]:
+        """`cells`, a list of (layer, row, column, value); or `picture`, the URL of one that the class has of its own;
+        or `fault`."""
+        if self.env is None or self.kit is None:
+            return {"fault": self.fault}
+        try:
+            if (own := self.env.picture(state)) is not None:
+                return {"picture": url_of(own)}
+            planes = planes_of(self.env, state)
+            layers, rows, columns = np.nonzero(planes)
+            return {"cells": np.stack([layers, rows, columns, planes[layers, rows, columns]], axis=1).tolist()}
+        except Exception as error:  # as above
+            return {"fault": f"This state cannot be drawn: {' '.join(str(error).split()) or type(error).__name__}"}
+
+
+def kit_of(env: Environment) -> dict[str, Any]:
+    """What the drawings of an environment are composed of.
+
+    Returns:
+        `rows`, `columns`, `cell` (pixels) and `margin` (pixels) of the drawing; `ground`, the URL of what lies below
+        all things; `tiles`, of each layer the URLs of what its values 1, 2, ... look like, the last for higher ones;
+        `layers`, their names.
+    """
+    rows, columns = env.grid()
+    fits = [cell for cell in CELLS if (max(rows, columns) + 1) * cell <= LONGEST]
+    cell = fits[-1] if fits else CELLS[0]
+    margin = cell // 2
+    canvas = np.empty((rows * cell + 2 * margin, columns * cell + 2 * margin, 3), np.float64)
+    canvas[:] = NIGHT
+    ground_of(env.look.ground)(canvas, (cell, cell), (margin,) * 4)
+    tiles = [
+        [url_of(tile(name, layer, value + 1, cell) * (1, 1, 1, 255)) for value in range(num_kinds(layer))]
+        for name, layer in env.layers.items()
+    ]
+    return {
+        "rows": rows,
+        "columns": columns,
+        "cell": cell,
+        "margin": margin,
+        "ground": url_of(canvas),
+        "tiles": tiles,
+        "layers": list(env.layers),
+    }
+
+
+def num_kinds(layer: Layer) -> int:
+    """How many values of a layer look different; higher ones look like the last."""
+    colors = len(layer.color) if np.ndim(layer.color) == 2 else 1
+    sprites = len(layer.sprite) if layer.sprite is not None and not isinstance(layer.sprite[0], str) else 1
+    return max(len(layer.glyph), colors, sprites)
+
+
+def url_of(picture: np.ndarray) -> str:
+    """A picture (H, W, 3 or 4), 0 to 255, as the URL of a PNG that holds it."""
+    written = io.BytesIO()
+    image(np.rint(picture).astype(np.uint8)).save(written, format="PNG", optimize=True)
+    return "data:image/png;base64," + base64.b64encode(written.getvalue()).decode()

@@ -1,8 +1,7 @@
 """MDPs for other programs: BRIDGE's npz, Gymnasium's `P` table, Storm's explicit DRN format."""
 
 from pharos.exporters.bridge import bridge
-from pharos.exporters.drn import drn
-from pharos.exporters.gymnasium import gym_p
+from pharos.exporters.drn import drn, gym_p
 
 __all__ = [
     "bridge",

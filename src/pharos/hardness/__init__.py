@@ -8,9 +8,8 @@ Visitation complexity: `diameter`, `start_eccentricity`, `covering`. Estimation 
 from pharos.hardness import built_in as _built_in  # registers the measures; the order of a report
 from pharos.hardness.distances.colosseum import colosseum_diameter
 from pharos.hardness.distances.diameter import diameter, start_eccentricity, start_eccentricity_interval
-from pharos.hardness.gaps.action_gap import ActionGapRegularity, action_gap_regularity
 from pharos.hardness.gaps.gaps import Gaps, gaps, minimal_gap, sum_of_reciprocal_gaps
-from pharos.hardness.gaps.value_norm import environmental_value_norm
+from pharos.hardness.gaps.value_norm import ActionGapRegularity, action_gap_regularity, environmental_value_norm
 from pharos.hardness.interval import Budget, Certificate, Certified, Interval, Progress
 from pharos.hardness.planning.effective_horizon import EffectiveHorizon, effective_horizon
 from pharos.hardness.planning.gorp import GorpBound, GorpRuns, gorp_bound, run_gorp
@@ -29,10 +28,8 @@ from pharos.hardness.representation.mean_field import LearningCurve, Rollouts, S
 from pharos.hardness.representation.policy_regret import kernel_policy_regret
 from pharos.hardness.representation.representation import Representation
 from pharos.hardness.representation.sampled_regret import SampledRegret, Sampling, sampled_regret
-from pharos.hardness.visitation.covering import Covering, covering
-from pharos.hardness.visitation.exploration_time import ExplorationTime, exploration_time
-from pharos.hardness.visitation.mismatch import distribution_mismatch
-from pharos.hardness.visitation.mixing_time import MixingTime, mixing_time
+from pharos.hardness.visitation.exploration_time import Covering, ExplorationTime, covering, exploration_time
+from pharos.hardness.visitation.mixing_time import MixingTime, distribution_mismatch, mixing_time
 from pharos.hardness.visitation.occupancy import Occupancy, discounted_visits, occupancy
 
 __all__ = [

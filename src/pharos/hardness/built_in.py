@@ -5,8 +5,7 @@ from typing import Any
 
 from pharos.errors import UndefinedMeasure
 from pharos.hardness.distances.diameter import diameter, start_eccentricity_interval
-from pharos.hardness.gaps.action_gap import action_gap_regularity
-from pharos.hardness.gaps.value_norm import certified_value_norm
+from pharos.hardness.gaps.value_norm import action_gap_regularity, certified_value_norm
 from pharos.hardness.interval import Certified
 from pharos.hardness.planning.effective_horizon import effective_horizon
 from pharos.hardness.planning.gorp import gorp_bound
@@ -20,10 +19,8 @@ from pharos.hardness.representation.kernel_spectrum import (
 )
 from pharos.hardness.representation.policy_regret import kernel_policy_regret
 from pharos.hardness.representation.sampled_regret import sampled_regret
-from pharos.hardness.visitation.covering import covering
-from pharos.hardness.visitation.exploration_time import exploration_time
-from pharos.hardness.visitation.mismatch import distribution_mismatch
-from pharos.hardness.visitation.mixing_time import mixing_time
+from pharos.hardness.visitation.exploration_time import covering, exploration_time
+from pharos.hardness.visitation.mixing_time import distribution_mismatch, mixing_time
 
 
 def _diameter(problem: Problem) -> Any:

@@ -22,11 +22,10 @@ from pharos.system import lazy
 
 if TYPE_CHECKING:
     from pharos.observations.complex_image import ComplexImage
-    from pharos.observations.custom import OwnObservation, imported, observation_of, own_observation
-    from pharos.observations.empirical import empirical_ntk
     from pharos.observations.hash import Hash
     from pharos.observations.memoryless import MemorylessLoss, memoryless_loss
     from pharos.observations.networks import Network, default_network
+    from pharos.observations.observation import OwnObservation, imported, observation_of, own_observation
     from pharos.observations.observation_aliasing import (
         Aliasing,
         aliasing,
@@ -35,7 +34,7 @@ if TYPE_CHECKING:
         observation_classes,
     )
     from pharos.observations.rendered import RENDERERS, render, renderers
-    from pharos.observations.represented import representation
+    from pharos.observations.represented import empirical_ntk, representation
     from pharos.observations.simple_image import SimpleImage
     from pharos.observations.tangent_kernels import network_inputs, ntk, tangent_kernel
 
@@ -45,21 +44,21 @@ _FILES = {
     "Hash": "hash",
     "MemorylessLoss": "memoryless",
     "Network": "networks",
-    "OwnObservation": "custom",
+    "OwnObservation": "observation",
     "RENDERERS": "rendered",
     "SimpleImage": "simple_image",
     "aliasing": "observation_aliasing",
     "counted": "observation_aliasing",
     "default_network": "networks",
-    "empirical_ntk": "empirical",
+    "empirical_ntk": "represented",
     "history_aliasing": "observation_aliasing",
-    "imported": "custom",
+    "imported": "observation",
     "memoryless_loss": "memoryless",
     "network_inputs": "tangent_kernels",
     "ntk": "tangent_kernels",
     "observation_classes": "observation_aliasing",
-    "observation_of": "custom",
-    "own_observation": "custom",
+    "observation_of": "observation",
+    "own_observation": "observation",
     "render": "rendered",
     "renderers": "rendered",
     "representation": "represented",

@@ -1,4 +1,7 @@
-"""An observation and a network as measures of hardness take them."""
+"""An observation and a network as measures of hardness take them.
+
+Tangent kernels of any network of PyTorch, as a mean over random networks: where no closed form is known.
+"""
 
 from collections.abc import Callable
 from functools import partial
@@ -8,7 +11,6 @@ import numpy as np
 
 from pharos.errors import MissingExtra, ParameterError, PharosError
 from pharos.hardness import Representation
-from pharos.observations.empirical import empirical_ntk
 from pharos.observations.networks import Network, default_network
 from pharos.observations.observation import observe
 from pharos.observations.observation_aliasing import observation_classes
@@ -117,3 +119,64 @@ def _digest(inputs: Any, num_states: int) -> str:
 
     states = np.unique(np.linspace(0, num_states - 1, min(SAMPLE, num_states)).astype(np.int64))
     return xxhash.xxh3_128_hexdigest(np.ascontiguousarray(inputs(states)).data)
+
+
+# Empirical ------------------------------------------------------------------------------------------------------------
+
+
+def empirical_ntk(
+    make: Callable[[], Any], x: np.ndarray, *, others: np.ndarray | None = None, networks: int = 100, seed: int = 0
+) -> np.ndarray:
+    """Return the mean over random networks of the inner products of gradients of the first output.
+
+    Args:
+        make: () -> a torch.nn.Module from inputs (N, ...) to outputs (N, A), with parameters drawn anew.
+        x: (N, ...) inputs, see `network_inputs`.
+        others: (M, ...) inputs y; None: x.
+        networks: how many; the standard error falls with the square root.
+        seed: of PyTorch's random numbers, which are left as they were.
+    Returns:
+        (N, M) float32; symmetric where `others` is None.
+    Raises:
+        MissingExtra: PyTorch is not installed. ParameterError: no network, or none was asked for; its outputs are not
+            (N, A), or its gradients are not finite.
+    Cost: `networks` times N + M gradients, which lie in memory one network at a time.
+    Source: Jacot, Gabriel and Hongler (2018).
+    """
+    try:
+        import torch
+    except ImportError as error:
+        raise MissingExtra("an empirical kernel", "torch", "agents") from error
+    if networks < 1:
+        raise ParameterError(f"networks is {networks!r}; expected at least 1")
+    inputs = torch.as_tensor(np.asarray(x, np.float32))
+    columns = None if others is None else torch.as_tensor(np.asarray(others, np.float32))
+    total = np.zeros((len(x), len(x if others is None else others)))
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        for _ in range(networks):
+            network = make()
+            if not isinstance(network, torch.nn.Module):
+                raise ParameterError(f"make returned {network!r}; expected a torch.nn.Module")
+            rows = _gradients(torch, network, inputs)
+            facing = rows if columns is None else _gradients(torch, network, columns)
+            total += (rows @ facing.T).double().numpy()
+    if not np.isfinite(total).all():
+        raise ParameterError("gradients of the network are not finite; expected finite parameters and inputs")
+    if others is None:
+        total = (total + total.T) / 2  # products of one matrix with its own transpose may differ in the last bits
+    return (total / networks).astype(np.float32)
+
+
+def _gradients(torch: Any, network: Any, inputs: Any) -> Any:
+    """(N, P): of the first output by all parameters."""
+    parameters = {name: value.detach() for name, value in network.named_parameters()}
+
+    def output(values: Any, one: Any) -> Any:
+        outputs = torch.func.functional_call(network, values, (one[None],))
+        if outputs.ndim != 2:
+            raise ParameterError(f"outputs of one input have shape {tuple(outputs.shape)}; expected (1, A)")
+        return outputs[0, 0]
+
+    gradients = torch.func.vmap(torch.func.grad(output), in_dims=(None, 0))(parameters, inputs)
+    return torch.cat([each.flatten(1) for each in gradients.values()], dim=1)

@@ -104,7 +104,7 @@ def _build(
 ) -> bool:
     """Make the folder hold the finished state space; returns whether it did before."""
     from pharos.state_space.outcome_journal import remove_parts
-    from pharos.state_space.ranked_search import RankedSearch
+    from pharos.state_space.ranked_table import RankedSearch
     from pharos.state_space.search import Search, check_size, journal_of
 
     manifest = _manifest_of(plan, path)

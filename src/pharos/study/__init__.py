@@ -9,6 +9,8 @@ from pharos.study.analysis import (
     mean_curve,
     models,
     paper_agreement,
+    paper_regressions,
+    paper_returns,
 )
 from pharos.study.archive import pack, unpack
 from pharos.study.blocks import Run, Specification
@@ -18,7 +20,6 @@ from pharos.study.findings import findings
 from pharos.study.forecast import Forecast
 from pharos.study.leave_one_class_out import outcomes, validation
 from pharos.study.logs import LOGGERS, RunLog, log
-from pharos.study.paper import paper_regressions, paper_returns
 from pharos.study.predictions import predict, read_predictions, write_predictions
 from pharos.study.regression import Fit, aggregate_r_squared, fit, fit_models, leave_one_class_out_r_squared
 from pharos.study.report import StudyReport, report

@@ -1,7 +1,11 @@
-"""What a study says: intervals, linear models, correlation of agents, and each beside what the paper printed."""
+"""What a study says: intervals, linear models, correlation of agents, and each beside what the paper printed.
+
+What the paper printed, as tables: the returns of its appendix C and the fits of its section 4.3.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from importlib import resources
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -9,7 +13,6 @@ import numpy as np
 from pharos.agents import TABULAR_OBSERVATION
 from pharos.errors import ParameterError
 from pharos.study.blocks import Run
-from pharos.study.paper import paper_regressions, paper_returns
 from pharos.study.regression import MEASURES, Fit, aggregate_r_squared, fit, leave_one_class_out_r_squared
 from pharos.study.statistics import mean_of_means, stratified_interval
 from pharos.study.tables import paper_instance
@@ -255,3 +258,23 @@ def _ours(model: str, subset: str, models: Models, cells: "pd.DataFrame") -> flo
     name = {"image": IMAGE}.get(subset, subset)
     one = models.get(model.split()[0], name)
     return missing if one is None else one.r_squared
+
+
+# Paper ----------------------------------------------------------------------------------------------------------------
+
+
+def paper_returns() -> "pd.DataFrame":
+    """One row a printed mean and deviation: environment, instance, randomization, agent, observation, mean, std."""
+    return _table("paper_returns.csv")
+
+
+def paper_regressions() -> "pd.DataFrame":
+    """One row a printed fit: model, subset, r_squared, significant_predictors_as_printed."""
+    return _table("paper_regressions.csv")
+
+
+def _table(name: str) -> "pd.DataFrame":
+    import pandas as pd
+
+    with resources.files("pharos.study").joinpath("data", name).open() as file:
+        return pd.read_csv(file)

@@ -2,8 +2,13 @@
 
 Cells of one class share more than any measure tells, so a class is held out as a whole, and classes weigh alike. The
 four classes of the paper tell nothing here: with four points every measure can be ordered well by luck.
+
+Mixed models of an outcome: a slope for the predictor, random intercepts for classes and for the MDPs within them.
+
+Whether a predictor orders the observations of one MDP: the one question that no tabular measure can answer.
 """
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -13,9 +18,7 @@ import numpy as np
 from pharos.errors import ParameterError
 from pharos.solvers import regret_scale
 from pharos.study import cross_validation as _held_out
-from pharos.study.mixed_models import mixed_fit
 from pharos.study.tables import CELL
-from pharos.study.within_mdps import Pairs
 from pharos.validation import POLICY_PREDICTORS, PREDICTORS, SAMPLED_PREDICTORS
 
 if TYPE_CHECKING:
@@ -375,3 +378,167 @@ def _mixed(cells: Cells, model: Model, tabular: Sequence[str], seed: int) -> dic
             f"{name}_upper": _percentile(values[1:], 97.5),
         }
     return row
+
+
+# Mixed models ---------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class MixedFit:
+    """y = intercept + slope z + class + MDP + residual, by restricted maximum likelihood.
+
+    Attributes:
+        slope: of the standardised predictor z, in units of the outcome; error: its standard error.
+        p_value: two-sided, of slope / error under Student's t with two degrees of freedom fewer than classes: a
+            predictor can differ between classes alone, and the normal distribution would trust few classes too much.
+        class_variance, mdp_variance, residual_variance: of the random parts and of what is left.
+    """
+
+    slope: float
+    error: float
+    p_value: float
+    class_variance: float
+    mdp_variance: float
+    residual_variance: float
+
+
+def mixed_fit(x: np.ndarray, y: np.ndarray, classes: np.ndarray, mdps: np.ndarray) -> MixedFit | None:
+    """Fit the model to cells: x, y (N,), classes and mdps (N,) integers; MDPs of different classes are different.
+
+    Returns:
+        None where there are fewer than three classes, x is constant, or the likelihood has no maximum that is found.
+    Source: statsmodels' MixedLM; Laird and Ware (1982).
+    """
+    import pandas as pd
+    import statsmodels.formula.api as smf
+    from scipy import stats
+
+    count = len(np.unique(classes))
+    if count < 3 or np.ptp(x) == 0 or np.ptp(y) == 0:
+        return None
+    data = pd.DataFrame({"y": y, "z": (x - x.mean()) / x.std(), "family": classes, "mdp": mdps})
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # variances at 0 are told as warnings
+        try:
+            model = smf.mixedlm("y ~ z", data, groups="family", re_formula="1", vc_formula={"mdp": "0 + C(mdp)"})
+            fit = model.fit(reml=True, method=["lbfgs", "powell"])
+            slope, error = float(fit.fe_params["z"]), float(fit.bse_fe["z"])  # of a perfect line: a root of about -0
+        except (np.linalg.LinAlgError, ValueError):
+            return None
+    if not np.isfinite(slope) or not error > 0:
+        return None
+    p = float(2 * stats.t.sf(abs(slope / error), count - 2))
+    return MixedFit(slope, error, p, float(fit.cov_re.iloc[0, 0]), float(fit.vcomp[0]), float(fit.scale))
+
+
+# Within mdps ----------------------------------------------------------------------------------------------------------
+
+
+BLOCK = 250  # permutations at a time
+CLEAR = 0.05  # difference of an outcome between two observations of one MDP that counts
+
+
+@dataclass(frozen=True, eq=False)
+class Pairs:
+    """Pairs of cells of one MDP that differ in the observation and whose outcomes differ by more than CLEAR.
+
+    Attributes:
+        first, second: (M,) rows of the cells.
+        sign: (M,) 1 where the outcome of the first is the larger one, else -1.
+    """
+
+    first: np.ndarray
+    second: np.ndarray
+    sign: np.ndarray
+
+    @staticmethod
+    def of(y: np.ndarray, mdps: np.ndarray, clear: float = CLEAR) -> "Pairs":
+        """Those of outcomes y (N,) and MDPs (N,)."""
+        first, second = np.triu_indices(len(y), 1)
+        same = mdps[first] == mdps[second]
+        first, second = first[same], second[same]
+        counts = np.abs(y[first] - y[second]) > clear
+        first, second = first[counts], second[counts]
+        return Pairs(first, second, np.sign(y[first] - y[second]))
+
+    def only(self, chosen: np.ndarray) -> "Pairs":
+        """Some of them: chosen (M,) bool."""
+        return Pairs(self.first[chosen], self.second[chosen], self.sign[chosen])
+
+    def right(self, x: np.ndarray) -> np.ndarray:
+        """(M,) 1 where x (N,) orders the pair as the outcome does, 1/2 where it says that both are alike, else 0."""
+        return 0.5 + 0.5 * np.sign(x[self.first] - x[self.second]) * self.sign
+
+    def agreement(self, x: np.ndarray) -> float:
+        """The share of pairs that x orders rightly; NaN without pairs."""
+        return float(self.right(x).mean()) if len(self.first) else np.nan
+
+    def ceiling(self, y: np.ndarray, noise: np.ndarray) -> float:
+        """The agreement of a predictor that knows the expectation of each cell: noise over seeds turns pairs around.
+
+            mean over pairs of P(the expectations differ as the means y do) = Phi(|y1 - y2| / sqrt(noise1 + noise2))
+
+        for means that are normal about their expectations, under a flat prior on the difference of two expectations.
+
+        Args:
+            y, noise: (N,) of cells: the mean over seeds, and the variance over seeds / seeds; NaN of a single seed.
+        Returns:
+            NaN where no pair has two seeds in both of its cells.
+        """
+        from scipy.special import ndtr
+
+        variance = noise[self.first] + noise[self.second]
+        is_known = np.isfinite(variance)
+        if not is_known.any():
+            return np.nan
+        difference = np.abs(y[self.first] - y[self.second])[is_known]
+        deviation = np.sqrt(np.maximum(variance[is_known], 1e-300))
+        return float(ndtr(difference / deviation).mean())
+
+    def interval(self, x: np.ndarray, classes: np.ndarray, counts: np.ndarray) -> tuple[float, float]:
+        """95 % interval of the agreement over samples of classes; (NaN, NaN) without pairs.
+
+        Args:
+            x, classes: (N,) of cells. counts: (R, C), how often each class counts in each sample.
+        """
+        number = counts.shape[1]
+        right = np.bincount(classes[self.first], self.right(x), minlength=number)
+        pairs = np.bincount(classes[self.first], minlength=number)
+        total = counts @ pairs
+        shares = (counts @ right)[total > 0] / total[total > 0]
+        if len(shares) == 0:
+            return np.nan, np.nan
+        return float(np.percentile(shares, 2.5)), float(np.percentile(shares, 97.5))
+
+    def permuted(
+        self,
+        x: np.ndarray,
+        classes: np.ndarray,
+        mdps: np.ndarray,
+        observations: Sequence[str],
+        permutations: int,
+        seed: int,
+    ) -> np.ndarray:
+        """(R,) agreement where observations change names, in all MDPs of a class alike, but in each class otherwise.
+
+        So a class whose instances all prefer the same observation counts once. NaN where no pair is left.
+
+        Args:
+            x, classes, mdps, observations: (N,) of cells; classes and MDPs are numbers from 0.
+            permutations: R.
+        """
+        names = {name: i for i, name in enumerate(dict.fromkeys(observations))}
+        columns = np.array([names[each] for each in observations])
+        row_at = np.full((mdps.max() + 1, len(names)), -1)
+        row_at[mdps, columns] = np.arange(len(x))
+        rng = np.random.default_rng(seed)
+        agreements = np.full(permutations, np.nan)
+        for start in range(0, permutations, BLOCK):
+            size = min(BLOCK, permutations - start)
+            orders = np.broadcast_to(np.arange(len(names)), (size, classes.max() + 1, len(names)))
+            rows = row_at[mdps, rng.permuted(orders, axis=2)[:, classes, columns]]
+            other = np.where(rows >= 0, x[rows], np.nan)
+            right = 0.5 + 0.5 * np.sign(other[:, self.first] - other[:, self.second]) * self.sign
+            some = np.isfinite(right).any(axis=1)
+            agreements[start : start + size][some] = np.nanmean(right[some], axis=1)
+        return agreements

@@ -4,18 +4,30 @@ The score of a run is 1 minus its normalised regret: 1 is optimal from the first
 random. A task is an instance under one kind of chance; runs are resampled within each task.
 
 Source: Agarwal et al. (2021), Deep reinforcement learning at the edge of the statistical precipice, sections 4.2, 4.3.
+
+Which states of a study's instances look alike, counted once and kept in its folder.
 """
 
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
 from itertools import combinations
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pharos.agents import TABULAR_OBSERVATION
+from pharos.errors import FileFormatError, PharosError
+from pharos.observations import Aliasing, aliasing
 from pharos.study.statistics import mean_of_means, performance_profile, probability_of_improvement
+from pharos.system.storage import digest_of_json, is_intact, read_json, replace_json, sealed
 from pharos.training import bootstrap_interval
 
 if TYPE_CHECKING:
     import pandas as pd
+
+    from pharos.study.specification import Specification
 
 THRESHOLDS = np.linspace(-0.25, 1.0, 51)
 GROUP = ["agent", "observation"]
@@ -92,3 +104,76 @@ def _scores(part: "pd.DataFrame") -> dict[Any, np.ndarray]:
     """Task -> scores of its runs."""
     defined = part[np.isfinite(part["normalized_regret"].to_numpy(float))]
     return {task: 1.0 - own["normalized_regret"].to_numpy(float) for task, own in defined.groupby(TASK, sort=True)}
+
+
+# Aliasing -------------------------------------------------------------------------------------------------------------
+
+
+# Instances with more states are not counted for a report
+MOST_STATES = 100_000
+
+
+def aliasing_table(
+    study: "Specification",
+    folder: Path,
+    num_states: Mapping[str, float],
+    progress: Callable[[str], None] | None = None,
+) -> "pd.DataFrame":
+    """Aliasing of every instance and observation of a study with at most MOST_STATES states; kept in the folder
+    `aliasing`.
+
+    Args:
+        num_states: of the instances that are to be looked at, by name.
+    Returns:
+        Columns `environment`, `instance`, `observation`, `states`, `observations`, `share`.
+    """
+    import pandas as pd
+
+    rows: dict[tuple[str, str], dict[str, Any]] = {}
+    for run in study.runs:
+        key = (run.instance, run.cell["observation"])
+        number = num_states.get(run.instance, np.inf)
+        if key in rows or key[1] == TABULAR_OBSERVATION or not number <= MOST_STATES:
+            continue
+        if progress is not None:
+            progress(f"states that share an observation: {', '.join(key)}")
+        try:
+            count = _counted(folder, run.config)
+        except PharosError:
+            continue
+        rows[key] = {"environment": run.cell["environment"], "instance": key[0], "observation": key[1]}
+        rows[key] |= {"states": count.num_states, "observations": count.num_observations, "share": count.share}
+    columns = ["environment", "instance", "observation", "states", "observations", "share"]
+    return pd.DataFrame(list(rows.values()), columns=columns)
+
+
+def with_aliasing(cells: "pd.DataFrame", counted: "pd.DataFrame") -> "pd.DataFrame":
+    """Cells with `aliasing` beside their regret: the share of states whose observation another state has; NaN where it
+    was not counted, 0 for the number of the state.
+    """
+    shares = counted[["environment", "instance", "observation", "share"]].rename(columns={"share": "aliasing"})
+    joined = cells.merge(shares.astype({"aliasing": float}), on=["environment", "instance", "observation"], how="left")
+    joined.loc[joined["observation"] == TABULAR_OBSERVATION, "aliasing"] = 0.0
+    return joined
+
+
+def _counted(folder: Path, config: Mapping[str, Any]) -> Aliasing:
+    from pharos.observations import observe
+    from pharos.state_space import build
+    from pharos.study.values import task_of
+
+    identity = {name: config[name] for name in ("environment", "parameters", "observation", "observation_options")}
+    task = task_of(config)
+    identity = json.loads(json.dumps({**identity, "version": task.env.version}))
+    file = folder / "aliasing" / f"{digest_of_json(identity)[:16]}.json"
+    try:
+        stored = read_json(file)
+        if is_intact(stored) and stored["asked"] == identity:
+            return Aliasing(**stored["counts"])
+    except (FileNotFoundError, FileFormatError, KeyError, TypeError, AttributeError):
+        pass
+    space = build(task.env, progress=False)
+    counts = aliasing(space, observe(task.env, task.observation, **dict(task.observation_options)))
+    file.parent.mkdir(parents=True, exist_ok=True)
+    replace_json(file, sealed({"asked": identity, "counts": asdict(counts)}))
+    return counts

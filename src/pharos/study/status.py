@@ -1,17 +1,21 @@
-"""How far a study is, told by the files in its folder."""
+"""How far a study is, told by the files in its folder.
+
+Code of the user's own in a study: what has changed since its runs were trained.
+"""
 
 import contextlib
 import os
 import socket
 import time
+import warnings
+from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from pharos.errors import FileFormatError, ParameterError
+from pharos.errors import FileFormatError, ParameterError, PharosError
 from pharos.study import worker as _worker
-from pharos.study.custom_code import warn_of_changes
 from pharos.study.specification import (
     STUDIES,
     STUDY_FILE,
@@ -23,6 +27,7 @@ from pharos.study.specification import (
 )
 from pharos.system.storage import read_json, replace_file
 from pharos.system.wording import many
+from pharos.training import read_record
 
 
 @dataclass(frozen=True)
@@ -163,3 +168,30 @@ def claim(study: Specification, folder: Path) -> None:
 
     text = yaml.safe_dump(study.model_dump(mode="json", exclude_unset=True), sort_keys=False, width=120)
     replace_file(file, text, devices=False)
+
+
+# Custom code ----------------------------------------------------------------------------------------------------------
+
+
+def warn_of_changes(study: Specification, folder: Path) -> None:
+    """Warn of each file of the user's own that has changed since finished runs in `folder` were trained with it.
+
+    Their ids do not depend on it, so they count as runs of the study.
+    """
+    changed: dict[str, int] = defaultdict(int)
+    for run in study.runs:
+        if not run.configuration.sources or not (folder / "runs" / run.id / "run.json").is_file():
+            continue
+        try:
+            stored = read_record(folder / "runs" / run.id)["config"]["sources"]
+            for part, source in run.configuration.sources.items():
+                changed[source.file] += stored[part]["checksum"] != source.checksum
+        except (PharosError, KeyError, TypeError):  # damaged: whoever reads the result says so
+            continue
+    for file, count in changed.items():
+        if count:
+            warnings.warn(
+                f"{file} has changed since {count} runs in {folder} were trained with it; "
+                f"another --out trains them anew",
+                stacklevel=3,
+            )

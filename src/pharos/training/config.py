@@ -158,7 +158,7 @@ class RunConfig:
         observation: name of what the agent sees; "index" for tabular agents.
         observation_options: options of the observation.
         agent: "q_learning", "dqn", "ppo", "a2c", or "module:Class" of an algorithm for Stable-Baselines3.
-        hyperparameters: of the agent, which go before those of agents/defaults.py.
+        hyperparameters: of the agent, which go before those of agents/hyperparameters.py.
         steps: number of environment steps to learn from.
         seed: of everything random.
         gamma: discount of values and returns; the agent's own discount is a hyperparameter.

@@ -65,7 +65,7 @@ def train(  # noqa: PLR0913
         reward_noise, reward_delay: how the agent is paid; values, returns and regret are of what it earns.
         gamma, horizon: setting of values and returns, see `Task`; the agent's own discount is a hyperparameter.
         evaluation_interval: steps between evaluations; None: a hundredth of `steps`.
-        hyperparameters: go before those of agents/defaults.py; or a YAML file of the same form, such as one
+        hyperparameters: go before those of agents/hyperparameters.py; or a YAML file of the same form, such as one
             that `tune` wrote.
         engine: what trains networks: "sb3", Stable-Baselines3; or "batched", pharos' own DQN and PPO, which trains many
             runs at once (`train_many`).

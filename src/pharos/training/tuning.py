@@ -11,12 +11,16 @@ runs of a trial that fit together are one program. The first trial is what the
 table says now, so that the best is never worse than that on the instances and seeds of the search.
 
 Source: Bergstra et al. (2011), Algorithms for hyper-parameter optimization; Akiba et al. (2019), Optuna.
+
+The journal of a search: Optuna's record, a JSON object a line, whose last line a full disk may have cut.
 """
 
+import contextlib
 import inspect
 import json
 import math
 import os
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -28,14 +32,14 @@ import numpy as np
 from pharos.agents import Q_LEARNING_DEFAULTS, agent_kind, algorithm
 from pharos.agents import hyperparameters as hyperparameters_of
 from pharos.environments import Environment, make
-from pharos.errors import FileFormatError, MissingExtra, ParameterError
+from pharos.errors import FileFormatError, FolderLocked, MissingExtra, ParameterError
 from pharos.observations import own_observation
 from pharos.system import storage
+from pharos.system.storage import check_regular, lock
 from pharos.system.wording import many
 from pharos.training import results as _results
 from pharos.training.batch import Progress, train_configs
 from pharos.training.config import ChanceSetting, RunConfig
-from pharos.training.journal import JournalLock, mend_journal
 from pharos.training.task import Task
 from pharos.training.task_cache import FailedRun, TaskCache
 
@@ -452,3 +456,63 @@ def _done(study: Any) -> int:
 def _best(study: Any) -> float:
     scores = [record["score"] for record in _trials(study) if record["score"] is not None]
     return min(scores, default=math.inf)
+
+
+# Journal --------------------------------------------------------------------------------------------------------------
+
+
+WAIT_SECONDS = 0.005
+
+
+class JournalLock:
+    """A lock for Optuna's journal, in the place of its own: a process that is killed holds nothing.
+
+    Optuna's is a file that stays when its process is killed; the next one waits 30 seconds for it.
+    """
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+        self.held = contextlib.ExitStack()
+
+    def acquire(self) -> bool:
+        """Wait until no other process holds the folder, and hold it."""
+        while True:
+            try:
+                self.held.enter_context(lock(self.folder, FolderLocked, "tuning"))
+                return True
+            except FolderLocked:
+                time.sleep(WAIT_SECONDS)
+
+    def release(self) -> None:
+        """Let the folder go."""
+        self.held.close()
+
+
+def mend_journal(path: Path) -> None:
+    """Cut off a last line that is not whole; what it said is done again.
+
+    Raises:
+        FileFormatError: another line is no JSON.
+    """
+    try:
+        check_regular(path)
+        data = path.read_bytes()
+    except FileNotFoundError:
+        return
+    except OSError as error:
+        raise FileFormatError(f"{path}: cannot be read: {error.strerror}; delete the folder and search again") from None
+    lines = data.splitlines(keepends=True)
+    for number, line in enumerate(lines, start=1):
+        if _is_whole(line):
+            continue
+        if number < len(lines):
+            raise FileFormatError(f"{path}:{number}: is no JSON; delete the folder and search again")
+        with open(path, "r+b") as file:
+            file.truncate(len(data) - len(line))
+
+
+def _is_whole(line: bytes) -> bool:
+    try:
+        return line.endswith(b"\n") and isinstance(json.loads(line), dict)
+    except (ValueError, RecursionError):
+        return False

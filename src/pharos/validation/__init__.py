@@ -8,8 +8,7 @@ from pharos.validation.learners import (
     SAMPLED_PREDICTORS,
     predicted,
 )
-from pharos.validation.prediction import PredictedRegret, Prediction, predict
-from pharos.validation.published import Published, published
+from pharos.validation.prediction import PredictedRegret, Prediction, Published, predict, published
 
 __all__ = ["PRIMARY", "PredictedRegret", "Prediction", "Published", "predict", "published"]
 _shared = """

@@ -1,4 +1,4 @@
-"""The networks of agents/networks.py with the heads that Stable-Baselines3 puts on them, for W runs at once."""
+"""The networks of agents/deep.py with the heads that Stable-Baselines3 puts on them, for W runs at once."""
 
 import math
 from collections.abc import Callable, Sequence

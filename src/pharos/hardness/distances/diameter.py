@@ -15,8 +15,7 @@ from pharos.errors import ParameterError, UndefinedMeasure
 from pharos.hardness.distances.lean_sweep import lean_diameter, lean_eccentricity, needs_more_than_memory
 from pharos.hardness.distances.sum_sweep import SumSweep
 from pharos.hardness.distances.transition_graph import Graph
-from pharos.hardness.hitting.stochastic_diameter import stochastic_diameter
-from pharos.hardness.hitting.stochastic_eccentricity import stochastic_start_eccentricity
+from pharos.hardness.hitting.stochastic_diameter import stochastic_diameter, stochastic_start_eccentricity
 from pharos.hardness.interval import Budget, BudgetClock, Interval, Progress, conventions_of
 from pharos.mdp import TabularMDP, require_mdp
 from pharos.system.wording import many

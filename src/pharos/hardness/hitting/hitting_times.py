@@ -29,19 +29,84 @@ moved up and down by W with
 
 J + W then falls short of no step, J - W exceeds none: both certificates hold with 0. W is about 1e-12 of J. Where the
 linear solver itself has no correct digit (J beyond 1e15), the bounds of plain floats stand, wide as they are.
+
+Bounds of the hitting times of a target, and sums of two floats; see hitting_times for what they certify.
+
+The linear equations of the hitting times of one policy, with nodes that are alike as one unknown; shorter rows.
 """
 
 import math
 from copy import copy
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy  # whose `sparse` is loaded where it is used
 
-from pharos.hardness.hitting.hitting_bounds import PRODUCT, Bounds, added, certified
-from pharos.hardness.hitting.hitting_equations import Factors, factors_of, without_common
 from pharos.hardness.interval import BudgetClock
 from pharos.kernels import hitting
 from pharos.mdp import ExpandedMDP
+
+# Relative rounding of a product of a bound and a factor.
+PRODUCT = 1 + 2.0**-50
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """Bounds of all hitting times of a target: J* lies between J times `low` and J times `high`.
+
+    largest: the largest J. limited: whether floats are too short for closer bounds, so that more time would not help.
+    """
+
+    low: float
+    high: float
+    largest: float
+    limited: bool = False
+
+    @property
+    def lower(self) -> float:
+        """Lower bound of the largest hitting time."""
+        return self.largest * self.low / PRODUCT
+
+    @property
+    def upper(self) -> float:
+        """Upper bound of the largest hitting time."""
+        return self.at_most(self.largest) * PRODUCT
+
+    def at_most(self, j: float) -> float:
+        """Upper bound of what is j in J, but for rounding: infinite where none is known, also where J is no more than
+        0."""
+        return j * self.high if math.isfinite(self.high) else math.inf
+
+    @property
+    def apart(self) -> float:
+        """Upper divided by lower bound, minus 1."""
+        return self.high / self.low - 1 if self.low > 0 else math.inf
+
+    def meets(self, tolerance: float) -> bool:
+        """Whether the bounds are within `tolerance` of each other."""
+        return math.isfinite(self.high) and self.high - self.low <= tolerance * self.high
+
+    def but_limited(self) -> "Bounds":
+        """The same bounds, as close as floats allow."""
+        return Bounds(self.low, self.high, self.largest, True)
+
+
+def certified(above: float, below: float, largest: float) -> Bounds:
+    """The bounds that follow from T J - J <= above and J - T J <= below."""
+    high = PRODUCT / (1 - above) if above < 1 - 1e-9 else math.inf
+    return Bounds(1 / ((1 + below) * PRODUCT), high, largest)
+
+
+def added(high: np.ndarray, low: np.ndarray, more: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """high + low + more as two floats, the first of which is the nearest to the sum. Source: Knuth's and Dekker's
+    sums."""
+    total = high + more
+    part = total - high
+    rest = (high - (total - part)) + (more - part) + low
+    result = total + rest
+    return result, rest - (result - total)
+
 
 # Sweeps before a policy is evaluated by a linear solve: as many as cost about as much as one.
 SWEEPS = 40
@@ -329,3 +394,83 @@ class HittingTimes:
         residual, error = np.zeros_like(high), np.zeros_like(high)
         arrays = (high, low, self.policy, residual, error)
         return residual, error, hitting.residuals_of_pairs(*self.arrays, self.goal, self.order, count, *arrays)
+
+
+# Hitting equations ----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Factors:
+    """Factors of a linear system in which nodes that are alike are one unknown.
+
+    first: (unknowns,) the first node of each. unknown: (inner nodes,) which one a node is.
+    """
+
+    factors: Any
+    first: np.ndarray
+    unknown: np.ndarray
+
+    def solve(self, right: np.ndarray) -> np.ndarray:
+        """(inner nodes,) the solution, given the right side."""
+        solution: np.ndarray = self.factors.solve(right[self.first])[self.unknown]
+        return solution
+
+
+def factors_of(choices: ExpandedMDP, policy: np.ndarray, inner: np.ndarray) -> Factors | None:
+    """The factors of 1 - P of a policy on the `inner` nodes; None where it is not proper. Rows are made to sum to 1."""
+    first, unknown = _numbered_once(choices.alike[inner])
+    place = np.full(len(policy), first.size)  # what leads elsewhere is left out of the equations
+    place[inner] = unknown
+    solved = inner[first]
+    rows = scipy.sparse.csr_matrix(choices.matrix[solved * choices.num_actions + policy[solved]])
+    row, column = np.repeat(np.arange(first.size), np.diff(rows.indptr)), place[rows.indices]
+    data = np.where(row == column, 0.0, rows.data)
+    leaving = np.bincount(row, data, first.size)
+    inside = column < first.size
+    matrix = scipy.sparse.coo_matrix((data[inside], (row[inside], column[inside])), shape=(first.size, first.size))
+    try:
+        return Factors(
+            scipy.sparse.linalg.splu(scipy.sparse.csc_matrix(scipy.sparse.diags(leaving) - matrix)), first, unknown
+        )
+    except RuntimeError:  # singular
+        return None
+
+
+def _numbered_once(alike: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(first member of each group, (N,) its group): nodes that are alike are one group, every other one a group."""
+    opens = ~alike
+    if alike.any():
+        opens[alike.argmax()] = True
+    group = np.cumsum(opens) - 1
+    if alike.any():
+        group[alike] = group[alike.argmax()]
+    return np.flatnonzero(opens), group
+
+
+def without_common(matrix: Any, num_actions: int) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
+    """What the actions of a node have in common is added up once: under random and sticky actions most of a row.
+
+    Returns:
+        ((first, node, weight) of the rows without it, one for each action; (first, node, weight) of it, one for each
+        node).
+    """
+    nodes = matrix.shape[0] // num_actions
+    row = np.repeat(np.arange(matrix.shape[0]), np.diff(matrix.indptr))
+    pairs, place, times = np.unique(
+        (row // num_actions) * np.int64(nodes) + matrix.indices, return_inverse=True, return_counts=True
+    )
+    least = np.full(len(pairs), np.inf)
+    np.minimum.at(least, place, matrix.data)
+    least[times < num_actions] = 0.0
+    rest = matrix.data - least[place]
+    distinct = rest > 8 * hitting.UNIT * matrix.data  # the kernels count as much as rounding of `least`
+    if distinct.sum() + np.count_nonzero(least) >= matrix.nnz:  # nothing gained
+        least[:] = 0.0
+        rest, distinct = matrix.data, np.ones(matrix.nnz, np.bool_)
+    shared = least > 0
+    first = np.concatenate([[0], np.cumsum(np.bincount(row[distinct], minlength=matrix.shape[0]))])
+    always = np.concatenate([[0], np.cumsum(np.bincount(pairs[shared] // nodes, minlength=nodes))])
+    return (
+        (first.astype(np.int64), matrix.indices[distinct].astype(np.int64), rest[distinct]),
+        (always.astype(np.int64), (pairs[shared] % nodes).astype(np.int64), least[shared]),
+    )
