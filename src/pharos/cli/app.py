@@ -12,7 +12,6 @@ from typer.core import TyperGroup
 from pharos.cli import (
     build,
     cache,
-    count,
     evaluate,
     explore,
     hardness,
@@ -153,7 +152,7 @@ def _options(
 
 app.command("list")(list_.list_)
 app.command("build")(build.build)
-app.command("count")(count.count)
+app.command("count")(build.count)
 app.command("solve")(solve.solve)
 app.command("hardness")(hardness.hardness)
 app.command("predict")(predict.predict)
