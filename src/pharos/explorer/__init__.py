@@ -8,14 +8,15 @@ from typing import TYPE_CHECKING
 from pharos.system import lazy
 
 if TYPE_CHECKING:
-    from pharos.explorer.exploration import ARROWS, Exploration, keys_of
+    from pharos.explorer.exploration import Exploration
+    from pharos.explorer.keys import ARROWS, keys_of
     from pharos.explorer.launch import Explorer, exploration_of, explore, open_browser
     from pharos.explorer.learned_policy import Learnt
     from pharos.explorer.pages import contents, page, write
     from pharos.explorer.server import Server
 
 _FILES = {
-    "ARROWS": "exploration",
+    "ARROWS": "keys",
     "Exploration": "exploration",
     "Explorer": "launch",
     "Learnt": "learned_policy",
@@ -23,7 +24,7 @@ _FILES = {
     "contents": "pages",
     "exploration_of": "launch",
     "explore": "launch",
-    "keys_of": "exploration",
+    "keys_of": "keys",
     "open_browser": "launch",
     "page": "pages",
     "write": "pages",

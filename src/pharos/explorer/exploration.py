@@ -3,8 +3,6 @@
 Answers are plain dictionaries, ready for JSON; numbers that JSON cannot say are None. A position is a state and, under
 sticky actions, the action executed before; there is none before the first step.
 
-Which key does which action, for whoever plays: in the terminal and in the page.
-
 How often policies are in states, and what they lose there.
 
 The drawing of a state for a page: what is in which cell, and once for all how each thing looks.
@@ -22,6 +20,7 @@ import numpy as np
 from pharos.drawing import NIGHT, ground_of, image, planes_of, tile
 from pharos.environments import Environment, Layer, State
 from pharos.errors import ParameterError
+from pharos.explorer.keys import keys_of
 from pharos.explorer.layers import Layers
 from pharos.explorer.learned_policy import LEARNT, OPTIMAL, UNIFORM, Learnt, probabilities
 from pharos.explorer.states import NumberedStates, SpaceStates, States
@@ -427,29 +426,6 @@ class Exploration:
 def number(value: Any) -> float | None:
     """A float; None where it is not a number."""
     return float(value) if np.isfinite(value) else None
-
-
-# Keys -----------------------------------------------------------------------------------------------------------------
-
-
-ARROWS = {"up": "w", "left": "a", "down": "s", "right": "d"}  # action -> letter
-
-
-def keys_of(actions: tuple[str, ...]) -> dict[str, int]:
-    """Key -> action: arrows and w a s d for directions, space for staying, and the digits for all."""
-    keys: dict[str, int] = {}
-    for number, action in enumerate(actions):
-        if number < 9:
-            keys[str(number + 1)] = number
-        direction = next(
-            (name for name in ARROWS if action.lower() == name or action.lower().endswith(f" {name}")), None
-        )
-        if direction is not None:
-            keys.setdefault(direction, number)
-            keys.setdefault(ARROWS[direction], number)
-        elif action.lower() in ("stay", "noop", "wait", "fire", "none"):
-            keys.setdefault("space", number)
-    return keys
 
 
 # Picture --------------------------------------------------------------------------------------------------------------
