@@ -7,6 +7,7 @@ import pickle
 import shutil
 import warnings
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -228,6 +229,29 @@ def test_the_folder_of_another_user_is_not_used(cache, monkeypatch):
     private_folder.cache_clear()
     with pytest.warns(RuntimeWarning, match=r"compiled belongs to another user .*compiled anew by every process"):
         assert private_folder(cache) is None
+    private_folder.cache_clear()
+
+
+@pytest.mark.skipif(not hasattr(os, "getuid"), reason="no users to tell apart")
+def test_a_folder_that_anybody_may_rename_or_link_is_not_used(cache, tmp_path, monkeypatch):
+    cache.mkdir(exist_ok=True)
+    cache.chmod(0o777)
+    with pytest.warns(RuntimeWarning, match="compiled lies in a folder whose entries anybody can rename"):
+        assert private_folder(cache) is None
+    private_folder.cache_clear()
+    cache.chmod(0o1777)  # as /tmp, where only the owner of an entry can
+    assert private_folder(cache) == cache / "compiled"
+    (cache / "compiled").rmdir()
+    (tmp_path / "mine").mkdir(mode=0o700)
+    (cache / "compiled").symlink_to(tmp_path / "mine")
+    private_folder.cache_clear()
+    assert private_folder(cache) == cache / "compiled"  # a link of one's own
+    usual, somebody = Path.lstat, os.getuid() + 1
+    fields = lambda path: (*usual(path)[:4], somebody, *usual(path)[5:])  # noqa: E731
+    monkeypatch.setattr(Path, "lstat", lambda path: os.stat_result(fields(path)))
+    private_folder.cache_clear()
+    with pytest.warns(RuntimeWarning, match=rf"compiled belongs to another user \(number {somebody}\)"):
+        private_folder(cache)
     private_folder.cache_clear()
 
 

@@ -3,7 +3,10 @@
 import importlib
 import json
 import math
+import os
 import shutil
+import subprocess
+import sys
 import tempfile
 from pathlib import Path
 
@@ -13,6 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pharos.errors import FileFormatError, FolderLocked, ResultCorrupted
+from pharos.system import storage
 from pharos.training import evaluate_agent, load_agent, read_curve, read_record, run_id, train
 from pharos.training import results as _results
 
@@ -127,6 +131,18 @@ def test_two_processes_do_not_train_one_run(tmp_path):
 
     train("q_learning", "simple_grid/4x4-plain", out=tmp_path / "run", progress=again, **options)
     assert {path.name for path in (tmp_path / "run").iterdir()} == {"run.json", "curve.parquet", "policy.npy"}
+
+
+def test_files_that_a_killed_process_was_writing_go_with_the_next_run(tmp_path, monkeypatch):
+    dead = subprocess.Popen([sys.executable, "-c", ""])
+    dead.wait()
+    monkeypatch.setattr(os, "getpid", lambda: dead.pid)
+    for name in ("run.json", "curve.parquet", "policy.npy", "regret.png"):
+        storage.temporary_path(tmp_path / name).touch()
+    monkeypatch.undo()
+    assert len([*tmp_path.iterdir()]) == 4
+    train("q_learning", "simple_grid/4x4-plain", out=tmp_path, steps=100)
+    assert {path.name for path in tmp_path.iterdir()} == {"run.json", "curve.parquet", "policy.npy"}
 
 
 @pytest.mark.slow

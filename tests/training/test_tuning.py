@@ -1,6 +1,9 @@
 """Searching hyperparameters: what a score is, what is written, that a search goes on, and what bad input gets."""
 
 import json
+import signal
+import subprocess
+import sys
 import time
 
 import optuna
@@ -200,3 +203,15 @@ def test_a_journal_that_lacks_a_name_is_one_line(tmp_path):
     journal.write_text(journal.read_text().replace('"trial_id"', '"trial_if"'))
     with pytest.raises(FileFormatError, match=r"journal\.log: is not as Optuna wrote it \(KeyError.*delete the folder"):
         tune("q_learning", "frozen_lake/4x4", steps=200, trials=3, seeds=[0], out=tmp_path)
+
+
+@pytest.mark.slow
+def test_an_interrupted_search_says_one_line(tmp_path):
+    code = "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); from pharos.cli import main; "
+    code += f"sys.argv = 'pharos tune {LAKE} --agent q_learning --steps 200000 --trials 99 --out out'.split(); main()"
+    process = subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.PIPE, text=True, cwd=tmp_path)
+    while process.poll() is None and not (tmp_path / "out" / "journal.log").exists():
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 130 and errors.startswith("pharos: interrupted") and errors.count("\n") == 1, errors

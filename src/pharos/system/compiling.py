@@ -145,15 +145,17 @@ def _problem_of(folder: Path) -> str:
         folder.parent.mkdir(parents=True, exist_ok=True)
         with contextlib.suppress(FileExistsError):
             folder.mkdir(mode=0o700)
-        status = folder.stat()
+        status, link, parent = folder.stat(), folder.lstat(), folder.parent.stat()
     except OSError as error:
         return f"cannot be used ({error.strerror})"
     if not stat.S_ISDIR(status.st_mode):
         return "is no folder"
     if not hasattr(os, "getuid"):
         return ""
-    if status.st_uid != os.getuid():
-        return f"belongs to another user (number {status.st_uid})"
+    if others := {status.st_uid, link.st_uid} - {os.getuid()}:
+        return f"belongs to another user (number {others.pop()})"
+    if parent.st_mode & stat.S_IWOTH and not parent.st_mode & stat.S_ISVTX:
+        return "lies in a folder whose entries anybody can rename"
     if status.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
         return "can be written to by other users"
     return "" if os.access(folder, os.W_OK | os.X_OK) else "cannot be written to"
