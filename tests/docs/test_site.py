@@ -7,6 +7,7 @@ import io
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -97,6 +98,42 @@ def test_tutorials_run_as_scripts(path, tmp_path):
     assert done.returncode == 0 and "Traceback" not in done.stderr, done.stderr
     shown = [output for cell in cells for output in cell["outputs"] if output.get("name") == "stdout"]
     assert done.stdout == "".join("".join(output["text"]) for output in shown)
+
+
+FRAGMENTS = {"format.md", "many-processes.md", "troubleshooting.md"}  # the first is run by test_format_page.py
+SCRIPTS_OF_PAGES = [page for page in PAGES if BLOCK.search(page.read_text()) and page.name not in FRAGMENTS]
+LAKE_STUDY = """
+name: lakes
+steps: 200
+evaluations: 2
+seeds: 2
+hardness: {measures: [diameter]}
+blocks: [{environments: [frozen_lake/4x4], agents: [q_learning]}]
+"""
+FEWER = ((r"steps=[\d_]+", "steps=600"), (r"learn\([\d_]+\)", "learn(300)"), (r"range\(64\)", "range(3)"))
+BEFORE = {
+    "importing.md": "import numpy as np\nimport pharos\nP, R = np.eye(2)[[[0, 1], [1, 0]]], np.eye(2)\n",
+    "leaderboard.md": "import pharos\npharos.train('q_learning', 'frozen_lake/4x4', steps=200, out='runs/lake')\n",
+    "regret.md": "import pharos\npharos.train('dqn', 'frozen_lake/4x4', steps=200, random=0.1, out='runs/dqn-0')\n",
+}
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("page", SCRIPTS_OF_PAGES, ids=lambda page: page.name)
+def test_the_code_of_a_page_runs_as_a_script(page, tmp_path):
+    """Saved as a file, without a guard; with what the page says is there already, and fewer steps of training."""
+    shutil.copy(ROOT / "tests/data/bridge/freeway_10_fs30.npz", tmp_path)
+    (tmp_path / "lakes.yaml").write_text(LAKE_STUDY)
+    code = "\n\n".join(block for block, _ in BLOCK.findall(page.read_text()))
+    for pattern, less in FEWER:
+        code = re.sub(pattern, less, code)
+    (tmp_path / "script.py").write_text(BEFORE.get(page.name, "") + code)
+    done = subprocess.run(
+        [sys.executable, "script.py"],
+        **{"cwd": tmp_path, "capture_output": True, "text": True, "timeout": 900},
+        env={**os.environ, "MPLBACKEND": "agg", "PHAROS_CACHE_DIR": str(tmp_path / "cache")},
+    )
+    assert done.returncode == 0 and "Traceback" not in done.stderr, done.stderr
 
 
 def test_there_are_tutorials_and_all_have_been_executed():
