@@ -89,6 +89,8 @@ def save(
     with storage.waiting_lock(folder, FolderLocked, "importing", _warn):
         if _is_foreign(folder):
             raise ParameterError(f"{folder}{FOREIGN}")
+        if not is_folder(folder):  # a mark, so that a killed import is repeated there
+            storage.replace_json(folder / MANIFEST, {"format": FORMAT, "format_version": "unfinished"})
         checksums = {}
         for name, array in arrays.items():
             path = folder / f"{name}.npy"
@@ -112,7 +114,8 @@ def save(
 
 def _is_foreign(folder: Path) -> bool:
     names = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
-    return bool(names - {storage.LOCK, storage.CLAIM}) and not is_folder(folder)
+    others = {name for name in names - {storage.LOCK, storage.CLAIM} if not storage.is_temporary(name)}
+    return bool(others) and not is_folder(folder)
 
 
 def _warn(text: str) -> None:

@@ -121,7 +121,6 @@ def write_manifest(folder: Path, manifest: dict[str, Any]) -> None:
     path = folder / MANIFEST
     try:
         storage.replace_file(path, json.dumps(manifest, indent=1))
-        storage.remove_leftovers(path)
         (folder / (MANIFEST + ".tmp")).unlink(missing_ok=True)  # of an older pharos that was killed
     except OSError as error:
         raise cannot_write(path, error) from error

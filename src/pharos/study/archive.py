@@ -4,7 +4,6 @@ import contextlib
 import json
 import os
 import shutil
-import uuid
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -192,9 +191,11 @@ def _curve(file: Path, id: str, row: dict[str, list | None], schema: "pa.Schema"
 
 def _write(place: Path, id: str, record: dict[str, Any], curve: "pa.Table") -> bool:
     """Whether the run was added: a finished one that is there already stays."""
+    target = place / "partial" / id
+    storage.remove_leftovers(target)
     if _worker.read_status(place, id) == _worker.FINISHED:
         return False
-    partial = place / "partial" / f"{id}.{uuid.uuid4().hex}"
+    partial = storage.temporary_path(target)
     partial.mkdir(parents=True)
     try:
         training.write_table(partial / "curve.parquet", curve)

@@ -105,6 +105,8 @@ def _attempt(runner: Runner, config: Mapping[str, Any], id: str, folder: Path, a
             except Exception as error:
                 traceback.print_exc()
                 write_failure(partial, config, id, describe(error), time.perf_counter() - began)
+    else:  # its process was killed before it could publish it
+        training.clear_run(partial)
     publish(partial, folder, id)
     return read_status(folder, id) or FAILED
 

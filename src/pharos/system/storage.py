@@ -11,6 +11,7 @@ import errno
 import json
 import math
 import os
+import shutil
 import socket
 import stat
 import time
@@ -64,6 +65,7 @@ def replacing(path: str | os.PathLike, *, durable: bool = True, devices: bool = 
             yield file
         return
     path = path if is_special else Path(os.path.realpath(path))
+    remove_leftovers(path)
     temporary = temporary_path(path)
     try:
         with open(temporary, "xb") as file:
@@ -166,15 +168,22 @@ def is_temporary(name: str) -> bool:
 
 
 def remove_leftovers(path: Path) -> None:
-    """Remove unfinished replacements of `path` by processes of this machine that are gone, or older than a day."""
-    for leftover in path.parent.iterdir():
-        if not is_temporary(leftover.name) or not leftover.name.startswith(_temporary_prefix(path)):
-            continue
-        host, process = leftover.name.split(".")[-4:-2]
-        with contextlib.suppress(OSError):
-            old = time.time() - leftover.stat().st_mtime > _LEFTOVER_SECONDS
-            if old or (host == _host() and not _is_alive(int(process))):
-                leftover.unlink()
+    """Remove unfinished replacements of `path` by processes of this machine that are gone, or older than a day.
+
+    `replacing` does it before it begins. Cost: a listing of the folder.
+    """
+    with contextlib.suppress(OSError):
+        for name in os.listdir(path.parent):
+            if name.startswith(_temporary_prefix(path)) and is_temporary(name):
+                _remove_leftover(path.with_name(name))
+
+
+def _remove_leftover(leftover: Path) -> None:
+    host, process = leftover.name.split(".")[-4:-2]
+    with contextlib.suppress(OSError):
+        old = time.time() - leftover.stat().st_mtime > _LEFTOVER_SECONDS
+        if old or (host == _host() and not _is_alive(int(process))):
+            shutil.rmtree(leftover) if leftover.is_dir() else leftover.unlink()
 
 
 def _temporary_prefix(path: Path) -> str:

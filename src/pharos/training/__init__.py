@@ -16,7 +16,7 @@ from pharos.training.results import (
     write_record,
     write_table,
 )
-from pharos.training.run_folder import TrainingResult, load_agent
+from pharos.training.run_folder import TrainingResult, clear_run, load_agent
 from pharos.training.task import Task, TaskValues
 from pharos.training.task_cache import FailedRun, TaskCache
 from pharos.training.train import train, train_config, train_many
@@ -43,6 +43,6 @@ __all__ = [
     "tune",
 ]
 _shared = """
-    ENGINES FailedRun Progress SPACES TaskCache TaskValues bootstrap_interval check_agent digest_of_curve read_curve
-    read_curve_table read_record read_rows read_table run_id steps_in_seconds write_record write_table
+    ENGINES FailedRun Progress SPACES TaskCache TaskValues bootstrap_interval check_agent clear_run digest_of_curve
+    read_curve read_curve_table read_record read_rows read_table run_id steps_in_seconds write_record write_table
 """

@@ -23,13 +23,13 @@ from pharos.agents import hyperparameters as hyperparameters_of
 from pharos.errors import FileFormatError, FolderLocked, ParameterError, PharosError
 from pharos.policies import is_small_table
 from pharos.system import compiling
-from pharos.system.storage import CLAIM, LOCK, digest_of_json, lock, read_json, remove_leftovers, replace_json
+from pharos.system.storage import digest_of_json, lock, read_json, replace_json
 from pharos.system.wording import many
 from pharos.training import results as _results
 from pharos.training.config import RunConfig
 from pharos.training.evaluation import values_together
 from pharos.training.learners import Learner, make_learner
-from pharos.training.run_folder import Checkpoint, Record, TrainingResult, finished_result
+from pharos.training.run_folder import Checkpoint, Record, TrainingResult, clear_run, finished_result
 from pharos.training.task import Task
 from pharos.training.task_cache import FailedRun, Member, TaskCache, in_one_line
 
@@ -145,8 +145,10 @@ class TrainingJobs:
         """Train all; their results in order."""
         for group in self._groups():
             TrainingGroup(self, group).train()
-        if self.checkpoints is not None and self.checkpoints.is_dir() and not any(self.checkpoints.iterdir()):
-            self.checkpoints.rmdir()
+        if self.checkpoints is not None and self.checkpoints.is_dir():
+            for folder in (*self.checkpoints.iterdir(), self.checkpoints):
+                with contextlib.suppress(OSError):  # it is not empty
+                    folder.rmdir()
         return [self.results[place] for place in range(len(self.configs))]
 
     def fail(self, place: int, error: Exception) -> None:
@@ -182,7 +184,8 @@ class TrainingJobs:
             except (ParameterError, FileFormatError) as error:
                 self.fail(place, error)
                 continue
-            if done is not None:
+            if done is not None and folder is not None:
+                clear_run(folder)
                 self.results[place] = done
                 self.done += config.steps
             elif config.engine == "batched" or self._is_shared_table(place, config):
@@ -222,9 +225,12 @@ class TrainingJobs:
     def _stored_groups(self, waiting: dict[int, RunConfig]) -> Iterator[list[Member]]:
         """Batches of checkpoints, with the runs that they had, which are taken from `waiting`."""
         by_id = {config.id: place for place, config in waiting.items()}
-        for configs in self._stored_batches():
+        finished = {self.configs[place].id for place, end in self.results.items() if isinstance(end, TrainingResult)}
+        for folder, configs in self._stored_batches():
             places = [by_id.get(config.id) for config in configs]
             if all(place is None for place in places):
+                if finished.issuperset(config.id for config in configs):  # it was killed before it removed this
+                    shutil.rmtree(folder, ignore_errors=True)
                 continue
             try:
                 group = [
@@ -238,11 +244,11 @@ class TrainingJobs:
                     del waiting[by_id.pop(config.id)]
             yield group
 
-    def _stored_batches(self) -> Iterator[list[RunConfig]]:
+    def _stored_batches(self) -> Iterator[tuple[Path, list[RunConfig]]]:
         for folder in [] if self.checkpoints is None else sorted(self.checkpoints.glob("*")):
             with contextlib.suppress(OSError, ValueError, KeyError, TypeError, PharosError):
                 stored = read_json(folder / "batch.json")
-                yield [RunConfig.from_dict(entry) for entry in stored["configs"]]
+                yield folder, [RunConfig.from_dict(entry) for entry in stored["configs"]]
 
 
 class TrainingGroup:
@@ -326,10 +332,9 @@ class TrainingGroup:
             return False
         folder.mkdir(parents=True, exist_ok=True)
         self.held.enter_context(lock(folder, FolderLocked, "training"))
-        for name in (_results.RECORD, _results.CURVE, "policy.npy", "regret.png"):  # of a process that was killed
-            remove_leftovers(folder / name)
         done = finished_result(folder, self.config)
         if done is not None:
+            clear_run(folder)
             self.jobs.results[place] = done
             self.jobs.done += self.config.steps
         return done is not None
@@ -355,6 +360,7 @@ class TrainingGroup:
 
     def _remove_checkpoint(self) -> None:
         if self.holds and self._folder is not None:
+            clear_run(self._folder)  # and last what says which runs these are
             shutil.rmtree(self._folder, ignore_errors=True)
 
     # Learning --------------------------------------------------------------------------------------------------------
@@ -431,10 +437,7 @@ class TrainingGroup:
             )
         self._remove_checkpoint()
         if self.is_alone and (folder := self.group[0].folder) is not None:
-            for leftover in folder.glob("checkpoint*"):  # of kills in the middle of replacing one, too
-                shutil.rmtree(leftover, ignore_errors=True)
-            for name in (LOCK, CLAIM):  # whoever waits for it finds a finished run
-                (folder / name).unlink(missing_ok=True)
+            clear_run(folder)
 
     def _fail(self, error: Exception) -> None:
         """The only run has failed."""

@@ -1,5 +1,6 @@
 """The folder of a run: record and checkpoints while it is trained; result and agent once it is finished."""
 
+import contextlib
 import json
 import math
 import os
@@ -14,7 +15,7 @@ import numpy as np
 
 from pharos.environments import class_called
 from pharos.errors import FileFormatError, ParameterError, UntrustedCode
-from pharos.system.storage import check_regular, digest_of_bytes, digest_of_file, read_json, sync
+from pharos.system.storage import CLAIM, LOCK, check_regular, digest_of_bytes, digest_of_file, read_json, sync
 from pharos.training import results as _results
 from pharos.training.config import RunConfig, run_id
 from pharos.training.task import Task
@@ -96,6 +97,15 @@ def finished_result(folder: Path, config: RunConfig) -> TrainingResult | None:
         return None
     rows = _results.read_rows(folder)
     return TrainingResult(record["config"], record["result"], rows, None, folder, record["seconds"])
+
+
+def clear_run(folder: Path) -> None:
+    """Remove what a finished run does not need; of kills in the middle of replacing or removing it, too."""
+    for leftover in folder.glob("checkpoint*"):
+        shutil.rmtree(leftover, ignore_errors=True)
+    for name in (LOCK, CLAIM):  # whoever waits for it finds a finished run
+        with contextlib.suppress(OSError):
+            (folder / name).unlink()
 
 
 def _digests(folder: Path) -> dict[str, str]:

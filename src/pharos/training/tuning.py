@@ -182,6 +182,8 @@ def tune(  # noqa: PLR0913
     while (done := _done(study)) < trials:
         study.sampler = _sampler(optuna, search, done, trials)
         study.optimize(lambda trial: search.score(trial, optuna.TrialPruned), n_trials=1, callbacks=[after])
+    if folder is not None and done:  # it may have been killed before it wrote the last one
+        _write(folder, search, study)
     if not math.isfinite(_best(study)):
         raise ParameterError(f"none of {many(trials, 'trial')} was finished; give more trials, or look at tuning.json")
     records = _trials(study)
@@ -366,7 +368,11 @@ def _opened(optuna: Any, search: _Search, folder: Path | None, trials: int) -> A
 def _sampler(optuna: Any, search: _Search, done: int, trials: int) -> Any:
     """What proposes the next trial, from those that are done: a search that was killed goes on as it would have."""
     seed = int(np.random.SeedSequence([search.search_seed, done]).generate_state(1)[0])
-    return optuna.samplers.TPESampler(seed=seed, n_startup_trials=min(10, max(2, trials // 4)))
+    return optuna.samplers.TPESampler(
+        seed=seed,
+        n_startup_trials=min(10, max(2, trials // 4)),
+        constant_liar=False,  # what was running when the search was killed counts for nothing
+    )
 
 
 def _checked_chances(
@@ -421,12 +427,14 @@ def _storage(optuna: Any, folder: Path | None) -> Any:
 
 
 def _write(folder: Path, search: _Search, study: Any) -> None:
-    record = {"format": 1, "config": search.config, "versions": _results.versions(), "trials": _trials(study)}
+    trials = _trials(study)
+    record = {"format": 1, "config": search.config, "versions": _results.versions(), "trials": trials}
     if math.isfinite(_best(study)):
         import yaml
 
         best = {**search.table, **study.best_params}
-        record["best"] = {"trial": study.best_trial.number, "score": study.best_value, "hyperparameters": best}
+        first = next(trial["number"] for trial in trials if trial["score"] == study.best_value)
+        record["best"] = {"trial": first, "score": study.best_value, "hyperparameters": best}
         head = f"# Mean normalised regret {study.best_value:.4f} after {many(_done(study), 'trial')}, see tuning.json\n"
         text = head + yaml.safe_dump(
             {search.agent: {search.environment: {search.observation_name: best}}}, sort_keys=False
