@@ -38,7 +38,7 @@ from cosmic_ray.plugins import get_operator
 NUMBERS = "core/NumberReplacer"
 TESTED_BY = {  # path in src/pharos: weight of its faults (kernels compile again for each), tests
     "mdp/dynamics.py": (1.0, "test_dynamics test_mdp test_occupancy"),
-    "mdp/table.py": (1.0, "test_dynamics test_mdp test_solvers"),
+    "mdp/compiled.py": (1.0, "test_dynamics test_mdp test_solvers"),
     "mdp/matrices.py": (1.0, "test_mdp test_dynamics test_bisimulation"),
     "mdp/outcome_table.py": (1.0, "test_outcome_table test_dynamics test_bisimulation"),
     "mdp/outcome_arrays.py": (1.0, "test_outcome_table test_mdp"),
@@ -50,9 +50,8 @@ TESTED_BY = {  # path in src/pharos: weight of its faults (kernels compile again
     "solvers/fixed_point.py": (1.0, "test_error_bounds test_solvers"),
     "solvers/linear_systems.py": (1.0, "test_error_bounds test_solvers"),
     "solvers/policy_iteration.py": (1.0, "test_error_bounds test_solvers"),
-    "solvers/policy_values.py": (1.0, "test_error_bounds test_solvers"),
+    "solvers/values.py": (1.0, "test_error_bounds test_solvers"),
     "solvers/solution.py": (1.0, "test_solvers test_error_bounds"),
-    "solvers/values.py": (1.0, "test_solvers test_error_bounds"),
     "hardness/distances/diameter.py": (0.6, "test_diameter"),
     "hardness/distances/sum_sweep.py": (0.6, "test_diameter"),
     "hardness/distances/transition_graph.py": (0.6, "test_diameter"),
@@ -64,7 +63,6 @@ TESTED_BY = {  # path in src/pharos: weight of its faults (kernels compile again
     "hardness/planning/steps.py": (0.6, "test_effective_horizon"),
     "kernels/bellman.py": (0.3, "test_solvers test_dynamics"),
     "kernels/gaps.py": (0.5, "test_gaps"),
-    "kernels/ties.py": (0.5, "test_gaps"),
     "kernels/graph.py": (0.2, "test_diameter test_dynamics"),
     "kernels/many_searches.py": (0.2, "test_diameter"),
     "kernels/clocks.py": (0.2, "test_diameter"),

@@ -34,7 +34,7 @@ def completed(*words):
 
 
 def test_seconds_of_compiling_are_not_seconds_of_work():
-    import pharos.kernels.ties  # noqa: F401  (which listens)
+    import pharos.kernels.gaps  # noqa: F401  (which listens)
 
     def slow_to_compile(x):
         for i in range(x):
@@ -60,7 +60,7 @@ class Stream(io.StringIO):
 
 @pytest.mark.parametrize("is_terminal", [True, False])
 def test_a_terminal_is_told_once_that_pharos_compiles(is_terminal, monkeypatch):
-    import pharos.kernels.ties  # noqa: F401  (which listens)
+    import pharos.kernels.gaps  # noqa: F401  (which listens)
 
     stream = Stream(is_terminal)
     monkeypatch.setattr(sys, "stderr", stream)

@@ -20,9 +20,9 @@ from pharos.errors import ParameterError, PrecisionError
 from pharos.mdp import BEST, WORST, Matrices, PolicyTable, TabularMDP
 from pharos.ranks import RankFailed
 from pharos.solvers import checkpoint as checkpoints
-from pharos.solvers import distributed as sharing
 from pharos.solvers import evaluate_policy, ranked, uniform_value, value_iteration
-from pharos.solvers.distributed import DistributedOptions, shared_solution
+from pharos.solvers import ranked as sharing
+from pharos.solvers.ranked import DistributedOptions, shared_solution
 from rank_threads import Killed, fails_at, out_of_order, threads
 from strategies import FEW, deterministic_mdps, hard_mdps, lazy_mdps, outcome_mdps, small_mdps
 
@@ -292,7 +292,7 @@ SOLVE = """
 import os, pathlib, signal, sys
 import numpy as np
 from pharos.mdp import BEST
-from pharos.solvers import checkpoint, distributed, ranked
+from pharos.solvers import checkpoint, ranked
 from test_ranked_values import chain
 folder, last, sweeps, first = pathlib.Path(sys.argv[1]), int(sys.argv[2]), [], []
 sweep, checkpoint._SHARE = ranked.RankedBackup.plain_sweep, 0
@@ -302,8 +302,8 @@ def dies(backup):
         os.kill(os.getpid(), signal.SIGKILL)
     return sweep(backup)
 ranked.RankedBackup.plain_sweep = dies
-options = distributed.DistributedOptions("mpi", folder / "values", -1.0)
-solution = distributed.shared_solution(chain(20_000), BEST, 1e-6, 80, options, lambda sweeps, _: first.append(sweeps))
+options = ranked.DistributedOptions("mpi", folder / "values", -1.0)
+solution = ranked.shared_solution(chain(20_000), BEST, 1e-6, 80, options, lambda sweeps, _: first.append(sweeps))
 if solution is not None:
     np.save(folder / "x.npy", solution.x)
     (folder / "first.txt").write_text(str(first[0]))

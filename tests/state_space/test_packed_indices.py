@@ -25,7 +25,7 @@ from pharos.errors import StateSpaceCorrupted, StateSpaceMismatch, StateSpaceToo
 from pharos.hardness.distances import lean_sweep
 from pharos.interaction import GymEnv, make_vec
 from pharos.mdp import OutcomeTable, Table, lazy_actions, random_actions, sticky_actions
-from pharos.solvers import distributed, evaluate_policy, uniform_value, value_iteration, worst_value
+from pharos.solvers import evaluate_policy, ranked, uniform_value, value_iteration, worst_value
 from pharos.state_space import files as writing
 from pharos.state_space import manifest as manifests
 from pharos.state_space import search
@@ -390,7 +390,7 @@ def test_spaces_are_solved_and_searched_where_they_lie(world, spaces, tmp_path, 
     one, other = (pharos.load(each.folder, environment=WORLDS[world]).mdp(0.95) for each in (narrow, wide))
     assert same(one.rewards, other.rewards)
     for options in ({}, {"blocks": 2}, {"dtype": "float32", "tolerance": 1e-3}, {"processes": "mpi"}):
-        with threads(distributed, 2):
+        with threads(ranked, 2):
             found, expected = value_iteration(other, **options), value_iteration(one, **options)
         assert same(found.v, expected.v) and same(found.q, expected.q), options
     kept = [value_iteration(each, values=tmp_path / f"{i}") for i, each in enumerate((one, other))]

@@ -19,7 +19,7 @@ from test_resuming import build, files_of
 import pharos
 from chance_worlds import ChanceWorld
 from pharos.errors import MissingExtra, ParameterError, RuleError, StateSpaceError, StateSpaceTooLarge
-from pharos.kernels import key_owner
+from pharos.kernels import hash_table
 from pharos.ranks import Halo, RankFailed, cuts_of, mpi, run_spmd
 from pharos.state_space import ranked_table, search
 from pharos.state_space.files import lock
@@ -151,9 +151,9 @@ def test_owners_keep_the_first_place_whatever_the_order_of_arrival(seed, words):
     for order in (np.arange(60), rng.permutation(60)):
         table = np.full(1 << 16, -1, np.int32)
         keys, numbers, entries = np.empty((200, words), np.uint64), np.empty(200, np.int64), np.empty(60, np.int64)
-        count = key_owner.claim(table, keys, numbers, 0, known, np.zeros(3, np.int64), np.empty(3, np.int64))
+        count = hash_table.claim(table, keys, numbers, 0, known, np.zeros(3, np.int64), np.empty(3, np.int64))
         numbers[:count] = np.arange(count)  # these have their numbers already
-        count = key_owner.claim(table, keys, numbers, count, asked[order], places[order], entries)
+        count = hash_table.claim(table, keys, numbers, count, asked[order], places[order], entries)
         assert (keys[entries] == asked[order]).all()
         assert count == len(first)
         for entry in range(count):
@@ -169,7 +169,7 @@ def test_candidates_go_to_one_owner_each_in_their_order(seed, size):
     keys = rng.integers(0, 50, (100, 2)).astype(np.uint64)
     indices = rng.integers(-5, 3, 100)
     order, counts = np.empty(100, np.int64), np.empty(size, np.int64)
-    key_owner.route(keys, indices, size, order, counts)
+    hash_table.route(keys, indices, size, order, counts)
     parts = np.split(order[: counts.sum()], np.cumsum(counts)[:-1])
     assert sorted(np.concatenate(parts)) == [*np.flatnonzero(indices < 0)]
     assert all((np.diff(part) > 0).all() for part in parts)

@@ -21,9 +21,8 @@ if TYPE_CHECKING:
         save_png,
         scenery_of,
     )
-    from pharos.drawing.planes import check_state, planes_of
     from pharos.drawing.shapes import SHAPES, color_of, glyph_of, shade, shape_of, sprite_of, sprite_pixels, tile
-    from pharos.drawing.text import colored_text, text_drawing
+    from pharos.drawing.text import check_state, colored_text, planes_of, text_drawing
     from pharos.drawing.window import Window
 
 _FILES = {
@@ -32,7 +31,7 @@ _FILES = {
     "NIGHT": "pictures",
     "SHAPES": "shapes",
     "Window": "window",
-    "check_state": "planes",
+    "check_state": "text",
     "color_of": "shapes",
     "colored_text": "text",
     "episode": "pictures",
@@ -41,7 +40,7 @@ _FILES = {
     "human": "pictures",
     "image": "pictures",
     "inside": "pictures",
-    "planes_of": "planes",
+    "planes_of": "text",
     "save_gif": "pictures",
     "save_png": "pictures",
     "scenery_of": "pictures",

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pharos.drawing.planes import planes_of
 from pharos.drawing.shapes import tile
+from pharos.drawing.text import planes_of
 from pharos.environments import Environment, Ground, Margin, Scenery, State
 from pharos.errors import UnknownName
 from pharos.system import storage

@@ -1,7 +1,6 @@
 """MDPs for other programs: BRIDGE's npz, Gymnasium's `P` table, Storm's explicit DRN format."""
 
-from pharos.exporters.bridge import bridge
-from pharos.exporters.drn import drn, gym_p
+from pharos.exporters.drn import bridge, drn, gym_p
 
 __all__ = [
     "bridge",

@@ -6,8 +6,12 @@ Visitation complexity: `diameter`, `start_eccentricity`, `covering`. Estimation 
 """
 
 from pharos.hardness import built_in as _built_in  # registers the measures; the order of a report
-from pharos.hardness.distances.colosseum import colosseum_diameter
-from pharos.hardness.distances.diameter import diameter, start_eccentricity, start_eccentricity_interval
+from pharos.hardness.distances.diameter import (
+    colosseum_diameter,
+    diameter,
+    start_eccentricity,
+    start_eccentricity_interval,
+)
 from pharos.hardness.gaps.gaps import Gaps, gaps, minimal_gap, sum_of_reciprocal_gaps
 from pharos.hardness.gaps.value_norm import ActionGapRegularity, action_gap_regularity, environmental_value_norm
 from pharos.hardness.interval import Budget, Certificate, Certified, Interval, Progress

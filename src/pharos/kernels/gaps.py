@@ -1,6 +1,13 @@
 """Suboptimality gaps of blocks of states, and their sums; hardness/gaps/gaps.py says what they mean.
 
 gap (N, A) float64 >= 0, 0 for the best actions; counted (N,) int64, how often a row counts.
+
+Proofs of ties between actions; hardness/gaps/ties.py says what is proven.
+
+gap (N, A) >= 0, 0 for the best actions; counted (N,) how often a row counts. The map from values to what comes of them:
+places (C, 3) int64, or (C, 5) where there are several previous actions, with open addressing: the bits of a value
+(FREE where there is none), of the reward and the value that follow, and of those of the previous action; C is a power
+of two.
 """
 
 import math
@@ -92,3 +99,87 @@ def _add(sums, k, value):
     total = sums[0, k] + value
     sums[1, k] = (total - sums[0, k]) - value if math.isfinite(total) else 0.0
     sums[0, k] = total
+
+
+# Ties -----------------------------------------------------------------------------------------------------------------
+
+
+FREE = -1  # the bits of a NaN, which no value is
+
+
+@interpreted_first("gap")
+@njit(cache=True, nogil=True)
+def extend(own, rewards, following, gap, counted, begin, places, filled):
+    """Map own[i, b] to (rewards, following) of the best actions, and where there are several b to those of b as well.
+
+    own (N, W), rewards, following (N, A): int64, the bits of floats. The best actions of a row have the same value, so
+    they must have the same rewards and following; then one of them stands for all.
+
+    Returns:
+        (i, filled): where it stopped, because all are done (i = N) or half of the places are taken, and how many those
+        are; i = -1 where a value has two different rows.
+    """
+    num_actions, width = gap.shape[1], own.shape[1]
+    for i in range(begin, len(gap)):
+        if counted[i] == 0:
+            continue
+        if 2 * (filled + width) >= len(places):
+            return i, filled
+        best = -1
+        for a in range(num_actions):
+            if gap[i, a] != 0.0:
+                continue
+            if best < 0:
+                best = a
+            elif rewards[i, a] != rewards[i, best] or following[i, a] != following[i, best]:
+                return -1, filled
+        if best < 0:
+            continue
+        for b in range(width):
+            put = _put(own[i, b], rewards[i, best], following[i, best], rewards[i, b], following[i, b], places)
+            if put < 0:
+                return -1, filled
+            filled += put
+    return len(gap), filled
+
+
+@interpreted_first()
+@njit(cache=True, nogil=True)
+def refill(old_places, places):
+    """Put one map into a larger one."""
+    for i in range(len(old_places)):
+        if old_places[i, 0] != FREE:
+            place = _place(old_places[i, 0], places)
+            for k in range(places.shape[1]):
+                places[place, k] = old_places[i, k]
+
+
+@njit(cache=True, nogil=True)
+def _put(key, reward, following, other_reward, other_following, places):
+    """1 where the key is new, 0 where it has this row, -1 where it has another."""
+    place = _place(key, places)
+    is_new = places[place, 0] == FREE
+    if is_new:
+        places[place, 0], places[place, 1], places[place, 2] = key, reward, following
+    elif places[place, 1] != reward or places[place, 2] != following:
+        return -1
+    if places.shape[1] > 3:
+        if is_new:
+            places[place, 3], places[place, 4] = other_reward, other_following
+        elif places[place, 3] != other_reward or places[place, 4] != other_following:
+            return -1
+    return 1 if is_new else 0
+
+
+@njit(cache=True, nogil=True)
+def _place(key, places):
+    """Where the key is, or may be put. Its hash is the finalizer of SplitMix64: similar floats go to different
+    places."""
+    z = np.uint64(key)
+    z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    mask = len(places) - 1
+    place = np.int64(z ^ (z >> np.uint64(31))) & mask
+    while places[place, 0] != FREE and places[place, 0] != key:
+        place = (place + 1) & mask
+    return place

@@ -11,14 +11,22 @@ if TYPE_CHECKING:
     from pharos.mdp.arguments import require_mdp
     from pharos.mdp.bisimulation import Minimization, minimize
     from pharos.mdp.chance import Chance, lazy_actions, random_actions, sticky_actions
-    from pharos.mdp.dynamics import BellmanEquation, Dynamics, Outcomes, PolicyStep
+    from pharos.mdp.compiled import Lazy, Table
+    from pharos.mdp.dynamics import (
+        BellmanEquation,
+        Dynamics,
+        Outcomes,
+        PolicyStep,
+        count_of,
+        runs_between,
+        runs_of,
+        shares_of,
+    )
     from pharos.mdp.expanded import ExpandedMDP, executed_actions, nodes_of_outcomes, outcomes_of
-    from pharos.mdp.lazy import Lazy
     from pharos.mdp.matrices import Matrices
     from pharos.mdp.outcome_table import OutcomeTable
     from pharos.mdp.part import Part
     from pharos.mdp.rewards import Rewards
-    from pharos.mdp.runs import count_of, runs_between, runs_of, shares_of
     from pharos.mdp.selection import BEST, WORST, Extreme, PolicyTable, Selection, chosen_mass, mass_of
     from pharos.mdp.space_rewards import (
         PaidOutcomes,
@@ -28,7 +36,6 @@ if TYPE_CHECKING:
         rewards_of_space,
         rewards_of_staying,
     )
-    from pharos.mdp.table import Table
     from pharos.mdp.tabular import TabularMDP
 
 _FILES = {
@@ -42,7 +49,7 @@ _FILES = {
     "nodes_of_outcomes": "expanded",
     "outcomes_of": "expanded",
     "Extreme": "selection",
-    "Lazy": "lazy",
+    "Lazy": "compiled",
     "Matrices": "matrices",
     "Minimization": "bisimulation",
     "OutcomeTable": "outcome_table",
@@ -53,10 +60,10 @@ _FILES = {
     "PolicyTable": "selection",
     "Rewards": "rewards",
     "Selection": "selection",
-    "Table": "table",
+    "Table": "compiled",
     "TabularMDP": "tabular",
     "chosen_mass": "selection",
-    "count_of": "runs",
+    "count_of": "dynamics",
     "mass_of": "selection",
     "lazy_actions": "chance",
     "minimize": "bisimulation",
@@ -66,9 +73,9 @@ _FILES = {
     "rewards_of_outcomes": "space_rewards",
     "rewards_of_space": "space_rewards",
     "rewards_of_staying": "space_rewards",
-    "runs_between": "runs",
-    "runs_of": "runs",
-    "shares_of": "runs",
+    "runs_between": "dynamics",
+    "runs_of": "dynamics",
+    "shares_of": "dynamics",
     "sticky_actions": "chance",
     "require_mdp": "arguments",
 }

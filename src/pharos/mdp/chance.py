@@ -2,7 +2,7 @@
 
 Nothing is copied. Which action is executed: an MDP carries three weights, and `Chance` says what they do to values
 (`choice`), to distributions (`executed`), to the weights of each action (`weights`) and to single steps (`draw`).
-Whether the executed action has an effect: its dynamics carry one probability more, see lazy.py.
+Whether the executed action has an effect: its dynamics carry one probability more, see compiled.py.
 """
 
 import math

@@ -1,18 +1,35 @@
-"""Dynamics that kernels read: the methods that are compiled, without temporary arrays."""
+"""Dynamics that kernels read: the methods that are compiled, without temporary arrays.
+
+Dynamics with one next state for each state and action: games, and whatever is deterministic.
+
+Dynamics in which now and then nothing happens: nothing is copied, neither successors nor probabilities.
+"""
 
 import math
 from abc import abstractmethod
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from pharos.kernels import bellman, graph, occupancy, outcomes
-from pharos.mdp.dynamics import BellmanEquation, Components, Dynamics, Order, PolicyStep
-from pharos.mdp.runs import count_of, shares_of
+from pharos.mdp.dynamics import (
+    BellmanEquation,
+    Components,
+    Dynamics,
+    Order,
+    Outcomes,
+    PolicyStep,
+    as_indices,
+    count_of,
+    shares_of,
+    split,
+)
 from pharos.mdp.selection import Extreme, PolicyTable, Selection
 from pharos.system.large_arrays import ranges_from_the_end
+from pharos.system.packed_indices import Indices, PackedIndices, blocks_of, holds_end, rows_of
 
 
 class CompiledDynamics(Dynamics):
@@ -31,7 +48,6 @@ class CompiledDynamics(Dynamics):
         return self.for_kernels
 
     def lazy(self, p: float) -> Dynamics:
-        from pharos.mdp.lazy import Lazy  # which derives from this class
 
         return Lazy(self, p)
 
@@ -192,3 +208,188 @@ def _shared(block: Callable[[np.ndarray], None], dynamics: CompiledDynamics, run
         return block(runs)
     with ThreadPoolExecutor(workers) as pool:
         list(pool.map(block, shares_of(runs, workers)))
+
+
+# Table ----------------------------------------------------------------------------------------------------------------
+
+
+class Table(CompiledDynamics):
+    """One next state for each state and action, as a table.
+
+    Attributes:
+        next_states: (S, A) int32, int64 or `PackedIndices`; -1: the episode ends there.
+    """
+
+    operations, mass, is_deterministic = 0, 1.0, True
+
+    def __init__(self, next_states: Indices):
+        self.next_states = next_states
+        self.num_states, self.num_actions = next_states.shape
+        self._has_ends: bool | None = None
+
+    @property
+    def for_kernels(self) -> Indices:
+        return self.next_states
+
+    @property
+    def has_ends(self) -> bool:  # type: ignore[override]
+        if self._has_ends is None:
+            self._has_ends = holds_end(self.next_states)
+        return self._has_ends
+
+    def deterministic_table(self) -> Indices:
+        return self.next_states
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        return {"next_states": np.asarray(self.next_states)}
+
+    def expected(self, x: np.ndarray, states: Any = slice(None)) -> np.ndarray:
+        if isinstance(self.next_states, PackedIndices) and isinstance(states, slice) and states == slice(None):
+            rows = self.next_states
+            out = np.empty((*rows.shape, *x.shape[2:]), x.dtype)
+            for first, table in blocks_of(rows):  # no more of them is unpacked at a time
+                out[first : first + len(table)] = self._expected(x, table)
+            return out
+        return self._expected(x, self.next_states[states])
+
+    def _expected(self, x: np.ndarray, table: np.ndarray) -> np.ndarray:
+        if x.ndim == 1:  # -1 reads the last row, which is the end's
+            return x[table]
+        return x[table, np.arange(self.num_actions)] if x.shape[1] > 1 else x[table, 0]
+
+    def successors_of(self, states: np.ndarray) -> np.ndarray:
+        following = np.unique(self.next_states[states])
+        if len(following) and following[0] == -1:
+            return np.append(following[1:], self.num_states)
+        return following
+
+    def outcomes(self, states: np.ndarray, actions: np.ndarray) -> Outcomes:
+        following = self.next_states[states, actions].astype(np.int64)
+        following[following < 0] = self.num_states
+        return Outcomes(np.arange(len(following)), following, np.ones(len(following)))
+
+    def sample(self, states: np.ndarray, actions: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        return self.next_states[states, actions]
+
+    def part(self, start: int, stop: int) -> tuple["Table", np.ndarray]:
+        rows = rows_of(self.next_states, start, stop)
+        local, halo = split(partial(blocks_of, rows), rows.shape, start, stop)
+        return Table(local), halo
+
+    def restricted_to(self, states: np.ndarray) -> "Table":
+        """These states alone; what leads out of them leads back to where it came from."""
+        number = np.full(self.num_states, -1, np.int64)
+        number[states] = np.arange(len(states))
+        table = np.asarray(self.next_states[states])
+        inside = number[table]  # what leads to -1 gets any number here
+        own = np.broadcast_to(np.arange(len(states))[:, None], table.shape)
+        return Table(as_indices(np.where(table < 0, -1, np.where(inside < 0, own, inside)), len(states)))
+
+    def merged(self, classes: np.ndarray, representatives: np.ndarray) -> "Table":
+        table = np.asarray(self.next_states[representatives]).astype(np.int64)
+        return Table(as_indices(np.where(table >= 0, classes[table], -1), len(representatives)))
+
+
+# Lazy -----------------------------------------------------------------------------------------------------------------
+
+
+_UNIT = 2.0**-53
+
+
+class Lazy(CompiledDynamics):
+    """Tables of next states or of outcomes, and a probability that a state stays what it is.
+
+        E x(next) of (s, a) = (1 - p) E x(next of the tables) + p x(s)
+
+    Under sticky actions the action that had no effect counts as executed.
+
+    Attributes:
+        tables: the dynamics without laziness.
+        laziness: p, in (0, 1).
+    """
+
+    is_deterministic = False
+
+    def __init__(self, tables: CompiledDynamics, p: float):
+        self.tables, self.laziness = tables, float(p)
+        self.num_states, self.num_actions = tables.num_states, tables.num_actions
+        self.operations = tables.operations + 4
+        # of the products with 1 - p, and of 1 - p
+        self.mass = max(1.0, tables.mass) * (1 + (self.operations + 2) * _UNIT)
+
+    def lazy(self, p: float) -> Dynamics:
+        return Lazy(self.tables, 1.0 - (1.0 - self.laziness) * (1.0 - p))
+
+    @property
+    def for_kernels(self) -> Any:
+        return self.tables.for_kernels, self.laziness
+
+    @property
+    def for_sweeps(self) -> Any:
+        return self.tables.for_sweeps, self.laziness
+
+    @property
+    def has_ends(self) -> bool:  # type: ignore[override]
+        return self.tables.has_ends
+
+    @property
+    def has_chance(self) -> bool:
+        return self.tables.has_chance
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        return {**self.tables.arrays(), "laziness": np.array(self.laziness)}
+
+    def expected(self, x: np.ndarray, states: Any = slice(None)) -> np.ndarray:
+        own = x[np.arange(self.num_states)[states]]
+        return (1.0 - self.laziness) * self.tables.expected(x, states) + self.laziness * (
+            own[:, None] if x.ndim == 1 else own
+        )
+
+    def pushed(self, mass: np.ndarray, width: int = 1) -> np.ndarray:
+        own = mass if width > 1 else mass.sum(axis=1, keepdims=True)
+        return (1.0 - self.laziness) * self.tables.pushed(mass, width) + self.laziness * own
+
+    def outcomes(self, states: np.ndarray, actions: np.ndarray) -> Outcomes:
+        from scipy import sparse
+
+        which, following, probabilities = self.tables.outcomes(states, actions)
+        count = len(states)
+        entries = (
+            np.concatenate([(1.0 - self.laziness) * probabilities, np.full(count, self.laziness)]),
+            (np.concatenate([which, np.arange(count)]), np.concatenate([following, np.asarray(states)])),
+        )
+        matrix = sparse.csr_matrix(entries, (count, self.num_states + 1))  # adds up what leads to the same state
+        which = np.repeat(np.arange(count), np.diff(matrix.indptr))
+        return Outcomes(which, matrix.indices.astype(np.int64), matrix.data)
+
+    def sample(self, states: np.ndarray, actions: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        stays = rng.random(len(states)) < self.laziness
+        return np.where(stays, states, self.tables.sample(states, actions, rng))
+
+    def largest(self, x: np.ndarray, states: Any = slice(None)) -> np.ndarray:
+        own = np.asarray(x)[np.arange(self.num_states)[states]]
+        return np.maximum(self.tables.largest(x, states), own[:, None])
+
+    def arrivals(self, states: np.ndarray) -> np.ndarray:
+        result = self.tables.arrivals(states)
+        result[states] = True
+        return result
+
+    def successors_of(self, states: np.ndarray) -> np.ndarray:
+        return np.union1d(self.tables.successors_of(states), states)
+
+    def reachable(self, starts: np.ndarray, steps: int | None = None) -> np.ndarray:
+        return self.tables.reachable(starts, steps)
+
+    def order(self, live: np.ndarray) -> Order | None:
+        return None if live.any() else self.tables.order(live)
+
+    def part(self, start: int, stop: int) -> tuple[Dynamics, np.ndarray]:
+        tables, halo = self.tables.part(start, stop)
+        return tables.lazy(self.laziness), halo
+
+    def restricted_to(self, states: np.ndarray) -> Dynamics:
+        return self.tables.restricted_to(states).lazy(self.laziness)
+
+    def merged(self, classes: np.ndarray, representatives: np.ndarray) -> Dynamics:
+        return self.tables.merged(classes, representatives).lazy(self.laziness)

@@ -12,12 +12,12 @@ import numpy as np
 
 from pharos.errors import ParameterError
 from pharos.mdp.chance import Chance
+from pharos.mdp.compiled import Table
 from pharos.mdp.dynamics import Dynamics, Order
 from pharos.mdp.matrices import Matrices, expected_rewards, transitions_of
 from pharos.mdp.outcome_arrays import checked_outcomes, compact_outcomes
 from pharos.mdp.outcome_table import OutcomeTable
 from pharos.mdp.rewards import Rewards
-from pharos.mdp.table import Table
 from pharos.mdp.tabular_arrays import (
     check_gamma,
     check_horizon,

@@ -9,8 +9,7 @@ import numpy as np
 from pharos.drawing import color_of, glyph_of, ground_of, scenery_of, shape_of, sprite_of, sprite_pixels
 from pharos.environments import Environment, Layer, Scenery
 from pharos.errors import ParameterError
-from pharos.observations.drawn import Drawing, num_values
-from pharos.observations.frames import Frames
+from pharos.observations.drawn import Drawing, Frames, num_values
 from pharos.observations.hiding import hidden_names
 
 LARGEST = 1024  # pixels on a side

@@ -32,7 +32,7 @@ Function = Callable[[Environment, np.ndarray], np.ndarray]
 class Observation:
     """A function of the state for one environment; called with a batch of states it gives a batch of observations.
 
-    Two options tell an agent something else besides: `frames`, pictures of the states before (frames.py), and
+    Two options tell an agent something else besides: `frames`, pictures of the states before (drawn.py), and
     `irrelevant`, coins that are thrown anew at each step (context.py). Who steps an environment brings them along.
 
     Attributes:

@@ -6,8 +6,7 @@ import numpy as np
 
 from pharos.environments import Environment, Layer
 from pharos.errors import ParameterError
-from pharos.observations.drawn import Drawing, num_values
-from pharos.observations.frames import Frames
+from pharos.observations.drawn import Drawing, Frames, num_values
 from pharos.observations.hiding import hidden_names
 
 DARKEST = 128  # of the shades of things on a plane of their own

@@ -5,10 +5,8 @@ are told apart by colour-blind people (Okabe and Ito, 2008). Nothing opens a win
 """
 
 from pharos.plots.grid import value_map
-from pharos.plots.growth import growth, states_by_depth
-from pharos.plots.plane import hardness_plane
+from pharos.plots.plane import growth, hardness_plane, predictions, states_by_depth
 from pharos.plots.policies import policies
-from pharos.plots.predictions import predictions
 from pharos.plots.regret import regret
 from pharos.plots.style import save
 

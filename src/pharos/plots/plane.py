@@ -1,15 +1,25 @@
-"""Instances in the plane of hardness: how long it takes to get around, against how hard it is to tell actions apart."""
+"""Instances in the plane of hardness: how long it takes to get around, against how hard it is to tell actions apart.
+
+How a state space grows with the number of steps from the start.
+
+Predicted regrets as bars with their intervals.
+"""
 
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from pharos.errors import ParameterError
-from pharos.plots.style import COLORS, plain_log, single, styled
+from pharos.plots.style import COLORS, GRID, INK, plain_log, single, styled
+from pharos.system.wording import many
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from pharos.hardness import Report
+    from pharos.state_space import StateSpace
+    from pharos.validation import Prediction
 
 MARKERS = "os^Dv<>P*X"
 
@@ -108,3 +118,81 @@ def _range(name: str, report: "Report", measure: str) -> tuple[float, float]:
             f"{name}: {measure} is {report[measure].text or 'undefined'}; expected a positive, finite value"
         )
     return float(low), float(high)
+
+
+# Growth ---------------------------------------------------------------------------------------------------------------
+
+
+def states_by_depth(space: "StateSpace") -> np.ndarray:
+    """(depth + 1,) numbers of states whose shortest way from a start state has 0, 1, ... steps; they sum to S.
+
+    Cost: one read of the successors in blocks; 8 bytes a state of memory.
+    """
+    reached = np.zeros(space.num_states, np.bool_)
+    frontier = np.unique(space.start_states)
+    reached[frontier] = True
+    counts = []
+    while frontier.size:
+        counts.append(frontier.size)
+        following = space.dynamics.successors_of(frontier)
+        frontier = following[~reached[following]]
+        reached[frontier] = True
+    return np.array(counts, np.int64)
+
+
+@styled
+def growth(spaces: Mapping[str, "StateSpace"], *, axes: Any = None) -> "Figure":
+    """Draw how many states are within so many steps from the start, a line for each space, on logarithmic axes.
+
+    Args:
+        spaces: label -> state space.
+        axes: where to draw; None for a new figure.
+    Raises:
+        ParameterError: no space is given.
+    """
+    if not spaces:
+        raise ParameterError("no state spaces to draw; give at least one")
+    drawn, axis = single(axes, (5.6, 3.6))
+    for number, (label, space) in enumerate(spaces.items()):
+        within, color = states_by_depth(space).cumsum(), COLORS[number % len(COLORS)]
+        distance = np.arange(1, len(within) + 1)
+        axis.plot(distance, within, color=color, label=f"{label}: {many(space.num_states, 'state')}")
+        axis.plot(distance[-1:], within[-1:], "o", color=color, markersize=5)
+    axis.set(xscale="log", yscale="log", xlabel="steps from the start + 1", ylabel="states")
+    for side in (axis.xaxis, axis.yaxis):
+        plain_log(side)
+    axis.legend()
+    return drawn
+
+
+# Predictions ----------------------------------------------------------------------------------------------------------
+
+
+@styled
+def predictions(prediction: "Prediction", *, axes: Any = None) -> "Figure":
+    """Draw a bar for each observation and network, from 0 (optimal) towards 1 (uniform play), with its interval.
+
+    Args:
+        axes: where to draw; None for a new figure.
+    """
+    cells = prediction.cells
+    drawn, axis = single(axes, (6.4, 1.1 + 0.42 * len(cells)))
+    rows = range(len(cells))
+    same_network = len({cell.network for cell in cells}) == 1
+    axis.barh(rows, [cell.value for cell in cells], color=COLORS[0], height=0.55)
+    ends = [[cell.value - cell.low for cell in cells], [cell.high - cell.value for cell in cells]]
+    axis.errorbar([cell.value for cell in cells], rows, xerr=ends, fmt="none", ecolor=INK, capsize=3, linewidth=1.2)
+    axis.axvline(1.0, color=INK, linewidth=1, linestyle=(0, (4, 3)))
+    right = max(1.15, *(cell.high + 0.05 for cell in cells))
+    axis.set(
+        yticks=list(rows),
+        yticklabels=[cell.observation if same_network else cell.label for cell in cells],
+        xlim=(0, right),
+        xlabel=f"predicted regret of {prediction.agent.upper()} after {prediction.steps:,} steps"
+        "  (0: optimal, 1: uniform play)",
+        title=f"{prediction.environment}, {prediction.chance}",
+    )
+    axis.grid(axis="y", visible=False)
+    axis.grid(axis="x", color=GRID)
+    axis.invert_yaxis()
+    return drawn

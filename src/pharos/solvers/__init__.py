@@ -1,9 +1,15 @@
 """Solving: optimal values and values of given policies, each with an error bound that is proven and met."""
 
-from pharos.solvers.policy_values import evaluate_apart, evaluate_policy, uniform_policy
 from pharos.solvers.regret import ReferenceValues, cumulative_expected_regret, regret, regret_scale
 from pharos.solvers.solution import Solution
-from pharos.solvers.values import uniform_value, value_iteration, worst_value
+from pharos.solvers.values import (
+    evaluate_apart,
+    evaluate_policy,
+    uniform_policy,
+    uniform_value,
+    value_iteration,
+    worst_value,
+)
 
 __all__ = [
     "Solution",

@@ -121,8 +121,8 @@ def bicgstab(
 
 def fills_little(matrix: "csr_matrix") -> bool:
     """Whether elimination in the order of the rows, with pivots on the diagonal, keeps within the limits above."""
-    from pharos.kernels import elimination
+    from pharos.kernels import krylov
 
     both = (abs(matrix) + abs(matrix).T).tocsr()
-    entries = elimination.entries_of_factor(both.indptr, both.indices, MOST_ENTRIES).astype(float)
+    entries = krylov.entries_of_factor(both.indptr, both.indices, MOST_ENTRIES).astype(float)
     return bool(entries.sum() <= MOST_ENTRIES and entries @ entries <= MOST_MULTIPLICATIONS)

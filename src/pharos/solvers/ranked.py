@@ -17,19 +17,27 @@ on that Breakout in 2, 4 and 16 ranks the states that read no halo before the ot
 that others read before the rest 240, 231 and 284, and a halo that is one sweep older 49, 96 and 208.
 
 All ranks run the same loop and see the same numbers, so they need nobody who tells them when to stop.
+
+Solving that several processes share: who takes part, and the Solution that comes of it.
 """
 
+import os
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 
 from pharos.errors import ParameterError
 from pharos.mdp import Part, Selection, TabularMDP, runs_between, runs_of, shares_of
-from pharos.ranks import Halo, Rank, check_ranks, cuts_of
-from pharos.solvers.checkpoint import Checkpoint
+from pharos.ranks import Halo, Rank, check_processes, check_ranks, cuts_of, run_spmd
+from pharos.solvers.checkpoint import SECONDS, Checkpoint
 from pharos.solvers.convergence import Convergence
 from pharos.solvers.fixed_point import Backup, bound_of_steps, largest_of
+from pharos.solvers.solution import Solution
+from pharos.system.compiling import Stopwatch
 from pharos.system.workers import usable_workers
 
 _ROWS = 1 << 20  # of values that a rank sends to the first in one exchange
@@ -213,3 +221,64 @@ def ranked_induction(
         if is_due:
             checkpoint.keep(backup, step, (bound, largest))
     return bound_of_steps(backup.mdp, horizon, bound, largest), before
+
+
+# Distributed ----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class DistributedOptions:
+    """Who sweeps, and how.
+
+    Attributes:
+        processes: 1; or "mpi": those that `mpiexec` has started, all of which make the call.
+        checkpoint: a folder for the values so far; None to keep none.
+        checkpoint_seconds: between two of them.
+    """
+
+    processes: int | str = 1
+    checkpoint: str | os.PathLike | None = None
+    checkpoint_seconds: float = SECONDS
+
+    def __post_init__(self) -> None:
+        check_processes(self.processes)
+
+    @property
+    def is_wanted(self) -> bool:
+        """Whether this is anything else than one process as ever."""
+        return self.processes != 1 or self.checkpoint is not None
+
+
+def shared_solution(
+    mdp: TabularMDP,
+    select: Selection,
+    tolerance: float,
+    horizon: int | None,
+    sharing: DistributedOptions,
+    progress: Callable[[int, float], None] | None = None,
+) -> Solution:
+    """The values of what is chosen, by several processes. Under MPI the first gets them, and the others None."""
+    watch = Stopwatch()
+    folder = None if sharing.checkpoint is None else Path(sharing.checkpoint)
+    if folder is not None and folder.exists() and not folder.is_dir():
+        raise ParameterError(f"checkpoint {folder}: is a file; expected a folder")
+
+    def program(rank: Rank) -> tuple[float, int, np.ndarray, np.ndarray] | None:
+        what = f"{mdp.gamma!r} {mdp.chance} horizon {horizon}"
+        checkpoint = Checkpoint(folder, what, sharing.checkpoint_seconds)
+        backup = RankedBackup(mdp, select, rank)
+        if horizon is None:
+            bound, sweeps = ranked_fixed_point(backup, tolerance, checkpoint, progress)
+            following = x = backup.gathered(backup.x)
+        else:
+            sweeps = horizon
+            bound, before = ranked_induction(backup, horizon, checkpoint, progress)
+            x, following = backup.gathered(backup.x), backup.gathered(before)
+        checkpoint.finish(backup)
+        return None if x is None or following is None else (bound, sweeps, x, following)
+
+    answer = run_spmd(sharing.processes, program)
+    if answer is None:
+        return cast(Any, None)
+    bound, sweeps, x, following = answer
+    return Solution(mdp, bound, sweeps, watch.seconds, horizon, select, x, following)

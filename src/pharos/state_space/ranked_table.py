@@ -1,7 +1,7 @@
 """The table of states that several processes share: what each rank does in a search by ranks.
 
 A *superstep* expands a block of states, in four exchanges. Each rank has an even part of the block's rows, and owns the
-states whose hash falls to it (kernels/key_owner.py).
+states whose hash falls to it (kernels/hash_table.py).
 
 1. Each rank expands its rows, and asks the owners of the successors for their numbers, saying at which place of the
    block each stands: row x branches + branch, the order in which one process would meet them.
@@ -30,7 +30,7 @@ import numpy as np
 
 from pharos.environments import Environment
 from pharos.errors import StateSpaceError
-from pharos.kernels import key_owner
+from pharos.kernels import hash_table
 from pharos.ranks import Rank, mpi_rank
 from pharos.rules import rules_of
 from pharos.state_space.journal import Journal, Position
@@ -79,7 +79,7 @@ class Owner:
             self._grow()
         entries = np.empty(len(candidates), np.int64)
         arrays = self.table.slots, self.table.states, self.numbers
-        self.count = key_owner.claim(*arrays, self.count, candidates, places, entries)
+        self.count = hash_table.claim(*arrays, self.count, candidates, places, entries)
         return entries
 
     def _grow(self) -> None:
@@ -215,7 +215,7 @@ class RankedTable:
     def _routed(self, keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(candidates to be asked for, sorted by owner; how many of each owner)."""
         counts = np.empty(self.rank.size, np.int64)
-        key_owner.route(keys, self._indices[: len(keys)], self.rank.size, self._order, counts)
+        hash_table.route(keys, self._indices[: len(keys)], self.rank.size, self._order, counts)
         return self._order[: counts.sum()], counts
 
     def _parts(self, array: np.ndarray, counts: np.ndarray) -> list[np.ndarray]:

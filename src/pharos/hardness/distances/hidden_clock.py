@@ -18,8 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pharos.hardness.distances.layers import WIDE, Layers
-from pharos.hardness.distances.transition_graph import Graph
+from pharos.hardness.distances.transition_graph import WIDE, Graph, Layers
 from pharos.kernels import clocks
 
 # Untyped, as starred arguments of compiled functions are not checked.

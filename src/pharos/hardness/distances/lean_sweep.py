@@ -1,7 +1,7 @@
 """The diameter of a graph whose searches do not fit in memory: two bytes a node and bound, and the table read in order.
 
 The algorithm is that of sum_sweep.py, without what needs room for more. Distances come from sweeps over the table
-(kernels/distance_sweeps.py) in place of searches with a queue and a reversed graph, which takes 8 bytes an edge. Arrays
+(kernels/graph.py) in place of searches with a queue and a reversed graph, which takes 8 bytes an edge. Arrays
 that memory has no room for are mapped files; bounds may be in files that outlive the process, of which
 the search in progress is all that is lost.
 
@@ -24,7 +24,7 @@ from pharos.errors import FileFormatError, ParameterError
 from pharos.hardness.distances.sum_sweep import SumSweep
 from pharos.hardness.distances.transition_graph import Graph
 from pharos.hardness.interval import BudgetClock, Interval
-from pharos.kernels import distance_sweeps
+from pharos.kernels import graph
 from pharos.system import storage
 from pharos.system.kept_arrays import kept_array
 from pharos.system.large_arrays import large_zeros, ranges_from_the_end
@@ -99,7 +99,7 @@ def digest_of(graph: Graph) -> str:
 
 
 # Untyped, as starred arguments of compiled functions are not checked.
-kernels: Any = distance_sweeps
+kernels: Any = graph
 Result = TypeVar("Result")
 
 

@@ -16,7 +16,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from pharos.hardness.gaps.gap_blocks import GapBlock
-from pharos.kernels import ties
+from pharos.kernels import gaps
 from pharos.mdp import TabularMDP
 
 # Different values up to which the map is kept; beyond, it would take more than 200 MB, and nothing is proven.
@@ -69,17 +69,17 @@ class TieProof:
         own, rewards, following = (np.ascontiguousarray(each).view(np.int64) for each in (own, rewards, following))
         begin = 0
         while self.holds and begin < len(gap):
-            begin, self._filled = ties.extend(own, rewards, following, gap, counted, begin, self._map, self._filled)
+            begin, self._filled = gaps.extend(own, rewards, following, gap, counted, begin, self._map, self._filled)
             if begin < 0 or self._filled > MOST:
                 self.holds = False
             elif begin < len(gap):
                 larger = _empty_map(4 * len(self._map), own.shape[1])
-                ties.refill(self._map, larger)
+                gaps.refill(self._map, larger)
                 self._map = larger
 
 
 def _empty_map(size: int, width: int) -> np.ndarray:
-    return np.full((size, 3 if width == 1 else 5), ties.FREE, np.int64)
+    return np.full((size, 3 if width == 1 else 5), gaps.FREE, np.int64)
 
 
 def same_outcomes(

@@ -13,7 +13,7 @@ import numpy as np
 
 from pharos.errors import ParameterError, PrecisionError, UndefinedMeasure
 from pharos.hardness.gaps.gaps import optimal_solution, solved
-from pharos.hardness.planning.look_ahead import LookAhead
+from pharos.hardness.planning.effective_horizon import LookAhead
 from pharos.hardness.planning.steps import expected_rewards, single_outcomes
 from pharos.mdp import ExpandedMDP, TabularMDP, require_mdp
 from pharos.solvers import Solution, uniform_value, value_iteration, worst_value

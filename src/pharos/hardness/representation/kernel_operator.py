@@ -102,13 +102,13 @@ class Exact(KernelOperator):
         self.matrix = np.ascontiguousarray(kernel(states, states), np.float32)
 
     def __call__(self, z: np.ndarray) -> np.ndarray:
-        from pharos.kernels import symmetric
+        from pharos.kernels import landmarks
 
         if z.shape[1] > FEW:
             return self.matrix @ z
         rows = np.ascontiguousarray(z.T, np.float64)
         out = np.empty_like(rows)
-        symmetric.product(self.matrix, rows, out)
+        landmarks.product(self.matrix, rows, out)
         return out.T
 
     def parts(self, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

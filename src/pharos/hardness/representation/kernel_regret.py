@@ -22,7 +22,7 @@ from pharos.hardness.representation.mean_field import (
     Schedule,
 )
 from pharos.hardness.representation.representation import LANDMARKS, MOST_EXACT, Grouped, Representation
-from pharos.hardness.visitation.standard_occupancy import drawn, standard_occupancy
+from pharos.hardness.visitation.occupancy import drawn, standard_occupancy
 from pharos.mdp import TabularMDP, require_mdp
 from pharos.solvers import Solution
 

@@ -9,7 +9,7 @@ import numpy as np
 from pharos.errors import UndefinedMeasure
 from pharos.hardness.representation.mean_field import Schedule
 from pharos.hardness.representation.representation import Grouped, Representation
-from pharos.hardness.visitation.standard_occupancy import StandardOccupancy, standard_occupancy
+from pharos.hardness.visitation.occupancy import StandardOccupancy, standard_occupancy
 from pharos.mdp import TabularMDP, require_mdp
 
 MOST_EIGENVALUES = 2000  # observations whose kernel is decomposed; of more, as many are drawn

@@ -16,7 +16,7 @@ from pharos.errors import ParameterError
 from pharos.hardness.representation.kernel_operator import Exact, Identity, KernelOperator, Landmarks
 from pharos.hardness.representation.mean_field import MARGIN, WORST_GREEDY, Learner, Schedule, greedy_policy
 from pharos.hardness.representation.representation import LANDMARKS, Grouped, Representation
-from pharos.hardness.visitation.standard_occupancy import drawn, standard_occupancy
+from pharos.hardness.visitation.occupancy import drawn, standard_occupancy
 from pharos.mdp import TabularMDP, paid_outcomes, require_mdp
 from pharos.solvers import Solution
 

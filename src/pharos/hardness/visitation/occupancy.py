@@ -1,4 +1,7 @@
-"""Occupancy measures: how often a policy is where, and what it does there. Source: Puterman (1994), section 6.9."""
+"""Occupancy measures: how often a policy is where, and what it does there. Source: Puterman (1994), section 6.9.
+
+Where measures of representations look: half the visits of uniform play, half those of optimal play.
+"""
 
 import math
 from collections.abc import Iterator
@@ -10,6 +13,7 @@ import numpy as np
 from pharos.errors import ParameterError, UndefinedMeasure
 from pharos.kernels import occupancy as kernels
 from pharos.mdp import Chance, PolicyStep, PolicyTable, TabularMDP, chosen_mass, require_mdp
+from pharos.solvers import value_iteration
 
 _MEMORY = 8 << 30  # bytes that all steps together may take
 _LEAST = 1e-280  # mass that is not worth a step: smaller numbers lose their digits, and take a hundred times longer
@@ -294,3 +298,40 @@ class Nodes:
 
     mass: np.ndarray
     first: bool
+
+
+# Standard occupancy ---------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class StandardOccupancy:
+    """Optimal values of the learner's discount, and where one is.
+
+    Attributes:
+        states: (S,) weights that sum to 1; 0 for terminal states.
+        q: (S, A) optimal values without a horizon; under sticky actions of executing an action.
+    """
+
+    states: np.ndarray
+    q: np.ndarray
+
+
+def standard_occupancy(mdp: TabularMDP, gamma: float, episode: int) -> StandardOccupancy:
+    """The mean of the undiscounted occupancies of uniform play and of optimal play over episodes of some steps.
+
+    Args:
+        gamma: the learner's discount, of the values that optimal play follows; its ties are chosen alike.
+    """
+    solution = value_iteration(mdp.with_gamma(gamma).with_horizon(None))
+    best = solution.optimal_actions(max(1e-8, 4 * solution.error_bound))
+    plain, total = mdp.with_gamma(1.0), np.zeros(mdp.num_states)
+    for policy in (None, best / best.sum(axis=1, keepdims=True)):
+        visits = occupancy(plain, policy, horizon=episode).states
+        total += visits / (2 * visits.sum())
+    return StandardOccupancy(total, solution.q)
+
+
+def drawn(weights: np.ndarray, count: int, seed: int = 0) -> np.ndarray:
+    """(count,) different places, drawn by nine parts of weights (N,) and one of uniform chance, in random order."""
+    share = 0.9 * weights / weights.sum() + 0.1 / len(weights)
+    return np.random.default_rng(seed).choice(len(weights), count, replace=False, p=share / share.sum())
