@@ -24,9 +24,8 @@ from typing import Any
 
 import numpy as np
 import yaml
-from typer.testing import CliRunner
 
-from pharos.cli import app
+from command_line import run
 from pharos.errors import PharosError
 
 SECONDS = 5
@@ -304,7 +303,7 @@ def limited() -> Iterator[None]:
 def command(*words: Any) -> dict[str, Any]:
     """What a command of pharos answers with --json; Refused where it fails as commands may."""
     with contextlib.redirect_stderr(io.StringIO()):
-        done = CliRunner().invoke(app, [*map(str, words), "--json"])
+        done = run(*words, "--json")
     if done.exit_code == 0:
         return json.loads(done.stdout)
     if not isinstance(done.exception, SystemExit):

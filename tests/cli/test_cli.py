@@ -11,10 +11,10 @@ import sys
 
 import pytest
 from rich.console import Console
-from typer.testing import CliRunner
 
+import command_line
 from pharos import build, hardness
-from pharos.cli import answers, app
+from pharos.cli import answers
 from pharos.cli.options import parse_parameters, parse_size, parse_value
 from pharos.cli.play import Game
 from pharos.environments import classes, make, named_instances
@@ -48,24 +48,13 @@ def cache(tmp_path_factory):
 def pharos(cache, monkeypatch):
     """Run the command line in this process."""
     monkeypatch.setenv("PHAROS_CACHE_DIR", str(cache))
-
-    def run(*words):
-        return CliRunner().invoke(app, [str(word) for word in words])
-
-    return run
+    return command_line.run
 
 
 @pytest.fixture
 def answer(pharos):
-    """Run a command with --json and return the object it prints, which is all it prints."""
-
-    def run(*words):
-        result = pharos(*words, "--json")
-        assert (result.exit_code, result.stderr) == (0, ""), result.output
-        assert result.stdout.count("\n") == 1
-        return json.loads(result.stdout)
-
-    return run
+    """Run a command with --json and return the object it prints."""
+    return command_line.answer
 
 
 @pytest.fixture
@@ -80,13 +69,6 @@ def failure(pharos):
         return result.exit_code, result.stderr
 
     return run
-
-
-def process(*words, cache=None, **options):
-    """Run the command line as a process of its own."""
-    environment = {**os.environ, **({"PHAROS_CACHE_DIR": str(cache)} if cache else {})}
-    command = [sys.executable, "-c", "from pharos.cli import main; main()", *map(str, words)]
-    return subprocess.run(command, capture_output=True, text=True, env=environment, timeout=300, **options)
 
 
 # Parameters ----------------------------------------------------------------------------------------------------------
@@ -231,7 +213,7 @@ def test_the_shell_completes_verbs_and_options(monkeypatch, words, expected):
     monkeypatch.setenv("_PHAROS_COMPLETE", "complete_bash")
     monkeypatch.setenv("COMP_WORDS", words)
     monkeypatch.setenv("COMP_CWORD", str(len(words.split()) - 1))
-    assert process().stdout.split() == [expected]
+    assert command_line.process().stdout.split() == [expected]
 
 
 def test_a_progress_bar_says_what_happens_before_anything_is_counted(monkeypatch):
@@ -292,27 +274,25 @@ def test_a_users_own_class_is_a_target(answer, tmp_path, monkeypatch):
 
 def test_the_cache_is_listed_and_cleared(tmp_path, monkeypatch):
     monkeypatch.setenv("PHAROS_CACHE_DIR", str(tmp_path))
-    run = CliRunner()
-    assert json.loads(run.invoke(app, ["cache", "list", "--json"]).stdout)["spaces"] == []
+    assert command_line.answer("cache", "list")["spaces"] == []
     for words in (["simple_grid"], ["simple_grid", "height=5"]):
-        assert run.invoke(app, ["build", *words]).exit_code == 0
+        assert command_line.run("build", *words).exit_code == 0
     (tmp_path / "compiled").mkdir(exist_ok=True)
     (tmp_path / "compiled" / "rules.py").write_text("pass")
-    listed = json.loads(run.invoke(app, ["cache", "list", "--json"]).stdout)
+    listed = command_line.answer("cache", "list")
     assert sorted(space["num_states"] for space in listed["spaces"]) == [16, 20]
     assert listed["total_bytes"] == sum(file.stat().st_size for file in tmp_path.rglob("*") if file.is_file())
-    cleared = json.loads(run.invoke(app, ["cache", "clear", "simple_grid", "--json"]).stdout)
-    assert len(cleared["removed"]) == 2
+    assert len(command_line.answer("cache", "clear", "simple_grid")["removed"]) == 2
     assert list((tmp_path / "spaces").iterdir()) == []
     assert (tmp_path / "compiled").is_dir()
-    assert run.invoke(app, ["cache", "clear"]).exit_code == 0
+    assert command_line.run("cache", "clear").exit_code == 0
     assert not (tmp_path / "compiled").exists()
 
 
 def test_only_state_spaces_are_cleared(tmp_path, monkeypatch):
     monkeypatch.setenv("PHAROS_CACHE_DIR", str(tmp_path))
-    run, spaces, elsewhere = CliRunner(), tmp_path / "spaces", tmp_path / "elsewhere"
-    assert run.invoke(app, ["build", "simple_grid"]).exit_code == 0
+    spaces, elsewhere = tmp_path / "spaces", tmp_path / "elsewhere"
+    assert command_line.run("build", "simple_grid").exit_code == 0
     (own,) = spaces.iterdir()
     (spaces / "photos").mkdir()
     (spaces / "photos" / "a.jpg").touch()
@@ -320,20 +300,18 @@ def test_only_state_spaces_are_cleared(tmp_path, monkeypatch):
     shutil.copytree(own, elsewhere)
     (spaces / f"linked-{'0' * 16}").symlink_to(elsewhere)
     before = set(spaces.iterdir())
-    cleared = run.invoke(app, ["cache", "clear", "--json"])
-    assert json.loads(cleared.stdout)["removed"] == [str(own)]
+    assert command_line.answer("cache", "clear")["removed"] == [str(own)]
     assert set(spaces.iterdir()) == before - {own} and (elsewhere / "manifest.json").exists()
 
 
 def test_compiled_rules_in_the_folder_of_ones_own_are_listed_and_cleared(tmp_path, monkeypatch):
     monkeypatch.setenv("PHAROS_CACHE_DIR", str(tmp_path))
-    run = CliRunner()
     mine, anothers = tmp_path / f"compiled-{os.getuid()}", tmp_path / f"compiled-{os.getuid() + 1}"
     for folder in (mine, anothers):
         folder.mkdir()
         (folder / "kernel").write_bytes(bytes(1000))
-    assert json.loads(run.invoke(app, ["cache", "list", "--json"]).stdout)["compiled_bytes"] == 1000
-    assert json.loads(run.invoke(app, ["cache", "clear", "--json"]).stdout)["bytes_freed"] == 1000
+    assert command_line.answer("cache", "list")["compiled_bytes"] == 1000
+    assert command_line.answer("cache", "clear")["bytes_freed"] == 1000
     assert not mine.exists() and anothers.exists()
 
 
@@ -512,7 +490,9 @@ def test_a_full_or_forbidden_disk_is_one_line(failure, monkeypatch):
 
 @pytest.mark.slow
 def test_a_pipe_gets_one_json_object_and_silence_beside_it(cache, tmp_path):
-    done = process("build", "simple_grid", "--out", tmp_path / "grid", "--json", cache=cache)
+    done = command_line.process(
+        "build", "simple_grid", "--out", tmp_path / "grid", "--json", environment={"PHAROS_CACHE_DIR": cache}
+    )
     assert (done.returncode, done.stderr) == (0, "")
     assert set(json.loads(done.stdout)) >= BUILD_KEYS
 
@@ -520,7 +500,7 @@ def test_a_pipe_gets_one_json_object_and_silence_beside_it(cache, tmp_path):
 @pytest.mark.slow
 def test_exit_codes_reach_the_shell(cache):
     for words, code in ((["build", "brekout"], 2), ([], 0), (["--help"], 0), (["--version"], 0)):
-        done = process(*words, cache=cache)
+        done = command_line.process(*words, environment={"PHAROS_CACHE_DIR": cache})
         assert done.returncode == code
         assert "Traceback" not in done.stderr
 
@@ -532,9 +512,7 @@ def test_what_the_environment_lacks_or_forbids_is_a_line(cache):
         ("solve frozen_lake/4x4", "NUMBA_NUM_THREADS=0"),
     ):
         name, value = added.split("=")
-        environment = {**os.environ, "PHAROS_CACHE_DIR": str(cache), name: value}
-        line = [sys.executable, "-m", "pharos", *words.split()]
-        done = subprocess.run(line, env=environment, capture_output=True, text=True, timeout=120)
+        done = command_line.process(*words.split(), environment={"PHAROS_CACHE_DIR": cache, name: value})
         assert done.returncode == 2 and done.stderr.count("\n") == 1 and "NUMBA_" in done.stderr, done.stderr
     closed = f"{sys.executable} -m pharos list >&-"
     done = subprocess.run(closed, shell=True, stderr=subprocess.PIPE, text=True, timeout=120, check=False)

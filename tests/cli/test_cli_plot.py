@@ -5,15 +5,10 @@ import json
 import numpy as np
 import pytest
 from PIL import Image
-from typer.testing import CliRunner
 
 import pharos
-from pharos.cli import app
+from command_line import run
 from pharos.training import Task, load_agent, read_record, train
-
-
-def run(*words):
-    return CliRunner().invoke(app, list(map(str, words)))
 
 
 def answer(*words):

@@ -3,14 +3,13 @@
 import json
 
 import pytest
-from typer.testing import CliRunner
 
-from pharos.cli import app
+import command_line
 from pharos.training import read_record
 
 
 def run(*words):
-    return CliRunner().invoke(app, ["train", *map(str, words)])
+    return command_line.run("train", *words)
 
 
 @pytest.mark.slow

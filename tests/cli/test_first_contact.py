@@ -2,9 +2,7 @@
 
 import io
 import json
-import os
 import re
-import subprocess
 import sys
 import time
 from pathlib import Path
@@ -14,23 +12,16 @@ import numba
 import pytest
 
 import pharos
+from command_line import process
 from pharos.cli.options import complete_target
 from pharos.environments import list_environments
 from pharos.environments.built_in import BUILT_IN
 from pharos.system import compiling
 
 
-def pharos_command(*words, **environment):
-    """What a fresh process answers."""
-    return subprocess.run(
-        [sys.executable, "-m", "pharos", *words],
-        **{"env": {**os.environ, **environment}, "capture_output": True, "text": True, "timeout": 600},
-    )
-
-
 def completed(*words):
     line = {"COMP_WORDS": " ".join(("pharos", *words)), "COMP_CWORD": str(len(words))}
-    return pharos_command(**line, _PHAROS_COMPLETE="complete_bash").stdout.split()
+    return process(environment=line | {"_PHAROS_COMPLETE": "complete_bash"}).stdout.split()
 
 
 def test_seconds_of_compiling_are_not_seconds_of_work():
@@ -84,11 +75,11 @@ def test_a_terminal_is_told_once_that_pharos_compiles(is_terminal, monkeypatch):
 @pytest.mark.long
 def test_what_warm_has_compiled_no_later_process_compiles(tmp_path):
     cache = {"PHAROS_CACHE_DIR": str(tmp_path / "cache")}
-    warmed = json.loads(pharos_command("warm", "simple_grid/4x4-plain", "--json", **cache).stdout)
+    warmed = json.loads(process("warm", "simple_grid/4x4-plain", "--json", environment=cache).stdout)
     assert warmed["compiling_seconds"] > 0 and len(warmed["environments"]) == 1
     for verb in ("build", "solve", "hardness"):
         words = ("simple_grid", "height=5", "width=4", "goal=[4,3]")  # another instance of the class
-        answer = json.loads(pharos_command(verb, *words, "--json", **cache).stdout)
+        answer = json.loads(process(verb, *words, "--json", environment=cache).stdout)
         assert answer["compiling_seconds"] == 0, verb
 
 
@@ -96,7 +87,7 @@ def test_what_warm_has_compiled_no_later_process_compiles(tmp_path):
 def test_the_first_listing_of_the_readme_is_what_is_printed(tmp_path):
     text = (Path(__file__).parents[2] / "README.md").read_text()
     command, shown = re.search(r"^```\n\$ pharos (.*)\n((?:.*\n)*?)```$", text, re.MULTILINE).groups()
-    printed = pharos_command(*command.split(), PHAROS_CACHE_DIR=str(tmp_path)).stdout + "\n"
+    printed = process(*command.split(), environment={"PHAROS_CACHE_DIR": tmp_path}).stdout + "\n"
     printed = re.sub(r"^compiling: .*\n", "", printed, flags=re.MULTILINE)  # the first time
 
     def lines(listing):

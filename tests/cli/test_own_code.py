@@ -8,11 +8,10 @@ import sys
 
 import gymnasium
 import pytest
-from typer.testing import CliRunner
 
 import pharos
+from command_line import process, run
 from pharos import study
-from pharos.cli import app
 from pharos.environments import catalog
 from pharos.errors import AllRunsFailed, FileFormatError, ParameterError, UntrustedCode
 from pharos.observations import observation
@@ -71,7 +70,7 @@ def lab(tmp_path_factory):
     (folder / "code" / "corners_file.py").write_text(CORNER.replace("register(", "# register("))
     (folder / "learner_module.py").write_text(LEARNER)
     (folder / "own.yaml").write_text(STUDY)
-    done = command("study", "run", "../own.yaml", "--out", "results", "--workers", 2, cwd=folder / "elsewhere")
+    done = process("study", "run", "../own.yaml", "--out", "results", "--workers", 2, cwd=folder / "elsewhere")
     assert (done.returncode, done.stdout) == (0, "own: 3 of 3 runs finished\n"), done.stderr
     return folder
 
@@ -92,17 +91,6 @@ def forget(monkeypatch):
     monkeypatch.setattr(sources, "_LOADED", {})
     monkeypatch.setattr(sources, "_MODULES", {})
     monkeypatch.setattr(observation, "_registered", {})
-
-
-def command(*words, cwd):
-    """Run pharos in a process of its own."""
-    line = [sys.executable, "-m", "pharos", *map(str, words)]
-    return subprocess.run(line, cwd=cwd, capture_output=True, text=True, timeout=300, env=dict(os.environ))
-
-
-def here(*words):
-    """Run pharos in this process."""
-    return CliRunner().invoke(app, [str(word) for word in words])
 
 
 def runs_of(lab):
@@ -127,7 +115,7 @@ def test_a_study_keeps_where_its_code_comes_from(lab):
 
 @pytest.mark.slow
 def test_a_shard_of_one_worker_finds_nothing_missing(lab):
-    done = command(
+    done = process(
         "study", "run", "own.yaml", "--out", lab / "elsewhere" / "results", "--shard", "1/2", "--workers", 1, cwd=lab
     )
     assert (done.returncode, done.stdout) == (0, "own: 2 of 2 runs finished\n"), done.stderr
@@ -139,7 +127,7 @@ def test_what_was_learnt_on_ones_own_environment_is_evaluated(lab, observation):
     record = runs_of(lab)[observation]
     run = lab / "elsewhere" / "results" / "runs" / record["id"]
     target = ["code/taxi_of_mine.py:Taxi"] if observation == "index" else ["taxi_module:Taxi", "height=3", "--trust"]
-    done = command("evaluate", *target, "--policy", run, "--horizon", record["config"]["horizon"], "--json", cwd=lab)
+    done = process("evaluate", *target, "--policy", run, "--horizon", record["config"]["horizon"], "--json", cwd=lab)
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)["value_at_start"] == pytest.approx(record["result"]["final_value"], abs=1e-6)
 
@@ -147,9 +135,9 @@ def test_what_was_learnt_on_ones_own_environment_is_evaluated(lab, observation):
 @pytest.mark.long
 def test_what_was_learnt_is_drawn_where_it_is_trusted(lab):
     run = lab / "elsewhere" / "results" / "runs" / runs_of(lab)["corner"]["id"]
-    refused = command("plot", "policies", run, "--out", "a.gif", cwd=lab)
+    refused = process("plot", "policies", run, "--out", "a.gif", cwd=lab)
     assert refused.returncode == 2 and "add --trust" in refused.stderr and not (lab / "a.gif").exists()
-    done = command("plot", "policies", run, "--out", "a.gif", "--steps", 3, "--trust", cwd=lab)
+    done = process("plot", "policies", run, "--out", "a.gif", "--steps", 3, "--trust", cwd=lab)
     assert done.returncode == 0 and (lab / "a.gif").stat().st_size > 0, done.stderr
 
 
@@ -319,7 +307,7 @@ COMMANDS = [
 @pytest.mark.slow
 @pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
 def test_received_files_execute_nothing(received, sent, words):
-    done = here(*(received if word == "RUN" else word for word in words))
+    done = run(*(received if word == "RUN" else word for word in words))
     assert done.exit_code == 2, done.output
     assert "executed only if you trust it: add --trust" in done.stderr
     assert done.stderr.count("\n") == 1
@@ -333,7 +321,7 @@ def test_a_folder_executes_nothing_though_it_has_no_runs(received, sent, verb, s
         folder.mkdir(parents=True)
         (folder / "study.yaml").write_text((sent / "sent.yaml").read_text())
         (folder / "canary.py").write_text(CANARY + TAXI)
-    done = here("study", verb, source, *(("--to", "again.parquet") if verb == "pack" else ()))
+    done = run("study", verb, source, *(("--to", "again.parquet") if verb == "pack" else ()))
     assert done.exit_code == 2, done.output
     assert "executed only if you trust it: add --trust" in done.stderr
     assert not list(sent.rglob("*.executed"))
@@ -345,14 +333,14 @@ def test_a_folder_executes_nothing_though_it_has_no_runs(received, sent, verb, s
     "words", [("study", "status", "got"), ("plot", "policies", "RUN", "--steps", "2", "--out", "policies.gif")]
 )
 def test_what_is_trusted_is_executed(received, sent, words):
-    done = here(*(received if word == "RUN" else word for word in words), "--trust")
+    done = run(*(received if word == "RUN" else word for word in words), "--trust")
     assert done.exit_code == 0, done.output
     assert executed(sent) == ["canary.executed"]
 
 
 @pytest.mark.slow
 def test_regret_is_drawn_without_any_code(received, sent):
-    assert here("plot", "regret", received, "--out", "regret.png").exit_code == 0
+    assert run("plot", "regret", received, "--out", "regret.png").exit_code == 0
     assert executed(sent) == []
 
 
@@ -386,13 +374,13 @@ def test_a_damaged_source_is_no_source(received, entry):
 
 @pytest.mark.filterwarnings("ignore:.*has changed since")
 def test_the_target_that_a_command_names_is_trusted(received, sent):
-    done = here("evaluate", "canary.py:Taxi", "--policy", received, "--horizon", 5, "--json")
+    done = run("evaluate", "canary.py:Taxi", "--policy", received, "--horizon", 5, "--json")
     assert done.exit_code == 0, done.output
     assert executed(sent) == ["canary.executed"]
 
 
 def test_a_study_is_unpacked_into_ones_own_without_trust(received, sent):
-    done = here("study", "unpack", "got.parquet", "--into", "sent.yaml", "--out", "new", "--json")
+    done = run("study", "unpack", "got.parquet", "--into", "sent.yaml", "--out", "new", "--json")
     assert done.exit_code == 0, done.output
     assert json.loads(done.stdout)["added"] == 1
 
@@ -451,7 +439,7 @@ def test_a_packed_study_says_nothing_of_the_machine_and_is_unpacked_beside_its_c
     import pyarrow.parquet as pq
 
     words = ("own.yaml", "--out", "elsewhere/results", "--to", tmp_path / "own.parquet")
-    assert command("study", "pack", *words, cwd=lab).returncode == 0
+    assert process("study", "pack", *words, cwd=lab).returncode == 0
     table = pq.read_table(tmp_path / "own.parquet")
     told = str(table.schema.metadata) + str(table["record"].to_pylist())
     assert str(lab) not in told and str(lab.parent) not in told
@@ -459,9 +447,9 @@ def test_a_packed_study_says_nothing_of_the_machine_and_is_unpacked_beside_its_c
     assert files == {"code/taxi_of_mine.py", "taxi_module.py"}
     for name in ("code", "taxi_module.py", "corners.py", "learner_module.py"):
         (shutil.copytree if (lab / name).is_dir() else shutil.copy)(lab / name, tmp_path / name)
-    done = command("study", "unpack", "own.parquet", "--out", "got", "--trust", "--json", cwd=tmp_path)
+    done = process("study", "unpack", "own.parquet", "--out", "got", "--trust", "--json", cwd=tmp_path)
     assert (done.returncode, json.loads(done.stdout)["added"]) == (0, 3), done.stderr
-    done = command("study", "status", "got", "--trust", "--json", cwd=tmp_path)
+    done = process("study", "status", "got", "--trust", "--json", cwd=tmp_path)
     assert json.loads(done.stdout)["finished"] == 3, done.stderr
 
 

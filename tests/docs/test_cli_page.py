@@ -7,9 +7,8 @@ import sys
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
-from pharos.cli import app
+from command_line import run
 
 ROOT = Path(__file__).parents[2]
 LINES = (
@@ -64,7 +63,7 @@ def test_answers_have_the_keys_of_the_page(page, tmp_path, monkeypatch):
     keys, _ = page.keys()
     names = sorted(keys, key=len, reverse=True)
     for line in LINES:
-        done = CliRunner().invoke(app, [*shlex.split(line), "--json"])
+        done = run(*shlex.split(line), "--json")
         assert done.exit_code == 0, (line, done.output)
         declared = keys[next(name for name in names if line == name or line.startswith(f"{name} "))]
         answer = set(json.loads(done.stdout))

@@ -6,11 +6,10 @@ from collections import Counter
 import gymnasium
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 import pharos
+from command_line import run
 from pharos import drawing, importers, study, training
-from pharos.cli import app
 from pharos.errors import FileFormatError, ParameterError
 from pharos.mdp import TabularMDP
 
@@ -24,10 +23,6 @@ P = np.array(
     ]
 )
 R = np.array([[1.0, 0.25], [0.5, -1.0], [0.0, 0.0], [9.0, 9.0]])
-
-
-def run(*words):
-    return CliRunner().invoke(app, [str(word) for word in words])
 
 
 def in_every_form():

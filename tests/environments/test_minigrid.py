@@ -11,11 +11,10 @@ import minigrid  # noqa: F401  (registers its environments)
 import numpy as np
 import pytest
 from minigrid.wrappers import FullyObsWrapper
-from typer.testing import CliRunner
 
 import pharos
+from command_line import run
 from pharos import hardness, importers
-from pharos.cli import app
 from pharos.errors import MissingExtra, ParameterError, RuleError, StateSpaceTooLarge
 from pharos.mdp.bisimulation import minimize
 
@@ -148,6 +147,6 @@ def test_without_the_package_the_extra_is_named(monkeypatch):
 @pytest.mark.slow
 def test_the_command_line_keeps_an_environment_in_a_folder(tmp_path):
     words = ["import", "minigrid", CORRIDOR, "--out", str(tmp_path / "kept"), "--json"]
-    answer = json.loads(CliRunner().invoke(app, words).stdout)
+    answer = json.loads(run(*words).stdout)
     assert (answer["num_states"], answer["horizon"]) == (156, 100)
     assert isomorphic(importers.load(tmp_path / "kept"), importers.minigrid(CORRIDOR))

@@ -9,11 +9,10 @@ from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 import pharos
+from command_line import run
 from naive import mdp as naive_mdp
-from pharos.cli import app
 from pharos.errors import ParameterError, UnknownName
 from pharos.explorer import Exploration, Explorer, Learnt, exploration_of, page, write
 from pharos.explorer.exploration import Pictures
@@ -356,12 +355,8 @@ def test_a_state_is_found_by_its_number_and_by_its_values(lake):
 # The command ----------------------------------------------------------------------------------------------------------
 
 
-def command(*words):
-    return CliRunner().invoke(app, ["explore", *map(str, words)])
-
-
 def test_the_command_writes_a_page(tmp_path):
-    done = command("frozen_lake/4x4", "--out", tmp_path / "lake.html")
+    done = run("explore", "frozen_lake/4x4", "--out", tmp_path / "lake.html")
     assert (done.exit_code, done.stdout) == (0, f"{tmp_path / 'lake.html'}\n")
 
 
@@ -377,5 +372,5 @@ def test_faults_of_the_command_are_one_line_each(tmp_path):
             (["frozen_lake/4x4", "--port", port], 2, f"port {port} of 127.0.0.1: Address already in use"),
             (["frozen_lake/4x4", "--policy", "best"], 2, "unknown policy 'best'"),
         ):
-            done = command(*words)
+            done = run("explore", *words)
             assert done.exit_code == code and fault in done.stderr and done.stderr.count("\n") == 1, done.output

@@ -6,10 +6,9 @@ import json
 import numpy as np
 import pytest
 from gymnasium import spaces
-from typer.testing import CliRunner
 
 import pharos
-from pharos.cli import app
+from command_line import run
 from pharos.errors import ParameterError
 from pharos.observations import aliasing, memoryless_loss, observation_classes, observe
 
@@ -38,7 +37,7 @@ def test_states_that_share_an_image_are_counted(breakout):
 
 
 def answer(folder, *words):
-    result = CliRunner().invoke(app, ["observations", str(folder), *map(str, words), "--json"])
+    result = run("observations", str(folder), *map(str, words), "--json")
     assert (result.exit_code, result.stderr) == (0, ""), result.output
     return json.loads(result.stdout)
 
@@ -69,7 +68,7 @@ def test_an_observation_of_ones_own_is_counted_too(breakout):
     register("ball_row", lambda env, states: states[:, 0], spaces.Discrete(7))
     (rows,) = answer(breakout.folder, "--observation", "ball_row")["observations"]
     assert (rows["num_observations"], rows["share"], rows["shape"]) == (7, 1.0, [])
-    result = CliRunner().invoke(app, ["observations", str(breakout.folder), "--option", "scale=2"])
+    result = run("observations", str(breakout.folder), "--option", "scale=2")
     assert result.exit_code == 2
     assert "--option goes with --observation" in result.stderr
 

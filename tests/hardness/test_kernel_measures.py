@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from typer.testing import CliRunner
 
 import pharos
+from command_line import run
 from pharos import hardness
-from pharos.cli import app
 from pharos.errors import ParameterError, UndefinedMeasure
 from pharos.hardness import Representation, Schedule, kernel_regret
 from pharos.mdp import TabularMDP, lazy_actions
@@ -484,12 +483,12 @@ def test_a_report_has_them_where_there_is_a_representation_and_keeps_them(grid):
 @pytest.mark.slow
 def test_the_command_line_has_them(grid):
     target = ["hardness", "simple_grid", "height=3", "width=4", "--measures", ",".join(MEASURES)]
-    done = CliRunner().invoke(app, [*target, "--observation", "simple_image", "--network", "cnn16", "--json"])
+    done = run(*target, "--observation", "simple_image", "--network", "cnn16", "--json")
     answer = json.loads(done.stdout)
     assert 0 < answer["measures"]["kernel_regret"]["value"] < 1
     assert answer["conventions"]["representation"]["network"] == "cnn16"
     assert answer["measures"]["aliasing_floor"] == 0
-    done = CliRunner().invoke(app, [*target, "--observation", "vector", "--network", "mlp128", "--landmarks", "4"])
+    done = run(*target, "--observation", "vector", "--network", "mlp128", "--landmarks", "4")
     assert "no bound" in " ".join(done.stdout.split())
     for words, line in (
         (["--network", "mlp128"], "--network goes with --observation NAME"),
@@ -500,7 +499,7 @@ def test_the_command_line_has_them(grid):
         (["--observation", "vector", "--network", "cnn16"], "has convolutions"),
         (["--observation", "vectors"], "did you mean 'vector'?"),
     ):
-        done = CliRunner().invoke(app, [*target, *words])
+        done = run(*target, *words)
         assert done.exit_code == 2
         assert line in done.stderr
         assert len(done.stderr.strip().splitlines()) == 1
@@ -546,7 +545,7 @@ def test_a_network_of_ones_own_has_its_empirical_kernel(grid, tmp_path):
     file.write_text(OWN)
     target = ["hardness", "simple_grid", "height=3", "width=4", "--measures", "kernel_regret,kernel_learning_time"]
     words = [*target, "--observation", "one_hot", "--network", f"{file}:small", "--fresh", "--json"]
-    done = CliRunner().invoke(app, words)
+    done = run(*words)
     answer = json.loads(done.stdout)
     assert 0 < answer["measures"]["kernel_regret"]["value"] < 1.5
     said = answer["conventions"]["representation"]
@@ -556,7 +555,7 @@ def test_a_network_of_ones_own_has_its_empirical_kernel(grid, tmp_path):
     assert (whole == whole.T).all()
     np.testing.assert_allclose(seen.kernel(states[:5], states[3:]), whole[:5, 3:], rtol=1e-4)
     for name, line in OWN_ERRORS.items():
-        done = CliRunner().invoke(app, [*words[:-3], f"{file}:{name}"])
+        done = run(*words[:-3], f"{file}:{name}")
         assert done.exit_code == 2
         assert line in done.stderr
         assert len(done.stderr.strip().splitlines()) == 1

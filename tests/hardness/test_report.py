@@ -5,11 +5,10 @@ import json
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
+import command_line
 import pharos
 from pharos import hardness
-from pharos.cli.app import app
 from pharos.errors import ParameterError, UndefinedMeasure, UnknownName
 from pharos.hardness import registry as _registry
 from pharos.mdp import TabularMDP
@@ -150,7 +149,7 @@ def test_a_horizon_must_be_a_number_of_steps():
 
 
 def run(*words):
-    return CliRunner().invoke(app, ["hardness", *words], env={"COLUMNS": "160"})
+    return command_line.run("hardness", *words, env={"COLUMNS": "160"})
 
 
 def test_the_command_answers_with_the_keys_of_its_contract():

@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 import xxhash
 from hypothesis import given, settings
-from typer.testing import CliRunner
 
 import pharos
+from command_line import run
 from pharos import exporters, hardness, importers
-from pharos.cli import app
 from pharos.errors import FileFormatError, ParameterError
 from pharos.mdp import TabularMDP, random_actions, sticky_actions
 from strategies import small_mdps
@@ -193,10 +192,6 @@ def test_folders_that_were_changed_are_refused(tmp_path):
     (tmp_path / "other" / "thesis.tex").write_text("years of work")
     with pytest.raises(ParameterError, match="holds no imported MDP"):
         importers.save(mdp, tmp_path / "other")
-
-
-def run(*words):
-    return CliRunner().invoke(app, [str(word) for word in words])
 
 
 @pytest.mark.slow

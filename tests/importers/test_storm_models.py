@@ -6,11 +6,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 import pharos
+from command_line import run
 from pharos import exporters, importers
-from pharos.cli import app
 from pharos.errors import FileFormatError, MissingExtra, ParameterError, UnknownName
 
 try:
@@ -20,10 +19,6 @@ except ImportError:
 
 storm = importlib.import_module("pharos.importers.storm")
 needs_storm = pytest.mark.skipif(models is None, reason="stormpy is not installed")
-
-
-def run(*words):
-    return CliRunner().invoke(app, [str(word) for word in words])
 
 
 @pytest.mark.skipif(models is not None, reason="stormpy is installed")

@@ -7,11 +7,10 @@ import struct
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
+import command_line
 import pharos
 from pharos import leaderboard
-from pharos.cli import app
 from pharos.errors import FileFormatError, ParameterError, ResultCorrupted, UntrustedCode
 from pharos.leaderboard import verification
 from pharos.leaderboard.entry import write
@@ -62,10 +61,6 @@ def file(entry, tmp_path):
     """The file of the entry, one for each test."""
     write(entry, tmp_path / "grid.safetensors")
     return tmp_path / "grid.safetensors"
-
-
-def pharos_(*words):
-    return CliRunner().invoke(app, [str(word) for word in words])
 
 
 def changed(entry, file, **changes):
@@ -220,26 +215,26 @@ def test_an_estimate_says_that_it_is_one_and_holds_within_its_interval(entry, fi
     verdict = leaderboard.verify(changed(entry, file, claim=claim), max_reached=1)
     assert verdict.holds and not verdict.exact and verdict.episodes == 2000
     assert abs(verdict.value - exact.value) <= verdict.error_bound
-    assert "estimated from 2,000 episodes" in pharos_("verify", file, "--max-reached", 1).stdout
+    assert "estimated from 2,000 episodes" in command_line.run("verify", file, "--max-reached", 1).stdout
     overstated = leaderboard.verify(changed(entry, file, claim=entry.claim), max_reached=1)
     assert overstated.claims_too_much and not overstated.holds
 
 
 def test_the_command_line_packs_verifies_and_tells(run, entry, file, tmp_path):
     out = tmp_path / "mine.safetensors"
-    answer = json.loads(pharos_("submit", run, "--out", out, "--name", "mine", "--json").stdout)
+    answer = json.loads(command_line.run("submit", run, "--out", out, "--name", "mine", "--json").stdout)
     assert answer["id"] == entry.id and answer["bytes"] == out.stat().st_size
-    done = pharos_("verify", out)
+    done = command_line.run("verify", out)
     assert done.exit_code == 0 and "the claim holds" in done.stdout and "exact: evaluated in 9 states" in done.stdout
     changed(entry, file, claim=dataclasses.replace(entry.claim, value=2.0))
-    failed = pharos_("verify", file, "--json")
+    failed = command_line.run("verify", file, "--json")
     assert failed.exit_code == 1 and not json.loads(failed.stdout)["checks"]["value"]["holds"]
     out.write_bytes(out.read_bytes()[:-1])
-    both = pharos_("verify", out, file)
+    both = command_line.run("verify", out, file)
     assert both.exit_code == 1 and "FAILS" in both.stdout
-    cut = pharos_("verify", out)
+    cut = command_line.run("verify", out)
     assert cut.exit_code == 1 and len(cut.stderr.splitlines()) == 1 and "cut short" in cut.stderr
-    assert pharos_("verify", tmp_path / "none.safetensors").exit_code == 2
+    assert command_line.run("verify", tmp_path / "none.safetensors").exit_code == 2
 
 
 def test_the_page_ranks_what_was_computed_and_escapes_what_it_shows(entry, tmp_path):
@@ -319,7 +314,7 @@ def test_one_hostile_entry_costs_its_own_row(entry, tmp_path, monkeypatch):
     assert "expected at most 100,000" in said["horizon"] and "at least 1e-12" in said["chance"]
     assert said["bug"] == "KeyError: 'it is not there'" and said["slow"] == "takes more than 2 s"
     assert made.verified[0].limits["seconds"] == 2
-    several = pharos_("verify", folder / "bug.safetensors", folder / "good.safetensors")
+    several = command_line.run("verify", folder / "bug.safetensors", folder / "good.safetensors")
     assert several.exit_code == 1 and "the claim holds" in several.output and "KeyError" in several.output
 
 
@@ -340,7 +335,7 @@ def test_claims_that_cannot_be_true_do_not_hold(entry, file):
     verdict = leaderboard.verify(changed(entry, file, claim=wide))
     assert all(check.holds for check in verdict.checks) and not verdict.holds
     assert "is larger than the values of policies are apart" in verdict.objections[0]
-    said = pharos_("verify", file)
+    said = command_line.run("verify", file)
     assert said.exit_code == 1 and "is larger than" in said.output and "does not hold" in said.output
     best, slack = entry.claim.value_optimal, 1e-4
     above = dataclasses.replace(entry.claim, value=best + slack, regret=-slack, exact=False, error_bound=slack / 2)
@@ -359,7 +354,7 @@ def test_authors_whom_nobody_would_see_are_refused(entry, file, text):
 
 def test_names_are_shown_as_they_are(entry, file):
     changed(entry, file, name="evil:x: on")
-    assert "evil:x: on" in pharos_("verify", file).output
+    assert "evil:x: on" in command_line.run("verify", file).output
 
 
 @pytest.mark.slow

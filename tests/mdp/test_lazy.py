@@ -1,6 +1,5 @@
 """Lazy actions: implicit in solvers and measures, drawn in interaction, against chains that are written out."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -8,12 +7,11 @@ import pytest
 from gymnasium.vector import AutoresetMode
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from typer.testing import CliRunner
 
+import command_line
 import pharos
 from naive import mdp as naive_mdp
 from pharos import exporters, hardness, importers, study
-from pharos.cli import app
 from pharos.errors import ParameterError, UnknownName
 from pharos.interaction import GymEnv, make_vec
 from pharos.mdp import Lazy, TabularMDP, lazy_actions, minimize, random_actions, sticky_actions
@@ -303,14 +301,14 @@ def test_exported_tables_have_the_chance_of_staying_and_its_pay(grid, slippery):
 @pytest.mark.slow
 def test_the_command_line_and_studies_take_the_knobs():
     knobs = ["--lazy", "0.25", "--reward-noise", "0.5", "--reward-delay", "2"]
-    done = CliRunner().invoke(app, ["train", "frozen_lake/4x4", "--steps", "200", *knobs])
+    done = command_line.run("train", "frozen_lake/4x4", "--steps", "200", *knobs)
     assert "lazy actions 0.25, reward noise 0.5, rewards 2 steps late" in " ".join(done.stdout.split())
-    solved = json.loads(CliRunner().invoke(app, ["solve", "frozen_lake/4x4", "--lazy", "0.25", "--json"]).stdout)
+    solved = command_line.answer("solve", "frozen_lake/4x4", "--lazy", 0.25)
     task = lazy_actions(pharos.build("frozen_lake/4x4").mdp(gamma=0.99), 0.25)
     assert solved["lazy"] == 0.25
     assert abs(solved["value_at_start"] - value_iteration(task).value_at_start) <= 2e-6
     for verb in (["evaluate", "--policy", "uniform"], ["hardness", "--measures", "diameter"]):
-        shown = CliRunner().invoke(app, [verb[0], "frozen_lake/4x4", *verb[1:], "--lazy", "0.25"])
+        shown = command_line.run(verb[0], "frozen_lake/4x4", *verb[1:], "--lazy", "0.25")
         assert "lazy actions 0.25" in " ".join(shown.stdout.split())
     chances = ["plain", {"lazy": 0.1}, {"reward_delay": 3}, {"sticky": 0.25, "reward_noise": 0.5}]
     block = {"environments": ["frozen_lake/4x4"], "chance": chances, "agents": ["q_learning"], "seeds": 1}

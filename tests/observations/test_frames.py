@@ -6,12 +6,11 @@ import json
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
-from typer.testing import CliRunner
 
+import command_line
 import pharos
 from naive import mdp as naive_mdp
 from pharos import training
-from pharos.cli import app
 from pharos.errors import ParameterError
 from pharos.interaction import GymEnv, make_sb3_vec, make_vec
 from pharos.mdp import PolicyTable
@@ -293,7 +292,7 @@ def test_runs_are_measured_exactly(agent, observation, options, tmp_path, monkey
     assert 0 <= run.result["final_regret"] <= run.result["value_optimal"] - Task(BREAKOUT, horizon=20).reference.worst
     assert run.config["observation_options"] == options
     evaluate = ["evaluate", "breakout", *WORDS, "--policy", str(tmp_path / "run"), "--horizon", "20"]
-    told = CliRunner().invoke(app, [*evaluate, "--json"])
+    told = command_line.run(*evaluate, "--json")
     assert (told.exit_code, told.stderr) == (0, "")
     answer = json.loads(told.stdout)
     assert (answer["exact"], answer["episodes"]) == (True, 0)
@@ -301,7 +300,7 @@ def test_runs_are_measured_exactly(agent, observation, options, tmp_path, monkey
     assert answer["regret"] == pytest.approx(run.result["final_regret"], abs=2e-6)
     if "frames" in options:
         monkeypatch.setattr(training, "evaluate_agent", lambda *_: Evaluation(0.5, False, 0.25, 9, 2000))
-        told = CliRunner().invoke(app, evaluate)  # whose lines are as long as the name of the folder lets them be
+        told = command_line.run(*evaluate)  # whose lines are as long as the name of the folder lets them be
         assert "0.25 with a probability of 99 % (estimated from 2,000 episodes)" in " ".join(told.stdout.split())
     if "irrelevant" in options:
         with pytest.raises(ParameterError, match="batched engine"):

@@ -6,11 +6,10 @@ from types import SimpleNamespace
 import numpy as np
 import pandas as pd
 import pytest
-from typer.testing import CliRunner
 
+from command_line import run
 from pharos import hardness, study
 from pharos.agents import hyperparameters
-from pharos.cli import app
 from pharos.errors import FileFormatError, ParameterError, ResultCorrupted
 from pharos.study import POLICY_PREDICTORS, predictions, read_predictions, specification, validation, write_predictions
 from pharos.validation import learners
@@ -211,12 +210,12 @@ def test_the_command_line_predicts_and_reports(tmp_path):
     file = tmp_path / "tiny.yaml"
     file.write_text(yaml.safe_dump({**spec, "blocks": blocks}))
     predictions = tmp_path / "predictions.parquet"
-    done = CliRunner().invoke(app, ["study", "predict", str(file), "--out", str(predictions), "--json"])
+    done = run("study", "predict", str(file), "--out", str(predictions), "--json")
     assert json.loads(done.stdout)["cells"] == 3
     assert done.stderr.count("pharos: predicting ") == 3  # no terminal: a line each, as it takes minutes
     where = ["--out", str(tmp_path / "results")]
-    assert CliRunner().invoke(app, ["study", "run", str(file), *where]).exit_code == 0
-    done = CliRunner().invoke(app, ["study", "report", str(file), *where, "--predictions", str(predictions)])
+    assert run("study", "run", str(file), *where).exit_code == 0
+    done = run("study", "report", str(file), *where, "--predictions", str(predictions))
     assert done.exit_code == 0, done.output
     assert "sha256" in (tmp_path / "results" / "report" / "report.html").read_text()
     assert (tmp_path / "results" / "report" / "tables" / "predictions.csv").exists()
@@ -225,12 +224,12 @@ def test_the_command_line_predicts_and_reports(tmp_path):
     rest = tmp_path / "rest.yaml"
     rest.write_text(yaml.safe_dump({**spec, "blocks": blocks[1:]}))
     for part in (first, rest):
-        assert CliRunner().invoke(app, ["study", "predict", str(part), "--out", f"{part}.parquet"]).exit_code == 0
+        assert run("study", "predict", str(part), "--out", f"{part}.parquet").exit_code == 0
     both = [word for part in (first, rest) for word in ("--predictions", f"{part}.parquet")]
-    together = CliRunner().invoke(app, ["study", "report", str(file), *where, "--to", str(tmp_path / "both"), *both])
+    together = run("study", "report", str(file), *where, "--to", str(tmp_path / "both"), *both)
     assert together.exit_code == 0, together.output
     assert "3 of 3 runs had begun" in together.stderr
     name = "report/tables/predictions.csv"
     assert (tmp_path / "both" / "tables" / "predictions.csv").read_text() == (tmp_path / "results" / name).read_text()
-    twice = CliRunner().invoke(app, ["study", "report", str(file), *where, *both, "--predictions", f"{first}.parquet"])
+    twice = run("study", "report", str(file), *where, *both, "--predictions", f"{first}.parquet")
     assert twice.exit_code == 2 and "1 cell predicted twice" in twice.stderr

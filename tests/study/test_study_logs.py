@@ -4,11 +4,10 @@ import sys
 import types
 
 import pytest
-from typer.testing import CliRunner
 
+import command_line
 import fake_training
 from pharos import study
-from pharos.cli import app
 from pharos.errors import MissingExtra, UnknownName
 from pharos.study import worker
 
@@ -107,5 +106,5 @@ def test_mistakes_in_where_to_log_are_one_line(opened, monkeypatch):
     monkeypatch.setitem(sys.modules, "wandb", None)
     with pytest.raises(MissingExtra, match=r"pip install 'pharos-rl\[wandb\]'"):
         study.log(spec, folder, to="wandb")
-    done = CliRunner().invoke(app, ["study", "log", "quick", "--to", "tensorboard", "--offline"])
+    done = command_line.run("study", "log", "quick", "--to", "tensorboard", "--offline")
     assert done.exit_code == 2 and "expected them with --to wandb" in done.stderr

@@ -4,14 +4,13 @@ import base64
 import hashlib
 import json
 import re
-import subprocess
-import sys
 from html.parser import HTMLParser
 
 import pandas as pd
 import pytest
 
 import fake_training
+from command_line import process
 from pharos import study
 from pharos.study import worker as _worker
 from pharos.study.curves import same_steps
@@ -55,8 +54,7 @@ def written(tmp_path_factory):
 def again(written, tmp_path_factory):
     """(folder, what was printed) of a report of the same study by the command line, in a process of its own."""
     folder = tmp_path_factory.mktemp("again")
-    command = [sys.executable, "-m", "pharos", "study", "report", str(written[0]), "--to", str(folder), "--json"]
-    return folder, subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    return folder, process("study", "report", written[0], "--to", folder, "--json", check=True).stdout
 
 
 @pytest.fixture
@@ -206,8 +204,7 @@ def test_numbers_are_short():
 @pytest.mark.slow
 def test_the_command_prints_where_the_report_is(written, again):
     assert json.loads(again[1])["html"] == str(again[0] / "report.html")
-    command = [sys.executable, "-m", "pharos", "study", "status", str(written[0])]
-    status = subprocess.run(command, capture_output=True, text=True)
+    status = process("study", "status", written[0])
     assert status.stdout.splitlines()[0] == "lakes: 28 of 30 runs finished, 1 failed"
     assert "ValueError: <no>" in status.stderr
 

@@ -10,10 +10,9 @@ import optuna
 import pytest
 import yaml
 from optuna.storages.journal import JournalFileBackend
-from typer.testing import CliRunner
 
+from command_line import run
 from pharos.agents import hyperparameters
-from pharos.cli import app
 from pharos.errors import FileFormatError, ParameterError
 from pharos.training import SPACES, read_record, train, tune
 
@@ -116,10 +115,6 @@ def test_a_search_that_cannot_be_done_is_refused(change, message):
     options = {"agent": "q_learning", "environments": LAKE, "steps": 100, "trials": 1, **change}
     with pytest.raises(ParameterError, match=message):
         tune(options.pop("agent"), options.pop("environments"), **options)
-
-
-def run(*words):
-    return CliRunner().invoke(app, [*map(str, words)])
 
 
 @pytest.mark.slow
