@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import pharos
-from chance_worlds import ChanceWorld
 from naive import mdp as naive_mdp
 from pharos import training
 from pharos.training import Task, evaluate_agent
+from worlds import ChanceWorld
 
 CLIFF = {"height": 3, "width": 4, "slippery": True}
 

@@ -12,7 +12,7 @@ import pytest
 import xxhash
 
 import pharos
-from chance_worlds import ChanceWorld
+from worlds import ChanceWorld
 
 PAGE = (Path(__file__).parents[2] / "docs" / "format.md").read_text()
 CODE, CODE_WITH_CHANCE, CODE_OF_40_BITS = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pharos import Environment, Layer, make
+from pharos import Layer, make
 from pharos.cli.play import Game
 from pharos.drawing import (
     SHAPES,
@@ -23,6 +23,7 @@ from pharos.drawing import (
 )
 from pharos.errors import ParameterError, UnknownName
 from pharos.observations import RENDERERS, render
+from worlds import Row
 
 ENVIRONMENTS = ["simple_grid/6x6-decoy", "frozen_lake/8x8", "freeway/16x7-speed2", "breakout/12x8x3"]
 
@@ -87,21 +88,17 @@ def test_text_is_the_drawing_of_the_environment():
 
 
 @dataclass(frozen=True, kw_only=True)
-class Lamp(Environment):
+class Lamp(Row):
     """A switch: on, dim or off."""
 
-    name = "lamp"
+    length: int = 3
+
+    name, variable = "lamp", "light"
     actions = ("press",)
     layers = {
         "lamp": Layer((".", "*"), ((90, 80, 10), (250, 240, 90)), (("#.", ".#"), ("15", "9."))),
         "frame": Layer("+", (0, 0, 255)),
     }
-
-    def variables(self):
-        return {"light": range(3)}
-
-    def initial_state(self):
-        return (0,)
 
     def transition(self, state, action, out):
         out[0] = (state[0] + 1) % 3
@@ -236,18 +233,7 @@ def test_what_cannot_be_drawn_is_said():
     with pytest.raises(ParameterError, match="2 components; expected 1"):
         human(Lamp(), (0, 0))
     with pytest.raises(ParameterError, match=r"must define grid\(\)"):
-        human(Blind(), (0,))
-
-
-@dataclass(frozen=True, kw_only=True)
-class Blind(Environment):
-    """An environment that nobody has drawn."""
-
-    name = "blind"
-    actions = ("wait",)
-
-    def variables(self):
-        return {"x": range(1)}
+        human(Row(), (0,))
 
 
 def test_png_holds_the_picture_and_a_caption_below(tmp_path):

@@ -12,9 +12,9 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from scipy.stats import chisquare
 
 import pharos
-from chance_worlds import ChanceWorld
 from pharos.interaction import GymEnv, make_sb3_vec, make_vec
 from pharos.rules import InterpretedStepping
+from worlds import ChanceWorld
 
 pytestmark = pytest.mark.long  # with each class compiled
 

@@ -8,11 +8,10 @@ import pytest
 from hypothesis import given, settings
 
 import pharos
-from chance_worlds import ChanceWorld, chance_worlds
 from naive import builder as naive_builder
-from pharos.environments import Environment
 from pharos.errors import RuleError, StateSpaceError, StateSpaceTooLarge
 from pharos.plots import states_by_depth
+from worlds import ChanceWorld, Row, chance_worlds
 
 search = importlib.import_module("pharos.state_space.search")
 table = importlib.import_module("pharos.state_space.table")
@@ -149,21 +148,16 @@ def test_many_environments_draw_outcomes_compiled_as_interpreted():
 
 
 @dataclass(frozen=True, kw_only=True)
-class Dice(Environment):
+class Dice(Row):
     """Add what a die of three sides shows, until 30. Broken from position 12 on, where `broken` says so."""
 
+    length: int = 33
     broken: int = 0
 
-    name = "dice"
+    name, variable = "dice", "total"
     actions = ("roll", "pass")
     outcomes = 3
     SUM, NEGATIVE, NONE, RANGE, AGE = range(1, 6)
-
-    def variables(self):
-        return {"total": range(33)}
-
-    def initial_state(self):
-        return (0,)
 
     def probability(self, state, action, outcome):
         wrong = self.broken if state[0] >= 12 else 0
@@ -255,16 +249,11 @@ def test_the_mdp_of_a_class_with_an_age_is_solved_in_one_pass(tmp_path):
 
 def test_an_age_without_chance_is_checked_too(tmp_path):
     @dataclass(frozen=True, kw_only=True)
-    class FiniteHorizonValues(Environment):
+    class Steps(Row):
+        length: int = 100
         back: bool = False
-        name = "steps"
+        name = variable = "steps"
         actions = ("on", "on_too")
-
-        def variables(self):
-            return {"step": range(100)}
-
-        def initial_state(self):
-            return (0,)
 
         def transition(self, state, action, out):
             out[0] = 3 if self.back and state[0] == 50 and action == 1 else state[0] + 1 + action
@@ -278,10 +267,10 @@ def test_an_age_without_chance_is_checked_too(tmp_path):
         def age(self, state):
             return state[0]
 
-    space = build(FiniteHorizonValues(), tmp_path / "space")
+    space = build(Steps(), tmp_path / "space")
     assert space.manifest["format_version"] == 1 and (space.ages == space.states()[:, 0]).all()
     with pytest.raises(RuleError, match=r"action 'on_too' leads from state \(50,\) of age 50 to state \(3,\) of age 3"):
-        build(FiniteHorizonValues(back=True), tmp_path / "back")
+        build(Steps(back=True), tmp_path / "back")
 
 
 @pytest.mark.long

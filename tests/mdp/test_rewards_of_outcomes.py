@@ -7,33 +7,28 @@ import numpy as np
 import pytest
 
 import pharos
-from pharos.environments import Environment
 from pharos.errors import ParameterError, RuleError
 from pharos.mdp import rewards_of_outcomes, rewards_of_staying
+from worlds import Row
 
 rules = importlib.import_module("pharos.rules.rules")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Toll(Environment):
+class Toll(Row):
     """A road of four places: on by outcomes 1 and 3, of which the latter meets a toll; outcome 2 stays, 0 is
     impossible."""
 
+    length: int = 4
     chancy: bool = True
 
-    name = "toll"
+    name, variable = "toll", "place"
     actions = ("walk", "run")
     layers = {}
 
     @property
     def outcomes(self):
         return 4 if self.chancy else 1
-
-    def variables(self):
-        return {"place": range(4)}
-
-    def initial_state(self):
-        return (0,)
 
     def probability(self, state, action, outcome):
         if not self.chancy:

@@ -12,10 +12,10 @@ from test_hostile_spaces import edited, refused, sealed
 from test_resuming import FullDisk, _build_and_die_at, _InterruptAtLine, build, files_of, in_a_child
 
 import pharos
-from chance_worlds import ChanceWorld
 from pharos.errors import DiskFull, PharosError, StateSpaceCorrupted, StateSpaceMismatch, StateSpaceTooLarge
 from pharos.state_space import read_manifest
 from pharos.system.packed_indices import PACKED, PackedIndices, unpacked
+from worlds import ChanceWorld
 
 search = importlib.import_module("pharos.state_space.search")
 table = importlib.import_module("pharos.state_space.table")

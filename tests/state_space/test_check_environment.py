@@ -10,26 +10,21 @@ import pytest
 import pharos
 from pharos.environments import Environment, Layer
 from pharos.errors import ParameterError, RuleError
+from worlds import Row
 
 COUNTER = itertools.count()
 RED, BLUE = (200, 60, 60), (60, 60, 200)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Corridor(Environment):
+class Corridor(Row):
     """Walk right to the end of a corridor. A good class, which the tests below break in one place each."""
 
     length: int = 5
 
     name = "corridor"
-    actions = ("left", "right")
+    variable = "position"
     layers = {"end": Layer("E", RED), "agent": Layer(("A", "a"), (BLUE, RED))}
-
-    def variables(self):
-        return {"position": range(self.length)}
-
-    def initial_state(self):
-        return (0,)
 
     def transition(self, state, action, out):
         if action == 1:

@@ -19,7 +19,6 @@ from test_ranks import build_by_threads
 from test_resuming import _build_and_die_at, build, files_of, in_a_child
 
 import pharos
-from chance_worlds import ChanceWorld
 from pharos import hardness
 from pharos.errors import StateSpaceCorrupted, StateSpaceMismatch, StateSpaceTooLarge
 from pharos.hardness.distances import lean_sweep
@@ -33,6 +32,7 @@ from pharos.system import large_arrays, packed_indices
 from pharos.system.packed_indices import INT40, PACKED, PackedIndices, blocks_of, holds_end
 from rank_threads import threads
 from strategies import deterministic_mdps, outcome_mdps
+from worlds import ChanceWorld
 
 EDGES = (0, 1, -1, 2**31 - 1, 2**31, 2**32 - 1, 2**32, 2**39 - 1, -(2**31), -(2**39))
 numbers = st.one_of(st.sampled_from(EDGES), st.integers(-(2**39), 2**39 - 1))

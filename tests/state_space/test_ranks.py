@@ -17,7 +17,6 @@ from hypothesis import strategies as st
 from test_resuming import build, files_of
 
 import pharos
-from chance_worlds import ChanceWorld
 from pharos.errors import MissingExtra, ParameterError, RuleError, StateSpaceError, StateSpaceTooLarge
 from pharos.kernels import hash_table
 from pharos.ranks import Halo, RankFailed, cuts_of, mpi, run_spmd
@@ -27,6 +26,7 @@ from pharos.state_space.plan import Plan
 from pharos.state_space.progress import reporter
 from pharos.state_space.search import Options, journal_of
 from rank_threads import Killed, fails_at, loop
+from worlds import ChanceWorld
 
 WORLDS = {
     "lake": pharos.make("frozen_lake/8x8"),

@@ -18,12 +18,11 @@ import numpy as np
 import pytest
 
 import pharos
-from pharos.environments import Environment
 from pharos.errors import DiskFull, RuleError, StateSpaceIncomplete, StateSpaceLocked, StateSpaceTooLarge
 from pharos.state_space import files as writing
 from pharos.system import storage
 from pharos.system.packed_indices import PackedIndices
-from table_worlds import TableWorld
+from worlds import Row, TableWorld
 
 building = importlib.import_module("pharos.state_space.build")
 search = importlib.import_module("pharos.state_space.search")
@@ -435,15 +434,12 @@ def test_a_rule_that_fails_in_another_process_is_blamed(tmp_path, interpreted):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Fanning(Environment):
+class Fanning(Row):
     """Doubles its level's width at each step; the last state of a wide level leaves its range."""
 
+    length: int = 2**13
     fails: bool = True
     name = "fanning"
-    actions = ("left", "right")
-
-    def variables(self):
-        return {"place": range(2**13)}
 
     def initial_states(self):
         return [((1,), 1.0)]
@@ -454,9 +450,6 @@ class Fanning(Environment):
 
     def is_terminal(self, state):
         return state[0] == 0
-
-    def reward(self, state, action, next_state):
-        return 0.0
 
 
 # More than 2^31 states -----------------------------------------------------------------------------------------------

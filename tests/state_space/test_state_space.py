@@ -22,7 +22,7 @@ from pharos.errors import (
     StateSpaceMismatch,
     StateSpaceTooLarge,
 )
-from table_worlds import TableWorld, table_worlds
+from worlds import Row, TableWorld, table_worlds
 
 building = importlib.import_module("pharos.state_space.build")
 search = importlib.import_module("pharos.state_space.search")
@@ -307,23 +307,10 @@ def test_a_folder_of_other_parameters_is_refused(folder):
     assert pharos.load(folder).environment == GRID
 
 
-@dataclass(frozen=True, kw_only=True)
-class Walk(Environment):
+class Walk(Row):
     """A walk along `length` cells; a base for environments that break the contract."""
 
-    length: int = 1000
-
     name = "walk"
-    actions = ("left", "right")
-
-    def variables(self):
-        return {"cell": range(self.length)}
-
-    def initial_state(self):
-        return (0,)
-
-    def transition(self, state, action, out):
-        out[0] = min(max(state[0] + 2 * action - 1, 0), self.length - 1)
 
     def reward(self, state, action, next_state):
         return float(next_state[0])

@@ -4,11 +4,10 @@ import json
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 import pharos
+from command_line import run
 from pharos import hardness, importers
-from pharos.cli import app
 from pharos.errors import ParameterError, UndefinedMeasure
 from pharos.observations import representation
 from pharos.validation import PRIMARY, Published, prediction, published
@@ -181,10 +180,6 @@ def test_a_world_where_nothing_can_be_learnt_has_no_prediction(tmp_path, monkeyp
     mdp = pharos.TabularMDP.from_arrays([[1, 1], [0, 0]], [[1.0, 1.0], [0.0, 0.0]], gamma=0.9, horizon=20)
     with pytest.raises(UndefinedMeasure, match="uniform"):
         pharos.predict(importers.environment(mdp), "one_hot", **OPTIONS)
-
-
-def run(*words):
-    return CliRunner().invoke(app, [*words])
 
 
 @pytest.mark.slow
