@@ -45,6 +45,8 @@ def test_what_a_run_has_learnt_has_the_value_that_the_run_wrote_down(folders, na
     own = answer("evaluate", "frozen_lake/4x4", "--policy", folders[name])
     assert {**own, "seconds": 0, "setting": ""} == {**found, "seconds": 0, "setting": ""}
     assert own["setting"] == "the run's own" and found["setting"] == "the run's own, but for horizon, random"
+    said = run("evaluate", "frozen_lake/4x4", "--policy", folders[name]).stdout
+    assert (", for the probabilities that its network computes in 32 bits" in " ".join(said.split())) == ("ppo" in name)
     assert own["policy_dtype"] == (None if name == "q_learning-0" else "float32")
     other = answer("evaluate", "frozen_lake/4x4", "--policy", folders[name], "--gamma", 0.5, "--random", 0)
     assert (other["gamma"], other["random"], other["horizon"]) == (0.5, 0.0, 100)

@@ -186,6 +186,21 @@ def test_commands_run_in_an_installation_that_is_mounted_to_be_read(tmp_path):
         assert done.returncode == 0 and "Traceback" not in done.stderr, (words, done.stderr)
 
 
+def test_pages_say_how_to_install_what_is_not_released_yet():
+    """The index has the package from the first release on, which the changelog then names."""
+    if not re.search(r"^## \[?\d", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE):
+        for page in ("README.md", "docs/start.md"):
+            assert "Before the first release: `pip install .` in a clone" in (ROOT / page).read_text(), page
+
+
+def test_files_that_docstrings_name_are_there():
+    there = {path.name for path in ROOT.rglob("*.py")} | {"file.py", "my_file.py"}
+    for path in (ROOT / "src").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
+                assert {*re.findall(r"\b(\w+\.py)\b", ast.get_docstring(node) or "")} <= there, path
+
+
 @pytest.mark.parametrize("folder", ["benchmarks", "scripts"])
 def test_scripts_import_what_is_there(folder):
     absent = []

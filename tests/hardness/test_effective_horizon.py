@@ -208,6 +208,12 @@ def test_states_that_no_episode_meets_do_not_matter(mdp, chance, steps):
         assert part == whole
 
 
+def test_the_limit_of_memory_is_what_is_free_in_the_container(monkeypatch):
+    monkeypatch.setattr("pharos.system.memory.available_memory", lambda: 100)
+    with pytest.raises(UndefinedMeasure, match=r"more than 0\.0, 60% of the free memory"):
+        LargeHorizon(TabularMDP.from_arrays([[0, 0]], [[0.0, 1.0]]), 4, TIE)
+
+
 @pytest.mark.slow
 def test_a_freeway_is_analysed_for_the_states_that_an_episode_meets():
     mdp = pharos.build(pharos.make("freeway", num_cars=8, lane_length=7)).mdp(gamma=1.0)

@@ -39,8 +39,9 @@ class Evaluation:
     Attributes:
         value: expected return of an episode, in the setting of the task.
         exact: whether the value is computed, not estimated.
-        error_bound: proven bound on the error of an exact value; for an estimate, half the width of an interval that
-            holds the value with a probability of at least 99 % (empirical Bernstein bound).
+        error_bound: proven bound on the error of an exact value, which is that of the probabilities that the policy
+            answers: a network rounds its own to 32 bits, which moves values by more. For an estimate, half the width of
+            an interval that holds the value with a probability of at least 99 % (empirical Bernstein bound).
         states: number of states (or pairs of state and previous action) in which the policy was asked.
         episodes: simulated episodes behind an estimate; 0 where the value is exact.
     """

@@ -1,6 +1,6 @@
 """A packed state that rules read and write as if it were an array of integers.
 
-A state of D small integers is stored in a few 64-bit words (state_space/_packing.py says where each component sits).
+A state of D small integers is stored in a few 64-bit words (rules/layout.py says where each component sits).
 Unpacking 29 components, running a rule and packing them again costs three times the rule itself. So compiled rules get
 a view instead: `state[i]` is a shift and a mask of a word on the stack, which LLVM keeps in a register when there is
 one word.

@@ -1,7 +1,7 @@
 """Layouts of MiniGrid: for each kind, the grid that the package minigrid draws for a seed, drawn again without it.
 
 Numbers are drawn in the order in which minigrid 3.2.0 asks for them, so a seed means the same layout here and there,
-which tests/environments/test_mini_grid.py compares. Cells are (column, row) here; mini_grid_canvas.py says how they are
+which tests/environments/test_mini_grid.py compares. Cells are (column, row) here; canvas.py says how they are
 written.
 
 Source: Chevalier-Boisvert et al. (2023), "Minigrid & Miniworld", and the behaviour of the package.

@@ -93,7 +93,7 @@ class MiniGrid(Environment):
         rooms: how many, in multi_room; None stands for 6.
         crossings: obstacles to cross, in lava_crossing and simple_crossing; None stands for 1.
         strip: the row of the second strip of lava, in dist_shift; None stands for 2.
-        level: a layout of one's own, in place of the above: two characters a cell (see mini_grid_canvas.py), rows
+        level: a layout of one's own, in place of the above: two characters a cell (see canvas.py), rows
             separated by "/" or line ends, with walls around.
         target: of a level: what to pick up, such as "BR" for the red box, or which door to open, such as "LY"; None:
             only goals.

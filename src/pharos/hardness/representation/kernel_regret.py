@@ -122,7 +122,8 @@ def kernel_regret(
     Returns:
         A KernelRegret. Actions whose values are within 1e-6 of the state's largest one are chosen alike. Values are in
         the MDP's setting (gamma, horizon). What agents see is the state, not the previous action: under sticky actions
-        a target is the mean over previous actions, weighted by visits.
+        a target is the mean over previous actions, weighted by visits. Rewards are expected ones: their noise is drawn
+        by `sampled_regret` alone.
     Raises:
         UndefinedMeasure: there is neither a horizon nor a time limit; or uniform play is optimal.
         ParameterError: the representation is of other states, or its kernel does not fit into memory.
