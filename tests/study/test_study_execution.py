@@ -1,6 +1,7 @@
 """Executing a study: what is missing runs, failures stay alone, and kill -9 at any moment loses and repeats nothing."""
 
 import json
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -444,3 +445,18 @@ def test_an_interrupted_study_leaves_no_warning_of_semaphores(tmp_path, log, sen
     _, errors = process.communicate(timeout=30)
     assert process.returncode == (130 if sent == signal.SIGINT else 143)
     assert "resource_tracker" not in errors and "Traceback" not in errors, errors
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
+def test_a_worker_on_a_full_disk_says_a_line(tmp_path, capfd):
+    """Not even its log takes the reason."""
+    run = specification().runs[0]
+    partial = tmp_path / "partial" / run.id
+    partial.mkdir(parents=True)
+    (partial / "log.txt").symlink_to("/dev/full")
+    arguments = (lambda *_: 1 / 0, run.config, run.id, tmp_path, False, True, dict(os.environ))
+    process = multiprocessing.get_context("fork").Process(target=_worker.main, args=arguments)
+    process.start()
+    process.join()
+    assert process.exitcode == 1
+    assert capfd.readouterr().err == f"pharos: run {run.id}: No space left on device\n"

@@ -195,7 +195,11 @@ def main(
 ) -> None:
     """The body of a worker process; see `begin` for `environment`."""
     begin(environment)
-    if attempt(runner, config, id, folder, again=again, resume=resume) == BUSY:
+    try:
+        status = attempt(runner, config, id, folder, again=again, resume=resume)
+    except OSError as error:  # a full disk, on which not even the log can say so
+        sys.exit(f"pharos: run {id}: {error.strerror or error}")
+    if status == BUSY:
         sys.exit(EXIT_BUSY)
 
 
