@@ -11,10 +11,11 @@ import sys
 
 import pytest
 from rich.console import Console
+from typer.testing import CliRunner
 
 import command_line
-from pharos import build, hardness
-from pharos.cli import answers
+from pharos import TabularMDP, build, hardness, importers
+from pharos.cli import answers, app
 from pharos.cli.options import parse_parameters, parse_size, parse_value
 from pharos.cli.play import Game
 from pharos.environments import classes, make, named_instances
@@ -570,3 +571,17 @@ def test_hardness_tells_how_many_gaps_are_ties_and_at_which_tolerance(pharos):
     gaps = hardness.gaps(build(make("frozen_lake/4x4"), progress=False).mdp(gamma=0.99))
     proven = gaps.ties - gaps.unresolved
     assert f"{gaps.ties} ties at a tolerance of {gaps.tie_tolerance:.2g}, {proven} proven" in told
+
+
+def test_check_says_whether_there_is_anything_to_learn(tmp_path, monkeypatch):
+    monkeypatch.setenv("PHAROS_CACHE_DIR", str(tmp_path / "cache"))
+    said = CliRunner().invoke(app, ["check", "river_swim", "length=5"])
+    assert said.exit_code == 0
+    assert "keeps the contract in all 5 states" in said.stdout and "by uniform play" in said.stdout
+    importers.save(TabularMDP.from_arrays([[1, 1], [0, 0]], [[1.0, 1.0], [0.0, 0.0]], gamma=0.9,
+                                                        horizon=4), tmp_path / "flat")  # fmt: skip
+    answer = json.loads(CliRunner().invoke(app, ["check", str(tmp_path / "flat"), "--json"]).stdout)
+    assert answer["complete"] and answer["values"]["optimal"] == answer["values"]["uniform"]
+    assert any("no policy beats uniform play" in note for note in answer["notes"])
+    sample = json.loads(CliRunner().invoke(app, ["check", "river_swim", "--max-states", "3", "--json"]).stdout)
+    assert sample["values"] is None and not sample["complete"]

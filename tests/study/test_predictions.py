@@ -11,7 +11,9 @@ from command_line import run
 from pharos import hardness, study
 from pharos.agents import hyperparameters
 from pharos.errors import FileFormatError, ParameterError, ResultCorrupted
+from pharos.hardness import registry
 from pharos.study import POLICY_PREDICTORS, predictions, read_predictions, specification, validation, write_predictions
+from pharos.study.report.unseen_section import winners
 from pharos.validation import learners
 
 SPEC = {
@@ -233,3 +235,30 @@ def test_the_command_line_predicts_and_reports(tmp_path):
     assert (tmp_path / "both" / "tables" / "predictions.csv").read_text() == (tmp_path / "results" / name).read_text()
     twice = run("study", "report", str(file), *where, *both, "--predictions", f"{first}.parquet")
     assert twice.exit_code == 2 and "1 cell predicted twice" in twice.stderr
+
+
+@pytest.mark.slow
+def test_parts_of_a_study_are_predicted_alone_and_wrong_parts_named(tmp_path):
+    part = study.predict(SPEC, tmp_path, blocks=[1], agents=["dqn"], observations=["vector"])
+    assert part["agent"].tolist() == ["dqn", "dqn"]
+    with pytest.raises(ParameterError, match="block 2: study 'tiny' has blocks 1 to 1"):
+        study.predict(SPEC, tmp_path, blocks=[2])
+    with pytest.raises(ParameterError, match="unknown agent of study 'tiny' 'sarsa'"):
+        study.predict(SPEC, tmp_path, agents=["sarsa"])
+    with pytest.raises(ParameterError, match="unknown observation of study 'tiny' 'one_hot'"):
+        study.predict(SPEC, tmp_path, observations=["one_hot"])
+
+
+@pytest.mark.slow
+def test_a_measure_of_the_users_own_is_a_predictor_beside_ours(tmp_path, monkeypatch):
+    monkeypatch.setattr(registry, "_MEASURES", dict(registry._MEASURES))
+    hardness.register("rows", lambda problem: float(problem.mdp.num_states), definition="number of rows")
+    told = study.predict(SPEC, tmp_path, agents=["dqn"])
+    assert told["rows"].tolist() == told["num_states"].tolist()
+
+    frame, cells = made_up(0.1)
+    frame["rows"] = frame.pop("kernel_regret")  # the user's is the one that is right
+    judged = validation(frame, cells, permutations=19)
+    assert judged.set_index("predictor").loc["rows", "r_squared"] > 0.8
+    assert "on classes left out rows (R² " in winners(judged)[0]
+    assert "of the baselines" in winners(judged)[0]

@@ -9,7 +9,7 @@ import pytest
 import xxhash
 
 from pharos import study
-from pharos.errors import ParameterError, UnknownName
+from pharos.errors import ParameterError, UnknownName, UntrustedCode
 from pharos.study import Specification, presets, run_id, specification
 from pharos.study.specification import parse
 
@@ -253,6 +253,21 @@ def test_a_wrong_list_of_environments_is_a_line(tmp_path, text, message):
     with pytest.raises(ParameterError, match=message) as error:
         specification("hardness-sealed", environments=file)
     assert "\n" not in str(error.value)
+
+
+def test_classes_of_ones_own_in_a_list_need_trust_and_lie_beside_it(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "sealed").mkdir()
+    code = "from pharos.environments import SimpleGrid\nclass Yard(SimpleGrid):\n    name = 'yard'\n"
+    (tmp_path / "sealed" / "yard_of_a_list.py").write_text(code)
+    file = tmp_path / "sealed" / "list.yaml"
+    file.write_text("- {name: 'yard_of_a_list.py:Yard', parameters: {height: 3, width: 3}}\n")
+    with pytest.raises(UntrustedCode, match="add --trust"):
+        specification("hardness-sealed", environments=file)
+    found = specification("hardness-sealed", environments=file, trust=True)
+    assert {run.cell["environment"] for run in found.runs} == {"yard"}
+    again = specification(found.model_dump(mode="json", exclude_unset=True), trust=True)
+    assert [run.id for run in again.runs] == [run.id for run in found.runs]
 
 
 def test_environments_are_given_to_studies_that_ask_for_them_alone(tmp_path):

@@ -12,6 +12,7 @@ from typer.core import TyperGroup
 from pharos.cli import (
     build,
     cache,
+    check,
     evaluate,
     explore,
     hardness,
@@ -153,6 +154,7 @@ def _options(
 app.command("list")(list_.list_)
 app.command("build")(build.build)
 app.command("count")(build.count)
+app.command("check")(check.check)
 app.command("solve")(solve.solve)
 app.command("hardness")(hardness.hardness)
 app.command("predict")(predict.predict)

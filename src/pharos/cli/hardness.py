@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 
 # What the column "exact" says of each kind of certificate.
 PROVEN = {"exact": "yes", "interval": "interval", "float64": "float64"}
+IDEALISED = ("kernel_regret", "kernel_policy_regret", "sampled_regret")
 
 
 def hardness(
@@ -209,6 +210,8 @@ def _print(title: str, report: Any, chance: str, definitions: bool) -> None:
     for result in report.results.values():
         value = "[dim]undefined[/dim]" if result.undefined else escape(result.text)
         exact = "" if result.undefined else PROVEN[result.certificate.kind]
+        if exact and result.name in IDEALISED:
+            exact = "prediction"
         row = [result.name, value, exact, "kept" if result.kept else f"{result.seconds:.2f}"]
         table.add_row(*row, *((escape(result.definition), escape(result.source)) if definitions else ()))
         if note := result.undefined or result.certificate.note:
@@ -232,6 +235,14 @@ def _print(title: str, report: Any, chance: str, definitions: bool) -> None:
         to.print(f"compiling: {how_long}", style="dim", soft_wrap=True)
     for note in notes:
         to.print(escape(note), style="dim", soft_wrap=True)
+    if not {*IDEALISED}.isdisjoint(report.results):
+        to.print(
+            "prediction: regret of an idealised learner, 0 is optimal, 1 is uniform play; kernel_regret has "
+            "expectations in the place of draws. `pharos predict` has the form that agrees best "
+            "with runs, and an interval",
+            style="dim",
+            soft_wrap=True,
+        )
 
 
 def _ties(report: Any) -> list[str]:

@@ -289,6 +289,13 @@ def log(
 def predict(
     spec: SpecArgument,
     to: Annotated[Path, typer.Option("--out", metavar="FILE", help="The Parquet file to write.")],
+    block: Annotated[
+        list[int] | None, typer.Option("--block", help="Of these blocks alone, from 1; again for another one.")
+    ] = None,
+    agent: Annotated[list[str] | None, typer.Option("--agent", help="Of this agent alone; again for another.")] = None,
+    observation: Annotated[
+        list[str] | None, typer.Option("--observation", help="Of this observation alone; again for another one.")
+    ] = None,
     environments: Environments = None,
     trust: Trust = False,
     json: Json = False,
@@ -298,7 +305,9 @@ def predict(
 
     opened, place = study.opened(spec, None, trust=trust or None, environments=environments)
     with progress_line("predicting", logged=True) as tell:
-        predictions = study.predict(opened, place, progress=tell)
+        predictions = study.predict(
+            opened, place, blocks=block or None, agents=agent or None, observations=observation or None, progress=tell
+        )
     said = study.write_predictions(opened, predictions, to)
     missing = int(predictions["kernel_regret"].isna().sum())
     if json:

@@ -245,7 +245,7 @@ def _horizon(value: Any) -> Any:
 
 
 Seeds = Annotated[list[Annotated[int, Field(ge=0)]], BeforeValidator(_seeds), Field(min_length=1)]
-FiniteHorizonValues = Annotated[int, Field(ge=1)]
+StepCount = Annotated[int, Field(ge=1)]
 Gamma = Annotated[float, Field(ge=0, le=1)]
 EngineEntry = Annotated[str | dict[str, str], BeforeValidator(_engines)]
 HorizonEntry = Annotated[Any, BeforeValidator(_horizon)]
@@ -262,8 +262,8 @@ class Block(_Part):
     agents: list[str] = Field(min_length=1)
     setting: str = Field("", pattern=NAME)
     seeds: Seeds | None = None
-    steps: FiniteHorizonValues | None = None
-    evaluations: FiniteHorizonValues | None = None
+    steps: StepCount | None = None
+    evaluations: StepCount | None = None
     gamma: Gamma | None = None
     horizon: HorizonEntry | None = None
     hyperparameters: dict[str, str | dict[str, Any]] = {}
@@ -278,8 +278,8 @@ class Specification(_Part):
     folder: str | None = None
     blocks: list[Block] = Field(min_length=1)
     seeds: Seeds = list(range(5))
-    steps: FiniteHorizonValues = 50_000
-    evaluations: FiniteHorizonValues = 100
+    steps: StepCount = 50_000
+    evaluations: StepCount = 100
     gamma: Gamma = 1.0
     horizon: HorizonEntry = "limit"
     hyperparameters: dict[str, dict[str, Any]] = {}

@@ -129,7 +129,7 @@ def validation(
     predictions: "pd.DataFrame | None",
     cells: "pd.DataFrame",
     *,
-    predictors: Sequence[str] = (*PREDICTORS, SAMPLED_PREDICTORS[0], *POLICY_PREDICTORS),
+    predictors: Sequence[str] | None = None,
     measures: "pd.DataFrame | None" = None,
     least_classes: int = 3,
     permutations: int = PERMUTATIONS,
@@ -140,6 +140,7 @@ def validation(
     Args:
         predictions: of `predict`; None: the measures alone are judged.
         cells: of `outcomes`.
+        predictors: columns of the predictions; None: all of ours, and the numbers that a user's measures added.
         measures: of `hardness_table`; their logarithms together are a baseline.
         least_classes: with fewer there is an error.
         permutations: of classes, and of observations within them; 0: no floors and no p-values of these.
@@ -165,6 +166,8 @@ def validation(
     import pandas as pd
 
     both = cells if predictions is None else predictions.merge(cells, on=CELL, how="inner")
+    if predictors is None:
+        predictors = () if predictions is None else _predictors_of(predictions)
     if not len(both):
         raise ParameterError("no cell of the predictions has finished runs; are they of this study?")
     if both["environment"].nunique() < least_classes:
@@ -180,13 +183,21 @@ def validation(
         for outcome in OUTCOMES:
             if outcome not in part:
                 continue
-            for model in models_of(part, predictors if predictions is not None else (), tabular):
+            for model in models_of(part, predictors, tabular):
                 if outcome == ABSOLUTE and model.name not in (SCALE, CLASSES, "kernel_regret_played"):
                     continue
                 row = _line(part, model, outcome, tabular, permutations, seed)
                 if row is not None:
                     rows.append({"agent": agent, "outcome": outcome, "predictor": model.name, **row})
     return _corrected(pd.DataFrame(rows))
+
+
+def _predictors_of(predictions: "pd.DataFrame") -> list[str]:
+    """Our predictors, and numbers of other names than those of our files."""
+    ours = (*PREDICTORS, SAMPLED_PREDICTORS[0], *POLICY_PREDICTORS)
+    others = {*CELL, *SAMPLED_PREDICTORS, "estimated_error"}
+    own = [name for name in predictions if name not in (*ours, *others) and predictions[name].dtype.kind in "fiu"]
+    return [*ours, *own]
 
 
 def _corrected(table: "pd.DataFrame") -> "pd.DataFrame":

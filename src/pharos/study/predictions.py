@@ -4,7 +4,7 @@ import hashlib
 import itertools
 import json
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 from pharos import training
 from pharos.agents import agent_kind
-from pharos.errors import FileFormatError, ParameterError, PharosError, ResultCorrupted
-from pharos.study.blocks import Specification
+from pharos.errors import FileFormatError, ParameterError, PharosError, ResultCorrupted, UnknownName
+from pharos.study.blocks import Run, Specification
 from pharos.study.specification import Source
 from pharos.study.status import opened
 from pharos.study.tables import CELL
@@ -33,12 +33,20 @@ Predictions: TypeAlias = "tuple[pd.DataFrame, Mapping[str, str]]"
 
 
 def predict(
-    source: Source, folder: str | os.PathLike | None = None, *, progress: Callable[[str], None] | None = None
+    source: Source,
+    folder: str | os.PathLike | None = None,
+    *,
+    blocks: Sequence[int] | None = None,
+    agents: Sequence[str] | None = None,
+    observations: Sequence[str] | None = None,
+    progress: Callable[[str], None] | None = None,
 ) -> "pd.DataFrame":
     """Return what is predicted of each cell of a study whose agent learns from observations: a row each.
 
     Args:
         source, folder: as for `run`; no run is looked at.
+        blocks, agents, observations: a part of the study: numbers of blocks from 1, names of agents, and of
+            observations without their options; None: all.
         progress: called with what is being done.
     Returns:
         Columns `environment`, `instance`, `chance`, `agent`, `observation`; PREDICTORS; `network`; `estimated_error`,
@@ -55,19 +63,52 @@ def predict(
 
     study, _ = opened(source, folder)
     rows: dict[tuple[str, ...], dict[str, Any]] = {}
-    for run in study.runs:
+    for run in _part_of(study, blocks, agents, observations):
         if agent_kind(run.configuration.agent).is_tabular:
             continue
         key = tuple(run.cell.values())
         if key in rows:
             continue
         if progress is not None:
-            progress(f"predicting {', '.join(key[1:])}")
+            progress(f"cell {len(rows) + 1}: {', '.join(key[1:])}")
         rows[key] = run.cell | predicted(run.config)
     if not rows:
         raise ParameterError(f"study {study.name!r}: no agent learns from observations, so there is nothing to predict")
     frame = pd.DataFrame(list(rows.values()))
     return frame.fillna({name: "" for name in POLICY_CURVES if name in frame})
+
+
+def _part_of(
+    study: Specification,
+    blocks: Sequence[int] | None,
+    agents: Sequence[str] | None,
+    observations: Sequence[str] | None,
+) -> Iterator[Run]:
+    """Runs of some blocks, agents and observations.
+
+    Raises:
+        ParameterError: one of these is not in the study.
+    """
+    runs = study.runs
+    if blocks is not None:
+        wrong = [block for block in blocks if not 1 <= block <= len(study.blocks)]
+        if wrong:
+            raise ParameterError(f"block {wrong[0]}: study {study.name!r} has blocks 1 to {len(study.blocks)}")
+        part = study.model_copy(update={"blocks": [study.blocks[block - 1] for block in blocks]})
+        ids = {run.id for run in part.runs}
+        runs = tuple(run for run in runs if run.id in ids)
+    for what, names, name_of in (
+        ("agent", agents, lambda run: run.configuration.agent),
+        ("observation", observations, lambda run: run.configuration.observation),
+    ):
+        unknown = {*(names or ())} - {name_of(run) for run in runs}
+        if unknown:
+            raise UnknownName(f"{what} of study {study.name!r}", min(unknown), sorted({name_of(run) for run in runs}))
+    for run in runs:
+        if agents is not None and run.configuration.agent not in agents:
+            continue
+        if observations is None or run.configuration.observation in observations:
+            yield run
 
 
 def write_predictions(study: Specification, predictions: "pd.DataFrame", file: str | os.PathLike) -> dict[str, str]:

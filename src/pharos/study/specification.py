@@ -171,12 +171,14 @@ def specification(
     """
     if isinstance(source, Specification):
         return source
-    entries = None if environments is None else given_environments(environments)
+    entries = None if environments is None else given_environments(environments, trust=bool(trust))
     if isinstance(source, Mapping):
         return _validated(source, "specification", None, Path.cwd(), trust is not False, entries)
     if str(source) in presets():
         file = resources.files("pharos.study").joinpath("presets", f"{source}.yaml")
-        return parse(file.read_text(encoding="utf-8"), f"preset {source}", entries=entries)
+        beside = None if environments is None else Path(environments).absolute().parent
+        text = file.read_text(encoding="utf-8")
+        return parse(text, f"preset {source}", folder=beside, trust=bool(trust), entries=entries)
     path = Path(source)
     if path.is_dir():
         path = path / STUDY_FILE
@@ -188,15 +190,19 @@ def specification(
     return parse(_text_of(path), str(path), folder=path.absolute().parent, trust=trusted, entries=entries)
 
 
-def given_environments(file: str | os.PathLike) -> list[Any]:
+def given_environments(file: str | os.PathLike, *, trust: bool = False) -> list[Any]:
     """The list in a YAML file: entries as under `environments:` of a block; folders are looked for beside the file.
 
         - taxi/5x5
         - {name: taxi, parameters: {size: 7}}
         - {name: folders/lava, family: lava, observations: [recorded, one_hot]}     # an imported MDP, and what it shows
+        - {name: "games.py:Snake", parameters: {rows: 2}}                           # a class of one's own
 
+    Args:
+        trust: whether classes of one's own may be imported; a preset looks for their files beside the list, a study's
+            own YAML file beside itself.
     Raises:
-        ParameterError: it is no such list, or names code: classes of one's own belong into a study's own YAML file.
+        ParameterError: it is no such list. UntrustedCode: it names code, and is not trusted.
     """
     path = Path(file)
     text = _text_of(path)
@@ -216,12 +222,13 @@ def given_environments(file: str | os.PathLike) -> list[Any]:
         name = entry.get("name")
         if isinstance(name, str) and mdp_files.is_folder(path.parent / name):
             entry = {**entry, "name": str((path.parent / name).absolute())}
-        elif isinstance(name, str) and is_reference(name):
-            raise ParameterError(
-                f"{path}: {name!r} is code; expected names that `pharos list` shows, or folders of imported MDPs"
+        elif isinstance(name, str) and is_reference(name) and not trust:
+            raise UntrustedCode(
+                f"{path}: {name!r} is code, which is executed only if you trust it: add --trust (in Python: trust=True)"
             )
         try:
-            _ = EnvironmentEntry.model_validate(entry).instance
+            context = {"folder": path.absolute().parent}
+            _ = EnvironmentEntry.model_validate(entry, context=context).instance
         except ValidationError as error:
             raise ParameterError(_messages(error, str(path), None)) from error
         except ParameterError as error:

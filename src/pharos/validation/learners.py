@@ -43,7 +43,8 @@ CURVE_POINTS = 40
 
 
 def predicted(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Return PREDICTORS of a run, SAMPLED_PREDICTORS of a DQN, POLICY_PREDICTORS of an actor-critic, and their curves.
+    """Return PREDICTORS of a run, SAMPLED_PREDICTORS of a DQN, POLICY_PREDICTORS of an actor-critic, and their curves;
+    and the measures that a user has registered, under their names.
 
     Args:
         config: of a run of a study that was read already, so that code which it names is trusted.
@@ -59,7 +60,8 @@ def predicted(config: Mapping[str, Any]) -> dict[str, Any]:
         name, initialisation = network_of(config, task)
         options = _options(task, name, initialisation)
         schedule = schedule_of(config)
-        measures = report(task.mdp, MEASURES, schedule=schedule, **options)
+        own = own_measures()
+        measures = report(task.mdp, (*MEASURES, *own), schedule=schedule, **options)
         rescaled = report(task.mdp, ["kernel_regret"], schedule=replace(schedule, optimizer="adam"), **options)
         if config["agent"] in ACTOR_CRITICS:
             row |= _of_policy(config, task.mdp, options)
@@ -76,12 +78,19 @@ def predicted(config: Mapping[str, Any]) -> dict[str, Any]:
     regret = rescaled["kernel_regret"].value
     if regret is not None:
         row |= {"adam_regret": regret["value"], "adam_regret_played": regret["played"], "adam_curve": _curve(regret)}
-    for measure in MEASURES[1:]:
+    for measure in (*MEASURES[1:], *own):
         value = measures[measure].value
         if value is not None:
             row[measure] = float(value["value"] if isinstance(value, Mapping) else value)
     notes = (result.undefined or result.certificate.note for result in measures.results.values())
     return {**row, "notes": "; ".join(note for note in notes if note)}
+
+
+def own_measures() -> list[str]:
+    """Names of the measures that a user has registered (`pharos.hardness.register`): predictors beside ours."""
+    from pharos.hardness import measures
+
+    return [name for name, measure in measures().items() if not measure.function.__module__.startswith("pharos.")]
 
 
 def _options(task: "Task", network: Any, initialisation: str, landmarks: int | None = None) -> dict[str, Any]:

@@ -89,8 +89,8 @@ class KernelRegret:
 
     def __str__(self) -> str:
         return (
-            f"{self.value:.4g} greedy, {self.curve.mean_played:.4g} as played; "
-            f"tabular {self.tabular.mean_greedy:.4g} and {self.tabular.mean_played:.4g}"
+            f"{self.value:.3g} (as played {self.curve.mean_played:.3g}); with a table {self.tabular.mean_greedy:.3g} "
+            f"({self.tabular.mean_played:.3g})"
         )
 
 

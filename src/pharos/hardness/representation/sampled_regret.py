@@ -154,7 +154,7 @@ class SampledRegret:
         }
 
     def __str__(self) -> str:
-        return f"{self.value:.4g}; a table without generalisation: {self.tabular.mean:.4g}"
+        return f"{self.value:.3g}; with a table {self.tabular.mean:.3g}"
 
 
 @require_mdp

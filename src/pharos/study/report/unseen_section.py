@@ -63,6 +63,7 @@ def unseen_section(
 def _text(judgement: "pd.DataFrame") -> list[str]:
     number = int(judgement["tests"].max())
     return [
+        *winners(judgement),
         "Does a number that is known before training predict regret on classes that it has not met? Each class is "
         "predicted by a line through the others, classes weighing alike; baselines stand first, and a measure that "
         "does not beat them says nothing that is new. R² below 0 is worse than the mean of all classes.",
@@ -71,6 +72,21 @@ def _text(judgement: "pd.DataFrame") -> list[str]:
         "independent. The floor is what 95 % of such permutations stay below; the ceiling is what noise over "
         "seeds leaves.",
     ]
+
+
+def winners(judgement: "pd.DataFrame") -> list[str]:
+    """A sentence for each agent: which predictor has the largest R2 on classes left out, and the best baseline."""
+    sentences = []
+    for agent, rows in judgement[judgement["outcome"] == "greedy"].groupby("agent", sort=False):
+        best = {
+            is_baseline: some.loc[some["r_squared"].idxmax()]
+            for is_baseline, some in rows.dropna(subset="r_squared").groupby("baseline")
+        }
+        if best:
+            said = [f"{best[key]['predictor']} (R² {best[key]['r_squared']:.2f})" for key in sorted(best)]
+            beside = f"; of the baselines {said[1]}" if len(said) > 1 else ""
+            sentences.append(f"{agent_name(str(agent))}: on classes left out {said[0]} predicts best{beside}.")
+    return sentences
 
 
 def _said(results: Results, predictions: Foretold | None) -> list[str]:
