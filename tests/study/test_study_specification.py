@@ -9,9 +9,11 @@ import pytest
 import xxhash
 
 from pharos import study
+from pharos.environments import catalog
 from pharos.errors import ParameterError, UnknownName, UntrustedCode
 from pharos.study import Specification, presets, run_id, specification
 from pharos.study.specification import parse
+from pharos.system import sources
 
 LAKES = """\
 name: lakes
@@ -257,6 +259,9 @@ def test_a_wrong_list_of_environments_is_a_line(tmp_path, text, message):
 
 def test_classes_of_ones_own_in_a_list_need_trust_and_lie_beside_it(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(catalog, "_REGISTERED", {})
+    monkeypatch.setattr(sources, "_LOADED", {})
+    monkeypatch.setattr(sources, "_MODULES", {})
     (tmp_path / "sealed").mkdir()
     code = "from pharos.environments import SimpleGrid\nclass Yard(SimpleGrid):\n    name = 'yard'\n"
     (tmp_path / "sealed" / "yard_of_a_list.py").write_text(code)

@@ -72,8 +72,8 @@ def test_orders_are_counted_among_clear_pairs_of_one_mdp():
 @pytest.mark.parametrize("agent", PRIMARY)
 def test_published_cells_are_of_many_classes_and_sets(agent):
     known = published(agent)
-    assert len(set(known.classes)) >= 14
-    assert len(known.predicted) >= 98
+    assert len(set(known.classes)) == 26
+    assert len(known.predicted) >= 350
     assert np.isfinite([known.predicted, known.observed, known.states, known.steps]).all()
     assert 0.74 <= known.coverage() <= 0.88
     right, pairs = known.ordered(1.0)

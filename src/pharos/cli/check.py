@@ -27,14 +27,14 @@ def check(
     env = parse_target(target, parameters).found_environment()
     from pharos import check_environment
 
-    found = check_environment(env, max_states=max_states)
-    values, told = _values(env) if found.complete else (None, "not solved: not all states were looked at")
+    conformance = check_environment(env, max_states=max_states)
+    values, sentence = _values(env) if conformance.complete else (None, "not solved: not all states were looked at")
     if json:
-        notes = [*found.notes, told]
-        print_json({**vars(found), "notes": notes, "values": values, "compiling_seconds": compiling.seconds()})
+        notes = [*conformance.notes, sentence]
+        print_json({**vars(conformance), "notes": notes, "values": values, "compiling_seconds": compiling.seconds()})
         return
-    print(found)
-    print(f"  {told}")
+    print(conformance)
+    print(f"  {sentence}")
     for name, value in compiling_fact():
         print(f"  {name}: {value}")
 
