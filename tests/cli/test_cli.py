@@ -8,6 +8,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+import time
 
 import pytest
 from rich.console import Console
@@ -504,6 +505,23 @@ def test_exit_codes_reach_the_shell(cache):
         done = command_line.process(*words, environment={"PHAROS_CACHE_DIR": cache})
         assert done.returncode == code
         assert "Traceback" not in done.stderr
+
+
+@pytest.mark.slow
+def test_a_solve_that_is_terminated_says_that_the_same_command_goes_on(cache, tmp_path):
+    code = "import time; from pharos import solvers; from pharos.cli import main; import sys; "
+    code += "solvers.value_iteration = lambda *_, **__: (open('began', 'w'), time.sleep(60)); "
+    code += "sys.argv = ['pharos', 'solve', 'simple_grid']; main()"
+    place = {"cwd": tmp_path, "env": {**os.environ, "PHAROS_CACHE_DIR": str(cache)}}
+    process = subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.PIPE, text=True, **place)
+    while process.poll() is None and not (tmp_path / "began").exists():
+        time.sleep(0.05)
+    process.terminate()
+    _, said = process.communicate(timeout=60)
+    assert (process.returncode, said) == (
+        143,
+        "pharos: interrupted; finished work is kept, and the same command goes on from there\n",
+    )
 
 
 @pytest.mark.slow

@@ -7,6 +7,7 @@ import math
 import os
 import re
 import shlex
+import signal
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 
     from pharos.environments import Environment
 
+INTERRUPTED = "interrupted; finished work is kept, and the same command goes on from there"
 NOTABLE_SECONDS = 0.2  # of compiling, beside those of work
 SPECIAL = re.compile(r"[^\w@%+=:,./\[\]-]")  # what a shell would read as more than a character of a word
 
@@ -183,6 +185,21 @@ def peak_memory_bytes() -> int:
 def bytes_of(folder: Path) -> int:
     """Bytes of the files in a folder and below."""
     return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+
+
+@contextlib.contextmanager
+def termination() -> Iterator[None]:
+    """SIGTERM ends what runs before it ends this process, and says that the same command goes on."""
+
+    def leave(*_: object) -> None:
+        complain(INTERRUPTED)
+        sys.exit(128 + signal.SIGTERM)
+
+    before = signal.signal(signal.SIGTERM, leave)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def complain(message: object) -> None:

@@ -32,7 +32,7 @@ from pharos.cli import (
 from pharos.cli import (
     list as list_,
 )
-from pharos.cli.answers import complain
+from pharos.cli.answers import INTERRUPTED, complain
 from pharos.errors import DivergenceError, ParameterError, PharosError
 from pharos.system import compiling
 from pharos.system.installation import conflict
@@ -69,7 +69,7 @@ class _Group(TyperGroup):
         except KeyboardInterrupt:
             code = EXIT_INTERRUPTED
         if code == EXIT_INTERRUPTED:
-            complain("interrupted; finished work is kept, and the same command goes on from there")
+            complain(INTERRUPTED)
         sys.exit(code if isinstance(code, int) else 0)
 
     def invoke(self, ctx: Any) -> Any:

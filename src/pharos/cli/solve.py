@@ -13,6 +13,7 @@ from pharos.cli.answers import (
     print_facts,
     print_json,
     progress_line,
+    termination,
 )
 from pharos.cli.options import (
     Gamma,
@@ -85,7 +86,8 @@ def solve(
         check_format(out, (".npz", ".npy"))
     building = build_options(memory, workers, max_states, processes)
     chance: dict[str, Any] = {"sticky": sticky, "random": random, "lazy": lazy}
-    mdp = parse_target(target, parameters).mdp(gamma=gamma, horizon=horizon, **chance, **building, processes=ranks)
+    with termination():
+        mdp = parse_target(target, parameters).mdp(gamma=gamma, horizon=horizon, **chance, **building, processes=ranks)
     from pharos.solvers import uniform_value, value_iteration
     from pharos.system import paths
 
@@ -93,7 +95,7 @@ def solve(
     sharing: dict[str, Any] = {"processes": ranks, "checkpoint": checkpoint}
     sharing |= {"dtype": dtype, "blocks": blocks}
     suffix = ".npy" if dtype == "float64" else f"-{dtype}.npy"
-    with progress_line("solving") as report:
+    with progress_line("solving") as report, termination():
 
         def solution_by(solver: Callable[..., Any], name: str, policy: str) -> Any:
             return solver(

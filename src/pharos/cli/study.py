@@ -1,7 +1,6 @@
 """pharos study: a grid of training runs from a YAML file: show it, run it, see how far it is, report on it."""
 
 import contextlib
-import signal
 import sys
 import time
 from collections import Counter
@@ -11,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from pharos.cli.answers import complain, console, print_json, progress_line
+from pharos.cli.answers import complain, console, print_json, progress_line, termination
 from pharos.cli.options import Json, Trust, parse_parameters
 from pharos.errors import AllRunsFailed, ParameterError, UnknownName
 from pharos.observations import title
@@ -143,7 +142,7 @@ def run(
     if to is not None and on == "slurm":
         raise ParameterError("--log goes with --on local or ray; write those of a cluster by `pharos study log`")
     logs = None if to is None else study.RunLog(opened, place, to)
-    with _progress() as shown, _termination():
+    with _progress() as shown, termination():
         progress = shown if logs is None else _logging(logs, shown)
         if on == "ray":
             end = study.run_on_ray(
@@ -400,20 +399,6 @@ def _progress() -> Iterator[Callable[[Any], None]]:
             bar.update(task, total=status.total, completed=status.finished + status.failed, description=str(status))
 
         yield show
-
-
-@contextlib.contextmanager
-def _termination() -> Iterator[None]:
-    """SIGTERM ends the runs before it ends this process."""
-
-    def leave(*_: Any) -> None:
-        sys.exit(128 + signal.SIGTERM)
-
-    before = signal.signal(signal.SIGTERM, leave)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 def _steps(runs) -> list[int]:
