@@ -1,11 +1,7 @@
 """Hyperparameters for every agent, class of environments and observation, in RL Zoo's convention.
 
-hyperparameters.py has those of each agent; a class of environments declares what suits it better
-(`Environment.hyperparameters`). A table of one's own, in YAML, holds both.
-
-Hyperparameters of each agent in every environment, under the names of Stable-Baselines3 and of `QLearning`.
-
-`n_envs` stands beside them. What suits a class of environments better stands in its file.
+Those of each agent stand here, under the names of Stable-Baselines3 and of `QLearning`, `n_envs` beside them; a class
+of environments declares what suits it better (`Environment.hyperparameters`). A table of one's own, in YAML, has both.
 """
 
 from collections.abc import Mapping

@@ -7,7 +7,7 @@ bool marks states whose row is not followed (terminal states). With `start` >= 0
 Distances are in steps, -1 where there is no path. `queue` is scratch of one entry a node; after a search it holds the
 nodes found, in the order of their distance.
 
-Distances of a graph by sweeps over its table in order: no queue, no reversed copy. Arguments: see graph.py.
+Distances of a graph by sweeps over its table in order: no queue, no reversed copy, the same arguments.
 
 distance (N,) holds 0 at the source and `far`, the largest number of its type, elsewhere, and upper bounds from then on;
 they are the distances once a sweep changes nothing, as none can be lowered along an edge then. Breadth-first search

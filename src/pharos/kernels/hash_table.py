@@ -7,7 +7,7 @@ Kernels of a search by several processes: each owns the states whose hash falls 
 
 An owner has keys (capacity, W) uint64, states in the order in which it heard of them, and numbers (capacity,) int64:
 the number of a state, or -1 - place while it waits for one, where place is the first of the places in the block that
-lead to it. table (slots,) leads from the hash of a state to its entry, as in hash_table.py.
+lead to it. table (slots,) leads from the hash of a state to its entry.
 """
 
 from typing import Any

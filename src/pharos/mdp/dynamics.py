@@ -202,7 +202,7 @@ class Dynamics(ABC):
     def backup(self, equation: BellmanEquation, x: np.ndarray, out: np.ndarray, runs: np.ndarray | None = None) -> None:
         """out = T x; x and out are not the same. Between the states and the end there may be others, of a part.
 
-        runs: the states of some runs (R, 2) alone, see dynamics.py; None: all.
+        runs: the states of some runs (R, 2) alone, see `runs_of`; None: all.
         """
         states = slice(None) if runs is None else slice(*runs[0]) if len(runs) == 1 else rows_of(runs)
         q = equation.rewards.rows(states) + equation.gamma * self.expected(x, states)

@@ -17,7 +17,7 @@ A search by several processes: the files of one process, whatever their number.
 
 Rank 0 runs the search and writes the files. While the frontier is narrow (Freeway: 148 thousand levels of 9 states) it
 works alone, as exchanges would cost more than the states. Once it is wide, or the table does not fit, all ranks share
-the table and expand blocks together (ranked_table.py); what memory holds is then what all of them have.
+the table and expand blocks together; what memory holds is then what all of them have.
 """
 
 import contextlib
