@@ -34,6 +34,7 @@ POLICY = "policy"
 LARGEST_HEADER = 1 << 22
 LARGEST_FILE = 1 << 30
 LONGEST_TEXT = 2000
+DEEPEST = 50
 SHOWN = ("name", "author", "note")
 INVISIBLE = "\u034f\u115f\u1160\u17b4\u17b5\u180b\u180c\u180d\u180f\u2800\u3164\uffa0"
 """Printable, and nothing to see: joiners, selectors, fillers of Hangul and the empty pattern of Braille."""
@@ -165,9 +166,10 @@ def read(file: str | os.PathLike) -> Entry:
         record = json.loads(text)
         if not isinstance(record, dict):
             raise TypeError("its record is no object")
+        is_intact = storage.DIGEST in record and storage.is_intact(record)
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise FileFormatError(f"{path}: is no entry of a leaderboard: {_reason(error)}; {_AGAIN}") from None
-    if not storage.is_intact(record) or storage.DIGEST not in record:
+    if not is_intact:
         raise ResultCorrupted(f"{path}: what it says was changed after it was written; {_AGAIN}")
     if record.get("format") != FORMAT:
         raise FileFormatError(f"{path}: is in format {record.get('format')!r}; this version of pharos reads {FORMAT}")
@@ -186,7 +188,7 @@ def read(file: str | os.PathLike) -> Entry:
     try:
         return _entry(record, arrays)
     except (FileFormatError, ParameterError) as error:
-        raise FileFormatError(f"{path}: {error}") from None
+        raise FileFormatError(f"{path}: {str(error)[:LONGEST_TEXT]}") from None
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise FileFormatError(f"{path}: its record is damaged: {_reason(error)}; {_AGAIN}") from None
 
@@ -254,15 +256,17 @@ def _entry(record: Mapping[str, Any], arrays: dict[str, np.ndarray]) -> Entry:
     )
 
 
-def _check_values(value: Any, name: str = "record") -> None:
+def _check_values(value: Any, name: str = "record", depth: int = 0) -> None:
     """Refuse texts that would do something to a terminal, or hide what they say, and numbers that no float holds."""
+    if depth > DEEPEST:
+        raise ValueError(f"its {name} is nested deeper than {DEEPEST} times")
     if isinstance(value, Mapping):
         for key, item in value.items():
             _check_values(key, name)
-            _check_values(item, key)
+            _check_values(item, key, depth + 1)
     elif isinstance(value, list):
         for item in value:
-            _check_values(item, name)
+            _check_values(item, name, depth + 1)
     elif isinstance(value, str):
         if not all(character.isprintable() or character == "\n" for character in value):
             raise ValueError(f"a text of its {name} has characters that cannot be printed")

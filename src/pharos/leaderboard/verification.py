@@ -1,6 +1,7 @@
 """Verifying an entry: value and regret of its policy, computed again from the rules and held against its claim."""
 
 import contextlib
+import errno
 import math
 import os
 import signal
@@ -15,11 +16,12 @@ import numpy as np
 
 from pharos.environments import BUILT_IN
 from pharos.errors import FileFormatError, ParameterError, StateSpaceTooLarge, TimeLimit, UntrustedCode
-from pharos.leaderboard.entry import LARGEST_FILE, POLICY, Claim, Entry, read
+from pharos.leaderboard.entry import LARGEST_FILE, LONGEST_TEXT, POLICY, Claim, Entry, read
 from pharos.leaderboard.policy import policy_of
 from pharos.observations import names as observation_names
 from pharos.state_space import build
 from pharos.system import storage
+from pharos.system.memory import available_memory
 from pharos.system.sources import is_reference
 from pharos.training import ReferenceValues, RunConfig, Task, TaskValues, evaluate_agent
 
@@ -29,6 +31,7 @@ REACHED = 100_000
 MAX_HORIZON = 100_000
 MAX_SECONDS = 600.0
 SMALLEST_CHANCE = 1e-12
+SHARE_OF_MEMORY = 0.9
 SEED = 1
 """Of estimates; another one than that of runs, so that an estimate is not compared with itself."""
 
@@ -136,24 +139,23 @@ def verify(
     """
     began, path = time.perf_counter(), Path(file)
     entry = read(path)
-    if (entry.config.horizon or 0) > max_horizon:
-        raise FileFormatError(
-            f"{path}: its horizon is {entry.config.horizon:,} steps; expected at most {max_horizon:,}"
-        )
+    for name, steps in (("horizon", entry.config.horizon or 0), ("reward_delay", entry.config.chance.reward_delay)):
+        if steps > max_horizon:
+            raise FileFormatError(f"{path}: its {name} is {steps:,} steps; expected at most {max_horizon:,}")
     try:
-        with _time_limit(max_seconds):
+        with _time_limit(max_seconds), _memory_limit():
             task = _task(entry, trust, max_states, values)
             policy = policy_of(entry, task, trust=trust)
             evaluation = evaluate_agent(policy, task, max_states=max_reached, seed=SEED)
             reference, range_of_returns = task.reference, task.return_range
-    except TimeLimit as error:
-        raise TimeLimit(f"{path}: {error}") from None
-    except UntrustedCode as error:
-        raise UntrustedCode(f"{path}: {error}") from None
+    except (TimeLimit, UntrustedCode, StateSpaceTooLarge) as error:
+        raise type(error)(f"{path}: {str(error)[:LONGEST_TEXT]}") from None
     except (ParameterError, FileFormatError) as error:
-        raise FileFormatError(f"{path}: {error}") from None
-    except StateSpaceTooLarge as error:
-        raise StateSpaceTooLarge(f"{path}: {error}") from None
+        raise FileFormatError(f"{path}: {str(error)[:LONGEST_TEXT]}") from None
+    except (MemoryError, OSError) as error:
+        if isinstance(error, OSError) and error.errno != errno.ENOMEM:
+            raise
+        raise FileFormatError(f"{path}: asks for more memory than there is: {error}") from None
     claim = entry.claim
     slack = tolerance * max(1.0, abs(reference.optimal)) + reference.error_bound
     apart = slack + evaluation.error_bound + (min(claim.error_bound, slack) if claim.exact else claim.error_bound)
@@ -229,11 +231,35 @@ def _time_limit(seconds: float) -> Iterator[None]:
         signal.signal(signal.SIGALRM, before)
 
 
+@contextlib.contextmanager
+def _memory_limit() -> Iterator[None]:
+    """Raise MemoryError within the block where it asks for more than is free, before the system ends the process.
+
+    On Linux, by RLIMIT_DATA of the whole process; elsewhere there is no limit.
+    """
+    statistics = Path("/proc/self/statm")
+    if not statistics.exists():
+        yield
+        return
+    import resource
+
+    used = int(statistics.read_text().split()[5]) * resource.getpagesize()
+    before = resource.getrlimit(resource.RLIMIT_DATA)
+    limits = [int(used + SHARE_OF_MEMORY * available_memory()), *(each for each in before if each >= 0)]
+    resource.setrlimit(resource.RLIMIT_DATA, (min(limits), before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_DATA, before)
+
+
 def _task(entry: Entry, trust: bool, max_states: int, values: MutableMapping[str, TaskValues] | None) -> Task:
     """The task of an entry, its state space built, within limits that hold before it is."""
     config = entry.config
     _check_code(config, trust)
     for name, value in config.chance.to_dict().items():
+        if type(value) not in (int, float):
+            raise FileFormatError(f"its {name} is {str(value)[:40]!r}; expected a number")
         if 0 < value < SMALLEST_CHANCE:
             raise FileFormatError(f"its {name} is {value:g}; expected 0, or at least {SMALLEST_CHANCE:g}")
     key = task_key(config)
