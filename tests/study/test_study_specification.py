@@ -9,7 +9,7 @@ import pytest
 import xxhash
 
 from pharos import study
-from pharos.environments import catalog
+from pharos.environments import FrozenLake, catalog
 from pharos.errors import ParameterError, UnknownName, UntrustedCode
 from pharos.study import Specification, presets, run_id, specification
 from pharos.study.specification import parse
@@ -210,6 +210,15 @@ def test_a_million_runs_of_a_product_are_refused_before_they_are_listed():
     block = {"environments": ["frozen_lake/4x4"] * 1000, "agents": ["q_learning"], "seeds": 2000}
     with pytest.raises(ParameterError, match="2,000,000 runs up to here; a study has at most 1,000,000"):
         study.specification({"name": "a", "blocks": [block]})
+
+
+def test_environments_named_again_are_made_once_each_and_run_once(monkeypatch):
+    """5,000 equal ones took half a minute."""
+    usual, calls = FrozenLake.validate, []
+    monkeypatch.setattr(FrozenLake, "validate", lambda self: calls.append(1) or usual(self))
+    block = {"environments": ["frozen_lake/4x4"] * 300, "agents": ["q_learning"]}
+    spec = specification({"name": "own", "steps": 100, "seeds": 2, "blocks": [block]})
+    assert len(spec.runs) == 2 and len(calls) <= 300
 
 
 def test_aliases_that_share_a_node_are_no_mistake():
