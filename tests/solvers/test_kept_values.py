@@ -8,14 +8,17 @@ import multiprocessing
 import os
 import signal
 import tempfile
+import time
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import pharos
 from naive import exact as naive_exact
 from pharos import hardness
+from pharos.cli.app import app
 from pharos.errors import FileFormatError, FolderLocked, ParameterError, PrecisionError
 from pharos.mdp import BEST, TabularMDP
 from pharos.solvers import uniform_value, value_iteration
@@ -24,6 +27,7 @@ from pharos.solvers.values import blocked_fixed_point
 from pharos.system import kept_arrays
 from strategies import small_mdps
 
+values = importlib.import_module("pharos.solvers.values")
 memory_map = importlib.import_module("pharos.system.large_arrays")
 
 
@@ -81,6 +85,72 @@ def test_values_in_files_are_those_in_memory_to_the_last_bit(tmp_path, monkeypat
     monkeypatch.setattr(memory_map, "SMALL", 0)
     monkeypatch.setattr(memory_map.machine, "available_memory", lambda: 0)
     assert (value_iteration(mdp).x == expected.x).all()
+
+
+def test_large_values_are_swept_in_memory_and_end_in_their_file(tmp_path, monkeypatch):
+    mdp, path = ring(), tmp_path / "values.npy"
+    whole = value_iteration(mdp)
+    monkeypatch.setattr(memory_map, "SMALL", 0)
+
+    def look(sweeps, _):
+        assert not np.load(path).any()  # what is swept is elsewhere
+        if sweeps == whole.sweeps - 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        value_iteration(mdp, values=path, progress=look)
+    resumed = value_iteration(mdp, values=path)
+    assert resumed.sweeps <= 2 and (resumed.x == whole.x).all() and (np.load(path) == whole.x).all()
+    monkeypatch.setattr(values, "_SECONDS", 0.0)  # what is swept is copied between sweeps
+    seen = []
+    value_iteration(
+        mdp, values=tmp_path / "again.npy", progress=lambda *_: seen.append(np.load(tmp_path / "again.npy"))
+    )
+    assert seen[0].any()
+
+
+def test_transitions_that_memory_has_no_room_for_are_read_by_pieces(tmp_path, monkeypatch):
+    space = pharos.build(pharos.make("breakout", height=6, columns=2), tmp_path / "space", progress=False)
+    mdp = space.mdp(gamma=0.99)
+    expected = [value_iteration(mdp, blocks=blocks) for blocks in (1, 3)]
+    reads = []
+    monkeypatch.setattr(memory_map, "PIECE", 7)
+    monkeypatch.setattr(memory_map.machine, "available_memory", lambda: 100 * mdp.num_actions * 4)
+    whole = memory_map._UncachedFile.read
+    monkeypatch.setattr(memory_map._UncachedFile, "read", lambda *words: reads.append(words[1:3]) or whole(*words))
+    for blocks, each in zip((1, 3), expected, strict=True):
+        found = value_iteration(mdp, blocks=blocks)
+        assert (found.x == each.x).all() and (found.sweeps, found.error_bound) == (each.sweeps, each.error_bound)
+    assert max(stop for _, stop in reads) == mdp.num_states and min(reads)[0] == 100 * 3 // 4 - 4 * 7
+
+
+@pytest.mark.parametrize("size", [7, 1000, 5000])
+def test_pieces_make_up_all_rows_once(tmp_path, monkeypatch, size):
+    rows = np.arange(30_000, dtype=np.int32).reshape(-1, 3)
+    rows.tofile(tmp_path / "rows.bin")
+    mapped = np.memmap(tmp_path / "rows.bin", np.int32, "r", shape=rows.shape)[50:]
+    monkeypatch.setattr(memory_map, "PIECE", size)
+    for kept in (0, 123, 9000, 9950):
+        stops = [9950]
+        for array, start, stop in memory_map.pieces_from_the_end(mapped, 100, 9950, kept):
+            assert stop == stops[-1] and array.shape == mapped.shape and array.dtype == mapped.dtype
+            assert (array[start:stop] == rows[50 + start : 50 + stop]).all() and not array.flags.writeable
+            stops.append(start)
+        assert stops[-1] == 100
+    (tmp_path / "rows.bin").unlink()
+    assert [place[1:] for place in memory_map.pieces_from_the_end(mapped, 100, 9950, 123)] == [(100, 9950)]
+
+
+def test_termination_of_solve_is_one_line(tmp_path, monkeypatch, capsys):
+    def terminated(*_, **__):
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(10)
+
+    monkeypatch.setattr("pharos.solvers.value_iteration", terminated)
+    with pytest.raises(SystemExit) as ended:
+        app(["solve", "simple_grid", "--values", str(tmp_path)])
+    assert ended.value.code == 130 and "the same command goes on" in capsys.readouterr().err
+    assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
 
 
 @pytest.mark.long

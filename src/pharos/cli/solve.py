@@ -58,7 +58,7 @@ def solve(
         Path | None,
         typer.Option(
             "--values",
-            help="Folder that holds the values while they are computed, in place of memory; a killed solve goes on.",
+            help="Folder for the values, in place of memory where that has no room; a solve that was ended goes on.",
         ),
     ] = None,
     threads: Annotated[

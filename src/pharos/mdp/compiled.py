@@ -28,7 +28,7 @@ from pharos.mdp.dynamics import (
     split,
 )
 from pharos.mdp.selection import Extreme, PolicyTable, Selection
-from pharos.system.large_arrays import ranges_from_the_end
+from pharos.system.large_arrays import pieces_from_the_end, rows_with_room
 from pharos.system.packed_indices import Indices, PackedIndices, blocks_of, holds_end, rows_of
 
 
@@ -163,7 +163,8 @@ def swept(
         part: the places [start, stop) of the order that are swept; None: all.
     """
     rewards, gamma, chance, select = equation
-    tables = (transitions, rewards.table, rewards.palette, gamma)
+    others = (rewards.table, rewards.palette, gamma)
+    tables = (transitions, *others)
     actions, scratch = bellman.actions_of(num_actions), np.empty(num_actions)
     choice, places = _choice(select), part or (0, rewards.shape[0])
     if choice is None:
@@ -174,12 +175,12 @@ def swept(
         return bellman.policy_sweep(*tables, *weights, select.later[:, 0], x[:, 0], order, *places)
     if chance.is_sticky:
         return bellman.sticky_sweep(*tables, chance.triple, choice, x, actions, scratch, order, *places)
-    v = x[:, 0]
+    v, kept = x[:, 0], rows_with_room(transitions, *places)
 
     def change_of(low: int, high: int) -> float:
         change = 0.0
-        for start, stop in ranges_from_the_end(transitions, low, high):
-            largest = bellman.optimal_sweep(*tables, chance.uniform, choice, v, actions, order, start, stop)
+        for piece, start, stop in pieces_from_the_end(transitions, low, high, kept):
+            largest = bellman.optimal_sweep(piece, *others, chance.uniform, choice, v, actions, order, start, stop)
             change = float(np.maximum(change, largest))
         return change
 

@@ -40,7 +40,7 @@ from pharos.errors import DivergenceError, PrecisionError
 from pharos.mdp import BellmanEquation, Part, PolicyTable, Selection, TabularMDP
 from pharos.solvers.convergence import SETTLED, SETTLING, Convergence, imprecise, operations, shrinking, sweeps_left
 from pharos.solvers.policy_iteration import PolicyIteration
-from pharos.system.large_arrays import large_zeros
+from pharos.system.large_arrays import SHARE_OF_VALUES, large_zeros
 from pharos.system.memory import available_memory
 
 _UNIT = 2.0**-53
@@ -102,7 +102,7 @@ class Backup:
 
     def zeros(self) -> np.ndarray:
         """(S + 1, W); mapped from a file where memory has little room for it."""
-        return large_zeros((self.mdp.num_states + 1, self.mdp.width), self.dtype)
+        return large_zeros((self.mdp.num_states + 1, self.mdp.width), self.dtype, share=SHARE_OF_VALUES)
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
         """T x, not in place."""

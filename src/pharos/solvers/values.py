@@ -16,9 +16,11 @@ margin of the bound is for the rounding of its own computation.
 Values of a given policy: on its functional graph where everything is deterministic, else by iteration.
 """
 
+import contextlib
 import math
 import os
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -38,12 +40,15 @@ from pharos.solvers.fixed_point import (
 from pharos.solvers.policy_iteration import chain, chain_values
 from pharos.solvers.ranked import DistributedOptions, shared_solution
 from pharos.solvers.solution import Solution
+from pharos.system import large_arrays
 from pharos.system.compiling import Stopwatch
 from pharos.system.kept_arrays import kept_array
 from pharos.system.workers import usable_workers
 
 # Rows of values in a file that are read in one go.
 _ROWS = 1 << 22
+# Between two copies of values to their file.
+_SECONDS = 600.0
 
 
 @require_mdp
@@ -73,8 +78,9 @@ def value_iteration(  # noqa: PLR0913
             S, A): row t has t steps to go.
         progress: called after each sweep with its number and the bound so far.
         values: a file (.npy) that holds the values while they are computed, in place of memory, and afterwards; what
-            it holds already is where the sweeps begin, so that a solve that was killed goes on. None: memory, or
-            where that has little room a file without a name.
+            it holds already is where the sweeps begin, so that a solve that was killed goes on. Large ones that memory
+            has room for are swept there, and copied to the file every ten minutes and in the end, whatever ends it.
+            None: memory, or where that has little room a file without a name.
         dtype: "float32" stores values in half of the memory; the bound counts what that costs, so that a tolerance
             below 1.2e-7 max |V| / (1 - gamma) is out of reach. For one process, and no horizon.
         blocks: ranges of states that are swept one after another, each some times in a row and as long as its own bound
@@ -174,13 +180,15 @@ def solution_of(  # noqa: PLR0913
     watch = Stopwatch()
     steps = None
     if horizon is None:
-        x = None if values is None else _kept_values(values, (mdp.num_states + 1, mdp.width), dtype)
-        if blocks > 1 and can_be_swept_by_blocks(mdp):
-            result = blocked_fixed_point(
-                Backup(mdp, select, usable_workers(threads), dtype), tolerance, blocks, progress, x
-            )
-        else:
-            result = fixed_point(mdp, select, tolerance, progress, x, usable_workers(threads), dtype)
+        kept = None if values is None else _kept_values(values, (mdp.num_states + 1, mdp.width), dtype)
+        with _in_memory(kept, progress) as (x, report):
+            if blocks > 1 and can_be_swept_by_blocks(mdp):
+                result = blocked_fixed_point(
+                    Backup(mdp, select, usable_workers(threads), dtype), tolerance, blocks, report, x
+                )
+            else:
+                result = fixed_point(mdp, select, tolerance, report, x, usable_workers(threads), dtype)
+        result = result if kept is None else result._replace(x=kept)
         following = result.x
     elif values is not None:
         raise ParameterError(f"values={str(values)!r}: a file keeps values without a horizon; found {horizon} steps")
@@ -208,6 +216,39 @@ def _kept_values(path: str | os.PathLike, shape: tuple[int, int], dtype: Any = n
             block[~np.isfinite(block)] = 0.0
     x[-1] = 0.0
     return x
+
+
+@contextlib.contextmanager
+def _in_memory(
+    kept: np.ndarray | None, progress: Callable[[int, float], None] | None
+) -> Iterator[tuple[np.ndarray | None, Callable[[int, float], None] | None]]:
+    """(values to sweep, the function that is told of sweeps).
+
+    Large values that memory has room for are swept there, as pages of a file that change are written again and again,
+    and copied to their file every ten minutes, where that costs little, and in the end, whatever ends it.
+    """
+    if (
+        kept is None
+        or kept.nbytes <= large_arrays.SMALL
+        or not large_arrays.fits(kept.nbytes, large_arrays.SHARE_OF_VALUES)
+    ):
+        yield kept, progress
+        return
+    x, due = np.array(kept), time.monotonic() + _SECONDS
+
+    def report(sweeps: int, bound: float) -> None:
+        nonlocal due
+        if time.monotonic() >= due:
+            began = time.monotonic()
+            kept[:] = x
+            due = time.monotonic() + max(_SECONDS, 20 * (time.monotonic() - began))
+        if progress is not None:
+            progress(sweeps, bound)
+
+    try:
+        yield x, report
+    finally:
+        kept[:] = x
 
 
 def check_tolerance(tolerance: float) -> None:

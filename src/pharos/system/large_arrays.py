@@ -4,12 +4,15 @@ And arrays that may be larger than memory: mapped files, of which the system kee
 """
 
 import contextlib
+import errno
+import itertools
 import math
 import mmap
 import os
 import sys
 import tempfile
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -22,9 +25,13 @@ from pharos.system.packed_indices import PackedIndices
 
 # Bytes that are always taken from memory; beyond them, the share of what is free that one array may take.
 SMALL, SHARE = 1 << 26, 4
+# The same of values, all of which are read and written in each sweep.
+SHARE_OF_VALUES = 1.5
 _BLOCK = 1 << 24
 # Rows of a mapped array that are swept while the next ones are read.
 RANGE = 1 << 22
+# Rows of one that memory has no room for: they are read at a time, into one of two arrays.
+PIECE = 1 << 19
 # Advice of Linux 5.4 that Python has no name for: these pages may go first.
 _COLD = 20
 
@@ -60,8 +67,8 @@ def huge_pages(length: int, dtype: np.dtype) -> np.ndarray:
     return np.frombuffer(memory, dtype)
 
 
-def large_zeros(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
-    """An array of zeros: in memory, or, where it would take more than a quarter of what is free, a mapped file.
+def large_zeros(shape: tuple[int, ...], dtype: Any, share: float = SHARE) -> np.ndarray:
+    """An array of zeros: in memory, or, where it would take more than 1 / share of what is free, a mapped file.
 
     The file is in the cache's folder and has no name: it is gone with the array, whatever becomes of the process. What
     is read and written in order, or near to where it was before, costs little more there than in memory.
@@ -71,7 +78,7 @@ def large_zeros(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
     """
     dtype = np.dtype(dtype)
     size = math.prod(shape) * dtype.itemsize
-    if size <= SMALL or size <= machine.available_memory() // SHARE:
+    if fits(size, share):
         return np.zeros(shape, dtype)
     folder = paths.cache_directory()
     try:
@@ -82,6 +89,11 @@ def large_zeros(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
             f"{folder}: {size / 2**30:.1f} GiB of scratch, which memory has no room for: {error.strerror}; "
             "free room on the disk, or set PHAROS_CACHE_DIR to a folder on another one"
         ) from error
+
+
+def fits(size: int, share: float = SHARE) -> bool:
+    """Whether so many bytes are at most 1 / share of what is free, or few."""
+    return size <= SMALL or size <= machine.available_memory() / share
 
 
 def mapped_file(folder: Path, size: int) -> mmap.mmap:
@@ -125,11 +137,94 @@ def ranges_from_the_end(rows: Any, low: int, high: int) -> Iterator[tuple[int, i
             _advise(rows, start, stop, _COLD)
 
 
+def rows_with_room(rows: Any, low: int, high: int) -> int:
+    """Of rows [low, high) of an array, memory has room for those below this one: all, but for mapped files."""
+    if sys.platform != "linux" or not isinstance(rows, np.memmap) or not isinstance(_mapping_of(rows), mmap.mmap):
+        return high
+    room = machine.available_memory() * 3 // 4 // rows.strides[0]
+    return high if high - low <= room else min(max(low, low + room - 4 * PIECE), high)
+
+
+def pieces_from_the_end(rows: Any, low: int, high: int, kept: int) -> Iterator[tuple[Any, int, int]]:
+    """(array, start, stop): ranges that make up [low, high), the last one first, each with an array that has its rows.
+
+    They are those of `ranges_from_the_end` as far as `kept`, see `rows_with_room`. Rows from there on are read into
+    memory of this process, the next ones while some are swept, and leave nothing in that of the system: pages of files
+    that come and go cost more than sweeps.
+    """
+    kept = min(max(low, kept), high)
+    with contextlib.ExitStack() as stack:
+        try:
+            file = stack.enter_context(_UncachedFile(rows)) if kept < high else None
+        except OSError:  # it has another name now, or none
+            file, kept = None, high
+        if file is not None:
+            pool = stack.enter_context(ThreadPoolExecutor(1))
+            cuts = [*range(high, kept, -PIECE), kept]
+            coming = pool.submit(file.read, cuts[1], cuts[0], 0)
+            for i, (stop, start) in enumerate(itertools.pairwise(cuts)):
+                array = coming.result()
+                if start > kept:
+                    coming = pool.submit(file.read, cuts[i + 2], start, (i + 1) % 2)
+                yield array, start, stop
+    for start, stop in ranges_from_the_end(rows, low, kept):
+        yield rows, start, stop
+
+
+class _UncachedFile:
+    """The file of a mapped array, read past the memory of the system where that is possible."""
+
+    def __init__(self, rows: np.memmap):
+        self._rows, self._row = rows, rows.strides[0]
+        begin = rows.offset // mmap.ALLOCATIONGRANULARITY * mmap.ALLOCATIONGRANULARITY  # of the mapping, in the file
+        self._offset = begin + rows.ctypes.data - np.frombuffer(_mapping_of(rows), np.uint8).ctypes.data
+        path = str(rows.filename)
+        try:
+            self._file = os.open(path, os.O_RDONLY | os.O_DIRECT)
+        except OSError:  # such as a file system in memory
+            self._file = os.open(path, os.O_RDONLY)
+        size = PIECE * self._row + 2 * mmap.PAGESIZE
+        self._memory = [huge_pages(size, np.dtype(np.uint8)) for _ in range(2)]
+
+    def __enter__(self) -> "_UncachedFile":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        os.close(self._file)
+
+    def read(self, start: int, stop: int, which: int) -> np.ndarray:
+        """An array of the shape of the mapped one that has the rows [start, stop), and nothing around them."""
+        memory, first = self._memory[which], self._offset + start * self._row
+        begin = first // mmap.PAGESIZE * mmap.PAGESIZE
+        wanted, done = first + (stop - start) * self._row - begin, 0
+        while done < wanted:
+            left = -(-(wanted - done) // mmap.PAGESIZE) * mmap.PAGESIZE
+            count = os.preadv(self._file, [memory[done : done + left].data], begin + done)
+            if count == 0:
+                raise OSError(errno.EIO, "the file became shorter", str(self._rows.filename))
+            done += count
+        os.posix_fadvise(self._file, begin, wanted, os.POSIX_FADV_DONTNEED)
+        address = memory.ctypes.data + first - begin - start * self._row
+        return np.asarray(_Rows(self._rows, memory, address))
+
+
+class _Rows:
+    """What NumPy makes an array of that begins before its memory."""
+
+    def __init__(self, like: np.memmap, memory: np.ndarray, address: int):
+        self._memory = memory
+        self.__array_interface__ = {**like.__array_interface__, "data": (address, True)}
+
+
+def _mapping_of(array: np.memmap) -> Any:
+    return getattr(array, "_mmap", None)
+
+
 def _advise(array: np.memmap, start: int, stop: int, advice: int | None) -> None:
     """Tell the system what becomes of rows of a mapped array: that they will be read soon, which it does while this
     process works; or that they will not.
     """
-    mapping = getattr(array, "_mmap", None)
+    mapping = _mapping_of(array)
     if start < stop and isinstance(mapping, mmap.mmap) and advice is not None:
         row = array.strides[0]
         first = start * row // mmap.PAGESIZE * mmap.PAGESIZE
