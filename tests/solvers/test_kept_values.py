@@ -146,7 +146,7 @@ def test_termination_of_solve_is_one_line(tmp_path, monkeypatch, capsys):
         os.kill(os.getpid(), signal.SIGTERM)
         time.sleep(10)
 
-    monkeypatch.setattr("pharos.solvers.value_iteration", terminated)
+    monkeypatch.setattr(Backup, "sweep", terminated)
     with pytest.raises(SystemExit) as ended:
         app(["solve", "simple_grid", "--values", str(tmp_path)])
     assert ended.value.code == 130 and "the same command goes on" in capsys.readouterr().err
