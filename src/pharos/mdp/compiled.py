@@ -175,11 +175,11 @@ def swept(
         return bellman.policy_sweep(*tables, *weights, select.later[:, 0], x[:, 0], order, *places)
     if chance.is_sticky:
         return bellman.sticky_sweep(*tables, chance.triple, choice, x, actions, scratch, order, *places)
-    v, kept = x[:, 0], rows_with_room(transitions, *places)
+    v, border = x[:, 0], rows_with_room(transitions, *places)
 
     def change_of(low: int, high: int) -> float:
         change = 0.0
-        for piece, start, stop in pieces_from_the_end(transitions, low, high, kept):
+        for piece, start, stop in pieces_from_the_end(transitions, low, high, border):
             largest = bellman.optimal_sweep(piece, *others, chance.uniform, choice, v, actions, order, start, stop)
             change = float(np.maximum(change, largest))
         return change

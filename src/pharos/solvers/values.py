@@ -180,15 +180,15 @@ def solution_of(  # noqa: PLR0913
     watch = Stopwatch()
     steps = None
     if horizon is None:
-        kept = None if values is None else _kept_values(values, (mdp.num_states + 1, mdp.width), dtype)
-        with _in_memory(kept, progress) as (x, report):
+        mapped = None if values is None else _kept_values(values, (mdp.num_states + 1, mdp.width), dtype)
+        with _in_memory(mapped, progress) as (x, report):
             if blocks > 1 and can_be_swept_by_blocks(mdp):
                 result = blocked_fixed_point(
                     Backup(mdp, select, usable_workers(threads), dtype), tolerance, blocks, report, x
                 )
             else:
                 result = fixed_point(mdp, select, tolerance, report, x, usable_workers(threads), dtype)
-        result = result if kept is None else result._replace(x=kept)
+        result = result if mapped is None else result._replace(x=mapped)
         following = result.x
     elif values is not None:
         raise ParameterError(f"values={str(values)!r}: a file keeps values without a horizon; found {horizon} steps")
@@ -220,7 +220,7 @@ def _kept_values(path: str | os.PathLike, shape: tuple[int, int], dtype: Any = n
 
 @contextlib.contextmanager
 def _in_memory(
-    kept: np.ndarray | None, progress: Callable[[int, float], None] | None
+    mapped: np.ndarray | None, progress: Callable[[int, float], None] | None
 ) -> Iterator[tuple[np.ndarray | None, Callable[[int, float], None] | None]]:
     """(values to sweep, the function that is told of sweeps).
 
@@ -228,19 +228,19 @@ def _in_memory(
     and copied to their file every ten minutes, where that costs little, and in the end, whatever ends it.
     """
     if (
-        kept is None
-        or kept.nbytes <= large_arrays.SMALL
-        or not large_arrays.fits(kept.nbytes, large_arrays.SHARE_OF_VALUES)
+        mapped is None
+        or mapped.nbytes <= large_arrays.SMALL
+        or not large_arrays.fits(mapped.nbytes, large_arrays.SHARE_OF_VALUES)
     ):
-        yield kept, progress
+        yield mapped, progress
         return
-    x, due = np.array(kept), time.monotonic() + _SECONDS
+    x, due = np.array(mapped), time.monotonic() + _SECONDS
 
     def report(sweeps: int, bound: float) -> None:
         nonlocal due
         if time.monotonic() >= due:
             began = time.monotonic()
-            kept[:] = x
+            mapped[:] = x
             due = time.monotonic() + max(_SECONDS, 20 * (time.monotonic() - began))
         if progress is not None:
             progress(sweeps, bound)
@@ -248,7 +248,7 @@ def _in_memory(
     try:
         yield x, report
     finally:
-        kept[:] = x
+        mapped[:] = x
 
 
 def check_tolerance(tolerance: float) -> None:

@@ -145,29 +145,29 @@ def rows_with_room(rows: Any, low: int, high: int) -> int:
     return high if high - low <= room else min(max(low, low + room - 4 * PIECE), high)
 
 
-def pieces_from_the_end(rows: Any, low: int, high: int, kept: int) -> Iterator[tuple[Any, int, int]]:
+def pieces_from_the_end(rows: Any, low: int, high: int, border: int) -> Iterator[tuple[Any, int, int]]:
     """(array, start, stop): ranges that make up [low, high), the last one first, each with an array that has its rows.
 
-    They are those of `ranges_from_the_end` as far as `kept`, see `rows_with_room`. Rows from there on are read into
+    They are those of `ranges_from_the_end` as far as `border`, see `rows_with_room`. Rows from there on are read into
     memory of this process, the next ones while some are swept, and leave nothing in that of the system: pages of files
     that come and go cost more than sweeps.
     """
-    kept = min(max(low, kept), high)
+    border = min(max(low, border), high)
     with contextlib.ExitStack() as stack:
         try:
-            file = stack.enter_context(_UncachedFile(rows)) if kept < high else None
+            file = stack.enter_context(_UncachedFile(rows)) if border < high else None
         except OSError:  # it has another name now, or none
-            file, kept = None, high
+            file, border = None, high
         if file is not None:
             pool = stack.enter_context(ThreadPoolExecutor(1))
-            cuts = [*range(high, kept, -PIECE), kept]
+            cuts = [*range(high, border, -PIECE), border]
             coming = pool.submit(file.read, cuts[1], cuts[0], 0)
             for i, (stop, start) in enumerate(itertools.pairwise(cuts)):
                 array = coming.result()
-                if start > kept:
+                if start > border:
                     coming = pool.submit(file.read, cuts[i + 2], start, (i + 1) % 2)
                 yield array, start, stop
-    for start, stop in ranges_from_the_end(rows, low, kept):
+    for start, stop in ranges_from_the_end(rows, low, border):
         yield rows, start, stop
 
 
