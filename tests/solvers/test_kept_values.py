@@ -8,7 +8,6 @@ import multiprocessing
 import os
 import signal
 import tempfile
-import time
 
 import numpy as np
 import pytest
@@ -18,7 +17,6 @@ from hypothesis import strategies as st
 import pharos
 from naive import exact as naive_exact
 from pharos import hardness
-from pharos.cli.app import app
 from pharos.errors import FileFormatError, FolderLocked, ParameterError, PrecisionError
 from pharos.mdp import BEST, TabularMDP
 from pharos.solvers import uniform_value, value_iteration
@@ -139,18 +137,6 @@ def test_pieces_make_up_all_rows_once(tmp_path, monkeypatch, size):
         assert stops[-1] == 100
     (tmp_path / "rows.bin").unlink()
     assert [place[1:] for place in memory_map.pieces_from_the_end(mapped, 100, 9950, 123)] == [(100, 9950)]
-
-
-def test_termination_of_solve_is_one_line(tmp_path, monkeypatch, capsys):
-    def terminated(*_, **__):
-        os.kill(os.getpid(), signal.SIGTERM)
-        time.sleep(10)
-
-    monkeypatch.setattr(Backup, "sweep", terminated)
-    with pytest.raises(SystemExit) as ended:
-        app(["solve", "simple_grid", "--values", str(tmp_path)])
-    assert ended.value.code == 130 and "the same command goes on" in capsys.readouterr().err
-    assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
 
 
 @pytest.mark.long
