@@ -28,6 +28,8 @@ def test_every_file_that_says_the_version_says_the_same():
     assert "version" in PROJECT["dynamic"]
     assert yaml.safe_load((ROOT / "CITATION.cff").read_text())["version"] == pharos.__version__
     assert f'version = "{pharos.__version__}"' in (ROOT / "conda/meta.yaml").read_text()
+    released = re.findall(r"^## (\S+)(?: - \d{4}-\d\d-\d\d)?$", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    assert released[:2] == ["Unreleased", pharos.__version__]
 
 
 @pytest.fixture(scope="module")
