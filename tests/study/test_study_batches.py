@@ -117,16 +117,18 @@ def test_a_batch_that_is_killed_too_often_goes_on_in_halves(tmp_path, sizes, mon
 @pytest.mark.slow
 def test_a_runner_that_is_killed_leaves_nothing_half_done(tmp_path, sizes):
     code = (
-        "import sys; sys.path.insert(0, sys.argv[1])\n"
+        "import sys; sys.path[:0] = sys.argv[1:3]\n"
         "if __name__ == '__main__':\n"
         "    from test_study_batches import run, specification\n"
-        "    run(specification(seeds=6), sys.argv[2])"
+        "    run(specification(seeds=6), sys.argv[3])"
     )
     script = tmp_path / "script.py"
     script.write_text(code)
     environment = {**os.environ, "PHAROS_FAKE_SECONDS": "0.1"}
-    process = subprocess.Popen([sys.executable, str(script), str(TESTS), str(tmp_path / "out")], env=environment)
+    folders = [str(TESTS), str(TESTS / "study")]
+    process = subprocess.Popen([sys.executable, str(script), *folders, str(tmp_path / "out")], env=environment)
     while not sizes():
+        assert process.poll() is None
         time.sleep(0.05)
     process.send_signal(signal.SIGKILL)
     process.wait()
