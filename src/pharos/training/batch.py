@@ -23,7 +23,7 @@ from pharos.agents import hyperparameters as hyperparameters_of
 from pharos.errors import FileFormatError, FolderLocked, ParameterError, PharosError
 from pharos.policies import is_small_table
 from pharos.system import compiling
-from pharos.system.storage import digest_of_json, lock, read_json, replace_json
+from pharos.system.storage import digest_of_json, lock, read_json, remove_leftovers, replace_json
 from pharos.system.wording import many
 from pharos.training import results as _results
 from pharos.training.config import RunConfig
@@ -332,6 +332,7 @@ class TrainingGroup:
             return False
         folder.mkdir(parents=True, exist_ok=True)
         self.held.enter_context(lock(folder, FolderLocked, "training"))
+        remove_leftovers(folder / "regret.png")  # of a killed process; those of other files go with the next one
         done = finished_result(folder, self.config)
         if done is not None:
             clear_run(folder)
