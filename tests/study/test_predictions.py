@@ -214,7 +214,7 @@ def test_the_command_line_predicts_and_reports(tmp_path):
     predictions = tmp_path / "predictions.parquet"
     done = run("study", "predict", str(file), "--out", str(predictions), "--json")
     assert json.loads(done.stdout)["cells"] == 3
-    assert done.stderr.count("pharos: predicting ") == 3  # no terminal: a line each, as it takes minutes
+    assert done.stderr.count("pharos: cell ") == 3  # no terminal: a line each, as it takes minutes
     where = ["--out", str(tmp_path / "results")]
     assert run("study", "run", str(file), *where).exit_code == 0
     done = run("study", "report", str(file), *where, "--predictions", str(predictions))
