@@ -133,13 +133,12 @@ class PrimaryRegret:
     Attributes:
         value: normalised regret, 0 optimal and 1 uniform play. deviation: of one walk; NaN where nothing is drawn.
         tabular: of the same learner with a table of the states in the place of the network.
-        estimated_error: what half of the landmarks change; 0 where the kernel is exact. note: what is random in it.
+        note: what is random in it, and what half of the landmarks change where they stand for the kernel.
     """
 
     value: float
     deviation: float
     tabular: float
-    estimated_error: float
     note: str
 
 
@@ -177,7 +176,6 @@ def primary_regret(
         value["value"] if agent == "dqn" else _evaluated(value),
         value.get("deviation", math.nan),
         value["tabular"],
-        value["estimated_error"],
         result.certificate.note or "",
     )
     return regret, str(options["representation"].conventions["network"])
