@@ -110,7 +110,9 @@ def test_shells_complete_environments_instances_and_parameters():
     assert complete_target("") == [entry.name for entry in BUILT_IN]
 
 
-def test_registered_classes_have_a_gymnasium_id():
+def test_registered_classes_have_a_gymnasium_id(monkeypatch):
+    monkeypatch.setattr("pharos.environments.catalog._REGISTERED", {})
+
     class TwoRooms(pharos.environments.SimpleGrid):
         """A grid under another name."""
 
