@@ -536,6 +536,13 @@ def test_what_the_environment_lacks_or_forbids_is_a_line(cache):
     closed = f"{sys.executable} -m pharos list >&-"
     done = subprocess.run(closed, shell=True, stderr=subprocess.PIPE, text=True, timeout=120, check=False)
     assert (done.returncode, done.stderr) == (0, "")
+    closed = f"{sys.executable} -m pharos play frozen_lake/4x4 <&-"
+    done = subprocess.run(closed, shell=True, stderr=subprocess.PIPE, text=True, timeout=120, check=False)
+    assert (
+        done.returncode == 1
+        and done.stderr.startswith("pharos: play needs a terminal")
+        and done.stderr.count("\n") == 1
+    )
 
 
 @pytest.mark.slow

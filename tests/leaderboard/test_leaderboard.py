@@ -330,6 +330,18 @@ def test_one_task_in_several_spellings_is_one_task(entry, tmp_path):
     assert made.file.read_text().count("<table") == 1
 
 
+def test_a_copy_under_another_author_is_told_beside_both(entry, tmp_path):
+    folder = tmp_path / "entries"
+    folder.mkdir()
+    for author in ("A. Turing", "A. Copyist"):
+        write(dataclasses.replace(entry, author=author), folder / f"{author[3:]}.safetensors")
+    other = dataclasses.replace(entry.config, seed=entry.config.seed + 1)  # the same table of another run is no copy
+    write(dataclasses.replace(entry, author="A. Church", config=other), folder / "other.safetensors")
+    page = leaderboard.board(folder, tmp_path / "board.html").file.read_text()
+    assert page.count("the same run as") == 2
+    assert "A. Turing (the same run as q_learning by A. Copyist)" in page
+
+
 def test_claims_that_cannot_be_true_do_not_hold(entry, file):
     wide = dataclasses.replace(entry.claim, value=1000.0, regret=-999.0, exact=False, error_bound=1e9)
     verdict = leaderboard.verify(changed(entry, file, claim=wide))
@@ -350,6 +362,14 @@ def test_authors_whom_nobody_would_see_are_refused(entry, file, text):
     with pytest.raises(FileFormatError, match=r"printed as nothing|more than 4 accents"):
         leaderboard.read(changed(entry, file, author=text))
     assert leaderboard.read(changed(entry, file, author="Ngô Bảo Châu")).author
+
+
+@pytest.mark.parametrize("text", ["\u0410. Turing", "Al\u03bfnzo"])
+def test_authors_who_look_like_others_are_refused(entry, file, text):
+    with pytest.raises(FileFormatError, match=r"mixes Latin letters with ones that look like them: (CYRILLIC|GREEK)"):
+        leaderboard.read(changed(entry, file, author=text))
+    for fine in ("\u0410\u043b\u0430\u043d", "DQN \u03b1", "A. Turing"):
+        assert leaderboard.read(changed(entry, file, author=fine)).author == fine
 
 
 def test_names_are_shown_as_they_are(entry, file):

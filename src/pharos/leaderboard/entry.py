@@ -38,6 +38,8 @@ DEEPEST = 50
 SHOWN = ("name", "author", "note")
 INVISIBLE = "\u034f\u115f\u1160\u17b4\u17b5\u180b\u180c\u180d\u180f\u2800\u3164\uffa0"
 """Printable, and nothing to see: joiners, selectors, fillers of Hangul and the empty pattern of Braille."""
+LOOKALIKES = "АВЕЅІЈКМНОРСТУХаеорсухѕіјΑΒΕΖΗΙΚΜΝΟΡΤΥΧοερν"
+"""Cyrillic and Greek letters that look like Latin ones: refused in names and authors that have Latin letters too."""
 MOST_MARKS = 4
 _METADATA, _RECORD, _ARRAYS = "__metadata__", "pharos", "arrays"
 _AGAIN = "fetch it again, or ask for it again"
@@ -285,6 +287,11 @@ def _check_shown(text: str, name: str) -> None:
         raise ValueError(f"its {name} has characters that are printed as nothing")
     if "M" * (MOST_MARKS + 1) in "".join(kinds):
         raise ValueError(f"its {name} has more than {MOST_MARKS} accents on one character")
+    foreign = sorted(set(text) & set(LOOKALIKES)) if name != "note" else []
+    if foreign and any(unicodedata.name(character, "").startswith("LATIN") for character in text):
+        raise ValueError(
+            f"its {name} mixes Latin letters with ones that look like them: {unicodedata.name(foreign[0])}"
+        )
 
 
 def _little_endian(name: str, array: np.ndarray) -> np.ndarray:
