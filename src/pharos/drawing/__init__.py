@@ -25,33 +25,6 @@ if TYPE_CHECKING:
     from pharos.drawing.text import check_state, colored_text, planes_of, text_drawing
     from pharos.drawing.window import Window
 
-_FILES = {
-    "GROUNDS": "pictures",
-    "INK": "pictures",
-    "NIGHT": "pictures",
-    "SHAPES": "shapes",
-    "Window": "window",
-    "check_state": "text",
-    "color_of": "shapes",
-    "colored_text": "text",
-    "episode": "pictures",
-    "glyph_of": "shapes",
-    "ground_of": "pictures",
-    "human": "pictures",
-    "image": "pictures",
-    "inside": "pictures",
-    "planes_of": "text",
-    "save_gif": "pictures",
-    "save_png": "pictures",
-    "scenery_of": "pictures",
-    "shade": "shapes",
-    "shape_of": "shapes",
-    "sprite_of": "shapes",
-    "sprite_pixels": "shapes",
-    "text_drawing": "text",
-    "tile": "shapes",
-}
-
 __all__ = [
     "GROUNDS",
     "SHAPES",
@@ -67,4 +40,4 @@ _shared = """
     sprite_of sprite_pixels tile
 """
 
-__getattr__ = lazy.attributes(__name__, _FILES)
+__getattr__ = lazy.attributes(__name__)

@@ -57,41 +57,6 @@ if TYPE_CHECKING:
     from pharos.environments.worlds.taxi import Taxi
     from pharos.environments.worlds.umbrella_chain import UmbrellaChain
 
-_FILES = {
-    **{entry.class_name: entry.file for entry in BUILT_IN},
-    "CELL": "parameters",
-    "CELLS": "parameters",
-    "VALUED_CELLS": "parameters",
-    "Color": "look",
-    "Components": "base",
-    "Environment": "base",
-    "Ground": "look",
-    "Kind": "parameters",
-    "Layer": "look",
-    "Look": "look",
-    "Margin": "look",
-    "Parameter": "parameters",
-    "Scenery": "look",
-    "Shape": "look",
-    "Sprite": "look",
-    "State": "base",
-    "as_tuples": "parameters",
-    "class_called": "catalog",
-    "class_of": "catalog",
-    "classes": "catalog",
-    "declared_parameters": "parameters",
-    "imported": "catalog",
-    "integers": "parameters",
-    "list_environments": "catalog",
-    "make": "catalog",
-    "named_instances": "catalog",
-    "one_of": "parameters",
-    "parameter": "parameters",
-    "register": "catalog",
-    "source_of": "catalog",
-    "start_distribution": "base",
-}
-
 __all__ = [
     "CELL",
     "CELLS",
@@ -142,4 +107,4 @@ _shared = """
     on_registration one_of source_of start_distribution
 """
 
-__getattr__ = lazy.attributes(__name__, _FILES)
+__getattr__ = lazy.attributes(__name__)

@@ -15,21 +15,6 @@ if TYPE_CHECKING:
     from pharos.explorer.pages import contents, page, write
     from pharos.explorer.server import Server
 
-_FILES = {
-    "ARROWS": "keys",
-    "Exploration": "exploration",
-    "Explorer": "launch",
-    "Learnt": "learned_policy",
-    "Server": "server",
-    "contents": "pages",
-    "exploration_of": "launch",
-    "explore": "launch",
-    "keys_of": "keys",
-    "open_browser": "launch",
-    "page": "pages",
-    "write": "pages",
-}
-
 __all__ = [
     "explore",
 ]
@@ -37,4 +22,4 @@ _shared = """
     ARROWS Exploration Explorer Learnt Server contents exploration_of keys_of open_browser page write
 """
 
-__getattr__ = lazy.attributes(__name__, _FILES)
+__getattr__ = lazy.attributes(__name__)

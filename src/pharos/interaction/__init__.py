@@ -15,20 +15,6 @@ if TYPE_CHECKING:
     from pharos.interaction.simulator import Interaction, Simulator, split_options
     from pharos.interaction.vector_env import VectorEnv, make_vec
 
-_FILES = {
-    "GymEnv": "gym_env",
-    "Interaction": "simulator",
-    "SB3VecEnv": "sb3_env",
-    "Simulator": "simulator",
-    "VectorEnv": "vector_env",
-    "ids_of": "registration",
-    "make_sb3_vec": "sb3_env",
-    "make_vec": "vector_env",
-    "register_class": "registration",
-    "split_options": "simulator",
-    "to_gymnax": "jax_export",
-}
-
 __all__ = [
     "GymEnv",
     "SB3VecEnv",
@@ -41,4 +27,4 @@ _shared = """
     Interaction Simulator ids_of register_class split_options
 """
 
-__getattr__ = lazy.attributes(__name__, _FILES)
+__getattr__ = lazy.attributes(__name__)

@@ -38,48 +38,6 @@ if TYPE_CHECKING:
     )
     from pharos.mdp.tabular import TabularMDP
 
-_FILES = {
-    "BEST": "selection",
-    "WORST": "selection",
-    "BellmanEquation": "dynamics",
-    "Chance": "chance",
-    "Dynamics": "dynamics",
-    "ExpandedMDP": "expanded",
-    "executed_actions": "expanded",
-    "nodes_of_outcomes": "expanded",
-    "outcomes_of": "expanded",
-    "Extreme": "selection",
-    "Lazy": "compiled",
-    "Matrices": "matrices",
-    "Minimization": "bisimulation",
-    "OutcomeTable": "outcome_table",
-    "Outcomes": "dynamics",
-    "PaidOutcomes": "space_rewards",
-    "Part": "part",
-    "PolicyStep": "dynamics",
-    "PolicyTable": "selection",
-    "Rewards": "rewards",
-    "Selection": "selection",
-    "Table": "compiled",
-    "TabularMDP": "tabular",
-    "chosen_mass": "selection",
-    "count_of": "dynamics",
-    "mass_of": "selection",
-    "lazy_actions": "chance",
-    "minimize": "bisimulation",
-    "paid_outcomes": "space_rewards",
-    "random_actions": "chance",
-    "ranged_rewards": "space_rewards",
-    "rewards_of_outcomes": "space_rewards",
-    "rewards_of_space": "space_rewards",
-    "rewards_of_staying": "space_rewards",
-    "runs_between": "dynamics",
-    "runs_of": "dynamics",
-    "shares_of": "dynamics",
-    "sticky_actions": "chance",
-    "require_mdp": "arguments",
-}
-
 __all__ = [
     "Chance",
     "Minimization",
@@ -98,4 +56,4 @@ _shared = """
     runs_of shares_of
 """
 
-__getattr__ = lazy.attributes(__name__, _FILES)
+__getattr__ = lazy.attributes(__name__)

@@ -38,33 +38,6 @@ if TYPE_CHECKING:
     from pharos.observations.simple_image import SimpleImage
     from pharos.observations.tangent_kernels import network_inputs, ntk, tangent_kernel
 
-_FILES = {
-    "Aliasing": "observation_aliasing",
-    "ComplexImage": "complex_image",
-    "Hash": "hash",
-    "MemorylessLoss": "memoryless",
-    "Network": "networks",
-    "OwnObservation": "observation",
-    "RENDERERS": "rendered",
-    "SimpleImage": "simple_image",
-    "aliasing": "observation_aliasing",
-    "counted": "observation_aliasing",
-    "default_network": "networks",
-    "empirical_ntk": "represented",
-    "history_aliasing": "observation_aliasing",
-    "imported": "observation",
-    "memoryless_loss": "memoryless",
-    "network_inputs": "tangent_kernels",
-    "ntk": "tangent_kernels",
-    "observation_classes": "observation_aliasing",
-    "observation_of": "observation",
-    "own_observation": "observation",
-    "render": "rendered",
-    "renderers": "rendered",
-    "representation": "represented",
-    "tangent_kernel": "tangent_kernels",
-}
-
 __all__ = [
     "Aliasing",
     "MemorylessLoss",
@@ -86,4 +59,4 @@ _shared = """
     own_observation registered render renderers tangent_kernel title
 """
 
-__getattr__ = lazy.attributes(__name__, _FILES)
+__getattr__ = lazy.attributes(__name__)

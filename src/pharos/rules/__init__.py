@@ -16,21 +16,9 @@ if TYPE_CHECKING:
     from pharos.rules.rules import Rules, not_compiled, rules_of
     from pharos.rules.stepping import InterpretedStepping
 
-_LAZY = {
-    "CompiledDrawing": "compiled",
-    "CompiledExploration": "compiled",
-    "CompiledMotion": "compiled",
-    "InterpretedStepping": "stepping",
-    "Rules": "rules",
-    "not_compiled": "rules",
-    "reason_of": "compiler",
-    "refused_reward": "interpreted",
-    "rules_of": "rules",
-}
-
 _shared = """
     CompiledDrawing CompiledExploration CompiledMotion InterpretedStepping Layout Rules fingerprint_of_rules
     layout_of mutable_attributes not_compiled pack reason_of refused_reward rules_of unpack
 """
 
-__getattr__ = lazy.attributes(__name__, _LAZY)
+__getattr__ = lazy.attributes(__name__)

@@ -3,26 +3,35 @@
 `import pharos` and a script's first lines need few of the names that a package publishes; the others cost nothing then.
 """
 
+import ast
+import functools
 import importlib
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 
-def attributes(package: str, files: Mapping[str, str]) -> Callable[[str], Any]:
-    """The `__getattr__` of a package.
+def attributes(package: str) -> Callable[[str], Any]:
+    """The `__getattr__` of a package: the names that its `__init__.py` imports from its files under `TYPE_CHECKING`.
 
     Args:
         package: its `__name__`.
-        files: name that the package publishes -> file of the package that has it.
     Returns:
         Function(name) -> what the file has under this name, which the package keeps; AttributeError for other names.
     """
 
+    @functools.cache
+    def modules() -> dict[str, str]:
+        tree = ast.parse(Path(str(sys.modules[package].__file__)).read_text(encoding="utf-8"))
+        imports = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
+        own = [(node, str(node.module)) for node in imports if str(node.module).startswith(f"{package}.")]
+        return {alias.name: module for node, module in own for alias in node.names}
+
     def attribute(name: str) -> Any:
-        if name not in files:
+        if name.startswith("__") or name not in modules():
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        value = getattr(importlib.import_module(f"{package}.{files[name]}"), name)
+        value = getattr(importlib.import_module(modules()[name]), name)
         setattr(sys.modules[package], name, value)
         return value
 

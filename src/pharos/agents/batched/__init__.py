@@ -11,16 +11,6 @@ if TYPE_CHECKING:
     from pharos.agents.batched.batch import Batch, make_batch
     from pharos.agents.batched.runs import BatchRun, ObservationSource, group_key, lane_width, supports
 
-_FILES = {
-    "Batch": "batch",
-    "BatchRun": "runs",
-    "ObservationSource": "runs",
-    "group_key": "runs",
-    "lane_width": "runs",
-    "make_batch": "batch",
-    "supports": "runs",
-}
-
 __all__ = ["Batch", "BatchRun", "ObservationSource", "group_key", "lane_width", "make_batch", "supports"]
 
-__getattr__ = lazy.attributes(__name__, _FILES)
+__getattr__ = lazy.attributes(__name__)
