@@ -17,7 +17,6 @@ from pharos.study.blocks import Run, Specification
 from pharos.study.clusters import run_on_ray, submit
 from pharos.study.execution import Status, opened, run, status
 from pharos.study.findings import findings
-from pharos.study.forecast import Forecast
 from pharos.study.leave_one_class_out import outcomes, validation
 from pharos.study.logs import LOGGERS, RunLog, log
 from pharos.study.predictions import predict, read_predictions, write_predictions
@@ -67,7 +66,7 @@ __all__ = [
     "validation",
 ]
 _shared = """
-    Forecast LOGGERS POLICY_PREDICTORS PREDICTORS RunLog has_regret intervals leave_one_class_out_r_squared opened
+    LOGGERS POLICY_PREDICTORS PREDICTORS RunLog has_regret intervals leave_one_class_out_r_squared opened
     paper_agreement paper_instance paper_regressions paper_returns read_predictions run_id run_on_ray
     write_predictions
 """

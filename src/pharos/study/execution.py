@@ -27,10 +27,9 @@ from pharos.study import batches as _batches
 from pharos.study import values as _values
 from pharos.study import worker as _worker
 from pharos.study.blocks import Run, Specification
-from pharos.study.forecast import Forecast, forecast
 from pharos.study.processes import end_processes, one_thread, processors, ready, worker_context
 from pharos.study.specification import Source
-from pharos.study.status import Status, claim, duration, opened, status
+from pharos.study.status import Forecast, Status, claim, duration, opened, status
 from pharos.system.storage import replace_json
 from pharos.system.wording import many
 from pharos.system.workers import check_guard, without_interrupts, without_main
@@ -104,8 +103,7 @@ def run(  # noqa: PLR0913
             spaces for the usual runner, and does nothing for another.
         batch_runner: `runner(configs, folders, folder for checkpoints)` of runs that the study says are batched; None:
             the usual one for the usual runner, else each of them alone.
-        foretold: called before the first run with how long all of them will take; paces that nothing tells are
-            measured where the whole takes long. None: nothing is foretold.
+        foretold: called before the first run with how many are to come, and how long they will take.
         device: where batches are trained, as torch names it: "cpu", "cuda".
     Returns:
         The Status at the end. Failed runs do not stop the others.
@@ -134,7 +132,7 @@ def run(  # noqa: PLR0913
     )
     execution = Execution(study, place, runs, options)
     if foretold is not None and execution.pending:
-        foretold(execution.forecast(measure=runner is train))
+        foretold(execution.forecast())
     if prepare is None and runner is train:
         prepare = prepare_instance
     if prepare is not None:
@@ -181,10 +179,10 @@ class Execution:
             if not self.note(run, options.retry_failed):
                 self.pending.append((0.0, run))
 
-    def forecast(self, *, measure: bool) -> Forecast:
+    def forecast(self) -> Forecast:
         """How long the runs that are missing will take."""
-        runs = [run for _, run in self.pending]
-        return forecast(runs, self.options.workers, self.seconds_per_step, measure=measure, tell=self.report)
+        steps = sum(run.config["steps"] for _, run in self.pending)
+        return Forecast(len(self.pending), steps, self.options.workers, self._remaining())
 
     def prepare(self, prepare: Callable[[Mapping[str, Any]], Any]) -> None:
         """Call `prepare` with one config of each instance that has runs to come; a failure is left to the runs to

@@ -80,6 +80,29 @@ class Status:
         return text
 
 
+@dataclass(frozen=True)
+class Forecast:
+    """What the missing runs of a study will take.
+
+    Attributes:
+        runs, steps: how many are missing.
+        workers: processes.
+        seconds: until the last is finished, at the pace of finished runs; None: no run is finished.
+    """
+
+    runs: int
+    steps: int
+    workers: int
+    seconds: float | None
+
+    def __str__(self) -> str:
+        text = f"{many(self.runs, 'run')} to come, {self.steps:,} steps"
+        if self.seconds is None:
+            return f"{text}; how long they take is told once one is finished"
+        workers = many(self.workers, "worker")
+        return f"{text}: about {duration(self.seconds)} with {workers}, at the pace of finished runs"
+
+
 def duration(seconds: float) -> str:
     """`40 s`, `12 min`, `3.5 h`."""
     if seconds < 90:

@@ -1,7 +1,7 @@
 """Training: an agent trained on a task, its policies evaluated exactly, and the result written down."""
 
 from pharos.solvers import ReferenceValues, cumulative_expected_regret, regret
-from pharos.training.batch import Progress, steps_in_seconds, train_configs
+from pharos.training.batch import Progress, train_configs
 from pharos.training.config import ENGINES, ChanceSetting, Horizon, RunConfig, run_id
 from pharos.training.curve import RegretCurve, bootstrap_interval
 from pharos.training.evaluation import Evaluation, evaluate_agent
@@ -44,5 +44,5 @@ __all__ = [
 ]
 _shared = """
     ENGINES FailedRun Progress SPACES TaskCache TaskValues bootstrap_interval check_agent clear_run digest_of_curve
-    read_curve read_curve_table read_record read_rows read_table run_id steps_in_seconds write_record write_table
+    read_curve read_curve_table read_record read_rows read_table run_id write_record write_table
 """

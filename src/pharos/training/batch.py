@@ -15,11 +15,10 @@ import time
 import warnings
 from collections import defaultdict
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pharos.agents import hyperparameters as hyperparameters_of
 from pharos.errors import FileFormatError, FolderLocked, ParameterError, PharosError
 from pharos.policies import is_small_table
 from pharos.system import compiling
@@ -28,14 +27,12 @@ from pharos.system.wording import many
 from pharos.training import results as _results
 from pharos.training.config import RunConfig
 from pharos.training.evaluation import values_together
-from pharos.training.learners import Learner, make_learner
+from pharos.training.learners import make_learner
 from pharos.training.run_folder import Checkpoint, Record, TrainingResult, clear_run, finished_result
-from pharos.training.task import Task
 from pharos.training.task_cache import FailedRun, Member, TaskCache, in_one_line
 
 # What a member is begun anew from, where its batch is halved.
 BEGINNING = ("place", "config", "folder", "task", "hyperparameters", "run", "key")
-EARLY = 100  # steps before DQN learns, where its pace is measured
 
 
 @dataclass(frozen=True)
@@ -460,29 +457,3 @@ def _is_memory(error: BaseException) -> bool:
     """Whether memory was not enough, in the words of Python, torch on the processor, or torch on a GPU."""
     words = str(error).lower()
     return isinstance(error, MemoryError) or "out of memory" in words or "can't allocate memory" in words
-
-
-def steps_in_seconds(config: RunConfig, task: Task, warm: int, measured: int, together: int = 1) -> tuple[float, Any]:
-    """The seconds that `measured` steps take after `warm` ones, without evaluations, and the policy by then.
-
-    Args:
-        task: of the configuration.
-        together: runs of the batched engine that take these steps at once, with other seeds.
-    """
-    chosen = hyperparameters_of(config.agent, config.environment, config.observation, config.hyperparameters)
-    if "learning_starts" in chosen:
-        chosen["learning_starts"] = min(EARLY, chosen["learning_starts"])
-    short = replace(config, steps=warm + measured, hyperparameters=chosen)
-    members = TaskCache(trust=True, strict=True)
-    members.adopt(short, task)
-    learner: Learner = make_learner(
-        [members.member(i, replace(short, seed=short.seed + i), None) for i in range(together)]
-    )
-    times: list[float] = []
-
-    def at_point(_: int) -> dict[str, float]:
-        times.append(time.perf_counter())
-        return {"value": 0.0, "expected_regret": 0.0, "mean_return": 0.0}
-
-    learner.learn([warm, warm + measured], at_point)
-    return times[1] - times[0], learner.policy(0)
