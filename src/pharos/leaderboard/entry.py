@@ -1,4 +1,4 @@
-"""The file of an entry: numbers and JSON in the layout of safetensors, read without executing anything.
+"""The file of an entry: numbers and JSON in a file of safetensors, read without executing anything.
 
     8 bytes      length N of the header, little-endian
     N bytes      JSON: name of each array -> dtype, shape, data_offsets; "__metadata__": {"pharos": the record, as JSON}
@@ -13,7 +13,6 @@ Source of the layout: the format of safetensors, https://github.com/huggingface/
 import json
 import math
 import os
-import struct
 import sys
 import unicodedata
 from collections.abc import Mapping
@@ -22,6 +21,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save
 
 from pharos.errors import FileFormatError, ParameterError, ResultCorrupted
 from pharos.system import storage
@@ -41,21 +42,8 @@ INVISIBLE = "\u034f\u115f\u1160\u17b4\u17b5\u180b\u180c\u180d\u180f\u2800\u3164\
 LOOKALIKES = "АВЕЅІЈКМНОРСТУХаеорсухѕіјΑΒΕΖΗΙΚΜΝΟΡΤΥΧοερν"
 """Cyrillic and Greek letters that look like Latin ones: refused in names and authors that have Latin letters too."""
 MOST_MARKS = 4
-_METADATA, _RECORD, _ARRAYS = "__metadata__", "pharos", "arrays"
+_RECORD, _ARRAYS = "pharos", "arrays"
 _AGAIN = "fetch it again, or ask for it again"
-_DTYPES = {
-    "BOOL": "|b1",
-    "U8": "|u1",
-    "U16": "<u2",
-    "U32": "<u4",
-    "I8": "|i1",
-    "I16": "<i2",
-    "I32": "<i4",
-    "I64": "<i8",
-    "F16": "<f2",
-    "F32": "<f4",
-    "F64": "<f8",
-}
 _KINDS: dict[str, tuple[type, ...]] = {  # of what a configuration says
     **dict.fromkeys(("environment", "observation", "agent"), (str,)),
     **dict.fromkeys(("parameters", "chance", "observation_options", "hyperparameters"), (dict,)),
@@ -63,7 +51,6 @@ _KINDS: dict[str, tuple[type, ...]] = {  # of what a configuration says
     "gamma": (int, float),
     "horizon": (int, type(None)),
 }
-_NAMES = {text: name for name, text in _DTYPES.items()}
 
 
 @dataclass(frozen=True)
@@ -121,7 +108,7 @@ class Entry:
 
 def write(entry: Entry, file: str | os.PathLike) -> None:
     """Replace a file by an entry, in one step; the same entry gives the same bytes."""
-    arrays = {name: _little_endian(name, array) for name, array in entry.arrays.items()}
+    arrays = {name: _checked(name, array) for name, array in entry.arrays.items()}
     record = {
         "format": FORMAT,
         "name": entry.name,
@@ -137,19 +124,10 @@ def write(entry: Entry, file: str | os.PathLike) -> None:
         _ARRAYS: {name: _digest(array) for name, array in arrays.items()},
     }
     text = json.dumps(storage.sealed(record), sort_keys=True, allow_nan=False)
-    header: dict[str, Any] = {_METADATA: {_RECORD: text}}
-    end = 0
-    for name, array in arrays.items():
-        begin, end = end, end + array.nbytes
-        header[name] = {"dtype": _NAMES[array.dtype.str], "shape": list(array.shape), "data_offsets": [begin, end]}
-    head = json.dumps(header, separators=(",", ":")).encode()
-    head += b" " * (-len(head) % 8)
-    if len(head) > LARGEST_HEADER or end > LARGEST_FILE:
-        raise ParameterError(f"{file}: the entry would have {end:,} bytes; expected at most {LARGEST_FILE:,}")
-    with storage.replacing(file) as out:
-        out.write(struct.pack("<Q", len(head)) + head)
-        for array in arrays.values():
-            out.write(array.tobytes())
+    data = save(arrays, {_RECORD: text})
+    if len(data) > LARGEST_FILE:
+        raise ParameterError(f"{file}: the entry would have {len(data):,} bytes; expected at most {LARGEST_FILE:,}")
+    storage.replace_file(file, data)
 
 
 def read(file: str | os.PathLike) -> Entry:
@@ -163,30 +141,23 @@ def read(file: str | os.PathLike) -> Entry:
     if not path.is_file():
         raise ParameterError(f"{path}: no such file")
     try:
-        header, begin, size = _header(path)
-        text = header.pop(_METADATA)[_RECORD]
-        record = json.loads(text)
+        _check_sizes(path)
+        with safe_open(path, "numpy") as stored:
+            record = json.loads(stored.metadata()[_RECORD])
+            arrays = {name: _checked(name, stored.get_tensor(name)) for name in stored.keys()}  # noqa: SIM118
         if not isinstance(record, dict):
             raise TypeError("its record is no object")
         is_intact = storage.DIGEST in record and storage.is_intact(record)
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+    except SafetensorError as error:
+        raise ResultCorrupted(f"{path}: is no entry, or was cut short or changed: {_reason(error)}; {_AGAIN}") from None
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError, ParameterError) as error:
         raise FileFormatError(f"{path}: is no entry of a leaderboard: {_reason(error)}; {_AGAIN}") from None
     if not is_intact:
         raise ResultCorrupted(f"{path}: what it says was changed after it was written; {_AGAIN}")
     if record.get("format") != FORMAT:
         raise FileFormatError(f"{path}: is in format {record.get('format')!r}; this version of pharos reads {FORMAT}")
-    try:
-        places = _places(header, size)
-        if list(record[_ARRAYS]) != sorted(places):
-            raise ValueError("its arrays are not those that it was written with")
-    except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
-        raise ResultCorrupted(f"{path}: was cut short or changed: {_reason(error)}; {_AGAIN}") from None
-    data = np.fromfile(path, np.uint8, size, offset=begin)
-    arrays = {}
-    for name, (dtype, shape, first, last) in places.items():
-        arrays[name] = data[first:last].view(dtype).reshape(shape)
-        if _digest(arrays[name]) != record[_ARRAYS][name]:
-            raise ResultCorrupted(f"{path}: its array {name!r} was changed after it was written; {_AGAIN}")
+    if record.get(_ARRAYS) != {name: _digest(array) for name, array in arrays.items()}:
+        raise ResultCorrupted(f"{path}: its arrays were changed after it was written; {_AGAIN}")
     try:
         return _entry(record, arrays)
     except (FileFormatError, ParameterError) as error:
@@ -195,35 +166,15 @@ def read(file: str | os.PathLike) -> Entry:
         raise FileFormatError(f"{path}: its record is damaged: {_reason(error)}; {_AGAIN}") from None
 
 
-def _header(path: Path) -> tuple[dict[str, Any], int, int]:
-    """The header, where the data begin, and how many bytes they are."""
+def _check_sizes(path: Path) -> None:
+    """ValueError where the file or its header is too large to be read."""
+    total = path.stat().st_size
     with open(path, "rb") as file:
-        total = os.fstat(file.fileno()).st_size
-        if not 8 < total <= LARGEST_FILE:
-            raise ValueError(f"it has {total:,} bytes; expected at most {LARGEST_FILE:,}")
-        (length,) = struct.unpack("<Q", file.read(8))
-        if length > min(LARGEST_HEADER, total - 8):
-            raise ValueError(f"its header would have {length:,} bytes, of {total:,} in the file")
-        header = json.loads(file.read(length))
-    if not isinstance(header, dict):
-        raise TypeError("its header is no object")
-    return header, 8 + length, total - 8 - length
-
-
-def _places(header: Mapping[str, Any], size: int) -> dict[str, tuple[np.dtype, tuple[int, ...], int, int]]:
-    """Name -> dtype, shape, first and last byte of each array; ValueError unless they fill the file without gaps."""
-    places, end = {}, 0
-    for name, place in header.items():
-        shape, (first, last) = tuple(place["shape"]), place["data_offsets"]
-        dtype = np.dtype(_DTYPES[place["dtype"]])
-        if not all(type(number) is int and number >= 0 for number in (*shape, first, last)) or len(shape) > 8:
-            raise ValueError(f"the array {name!r} has a strange shape")
-        if first != end or last - first != math.prod(shape) * dtype.itemsize:
-            raise ValueError(f"the array {name!r} is not where its shape and type say")
-        places[name], end = (dtype, shape, first, last), last
-    if end != size:
-        raise ValueError(f"its arrays have {end:,} bytes; found {size:,}")
-    return places
+        length = int.from_bytes(file.read(8), "little")
+    if not 8 < total <= LARGEST_FILE:
+        raise ValueError(f"it has {total:,} bytes; expected at most {LARGEST_FILE:,}")
+    if length > min(LARGEST_HEADER, total - 8):
+        raise ValueError(f"its header would have {length:,} bytes, of {total:,} in the file")
 
 
 def _entry(record: Mapping[str, Any], arrays: dict[str, np.ndarray]) -> Entry:
@@ -294,12 +245,10 @@ def _check_shown(text: str, name: str) -> None:
         )
 
 
-def _little_endian(name: str, array: np.ndarray) -> np.ndarray:
-    array = np.ascontiguousarray(array).reshape(array.shape)
-    array = array.astype(array.dtype.newbyteorder("<"), copy=False)
-    if array.dtype.str not in _NAMES:
+def _checked(name: str, array: np.ndarray) -> np.ndarray:
+    if array.dtype.kind not in "biuf" or array.dtype.itemsize > 8:
         raise ParameterError(f"the array {name!r} holds {array.dtype}; expected integers or floats of at most 64 bits")
-    return array
+    return np.asarray(array, array.dtype.newbyteorder("<"), order="C")
 
 
 def _digest(array: np.ndarray) -> str:
