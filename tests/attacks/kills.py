@@ -27,7 +27,7 @@ CHANGES = ("os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.truncate", "os.
 WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC
 VOLATILE = {"seconds", "compiling_seconds", "written", "digest", "elapsed", "remaining", "updated", "process", "host"}
 """What JSON files say of when and where, not of what came out."""
-UNCOMPARED = ("journal.log", "log.txt", "status.json", "lock")
+UNCOMPARED = ("log.txt", "status.json", "lock")
 REMADE = ("cache/values",)
 """What is computed again where it is not there, and then not kept."""
 LONGEST = 60.0

@@ -368,10 +368,10 @@ def test_searches(attack, tmp_path):
     command("tune", *options, "--trials", 3, "--out", tmp_path / "search")
 
     def read(folder):
-        """A search goes on from what its journal says, whose numbers are believed."""
+        """A search goes on from its trials."""
         return len(command("tune", *options, "--trials", 4, "--out", folder)["trials"]) >= 4
 
-    names = ("journal.log", "tuning.json", "hyperparameters.yaml")
+    names = ("tuning.json", "hyperparameters.yaml")
     attack("searches", 40, tmp_path / "search", names, read, fewer=2)
 
 

@@ -15,6 +15,7 @@ from command_line import run
 from pharos.agents import hyperparameters
 from pharos.errors import FileFormatError, ParameterError
 from pharos.training import SPACES, read_record, train, tune
+from pharos.training.results import identifier
 
 LAKE = "frozen_lake/4x4"
 ONE = {"learning_rate": ("log", 0.001, 1.0)}
@@ -156,48 +157,82 @@ def test_the_command_takes_several_kinds_of_chance(tmp_path):
     assert kept == [{"sticky": 0.0, "random": 0.0}, {"sticky": 0.25, "random": 0.1}]
 
 
-@pytest.mark.slow
-def test_a_search_goes_on_where_the_last_line_of_its_journal_was_cut(tmp_path):
-    once = tune("q_learning", "frozen_lake/4x4", steps=200, trials=3, seeds=[0], out=tmp_path)
-    journal = tmp_path / "journal.log"
-    journal.write_bytes(journal.read_bytes()[:-7])
-    (tmp_path / "journal.log.lock").touch()  # Optuna's, of a process that was killed
-    began = time.perf_counter()
-    again = tune("q_learning", "frozen_lake/4x4", steps=200, trials=4, seeds=[0], out=tmp_path)
-    assert time.perf_counter() - began < 20
-    assert [trial["score"] for trial in again.trials][:2] == [trial["score"] for trial in once.trials][:2]
-    assert sum(trial["status"] in ("finished", "given up") for trial in again.trials) == 4
+TOLD = ("number", "hyperparameters", "score", "status")
 
 
-def test_a_journal_that_is_damaged_elsewhere_is_one_line(tmp_path):
-    tune("q_learning", "frozen_lake/4x4", steps=200, trials=2, seeds=[0], out=tmp_path)
-    journal = tmp_path / "journal.log"
-    lines = journal.read_bytes().splitlines(keepends=True)
-    journal.write_bytes(b"".join([lines[0], lines[1][:9] + b"\n", *lines[2:]]))
-    with pytest.raises(FileFormatError, match=r"journal\.log:2: is no JSON"):
-        tune("q_learning", "frozen_lake/4x4", steps=200, trials=3, seeds=[0], out=tmp_path)
+def told(result):
+    return [[trial[name] for name in TOLD] for trial in result.trials]
 
 
 def test_a_search_that_was_killed_goes_on_as_it_would_have(tmp_path):
     options = {"steps": 200, "seeds": [0], "search_seed": 5}
-    once = tune("q_learning", "frozen_lake/4x4", trials=6, out=tmp_path / "once", **options)
-    tune("q_learning", "frozen_lake/4x4", trials=3, out=tmp_path / "twice", **options)
-    storage = optuna.storages.JournalStorage(JournalFileBackend(str(tmp_path / "twice" / "journal.log")))
-    optuna.load_study(study_name=None, storage=storage).ask()  # a trial that has begun and never ends
-    twice = tune("q_learning", "frozen_lake/4x4", trials=6, out=tmp_path / "twice", **options)
-    told = ("number", "hyperparameters", "score", "status")
-    assert [[each[name] for name in told] for each in twice.trials] == [
-        [each[name] for name in told] for each in once.trials
-    ]
-    assert len({str(each["hyperparameters"]) for each in once.trials}) == 6
+    once = tune("q_learning", LAKE, trials=20, out=tmp_path / "once", **options)
+
+    def stop(done, *_):
+        if done == 9:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        tune("q_learning", LAKE, trials=20, out=tmp_path / "twice", progress=stop, **options)
+    twice = tune("q_learning", LAKE, trials=20, out=tmp_path / "twice", **options)
+    assert told(twice) == told(once)
+    assert {trial["status"] for trial in once.trials} == {"finished", "given up"}
+    assert len({str(trial["hyperparameters"]) for trial in once.trials}) == 20
 
 
-def test_a_journal_that_lacks_a_name_is_one_line(tmp_path):
-    tune("q_learning", "frozen_lake/4x4", steps=200, trials=2, seeds=[0], out=tmp_path)
-    journal = tmp_path / "journal.log"
-    journal.write_text(journal.read_text().replace('"trial_id"', '"trial_if"'))
-    with pytest.raises(FileFormatError, match=r"journal\.log: is not as Optuna wrote it \(KeyError.*delete the folder"):
-        tune("q_learning", "frozen_lake/4x4", steps=200, trials=3, seeds=[0], out=tmp_path)
+@pytest.fixture
+def journal(tmp_path):
+    """Folder of a search of an earlier pharos, killed in its fourth trial and in the middle of a line of its journal;
+    trials that it had done."""
+    result = tune("q_learning", LAKE, steps=200, trials=3, seeds=[0], out=tmp_path / "now")
+    record = json.loads((tmp_path / "now" / "tuning.json").read_text())
+    for trial in [record, *record["trials"]]:
+        trial.pop("reports", None), trial.pop("digest", None)
+    old = tmp_path / "old"
+    old.mkdir()
+    (old / "tuning.json").write_text(json.dumps(record))
+    storage = optuna.storages.JournalStorage(JournalFileBackend(str(old / "journal.log")))
+    study = optuna.create_study(study_name=identifier(record["config"]), storage=storage)
+    space = {
+        "one of": lambda values: optuna.distributions.CategoricalDistribution(values),
+        "linear": lambda values: optuna.distributions.FloatDistribution(*values),
+        "log": lambda values: optuna.distributions.FloatDistribution(*values, log=True),
+    }
+    distributions = {name: space[kind](values) for name, (kind, *values) in record["config"]["space"].items()}
+    for trial in result.trials:
+        reports = {int(step): mean for step, mean in trial["reports"].items()}
+        stated = {"params": trial["hyperparameters"], "distributions": distributions, "intermediate_values": reports}
+        study.add_trial(optuna.trial.create_trial(value=trial["score"], **stated))
+    study.ask()
+    with open(old / "journal.log", "ab") as file:
+        file.write(b'{"op_code": 5')
+    return old, result
+
+
+def test_a_journal_of_an_earlier_pharos_is_read_on(journal):
+    folder, result = journal
+    again = tune("q_learning", LAKE, steps=200, trials=3, seeds=[0], out=folder)
+    assert told(again) == told(result)
+    assert [trial["reports"] for trial in again.trials] == [trial["reports"] for trial in result.trials]
+    assert not (folder / "journal.log").exists()
+    more = tune("q_learning", LAKE, steps=200, trials=5, seeds=[0], out=folder)
+    assert told(more) == told(tune("q_learning", LAKE, steps=200, trials=5, seeds=[0]))
+
+
+@pytest.mark.parametrize("name", ["journal.log", "tuning.json"])
+def test_damaged_files_of_a_search_are_one_line(journal, name):
+    file = journal[0] / name
+    file.write_bytes(file.read_bytes()[:1] + b"?" + file.read_bytes()[1:])
+    with pytest.raises(FileFormatError, match=rf"{name}: is no.*delete the folder and search again"):
+        tune("q_learning", LAKE, steps=200, trials=4, seeds=[0], out=journal[0])
+
+
+def test_a_record_that_was_changed_is_one_line(tmp_path):
+    tune("q_learning", LAKE, steps=200, trials=2, seeds=[0], out=tmp_path)
+    file = tmp_path / "tuning.json"
+    file.write_text(file.read_text().replace('"score": 0.', '"score": 0.1'))
+    with pytest.raises(FileFormatError, match=r"tuning\.json: was changed after it was written; delete the folder"):
+        tune("q_learning", LAKE, steps=200, trials=3, seeds=[0], out=tmp_path)
 
 
 @pytest.mark.slow
@@ -205,7 +240,7 @@ def test_an_interrupted_search_says_one_line(tmp_path):
     code = "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); from pharos.cli import main; "
     code += f"sys.argv = 'pharos tune {LAKE} --agent q_learning --steps 200000 --trials 99 --out out'.split(); main()"
     process = subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.PIPE, text=True, cwd=tmp_path)
-    while process.poll() is None and not (tmp_path / "out" / "journal.log").exists():
+    while process.poll() is None and not (tmp_path / "out" / "lock").exists():
         time.sleep(0.05)
     process.send_signal(signal.SIGINT)
     _, errors = process.communicate(timeout=60)

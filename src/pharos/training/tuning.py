@@ -1,8 +1,8 @@
 """Tuning: hyperparameters for an agent on a class of environments, searched by Optuna's TPE sampler.
 
     FOLDER/hyperparameters.yaml   the best ones, in the form that docs/agents.md describes
-    FOLDER/tuning.json            what was searched, and every trial: hyperparameters, score, status, seconds
-    FOLDER/journal.log            Optuna's own record, from which an interrupted search goes on
+    FOLDER/tuning.json            what was searched, and every trial: hyperparameters, score, status, seconds, reports
+                                  (means on the way, by evaluations), from which an interrupted search goes on
 
 A trial trains on every instance with every seed. Its score is the mean over these runs of the mean normalised regret of
 their evaluations after the first: 0 is optimal from the first evaluation on, 1 as bad as acting at random. A trial
@@ -11,8 +11,6 @@ runs of a trial that fit together are one program. The first trial is what the
 table says now, so that the best is never worse than that on the instances and seeds of the search.
 
 Source: Bergstra et al. (2011), Algorithms for hyper-parameter optimization; Akiba et al. (2019), Optuna.
-
-The journal of a search: Optuna's record, a JSON object a line, whose last line a full disk may have cut.
 """
 
 import contextlib
@@ -20,7 +18,6 @@ import inspect
 import json
 import math
 import os
-import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -35,7 +32,6 @@ from pharos.environments import Environment, make
 from pharos.errors import FileFormatError, FolderLocked, MissingExtra, ParameterError
 from pharos.observations import own_observation
 from pharos.system import storage
-from pharos.system.storage import check_regular, lock
 from pharos.system.wording import many
 from pharos.training import results as _results
 from pharos.training.batch import Progress, train_configs
@@ -44,6 +40,9 @@ from pharos.training.task import Task
 from pharos.training.task_cache import FailedRun, TaskCache
 
 EVALUATIONS = 20  # of a run
+JOURNAL = "journal.log"
+_STATUS = {"COMPLETE": "finished", "PRUNED": "given up"}
+_AGAIN = "delete the folder and search again"
 SPACES: dict[str, dict[str, tuple[Any, ...]]] = {
     "q_learning": {
         "learning_rate": ("log", 0.01, 1.0),
@@ -93,8 +92,8 @@ class TuningResult:
         hyperparameters: the best that were found, all of them, those that were not searched included.
         score: mean normalised regret of the best trial.
         first_score: that of the first trial, what the table said before; None where it was not finished.
-        trials: a dictionary for each: number, hyperparameters, score, status ("finished", "given up", "failed"),
-            seconds.
+        trials: a dictionary for each: number, hyperparameters, score, status ("finished", "given up"), seconds,
+            reports (number of evaluations -> mean so far).
         folder: where it was written, or None.
     """
 
@@ -168,31 +167,32 @@ def tune(  # noqa: PLR0913
         engine=engine,
     )
     folder = None if out is None else Path(out)
-    if folder is not None:
-        _claim(folder, search.config)
-    study = _opened(optuna, search, folder, trials)
-    search.check_tasks()
-
-    def after(*_: Any) -> None:
+    with contextlib.ExitStack() as held:
         if folder is not None:
-            _write(folder, search, study)
-        if progress is not None:
-            progress(_done(study), trials, _best(study))
-
-    while (done := _done(study)) < trials:
-        study.sampler = _sampler(optuna, search, done, trials)
-        study.optimize(lambda trial: search.score(trial, optuna.TrialPruned), n_trials=1, callbacks=[after])
-    if folder is not None and done:  # it may have been killed before it wrote the last one
-        _write(folder, search, study)
-    if not math.isfinite(_best(study)):
+            folder.mkdir(parents=True, exist_ok=True)
+            held.enter_context(storage.lock(folder, FolderLocked, "tuning"))
+        records = [] if folder is None else _earlier_trials(optuna, search, folder)
+        search.check_tasks()
+        study = _study(optuna, search, records)
+        while len(records) < trials:
+            study.sampler = _sampler(optuna, search, len(records), trials)
+            study.optimize(lambda trial: search.score(trial, optuna.TrialPruned), n_trials=1)
+            records.append(_record(study.trials[-1]))
+            if folder is not None:
+                _write(folder, search, records)
+            if progress is not None:
+                progress(len(records), trials, _best(records)["score"])
+        if folder is not None and (folder / JOURNAL).exists():
+            _write(folder, search, records)
+    best = _best(records)
+    if not best["hyperparameters"]:
         raise ParameterError(f"none of {many(trials, 'trial')} was finished; give more trials, or look at tuning.json")
-    records = _trials(study)
     return TuningResult(
         agent=agent,
         environment=search.environment,
         observation=search.observation_name,
-        hyperparameters={**search.table, **study.best_params},
-        score=float(study.best_value),
+        hyperparameters={**search.table, **best["hyperparameters"]},
+        score=float(best["score"]),
         first_score=records[0]["score"],
         trials=records,
         folder=folder,
@@ -340,26 +340,28 @@ def _allows(choices: tuple[Any, ...], value: Any) -> bool:
     return isinstance(value, int | float) and values[0] <= value <= values[1]
 
 
-def _opened(optuna: Any, search: _Search, folder: Path | None, trials: int) -> Any:
-    """Optuna's study, new or as it was left; its first trial is what the table says."""
+def _study(optuna: Any, search: _Search, records: Sequence[Mapping[str, Any]]) -> Any:
+    """Optuna's study with the trials that are over; its first trial is what the table says."""
     optuna.logging.set_verbosity(optuna.logging.ERROR)  # what fails is raised
-    try:
-        study = optuna.create_study(
-            study_name=_results.identifier(search.config),
-            storage=_storage(optuna, folder),
-            sampler=_sampler(optuna, search, 0, trials),
-            pruner=optuna.pruners.MedianPruner(n_startup_trials=5, n_warmup_steps=10),
-            direction="minimize",
-            load_if_exists=True,
+    pruner = optuna.pruners.MedianPruner(n_startup_trials=5, n_warmup_steps=10)
+    study = optuna.create_study(pruner=pruner, direction="minimize")
+    distributions = {
+        name: optuna.distributions.CategoricalDistribution(values)
+        if kind == "one of"
+        else optuna.distributions.FloatDistribution(*values, log=kind == "log")
+        for name, (kind, *values) in search.space.items()
+    }
+    for record in records:
+        study.add_trial(
+            optuna.trial.create_trial(
+                state=getattr(optuna.trial.TrialState, "PRUNED" if record["score"] is None else "COMPLETE"),
+                value=record["score"],
+                params=record["hyperparameters"],
+                distributions={name: distributions[name] for name in record["hyperparameters"]},
+                intermediate_values={int(step): mean for step, mean in record.get("reports", {}).items()},
+            )
         )
-    except (KeyError, ValueError, TypeError, AttributeError) as error:
-        if isinstance(error, FileFormatError) or folder is None:
-            raise
-        raise FileFormatError(
-            f"{folder / 'journal.log'}: is not as Optuna wrote it ({type(error).__name__}: {error}); delete the folder "
-            f"and search again"
-        ) from error
-    if not _trials(study) and all(trial.state.name != "WAITING" for trial in study.trials):
+    if not records:
         before = {key: search.table.get(key, _default_value(search.agent, key)) for key in search.space}
         study.enqueue_trial({key: value for key, value in before.items() if _allows(search.space[key], value)})
     return study
@@ -397,130 +399,68 @@ def _class_of(instances: Sequence[Environment]) -> str:
 # Files ----------------------------------------------------------------------------------------------------------------
 
 
-def _claim(folder: Path, config: Mapping[str, Any]) -> None:
-    """Make the folder; ParameterError where another search lies there."""
-    folder.mkdir(parents=True, exist_ok=True)
-    try:
-        record = storage.read_json(folder / "tuning.json")["config"]
-        different = [key for key in config if record.get(key) != config[key]]
-    except FileNotFoundError:
-        return
-    except (ValueError, KeyError, TypeError, AttributeError):
-        raise ParameterError(f"{folder}/tuning.json: is not the record of a search; choose another folder") from None
-    if different:
-        raise ParameterError(f"{folder}: holds a search with another {', '.join(different)}; choose another folder")
-
-
-def _storage(optuna: Any, folder: Path | None) -> Any:
-    if folder is None:
-        return None
-    from optuna.storages.journal import JournalFileBackend
-
-    journal_lock = JournalLock(folder)
-    journal_lock.acquire()
-    try:
-        mend_journal(folder / "journal.log")
-    finally:
-        journal_lock.release()
-    backend = JournalFileBackend(str(folder / "journal.log"), lock_obj=journal_lock)  # type: ignore[arg-type]
-    return optuna.storages.JournalStorage(backend)
-
-
-def _write(folder: Path, search: _Search, study: Any) -> None:
-    trials = _trials(study)
-    record = {"format": 1, "config": search.config, "versions": _results.versions(), "trials": trials}
-    if math.isfinite(_best(study)):
-        import yaml
-
-        best = {**search.table, **study.best_params}
-        first = next(trial["number"] for trial in trials if trial["score"] == study.best_value)
-        record["best"] = {"trial": first, "score": study.best_value, "hyperparameters": best}
-        head = f"# Mean normalised regret {study.best_value:.4f} after {many(_done(study), 'trial')}, see tuning.json\n"
-        text = head + yaml.safe_dump(
-            {search.agent: {search.environment: {search.observation_name: best}}}, sort_keys=False
-        )
-        storage.replace_file(folder / "hyperparameters.yaml", text, devices=False)
-    storage.replace_json(folder / "tuning.json", record)
-
-
-def _trials(study: Any) -> list[dict[str, Any]]:
-    words = {"COMPLETE": "finished", "PRUNED": "given up", "FAIL": "failed"}
-    return [
-        {
-            "number": number,
-            "hyperparameters": trial.params,
-            "score": trial.value if trial.state.name == "COMPLETE" else None,
-            "status": words[trial.state.name],
-            "seconds": trial.duration.total_seconds() if trial.duration else None,
-        }
-        for number, trial in enumerate(each for each in study.trials if each.state.name in words)
-    ]
-
-
-def _done(study: Any) -> int:
-    return sum(record["status"] != "failed" for record in _trials(study))
-
-
-def _best(study: Any) -> float:
-    scores = [record["score"] for record in _trials(study) if record["score"] is not None]
-    return min(scores, default=math.inf)
-
-
-# Journal --------------------------------------------------------------------------------------------------------------
-
-
-WAIT_SECONDS = 0.005
-
-
-class JournalLock:
-    """A lock for Optuna's journal, in the place of its own: a process that is killed holds nothing.
-
-    Optuna's is a file that stays when its process is killed; the next one waits 30 seconds for it.
-    """
-
-    def __init__(self, folder: Path):
-        self.folder = folder
-        self.held = contextlib.ExitStack()
-
-    def acquire(self) -> bool:
-        """Wait until no other process holds the folder, and hold it."""
-        while True:
-            try:
-                self.held.enter_context(lock(self.folder, FolderLocked, "tuning"))
-                return True
-            except FolderLocked:
-                time.sleep(WAIT_SECONDS)
-
-    def release(self) -> None:
-        """Let the folder go."""
-        self.held.close()
-
-
-def mend_journal(path: Path) -> None:
-    """Cut off a last line that is not whole; what it said is done again.
+def _earlier_trials(optuna: Any, search: _Search, folder: Path) -> list[dict[str, Any]]:
+    """The trials of a search that goes on, also of an earlier pharos, which kept them in a journal of Optuna's.
 
     Raises:
-        FileFormatError: another line is no JSON.
+        ParameterError: another search lies there. FileFormatError: its files were changed, or cut short.
     """
+    file, journal = folder / "tuning.json", folder / JOURNAL
     try:
-        check_regular(path)
-        data = path.read_bytes()
+        stored = storage.read_json(file, advice=_AGAIN)
+        if not storage.is_intact(stored):
+            raise FileFormatError(f"{file}: was changed after it was written; {_AGAIN}")
+        different = [key for key in search.config if stored["config"].get(key) != search.config[key]]
+        trials = [trial for trial in stored["trials"] if trial["status"] in _STATUS.values()]
     except FileNotFoundError:
-        return
-    except OSError as error:
-        raise FileFormatError(f"{path}: cannot be read: {error.strerror}; delete the folder and search again") from None
-    lines = data.splitlines(keepends=True)
-    for number, line in enumerate(lines, start=1):
-        if _is_whole(line):
-            continue
-        if number < len(lines):
-            raise FileFormatError(f"{path}:{number}: is no JSON; delete the folder and search again")
-        with open(path, "r+b") as file:
-            file.truncate(len(data) - len(line))
+        trials, different = [], []
+    except (KeyError, TypeError, AttributeError):
+        raise ParameterError(f"{file}: is not the record of a search; choose another folder") from None
+    if different:
+        raise ParameterError(f"{folder}: holds a search with another {', '.join(different)}; choose another folder")
+    if not journal.exists():
+        return trials
+    from optuna.storages.journal import JournalFileBackend
 
-
-def _is_whole(line: bytes) -> bool:
     try:
-        return line.endswith(b"\n") and isinstance(json.loads(line), dict)
-    except (ValueError, RecursionError):
-        return False
+        storage.check_regular(journal)
+        backend = optuna.storages.JournalStorage(JournalFileBackend(str(journal)))
+        old = optuna.load_study(study_name=_results.identifier(search.config), storage=backend)
+        return [_record(trial) for trial in old.trials if trial.state.name in _STATUS]
+    except Exception as error:  # Optuna trusts what it reads
+        said = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        raise FileFormatError(f"{journal}: is not as Optuna wrote it ({said}); {_AGAIN}") from error
+
+
+def _write(folder: Path, search: _Search, trials: Sequence[dict[str, Any]]) -> None:
+    record = {"format": 1, "config": search.config, "versions": _results.versions(), "trials": trials}
+    if hyperparameters := (best := _best(trials))["hyperparameters"]:
+        import yaml
+
+        mine = {**search.table, **hyperparameters}
+        record["best"] = {"trial": best["number"], "score": best["score"], "hyperparameters": mine}
+        head = f"# Mean normalised regret {best['score']:.4f} after {many(len(trials), 'trial')}, see tuning.json\n"
+        text = head + yaml.safe_dump(
+            {search.agent: {search.environment: {search.observation_name: mine}}}, sort_keys=False
+        )
+        storage.replace_file(folder / "hyperparameters.yaml", text, devices=False)
+    storage.replace_json(folder / "tuning.json", storage.sealed(storage.plain(record)))
+    (folder / JOURNAL).unlink(missing_ok=True)
+
+
+def _record(trial: Any) -> dict[str, Any]:
+    """A trial that is over, as tuning.json keeps it."""
+    return {
+        "number": trial.number,
+        "hyperparameters": trial.params,
+        "score": trial.value if trial.state.name == "COMPLETE" else None,
+        "status": _STATUS[trial.state.name],
+        "seconds": trial.duration.total_seconds() if trial.duration else None,
+        "reports": {str(step): mean for step, mean in trial.intermediate_values.items()},
+    }
+
+
+def _best(trials: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """The first of the best trials; a score of infinity where none is finished."""
+    finished = [trial for trial in trials if trial["status"] == "finished"]
+    return min(finished, key=lambda trial: trial["score"], default={"score": math.inf, "hyperparameters": {}})
