@@ -7,6 +7,7 @@ import itertools
 import multiprocessing
 import os
 import signal
+import sys
 import tempfile
 
 import numpy as np
@@ -128,6 +129,9 @@ def test_pieces_make_up_all_rows_once(tmp_path, monkeypatch, size):
     rows.tofile(tmp_path / "rows.bin")
     mapped = np.memmap(tmp_path / "rows.bin", np.int32, "r", shape=rows.shape)[50:]
     monkeypatch.setattr(memory_map, "PIECE", size)
+    monkeypatch.setattr(memory_map.machine, "available_memory", lambda: 1)
+    advice = []
+    monkeypatch.setattr(memory_map, "_advise", lambda *words: advice.append(words[-1]))
     for kept in (0, 123, 9000, 9950):
         stops = [9950]
         for array, start, stop in memory_map.pieces_from_the_end(mapped, 100, 9950, kept):
@@ -135,8 +139,10 @@ def test_pieces_make_up_all_rows_once(tmp_path, monkeypatch, size):
             assert (array[start:stop] == rows[50 + start : 50 + stop]).all() and not array.flags.writeable
             stops.append(start)
         assert stops[-1] == 100
+    assert memory_map._COLD not in advice  # rows that have room are wanted in the next sweep
     (tmp_path / "rows.bin").unlink()
     assert [place[1:] for place in memory_map.pieces_from_the_end(mapped, 100, 9950, 123)] == [(100, 9950)]
+    assert sys.platform != "linux" or memory_map._COLD in advice
 
 
 @pytest.mark.long

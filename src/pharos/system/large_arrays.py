@@ -116,19 +116,19 @@ def append_zeros(file: BinaryIO, size: int) -> None:
         file.flush()
 
 
-def ranges_from_the_end(rows: Any, low: int, high: int) -> Iterator[tuple[int, int]]:
+def ranges_from_the_end(rows: Any, low: int, high: int, have_room: bool = False) -> Iterator[tuple[int, int]]:
     """Ranges [start, stop) that make up [low, high), the last one first: how rows are swept from the last to the first.
 
     Rows in memory are one range. Of a mapped array, `RANGE` rows are swept while the system reads those before them: it
     finds out by itself what is read from the first byte to the last, but not what is read the other way round. Where
-    the rows fill memory, those that were swept go before anything else: values, which may be mapped as well, are needed
-    all the time.
+    the rows fill memory, unless these `have_room` in it, those that were swept go before anything else: values, which
+    may be mapped as well, are needed all the time.
     """
     rows = rows.packed if isinstance(rows, PackedIndices) else rows
     if not isinstance(rows, np.memmap):
         yield low, high
         return
-    fills_memory = 2 * rows.nbytes > machine.available_memory()
+    fills_memory = not have_room and 2 * rows.nbytes > machine.available_memory()
     for stop in range(high, low, -RANGE):
         start = max(stop - RANGE, low)
         _advise(rows, max(start - RANGE, low), start, getattr(mmap, "MADV_WILLNEED", None))
@@ -152,7 +152,7 @@ def pieces_from_the_end(rows: Any, low: int, high: int, border: int) -> Iterator
     memory of this process, the next ones while some are swept, and leave nothing in that of the system: pages of files
     that come and go cost more than sweeps.
     """
-    border = min(max(low, border), high)
+    border = room = min(max(low, border), high)
     with contextlib.ExitStack() as stack:
         try:
             file = stack.enter_context(_UncachedFile(rows)) if border < high else None
@@ -167,7 +167,7 @@ def pieces_from_the_end(rows: Any, low: int, high: int, border: int) -> Iterator
                 if start > border:
                     coming = pool.submit(file.read, cuts[i + 2], start, (i + 1) % 2)
                 yield array, start, stop
-    for start, stop in ranges_from_the_end(rows, low, border):
+    for start, stop in ranges_from_the_end(rows, low, border, have_room=border == room):
         yield rows, start, stop
 
 
