@@ -34,10 +34,8 @@ class BatchRun:
     key: int
     gamma: float
     outcome_rewards: Any = None
-    laziness: float = 0.0
+    chance: Any = None
     staying: Any = None
-    reward_noise: float = 0.0
-    reward_delay: int = 0
 
 
 def supports(agent, hyperparameters):

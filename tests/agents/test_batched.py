@@ -11,7 +11,7 @@ from pharos.agents.batched.runs import lane_width, lane_widths
 from pharos.environments import make
 from pharos.errors import ParameterError
 from pharos.kernels.philox import philox
-from pharos.mdp import lazy_actions, random_actions
+from pharos.mdp import ChanceSetting, lazy_actions, random_actions
 from pharos.policies import is_walk, walk_values
 from pharos.training import Task, evaluate_agent
 
@@ -71,7 +71,7 @@ def test_philox_gives_the_known_answers_of_random123(counter, key, words):
 def test_a_run_is_the_same_alone_among_others_and_in_another_order(grid, agent):
     runs = runs_of(grid, AGENTS[agent], 40)
     staying = np.zeros((grid.mdp.num_states, grid.mdp.num_actions))
-    runs[5] = replace(runs[5], laziness=0.1, staying=staying, reward_noise=0.1, reward_delay=3)
+    runs[5] = replace(runs[5], chance=ChanceSetting(lazy=0.1, reward_noise=0.1, reward_delay=3), staying=staying)
     together, backwards, alone = learned(agent, runs), learned(agent, runs[::-1]), learned(agent, runs[5:6])
     assert outcome(together, 5) == outcome(alone, 0)
     assert all(outcome(together, i) == outcome(backwards, 39 - i) for i in range(40))

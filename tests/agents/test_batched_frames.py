@@ -19,7 +19,7 @@ from pharos.kernels import batched_learning as learning
 from pharos.kernels import batched_worlds as worlds
 from pharos.kernels import philox
 from pharos.policies import walk_values
-from pharos.training import Task, evaluate_agent, load_agent, train_many
+from pharos.training import ChanceSetting, Task, evaluate_agent, load_agent, train_many
 
 BREAKOUT = pharos.make("breakout", height=6, columns=3, brick_rows=1)
 SIGHTS = {
@@ -177,7 +177,7 @@ def learned(agent, runs, points=(60, 120), **options):
 def test_a_run_with_frames_is_the_same_alone_among_others_and_drawn(agent, monkeypatch):
     """`drawn`: where pictures fit no table."""
     runs = runs_of(task_of(sticky=0.1), AGENTS[agent], 11)
-    runs[5] = replace(runs[5], reward_noise=0.1, reward_delay=3)
+    runs[5] = replace(runs[5], chance=ChanceSetting(reward_noise=0.1, reward_delay=3))
     together, backwards = learned(agent, runs), learned(agent, runs[::-1])
     alone = outcome(learned(agent, runs[5:6]), 0)
     assert outcome(together, 5) == alone

@@ -7,10 +7,9 @@ from scipy.stats import kstest
 from pharos.agents.batched import BatchRun, ObservationSource, make_batch, observed
 from pharos.agents.batched.lane import BatchedEpisodes
 from pharos.environments import make
-from pharos.interaction import Interaction
 from pharos.interaction.reward_channel import RewardChannel
 from pharos.kernels import batched_worlds as kernels
-from pharos.mdp import TabularMDP, random_actions, sticky_actions
+from pharos.mdp import ChanceSetting, TabularMDP, random_actions, sticky_actions
 from pharos.training.task import Task
 
 DQN = {"learning_rate": 0.01, "buffer_size": 50, "learning_starts": 20, "batch_size": 8, "net_arch": [8], "n_envs": 2}
@@ -81,7 +80,7 @@ def test_episodes_are_as_likely_as_the_mdp_says(slippery, chance):
 def test_lazy_actions_stay_as_often_as_they_should_and_pay_what_staying_pays(slippery):
     mdp, successors, probabilities, rewards = slippery
     staying = 100.0 + np.arange(10.0).reshape(5, 2)
-    runs = runs_on(mdp, 40, outcome_rewards=rewards.ravel(), laziness=0.3, staying=staying)
+    runs = runs_on(mdp, 40, outcome_rewards=rewards.ravel(), chance=ChanceSetting(lazy=0.3), staying=staying)
     worlds = BatchedEpisodes(runs, np.array([run.key for run in runs], np.uint64), 5)
     rng, counts, met = np.random.default_rng(3), np.zeros(2), np.zeros(5)
     for step in range(300):
@@ -106,9 +105,11 @@ def test_pay_is_late_and_noisy_as_elsewhere_and_returns_are_of_what_is_earned(sl
         {"reward_noise": 2.0},
         {"reward_delay": 3, "reward_noise": 2.0},
     )
-    runs = [run for way in ways for run in runs_on(mdp, 8, outcome_rewards=rewards.ravel(), **way)]
+    runs = [
+        run for way in ways for run in runs_on(mdp, 8, outcome_rewards=rewards.ravel(), chance=ChanceSetting(**way))
+    ]
     worlds = BatchedEpisodes(runs, np.array([run.key for run in runs], np.uint64), 5)
-    payments = [RewardChannel(Interaction(reward_delay=delay), 40) for delay in (1, 3)]
+    payments = [RewardChannel(ChanceSetting(reward_delay=delay), 40) for delay in (1, 3)]
     rng, noise = np.random.default_rng(4), []
     for step in range(500):
         actions = np.tile(rng.integers(0, 2, (8, 5)), (5, 1))

@@ -285,8 +285,8 @@ def test_gymnasium_finds_the_environments_in_a_fresh_process(env_id):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"sticky": 1.5}, "sticky is 1.5; expected a probability"),
-        ({"random": "often"}, "random is 'often'; expected a probability"),
+        ({"sticky": 1.5}, "sticky=1.5; expected a finite number from 0 to 1"),
+        ({"random": "often"}, "random='often'; expected a finite number from 0 to 1"),
         ({"time_limit": 0}, "time_limit is 0; expected a number of steps"),
         ({"initial_previous_action": 3}, "initial_previous_action is 3; expected None or an action from 0 to 2"),
         ({"heigth": 12}, "did you mean 'height'"),

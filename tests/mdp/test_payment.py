@@ -10,7 +10,7 @@ import pharos
 from naive.learning import paid
 from pharos.agents import QLearning
 from pharos.errors import ParameterError
-from pharos.interaction import GymEnv, Interaction, make_sb3_vec, make_vec
+from pharos.interaction import GymEnv, make_sb3_vec, make_vec
 from pharos.interaction.reward_channel import RewardChannel
 from pharos.solvers import value_iteration
 from pharos.training import ChanceSetting, RunConfig, Task
@@ -23,7 +23,7 @@ BOTH = {"reward_noise": 0.5, "reward_delay": 2}
 @settings(max_examples=100, deadline=None)
 @given(st.lists(st.lists(st.integers(-3, 3), min_size=1, max_size=8), min_size=1, max_size=4), st.integers(0, 9))
 def test_what_is_paid_in_an_episode_is_what_was_earned(episodes, delay):
-    payment = RewardChannel(Interaction(reward_delay=delay), 1)
+    payment = RewardChannel(ChanceSetting(reward_delay=delay), 1)
     for episode in episodes:
         received = []
         for t, earned in enumerate(episode):

@@ -109,9 +109,9 @@ def test_a_block_may_say_otherwise_than_the_whole():
         (3, "horizon: 0", "specification:3: horizon: found 0; expected a number of steps, limit (the environment's), or none"),  # noqa: E501
         (3, "horizon: none", "specification:8: gamma is 1 and horizon is none, so values may be infinite"),
         (3, "hardness: {measures: [diametr]}", "unknown measure of hardness 'diametr'; did you mean 'diameter'?"),
-        (9, "    chance: [plain, {stiky: 0.25}]", "specification:9: unknown key 'stiky'; did you mean 'sticky'?"),
+        (9, "    chance: [plain, {stiky: 0.25}]", "specification:9: unknown kind of chance 'stiky'; did you mean"),
         (9, "    chance: [plian]", "specification:9: unknown chance 'plian'; did you mean 'plain'?"),
-        (9, "    chance: [{random: 1.5}]", "specification:9: random: found 1.5; expected: less than or equal to 1"),
+        (9, "    chance: [{random: 1.5}]", "specification:9: ChanceSetting: random=1.5; expected a finite number"),
         (10, "    observations: [vectr]", "specification:10: unknown observation 'vectr'; did you mean 'vector'?"),
         (11, "    agents: [dqn, ppo, qlearning]", "specification:11: unknown agent 'qlearning'; did you mean 'q_learning'?"),  # noqa: E501
         (11, "    agents: []", "specification:11: agents: found []"),

@@ -89,9 +89,9 @@ def evaluate(
         overridden = {name for name in SETTING if context.get_parameter_source(name).name == "COMMANDLINE"}  # type: ignore[union-attr]
         gamma = gamma if "gamma" in overridden else own.gamma
         horizon = horizon if "horizon" in overridden else own.horizon_steps
-        sticky = sticky if "sticky" in overridden else own.sticky
-        random = random if "random" in overridden else own.random
-        lazy = lazy if "lazy" in overridden else own.lazy
+        sticky = sticky if "sticky" in overridden else own.chance.sticky
+        random = random if "random" in overridden else own.chance.random
+        lazy = lazy if "lazy" in overridden else own.chance.lazy
         source = "the run's own" if not overridden else f"the run's own, but for {', '.join(sorted(overridden))}"
     if goal.is_imported and Path(policy).expanduser().is_dir():  # what was learnt on the environment of the table
         table = goal.mdp()

@@ -12,6 +12,7 @@ from pharos.cli.answers import console, print_json
 from pharos.cli.options import Json, complete_target
 from pharos.environments import class_called, classes, declared_parameters, imported, named_instances
 from pharos.errors import UnknownName
+from pharos.system.options import meanings
 
 if TYPE_CHECKING:
     from pharos.environments import Environment
@@ -68,32 +69,15 @@ def _overview(name: str, cls: type["Environment"]) -> dict[str, Any]:
 
 def _parameters(cls: type["Environment"]) -> dict[str, dict[str, Any]]:
     """Name -> default, what it may be, and what it means: the line under *Attributes* in the docstring of the class."""
-    declared, meanings = declared_parameters(cls), _meanings(cls)
+    declared, texts = declared_parameters(cls), meanings(cls)
     return {
         field.name: {
             "default": _default(field),
             "values": declared[field.name].text if field.name in declared else _annotation(field.type),
-            "meaning": meanings.get(field.name, ""),
+            "meaning": texts.get(field.name, ""),
         }
         for field in dataclasses.fields(cls)  # type: ignore[arg-type]
     }
-
-
-def _meanings(cls: type["Environment"]) -> dict[str, str]:
-    """Name -> text, of entries such as `height, width: of the grid` in the section Attributes of the docstring."""
-    _, _, section = (inspect.getdoc(cls) or "").partition("Attributes:\n")
-    meanings: dict[str, str] = {}
-    names: list[str] = []
-    for line in section.splitlines():
-        entry = re.match(r"    (\w+(?:, \w+)*): (.*)", line)
-        if entry:
-            names = entry[1].split(", ")
-            meanings |= dict.fromkeys(names, entry[2])
-        elif not line.startswith("     "):
-            names = []
-        for name in () if entry else names:
-            meanings[name] += " " + line.strip()
-    return meanings
 
 
 def rules_of(cls: type["Environment"]) -> list[tuple[str, str]]:

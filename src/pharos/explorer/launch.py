@@ -167,7 +167,7 @@ def _of_run(
     progress: Callable[[str], None],
 ) -> Exploration:
     """The environment of a run with its chance, and what it has learnt."""
-    if any((chance.sticky, chance.random, chance.lazy)):
+    if chance:
         raise ParameterError(f"{folder}: a run has its chance already; leave out sticky, random and lazy")
     progress("what was learnt")
     task, agent = load_agent(folder, trust=trust)

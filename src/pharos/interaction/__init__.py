@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from pharos.interaction.jax_export import to_gymnax
     from pharos.interaction.registration import ids_of, register_class
     from pharos.interaction.sb3_env import SB3VecEnv, make_sb3_vec
-    from pharos.interaction.simulator import Interaction, Simulator, split_options
+    from pharos.interaction.simulator import Interaction, Simulator
     from pharos.interaction.vector_env import VectorEnv, make_vec
 
 __all__ = [
@@ -24,7 +24,7 @@ __all__ = [
     "to_gymnax",
 ]
 _shared = """
-    Interaction Simulator ids_of register_class split_options
+    Interaction Simulator ids_of register_class
 """
 
 __getattr__ = lazy.attributes(__name__)

@@ -15,8 +15,9 @@ from pharos.environments import Environment
 from pharos.errors import ParameterError
 from pharos.interaction.frame_stack import FrameStack
 from pharos.interaction.reward_channel import RewardChannel
-from pharos.interaction.simulator import SimulatedEnv, Simulator, Stream, split_options
+from pharos.interaction.simulator import Interaction, SimulatedEnv, Simulator, Stream
 from pharos.observations import NO_ACTION, Index
+from pharos.system.options import split
 
 if TYPE_CHECKING:
     from pharos.drawing import Window
@@ -51,7 +52,7 @@ class GymEnv(SimulatedEnv, gymnasium.Env):
     metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array", "ansi"], "render_fps": 15}
 
     def __init__(self, environment: Environment | str, *, render_mode: str | None = None, **options: Any):
-        interaction, parameters = split_options(options)
+        interaction, parameters = split(Interaction, options)
         self.simulator = simulator = Simulator(environment, interaction, parameters)
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise ParameterError(
@@ -89,7 +90,7 @@ class GymEnv(SimulatedEnv, gymnasium.Env):
         self._is_index = simulator.context.is_plain and isinstance(observation, Index)
         self._seeing = FrameStack(simulator, 1) if simulator.context.has_more else None
         self._last: Any = None  # the observation, where it is more than a function of the state
-        self._payment = RewardChannel(interaction, 1) if simulator.modifies_rewards else None
+        self._payment = RewardChannel(interaction.chance, 1) if simulator.modifies_rewards else None
         space = simulator.state_space
         self._successors = None if space is None or self._has_outcomes else space.successors
 

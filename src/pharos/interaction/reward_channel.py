@@ -5,8 +5,9 @@ Source: the reward delay and reward noise of MDP Playground (Rajan et al. 2023).
 
 import numpy as np
 
-from pharos.interaction.simulator import Interaction, stream_of
+from pharos.interaction.simulator import stream_of
 from pharos.kernels import stepping
+from pharos.mdp import ChanceSetting
 
 
 class RewardChannel:
@@ -26,8 +27,8 @@ class RewardChannel:
         earned: (N,) of the last step.
     """
 
-    def __init__(self, options: Interaction, num_envs: int):
-        self.noise, self.delay = float(options.reward_noise), int(options.reward_delay)
+    def __init__(self, chance: ChanceSetting, num_envs: int):
+        self.noise, self.delay = float(chance.reward_noise), int(chance.reward_delay)
         self.earned = np.zeros(num_envs)
         self._pending = np.zeros((num_envs, self.delay))
         self._steps = np.zeros(num_envs, np.int64)

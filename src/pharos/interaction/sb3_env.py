@@ -1,7 +1,6 @@
 """Many environments for Stable-Baselines3: its VecEnv over the native vector environment, without a loop in Python."""
 
 import time
-from collections.abc import Mapping
 from typing import Any
 
 import gymnasium
@@ -97,13 +96,7 @@ def make_sb3_vec(
     env: Environment | str,
     num_envs: int = 1,
     *,
-    observation: Any = "vector",
-    observation_options: Mapping[str, Any] | None = None,
-    sticky: float = 0.0,
-    random: float = 0.0,
-    time_limit: int | str | None = "default",
     seed: int | None = None,
-    space: Any = None,
     **options: Any,
 ) -> SB3VecEnv:
     """Return `num_envs` copies of an environment as a VecEnv of Stable-Baselines3.
@@ -111,23 +104,9 @@ def make_sb3_vec(
     Args:
         env: a name that `pharos.make` knows, or an Environment.
         seed: of the first reset; environment i is seeded with seed + i.
-        options: the rest of `pharos.interaction.Interaction`, and the parameters of the environment where `env`
+        options: see `pharos.interaction.Interaction`, and the parameters of the environment where `env`
             is a name.
     Raises:
         ParameterError: an option or parameter is wrong.
     """
-    return SB3VecEnv(
-        VectorEnv(
-            env,
-            num_envs,
-            autoreset_mode=AutoresetMode.SAME_STEP,
-            seed=seed,
-            observation=observation,
-            observation_options=observation_options,
-            sticky=sticky,
-            random=random,
-            time_limit=time_limit,
-            space=space,
-            **options,
-        )
-    )
+    return SB3VecEnv(VectorEnv(env, num_envs, autoreset_mode=AutoresetMode.SAME_STEP, seed=seed, **options))

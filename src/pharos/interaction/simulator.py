@@ -1,6 +1,5 @@
 """An environment made ready for interaction: the options that single and vector environments share."""
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -12,9 +11,10 @@ from pharos.environments import Environment, make, start_distribution
 from pharos.errors import ParameterError, RuleError, StateSpaceTooLarge
 from pharos.kernels import stepping
 from pharos.kernels.stepping import Setting
-from pharos.mdp import Chance
+from pharos.mdp import Chance, ChanceSetting
 from pharos.observations import NO_ACTION, ObservationInContext, observe
 from pharos.rules import rules_of
+from pharos.system.options import flat, option_names
 
 if TYPE_CHECKING:
     from pharos.state_space import StateSpace
@@ -23,22 +23,15 @@ if TYPE_CHECKING:
 LARGEST_INDEX = 20_000_000
 
 
+@flat
 @dataclass(frozen=True, kw_only=True)
 class Interaction:
-    """The options of interaction, which single and vector environments share.
+    """The options of interaction, which single and vector environments share; chance by its own names, `sticky=0.1`.
 
     Attributes:
         observation: a name (`pharos.observations.names()`), a pair (function, Gymnasium space), or an Observation.
         observation_options: of the named observation, such as {"grey": True}.
-        sticky: probability that the previously executed action is executed again.
-        random: probability that the action is replaced by one uniform over all; with both, the choice is replaced first
-            and then may stick: the chance of `random_actions(sticky_actions(mdp, sticky), random)`.
-        lazy: probability that the executed action has no effect: the state stays what it is, and the rules' reward of
-            that is paid, as `lazy_actions` has it.
-        reward_noise: standard deviation of normal noise that is added to what is paid at each step. It has mean 0, so
-            values and optimal policies stay what they are.
-        reward_delay: steps by which rewards are paid late; at the end of an episode everything is paid that is due, see
-            `RewardChannel`.
+        chance: of acting, and in how rewards are paid; see `pharos.training.ChanceSetting` and `RewardChannel`.
         initial_previous_action: what sticks on the first step. None: nothing, the chosen action is executed (as in
             Gymnasium's StickyAction); the Arcade Learning Environment starts with its action "noop".
         previous_action: whether the agent sees the previously executed action.
@@ -50,11 +43,7 @@ class Interaction:
 
     observation: Any = "vector"
     observation_options: Mapping[str, Any] | None = None
-    sticky: float = 0.0
-    random: float = 0.0
-    lazy: float = 0.0
-    reward_noise: float = 0.0
-    reward_delay: int = 0
+    chance: ChanceSetting = ChanceSetting()
     initial_previous_action: int | None = None
     previous_action: bool = False
     remaining_time: bool = False
@@ -90,11 +79,11 @@ class Simulator:
             remaining_time=options.remaining_time,
             limit=self.limit,
         )
-        chance = _chance(options)
+        chance = Chance.of(options.chance.sticky, options.chance.random)
         self.chance, self.first_chosen = chance.triple, float(chance.first_chosen)
-        self.lazy = float(options.lazy)
+        self.lazy = float(options.chance.lazy)
         self._weights = (*self.chance, self.first_chosen, *([self.lazy] if self.lazy else []))
-        self.modifies_rewards = _pays_otherwise(options)
+        self.modifies_rewards = options.chance.modifies_rewards
         self.has_chance = self.chance != (1.0, 0.0, 0.0)
         self.has_outcomes = self.env.has_chance
         self.first_previous = _first_previous(options.initial_previous_action, self.env)
@@ -201,13 +190,6 @@ class SimulatedEnv:
         self._spec = None if spec is None else replace(spec, max_episode_steps=self.simulator.limit)
 
 
-def split_options(options: Mapping[str, Any]) -> tuple[Interaction, dict[str, Any]]:
-    """The options of interaction, and the rest: parameters of the environment."""
-    fields = Interaction.__dataclass_fields__
-    interaction = Interaction(**{name: value for name, value in options.items() if name in fields})
-    return interaction, {name: value for name, value in options.items() if name not in fields}
-
-
 def _environment(environment: Environment | str, parameters: Mapping[str, Any]) -> Environment:
     if isinstance(environment, str):
         env = make(environment, **parameters)
@@ -222,7 +204,7 @@ def _environment(environment: Environment | str, parameters: Mapping[str, Any]) 
 
         advice = ": pharos.importers.environment(mdp) makes one" if isinstance(environment, TabularMDP) else ""
         raise ParameterError(f"environment is {environment!r}; expected a name or a pharos Environment{advice}")
-    clashes = sorted(set(env.parameters) & set(Interaction.__dataclass_fields__))
+    clashes = sorted(set(env.parameters) & option_names(Interaction))
     if clashes:
         raise ParameterError(
             f"{env}: parameter {clashes[0]!r} is also an option of the Gymnasium environment; rename it"
@@ -252,24 +234,6 @@ def _indexed(env: Environment) -> "StateSpace":
             f"{env}: observation 'index' without space= builds at most {LARGEST_INDEX:,} states; "
             f"build it yourself and give space=pharos.build(env), or its folder"
         ) from error
-
-
-def _chance(options: Interaction) -> Chance:
-    for name, p in (("sticky", options.sticky), ("random", options.random), ("lazy", options.lazy)):
-        if isinstance(p, bool) or not isinstance(p, int | float) or not 0 <= p <= 1:
-            raise ParameterError(f"{name} is {p!r}; expected a probability in [0, 1]")
-    if options.lazy == 1:
-        raise ParameterError("lazy is 1, so nothing ever happens; expected a probability in [0, 1)")
-    return Chance.of(options.sticky, options.random)
-
-
-def _pays_otherwise(options: Interaction) -> bool:
-    noise, delay = options.reward_noise, options.reward_delay
-    if isinstance(noise, bool) or not isinstance(noise, int | float) or not 0 <= noise < math.inf:
-        raise ParameterError(f"reward_noise is {noise!r}; expected a standard deviation of at least 0")
-    if isinstance(delay, bool) or not isinstance(delay, int | np.integer) or delay < 0:
-        raise ParameterError(f"reward_delay is {delay!r}; expected a number of steps of at least 0")
-    return bool(noise or delay)
 
 
 def _time_limit(limit: int | str | None, env: Environment) -> int | None:

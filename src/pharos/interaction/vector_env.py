@@ -19,10 +19,11 @@ from pharos.environments import Environment
 from pharos.errors import ParameterError
 from pharos.interaction.frame_stack import FrameStack
 from pharos.interaction.reward_channel import RewardChannel
-from pharos.interaction.simulator import SimulatedEnv, Simulator, split_options, stream_of
+from pharos.interaction.simulator import Interaction, SimulatedEnv, Simulator, stream_of
 from pharos.interaction.walks import RulesWalk, TableWalk
 from pharos.kernels.stepping import DISABLED, SAME_STEP, Batch, first_outside
 from pharos.observations import NO_ACTION
+from pharos.system.options import split
 
 _MODES = (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP, AutoresetMode.DISABLED)
 
@@ -64,7 +65,7 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
     ):
         if max_episode_steps is not None:
             options["time_limit"] = None if max_episode_steps == -1 else max_episode_steps
-        interaction, parameters = split_options(options)
+        interaction, parameters = split(Interaction, options)
         if isinstance(num_envs, bool) or not isinstance(num_envs, int | np.integer) or num_envs < 1:
             raise ParameterError(f"num_envs is {num_envs!r}; expected an integer of at least 1")
         self._mode = _MODES.index(_checked_mode(autoreset_mode))
@@ -86,7 +87,7 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
         self._elapsed = np.zeros(n, np.int64)
         self._ended = np.zeros(n, np.bool_)
         self._seeing = FrameStack(simulator, n) if simulator.context.has_more else None
-        self._payment = RewardChannel(interaction, n) if simulator.modifies_rewards else None
+        self._payment = RewardChannel(interaction.chance, n) if simulator.modifies_rewards else None
         self._num_drawn = n if simulator.has_outcomes else 0  # outcomes that are drawn in a step
         walk = RulesWalk if simulator.state_space is None else TableWalk
         self._walk: Any = walk(simulator, n, self._mode)

@@ -10,7 +10,7 @@ from pharos.system import lazy
 if TYPE_CHECKING:
     from pharos.mdp.arguments import require_mdp
     from pharos.mdp.bisimulation import Minimization, minimize
-    from pharos.mdp.chance import Chance, lazy_actions, random_actions, sticky_actions
+    from pharos.mdp.chance import Chance, ChanceSetting, lazy_actions, random_actions, sticky_actions
     from pharos.mdp.compiled import Lazy, Table
     from pharos.mdp.dynamics import (
         BellmanEquation,
@@ -50,7 +50,7 @@ __all__ = [
     "sticky_actions",
 ]
 _shared = """
-    BEST BellmanEquation Dynamics ExpandedMDP Extreme Lazy Matrices OutcomeTable Outcomes Part PolicyStep
+    BEST BellmanEquation ChanceSetting Dynamics ExpandedMDP Extreme Lazy Matrices OutcomeTable Outcomes Part PolicyStep
     PolicyTable Rewards Selection Table WORST chosen_mass count_of executed_actions mass_of nodes_of_outcomes
     outcomes_of ranged_rewards require_mdp rewards_of_outcomes rewards_of_space rewards_of_staying runs_between
     runs_of shares_of

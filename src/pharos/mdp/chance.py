@@ -6,12 +6,14 @@ Whether the executed action has an effect: its dynamics carry one probability mo
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pharos.errors import ParameterError
+from pharos.environments import declared_parameters, parameter
+from pharos.errors import ParameterError, UnknownName
 from pharos.mdp.arguments import require_mdp
 
 if TYPE_CHECKING:
@@ -173,6 +175,80 @@ class Chance:
             "uniform": self.uniform,
             "first_chosen": self.first_chosen,
         }
+
+
+@dataclass(frozen=True)
+class ChanceSetting:
+    """What is added to an environment: chance of acting, which changes the MDP, and how rewards are paid, which does
+    not: values and regret are those of the rewards as they are earned.
+
+    Attributes:
+        sticky: probability that the previous action is executed again.
+        random: probability that a uniformly random action is executed. With both the choice is replaced first, and then
+            may stick: `random_actions(sticky_actions(mdp, sticky), random)`.
+        lazy: probability that the action has no effect. The state stays what it is, and what the rules pay for that is
+            paid, as `lazy_actions` has it.
+        reward_noise: standard deviation of noise in what is paid; 0 on average.
+        reward_delay: steps by which rewards are paid late, the last at the end.
+    Raises:
+        ParameterError: one of them is out of range.
+    """
+
+    sticky: float = parameter(0.0, low=0, high=1)
+    random: float = parameter(0.0, low=0, high=1)
+    lazy: float = parameter(0.0, low=0, high=1)
+    reward_noise: float = parameter(0.0, low=0)
+    reward_delay: int = parameter(0, low=0)
+
+    def __post_init__(self) -> None:
+        for name, declared in declared_parameters(ChanceSetting).items():
+            value = getattr(self, name)
+            number = declared.checked(self, name, value)
+            if not isinstance(value, int | float):  # a number of NumPy
+                object.__setattr__(self, name, number)
+        if self.lazy == 1:
+            raise ParameterError("ChanceSetting: lazy=1, so nothing ever happens; expected a number below 1")
+
+    @staticmethod
+    def from_dict(entry: Mapping[str, float]) -> "ChanceSetting":
+        """Read `{"sticky": .., "random": ..}`; what is left out is 0.
+
+        Raises:
+            UnknownName: another kind of chance. ParameterError: one is out of range.
+        """
+        for name in entry:
+            if name not in ChanceSetting.__dataclass_fields__:
+                raise UnknownName("kind of chance", name, ChanceSetting.__dataclass_fields__)
+        delay = entry.get("reward_delay", 0)
+        whole = int(delay) if isinstance(delay, float) and delay.is_integer() else delay  # as `--chance` reads it
+        return ChanceSetting(**{**entry, "reward_delay": whole})  # type: ignore[arg-type]
+
+    def to_dict(self) -> dict[str, float]:
+        """`{"sticky": .., "random": ..}`, and the others where they are not 0."""
+        return {name: value for name, value in vars(self).items() if value or name in ("sticky", "random")}
+
+    @property
+    def modifies_rewards(self) -> bool:
+        """Whether rewards are paid late or with noise."""
+        return bool(self.reward_noise or self.reward_delay)
+
+    @property
+    def changes_mdp(self) -> bool:
+        """Whether there is chance of acting."""
+        return bool(self.sticky or self.random or self.lazy)
+
+    def of(self, mdp: "TabularMDP") -> "TabularMDP":
+        """The MDP with this chance added."""
+        mdp = lazy_actions(mdp, self.lazy) if self.lazy else mdp
+        mdp = sticky_actions(mdp, self.sticky) if self.sticky else mdp
+        return random_actions(mdp, self.random) if self.random else mdp
+
+    def __bool__(self) -> bool:
+        return any(vars(self).values())
+
+    def __str__(self) -> str:
+        """`plain`, `sticky 0.25`, `random 0.1`, or several of them."""
+        return ", ".join(f"{name} {value:g}" for name, value in vars(self).items() if value) or "plain"
 
 
 @require_mdp

@@ -21,6 +21,8 @@ try:
         BeforeValidator,
         ConfigDict,
         Field,
+        PlainSerializer,
+        PlainValidator,
         PrivateAttr,
         ValidationInfo,
         field_validator,
@@ -106,12 +108,12 @@ def _entry(value: Any) -> Any:
     return {"name": value} if isinstance(value, str) else value
 
 
-def _chance(value: Any) -> Any:
-    if value == "plain" or value is None:
-        return {}
-    if isinstance(value, str):
+def _chance(value: Any) -> ChanceSetting:
+    if isinstance(value, Mapping):
+        return ChanceSetting.from_dict({name: float(p) if type(p) is int else p for name, p in value.items()})
+    if value not in ("plain", None):
         raise UnknownName("chance", value, ("plain", "{sticky: 0.25}", "{random: 0.1}"))
-    return value
+    return ChanceSetting()
 
 
 def _seeds(value: Any) -> Any:
@@ -126,22 +128,6 @@ def _seeds(value: Any) -> Any:
 
 class _Part(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class ChanceEntry(_Part):
-    """Probabilities that the previous action, or a uniformly random one, is executed instead of the chosen one, and
-    that it has no effect; noise and delay of what is paid."""
-
-    sticky: float = Field(default=0.0, ge=0, le=1)
-    random: float = Field(default=0.0, ge=0, le=1)
-    lazy: float = Field(default=0.0, ge=0, lt=1)
-    reward_noise: float = Field(default=0.0, ge=0, allow_inf_nan=False)
-    reward_delay: int = Field(default=0, ge=0)
-
-    @property
-    def setting(self) -> ChanceSetting:
-        """The same for a run."""
-        return ChanceSetting(**self.model_dump())
 
 
 class ObservationEntry(_Part):
@@ -247,6 +233,9 @@ def _horizon(value: Any) -> Any:
 Seeds = Annotated[list[Annotated[int, Field(ge=0)]], BeforeValidator(_seeds), Field(min_length=1)]
 StepCount = Annotated[int, Field(ge=1)]
 Gamma = Annotated[float, Field(ge=0, le=1)]
+ChanceEntry = Annotated[
+    ChanceSetting, PlainValidator(_chance), PlainSerializer(lambda chance: {k: p for k, p in vars(chance).items() if p})
+]
 EngineEntry = Annotated[str | dict[str, str], BeforeValidator(_engines)]
 HorizonEntry = Annotated[Any, BeforeValidator(_horizon)]
 
@@ -255,7 +244,7 @@ class Block(_Part):
     """A product of environments, kinds of chance, observations, agents and seeds."""
 
     environments: list[Annotated[EnvironmentEntry, BeforeValidator(_entry)]] = Field(min_length=1)
-    chance: list[Annotated[ChanceEntry, BeforeValidator(_chance)]] = Field([ChanceEntry()], min_length=1)
+    chance: list[ChanceEntry] = Field([ChanceSetting()], min_length=1)
     observations: list[Annotated[ObservationEntry, BeforeValidator(_entry)]] = Field(
         [ObservationEntry(name="vector")], min_length=1
     )
@@ -327,7 +316,7 @@ class Specification(_Part):
                                 RunConfig(
                                     environment=environment.instance.name,
                                     parameters=_jsonable(environment.instance.parameters),
-                                    chance=chance.setting,
+                                    chance=chance,
                                     observation=observation_name,
                                     observation_options=dict(observation.options),
                                     agent=agent if agent_from is None else agent_from.name,

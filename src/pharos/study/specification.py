@@ -36,7 +36,6 @@ from pharos.errors import MissingExtra, ParameterError, UnknownName, UntrustedCo
 from pharos.study.blocks import (
     MOST_RUNS,
     Block,
-    ChanceEntry,
     EnvironmentEntry,
     Hardness,
     ObservationEntry,
@@ -138,7 +137,6 @@ _PARTS: dict[Loc, type[BaseModel]] = {
     ("hardness",): Hardness,
     ("blocks",): Block,
     ("blocks", "environments"): EnvironmentEntry,
-    ("blocks", "chance"): ChanceEntry,
     ("blocks", "observations"): ObservationEntry,
 }
 

@@ -1,8 +1,9 @@
 """Training: an agent trained on a task, its policies evaluated exactly, and the result written down."""
 
+from pharos.mdp import ChanceSetting
 from pharos.solvers import ReferenceValues, cumulative_expected_regret, regret
 from pharos.training.batch import Progress, train_configs
-from pharos.training.config import ENGINES, ChanceSetting, Horizon, RunConfig, run_id
+from pharos.training.config import ENGINES, Horizon, RunConfig, run_id
 from pharos.training.curve import RegretCurve, bootstrap_interval
 from pharos.training.evaluation import Evaluation, evaluate_agent
 from pharos.training.results import (

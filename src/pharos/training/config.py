@@ -1,12 +1,11 @@
 """The configuration of a run: everything that determines its result, as run.json keeps it.
 
 `RunConfig` is what `train`, `tune`, studies and the command line make of their options, and what a stored run is read
-back into. Its `id` names the run: the same configuration has the same id on every machine. Beside it stand the two
-settings that a run shares with values and measures of hardness: `ChanceSetting` and `Horizon`.
+back into. Its `id` names the run: the same configuration has the same id on every machine. Beside it stands
+`Horizon`, which a run shares with values and measures of hardness.
 """
 
 import json
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any
@@ -14,99 +13,15 @@ from typing import TYPE_CHECKING, Any
 from pharos.agents import BATCHED, agent_kind, agent_source, is_known
 from pharos.environments import Environment, as_tuples, class_called, class_of, make, source_of
 from pharos.errors import FileFormatError, ParameterError, UnknownName, UntrustedCode
+from pharos.mdp import ChanceSetting
 from pharos.observations import OwnObservation, observation_of, registered
 from pharos.system.sources import Source, is_reference, resolve
 
 if TYPE_CHECKING:
-    from pharos.mdp import TabularMDP
     from pharos.training.task import Task, TaskValues
 
 ENGINES = ("sb3", "batched")
 """What trains networks: Stable-Baselines3, one run in a process; or many runs as one program."""
-
-
-@dataclass(frozen=True)
-class ChanceSetting:
-    """What is added to an environment: chance of acting, which changes the MDP, and how rewards are paid, which does
-    not: values and regret are those of the rewards as they are earned.
-
-    Attributes:
-        sticky: probability that the previous action is executed again.
-        random: probability that a uniformly random action is executed. Where both are given, random ones come first.
-        lazy: probability that the executed action has no effect.
-        reward_noise: standard deviation of the noise that is added to what is paid.
-        reward_delay: steps by which rewards are paid late.
-    """
-
-    sticky: float = 0.0
-    random: float = 0.0
-    lazy: float = 0.0
-    reward_noise: float = 0.0
-    reward_delay: int = 0
-
-    def __post_init__(self) -> None:
-        noise, delay = self.reward_noise, self.reward_delay
-        if isinstance(noise, bool) or not isinstance(noise, int | float) or not 0 <= noise < math.inf:
-            raise ParameterError(f"reward_noise is {noise!r}; expected a standard deviation of at least 0")
-        if isinstance(delay, bool) or not isinstance(delay, int) or delay < 0:
-            raise ParameterError(f"reward_delay is {delay!r}; expected a whole number of steps of at least 0")
-
-    @staticmethod
-    def from_dict(entry: Mapping[str, float]) -> "ChanceSetting":
-        """Read `{"sticky": .., "random": ..}`; what is left out is 0.
-
-        Raises:
-            UnknownName: another kind of chance. ParameterError: noise or delay is out of range.
-        """
-        names = [each.name for each in fields(ChanceSetting)]
-        for name in entry:
-            if name not in names:
-                raise UnknownName("kind of chance", name, names)
-        delay = entry.get("reward_delay", 0)
-        whole = int(delay) if isinstance(delay, float) and delay.is_integer() else delay  # as `--chance` reads it
-        return ChanceSetting(**{**entry, "reward_delay": whole})  # type: ignore[arg-type]
-
-    def to_dict(self) -> dict[str, float]:
-        """`{"sticky": .., "random": ..}`, and the others where they are not 0."""
-        values = vars(self)
-        return {name: value for name, value in values.items() if value or name in ("sticky", "random")}
-
-    @property
-    def options(self) -> dict[str, Any]:
-        """All of them, as a `Task` and environments take them."""
-        return dict(vars(self))
-
-    @property
-    def modifies_rewards(self) -> bool:
-        """Whether rewards are paid late or with noise."""
-        return bool(self.reward_noise or self.reward_delay)
-
-    @property
-    def changes_mdp(self) -> bool:
-        """Whether there is chance of acting."""
-        return bool(self.sticky or self.random or self.lazy)
-
-    def of(self, mdp: "TabularMDP") -> "TabularMDP":
-        """The MDP with this chance added.
-
-        Raises:
-            ParameterError: a probability is not between 0 and 1.
-        """
-        from pharos.mdp import lazy_actions, random_actions, sticky_actions
-
-        if self.lazy:
-            mdp = lazy_actions(mdp, self.lazy)
-        if self.sticky:
-            mdp = sticky_actions(mdp, self.sticky)
-        return random_actions(mdp, self.random) if self.random else mdp
-
-    def __bool__(self) -> bool:
-        return any(vars(self).values())
-
-    def __str__(self) -> str:
-        """`plain`, `sticky 0.25`, `random 0.1`, or several of them."""
-        parts = [f"{name} {value:g}" for name, value in self.to_dict().items() if value]
-        return ", ".join(parts) or "plain"
 
 
 @dataclass(frozen=True)
@@ -324,7 +239,7 @@ class RunConfig:
             self._check_trust("observation", trust)
         return Task(
             self.make_environment(trust=trust, strict=strict),
-            **self.chance.options,
+            chance=self.chance,
             observation=observation,
             observation_options=dict(self.observation_options),
             gamma=self.gamma,

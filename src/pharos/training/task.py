@@ -10,11 +10,12 @@ import numpy as np
 
 from pharos.environments import Environment, make
 from pharos.errors import ParameterError
-from pharos.mdp import TabularMDP
+from pharos.mdp import ChanceSetting, TabularMDP
 from pharos.policies import ReachableRows, Sight, reachable_rows
 from pharos.solvers import ReferenceValues, Solution, uniform_value, value_iteration, worst_value
 from pharos.state_space import StateSpace, build
-from pharos.training.config import ChanceSetting, Horizon
+from pharos.system.options import flat
+from pharos.training.config import Horizon
 
 TAIL = 1e-9  # part of a discounted return that is not looked at
 
@@ -42,6 +43,7 @@ class TaskValues:
         return {"reference": asdict(self.reference), "return_range": list(self.return_range)}
 
 
+@flat
 @dataclass(frozen=True, eq=False)
 class Task:
     """What an agent learns, and what its policies are measured against.
@@ -52,10 +54,8 @@ class Task:
 
     Attributes:
         env: the environment.
-        sticky, random, lazy: chance, as in `pharos.sticky_actions`, `pharos.random_actions` and `pharos.lazy_actions`;
-            random ones come first, then sticky ones.
-        reward_noise, reward_delay: how agents are paid, as `pharos.interaction.Interaction` has it; values and regret
-            are those of the rewards without noise and delay.
+        chance: of acting, and in how agents are paid; its fields are keywords too, `Task(env, sticky=0.1)`. Values and
+            regret are those of the rewards without noise and delay.
         observation, observation_options: what the agent sees, as `pharos.observe` takes it.
         previous_action: whether the agent also sees the previously executed action.
         gamma: discount of values and returns.
@@ -65,11 +65,7 @@ class Task:
     """
 
     env: Environment
-    sticky: float = 0.0
-    random: float = 0.0
-    lazy: float = 0.0
-    reward_noise: float = 0.0
-    reward_delay: int = 0
+    chance: ChanceSetting = ChanceSetting()
     observation: Any = "vector"
     observation_options: Mapping[str, Any] = field(default_factory=dict)
     previous_action: bool = False
@@ -87,7 +83,6 @@ class Task:
             )
         if not isinstance(self.env, Environment):
             raise ParameterError(f"env is {self.env!r}; expected an Environment, or its name")
-        _ = self.chance  # which refuses what is out of range
         object.__setattr__(self, "horizon", Horizon.of(self.horizon).steps(self.env))
         if self.horizon is None and self.gamma >= 1:
             raise ParameterError(
@@ -102,11 +97,6 @@ class Task:
         if parameters:
             raise ParameterError(f"{environment} has its parameters already; found {', '.join(parameters)}")
         return Task(environment, **options)
-
-    @property
-    def chance(self) -> ChanceSetting:
-        """The chance that is added to the environment."""
-        return ChanceSetting(self.sticky, self.random, self.lazy, self.reward_noise, self.reward_delay)
 
     @property
     def horizon_steps(self) -> int | None:
@@ -129,7 +119,7 @@ class Task:
         options: dict[str, Any] = {
             "observation": self.observation,
             "observation_options": dict(self.observation_options) or None,
-            **self.chance.options,
+            "chance": self.chance,
             "previous_action": self.previous_action,
             "time_limit": self.time_limit,
         }

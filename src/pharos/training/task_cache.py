@@ -130,7 +130,7 @@ class TaskCache:
             algorithm, task = config.algorithm(trust=self.trust, strict=self.strict), self.task(config)
 
             def table() -> QLearning:
-                limit, noise, delay = task.time_limit, task.reward_noise, task.reward_delay
+                limit, noise, delay = task.time_limit, task.chance.reward_noise, task.chance.reward_delay
                 return QLearning(
                     task.mdp,
                     total_steps=config.steps,
@@ -162,10 +162,8 @@ class TaskCache:
             key=int(config.id, 16),
             gamma=config.gamma,
             outcome_rewards=self._once("rewards", config, WORLD, lambda: _drawn_rewards(task)),
-            laziness=chance.lazy,
+            chance=chance,
             staying=self._once("staying", config, WORLD, lambda: _staying(task)) if chance.lazy else None,
-            reward_noise=chance.reward_noise,
-            reward_delay=chance.reward_delay,
         )
         return Member(place, config, folder, task, chosen, run, (key, group_key(config.agent, run, self.device)))
 

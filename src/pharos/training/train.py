@@ -18,9 +18,10 @@ from pharos.agents import agent_kind
 from pharos.agents import hyperparameters as hyperparameters_of
 from pharos.environments import Environment, make
 from pharos.errors import AllRunsFailed, ParameterError
+from pharos.mdp import ChanceSetting
 from pharos.observations import own_observation
 from pharos.training.batch import Progress, ProgressCallback, TrainingJobs, train_configs
-from pharos.training.config import ChanceSetting, RunConfig
+from pharos.training.config import RunConfig
 from pharos.training.process_pool import parts_of, train_parts
 from pharos.training.run_folder import TrainingResult
 from pharos.training.task import Task, TaskValues
@@ -216,7 +217,7 @@ def _runs(
     **options: Any,
 ) -> tuple[Task, list[RunConfig]]:
     """The task, and the configuration of a run with each of the seeds; `options` as `train` takes them."""
-    names = ("observation", "observation_options", "gamma", "horizon", *ChanceSetting().options)
+    names = ("observation", "observation_options", "gamma", "horizon", *vars(ChanceSetting()))
     task = task_for(agent, environment, parameters, **{name: options[name] for name in names})
     if hyperparameters is not None and not isinstance(hyperparameters, Mapping):
         hyperparameters = hyperparameters_of(agent, task.env.name, str(task.observation), table=Path(hyperparameters))

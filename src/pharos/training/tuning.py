@@ -30,12 +30,13 @@ from pharos.agents import Q_LEARNING_DEFAULTS, agent_kind, algorithm
 from pharos.agents import hyperparameters as hyperparameters_of
 from pharos.environments import Environment, make
 from pharos.errors import FileFormatError, FolderLocked, MissingExtra, ParameterError
+from pharos.mdp import ChanceSetting
 from pharos.observations import own_observation
 from pharos.system import storage
 from pharos.system.wording import many
 from pharos.training import results as _results
 from pharos.training.batch import Progress, train_configs
-from pharos.training.config import ChanceSetting, RunConfig
+from pharos.training.config import RunConfig
 from pharos.training.task import Task
 from pharos.training.task_cache import FailedRun, TaskCache
 
@@ -227,9 +228,7 @@ class _Search:
     @cached_property
     def tasks(self) -> list[Task]:
         """Every instance under every kind of chance."""
-        return [
-            Task(each, **kind.options, observation=self._observed) for each in self.instances for kind in self.kinds
-        ]
+        return [Task(each, chance=kind, observation=self._observed) for each in self.instances for kind in self.kinds]
 
     @cached_property
     def table(self) -> dict[str, Any]:

@@ -304,7 +304,7 @@ def predict(  # noqa: PLR0913
     chance = ChanceSetting(sticky, random, lazy, reward_noise)
     width, cells, states, own = calibration.half_width(), [], 0, dict(hyperparameters or {})
     for name, options in _observations(observations):
-        task = Task.of(env, **chance.options, observation=name, observation_options=options, horizon=horizon)
+        task = Task.of(env, chance=chance, observation=name, observation_options=options, horizon=horizon)
         states = _checked_states(task.space.num_states, env)
         chosen = hyperparameters_of(agent, env.name, str(task.observation), own)
         config = RunConfig.of_task(task, agent, steps=steps, hyperparameters=chosen).to_dict()

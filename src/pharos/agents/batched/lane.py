@@ -290,8 +290,9 @@ class BatchedEpisodes:
         self._chances = np.array([(*run.mdp.chance.triple, run.mdp.chance.first_chosen) for run in runs], np.float64)
         self._limits = np.array([run.time_limit for run in runs], np.int64)
         self._gammas = np.array([run.gamma for run in runs], np.float64)
-        self._knobs = np.array([(run.laziness, run.reward_noise, run.reward_delay) for run in runs], np.float64)
-        self.pending = np.zeros((width, copies, max(run.reward_delay for run in runs)))
+        chances = [run.chance for run in runs]
+        self._knobs = np.array([(each.lazy, each.reward_noise, each.reward_delay) for each in chances], np.float64)
+        self.pending = np.zeros((width, copies, max(each.reward_delay for each in chances)))
         self.state = np.zeros((width, copies), np.int64)
         self.previous = np.full((width, copies), -1, np.int64)
         self.elapsed = np.zeros((width, copies), np.int64)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from pharos.errors import ParameterError
-from pharos.mdp import TabularMDP
+from pharos.mdp import ChanceSetting, TabularMDP
 
 if TYPE_CHECKING:
     from pharos.observations import ObservationInContext
@@ -147,10 +147,9 @@ class BatchRun:
         gamma: of the returns that are counted, not the agent's own discount.
         outcome_rewards: (N,) what each possible outcome pays, as `rewards_of_outcomes` gives it; None: expected rewards
             are paid.
-        laziness: the probability that an executed action has no effect.
-        staying: (S, A) what an action without effect pays; needed where there is laziness.
-        reward_noise, reward_delay: deviation of the noise in what is paid, and steps by which that comes late. Returns
-            are of what is earned.
+        chance: of it laziness, and noise and delay in what is paid; the rest is in `mdp`. Returns are of what is
+            earned.
+        staying: (S, A) what an action without effect pays; needed where actions are lazy.
     """
 
     mdp: TabularMDP
@@ -162,10 +161,8 @@ class BatchRun:
     key: int
     gamma: float = 1.0
     outcome_rewards: np.ndarray | None = None
-    laziness: float = 0.0
+    chance: ChanceSetting = ChanceSetting()
     staying: np.ndarray | None = None
-    reward_noise: float = 0.0
-    reward_delay: int = 0
 
 
 def supports(agent: str, hyperparameters: Mapping[str, Any]) -> str | None:

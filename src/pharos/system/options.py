@@ -1,0 +1,80 @@
+"""Options that travel together, as frozen dataclasses: declared once, and documented under *Attributes* of the class.
+
+Python's keywords, the command line and YAML files are read into them by what stands here.
+"""
+
+import functools
+import inspect
+import operator
+import re
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass, replace
+from typing import Any, TypeVar, get_type_hints
+
+T = TypeVar("T")
+
+
+def meanings(documented: Any) -> dict[str, str]:
+    """Name -> text, of entries such as `height, width: of the grid` in the section Attributes or Args of a docstring;
+    also of the classes that a class extends.
+    """
+    texts: dict[str, str] = {}
+    for each in reversed(getattr(documented, "__mro__", [documented])):
+        sections = re.findall(
+            r"^(?:Attributes|Args):\n((?:(?: .*)?(?:\n|$))+)", inspect.getdoc(each) or "", re.MULTILINE
+        )
+        names: list[str] = []
+        for line in "\n".join(sections).splitlines():
+            entry = re.match(r"    (\w+(?:, \w+)*): (.*)", line)
+            if entry:
+                names = entry[1].split(", ")
+                texts |= dict.fromkeys(names, entry[2])
+            elif not line.startswith("     "):
+                names = []
+            for name in () if entry else names:
+                texts[name] += " " + line.strip()
+    return texts
+
+
+@functools.cache
+def parts(cls: Any) -> dict[str, type]:
+    """Field -> its class, of the fields that are dataclasses themselves."""
+    hints = get_type_hints(cls)
+    return {each.name: hints[each.name] for each in fields(cls) if is_dataclass(hints[each.name])}
+
+
+def option_names(cls: type) -> set[str]:
+    """Names of the fields of a dataclass, and of those of its parts."""
+    return {each.name for owner in (cls, *parts(cls).values()) for each in fields(owner)}
+
+
+def joined(cls: type, options: Mapping[str, Any]) -> dict[str, Any]:
+    """Options of a dataclass, with fields of its parts given by their own names: `sticky=0.1` as `chance=...`."""
+    own = dict(options)
+    for name, part in parts(cls).items():
+        inside = {each.name: own.pop(each.name) for each in fields(part) if each.name in own}
+        if inside:
+            own[name] = replace(own.get(name, part()), **inside)
+    return own
+
+
+def flat(cls: type[T]) -> type[T]:
+    """Class decorator: a dataclass that takes the fields of its parts as keywords, too, and has them as attributes."""
+    init = cls.__init__
+
+    @functools.wraps(init)
+    def flat_init(self: T, *args: Any, **options: Any) -> None:
+        init(self, *args, **joined(cls, options))
+
+    cls.__init__ = flat_init  # type: ignore[method-assign, assignment]
+    for name, part in parts(cls).items():  # type: ignore[arg-type]
+        for each in fields(part):  # type: ignore[arg-type]
+            setattr(cls, each.name, property(operator.attrgetter(f"{name}.{each.name}")))
+    return cls
+
+
+def split(cls: type[T], options: Mapping[str, Any]) -> tuple[T, dict[str, Any]]:
+    """An object of the options that are fields of a dataclass or of its parts; and the other options."""
+    names = option_names(cls)
+    own = {name: value for name, value in options.items() if name in names}
+    return cls(**joined(cls, own)), {name: value for name, value in options.items() if name not in names}
