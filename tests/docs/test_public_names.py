@@ -91,6 +91,12 @@ def test_importing_pharos_loads_nothing_heavy(command):
     assert done.stdout.strip() == "[]"
 
 
+def test_measures_and_training_load_sparse_matrices_where_they_use_them():
+    code = "import sys, pharos.training, pharos.hardness.built_in; print('scipy.sparse' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"
+
+
 def test_every_part_has_its_place_in_the_order():
     parts = {path.stem for path in SOURCE.iterdir() if path.suffix == ".py" or (path / "__init__.py").exists()}
     assert parts - set(ORDER) <= {"__init__"}

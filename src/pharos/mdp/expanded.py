@@ -29,7 +29,7 @@ class ExpandedMDP:
             in which episodes end, where a restart leads to one of several start states.
     """
 
-    matrix: scipy.sparse.csr_matrix
+    matrix: "scipy.sparse.csr_matrix"
     underlying: np.ndarray
     previous: np.ndarray
     starts: list[tuple[int, float]]
@@ -154,7 +154,7 @@ class ExpandedMDP:
 
 def executed_actions(
     mdp: TabularMDP, chosen: np.ndarray, owner: np.ndarray, previous: np.ndarray
-) -> scipy.sparse.csr_matrix:
+) -> "scipy.sparse.csr_matrix":
     """(N, S A) CSR: the probability that each action is executed in the state of a node.
 
     Args:
@@ -168,7 +168,7 @@ def executed_actions(
     return matrix
 
 
-def nodes_of_outcomes(outcomes: scipy.sparse.csr_matrix, num_actions: int, width: int) -> scipy.sparse.csr_matrix:
+def nodes_of_outcomes(outcomes: "scipy.sparse.csr_matrix", num_actions: int, width: int) -> "scipy.sparse.csr_matrix":
     """(S A, E W) CSR of outcomes (S A, E): each leads to the node of its state and of the action that was executed."""
     if width == 1:
         return outcomes
@@ -177,7 +177,7 @@ def nodes_of_outcomes(outcomes: scipy.sparse.csr_matrix, num_actions: int, width
     return scipy.sparse.csr_matrix((coo.data, (coo.row, nodes)), shape=(outcomes.shape[0], outcomes.shape[1] * width))
 
 
-def outcomes_of(mdp: TabularMDP, terminal: np.ndarray) -> tuple[scipy.sparse.csr_matrix, bool]:
+def outcomes_of(mdp: TabularMDP, terminal: np.ndarray) -> "tuple[scipy.sparse.csr_matrix, bool]":
     """(S A, S + 1 or S) outcomes of executing actions, rows of terminal states empty; whether the end is among them."""
     matrix = mdp.dynamics.matrix(~terminal)
     ends = bool((matrix.indices == mdp.num_states).any())
@@ -190,7 +190,7 @@ def outcomes_of(mdp: TabularMDP, terminal: np.ndarray) -> tuple[scipy.sparse.csr
 
 def _restarts(
     owner: np.ndarray, live: np.ndarray, starts: list[tuple[int, float]], num_actions: int, nodes: int, restart: bool
-) -> scipy.sparse.csr_matrix:
+) -> "scipy.sparse.csr_matrix":
     """(N A, N): what terminal states and the end lead to."""
     ended = np.flatnonzero(~live[owner])
     if restart:
