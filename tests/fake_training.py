@@ -8,12 +8,13 @@ import json
 import math
 import os
 import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
-from pharos.study import run_id
+from pharos.study import run_id, worker
 
 SIZES = {"simple_grid": 16, "frozen_lake": 30, "freeway": 400, "breakout": 900}
 SLOWNESS = {"vector": 1.0, "simple_image": 1.7, "index": 0.5}
@@ -71,6 +72,13 @@ def train(config, folder):
     if log := os.environ.get("PHAROS_FAKE_LOG"):
         with open(log, "a") as file:
             file.write(f"{id}\n")
+
+
+def attempt(run, folder):
+    """Execute one run of a study in this process: how it ended."""
+    runner = partial(worker.run_alone, train)
+    (end,) = worker.attempt(runner, [run.config], [run.id], Path(folder))
+    return end
 
 
 def hold(config, folder):

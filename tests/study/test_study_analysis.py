@@ -40,7 +40,7 @@ def done(tmp_path_factory):
     folder = tmp_path_factory.mktemp("study")
     found = study.specification(SPECIFICATION)
     for run in found.runs:
-        assert _worker.attempt(fake_training.train, run.config, run.id, folder) == "finished"
+        assert fake_training.attempt(run, folder) == "finished"
     return found, folder
 
 
@@ -77,7 +77,7 @@ def test_a_study_without_results_says_what_to_do(done, tmp_path):
 def test_runs_that_are_missing_or_failed_are_no_rows(tmp_path):
     spec = study.specification(SPECIFICATION)
     first, second = spec.runs[:2]
-    _worker.attempt(fake_training.train, first.config, first.id, tmp_path)
+    fake_training.attempt(first, tmp_path)
     (tmp_path / "partial" / second.id).mkdir(parents=True)
     _worker.write_failure(tmp_path / "partial" / second.id, second.config, second.id, "no", 1.0)
     _worker.publish(tmp_path / "partial" / second.id, tmp_path, second.id)

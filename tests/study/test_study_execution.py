@@ -271,7 +271,7 @@ def test_what_another_runner_finishes_is_counted_at_once(tmp_path, log, monkeypa
         told.append((status.finished, len(log.read_text().splitlines()) if log.exists() else 0))
         if len(told) == 2:
             for run in others:
-                assert _worker.attempt(fake_training.train, run.config, run.id, tmp_path / "out") == "finished"
+                assert fake_training.attempt(run, tmp_path / "out") == "finished"
 
     end = study.run(spec, tmp_path / "out", runner=fake_training.train, workers=1, progress=look)
     assert end.finished == len(spec.runs) and end.missing == 0
@@ -413,7 +413,7 @@ def without_flock(monkeypatch):
 def test_where_locks_are_not_supported_runs_and_instances_are_no_longer_taken_for_held(tmp_path, log, monkeypatch):
     without_flock(monkeypatch)
     run = specification().runs[0]
-    assert _worker.attempt(fake_training.train, run.config, run.id, tmp_path) == "finished"
+    assert fake_training.attempt(run, tmp_path) == "finished"
     sent = []
     preparing.unless_locked(lambda config: sent.append(config), run.config, sent.append)
     assert sent == [run.config]
@@ -427,7 +427,7 @@ def test_a_run_that_another_process_holds_is_busy_and_says_so_of_training(tmp_pa
     place = tmp_path / "locks" / run.id
     place.mkdir(parents=True)
     with lock(place, FolderLocked, "training"):
-        assert _worker.attempt(fake_training.train, run.config, run.id, tmp_path) == "busy"
+        assert fake_training.attempt(run, tmp_path) == "busy"
     assert not issubclass(FolderLocked, StateSpaceLocked)
 
 
@@ -454,7 +454,7 @@ def test_a_worker_on_a_full_disk_says_a_line(tmp_path, capfd):
     partial = tmp_path / "partial" / run.id
     partial.mkdir(parents=True)
     (partial / "log.txt").symlink_to("/dev/full")
-    arguments = (lambda *_: 1 / 0, run.config, run.id, tmp_path, False, True, dict(os.environ))
+    arguments = (lambda *_: 1 / 0, [run.config], [run.id], tmp_path, (), True, dict(os.environ))
     process = multiprocessing.get_context("fork").Process(target=_worker.main, args=arguments)
     process.start()
     process.join()

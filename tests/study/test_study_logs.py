@@ -9,7 +9,6 @@ import command_line
 import fake_training
 from pharos import study
 from pharos.errors import MissingExtra, UnknownName
-from pharos.study import worker
 
 SPECIFICATION = {
     "name": "logged",
@@ -25,7 +24,7 @@ def opened(tmp_path):
     """A study of four runs, of which three are finished."""
     spec = study.specification(SPECIFICATION)
     for run in spec.runs[:3]:
-        worker.attempt(fake_training.train, run.config, run.id, tmp_path)
+        fake_training.attempt(run, tmp_path)
     return spec, tmp_path
 
 
@@ -35,7 +34,7 @@ def test_tensorboard_gets_each_finished_run_once(opened):
     spec, folder = opened
     assert study.log(spec, folder, to="tensorboard") == 3
     assert study.log(spec, folder, to="tensorboard") == 0
-    worker.attempt(fake_training.train, spec.runs[3].config, spec.runs[3].id, folder)
+    fake_training.attempt(spec.runs[3], folder)
     assert study.log(spec, folder, to="tensorboard") == 1
     files = sorted(folder.glob("tensorboard/*/*/*/*/events*"))
     agent = "frozen_lake_4x4/{}/tabular_Q_learning/seed-{}"

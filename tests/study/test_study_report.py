@@ -42,7 +42,7 @@ def written(tmp_path_factory):
     spec = study.specification(SPECIFICATION)
     claim(spec, folder)
     for run in spec.runs[2:]:
-        _worker.attempt(fake_training.train, run.config, run.id, folder)
+        fake_training.attempt(run, folder)
     failed = spec.runs[0]
     (folder / "partial" / failed.id).mkdir()
     _worker.write_failure(folder / "partial" / failed.id, failed.config, failed.id, "ValueError: <no>", 1.0)
@@ -181,7 +181,7 @@ def test_runs_of_different_length_or_without_regret_leave_a_report(tmp_path):
     blocks = [{**block, "seeds": [0, 1], "steps": 100}, {**block, "seeds": [2], "steps": 70}]
     spec = study.specification({"name": "odd", "evaluations": 5, "hardness": hardness, "blocks": blocks})
     for run in spec.runs:
-        _worker.attempt(fake_training.train, run.config, run.id, tmp_path)
+        fake_training.attempt(run, tmp_path)
         file = tmp_path / "runs" / run.id / "run.json"
         record = json.loads(file.read_text())
         record["result"]["normalized_regret"] = None  # as pharos writes what is not a number
@@ -219,7 +219,7 @@ def report_of(tmp_path, name="own", change=None, **block):
         {"name": name, "steps": 400, "evaluations": 4, "seeds": 2, "hardness": hardness, "blocks": [block]}
     )
     for run in spec.runs:
-        _worker.attempt(fake_training.train, run.config, run.id, tmp_path)
+        fake_training.attempt(run, tmp_path)
     if change is not None:
         change(spec)
     report = study.report(spec, tmp_path)
@@ -277,7 +277,7 @@ def test_what_has_no_run_is_not_measured_and_the_cost_is_told_beforehand(tmp_pat
     block = {"environments": ["frozen_lake/4x4", "frozen_lake/8x8"], "agents": ["q_learning"]}
     spec = study.specification({"name": "half", "hardness": {"measures": ["diameter"], "budget": 7}, "blocks": [block]})
     run = spec.runs[0]
-    _worker.attempt(fake_training.train, run.config, run.id, tmp_path)
+    fake_training.attempt(run, tmp_path)
     told = []
     study.report(spec, tmp_path, progress=told.append)
     assert [line for line in told if "hardness of" in line] == [
@@ -355,7 +355,7 @@ def test_the_page_escapes_whatever_a_study_says(tmp_path, sketched):
     spec = study.specification(
         {"name": "x", "description": "<script>alert(1)</script>", "blocks": [block], "steps": 10}
     )
-    _worker.attempt(fake_training.train, spec.runs[0].config, spec.runs[0].id, tmp_path)
+    fake_training.attempt(spec.runs[0], tmp_path)
     page = study.report(spec, tmp_path).html.read_text()
     assert "<script>alert" not in page and page.count("<script") == 1 and "&lt;script&gt;" in page
 

@@ -1,4 +1,4 @@
-"""Runs of a study that are trained as one program: which fit together, and the process that trains them.
+"""Runs of a study that are trained as one program: which fit together, and what trains them.
 
 A run belongs to a batch where the study says `engine: batched`. Batches are formed when a worker is free, from the
 runs that are missing then; a run does not depend on its batch, so neither do results. While a batch is trained, its
@@ -7,12 +7,10 @@ checkpoints are in DIR/batches; a batch that was killed goes on from there with 
 
 import contextlib
 import json
-import os
 import shutil
 import time
-import traceback
 from collections import deque
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -21,17 +19,12 @@ import numpy as np
 
 from pharos.agents.batched import lane_width
 from pharos.environments import Environment
-from pharos.errors import FolderLocked
 from pharos.study import values as _values
-from pharos.study import worker as _worker
 from pharos.study.blocks import Run
+from pharos.study.worker import BATCHES
 from pharos.system import storage
 
-BATCHES = "batches"
 TABLES = 16  # runs of one program that learn tables
-
-BatchRunner = Callable[[Sequence[Mapping[str, Any]], Sequence[Path], Path], Sequence[str | None]]
-"""runner(configs, folders, folder for checkpoints) -> for each run None, or why it failed."""
 
 
 def train_batch(
@@ -163,79 +156,3 @@ class Batches:
 def most_states(environment: Environment) -> float:
     """At most how many states an environment has: the product of the ranges of its variables."""
     return float(np.prod(environment.components.size.astype(float)))
-
-
-# As a process --------------------------------------------------------------------------------------------------------
-
-
-def main(
-    runner: BatchRunner,
-    configs: Sequence[Mapping[str, Any]],
-    ids: Sequence[str],
-    folder: Path,
-    again: Sequence[str],
-    environment: Mapping[str, str],
-) -> None:
-    """The body of a worker process that trains a batch; see `worker.main`."""
-    _worker.begin(environment)
-    attempt(runner, configs, ids, folder, again)
-
-
-def attempt(
-    runner: BatchRunner, configs: Sequence[Mapping[str, Any]], ids: Sequence[str], folder: Path, again: Sequence[str]
-) -> None:
-    """Execute those of the runs that are not over, and that no other process is at; each leaves its folder.
-
-    Args:
-        again: runs that are repeated where they have failed.
-    """
-    with contextlib.ExitStack() as held:
-        todo = []
-        for config, id in zip(configs, ids, strict=True):
-            holder = folder / "locks" / id
-            holder.mkdir(parents=True, exist_ok=True)
-            try:
-                held.enter_context(storage.lock(holder, FolderLocked, "training"))
-            except FolderLocked:
-                continue
-            done = _worker.read_status(folder, id)
-            if done != _worker.FINISHED and (done != _worker.FAILED or id in again):
-                todo.append((config, id))
-        waiting = []
-        for config, id in todo:
-            if _worker.is_complete(folder / "partial" / id):
-                _worker.publish(folder / "partial" / id, folder, id)
-            else:
-                waiting.append((config, id))
-        if waiting:
-            _train(runner, waiting, folder)
-
-
-def _train(runner: BatchRunner, waiting: Sequence[tuple[Mapping[str, Any], str]], folder: Path) -> None:
-    """Train, and put every run into its place, finished or failed."""
-    places = [folder / "partial" / id for _, id in waiting]
-    for place in places:
-        place.mkdir(parents=True, exist_ok=True)
-    began = time.perf_counter()
-    log = folder / "partial" / f"{waiting[0][1]}.log"
-    with _worker.log(log):
-        try:
-            errors = list(runner([config for config, _ in waiting], places, folder / BATCHES))
-        except Exception as error:
-            traceback.print_exc()
-            errors = [_worker.describe(error)] * len(waiting)
-    seconds = (time.perf_counter() - began) / len(waiting)
-    for (config, id), place, said in zip(waiting, places, errors, strict=True):
-        shutil.copyfile(log, place / "log.txt")
-        if not _worker.is_complete(place):
-            _worker.write_failure(place, config, id, said or "the runner returned without a finished run", seconds)
-        _worker.publish(place, folder, id)
-    log.unlink(missing_ok=True)
-
-
-def arguments(
-    runner: BatchRunner, unit: Sequence[Run], folder: Path, repeated: set[str]
-) -> tuple[BatchRunner, list[dict[str, Any]], list[str], Path, list[str], dict[str, str]]:
-    """What `main` takes for these runs."""
-    again = [run.id for run in unit if run.id in repeated]
-    return runner, [dict(run.config) for run in unit], [run.id for run in unit], folder, again, dict(os.environ)

@@ -6,7 +6,7 @@ may be killed, repeated, or followed by another.
 
 import os
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -103,7 +103,7 @@ def run_on_ray(
     resume: bool = False,
     progress: Callable[[Status], None] | None = None,
     runner: _worker.Runner = train,
-    batch_runner: _batches.BatchRunner | None = None,
+    batch_runner: _worker.BatchRunner | None = None,
 ) -> Status:
     """Execute the runs of a study that are not over on a Ray cluster, one processor a run, or a batch of runs.
 
@@ -130,35 +130,20 @@ def run_on_ray(
     if ours:
         ray.init(address=address, log_to_driver=False, include_dashboard=False if address is None else None)
     try:
-        one, batch = (
-            ray.remote(num_cpus=1, max_retries=ATTEMPTS - 1)(function) for function in (_attempt, _attempt_all)
-        )
-        return _follow(ray, one, batch, execution)
+        return _follow(ray, ray.remote(num_cpus=1, max_retries=ATTEMPTS - 1)(_attempt), execution)
     finally:
         if ours:
             ray.shutdown()
 
 
-def _attempt(runner: _worker.Runner, config: Mapping[str, Any], id: str, folder: str, again: bool, resume: bool) -> str:
+def _attempt(*job: Any) -> None:
+    """Execute one run or a batch; what another process is at is left to it."""
     _worker.use_one_thread()
-    while (end := _worker.attempt(runner, config, id, Path(folder), again=again, resume=resume)) == _worker.BUSY:
-        time.sleep(STATUS_SECONDS)
-    return end
+    *arguments, again, resume = job
+    _worker.attempt(*arguments, again=again, resume=resume)
 
 
-def _attempt_all(
-    runner: _batches.BatchRunner,
-    configs: Sequence[Mapping[str, Any]],
-    ids: Sequence[str],
-    folder: str,
-    again: Sequence[str],
-) -> None:
-    """The runs of a batch; those that another process is at are left to it."""
-    _worker.use_one_thread()
-    _batches.attempt(runner, configs, ids, Path(folder), again)
-
-
-def _follow(ray: Any, remote: Any, remote_batch: Any, execution: Execution) -> Status:
+def _follow(ray: Any, remote: Any, execution: Execution) -> Status:
     """Start every run or batch, and await them one by one.
 
     A batch whose process died too often goes on in halves; a run has failed.
@@ -167,16 +152,8 @@ def _follow(ray: Any, remote: Any, remote_batch: Any, execution: Execution) -> S
 
     def start() -> None:
         while execution.pending:
-            _, run = execution.pending.popleft()
-            runner, batch_runner = execution.options.runner, execution.options.batch_runner
-            if batch_runner is None or run.engine != "batched":
-                how = (run.id in execution.repeated, execution.options.resume)
-                started[remote.remote(runner, dict(run.config), run.id, str(execution.folder), *how)] = (run,)
-                continue
-            unit = execution.batches.unit(run, execution.pending)
-            arguments = _batches.arguments(batch_runner, unit, execution.folder, execution.repeated)
-            _, configs, ids, folder, again, _ = arguments
-            started[remote_batch.remote(batch_runner, configs, ids, str(folder), again)] = unit
+            unit = execution.unit(execution.pending.popleft()[1])
+            started[remote.remote(*execution.job(unit))] = unit
 
     start()
     while started:
@@ -192,19 +169,10 @@ def _follow(ray: Any, remote: Any, remote_batch: Any, execution: Execution) -> S
                 execution.batches.halve(left)
             elif error is not None:
                 for run in left:
-                    _fail(execution, run, error)
-            if left and unit[0].engine == "batched" and (error is None or len(left) > 1):
+                    execution.fail(run, _worker.describe(error))
+            if left and (error is None or len(left) > 1):
                 time.sleep(BUSY_SECONDS)  # another process may be at them
                 execution.pending.extend((0.0, run) for run in left)
             start()
         execution.report()
     return execution.report(final=True)
-
-
-def _fail(execution: Execution, run: Run, error: Exception) -> None:
-    """A run has failed, as Ray says."""
-    partial = execution.folder / "partial" / run.id
-    partial.mkdir(parents=True, exist_ok=True)
-    _worker.write_failure(partial, run.config, run.id, _worker.describe(error), 0.0)
-    _worker.publish(partial, execution.folder, run.id)
-    execution.note(run)

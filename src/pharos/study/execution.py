@@ -47,6 +47,9 @@ LOST_SERVERS = 10
 SERVER_LOST = 255
 
 
+Job = tuple[_worker.BatchRunner, list[dict[str, Any]], list[str], Path, set[str], bool]
+
+
 def train(config: Mapping[str, Any], folder: Path) -> None:
     """The runner of studies: trains as `config` says and writes run.json and curve.parquet into `folder`."""
     from pharos.training import TaskValues, train_config
@@ -81,7 +84,7 @@ def run(  # noqa: PLR0913
     progress: Callable[[Status], None] | None = None,
     runner: _worker.Runner = train,
     prepare: Callable[[Mapping[str, Any]], Any] | None = None,
-    batch_runner: _batches.BatchRunner | None = None,
+    batch_runner: _worker.BatchRunner | None = None,
     foretold: Callable[[Forecast], None] | None = None,
     device: str = "cpu",
 ) -> Status:
@@ -153,7 +156,7 @@ class Options:
     workers: int
     progress: Callable[[Status], None] | None = None
     runner: _worker.Runner = train
-    batch_runner: _batches.BatchRunner | None = None
+    batch_runner: _worker.BatchRunner | None = None
     device: str = "cpu"
     status_file: str = "status.json"
 
@@ -227,7 +230,7 @@ class Execution:
                 continue
             if self.note(run, run.id in self.repeated):
                 continue
-            unit = (run,) if self.options.batch_runner is None else self.batches.unit(run, self.pending)
+            unit = self.unit(run)
             try:
                 process = self._worker(context, unit)
             except (EOFError, ConnectionError) as error:
@@ -249,21 +252,26 @@ class Execution:
         time.sleep(BUSY_SECONDS)
 
     def _worker(self, context: Any, unit: tuple[Run, ...]) -> Any:
-        run, folder = unit[0], self.folder.absolute()
-        target: Callable[..., None] = _worker.main
-        arguments: tuple[Any, ...]
-        if self.options.batch_runner is not None and run.engine == "batched":
-            target = _batches.main
-            arguments = _batches.arguments(self.options.batch_runner, unit, folder, self.repeated)
-        else:
-            where = (run.id, folder, run.id in self.repeated, self.options.resume)
-            arguments = (self.options.runner, dict(run.config), *where, dict(os.environ))
-        process = context.Process(target=target, args=arguments, name=run.id)
+        arguments = (*self.job(unit), dict(os.environ))
+        process = context.Process(target=_worker.main, args=arguments, name=unit[0].id)
         definitions = [each for run in unit for each in run.configuration.definitions]
         with one_thread(), without_main(self.options.runner, self.options.batch_runner, *definitions):
             ready(context)
             process.start()
         return process
+
+    def unit(self, run: Run) -> tuple[Run, ...]:
+        """The runs that are executed by one process with this one; they are taken from `pending`."""
+        return (run,) if self.options.batch_runner is None else self.batches.unit(run, self.pending)
+
+    def job(self, unit: Sequence[Run]) -> Job:
+        """The arguments of `worker.main` for these runs, but for the last."""
+        runner, resume = self.options.batch_runner, True
+        if runner is None or unit[0].engine != "batched":
+            runner, resume = partial(_worker.run_alone, self.options.runner), self.options.resume
+        ids = [run.id for run in unit]
+        configs, again = [dict(run.config) for run in unit], self.repeated.intersection(ids)
+        return runner, configs, ids, self.folder.absolute(), again, resume
 
     def _await(self) -> None:
         waiting = BUSY_SECONDS if self.pending and len(self.running) < self.options.workers else STATUS_SECONDS / 2
@@ -317,14 +325,17 @@ class Execution:
     def _give_up(self, run: Run, code: int) -> None:
         """A run has failed: its process was killed too often, or took too long."""
         if self.kills[run.id] > ATTEMPTS:
-            error = f"took longer than {self.options.timeout:g} s"
+            self.fail(run, f"took longer than {self.options.timeout:g} s")
         else:
             how = f"by signal {-code}" if code < 0 else f"with exit code {code}"
-            error = f"its process ended {how}, {ATTEMPTS} times; was there memory enough?"
-        partial = self.folder / "partial" / run.id
-        partial.mkdir(parents=True, exist_ok=True)
-        _worker.write_failure(partial, run.config, run.id, error, 0.0)
-        _worker.publish(partial, self.folder, run.id)
+            self.fail(run, f"its process ended {how}, {ATTEMPTS} times; was there memory enough?")
+
+    def fail(self, run: Run, error: str) -> None:
+        """Publish a run that has failed, with what its process has left behind."""
+        folder = self.folder / "partial" / run.id
+        folder.mkdir(parents=True, exist_ok=True)
+        _worker.write_failure(folder, run.config, run.id, error, 0.0)
+        _worker.publish(folder, self.folder, run.id)
         self.note(run, False)
 
     def note(self, run: Run, again: bool = False) -> bool:
@@ -389,7 +400,7 @@ def _clear(folder: Path, runs: Iterable[Run]) -> None:
     for run in runs:
         for name in (f"partial/{run.id}", f"partial/{run.id}.failed", f"locks/{run.id}"):
             shutil.rmtree(folder / name, ignore_errors=True)
-    for name in ("partial", "locks", _batches.BATCHES):
+    for name in ("partial", "locks", _worker.BATCHES):
         with contextlib.suppress(OSError):
             (folder / name).rmdir()
 

@@ -1,6 +1,6 @@
-"""One run in one process: the folder of a run appears whole, or not at all.
+"""One run, or a batch of runs, in one process: the folder of a run appears whole, or not at all.
 
-    DIR/partial/ID/   while it is being run: its log, and whatever the runner writes
+    DIR/partial/ID/   while it is being run: its log (of a batch: with its first run), and whatever the runner writes
     DIR/runs/ID/      when it is over, moved there in one step: run.json (finished or failed), curve.parquet, log.txt
     DIR/locks/ID/     held by the process that runs it
 
@@ -16,7 +16,7 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Container, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +32,11 @@ LONGEST = 3e11
 CLEAN_SECONDS = 2.0
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
 
+BATCHES = "batches"
+
 Runner = Callable[[Mapping[str, Any], Path], Any]
+BatchRunner = Callable[[Sequence[Mapping[str, Any]], Sequence[Path], Path], Sequence[str | None]]
+"""runner(configs, folders, folder for checkpoints) -> for each run None, or why it failed."""
 
 
 def read_status(folder: Path, id: str) -> str | None:
@@ -71,44 +75,72 @@ def read_record(folder: Path) -> dict[str, Any] | None:
 
 
 def attempt(
-    runner: Runner, config: Mapping[str, Any], id: str, folder: Path, *, again: bool = False, resume: bool = False
-) -> str:
-    """Execute one run unless it is finished already; FINISHED, FAILED or BUSY (another process is at it).
+    runner: BatchRunner,
+    configs: Sequence[Mapping[str, Any]],
+    ids: Sequence[str],
+    folder: Path,
+    *,
+    again: Container[str] = (),
+    resume: bool = False,
+) -> list[str]:
+    """Execute those of the runs that are not over: FINISHED, FAILED or BUSY (another process is at it) for each.
 
-    A run that raises is FAILED: its error stands in run.json and its log; `again` repeats such runs. With `resume` the
-    runner gets what an attempt that was killed left behind, else an empty folder.
+    A run that raises is FAILED: its error stands in run.json and its log; those in `again` are repeated. With `resume`
+    the runner gets what an attempt that was killed left behind, else empty folders.
     """
-    holder = folder / "locks" / id
-    holder.mkdir(parents=True, exist_ok=True)
-    try:
-        with storage.lock(holder, FolderLocked, "training"):
-            return _attempt(runner, config, id, folder, again, resume)
-    except FolderLocked:
-        return BUSY
-
-
-def _attempt(runner: Runner, config: Mapping[str, Any], id: str, folder: Path, again: bool, resume: bool) -> str:
-    done = read_status(folder, id)
-    if done == FINISHED or (done == FAILED and not again):
-        return done
-    partial = folder / "partial" / id
-    if not is_complete(partial):
-        if partial.exists() and not resume:
-            shutil.rmtree(partial)
-        partial.mkdir(parents=True, exist_ok=True)
-        began = time.perf_counter()
-        with log(partial / "log.txt"):
+    ends: dict[str, str] = {}
+    with contextlib.ExitStack() as held:
+        todo = []
+        for config, id in zip(configs, ids, strict=True):
+            holder, partial = folder / "locks" / id, folder / "partial" / id
+            holder.mkdir(parents=True, exist_ok=True)
             try:
-                runner(config, partial)
-                if not is_complete(partial):
-                    raise RuntimeError("the runner returned without a finished run.json and a curve.parquet")
-            except Exception as error:
-                traceback.print_exc()
-                write_failure(partial, config, id, describe(error), time.perf_counter() - began)
-    else:  # its process was killed before it could publish it
-        training.clear_run(partial)
-    publish(partial, folder, id)
-    return read_status(folder, id) or FAILED
+                held.enter_context(storage.lock(holder, FolderLocked, "training"))
+            except FolderLocked:
+                ends[id] = BUSY
+                continue
+            done = read_status(folder, id)
+            if done == FINISHED or (done == FAILED and id not in again):
+                ends[id] = done
+            elif is_complete(partial):  # its process was killed before it could publish it
+                training.clear_run(partial)
+                publish(partial, folder, id)
+            else:
+                if partial.exists() and not resume:
+                    shutil.rmtree(partial)
+                partial.mkdir(parents=True, exist_ok=True)
+                todo.append((config, id, partial))
+        if todo:
+            _execute(runner, todo, folder)
+        return [ends.get(id) or read_status(folder, id) or FAILED for id in ids]
+
+
+def _execute(runner: BatchRunner, todo: Sequence[tuple[Mapping[str, Any], str, Path]], folder: Path) -> None:
+    """Call the runner, and put every run into its place, finished or failed."""
+    began = time.perf_counter()
+    first, *others = places = [partial for _, _, partial in todo]
+    with log(first / "log.txt"):
+        try:
+            errors = list(runner([config for config, _, _ in todo], places, folder / BATCHES))
+        except Exception as error:
+            traceback.print_exc()
+            errors = [describe(error)] * len(todo)
+    for place in others:
+        shutil.copyfile(first / "log.txt", place / "log.txt")
+    seconds = (time.perf_counter() - began) / len(todo)
+    for (config, id, place), reason in zip(todo, errors, strict=True):
+        if not is_complete(place):
+            missing = "the runner returned without a finished run.json and a curve.parquet"
+            write_failure(place, config, id, reason or missing, seconds)
+        publish(place, folder, id)
+
+
+def run_alone(
+    runner: Runner, configs: Sequence[Mapping[str, Any]], folders: Sequence[Path], _: Path
+) -> Sequence[str | None]:
+    """A runner of one run as one of batches, for `functools.partial`."""
+    runner(configs[0], folders[0])
+    return [None]
 
 
 def describe(error: BaseException) -> str:
@@ -185,21 +217,21 @@ def log(path: Path):
 
 
 def main(
-    runner: Runner,
-    config: Mapping[str, Any],
-    id: str,
+    runner: BatchRunner,
+    configs: Sequence[Mapping[str, Any]],
+    ids: Sequence[str],
     folder: Path,
-    again: bool,
+    again: Container[str],
     resume: bool,
     environment: Mapping[str, str],
 ) -> None:
     """The body of a worker process; see `begin` for `environment`."""
     begin(environment)
     try:
-        status = attempt(runner, config, id, folder, again=again, resume=resume)
+        ends = attempt(runner, configs, ids, folder, again=again, resume=resume)
     except OSError as error:  # a full disk, on which not even the log can say so
-        sys.exit(f"pharos: run {id}: {error.strerror or error}")
-    if status == BUSY:
+        sys.exit(f"pharos: run {ids[0]}: {error.strerror or error}")
+    if {*ends} == {BUSY}:
         sys.exit(EXIT_BUSY)
 
 
