@@ -9,6 +9,8 @@ import pytest
 from pharos import study
 from pharos.study import execution as _execution
 from pharos.study import values as _values
+from pharos.system.paths import cache_directory
+from pharos.system.storage import sealed
 from pharos.training import train_config
 
 
@@ -63,12 +65,21 @@ def test_another_seed_agent_or_observation_shares_them(config):
 )
 def test_stored_values_that_were_changed_are_solved_again(change, config):
     values = _values.solve(config)
-    file = _values._file(config)
+    (file,) = (cache_directory() / "values").iterdir()
     text = file.read_text()
     start = text.index('"values"')
     file.write_text(text[:start] + change(text[start:]) if "values" in change(text) else change(text))
     assert _values.stored_values(config) is None
     assert _values.solve(config) == values == _values.stored_values(config)
+
+
+def test_values_that_an_earlier_pharos_has_kept_are_read_on(config):
+    values = _values.solve(config)
+    (file,) = (cache_directory() / "values").iterdir()
+    record = json.loads(file.read_text())
+    entry = {"values": record.pop("values"), "task": {name: record[name] for name in record if name != "digest"}}
+    file.write_text(json.dumps(sealed(entry)))
+    assert _values.stored_values(config) == values
 
 
 def test_values_of_other_rules_are_not_taken(config, monkeypatch):

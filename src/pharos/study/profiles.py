@@ -18,10 +18,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pharos.agents import TABULAR_OBSERVATION
-from pharos.errors import FileFormatError, PharosError
+from pharos.errors import PharosError
 from pharos.observations import Aliasing, aliasing
 from pharos.study.statistics import mean_of_means, performance_profile, probability_of_improvement
-from pharos.system.storage import digest_of_json, is_intact, read_json, replace_json, sealed
+from pharos.system.storage import ResultCache
 from pharos.training import bootstrap_interval
 
 if TYPE_CHECKING:
@@ -162,18 +162,13 @@ def _counted(folder: Path, config: Mapping[str, Any]) -> Aliasing:
     from pharos.state_space import build
     from pharos.study.values import task_of
 
-    identity = {name: config[name] for name in ("environment", "parameters", "observation", "observation_options")}
-    task = task_of(config)
-    identity = json.loads(json.dumps({**identity, "version": task.env.version}))
-    file = folder / "aliasing" / f"{digest_of_json(identity)[:16]}.json"
-    try:
-        stored = read_json(file)
-        if is_intact(stored) and stored["asked"] == identity:
-            return Aliasing(**stored["counts"])
-    except (FileNotFoundError, FileFormatError, KeyError, TypeError, AttributeError):
-        pass
-    space = build(task.env, progress=False)
-    counts = aliasing(space, observe(task.env, task.observation, **dict(task.observation_options)))
-    file.parent.mkdir(parents=True, exist_ok=True)
-    replace_json(file, sealed({"asked": identity, "counts": asdict(counts)}))
-    return counts
+    task, cache = task_of(config), ResultCache(folder / "aliasing")
+    names = ("environment", "parameters", "observation", "observation_options")
+    dependencies = json.loads(json.dumps({**{name: config[name] for name in names}, "version": task.env.version}))
+    stored = cache.get(dependencies)
+    if stored is None:
+        space = build(task.env, progress=False)
+        counts = aliasing(space, observe(task.env, task.observation, **dict(task.observation_options)))
+        cache.put(dependencies, counts=asdict(counts))
+        return counts
+    return Aliasing(**stored["counts"])

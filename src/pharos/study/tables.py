@@ -23,7 +23,7 @@ from pharos.study import worker as _worker
 from pharos.study.blocks import Run, Specification
 from pharos.study.execution import opened
 from pharos.study.specification import Source
-from pharos.system.storage import is_intact, read_json, replace_json, sealed
+from pharos.system.storage import ResultCache
 from pharos.system.wording import many
 from pharos.training import ChanceSetting
 
@@ -254,9 +254,9 @@ def hardness_cost(study: Specification, place: Path, tasks: Container[tuple[str,
     for run in study.runs:
         if (run.instance, run.chance) in tasks:
             for config in (run.config, {**run.config, "chance": PLAIN}):
-                identity, file = _identity_of(study, place, config)
-                stored = _stored(file, identity) or {"measures": {}}
-                missing[file] = sum(name not in stored["measures"] for name in study.hardness.measures)
+                cache, dependencies = ResultCache(place / "hardness"), _dependencies(study, config)
+                there = (cache.get(dependencies) or {"measures": {}})["measures"]
+                missing[cache.file(dependencies)] = sum(name not in there for name in study.hardness.measures)
     return sum(number > 0 for number in missing.values()), sum(missing.values()) * study.hardness.budget
 
 
@@ -283,39 +283,24 @@ def _usable(measure: dict[str, Any]) -> dict[str, Any]:
     return {"value": None, "why": f"only {measure['lower']:g} to {measure['upper']:g} is proven within the budget"}
 
 
-def _identity_of(study: Specification, place: Path, config: Mapping[str, Any]) -> tuple[dict[str, Any], Path]:
-    """What the measures of a run's task depend on, and the file that keeps them."""
-    import xxhash
-
-    identity = {name: config[name] for name in ("environment", "parameters", "chance", "horizon")}
-    identity["gamma"] = study.hardness.gamma
+def _dependencies(study: Specification, config: Mapping[str, Any]) -> dict[str, Any]:
+    """What the measures of a run's task depend on."""
+    dependencies = {name: config[name] for name in ("environment", "parameters", "chance", "horizon")}
+    dependencies["gamma"] = study.hardness.gamma
     if "environment" in config.get("sources", {}):  # a class of the user's own, which may change
-        identity["code"] = config["sources"]["environment"]["checksum"]
-    key = xxhash.xxh3_64_hexdigest(json.dumps(identity, sort_keys=True).encode())
-    return identity, place / "hardness" / f"{key}.json"
+        dependencies["code"] = config["sources"]["environment"]["checksum"]
+    return dependencies
 
 
 def _measured(study: Specification, place: Path, config: Mapping[str, Any]) -> dict[str, Any]:
-    identity, file = _identity_of(study, place, config)
-    stored = _stored(file, identity) or {**identity, "measures": {}, "num_states": None}
+    cache, dependencies = ResultCache(place / "hardness"), _dependencies(study, config)
+    stored = cache.get(dependencies) or {"measures": {}, "num_states": None}
     missing = [name for name in study.hardness.measures if name not in stored["measures"]]
     if missing:
         stored, all_measures = _measure(study, config, missing, stored)
-        file.parent.mkdir(parents=True, exist_ok=True)
-        replace_json(file, sealed(stored))
+        cache.put(dependencies, **stored)
         return all_measures
     return stored
-
-
-def _stored(file: Path, identity: Mapping[str, Any]) -> dict[str, Any] | None:
-    """What was measured before; None where there is nothing, or not what was written there."""
-    try:
-        stored = read_json(file)
-    except (FileNotFoundError, FileFormatError):
-        return None
-    if not isinstance(stored, dict) or not is_intact(stored) or not isinstance(stored.get("measures"), dict):
-        return None
-    return stored if all(stored.get(name) == value for name, value in identity.items()) else None
 
 
 def _measure(

@@ -7,14 +7,12 @@ instance again for each run would take longer than some training.
 import json
 import math
 from collections.abc import Mapping
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pharos.environments import start_distribution
-from pharos.errors import FileFormatError
 from pharos.solvers import ReferenceValues
 from pharos.system.paths import cache_directory
-from pharos.system.storage import is_intact, read_json, replace_json, sealed
+from pharos.system.storage import ResultCache
 from pharos.training import RunConfig
 
 if TYPE_CHECKING:
@@ -34,21 +32,14 @@ def solve(config: Mapping[str, Any]) -> dict[str, Any]:
 
         task = task_of(config)
         values = TaskValues(task.reference, task.return_range).to_dict()
-        file = _file(config)
-        file.parent.mkdir(parents=True, exist_ok=True)
-        replace_json(file, sealed({"task": _key(config), "values": values}))
+        _cache().put(_dependencies(config), values=values)
     return values
 
 
 def stored_values(config: Mapping[str, Any]) -> dict[str, Any] | None:
     """The stored values for these rules; None where there are none, or where the file was changed."""
-    try:
-        stored = read_json(_file(config))
-    except (FileNotFoundError, FileFormatError):
-        return None
-    if not isinstance(stored, dict) or not is_intact(stored) or stored.get("task") != _key(config):
-        return None
-    return stored.get("values")
+    stored = _cache().get(_dependencies(config))
+    return None if stored is None else stored["values"]
 
 
 def has_regret(config: Mapping[str, Any]) -> bool:
@@ -57,14 +48,11 @@ def has_regret(config: Mapping[str, Any]) -> bool:
     return values is None or not math.isnan(ReferenceValues(**values["reference"]).spread())
 
 
-def _file(config: Mapping[str, Any]) -> Path:
-    import xxhash
-
-    name = xxhash.xxh3_64_hexdigest(json.dumps(_key(config), sort_keys=True).encode())
-    return cache_directory() / "values" / f"{name}.json"
+def _cache() -> ResultCache:
+    return ResultCache(cache_directory() / "values")
 
 
-def _key(config: Mapping[str, Any]) -> dict[str, Any]:
+def _dependencies(config: Mapping[str, Any]) -> dict[str, Any]:
     """What the values depend on: parameters, rules by their code, start states, chance and setting."""
     from pharos.rules import fingerprint_of_rules
 

@@ -483,3 +483,29 @@ def is_intact(record: Mapping[str, Any]) -> bool:
     """
     content = {key: value for key, value in record.items() if key != DIGEST}
     return DIGEST not in record or record[DIGEST] == digest_of_json(content)
+
+
+class ResultCache:
+    """A folder of results, each sealed in a file that is named by a digest of all that it depends on."""
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+
+    def file(self, dependencies: Mapping[str, Any]) -> Path:
+        """The file of the result that depends on this, JSON-able."""
+        return self.folder / f"{xxhash.xxh3_64_hexdigest(json.dumps(dependencies, sort_keys=True).encode())}.json"
+
+    def get(self, dependencies: Mapping[str, Any]) -> dict[str, Any] | None:
+        """The entries of a result; None where there is none, or not what was written there."""
+        try:
+            record = read_json(self.file(dependencies))
+            said = record.get("task", record)  # where values of 0.1.0 have it
+            is_ours = DIGEST in record and all(said.get(name) == value for name, value in dependencies.items())
+            return record if is_ours and is_intact(record) else None
+        except (FileNotFoundError, FileFormatError, AttributeError, TypeError):
+            return None
+
+    def put(self, dependencies: Mapping[str, Any], **entries: Any) -> None:
+        """Keep a result."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        replace_json(self.file(dependencies), sealed({**dependencies, **entries}))
