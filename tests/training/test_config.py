@@ -103,7 +103,7 @@ def test_a_configuration_is_that_of_its_task(entry):
     [
         ({"steps": None}, "steps is None"),
         ({"chance": {"windy": 0.1}}, "unknown kind of chance 'windy'"),
-        ({"chance": 3}, "damaged"),
+        ({"chance": 3}, "a run: chance is 3; expected ChanceSetting"),
         ({"colour": "red"}, "unknown entry 'colour'"),
     ],
 )

@@ -11,7 +11,6 @@ Source of the layout: the format of safetensors, https://github.com/huggingface/
 """
 
 import json
-import math
 import os
 import sys
 import unicodedata
@@ -25,7 +24,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from pharos.errors import FileFormatError, ParameterError, ResultCorrupted
-from pharos.system import storage
+from pharos.system import records, storage
 from pharos.training import RunConfig, run_id
 
 FORMAT = 1
@@ -44,13 +43,6 @@ LOOKALIKES = "АВЕЅІЈКМНОРСТУХаеорсухѕіјΑΒΕΖΗΙΚΜ
 MOST_MARKS = 4
 _RECORD, _ARRAYS = "pharos", "arrays"
 _AGAIN = "fetch it again, or ask for it again"
-_KINDS: dict[str, tuple[type, ...]] = {  # of what a configuration says
-    **dict.fromkeys(("environment", "observation", "agent"), (str,)),
-    **dict.fromkeys(("parameters", "chance", "observation_options", "hyperparameters"), (dict,)),
-    "seed": (int,),
-    "gamma": (int, float),
-    "horizon": (int, type(None)),
-}
 
 
 @dataclass(frozen=True)
@@ -179,34 +171,13 @@ def _check_sizes(path: Path) -> None:
 
 def _entry(record: Mapping[str, Any], arrays: dict[str, np.ndarray]) -> Entry:
     _check_values(record)
-    for name, kinds in _KINDS.items():
-        if type(record["config"][name]) not in kinds:
-            raise TypeError(f"its {name} is {str(record['config'][name])[:40]!r}")
-    config = RunConfig.from_dict(record["config"])
+    said = {name: value for name, value in record.items() if name not in ("format", "id", storage.DIGEST)}
+    entry = records.read(Entry, {**said, _ARRAYS: arrays}, "its record")
     if record["id"] != run_id(record["config"]):
         raise ValueError("its configuration is not that of its run")
-    claim = {name: record["claim"][name] for name in Claim.__dataclass_fields__}
-    numbers = [value for name, value in claim.items() if name != "exact"]
-    if not all(type(number) in (int, float) and math.isfinite(number) for number in numbers):
-        raise ValueError("what it claims are no numbers")
-    for name in ("hyperparameters", "versions", "training"):
-        if not isinstance(record[name], dict):
-            raise TypeError(f"its {name} are no object")
-    texts = {name: record[name] for name in SHOWN}
-    if not all(isinstance(text, str) for text in (*texts.values(), *record["versions"].values())):
-        raise TypeError("its name, author, note and versions are no texts")
-    if type(claim["exact"]) is not bool or type(record["rules_version"]) is not int or claim["error_bound"] < 0:
-        raise ValueError("what it claims is not what a claim is")
-    return Entry(
-        config=config,
-        hyperparameters=record["hyperparameters"],
-        versions=record["versions"],
-        rules_version=record["rules_version"],
-        claim=Claim(**claim),
-        training=record["training"],
-        arrays=arrays,
-        **texts,
-    )
+    if entry.claim.error_bound < 0:
+        raise ValueError(f"its error_bound is {entry.claim.error_bound}; expected at least 0")
+    return entry
 
 
 def _check_values(value: Any, name: str = "record", depth: int = 0) -> None:

@@ -16,6 +16,7 @@ from types import ModuleType
 from typing import Any
 
 from pharos.errors import FileFormatError, ParameterError, UntrustedCode
+from pharos.system.records import read
 
 # Modules loaded from files, by their path: (digest of the file, module).
 _MODULES: dict[str, tuple[str, ModuleType]] = {}
@@ -44,16 +45,9 @@ class Source:
         Raises:
             FileFormatError: it is damaged.
         """
-        try:
-            source = Source(**entry)
-        except TypeError:
-            source = None  # type: ignore[assignment]
-        if (
-            source is None
-            or not all(isinstance(value, str) for value in asdict(source).values())
-            or ":" not in source.name
-        ):
-            raise FileFormatError(f"the source of a class is {entry!r}; expected its name, file and checksum")
+        source = read(Source, entry, "the source of a class")
+        if ":" not in source.name:
+            raise FileFormatError(f"the source of a class: name is {source.name!r}; expected module:Name")
         return source
 
     def to_dict(self) -> dict[str, str]:

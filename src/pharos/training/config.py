@@ -7,7 +7,7 @@ back into. Its `id` names the run: the same configuration has the same id on eve
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from pharos.agents import BATCHED, agent_kind, agent_source, is_known
@@ -15,6 +15,7 @@ from pharos.environments import Environment, as_tuples, class_called, class_of, 
 from pharos.errors import FileFormatError, ParameterError, UnknownName, UntrustedCode
 from pharos.mdp import ChanceSetting
 from pharos.observations import OwnObservation, observation_of, registered
+from pharos.system.records import read
 from pharos.system.sources import Source, is_reference, resolve
 
 if TYPE_CHECKING:
@@ -163,39 +164,20 @@ class RunConfig:
         Raises:
             FileFormatError: an entry is missing, unknown or of another type.
         """
-        names = [each.name for each in fields(RunConfig)]
-        missing = [name for name in names if name not in entry and name not in ("sources", "engine")]
-        unknown = [name for name in entry if name not in names]
-        if missing or unknown:
-            wrong = f"lacks {', '.join(missing)}" if missing else f"has the unknown entry {unknown[0]!r}"
-            raise FileFormatError(f"the configuration of a run {wrong}; expected {', '.join(names)}")
         try:
-            sources = {part: Source.from_dict(source) for part, source in entry.get("sources", {}).items()}
-            return RunConfig(**{**entry, "chance": ChanceSetting.from_dict(entry["chance"]), "sources": sources})
-        except (ParameterError, AttributeError, TypeError) as error:
+            return read(RunConfig, entry, "the configuration of a run", optional=("engine", "sources"))
+        except ParameterError as error:
             raise FileFormatError(f"the configuration of a run is damaged: {error}") from error
 
     def to_dict(self) -> dict[str, Any]:
         """The `config` of a run.json, JSON-able."""
-        entry = {
-            "environment": self.environment,
-            "parameters": dict(self.parameters),
-            "chance": self.chance.to_dict(),
-            "observation": self.observation,
-            "observation_options": dict(self.observation_options),
-            "agent": self.agent,
-            "hyperparameters": dict(self.hyperparameters),
-            "steps": self.steps,
-            "seed": self.seed,
-            "gamma": self.gamma,
-            "horizon": self.horizon,
-            "evaluation_interval": self.evaluation_interval,
-        }
-        if self.engine != "sb3":
-            entry["engine"] = self.engine
-        if self.sources:
-            entry["sources"] = {part: source.to_dict() for part, source in self.sources.items()}
-        return entry
+        sources = {part: source.to_dict() for part, source in self.sources.items()}
+        entry = {**vars(self), "chance": self.chance.to_dict(), "sources": sources}
+        if self.engine == "sb3":
+            del entry["engine"]
+        if not sources:
+            del entry["sources"]
+        return {name: dict(value) if isinstance(value, Mapping) else value for name, value in entry.items()}
 
     @property
     def id(self) -> str:
