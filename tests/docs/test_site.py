@@ -16,6 +16,7 @@ import pytest
 
 from pharos.environments import class_called, named_instances
 from pharos.environments.built_in import BUILT_IN
+from pharos.explorer.pages import MOST_POSITIONS
 
 ROOT = Path(__file__).parents[2]
 DOCS, SCRIPTS = ROOT / "docs", ROOT / "scripts"
@@ -161,6 +162,15 @@ def test_every_named_instance_has_values_or_a_reason_why_not(scripts):
     without = {name for name in named_instances() if "discounted" not in stored.get(name, {})}
     assert without == set(scripts("site_pages").NOT_COMPUTED)
     assert all(stored[name]["more_than"] for name in without)
+
+
+def test_each_of_the_two_games_has_an_instance_for_a_page_of_the_explorer():
+    stored = json.loads((DOCS / "environments.json").read_text())
+    for game in ("breakout", "freeway"):
+        sizes = [
+            entry["num_states"] for name, entry in stored.items() if name.startswith(game) and "num_states" in entry
+        ]
+        assert min(sizes) <= MOST_POSITIONS
 
 
 def test_stored_values_are_in_order():
