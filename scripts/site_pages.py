@@ -184,7 +184,7 @@ def described(cls) -> dict:
     """What `pharos list NAME --json` says."""
     answer = io.StringIO()
     with contextlib.redirect_stdout(answer):
-        list_(cls.name, json=True)
+        list_(cls.name).say(json=True)
     return json.loads(answer.getvalue())
 
 

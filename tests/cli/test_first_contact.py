@@ -16,6 +16,7 @@ from command_line import process
 from pharos.cli.options import complete_target
 from pharos.environments import list_environments
 from pharos.environments.built_in import BUILT_IN
+from pharos.mdp import ChanceSetting
 from pharos.system import compiling
 
 
@@ -100,7 +101,7 @@ def test_a_space_too_large_to_measure_is_compiled_for_all_the_same(tmp_path, mon
     from pharos.cli import warm
 
     monkeypatch.setattr(sys.modules[warm.warm.__module__], "LARGEST", 5)
-    warm.warm.__globals__["_use"](pharos.make("simple_grid/4x4-plain"), 0.0, 0.0)
+    warm.warm.__globals__["_use"](pharos.make("simple_grid/4x4-plain"), ChanceSetting())
 
 
 def test_shells_complete_environments_instances_and_parameters():

@@ -11,7 +11,9 @@ import signal
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import typer
 
 from pharos.system import compiling, paths
 
@@ -19,10 +21,38 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from pharos.environments import Environment
+    from pharos.mdp import ChanceSetting
 
 INTERRUPTED = "interrupted; finished work is kept, and the same command goes on from there"
 NOTABLE_SECONDS = 0.2  # of compiling, beside those of work
 SPECIAL = re.compile(r"[^\w@%+=:,./\[\]-]")  # what a shell would read as more than a character of a word
+
+
+class Answer(NamedTuple):
+    """What a command answers.
+
+    Attributes:
+        json: the object that `--json` prints.
+        text: what people get instead: (title, facts), text or a path, or a function that prints.
+        failed: whether the exit code is 1.
+    """
+
+    json: Mapping[str, Any]
+    text: object
+    failed: bool = False
+
+    def say(self, json: bool) -> None:
+        """Print it; typer.Exit where it says that something failed."""
+        if json:
+            print_json(self.json)
+        elif isinstance(self.text, tuple):
+            print_facts(*self.text)
+        elif callable(self.text):
+            self.text()
+        else:
+            print(self.text)
+        if self.failed:
+            raise typer.Exit(1)
 
 
 def print_json(answer: Mapping[str, Any]) -> None:
@@ -123,19 +153,16 @@ def print_facts(title: str, facts: Sequence[tuple[str, object]]) -> None:
     to.print(table)
 
 
-def describe_chance(
-    sticky: float, random: float, of_the_world: bool = False, lazy: float = 0.0, noise: float = 0.0, delay: int = 0
-) -> str:
+def describe_chance(chance: "ChanceSetting", of_the_world: bool = False) -> str:
     """Chance in words.
 
     Args:
         of_the_world: whether executing an action may have several outcomes itself.
-        noise, delay: of the rewards that are paid.
     """
     parts = ["of the world"] * of_the_world
-    parts += [f"sticky actions {sticky:g}"] * bool(sticky) + [f"random actions {random:g}"] * bool(random)
-    parts += [f"lazy actions {lazy:g}"] * bool(lazy) + [f"reward noise {noise:g}"] * bool(noise)
-    parts += [f"rewards {delay} steps late"] * bool(delay)
+    parts += [f"{name} actions {p:g}" for name in ("sticky", "random", "lazy") if (p := getattr(chance, name))]
+    parts += [f"reward noise {chance.reward_noise:g}"] * bool(chance.reward_noise)
+    parts += [f"rewards {chance.reward_delay} steps late"] * bool(chance.reward_delay)
     return ", ".join(parts) or "none"
 
 
@@ -159,11 +186,12 @@ def describe(environment: "Environment") -> str:
     parameters = {
         name: value for name, value in environment.parameters.items() if value is not None or name not in absent
     }
-    words = (f"{name}={_written(value)}" for name, value in parameters.items())
+    words = (f"{name}={written(value)}" for name, value in parameters.items())
     return " ".join((environment.name, *(shlex.quote(word) if SPECIAL.search(word) else word for word in words)))
 
 
-def _written(value: Any) -> str:
+def written(value: object) -> str:
+    """A value as the command line reads it."""
     return str(value) if isinstance(value, str) else json.dumps(value, separators=(",", ":"))
 
 

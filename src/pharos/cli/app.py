@@ -33,6 +33,7 @@ from pharos.cli import (
     list as list_,
 )
 from pharos.cli.answers import INTERRUPTED, complain
+from pharos.cli.command import Commands
 from pharos.errors import DivergenceError, ParameterError, PharosError
 from pharos.system import compiling
 from pharos.system.installation import conflict
@@ -124,7 +125,7 @@ def _command_of(error: Exception) -> str:
     return context.command_path if context is not None else "pharos"
 
 
-app = typer.Typer(
+app = Commands(
     name="pharos",
     cls=_Group,
     pretty_exceptions_enable=False,

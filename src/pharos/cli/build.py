@@ -7,32 +7,10 @@ import math
 import shutil
 import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING
 
-import typer
-
-from pharos.cli.answers import (
-    bytes_of,
-    compiling_fact,
-    describe,
-    peak_memory_bytes,
-    print_facts,
-    print_json,
-    size_text,
-)
-from pharos.cli.options import (
-    Json,
-    MaxStates,
-    Memory,
-    Parameters,
-    Processes,
-    TargetArgument,
-    Workers,
-    memory_of,
-    parse_size,
-    ranks_of,
-)
-from pharos.cli.target import Target, parse_environment, parse_target
+from pharos.cli.answers import Answer, bytes_of, compiling_fact, describe, peak_memory_bytes, size_text
+from pharos.cli.target import Building, SharedBuilding, Target
 from pharos.errors import ParameterError, StateSpaceTooLarge
 from pharos.system.compiling import Stopwatch
 from pharos.system.wording import many
@@ -42,33 +20,19 @@ if TYPE_CHECKING:
     from pharos.state_space import StateSpace
 
 
-def build(
-    environment: TargetArgument,
-    parameters: Parameters = None,
-    out: Annotated[Path | None, typer.Option("--out", help="Folder to write; the cache when not given.")] = None,
-    memory: Memory = None,
-    workers: Workers = None,
-    processes: Processes = "1",
-    max_states: MaxStates = None,
-    json: Json = False,
-) -> None:
-    """Enumerate every state that can be reached, and its transitions, onto disk. The same command resumes."""
+def build(building: SharedBuilding, target: Target, *, out: Path | None = None) -> Answer:
+    """Enumerate every state that can be reached, and its transitions, onto disk. The same command resumes.
+
+    Args:
+        out: Folder to write; the cache when not given.
+    """
     from pharos import state_space
     from pharos.state_space import cached_folder
 
-    ranks = ranks_of(processes)
-    env = parse_environment(environment, parameters)
-    limit = memory_of(memory, processes)
+    options, env = building.options, target.found_environment()
     was_there = _is_there(out or cached_folder(env))
     watch = Stopwatch()
-    space = state_space.build(
-        env,
-        out,
-        memory=limit,
-        workers=workers,
-        processes=ranks,
-        max_states=max_states,
-    )
+    space = state_space.build(env, out, **options)
     seconds = watch.seconds
     rate, peak, bytes_on_disk = space.num_states / seconds, peak_memory_bytes(), bytes_of(space.folder)
     answer = {
@@ -87,26 +51,19 @@ def build(
         "folder": str(space.folder),
         "found": was_there,
     }
-    if json:
-        print_json(answer)
-        return
-    print_facts(
-        describe(env),
-        [
-            ("states", f"{space.num_states:,} ({space.num_terminal_states:,} terminal)"),
-            ("actions", f"{space.num_actions} ({', '.join(env.actions)})"),
-            *_outcomes(space),
-            ("depth", f"{space.depth:,}"),
-            (
-                "seconds",
-                f"{seconds:.2f} (it was there already)" if was_there else f"{seconds:.2f} ({rate:,.0f} states/s)",
-            ),
-            *compiling_fact(),
-            ("peak memory", size_text(peak)),
-            ("on disk", size_text(bytes_on_disk)),
-            ("folder", space.folder),
-        ],
-    )
+    pace = "it was there already" if was_there else f"{rate:,.0f} states/s"
+    facts = [
+        ("states", f"{space.num_states:,} ({space.num_terminal_states:,} terminal)"),
+        ("actions", f"{space.num_actions} ({', '.join(env.actions)})"),
+        *_outcomes(space),
+        ("depth", f"{space.depth:,}"),
+        ("seconds", f"{seconds:.2f} ({pace})"),
+        *compiling_fact(),
+        ("peak memory", size_text(peak)),
+        ("on disk", size_text(bytes_on_disk)),
+        ("folder", space.folder),
+    ]
+    return Answer(answer, (describe(env), facts))
 
 
 def _outcomes(space: "StateSpace") -> list[tuple[str, str]]:
@@ -131,41 +88,22 @@ def _is_there(folder: Path) -> bool:
 SMALL = 10_000  # states, so that solving takes no time
 
 
-def count(
-    target: TargetArgument,
-    parameters: Parameters = None,
-    memory: Memory = None,
-    workers: Workers = None,
-    max_states: MaxStates = None,
-    json: Json = False,
-) -> None:
+def count(target: Target, *, building: Building) -> Answer:
     """Count the states that can be reached, their transitions and the depth, and keep nothing."""
-    watch = Stopwatch()
-    goal = parse_target(target, parameters)
-    if goal.is_imported:
-        counted = counts_of_table(_table_of(goal))
-        if max_states is not None and counted["num_states"] > max_states:
-            raise StateSpaceTooLarge(f"{target}: has {counted['num_states']:,} states; expected at most {max_states:,}")
-    else:
-        counted = _counts_of_space(goal, memory=parse_size(memory), workers=workers, max_states=max_states)
-    has_regret = counted.pop("has_regret", True)
-    answer: dict[str, Any] = {
-        "target": target,
-        **counted,
-        "seconds": watch.seconds,
-        "compiling_seconds": watch.compiling,
-    }
-    if json:
-        print_json(answer)
-        return
-    apart = answer["num_states"] - answer["num_reachable_states"]
-    extra = f", {apart:,} never reached" if apart else ""
-    print(
-        f"{' '.join((target, *(parameters or ())))}: {many(answer['num_states'], 'state')} "
-        f"({answer['num_terminal_states']:,} terminal{extra}), {many(answer['num_actions'], 'action')}, "
-        f"{many(answer['num_transitions'], 'transition')}, depth {answer['depth']:,}, {answer['seconds']:.2f} s"
-        + ("" if has_regret else ", no policy beats uniform play")
-        + "".join(f", compiling {how_long}" for _, how_long in compiling_fact())
+    watch, most = Stopwatch(), building.max_states
+    counted = counts_of_table(_table_of(target)) if target.is_imported else _counts_of_space(target, building)
+    if target.is_imported and most is not None and counted["num_states"] > most:
+        raise StateSpaceTooLarge(f"{target.target}: has {counted['num_states']:,} states; expected at most {most:,}")
+    extra = "" if counted.pop("has_regret", True) else ", no policy beats uniform play"
+    answer = {"target": target.target, **counted, "seconds": watch.seconds, "compiling_seconds": watch.compiling}
+    apart = counted["num_states"] - counted["num_reachable_states"]
+    return Answer(
+        answer,
+        f"{target.title}: {many(counted['num_states'], 'state')} ({counted['num_terminal_states']:,} terminal"
+        + (f", {apart:,} never reached" if apart else "")
+        + f"), {many(counted['num_actions'], 'action')}, {many(counted['num_transitions'], 'transition')}, "
+        f"depth {counted['depth']:,}, {watch.seconds:.2f} s{extra}"
+        + "".join(f", compiling {how_long}" for _, how_long in compiling_fact()),
     )
 
 
@@ -177,7 +115,7 @@ def _table_of(goal: Target) -> "TabularMDP":
         return goal.mdp(horizon=1)
 
 
-def _counts_of_space(goal: Target, **options: Any) -> dict[str, int]:
+def _counts_of_space(goal: Target, building: Building) -> dict[str, int]:
     """Counts of a folder, or of the cache where the space is there; else it is built beside the cache and removed."""
     from pharos.state_space import cached_folder, load, read_manifest
     from pharos.system import paths
@@ -187,12 +125,12 @@ def _counts_of_space(goal: Target, **options: Any) -> dict[str, int]:
         return counts_of(load(goal.path, verify=False))
     manifest = read_manifest(cached_folder(goal.environment))
     if manifest is not None and manifest["complete"]:
-        return counts_of(goal.space(**options))
+        return counts_of(goal.space(building))
     place = paths.cache_directory()
     place.mkdir(parents=True, exist_ok=True)
     temporary = Path(tempfile.mkdtemp(prefix="count-", dir=place))
     try:
-        return counts_of(goal.space(out=temporary, **options))
+        return counts_of(goal.space(building, temporary))
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
 

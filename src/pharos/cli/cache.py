@@ -8,19 +8,19 @@ from typing import Annotated, Any
 
 import typer
 
-from pharos.cli.answers import bytes_of, console, print_json, size_text
-from pharos.cli.options import Json
+from pharos.cli.answers import Answer, bytes_of, console, size_text
+from pharos.cli.command import Commands
 from pharos.errors import PharosError, StateSpaceLocked, UnknownName
 from pharos.system.wording import many
 
 SPACE = re.compile(r".+-[0-9a-f]{16}")
 """Names of folders in the cache: of the environment, and a digest of its rules."""
 
-app = typer.Typer(help="List or clear the cached state spaces.", no_args_is_help=False)
+app = Commands(help="List or clear the cached state spaces.", no_args_is_help=False)
 
 
 @app.command("list")
-def list_(json: Json = False) -> None:
+def list_() -> Answer:
     """Show the cached state spaces and how much room they take."""
     from pharos.system import paths
 
@@ -28,23 +28,17 @@ def list_(json: Json = False) -> None:
     spaces = _spaces(directory)
     compiled = sum(map(bytes_of, _compiled(directory)))
     total = compiled + sum(space["bytes"] for space in spaces)
-    if json:
-        print_json({"directory": directory, "spaces": spaces, "compiled_bytes": compiled, "total_bytes": total})
-        return
-    _print(directory, spaces, compiled, total)
+    answer = {"directory": directory, "spaces": spaces, "compiled_bytes": compiled, "total_bytes": total}
+    return Answer(answer, lambda: _print(directory, spaces, compiled, total))
 
 
 @app.command("clear")
-def clear(
-    environments: Annotated[
-        list[str] | None,
-        typer.Argument(
-            metavar="[ENVIRONMENT]...", help="Clear only these: names of environments or of cached folders."
-        ),
-    ] = None,
-    json: Json = False,
-) -> None:
-    """Delete cached state spaces (and, when no name is given, compiled rules). They are made again when needed."""
+def clear(environments: Annotated[list[str] | None, typer.Argument(metavar="[ENVIRONMENT]...")] = None) -> Answer:
+    """Delete cached state spaces (and, when no name is given, compiled rules). They are made again when needed.
+
+    Args:
+        environments: Clear only these: names of environments or of cached folders.
+    """
     from pharos.system import paths, storage
 
     directory = paths.cache_directory()
@@ -64,10 +58,8 @@ def clear(
     for folder in _compiled(directory) if not environments else ():
         freed += bytes_of(folder)
         shutil.rmtree(folder)
-    if json:
-        print_json({"removed": removed, "bytes_freed": freed, "directory": directory})
-        return
-    print(f"{many(len(removed), 'state space')} deleted, {size_text(freed)} freed in {directory}")
+    answer = {"removed": removed, "bytes_freed": freed, "directory": directory}
+    return Answer(answer, f"{many(len(removed), 'state space')} deleted, {size_text(freed)} freed in {directory}")
 
 
 def _compiled(directory: Path) -> list[Path]:

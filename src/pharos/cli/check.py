@@ -1,13 +1,11 @@
 """pharos check: whether a class keeps the contract, and whether there is anything to learn in an instance of it."""
 
 import math
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-import typer
-
-from pharos.cli.answers import compiling_fact, print_json
-from pharos.cli.options import Json, Parameters, TargetArgument
-from pharos.cli.target import parse_target
+from pharos.cli.answers import Answer, compiling_fact
+from pharos.cli.options import Count
+from pharos.cli.target import Target
 from pharos.errors import PharosError
 from pharos.system import compiling
 
@@ -15,28 +13,20 @@ if TYPE_CHECKING:
     from pharos.environments import Environment
 
 
-def check(
-    target: TargetArgument,
-    parameters: Parameters = None,
-    max_states: Annotated[
-        int, typer.Option("--max-states", min=1, help="States that are looked at; more for a larger sample.")
-    ] = 1000,
-    json: Json = False,
-) -> None:
-    """Check an environment against the contract, state by state, and whether any policy beats uniform play."""
-    env = parse_target(target, parameters).found_environment()
+def check(target: Target, *, max_states: Count = 1000) -> Answer:
+    """Check an environment against the contract, state by state, and whether any policy beats uniform play.
+
+    Args:
+        max_states: States that are looked at; more for a larger sample.
+    """
+    env = target.found_environment()
     from pharos import check_environment
 
     conformance = check_environment(env, max_states=max_states)
     values, sentence = _values(env) if conformance.complete else (None, "not solved: not all states were looked at")
-    if json:
-        notes = [*conformance.notes, sentence]
-        print_json({**vars(conformance), "notes": notes, "values": values, "compiling_seconds": compiling.seconds()})
-        return
-    print(conformance)
-    print(f"  {sentence}")
-    for name, value in compiling_fact():
-        print(f"  {name}: {value}")
+    notes = {"notes": [*conformance.notes, sentence], "values": values, "compiling_seconds": compiling.seconds()}
+    lines = [sentence, *(f"{name}: {value}" for name, value in compiling_fact())]
+    return Answer({**vars(conformance), **notes}, "\n  ".join([str(conformance), *lines]))
 
 
 def _values(env: "Environment") -> tuple[dict[str, float] | None, str]:

@@ -2,39 +2,24 @@
 
 import math
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 
-from pharos.cli.answers import describe_chance, describe_discount, print_facts, print_json, progress_line
-from pharos.cli.options import (
-    Gamma,
-    Horizon,
-    Json,
-    Lazy,
-    MaxStates,
-    Memory,
-    Parameters,
-    Random,
-    Sticky,
-    TargetArgument,
-    Tolerance,
-    Trust,
-    Workers,
-    build_options,
-)
-from pharos.cli.target import Target, parse_target
+from pharos.cli.answers import Answer, describe_chance, describe_discount, progress_line
+from pharos.cli.options import Chance, Gamma, Horizon, Tolerance, Trust
+from pharos.cli.target import Building, Target
 from pharos.errors import FileFormatError, ParameterError, UnknownName
 
 if TYPE_CHECKING:
-    from pharos.mdp import TabularMDP
+    from pharos.mdp import ChanceSetting, TabularMDP
     from pharos.solvers import Solution
     from pharos.training import Task
 
 POLICIES = ("optimal", "uniform", "worst")
-SETTING = ("gamma", "horizon", "sticky", "random", "lazy")
+ACTING = ("sticky", "random", "lazy")
 
 
 @dataclass(frozen=True)
@@ -52,105 +37,86 @@ class Given:
 
 def evaluate(
     context: typer.Context,
-    target: TargetArgument,
-    parameters: Parameters = None,
-    policy: Annotated[
-        str,
-        typer.Option(
-            "--policy",
-            help="optimal, uniform, worst; FILE.npy: actions (S,), probabilities (S, A); or a finished run's folder.",
-        ),
-    ] = "uniform",
+    target: Target,
+    *,
+    policy: str = "uniform",
     gamma: Gamma = None,
     horizon: Horizon = None,
-    sticky: Sticky = 0.0,
-    random: Random = 0.0,
-    lazy: Lazy = 0.0,
+    chance: Chance,
     tolerance: Tolerance = 1e-6,
-    memory: Memory = None,
-    workers: Workers = None,
-    max_states: MaxStates = None,
+    building: Building,
     trust: Trust = False,
-    json: Json = False,
-) -> None:
+) -> Answer:
     """Evaluate a policy exactly, and say where it stands: regret 0 is optimal, 1 is as bad as playing at random.
 
     What a run has learnt is evaluated in the run's own setting (discount, horizon, chance) but for what options say.
     Only a policy that sees several frames and reaches more than 100,000 histories is estimated, from 2,000 episodes.
+
+    Args:
+        policy: optimal, uniform, worst; FILE.npy: actions (S,), probabilities (S, A); or a finished run's folder.
     """
     from pharos.solvers import regret_scale
 
-    building = build_options(memory, workers, max_states)
-    goal = parse_target(target, parameters)
     decisions = None if policy in POLICIES else read_policy(policy, trust=trust)
     source = "given"
     if decisions is not None and decisions.task is not None:
-        own = decisions.task
-        overridden = {name for name in SETTING if context.get_parameter_source(name).name == "COMMANDLINE"}  # type: ignore[union-attr]
+        own, names = decisions.task, ("gamma", "horizon", *ACTING)
+        overridden = {name for name in names if context.get_parameter_source(name).name == "COMMANDLINE"}  # type: ignore[union-attr]
         gamma = gamma if "gamma" in overridden else own.gamma
         horizon = horizon if "horizon" in overridden else own.horizon_steps
-        sticky = sticky if "sticky" in overridden else own.chance.sticky
-        random = random if "random" in overridden else own.chance.random
-        lazy = lazy if "lazy" in overridden else own.chance.lazy
+        chance = replace(chance, **{name: getattr(own.chance, name) for name in {*ACTING} - overridden})
         source = "the run's own" if not overridden else f"the run's own, but for {', '.join(sorted(overridden))}"
+    goal = target
     if goal.is_imported and Path(policy).expanduser().is_dir():  # what was learnt on the environment of the table
         table = goal.mdp()
         gamma, horizon = table.gamma if gamma is None else gamma, table.horizon if horizon is None else horizon
-        goal = Target(target, environment=goal.found_environment())
-    mdp = goal.mdp(gamma=gamma, horizon=horizon, sticky=sticky, random=random, lazy=lazy, **building)
+        goal = goal.as_environment()
+    mdp = goal.mdp(building, gamma=gamma, horizon=horizon, chance=chance)
     with progress_line("evaluating"):
         values = {name: _worth(solution_of(mdp, name, None, tolerance)) for name in POLICIES}
         if decisions is None:
-            values["given"] = values[policy]
+            worth = values[policy]
         elif _sees_frames(goal, decisions):
-            values["given"] = _worth_over_histories(goal, mdp, decisions, sticky=sticky, random=random, lazy=lazy)
+            worth = _worth_over_histories(goal, mdp, decisions, chance)
         else:
-            values["given"] = _worth(solution_of(mdp, policy, decisions, tolerance))
+            worth = _worth(solution_of(mdp, policy, decisions, tolerance))
     is_network = decisions is not None and "observation" in decisions.seeing
     rounding = ", for the probabilities that its network computes in 32 bits" if is_network else ""
     best, uniform, worst = (values[name].value for name in POLICIES)
-    worth = values["given"]
-    value = worth.value
+    every = [*values.values(), worth]
     error = max(values[name].error_bound for name in POLICIES)
-    relative, against_worst = ((best - value) / regret_scale(best, other, error) for other in (uniform, worst))
+    relative, against_worst = ((best - worth.value) / regret_scale(best, other, error) for other in (uniform, worst))
     answer = {
         "policy": policy,
-        "value_at_start": value,
+        "value_at_start": worth.value,
         "error_bound": worth.error_bound,
         "exact": worth.episodes == 0,
         "episodes": worth.episodes,
-        "regret": best - value,
+        "regret": best - worth.value,
         "normalized_regret": relative,
         "regret_relative_to_worst": against_worst,
         "optimal_value_at_start": best,
         "uniform_value_at_start": uniform,
         "worst_value_at_start": worst,
-        "seconds": sum(each.seconds for each in values.values()),
+        "seconds": sum(each.seconds for each in every),
         "gamma": mdp.gamma,
         "horizon": mdp.horizon,
-        "sticky": sticky,
-        "random": random,
-        "lazy": lazy,
+        **{name: getattr(chance, name) for name in ACTING},
         "setting": source,
         "policy_dtype": "float32" if is_network else None,
     }
-    if json:
-        print_json(answer)
-        return
-    print_facts(
-        f"{policy} policy on {' '.join((target, *(parameters or ())))}",
-        [
-            ("value at the start", f"{value:.8g}"),
-            ("regret", f"{answer['regret']:.8g}"),
-            ("normalised regret", "-" if math.isnan(relative) else f"{relative:.6g}  (0: optimal, 1: uniform)"),
-            ("relative to worst", "-" if math.isnan(against_worst) else f"{against_worst:.6g}  (0: optimal, 1: worst)"),
-            ("optimal, uniform, worst", f"{best:.8g}, {uniform:.8g}, {worst:.8g}"),
-            ("error at most", f"{max(each.error_bound for each in values.values()):.2g}{_estimated(worth)}{rounding}"),
-            *([] if source == "given" else [("setting", source)]),
-            ("discount", describe_discount(mdp.gamma, mdp.horizon)),
-            ("chance", describe_chance(sticky, random, mdp.dynamics.has_chance, lazy)),
-        ],
-    )
+    facts = [
+        ("value at the start", f"{worth.value:.8g}"),
+        ("regret", f"{answer['regret']:.8g}"),
+        ("normalised regret", "-" if math.isnan(relative) else f"{relative:.6g}  (0: optimal, 1: uniform)"),
+        ("relative to worst", "-" if math.isnan(against_worst) else f"{against_worst:.6g}  (0: optimal, 1: worst)"),
+        ("optimal, uniform, worst", f"{best:.8g}, {uniform:.8g}, {worst:.8g}"),
+        ("error at most", f"{max(each.error_bound for each in every):.2g}{_estimated(worth)}{rounding}"),
+        *([] if source == "given" else [("setting", source)]),
+        ("discount", describe_discount(mdp.gamma, mdp.horizon)),
+        ("chance", describe_chance(chance, mdp.dynamics.has_chance)),
+    ]
+    return Answer(answer, (f"{policy} policy on {target.title}", facts))
 
 
 @dataclass(frozen=True)
@@ -182,12 +148,12 @@ def _sees_frames(goal: Target, decisions: Given) -> bool:
     return "frames" in options and observe(goal.found_environment(), name, **options).frames > 1
 
 
-def _worth_over_histories(goal: Target, mdp: "TabularMDP", decisions: Given, **chance: float) -> Worth:
+def _worth_over_histories(goal: Target, mdp: "TabularMDP", decisions: Given, chance: "ChanceSetting") -> Worth:
     """Of a policy that sees several frames: exact where it reaches few histories, else estimated."""
     from pharos.training import Task, evaluate_agent
 
     began = time.perf_counter()
-    task = Task(goal.found_environment(), **chance, **decisions.seeing, gamma=mdp.gamma, horizon=mdp.horizon)  # type: ignore[arg-type]
+    task = Task(goal.found_environment(), chance, **decisions.seeing, gamma=mdp.gamma, horizon=mdp.horizon)
     evaluation = evaluate_agent(decisions.policy, task)
     return Worth(evaluation.value, evaluation.error_bound, time.perf_counter() - began, evaluation.episodes)
 

@@ -1,33 +1,21 @@
 """pharos hardness: all measures of one instance in a table, with exactness and sources."""
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pharos.cli.answers import compiling_fact, console, describe_chance, print_json, progress_line
-from pharos.cli.options import (
-    Json,
-    Lazy,
-    MaxStates,
-    Memory,
-    Parameters,
-    Random,
-    Sticky,
-    TargetArgument,
-    Workers,
-    build_options,
-    parse_parameters,
-)
-from pharos.cli.target import parse_target
+from pharos.cli.answers import Answer, compiling_fact, console, describe_chance, progress_line
+from pharos.cli.options import Chance, Discount, Seconds
+from pharos.cli.target import Building, Target
 from pharos.errors import ParameterError
 from pharos.system import compiling
 from pharos.system.wording import many
 
 if TYPE_CHECKING:
-    from pharos.cli.target import Target
-    from pharos.hardness import Representation
+    from pharos.hardness import Report, Representation
     from pharos.mdp import TabularMDP
 
 # What the column "exact" says of each kind of certificate.
@@ -36,119 +24,69 @@ IDEALISED = ("kernel_regret", "kernel_policy_regret", "sampled_regret")
 
 
 def hardness(
-    target: TargetArgument,
-    parameters: Parameters = None,
-    measures: Annotated[
-        str | None,
-        typer.Option(
-            "--measures", metavar="A,B", help="Names of measures, or all; those that are quick when not given."
-        ),
-    ] = None,
-    gamma: Annotated[
-        float | None,
-        typer.Option(
-            "--gamma",
-            min=0,
-            max=1,
-            help="Discount of values and gaps; 0.99 when not given, or what an imported file says.",
-            show_default=False,
-        ),
-    ] = None,
-    horizon: Annotated[
-        int | None, typer.Option("--horizon", min=1, help="Steps of an episode, for measures of episodes.")
-    ] = None,
-    sticky: Sticky = 0.0,
-    random: Random = 0.0,
-    lazy: Lazy = 0.0,
-    tolerance: Annotated[
-        float, typer.Option("--tolerance", help="Largest error of the optimal values, in units of return.")
-    ] = 1e-9,
-    restart: Annotated[
-        bool, typer.Option("--restart/--no-restart", help="Whether terminal states lead back to the start.")
-    ] = True,
-    budget: Annotated[
-        float, typer.Option("--budget", min=0, help="Seconds a measure may take before it gives a proven interval.")
-    ] = 300.0,
-    observation: Annotated[
-        str | None,
-        typer.Option(
-            "--observation", help="What the agent sees, as of train: adds measures of what its network makes of it."
-        ),
-    ] = None,
-    option: Annotated[
-        list[str] | None,
-        typer.Option("--option", metavar="NAME=VALUE", help="Option of the observation, such as hide=row."),
-    ] = None,
-    network: Annotated[
-        str | None,
-        typer.Option(
-            "--network",
-            help="mlp128, mlp128x2, cnn16, nature; that of the agents when not given. Or file.py:function, your own.",
-        ),
-    ] = None,
-    initialisation: Annotated[
-        str | None,
-        typer.Option(
-            "--initialisation", help="Of the network: pytorch (as DQN has; when not given), or sb3 (as PPO and A2C)."
-        ),
-    ] = None,
-    optimizer: Annotated[
-        str | None,
-        typer.Option(
-            "--optimizer",
-            help="Of the idealised learner: gradient (when not given), or adam, which rescales gradients.",
-        ),
-    ] = None,
-    landmarks: Annotated[
-        int | None,
-        typer.Option(
-            "--landmarks", min=0, help="Approximate the kernel by so many; 0: never; beyond 4,096 when not given."
-        ),
-    ] = None,
-    definitions: Annotated[bool, typer.Option("--definitions", help="Show definitions and sources.")] = False,
-    latex: Annotated[bool, typer.Option("--latex", help="Print a LaTeX table.")] = False,
-    values: Annotated[
-        Path | None,
-        typer.Option(
-            "--values",
-            help="Folder for values and bounds while they are computed, in place of memory; what was killed goes on.",
-        ),
-    ] = None,
-    fresh: Annotated[bool, typer.Option("--fresh", help="Compute anew what is kept beside the state space.")] = False,
-    memory: Memory = None,
-    workers: Workers = None,
-    max_states: MaxStates = None,
-    json: Json = False,
-) -> None:
-    """Measure how hard an instance is: visitation, estimation and planning complexity."""
-    building = build_options(memory, workers, max_states)
+    target: Target,
+    *,
+    measures: Annotated[str | None, typer.Option(metavar="A,B")] = None,
+    gamma: Discount | None = None,
+    horizon: Annotated[int | None, typer.Option(min=1)] = None,
+    chance: Chance,
+    tolerance: float = 1e-9,
+    restart: bool = True,
+    budget: Seconds = 300.0,
+    observation: str | None = None,
+    option: Mapping[str, Any],
+    network: str | None = None,
+    initialisation: str | None = None,
+    optimizer: str | None = None,
+    landmarks: Annotated[int | None, typer.Option(min=0)] = None,
+    definitions: bool = False,
+    latex: bool = False,
+    values: Path | None = None,
+    fresh: bool = False,
+    building: Building,
+) -> Answer:
+    """Measure how hard an instance is: visitation, estimation and planning complexity.
+
+    Args:
+        measures: Names of measures, or all; those that are quick when not given.
+        gamma: Discount of values and gaps; 0.99 when not given, or what an imported file says.
+        horizon: Steps of an episode, for measures of episodes.
+        tolerance: Largest error of the optimal values, in units of return.
+        restart: Whether terminal states lead back to the start.
+        budget: Seconds a measure may take before it gives a proven interval.
+        observation: What the agent sees, as of train: adds measures of what its network makes of it.
+        option: Option of the observation, such as hide=row.
+        network: mlp128, mlp128x2, cnn16, nature; that of the agents when not given. Or file.py:function, your own.
+        initialisation: Of the network: pytorch (as DQN has; when not given), or sb3 (as PPO and A2C).
+        optimizer: Of the idealised learner: gradient (when not given), or adam, which rescales gradients.
+        landmarks: Approximate the kernel by so many; 0: never; beyond 4,096 when not given.
+        definitions: Show definitions and sources.
+        latex: Print a LaTeX table.
+        values: Folder for values and bounds while they are computed, in place of memory; what was killed goes on.
+        fresh: Compute anew what is kept beside the state space.
+    """
     needs_rewards = True
     if measures is not None:
         from pharos.hardness import chosen
 
         wanted = chosen(measures)  # an unknown name is told before anything is built
         needs_rewards = any(each.depends != "structure" for each in wanted)
-    of_observations: dict[str, object] = {"option": option, "network": network, "initialisation": initialisation}
-    of_observations |= {"optimizer": optimizer, "landmarks": landmarks}
-    useless = [f"--{name}" for name, value in of_observations.items() if value not in (None, [])]
+    of_network = {"network": network, "initialisation": initialisation, "optimizer": optimizer, "landmarks": landmarks}
+    useless = [name for name, value in {"option": option or None, **of_network}.items() if value is not None]
     if observation is None and useless:
-        raise ParameterError(f"{useless[0]} goes with --observation NAME, what the agent sees")
-    goal = parse_target(target, parameters)
-    own = goal.is_imported  # an imported MDP has a discount and a horizon of its own
-    mdp = goal.mdp(
+        raise ParameterError(f"--{useless[0]} goes with --observation NAME, what the agent sees")
+    own = target.is_imported  # an imported MDP has a discount and a horizon of its own
+    mdp = target.mdp(
+        building,
         gamma=0.99 if gamma is None and not own else gamma,
         horizon=horizon if gamma == 1 or own else None,
-        sticky=sticky,
-        random=random,
-        lazy=lazy,
+        chance=chance,
         by_range=not needs_rewards,
-        **building,
     )
     representation = None
     if observation is not None:
-        words = parse_parameters(option)
         named = {"network": network, "initialisation": initialisation or "pytorch", "landmarks": landmarks}
-        mdp, representation = _represented(goal, mdp, observation, building, {**words, **named})
+        mdp, representation = _represented(target, mdp, observation, building, {**option, **named})
     from pharos.hardness import Schedule
     from pharos.hardness import report as measure
 
@@ -166,22 +104,21 @@ def hardness(
             schedule=None if representation is None else Schedule(optimizer=optimizer or "gradient"),
             folder=values,
         )
-    if json:
-        print_json({**report.to_dict(), "compiling_seconds": compiling.seconds()})
-    elif latex:
-        print(report.to_latex())
-    else:
-        chance = describe_chance(sticky, random, mdp.dynamics.has_chance, lazy)
-        _print(" ".join((target, *(parameters or ()))), report, chance, definitions)
+
+    def table() -> None:
+        _print(target.title, report, describe_chance(chance, mdp.dynamics.has_chance), definitions)
+
+    answer = {**report.to_dict(), "compiling_seconds": compiling.seconds()}
+    return Answer(answer, report.to_latex() if latex else table)
 
 
 def _represented(
-    goal: "Target", mdp: "TabularMDP", observation: str, building: dict[str, Any], options: dict[str, Any]
+    goal: Target, mdp: "TabularMDP", observation: str, building: Building, options: dict[str, Any]
 ) -> "tuple[TabularMDP, Representation]":
     """The MDP with its states numbered as in the state space, and what is seen of them."""
     from pharos.observations import representation
 
-    space = goal.space(**building)
+    space = goal.space(building)
     if goal.is_imported:  # its table has an order of its own
         from dataclasses import replace
 
@@ -193,7 +130,7 @@ def _represented(
         return mdp, representation(space, observation, **options)
 
 
-def _print(title: str, report: Any, chance: str, definitions: bool) -> None:
+def _print(title: str, report: "Report", chance: str, definitions: bool) -> None:
     from rich.markup import escape
     from rich.table import Table
 
@@ -245,7 +182,7 @@ def _print(title: str, report: Any, chance: str, definitions: bool) -> None:
         )
 
 
-def _ties(report: Any) -> list[str]:
+def _ties(report: "Report") -> list[str]:
     """How many gaps count as ties, and at which tolerance, where a measure of gaps is among them."""
     for result in report.results.values():
         details = {} if result.undefined else result.certificate.details

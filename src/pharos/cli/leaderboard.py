@@ -1,96 +1,101 @@
 """pharos submit, verify, board: entries of a leaderboard, and what is true of them."""
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pharos.cli.answers import complain, console, print_facts, print_json, progress_bar, progress_line, size_text
-from pharos.cli.options import Json, Trust
+from pharos.cli.answers import (
+    Answer,
+    complain,
+    console,
+    print_facts,
+    print_json,
+    progress_bar,
+    progress_line,
+    size_text,
+)
+from pharos.cli.options import Count, Trust
 from pharos.errors import ParameterError
 from pharos.system.wording import in_words, many
 
 if TYPE_CHECKING:
     from pharos.leaderboard import Verdict
 
-Within = Annotated[
-    float,
-    typer.Option("--tolerance", min=0, help="How far an exact number may be from the claimed one, relative to V*."),
-]
-MaxStates = Annotated[int, typer.Option("--max-states", min=1, help="Refuse state spaces larger than this.")]
-MaxReached = Annotated[
-    int, typer.Option("--max-reached", min=1, help="Values of policies that reach more states are estimated.")
-]
-MaxHorizon = Annotated[int, typer.Option("--max-horizon", min=1, help="Refuse entries with more steps than this.")]
-MaxSeconds = Annotated[float, typer.Option("--max-seconds", min=1, help="Refuse entries that take longer, each.")]
+
+@dataclass(frozen=True)
+class Limits:
+    """What a verification allows, and costs at most.
+
+    Attributes:
+        tolerance: how far an exact number may be from the claimed one, relative to V*.
+        max_states: refuse state spaces larger than this.
+        max_reached: values of policies that reach more states are estimated.
+        max_horizon: refuse entries with more steps than this.
+        max_seconds: refuse entries that take longer, each.
+    """
+
+    tolerance: Annotated[float, typer.Option(min=0)] = 1e-6
+    max_states: Count = 10_000_000
+    max_reached: Count = 100_000
+    max_horizon: Count = 100_000
+    max_seconds: Annotated[float, typer.Option(min=1)] = 600.0
 
 
 def submit(
-    run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a finished run.")],
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", help="FILE.safetensors; ID.safetensors when not given.", show_default=False),
-    ] = None,
-    name: Annotated[str, typer.Option("--name", help="Of the entry; the agent's when not given.")] = "",
-    author: Annotated[str, typer.Option("--author", help="Who submits it.")] = "",
-    note: Annotated[str, typer.Option("--note", help="Shown beside it.")] = "",
-    json: Json = False,
-) -> None:
-    """Pack what a run has learnt and claims into one file that anybody can verify."""
+    run: Annotated[Path, typer.Argument(metavar="RUN")],
+    *,
+    out: Path | None = None,
+    name: str = "",
+    author: str = "",
+    note: str = "",
+) -> Answer:
+    """Pack what a run has learnt and claims into one file that anybody can verify.
+
+    Args:
+        run: Folder of a finished run.
+        out: FILE.safetensors; ID.safetensors when not given.
+        name: Of the entry; the agent's when not given.
+        author: Who submits it.
+        note: Shown beside it.
+    """
     from pharos import leaderboard
 
     file = leaderboard.submit(run, out, name=name, author=author, note=note)
-    entry = leaderboard.read(file)
-    claim = entry.claim
-    if json:
-        print_json({"file": file, "bytes": file.stat().st_size, "id": entry.id, "claim": claim})
-        return
+    entry, size = leaderboard.read(file), file.stat().st_size
+    claim, config = entry.claim, entry.config
     kind = "exact" if claim.exact else f"estimated, ± {claim.error_bound:.2g}"
-    print_facts(
-        str(file),
-        [
-            (
-                "entry",
-                f"{entry.name}: {entry.config.agent} on {entry.config.environment}, {entry.config.steps:,} steps",
-            ),
-            ("value", f"{claim.value:.8g} ({kind})"),
-            ("regret", f"{claim.regret:.8g}"),
-            ("size", size_text(file.stat().st_size)),
-            *(
-                [("code", "others verify it with --trust alone: it names code of your own")]
-                if entry.config.sources
-                else []
-            ),
-        ],
-    )
+    facts = [
+        ("entry", f"{entry.name}: {config.agent} on {config.environment}, {config.steps:,} steps"),
+        ("value", f"{claim.value:.8g} ({kind})"),
+        ("regret", f"{claim.regret:.8g}"),
+        ("size", size_text(size)),
+    ]
+    if config.sources:
+        facts.append(("code", "others verify it with --trust alone: it names code of your own"))
+    return Answer({"file": file, "bytes": size, "id": entry.id, "claim": claim}, (str(file), facts))
 
 
 def verify(
-    files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="Entries that `pharos submit` wrote.")],
-    tolerance: Within = 1e-6,
-    max_states: MaxStates = 10_000_000,
-    max_reached: MaxReached = 100_000,
-    max_horizon: MaxHorizon = 100_000,
-    max_seconds: MaxSeconds = 600.0,
+    files: Annotated[list[Path], typer.Argument(metavar="FILE...")],
+    *,
+    limits: Limits,
     trust: Trust = False,
-    json: Json = False,
+    json: bool = False,
 ) -> None:
-    """Compute value and regret of entries again, and compare them with what they claim; exit code 1 where one fails."""
+    """Compute value and regret of entries again, and compare them with what they claim; exit code 1 where one fails.
+
+    Args:
+        files: Entries that `pharos submit` wrote.
+    """
     from pharos import leaderboard
 
     answers, holds = [], True
     for file in files:
         try:
             with progress_line(f"verifying {file}"):
-                verdict = leaderboard.verify(
-                    file,
-                    trust=trust,
-                    tolerance=tolerance,
-                    max_states=max_states,
-                    max_reached=max_reached,
-                    max_horizon=max_horizon,
-                    max_seconds=max_seconds,
-                )
+                verdict = leaderboard.verify(file, trust=trust, **vars(limits))
         except Exception as error:
             if len(files) == 1:
                 raise
@@ -159,18 +164,20 @@ def _print(verdict: "Verdict") -> None:
 
 
 def board(
-    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="With entries, in it and below.")],
-    out: Annotated[Path, typer.Option("--out", help="FILE.html.")] = Path("board.html"),
-    title: Annotated[str, typer.Option("--title", help="Of the page.")] = "Leaderboard",
-    tolerance: Within = 1e-6,
-    max_states: MaxStates = 10_000_000,
-    max_reached: MaxReached = 100_000,
-    max_horizon: MaxHorizon = 100_000,
-    max_seconds: MaxSeconds = 600.0,
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER")],
+    *,
+    out: Path = Path("board.html"),
+    title: str = "Leaderboard",
+    limits: Limits,
     trust: Trust = False,
-    json: Json = False,
-) -> None:
-    """Verify the entries in a folder, and write a page that ranks them by what was computed."""
+) -> Answer:
+    """Verify the entries in a folder, and write a page that ranks them by what was computed.
+
+    Args:
+        folder: With entries, in it and below.
+        out: FILE.html.
+        title: Of the page.
+    """
     from pharos import leaderboard
 
     if out.suffix.lower() not in (".html", ".htm"):
@@ -181,21 +188,11 @@ def board(
             if tell is not None:
                 tell(done, f"{done} of {total}: {name}")
 
-        made = leaderboard.board(
-            folder,
-            out,
-            title=title,
-            trust=trust,
-            tolerance=tolerance,
-            max_states=max_states,
-            max_reached=max_reached,
-            max_horizon=max_horizon,
-            max_seconds=max_seconds,
-            progress=show,
-        )
-    if json:
-        print_json({"file": made.file, "verified": len(made.verified), "refused": made.refused})
-        return
-    for name, reason in made.refused.items():
-        complain(f"{name}: {reason}")
-    print_facts(str(made.file), [("verified", f"{len(made.verified):,}"), ("refused", f"{len(made.refused):,}")])
+        made = leaderboard.board(folder, out, title=title, trust=trust, progress=show, **vars(limits))
+
+    def text() -> None:
+        for name, reason in made.refused.items():
+            complain(f"{name}: {reason}")
+        print_facts(str(made.file), [("verified", f"{len(made.verified):,}"), ("refused", f"{len(made.refused):,}")])
+
+    return Answer({"file": made.file, "verified": len(made.verified), "refused": made.refused}, text)

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pharos.cli.answers import console, print_json
-from pharos.cli.options import Json, complete_target
+from pharos.cli.answers import Answer, console
+from pharos.cli.options import complete_target
 from pharos.environments import class_called, classes, declared_parameters, imported, named_instances
 from pharos.errors import UnknownName
 from pharos.system.options import meanings
@@ -20,29 +20,20 @@ if TYPE_CHECKING:
 
 def list_(
     name: Annotated[
-        str | None,
-        typer.Argument(
-            metavar="[ENVIRONMENT]",
-            help="One class, or file.py:Class: its rules and parameters.",
-            show_default=False,
-            autocompletion=complete_target,
-        ),
+        str | None, typer.Argument(metavar="[ENVIRONMENT]", show_default=False, autocompletion=complete_target)
     ] = None,
-    json: Json = False,
-) -> None:
-    """Show the environments with their parameters and instances; of one of them its rules and parameters in full."""
+) -> Answer:
+    """Show the environments with their parameters and instances; of one of them its rules and parameters in full.
+
+    Args:
+        name: One class, or file.py:Class: its rules and parameters.
+    """
     if name is None:
         described = [_overview(name, cls) for name, cls in classes().items()]
-        if json:
-            print_json({"environments": described})
-        else:
-            _print_all(described)
-        return
+        return Answer({"environments": described}, lambda: _print_all(described))
     cls = _class_called(name)
-    if json:
-        print_json({**_overview(cls.name, cls), "rules": inspect.getdoc(cls), "parameters": _parameters(cls)})
-    else:
-        _print_one(cls)
+    answer = {**_overview(cls.name, cls), "rules": inspect.getdoc(cls), "parameters": _parameters(cls)}
+    return Answer(answer, lambda: _print_one(cls))
 
 
 def _class_called(name: str) -> type["Environment"]:

@@ -1,31 +1,21 @@
 """pharos observations: what an agent sees, which states it cannot tell apart, and what that costs."""
 
+from collections.abc import Mapping
 from functools import cached_property
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
-from pharos.cli.answers import console, describe_chance, print_json, progress_bar, progress_line
-from pharos.cli.options import (
-    Gamma,
-    Json,
-    MaxStates,
-    Memory,
-    Parameters,
-    Random,
-    TargetArgument,
-    Workers,
-    build_options,
-    discount,
-    parse_parameters,
-)
-from pharos.cli.target import parse_target
+from pharos.cli.answers import Answer, console, describe_chance, progress_bar, progress_line
+from pharos.cli.options import Gamma, Seconds, discount
+from pharos.cli.target import Building, Target
 from pharos.errors import ParameterError
+from pharos.mdp import ChanceSetting
 from pharos.system.wording import many
 
 if TYPE_CHECKING:
     import numpy as np
 
+    from pharos.mdp import TabularMDP
+    from pharos.solvers import Solution
     from pharos.state_space import StateSpace
 
 # States of the largest space that is solved to say what an observation costs
@@ -44,62 +34,54 @@ COUNTED: tuple[tuple[str, dict[str, Any]], ...] = (
 
 
 def observations(
-    target: TargetArgument,
-    parameters: Parameters = None,
-    observation: Annotated[
-        list[str] | None,
-        typer.Option("--observation", help="This one alone, or your own; may be given several times."),
-    ] = None,
-    option: Annotated[
-        list[str] | None,
-        typer.Option("--option", metavar="NAME=VALUE", help="Option of the observations that were named."),
-    ] = None,
+    target: Target,
+    *,
+    observation: list[str] | None = None,
+    option: Mapping[str, Any],
     gamma: Gamma = None,
-    random: Random = 0.0,
-    budget: Annotated[
-        float, typer.Option("--budget", min=0, help="Seconds to bound what one observation costs; 0: do not.")
-    ] = 10.0,
-    memory: Memory = None,
-    workers: Workers = None,
-    max_states: MaxStates = None,
-    json: Json = False,
-) -> None:
-    """Count the states that share their observation with another state, and bound what that costs."""
-    options = parse_parameters(option)
-    if options and not observation:
+    chance: Annotated[ChanceSetting, "random"],
+    budget: Seconds = 10.0,
+    building: Building,
+) -> Answer:
+    """Count the states that share their observation with another state, and bound what that costs.
+
+    Args:
+        observation: This one alone, or your own; may be given several times.
+        option: Option of the observations that were named.
+        budget: Seconds to bound what one observation costs; 0: do not.
+    """
+    if option and not observation:
         raise ParameterError("--option goes with --observation NAME")
-    choices = tuple((name, options) for name in observation) if observation else COUNTED
-    space = parse_target(target, parameters).space(**build_options(memory, workers, max_states))
-    if space.environment is None:
-        raise ParameterError(f"{target}: pharos does not know the class of this environment; name it as module:Class")
-    if not observation and not space.environment.has_motion:
-        choices = tuple((name, options) for name, options in choices if "motion" not in options)
-    if not observation and space.environment.recorded is not None:
-        choices += (("recorded", {}),)
-    price = _Price(space, discount(gamma, None), random, budget)
-    entries = [_entry(space, name, options, price, strict=bool(observation)) for name, options in choices]
-    if json:
-        answer = {"environment": space.environment.name, "parameters": space.environment.parameters}
-        terminal = int(space.terminal.sum())
-        print_json(
-            {
-                **answer,
-                "num_states": space.num_states,
-                "num_terminal_states": terminal,
-                "gamma": price.gamma,
-                "random": random,
-                "observations": entries,
-            }
+    choices = tuple((name, dict(option)) for name in observation) if observation else COUNTED
+    space = target.space(building)
+    env = space.environment
+    if env is None:
+        raise ParameterError(
+            f"{target.target}: pharos does not know the class of this environment; name it as module:Class"
         )
-        return
-    _print(" ".join((target, *(parameters or ()))), space, entries, price)
+    if not observation and not env.has_motion:
+        choices = tuple((name, options) for name, options in choices if "motion" not in options)
+    if not observation and env.recorded is not None:
+        choices += (("recorded", {}),)
+    price = _Price(space, discount(gamma, None), chance, budget)
+    entries = [_entry(space, name, options, price, strict=bool(observation)) for name, options in choices]
+    answer = {
+        "environment": env.name,
+        "parameters": env.parameters,
+        "num_states": space.num_states,
+        "num_terminal_states": int(space.terminal.sum()),
+        "gamma": price.gamma,
+        "random": chance.random,
+        "observations": entries,
+    }
+    return Answer(answer, lambda: _print(target.title, space, entries, price))
 
 
 class _Price:
     """What observations cost an agent without memory; the space is solved once, when it is first asked."""
 
-    def __init__(self, space: "StateSpace", gamma: float, random: float, budget: float):
-        self.space, self.gamma, self.random, self.budget = space, gamma, random, budget
+    def __init__(self, space: "StateSpace", gamma: float, chance: ChanceSetting, budget: float):
+        self.space, self.gamma, self.chance, self.budget = space, gamma, chance, budget
 
     def of(self, classes: "np.ndarray | None", num_confused: int) -> dict[str, Any] | None:
         """Bounds of the loss; None where they were not wanted, the space is too large, or there are several frames."""
@@ -115,11 +97,10 @@ class _Price:
         return {"lower": loss.lower, "upper": loss.upper, "exact": loss.exact}
 
     @cached_property
-    def _solved(self) -> tuple[Any, Any]:
-        from pharos.mdp import random_actions
+    def _solved(self) -> tuple["TabularMDP", "Solution"]:
         from pharos.solvers import value_iteration
 
-        mdp = random_actions(self.space.mdp(gamma=self.gamma), self.random)
+        mdp = self.chance.of(self.space.mdp(gamma=self.gamma))
         return mdp, value_iteration(mdp, 1e-7)
 
 
@@ -194,7 +175,7 @@ def _print(title: str, space: "StateSpace", entries: list[dict[str, Any]], price
         "states that share one: terminal states count like others; where one acts: those that share one with another "
         "state, neither of them terminal",
         f"loses: optimal value at the start less that of the best deterministic policy without memory, discount "
-        f"{price.gamma:g}, chance: {describe_chance(0.0, price.random, space.has_chance)}",
+        f"{price.gamma:g}, chance: {describe_chance(price.chance, space.has_chance)}",
     ):
         to.print(note, style="dim", soft_wrap=True)
 

@@ -6,14 +6,16 @@ import json
 import os
 import re
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from typer.models import ParameterInfo
 
 from pharos.environments import as_tuples
 from pharos.errors import ParameterError
+from pharos.mdp import ChanceSetting
 
 
 def complete_target(incomplete: str) -> list[str]:
@@ -36,64 +38,37 @@ def complete_parameter(context: typer.Context, incomplete: str) -> list[str]:
     return [f"{name}=" for name in names if name.startswith(incomplete)]
 
 
-Json = Annotated[bool, typer.Option("--json", help="One JSON object on standard output, nothing else.")]
-TargetArgument = Annotated[
-    str,
-    typer.Argument(
-        metavar="TARGET",
-        help="Environment, module:Class, built folder or imported file.",
-        autocompletion=complete_target,
-    ),
+Targets = Annotated[
+    list[str], typer.Argument(metavar="TARGET...", help="Instances such as frozen_lake/8x8, or folders.")
 ]
-Parameters = Annotated[
-    list[str] | None,
-    typer.Argument(
-        metavar="[NAME=VALUE]...",
-        help="Parameters of the environment.",
-        show_default=False,
-        autocompletion=complete_parameter,
-    ),
-]
-Tolerance = Annotated[float, typer.Option("--tolerance", help="Largest error of a value, in units of return.")]
-Memory = Annotated[
-    str | None, typer.Option("--memory", metavar="SIZE", help="Memory to use at most, such as 2GiB or 500MB.")
-]
-Workers = Annotated[int | None, typer.Option("--workers", min=1, help="Threads; all processors when not given.")]
-Processes = Annotated[
-    str,
-    typer.Option(
-        "--processes",
-        metavar="N|mpi",
-        help="Processes that share the work and the memory, by MPI; under mpiexec: those that it has started.",
-    ),
-]
-Gamma = Annotated[
-    float | None,
-    typer.Option(
-        "--gamma", min=0, max=1, help="Discount; 0.99 when not given, or 1 with a horizon.", show_default=False
-    ),
-]
+Count = Annotated[int, typer.Option(min=1)]
+Seed = Annotated[int, typer.Option(min=0)]
+Seconds = Annotated[float, typer.Option(min=0)]
+Discount = Annotated[float, typer.Option(min=0, max=1)]
+Gamma = Annotated[float | None, typer.Option(min=0, max=1, help="Discount; 0.99 when not given, or 1 with a horizon.")]
 Horizon = Annotated[
-    int | None, typer.Option("--horizon", min=1, help="Steps after which an episode ends; without end when not given.")
+    int | None, typer.Option(min=1, help="Steps after which an episode ends; without end when not given.")
 ]
-Sticky = Annotated[
-    float, typer.Option("--sticky", min=0, max=1, help="Probability that the previous action is executed again.")
-]
-Random = Annotated[
-    float, typer.Option("--random", min=0, max=1, help="Probability that a uniformly random action is executed.")
-]
-Lazy = Annotated[float, typer.Option("--lazy", min=0, max=1, help="Probability that the action has no effect.")]
-Trust = Annotated[
-    bool, typer.Option("--trust", help="Execute code that received files name: classes, observations and agents.")
-]
-MaxStates = Annotated[
-    int | None, typer.Option("--max-states", min=1, help="Stop with an error beyond this many states.")
-]
+Tolerance = Annotated[float, typer.Option(help="Largest error of a value, in units of return.")]
+Chance = Annotated[ChanceSetting, "sticky random lazy"]
+Trust = Annotated[bool, typer.Option(help="Execute code that received files name: classes, observations and agents.")]
+
+
+def file_ending(*suffixes: str, help: str | None = None) -> ParameterInfo:
+    """A file to write, whose name has one of the endings, in a folder that is there."""
+
+    def checked(option: typer.CallbackParam, path: Path | None) -> Path | None:
+        if path is not None:
+            check_format(Path(path), suffixes, option.opts[0])
+        return path
+
+    return typer.Option(callback=checked, help=help)
+
 
 # Texts ----------------------------------------------------------------------------------------------------------------
 
 
-def parse_parameters(words: Iterable[str] | None) -> dict[str, Any]:
+def parse_parameters(words: list[str] | None) -> dict[str, Any]:
     """`["height=12", "speeds=1,2"]` -> `{"height": 12, "speeds": (1, 2)}`; ParameterError: not name=value."""
     parameters: dict[str, Any] = {}
     for word in words or ():
@@ -159,13 +134,6 @@ def discount(gamma: float | None, horizon: int | None) -> float:
     return 0.99 if horizon is None else 1.0
 
 
-def build_options(
-    memory: str | None, workers: int | None, max_states: int | None, processes: str = "1"
-) -> dict[str, Any]:
-    """What `build` takes, of --memory, --workers and --max-states."""
-    return {"memory": memory_of(memory, processes), "workers": workers, "max_states": max_states}
-
-
 def ranks_of(processes: str) -> int | str:
     """1, or "mpi" in a process that a launcher has started with others; all but the first of them are silent from here
     on. A number above 1 starts this command once more, by `mpiexec`.
@@ -182,12 +150,6 @@ def ranks_of(processes: str) -> int | str:
     if rank > 0:  # the first one speaks for all
         sys.stdout = sys.stderr = open(os.devnull, "w")  # noqa: SIM115
     return "mpi" if size > 1 or processes == "mpi" else 1
-
-
-def memory_of(memory: str | None, processes: str) -> int | None:
-    """Bytes of --memory that a process has, where --processes N share them."""
-    size = parse_size(memory)
-    return size // int(processes) if size is not None and processes.isdigit() else size
 
 
 def check_format(path: Path, suffixes: Sequence[str], option: str = "--out") -> str:

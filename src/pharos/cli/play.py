@@ -5,14 +5,12 @@ import os
 import random
 import sys
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-import typer
-
-from pharos.cli.answers import console, print_json
-from pharos.cli.options import Json, Parameters, TargetArgument
-from pharos.cli.render import environment_of, find_state
-from pharos.cli.target import parse_target
+from pharos.cli.answers import Answer, console
+from pharos.cli.options import Seed
+from pharos.cli.render import find_state
+from pharos.cli.target import Target
 from pharos.errors import PharosError
 from pharos.explorer import keys_of
 from pharos.system.wording import many
@@ -27,24 +25,17 @@ SIGNS = {"up": "↑", "left": "←", "down": "↓", "right": "→", "space": "sp
 QUIT, AGAIN, BACK = "q", "r", "u"
 
 
-def play(
-    environment: TargetArgument,
-    parameters: Parameters = None,
-    state: Annotated[
-        str | None, typer.Option("--state", help="Number of a state, or its values 2,3,1; the start when not given.")
-    ] = None,
-    seed: Annotated[
-        int | None, typer.Option("--seed", min=0, help="Of chance in the rules; another game each time without it.")
-    ] = None,
-    json: Json = False,
-) -> None:
-    """Play with the keyboard, in the terminal; one key is one step."""
+def play(target: Target, *, state: str | None = None, seed: Seed | None = None) -> Answer:
+    """Play with the keyboard, in the terminal; one key is one step.
+
+    Args:
+        state: Number of a state, or its values 2,3,1; the start when not given.
+        seed: Of chance in the rules; another game each time without it.
+    """
     if not (sys.stdin.isatty() and sys.stderr.isatty()):
         raise PharosError("play needs a terminal for the keyboard and the picture; it cannot run in a pipe")
-    target = parse_target(environment, parameters)
-    env = environment_of(target)
-    start = find_state(target, env, state)
-    game = Game(env, start, seed)
+    env = target.found_environment()
+    game = Game(env, find_state(target, env, state), seed)
     with _screen() as show, _keys() as next_key:
         while True:
             show(_picture(game))
@@ -52,19 +43,11 @@ def play(
             if key in (QUIT, "\x03", "\x04", "escape", ""):
                 break
             game.press(key)
-    if json:
-        print_json(
-            {
-                "environment": env.name,
-                "parameters": env.parameters,
-                "steps": game.steps,
-                "return": game.total,
-                "state": game.state,
-                "terminal": game.over,
-            }
-        )
-    else:
-        print(f"{env.name}: {many(game.steps, 'step')}, return {game.total:g}{', ended' if game.over else ''}")
+    answer = {"environment": env.name, "parameters": env.parameters, "steps": game.steps, "return": game.total}
+    return Answer(
+        {**answer, "state": game.state, "terminal": game.over},
+        f"{env.name}: {many(game.steps, 'step')}, return {game.total:g}{', ended' if game.over else ''}",
+    )
 
 
 class Game:

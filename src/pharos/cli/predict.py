@@ -5,90 +5,61 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pharos.cli.answers import compiling_fact, complain, console, print_json, progress_line
-from pharos.cli.options import Json, Lazy, Parameters, Random, Sticky, TargetArgument, check_format, parse_parameters
-from pharos.cli.target import parse_target
+from pharos.cli.answers import Answer, compiling_fact, complain, console, progress_line
+from pharos.cli.options import Count, file_ending, parse_parameters
+from pharos.cli.target import Target
 from pharos.errors import ParameterError
 from pharos.system import compiling
+from pharos.training import TrainingOptions
 
 if TYPE_CHECKING:
     from pharos.validation import Prediction
 
+DEFAULT = TrainingOptions(agent="dqn", steps=30_000)
+OPTIONS = "agent steps hyperparameters sticky random lazy reward_noise"
+
 
 def predict(
-    target: TargetArgument,
-    parameters: Parameters = None,
-    observation: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--observation",
-            metavar="NAME[,OPTION=VALUE...]",
-            help="What the agent sees, as of train, such as hash,bits=64; again for another; vector when not given.",
-        ),
-    ] = None,
-    network: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--network",
-            help="mlp64, mlp256x3, cnn16, ..., or file.py:function, your own; again for another one. "
-            "That of the agent when not given.",
-        ),
-    ] = None,
-    agent: Annotated[str, typer.Option("--agent", help="dqn or ppo.")] = "dqn",
-    steps: Annotated[int, typer.Option("--steps", min=1, help="Steps that it would learn from.")] = 30_000,
-    hyperparameter: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="NAME=VALUE", help="Hyperparameter of the agent, such as gamma=0.95."),
-    ] = None,
-    sticky: Sticky = 0.0,
-    random: Random = 0.0,
-    lazy: Lazy = 0.0,
-    reward_noise: Annotated[
-        float, typer.Option("--reward-noise", min=0, help="Standard deviation of noise in what is paid; 0 on average.")
-    ] = 0.0,
-    horizon: Annotated[
-        int | None,
-        typer.Option("--horizon", min=1, help="Steps of an episode; the environment's time limit when not given."),
-    ] = None,
-    landmarks: Annotated[
-        int | None,
-        typer.Option(
-            "--landmarks", min=0, help="Approximate the kernel by so many; 0: never; beyond 2,048 if not given."
-        ),
-    ] = None,
-    plot: Annotated[Path | None, typer.Option("--plot", help="Draw the bars into a PNG, PDF or SVG.")] = None,
-    json: Json = False,
-) -> None:
-    """Predict the regret of an agent behind each observation, before anything is trained."""
-    if plot is not None:
-        check_format(plot, (".png", ".pdf", ".svg"), "--plot")
-    env = parse_target(target, parameters).found_environment()
+    target: Target,
+    *,
+    observation: Annotated[list[str] | None, typer.Option(metavar="NAME[,OPTION=VALUE...]")] = None,
+    network: list[str] | None = None,
+    training: Annotated[TrainingOptions, OPTIONS] = DEFAULT,
+    horizon: Count | None = None,
+    landmarks: Annotated[int | None, typer.Option(min=0)] = None,
+    plot: Annotated[Path | None, file_ending(".png", ".pdf", ".svg")] = None,
+) -> Answer:
+    """Predict the regret of an agent behind each observation, before anything is trained.
+
+    Args:
+        observation: What the agent sees, as of train, such as hash,bits=64; again for another; vector when not given.
+        network: mlp64, mlp256x3, cnn16, ..., or file.py:function, your own; again for another one. That of the agent
+            when not given.
+        agent: dqn or ppo.
+        steps: Steps that it would learn from.
+        horizon: Steps of an episode; the environment's time limit when not given.
+        landmarks: Approximate the kernel by so many; 0: never; beyond 2,048 if not given.
+        plot: Draw the bars into a PNG, PDF or SVG.
+    """
+    env = target.found_environment()
     from pharos.validation import predict as foretell
 
     with progress_line("predicting") as tell:
         prediction = foretell(
             env,
             [_observation(text) for text in observation or ["vector"]],
-            agent=agent,
             networks=network or None,
-            steps=steps,
-            sticky=sticky,
-            random=random,
-            lazy=lazy,
-            reward_noise=reward_noise,
-            horizon=horizon or "default",
-            hyperparameters=parse_parameters(hyperparameter),
             landmarks=landmarks,
             progress=tell,
+            **{name: getattr(training, name) for name in ("agent", "steps", "hyperparameters", "chance")},
+            horizon=horizon or "limit",
         )
     if plot is not None:
         from pharos import plots
 
         plots.save(plots.predictions(prediction), plot)
-    if json:
-        print_json({**prediction.to_dict(), "plot": plot, "compiling_seconds": compiling.seconds()})
-        return
-    _print(prediction, plot)
+    answer = {**prediction.to_dict(), "plot": plot, "compiling_seconds": compiling.seconds()}
+    return Answer(answer, lambda: _print(prediction, plot))
 
 
 def _observation(text: str) -> tuple[str, dict[str, Any]]:

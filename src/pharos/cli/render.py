@@ -1,14 +1,14 @@
 """pharos render: a picture of a state, or of a played episode."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pharos.cli.answers import complain, describe, print_json
-from pharos.cli.options import Json, Parameters, TargetArgument, check_format, parse_parameters, parse_value
-from pharos.cli.target import Target, parse_target
+from pharos.cli.answers import Answer, complain, console, describe
+from pharos.cli.options import Discount, Seed, file_ending, parse_value
+from pharos.cli.target import Target
 from pharos.errors import ParameterError, PharosError, UnknownName
 
 if TYPE_CHECKING:
@@ -19,83 +19,77 @@ AUTOMATIC_STATES = 20_000_000  # "auto" solves what is not larger
 
 
 def render(
-    target: TargetArgument,
-    parameters: Parameters = None,
-    observation: Annotated[
-        str, typer.Option("--observation", help="How to draw: human, text, simple_image, complex_image, or your own.")
-    ] = "human",
-    option: Annotated[
-        list[str] | None,
-        typer.Option("--option", metavar="NAME=VALUE", help="Option of the observation, such as size=natural."),
-    ] = None,
-    out: Annotated[
-        Path | None, typer.Option("--out", help="FILE.png, FILE.gif or FILE.txt; the terminal when not given.")
-    ] = None,
-    state: Annotated[
-        str | None, typer.Option("--state", help="Number of a state, or its values 2,3,1; the start when not given.")
-    ] = None,
-    steps: Annotated[int | None, typer.Option("--steps", min=0, help="Play this many steps from the state.")] = None,
-    policy: Annotated[
-        str, typer.Option("--policy", help="optimal, uniform, or auto: optimal where that is quick to find.")
-    ] = "auto",
-    gamma: Annotated[float, typer.Option("--gamma", min=0, max=1, help="Discount of the optimal policy.")] = 0.99,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Of the uniform policy, and of chance in the rules.")] = 0,
-    fps: Annotated[float, typer.Option("--fps", min=0.1, max=50, help="Frames a second of a GIF.")] = 10.0,
-    json: Json = False,
-) -> None:
-    """Draw a state (PNG) or an episode (GIF, or the state after --steps as PNG); in the terminal without --out."""
+    target: Target,
+    *,
+    observation: str = "human",
+    option: Mapping[str, Any],
+    out: Annotated[Path | None, file_ending(".png", ".gif", ".txt")] = None,
+    state: str | None = None,
+    steps: Annotated[int | None, typer.Option(min=0)] = None,
+    policy: str = "auto",
+    gamma: Discount = 0.99,
+    seed: Seed = 0,
+    fps: Annotated[float, typer.Option(min=0.1, max=50)] = 10.0,
+    json: bool = False,
+) -> Answer | None:
+    """Draw a state (PNG) or an episode (GIF, or the state after --steps as PNG); in the terminal without --out.
+
+    Args:
+        observation: How to draw: human, text, simple_image, complex_image, or your own.
+        option: Option of the observation, such as size=natural.
+        out: FILE.png, FILE.gif or FILE.txt; the terminal when not given.
+        state: Number of a state, or its values 2,3,1; the start when not given.
+        steps: Play this many steps from the state.
+        policy: optimal, uniform, or auto: optimal where that is quick to find.
+        gamma: Discount of the optimal policy.
+        seed: Of the uniform policy, and of chance in the rules.
+        fps: Frames a second of a GIF.
+    """
     from pharos import drawing, observations
     from pharos.system import storage
 
-    goal = parse_target(target, parameters)
-    suffix = check_format(out, (".png", ".gif", ".txt")) if out else ""
-    options = parse_parameters(option)
+    suffix = out.suffix.lower() if out else ""
     if observation != "text" and observation not in (renderers := observations.renderers()):
         raise UnknownName("observation to render", observation, [*renderers, "text"])
     if policy not in POLICIES:
         raise UnknownName("policy", policy, POLICIES)
-    env = environment_of(goal)
-    start = find_state(goal, env, state)
+    env = target.found_environment()
+    start = find_state(target, env, state)
     if steps is None:
         steps = min(env.max_episode_steps, 200) if suffix == ".gif" else 0
-    used, choose = (policy, None) if steps == 0 else find_policy(goal, env, policy, gamma, seed)
+    used, choose = (policy, None) if steps == 0 else find_policy(target, env, policy, gamma, seed)
     played = drawing.episode(env, choose or (lambda _: 0), start, steps=steps, seed=seed)
 
     returned = sum(reward for _, _, reward in played)
     last = played[-1][0]
+    at_least = 0 if observation == "human" else 400
     if out is None and not json:
-        print_in_color(env, last)
+        console().print(drawing.colored_text(env, last))
     elif out is not None and suffix == ".txt":
         frames = [drawing.text_drawing(env, each) for each, _, _ in played]
         storage.replace_file(out, "\n\n".join(frames) + "\n")
     elif out is not None and suffix == ".gif":
         shown = played if len(played) > 1 else [played[0]]
-        pictures = [observations.render(env, each, observation, **options) for each, _, _ in shown]
+        pictures = [observations.render(env, each, observation, **option) for each, _, _ in shown]
         captions = _captions(env, shown) if observation == "human" else ()
-        drawing.save_gif(out, pictures, captions=captions, frames_per_second=fps, at_least=_at_least(observation))
+        drawing.save_gif(out, pictures, captions=captions, frames_per_second=fps, at_least=at_least)
     elif out is not None:
-        drawing.save_png(out, observations.render(env, last, observation, **options), at_least=_at_least(observation))
-    if json:
-        print_json(
-            {
-                "environment": env.name,
-                "parameters": env.parameters,
-                "observation": observation,
-                "policy": used if steps else None,
-                "steps": len(played) - 1,
-                "return": returned,
-                "state": last,
-                "file": out,
-                "bytes": out.stat().st_size if out else 0,
-            }
-        )
-    elif out is not None:
-        after = f" after {len(played) - 1} steps of the {used} policy, return {returned:g}" if steps else ""
-        print(f"{describe(env)}{after}: {out}")
-
-
-def _at_least(observation: str) -> int:
-    return 0 if observation == "human" else 400
+        drawing.save_png(out, observations.render(env, last, observation, **option), at_least=at_least)
+    if out is None and not json:
+        return None
+    answer = {
+        "environment": env.name,
+        "parameters": env.parameters,
+        "observation": observation,
+        "policy": used if steps else None,
+        "steps": len(played) - 1,
+        "return": returned,
+        "state": last,
+        "file": out,
+        "bytes": out.stat().st_size if out else 0,
+    }
+    after = f" after {len(played) - 1} steps of the {used} policy, return {returned:g}" if steps else ""
+    return Answer(answer, f"{describe(env)}{after}: {out}")
 
 
 def _captions(env: "Environment", played: Sequence[tuple]) -> list[str]:
@@ -108,11 +102,6 @@ def _captions(env: "Environment", played: Sequence[tuple]) -> list[str]:
 
 
 # Shared with `play` and `evaluate` ----------------------------------------------------------------------------------
-
-
-def environment_of(target: Target) -> "Environment":
-    """The environment of a target; ParameterError where there is none to draw."""
-    return target.found_environment()
 
 
 def find_state(target: Target, env: "Environment", text: str | None) -> "State":
@@ -155,11 +144,3 @@ def _optimal(target: Target, gamma: float, max_states: int | None) -> Callable[[
     space = target.space(max_states=max_states)
     policy = value_iteration(space.mdp(gamma=gamma)).policy
     return lambda state: int(policy[space.index(state)])
-
-
-def print_in_color(env: "Environment", state: Sequence[int]) -> None:
-    """The text drawing, in the colours of the layers where the terminal has them."""
-    from pharos.cli.answers import console
-    from pharos.drawing import colored_text
-
-    console().print(colored_text(env, state))

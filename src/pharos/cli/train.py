@@ -4,157 +4,106 @@ import math
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pharos.cli.answers import compiling_fact, complain, describe_chance, print_facts, print_json, progress_bar
-from pharos.cli.options import Json, Lazy, Parameters, Random, Sticky, TargetArgument, parse_parameters, parse_seeds
-from pharos.cli.target import parse_environment
+from pharos.cli.answers import Answer, compiling_fact, complain, describe_chance, progress_bar
+from pharos.cli.options import Count, Discount, Seed, parse_seeds
+from pharos.cli.target import Target
 from pharos.errors import AllRunsFailed, ParameterError
 from pharos.system import compiling
 from pharos.system.wording import in_words, many
+from pharos.training import TrainingOptions
 
 if TYPE_CHECKING:
-    from pharos.environments import Environment
     from pharos.training import TrainingResult
+
+OPTIONS = "agent observation observation_options steps engine hyperparameters evaluation_interval"
+CHANCE = "sticky random lazy reward_noise reward_delay"
+BEFORE = "loading, building, compiling, first evaluation"
 
 
 def train(
-    target: TargetArgument,
-    parameters: Parameters = None,
-    agent: Annotated[
-        str, typer.Option("--agent", help="q_learning, dqn, ppo, a2c, or module:Class for Stable-Baselines3.")
-    ] = "q_learning",
-    observation: Annotated[
-        str,
-        typer.Option(
-            "--observation", help="vector, simple_image, complex_image, one_hot, index, hash, recorded, or your own."
-        ),
-    ] = "vector",
-    option: Annotated[
-        list[str] | None,
-        typer.Option("--option", metavar="NAME=VALUE", help="Option of the observation, such as size=natural."),
-    ] = None,
-    steps: Annotated[int, typer.Option("--steps", min=1, help="Steps to learn from.")] = 50_000,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Decides everything random.")] = 0,
-    seeds: Annotated[
-        str | None,
-        typer.Option("--seeds", metavar="A:B|S,...", help="A run for each, such as 0:64; --out has a folder for each."),
-    ] = None,
-    engine: Annotated[
-        str, typer.Option("--engine", help="sb3 (Stable-Baselines3), or batched: many seeds as one program.")
-    ] = "sb3",
-    device: Annotated[str, typer.Option("--device", help="Of the batched engine: cpu or cuda.")] = "cpu",
-    out: Annotated[
-        Path | None, typer.Option("--out", help="Folder for results; an unfinished run there is resumed.")
-    ] = None,
-    hyperparameter: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="NAME=VALUE", help="Hyperparameter of the agent, such as learning_rate=0.001."),
-    ] = None,
-    table: Annotated[
-        Path | None,
-        typer.Option(
-            "--hyperparameters", metavar="FILE", help="YAML of hyperparameters, such as `pharos tune` writes."
-        ),
-    ] = None,
-    interval: Annotated[
-        int | None, typer.Option("--interval", min=1, help="Steps between evaluations; a hundredth when not given.")
-    ] = None,
-    workers: Annotated[
-        int | None,
-        typer.Option("--workers", min=1, help="Processes for many seeds; as many as processors when not given."),
-    ] = None,
-    sticky: Sticky = 0.0,
-    random: Random = 0.0,
-    lazy: Lazy = 0.0,
-    reward_noise: Annotated[
-        float, typer.Option("--reward-noise", min=0, help="Standard deviation of noise in what is paid; 0 on average.")
-    ] = 0.0,
-    reward_delay: Annotated[
-        int, typer.Option("--reward-delay", min=0, help="Steps by which rewards are paid late, the last at the end.")
-    ] = 0,
-    gamma: Annotated[
-        float | None,
-        typer.Option("--gamma", min=0, max=1, help="Discount of values and returns; 1 when not given, with a horizon."),
-    ] = None,
-    horizon: Annotated[
-        int | None,
-        typer.Option("--horizon", min=1, help="Steps of an episode; the environment's time limit when not given."),
-    ] = None,
-    endless: Annotated[
-        bool, typer.Option("--no-horizon", help="Discounted values without a horizon, at --gamma (0.99).")
-    ] = False,
-    tensorboard: Annotated[bool, typer.Option("--tensorboard", help="Write TensorBoard logs into --out.")] = False,
-    json: Json = False,
-) -> None:
-    """Train an agent and measure the exact regret of its policy on the way."""
-    env = parse_environment(target, parameters)
+    target: Target,
+    *,
+    training: Annotated[TrainingOptions, f"{OPTIONS} {CHANCE}"],
+    seed: Seed = 0,
+    seeds: Annotated[str | None, typer.Option(metavar="A:B|S,...")] = None,
+    device: str = "cpu",
+    out: Path | None = None,
+    table: Annotated[Path | None, typer.Option("--hyperparameters", metavar="FILE")] = None,
+    workers: Count | None = None,
+    gamma: Discount | None = None,
+    horizon: Count | None = None,
+    endless: Annotated[bool, typer.Option("--no-horizon")] = False,
+    tensorboard: bool = False,
+) -> Answer:
+    """Train an agent and measure the exact regret of its policy on the way.
+
+    Args:
+        seed: Decides everything random.
+        seeds: A run for each, such as 0:64; --out has a folder for each.
+        device: Of the batched engine: cpu or cuda.
+        out: Folder for results; an unfinished run there is resumed.
+        table: YAML of hyperparameters, such as `pharos tune` writes.
+        workers: Processes for many seeds; as many as processors when not given.
+        gamma: Discount of values and returns; 1 when not given, with a horizon.
+        horizon: Steps of an episode; the environment's time limit when not given.
+        endless: Discounted values without a horizon, at --gamma (0.99).
+        tensorboard: Write TensorBoard logs into --out.
+    """
+    env = target.found_environment()
     from pharos.agents import agent_kind
     from pharos.agents import hyperparameters as hyperparameters_of
     from pharos.training import train as learn
 
-    hyperparameters = parse_parameters(hyperparameter)
+    agent, hyperparameters = training.agent, training.hyperparameters
     if table is not None:
-        sight = agent_kind(agent).observation(observation)
+        sight = agent_kind(agent).observation(training.observation)
         hyperparameters = hyperparameters_of(agent, env.name, sight, hyperparameters, table=table)
-
-    setting: dict[str, Any] = {
-        "steps": steps,
-        "observation": observation,
-        "observation_options": parse_parameters(option),
-        "sticky": sticky,
-        "random": random,
-        "lazy": lazy,
-        "reward_noise": reward_noise,
-        "reward_delay": reward_delay,
-        "gamma": gamma if gamma is not None else 0.99 if endless else 1.0,
-        "horizon": None if endless else horizon or "default",
-        "evaluation_interval": interval,
-        "hyperparameters": hyperparameters,
-        "engine": engine,
-        "out": out,
-    }
+    training = replace(
+        training,
+        hyperparameters=hyperparameters,
+        gamma=gamma if gamma is not None else 0.99 if endless else 1.0,
+        horizon=None if endless else horizon or "limit",
+    )
+    title = f"{agent} on {target.title}"
     if seeds is not None:
         if seed or tensorboard:
             raise ParameterError("--seeds goes with neither --seed nor --tensorboard; expected one of them")
-        title = f"{agent} on {' '.join((target, *(parameters or ())))}"
         from pharos.system.workers import usable_workers
 
-        together = {"seeds": parse_seeds(seeds), "device": device, "workers": usable_workers(workers)}
-        _train_many(title, agent, env, {**setting, **together}, json)
-        return
-    with progress_bar("training", steps, "loading, building, compiling, first evaluation") as show:
-        result = learn(agent, env, seed=seed, tensorboard=tensorboard, progress=_telling(show), **setting)
+        together: dict[str, Any] = {"device": device, "workers": usable_workers(workers), **vars(training)}
+        return _train_many(title, seeds=parse_seeds(seeds), environment=env, out=out, **together)
+    with progress_bar("training", training.steps, BEFORE) as show:
+        options = {**vars(training), "seed": seed, "out": out, "tensorboard": tensorboard}
+        result = learn(environment=env, progress=_telling(show), **options)
     picture = _plot(out)
-    if json:
-        print_json(
-            {
-                **result.result,
-                "config": result.config,
-                "seconds": result.seconds,
-                "compiling_seconds": compiling.seconds(),
-                "folder": out,
-                "plot": picture,
-            }
-        )
-        return
-    facts = _facts(result, steps, describe_chance(sticky, random, env.has_chance, lazy, reward_noise, reward_delay))
+    answer = {
+        **result.result,
+        "config": result.config,
+        "seconds": result.seconds,
+        "compiling_seconds": compiling.seconds(),
+        "folder": out,
+        "plot": picture,
+    }
+    facts = _facts(result, training.steps, describe_chance(training.chance, env.has_chance))
     if out is not None:
         facts += [("results", out), *([("plot", picture)] if picture else [])]
-    print_facts(f"{agent} on {' '.join((target, *(parameters or ())))}, {result.config['observation']}", facts)
+    return Answer(answer, (f"{title}, {result.config['observation']}", facts))
 
 
-def _train_many(title: str, agent: str, env: "Environment", setting: dict[str, Any], json: bool) -> None:
+def _train_many(title: str, *, seeds: list[int], steps: int, out: Path | None, **setting: Any) -> Answer:
     """A run for each seed; what they have in common is told, and what went wrong."""
     from pharos.training import FailedRun, train_many
 
-    seeds, steps, began = setting["seeds"], setting["steps"], time.perf_counter()
-    with progress_bar("training", len(seeds) * steps, "loading, building, compiling, first evaluation") as show:
+    began = time.perf_counter()
+    with progress_bar("training", len(seeds) * steps, BEFORE) as show:
         try:
-            ends = train_many(agent, env, progress=_telling_of_many(show), **setting)
+            ends = train_many(seeds=seeds, steps=steps, out=out, progress=_telling_of_many(show), **setting)
         except AllRunsFailed as all_failed:  # the answer says of each why
             ends = all_failed.outcome
     seconds = time.perf_counter() - began
@@ -164,16 +113,15 @@ def _train_many(title: str, agent: str, env: "Environment", setting: dict[str, A
         name: _quartiles([run.result[name] for run in results.values()])
         for name in ("final_value", "final_regret", "normalized_regret", "mean_return")
     }
-    if json:
-        runs = [{"seed": seed, **run.result, "folder": run.folder} for seed, run in results.items()]
-        answer = {"runs": runs, "failed": failed, "quartiles": spread, "seconds": seconds, "folder": setting["out"]}
-        print_json(answer)
-    else:
-        print_facts(f"{title}, {many(len(seeds), 'seed')}", _facts_of_many(results, spread, steps, seconds, setting))
+    runs = [{"seed": seed, **run.result, "folder": run.folder} for seed, run in results.items()]
+    answer = {"runs": runs, "failed": failed, "quartiles": spread, "seconds": seconds, "folder": out}
+    facts = _facts_of_many(results, spread, steps, seconds)
+    if out is not None:
+        facts.append(("results", f"{out}/seed-{seeds[0]} and so on"))
+
     for error, count in Counter(failed.values()).most_common():
         complain(f"{count} x {error}")
-    if failed:
-        raise typer.Exit(1)
+    return Answer(answer, (f"{title}, {many(len(seeds), 'seed')}", facts), bool(failed))
 
 
 def _quartiles(values: list[float | None]) -> list[float] | None:
@@ -189,7 +137,6 @@ def _facts_of_many(
     spread: Mapping[str, list[float] | None],
     steps: int,
     seconds: float,
-    setting: Mapping[str, Any],
 ) -> list[tuple[str, object]]:
     facts: list[tuple[str, object]] = []
     for name, quartiles in spread.items():
@@ -204,8 +151,6 @@ def _facts_of_many(
         ]
     pace = len(results) * steps / seconds
     facts.append(("seconds", f"{seconds:.1f} ({pace:,.0f} agent-steps/s, evaluation and finished runs included)"))
-    if setting["out"] is not None:
-        facts.append(("results", f"{setting['out']}/seed-{setting['seeds'][0]} and so on"))
     return facts
 
 

@@ -6,87 +6,62 @@ from typing import Annotated, Any
 
 import typer
 
-from pharos.cli.answers import print_facts, print_json, progress_bar
-from pharos.cli.options import Json, Random, Sticky, parse_seeds, parse_value
-from pharos.cli.target import parse_environment
+from pharos.cli.answers import Answer, progress_bar
+from pharos.cli.options import Count, Seed, parse_seeds, parse_value
+from pharos.cli.target import Target
 from pharos.errors import ParameterError
+from pharos.training import TrainingOptions
+
+DEFAULT = TrainingOptions(agent="dqn")
 
 
 def tune(
-    targets: Annotated[
-        list[str],
-        typer.Argument(metavar="TARGET...", help="Instances of one class, such as frozen_lake/4x4 frozen_lake/8x8."),
-    ],
-    agent: Annotated[str, typer.Option("--agent", help="As for `pharos train`.")] = "dqn",
-    observation: Annotated[str, typer.Option("--observation", help="As for `pharos train`.")] = "vector",
-    steps: Annotated[int, typer.Option("--steps", min=1, help="Steps of every run.")] = 50_000,
-    trials: Annotated[int, typer.Option("--trials", min=1, help="Trials in all, earlier ones in --out included.")] = 50,
-    seeds: Annotated[
-        str, typer.Option("--seeds", metavar="A:B|S,...", help="Of the runs of a trial; not those of your experiment.")
-    ] = "1000,1001",
-    search: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--search",
-            metavar="NAME=CHOICES",
-            help="Search this instead of the agent's own space: learning_rate=log,0.0001,0.01, gamma=linear,0.9,1, "
-            "batch_size=32,64. Can be given several times.",
-        ),
-    ] = None,
-    search_seed: Annotated[int, typer.Option("--search-seed", min=0, help="Of the search.")] = 0,
-    engine: Annotated[
-        str, typer.Option("--engine", help="sb3; or batched: all runs of a trial that fit together as one program.")
-    ] = "sb3",
-    out: Annotated[
-        Path | None, typer.Option("--out", help="Folder for the YAML and the record; a search there goes on.")
-    ] = None,
-    sticky: Sticky = 0.0,
-    random: Random = 0.0,
-    chance: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--chance",
-            metavar="plain|NAME=P,...",
-            help="A kind of chance, for every instance: --chance plain --chance random=0.1 --chance sticky=0.25.",
-        ),
-    ] = None,
-    json: Json = False,
-) -> None:
-    """Search hyperparameters of an agent for one class of environments."""
-    instances = [parse_environment(target) for target in targets]
+    targets: Annotated[list[str], typer.Argument(metavar="TARGET...")],
+    *,
+    training: Annotated[TrainingOptions, "agent observation steps engine sticky random"] = DEFAULT,
+    trials: Count = 50,
+    seeds: Annotated[str, typer.Option(metavar="A:B|S,...")] = "1000,1001",
+    search: Annotated[list[str] | None, typer.Option(metavar="NAME=CHOICES")] = None,
+    search_seed: Seed = 0,
+    out: Path | None = None,
+    chance: Annotated[list[str] | None, typer.Option(metavar="plain|NAME=P,...")] = None,
+) -> Answer:
+    """Search hyperparameters of an agent for one class of environments.
+
+    Args:
+        targets: Instances of one class, such as frozen_lake/4x4 frozen_lake/8x8.
+        trials: Trials in all, earlier ones in --out included.
+        steps: Steps of every run.
+        seeds: Of the runs of a trial; not those of your experiment.
+        search: Search this instead of the agent's own space: learning_rate=log,0.0001,0.01, gamma=linear,0.9,1,
+            batch_size=32,64. Can be given several times.
+        search_seed: Of the search.
+        engine: sb3; or batched: all runs of a trial that fit together as one program.
+        out: Folder for the YAML and the record; a search there goes on.
+        chance: A kind of chance, for every instance: --chance plain --chance random=0.1 --chance sticky=0.25.
+    """
+    instances = [Target(target).found_environment() for target in targets]
     from pharos.training import tune as find
 
     with progress_bar("tuning", trials) as show:
         result = find(
-            agent,
+            training.agent,
             instances,
-            steps=steps,
+            steps=training.steps,
             trials=trials,
-            observation=observation,
+            observation=training.observation,
             seeds=parse_seeds(seeds),
-            sticky=sticky,
-            random=random,
+            sticky=training.chance.sticky,
+            random=training.chance.random,
             chances=_chances(chance),
             space=_space(search),
             search_seed=search_seed,
-            engine=engine,
+            engine=training.engine,
             out=out,
             progress=_telling(show),
         )
-    if json:
-        print_json(
-            {
-                "agent": result.agent,
-                "environment": result.environment,
-                "observation": result.observation,
-                "score": result.score,
-                "first_score": result.first_score,
-                "hyperparameters": result.hyperparameters,
-                "trials": result.trials,
-                "folder": out,
-            }
-        )
-        return
+    names = ("agent", "environment", "observation", "score", "first_score", "hyperparameters", "trials")
+    answer = {**{name: getattr(result, name) for name in names}, "folder": out}
     count = {
         word: sum(trial["status"] == word for trial in result.trials) for word in ("finished", "given up", "failed")
     }
@@ -98,7 +73,7 @@ def tune(
     ]
     if out is not None:
         facts += [("use it", f"pharos train ... --hyperparameters {out / 'hyperparameters.yaml'}")]
-    print_facts(f"{agent} on {result.environment}, {result.observation}", facts)
+    return Answer(answer, (f"{result.agent} on {result.environment}, {result.observation}", facts))
 
 
 def _chances(words: list[str] | None) -> list[dict[str, float]] | None:

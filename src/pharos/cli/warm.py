@@ -1,14 +1,15 @@
 """pharos warm: compile beforehand what the other commands would compile as they go."""
 
 import tempfile
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pharos.cli.answers import print_facts, print_json, progress_line
-from pharos.cli.options import Json, Random, Sticky, complete_target
-from pharos.cli.target import parse_target
+from pharos.cli.answers import Answer, progress_line
+from pharos.cli.options import complete_target
+from pharos.cli.target import Target
 from pharos.errors import StateSpaceTooLarge
+from pharos.mdp import ChanceSetting
 from pharos.system import compiling
 from pharos.system.compiling import Stopwatch
 from pharos.system.wording import many
@@ -30,19 +31,17 @@ LARGEST = 5_000_000
 def warm(
     targets: Annotated[
         list[str] | None,
-        typer.Argument(
-            metavar="[ENVIRONMENT]...",
-            autocompletion=complete_target,
-            help="Environments or named instances; small ones of the paper's four classes when not given.",
-            show_default=False,
-        ),
+        typer.Argument(metavar="[ENVIRONMENT]...", autocompletion=complete_target, show_default=False),
     ] = None,
-    sticky: Sticky = 0.0,
-    random: Random = 0.0,
-    json: Json = False,
-) -> None:
-    """Compile what building, solving, measuring, playing and Q-learning need, and keep it for later processes."""
-    environments = [parse_target(name).found_environment() for name in targets or ()]
+    *,
+    chance: Annotated[ChanceSetting, "sticky random"],
+) -> Answer:
+    """Compile what building, solving, measuring, playing and Q-learning need, and keep it for later processes.
+
+    Args:
+        targets: Environments or named instances; small ones of the paper's four classes when not given.
+    """
+    environments = [Target(name).found_environment() for name in targets or ()]
     if not targets:
         from pharos.environments import make
 
@@ -54,27 +53,24 @@ def warm(
         for env in environments:
             tell(str(env))
             before = watch.compiling
-            _use(env, sticky, random)
+            _use(env, chance)
             seconds[str(env)] = watch.compiling - before
-    if json:
-        print_json({"environments": seconds, "seconds": watch.seconds, "compiling_seconds": watch.compiling})
-        return
-    facts: list[tuple[str, object]] = [(name, f"{spent:.1f} s") for name, spent in seconds.items()]
-    print_facts(f"compiled for {many(len(facts), 'environment')}, and kept", facts)
+    answer = {"environments": seconds, "seconds": watch.seconds, "compiling_seconds": watch.compiling}
+    facts = [(name, f"{spent:.1f} s") for name, spent in seconds.items()]
+    return Answer(answer, (f"compiled for {many(len(facts), 'environment')}, and kept", facts))
 
 
-def _use(env: "Environment", sticky: float, random: float) -> None:
+def _use(env: "Environment", chance: ChanceSetting) -> None:
     """Do a little of everything with an environment; a space beyond LARGEST states is stepped through alone."""
     from pharos import hardness, solvers, state_space
     from pharos.interaction import GymEnv, VectorEnv
-    from pharos.training import ChanceSetting, train
+    from pharos.training import train
 
-    chance: dict[str, Any] = {"sticky": sticky, "random": random}
     for observation in ("vector", "simple_image"):
-        one = GymEnv(env, observation=observation, **chance)
+        one = GymEnv(env, observation=observation, chance=chance)
         one.reset(seed=0)
         one.step(0)
-        two = VectorEnv(env, 2, observation=observation, **chance)
+        two = VectorEnv(env, 2, observation=observation, chance=chance)
         two.reset(seed=0)
         two.step([0, 0])
     with tempfile.TemporaryDirectory() as folder:
@@ -82,8 +78,8 @@ def _use(env: "Environment", sticky: float, random: float) -> None:
             space = state_space.build(env, f"{folder}/space", max_states=LARGEST, progress=False)
         except StateSpaceTooLarge:
             return
-        mdp = ChanceSetting(sticky, random).of(space.mdp(gamma=0.99))
+        mdp = chance.of(space.mdp(gamma=0.99))
         solvers.value_iteration(mdp)
         solvers.uniform_value(mdp)
         hardness.report(mdp, budget=10.0, keep=False)
-    train("q_learning", env, steps=STEPS, gamma=0.99, horizon=None, evaluation_interval=STEPS, **chance)
+    train("q_learning", env, steps=STEPS, gamma=0.99, horizon=None, evaluation_interval=STEPS, chance=chance)

@@ -13,20 +13,20 @@ from typing import Any
 
 
 def attributes(package: str) -> Callable[[str], Any]:
-    """The `__getattr__` of a package: the names that its `__init__.py` imports from its files under `TYPE_CHECKING`.
+    """The `__getattr__` of a package: the names that its `__init__.py` imports under `TYPE_CHECKING`.
 
     Args:
         package: its `__name__`.
     Returns:
-        Function(name) -> what the file has under this name, which the package keeps; AttributeError for other names.
+        Function(name) -> what the module has under this name, which the package keeps; AttributeError for other names.
     """
 
     @functools.cache
     def modules() -> dict[str, str]:
         tree = ast.parse(Path(str(sys.modules[package].__file__)).read_text(encoding="utf-8"))
-        imports = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
-        own = [(node, str(node.module)) for node in imports if str(node.module).startswith(f"{package}.")]
-        return {alias.name: module for node, module in own for alias in node.names}
+        blocks = [node for node in tree.body if isinstance(node, ast.If)]
+        imports = [node for block in blocks for node in block.body if isinstance(node, ast.ImportFrom)]
+        return {alias.name: str(node.module) for node in imports for alias in node.names}
 
     def attribute(name: str) -> Any:
         if name.startswith("__") or name not in modules():

@@ -36,6 +36,12 @@ def meanings(documented: Any) -> dict[str, str]:
     return texts
 
 
+def first_sentence(text: str) -> str:
+    """The first sentence of a text, with a capital letter, but for names such as `dqn, ppo`."""
+    sentence = re.split(r"(?<=\.) (?=[A-Z])", text)[0]
+    return sentence[:1].upper() + sentence[1:] if re.match(r"[a-z]+[ ;:]", sentence) else sentence
+
+
 @functools.cache
 def parts(cls: Any) -> dict[str, type]:
     """Field -> its class, of the fields that are dataclasses themselves."""

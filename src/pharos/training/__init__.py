@@ -1,27 +1,36 @@
-"""Training: an agent trained on a task, its policies evaluated exactly, and the result written down."""
+"""Training: an agent trained on a task, its policies evaluated exactly, and the result written down.
 
-from pharos.mdp import ChanceSetting
-from pharos.solvers import ReferenceValues, cumulative_expected_regret, regret
-from pharos.training.batch import Progress, train_configs
-from pharos.training.config import ENGINES, Horizon, RunConfig, run_id
-from pharos.training.curve import RegretCurve, bootstrap_interval
-from pharos.training.evaluation import Evaluation, evaluate_agent
-from pharos.training.results import (
-    check_agent,
-    digest_of_curve,
-    read_curve,
-    read_curve_table,
-    read_record,
-    read_rows,
-    read_table,
-    write_record,
-    write_table,
-)
-from pharos.training.run_folder import TrainingResult, clear_run, load_agent
-from pharos.training.task import Task, TaskValues
-from pharos.training.task_cache import FailedRun, TaskCache
-from pharos.training.train import train, train_config, train_many
-from pharos.training.tuning import SPACES, TuningResult, tune
+A file is loaded when something in it is first used: the command line needs `TrainingOptions` alone to show its help.
+"""
+
+from typing import TYPE_CHECKING
+
+from pharos.system import lazy
+
+if TYPE_CHECKING:
+    from pharos.mdp import ChanceSetting
+    from pharos.solvers import ReferenceValues, cumulative_expected_regret, regret
+    from pharos.training.batch import Progress, train_configs
+    from pharos.training.config import RunConfig, run_id
+    from pharos.training.curve import RegretCurve, bootstrap_interval
+    from pharos.training.evaluation import Evaluation, evaluate_agent
+    from pharos.training.options import ENGINES, Horizon, TrainingOptions
+    from pharos.training.results import (
+        check_agent,
+        digest_of_curve,
+        read_curve,
+        read_curve_table,
+        read_record,
+        read_rows,
+        read_table,
+        write_record,
+        write_table,
+    )
+    from pharos.training.run_folder import TrainingResult, clear_run, load_agent
+    from pharos.training.runs import train, train_config, train_many
+    from pharos.training.task import Task, TaskValues
+    from pharos.training.task_cache import FailedRun, TaskCache
+    from pharos.training.tuning import SPACES, TuningResult, tune
 
 __all__ = [
     "ChanceSetting",
@@ -31,6 +40,7 @@ __all__ = [
     "RegretCurve",
     "RunConfig",
     "Task",
+    "TrainingOptions",
     "TrainingResult",
     "TuningResult",
     "cumulative_expected_regret",
@@ -47,3 +57,5 @@ _shared = """
     ENGINES FailedRun Progress SPACES TaskCache TaskValues bootstrap_interval check_agent clear_run digest_of_curve
     read_curve read_curve_table read_record read_rows read_table run_id write_record write_table
 """
+
+__getattr__ = lazy.attributes(__name__)

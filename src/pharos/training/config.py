@@ -1,8 +1,7 @@
 """The configuration of a run: everything that determines its result, as run.json keeps it.
 
-`RunConfig` is what `train`, `tune`, studies and the command line make of their options, and what a stored run is read
-back into. Its `id` names the run: the same configuration has the same id on every machine. Beside it stands
-`Horizon`, which a run shares with values and measures of hardness.
+`RunConfig` is what `train`, `tune`, studies and the command line make of `TrainingOptions`, and what a stored run is
+read back into. Its `id` names the run: the same configuration has the same id on every machine.
 """
 
 import json
@@ -13,73 +12,34 @@ from typing import TYPE_CHECKING, Any
 from pharos.agents import BATCHED, agent_kind, agent_source, is_known
 from pharos.environments import Environment, as_tuples, class_called, class_of, make, source_of
 from pharos.errors import FileFormatError, ParameterError, UnknownName, UntrustedCode
-from pharos.mdp import ChanceSetting
 from pharos.observations import OwnObservation, observation_of, registered
+from pharos.system.options import flat
 from pharos.system.records import read
 from pharos.system.sources import Source, is_reference, resolve
+from pharos.training.options import ENGINES, TrainingOptions
 
 if TYPE_CHECKING:
     from pharos.training.task import Task, TaskValues
 
-ENGINES = ("sb3", "batched")
-"""What trains networks: Stable-Baselines3, one run in a process; or many runs as one program."""
+# In the order of run.json
+KEYS = (
+    *("environment", "parameters", "chance", "observation", "observation_options", "agent", "hyperparameters", "steps"),
+    *("seed", "gamma", "horizon", "evaluation_interval", "engine", "sources"),
+)
 
 
-@dataclass(frozen=True)
-class Horizon:
-    """The number of steps of an episode in values and returns: a number, the environment's time limit, or none.
-
-    Attributes:
-        value: a number of steps; "limit": the time limit of the environment; "none": discounted values without a
-            horizon.
-    """
-
-    value: int | str = "limit"
-
-    @staticmethod
-    def of(setting: "Horizon | int | str | None") -> "Horizon":
-        """Read a setting: a number of steps, "limit" (also "default"), or "none" (also None).
-
-        Raises:
-            ParameterError: none of these.
-        """
-        if isinstance(setting, Horizon):
-            return setting
-        if setting in ("limit", "default"):
-            return Horizon("limit")
-        if setting is None or setting == "none":
-            return Horizon("none")
-        if isinstance(setting, int) and not isinstance(setting, bool) and 1 <= setting < 2**31:
-            return Horizon(setting)
-        raise ParameterError(
-            f"horizon: found {setting!r}; expected a number of steps, limit (the environment's), or none"
-            + (" (a number below 2^31)" if isinstance(setting, int) and setting >= 2**31 else "")
-        )
-
-    def steps(self, env: Environment) -> int | None:
-        """The number of steps in an environment; None for discounted values without a horizon."""
-        if self.value == "none":
-            return None
-        return int(env.max_episode_steps if self.value == "limit" else self.value)
-
-
+@flat
 @dataclass(frozen=True, kw_only=True)
-class RunConfig:
-    """What determines the result of a training run.
+class RunConfig(TrainingOptions):
+    """What determines the result of a training run: the options of training, on an environment, with a seed.
 
     Attributes:
         environment: name of the class of environments.
         parameters: all parameters of the environment, JSON-able.
-        chance: added to the environment: of acting, and in how rewards are paid.
-        observation: name of what the agent sees; "index" for tabular agents.
-        observation_options: options of the observation.
-        agent: "q_learning", "dqn", "ppo", "a2c", or "module:Class" of an algorithm for Stable-Baselines3.
-        hyperparameters: of the agent, which go before those of agents/hyperparameters.py.
-        steps: number of environment steps to learn from.
         seed: of everything random.
-        gamma: discount of values and returns; the agent's own discount is a hyperparameter.
         horizon: number of steps of an episode in values and returns; None: discounted values without a horizon.
         evaluation_interval: steps between evaluations of the policy.
+        hyperparameters: of the agent, which go before those of agents/hyperparameters.py.
         engine: what trains networks, one of ENGINES. Tables are the same with each, so theirs is always "sb3"; `id` and
             `to_dict` have it only where it is another.
         sources: where a class, observation or agent of the user's own comes from, under "environment", "observation"
@@ -88,17 +48,10 @@ class RunConfig:
 
     environment: str
     parameters: Mapping[str, Any] = field(default_factory=dict)
-    chance: ChanceSetting = ChanceSetting()
-    observation: str = "vector"
-    observation_options: Mapping[str, Any] = field(default_factory=dict)
-    agent: str = "q_learning"
-    hyperparameters: Mapping[str, Any] = field(default_factory=dict)
-    steps: int
     seed: int = 0
-    gamma: float = 1.0
-    horizon: int | None
-    evaluation_interval: int
-    engine: str = "sb3"
+    hyperparameters: Mapping[str, Any] = field(default_factory=dict)
+    horizon: int | None = field()
+    evaluation_interval: int = field()
     sources: Mapping[str, Source] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -177,7 +130,8 @@ class RunConfig:
             del entry["engine"]
         if not sources:
             del entry["sources"]
-        return {name: dict(value) if isinstance(value, Mapping) else value for name, value in entry.items()}
+        ordered = {name: entry[name] for name in KEYS if name in entry}
+        return {name: dict(value) if isinstance(value, Mapping) else value for name, value in ordered.items()}
 
     @property
     def id(self) -> str:

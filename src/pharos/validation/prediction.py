@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from pharos.environments import Environment, make
+from pharos.environments import Environment
 from pharos.errors import ParameterError
 from pharos.validation.learners import PRIMARY, primary_regret
 
@@ -26,6 +26,7 @@ CLEAR = 0.05
 BINS = (0.0, 0.05, 0.1, 0.2, 0.4)
 """Lower ends of the predicted differences that are counted together."""
 LEVEL = 0.8
+TAKEN = {"chance", "sticky", "random", "lazy", "reward_noise", "horizon", "hyperparameters"}  # of TrainingOptions
 
 
 @dataclass(frozen=True, eq=False)
@@ -251,22 +252,16 @@ class Prediction:
         return "\n".join([*lines, *map(str, self.orders), *self.warnings])
 
 
-def predict(  # noqa: PLR0913
+def predict(
     environment: Environment | str,
     observations: "str | Iterable[str | tuple[str, Mapping[str, Any]]]" = "vector",
     *,
     agent: str = "dqn",
     networks: "str | Callable[..., Any] | Iterable[Any] | None" = None,
     steps: int = 30_000,
-    sticky: float = 0.0,
-    random: float = 0.0,
-    lazy: float = 0.0,
-    reward_noise: float = 0.0,
-    horizon: int | str | None = "default",
-    hyperparameters: Mapping[str, Any] | None = None,
     landmarks: int | None = None,
     progress: Callable[[str], None] | None = None,
-    **parameters: Any,
+    **options: Any,
 ) -> Prediction:
     """Predict the regret of an agent behind each of some observations, before anything is trained.
 
@@ -275,17 +270,17 @@ def predict(  # noqa: PLR0913
     PPO. How far that agrees with runs was tested on classes that nobody had used (docs/prediction.md).
 
     Args:
-        environment: a name, with its `parameters` as keywords, or an Environment, such as one's own or
+        environment: a name, with its parameters as keywords, or an Environment, such as one's own or
             `pharos.importers.environment(mdp)`.
         observations: names as for `pharos.observe`, alone or with their options: ("hash", {"bits": 64}).
         agent: "dqn" or "ppo".
         networks: as for `pharos.observations.representation`, such as "mlp64x2" or a function of an input's shape that
             returns a torch.nn.Module; several: each with each observation. None: the agent's own.
         steps: of training.
-        sticky, random, lazy, reward_noise, horizon: as for `pharos.train`; chance of acting, and noise in what is paid.
-        hyperparameters: of the agent, before those that `pharos.train` takes.
         landmarks: as for `representation`.
         progress: called with what is being done.
+        options: sticky, random, lazy, reward_noise, horizon and hyperparameters, as for `pharos.train`; and parameters
+            of the environment.
     Returns:
         A Prediction, whose cells have a value and an interval, and whose orders say which is easier.
     Raises:
@@ -295,22 +290,21 @@ def predict(  # noqa: PLR0913
         beside the state space.
     """
     from pharos.agents import hyperparameters as hyperparameters_of
-    from pharos.training import ChanceSetting, RunConfig, Task
+    from pharos.training import RunConfig, Task, TrainingOptions
 
     calibration = published(agent)
-    env = make(environment, **parameters) if isinstance(environment, str) else environment
-    if isinstance(steps, bool) or not isinstance(steps, int) or steps < 1:
-        raise ParameterError(f"steps is {steps!r}; expected a whole number of at least 1")
-    chance = ChanceSetting(sticky, random, lazy, reward_noise)
-    width, cells, states, own = calibration.half_width(), [], 0, dict(hyperparameters or {})
-    for name, options in _observations(observations):
-        task = Task.of(env, chance=chance, observation=name, observation_options=options, horizon=horizon)
+    training = TrainingOptions(**{name: value for name, value in options.items() if name in TAKEN})
+    parameters = {name: value for name, value in options.items() if name not in TAKEN}
+    env, chance = Task.of(environment, parameters).env, training.chance
+    width, cells, states, own = calibration.half_width(), [], 0, dict(training.hyperparameters or {})
+    for name, view in _observations(observations):
+        task = Task.of(env, chance=chance, observation=name, observation_options=view, horizon=training.horizon)
         states = _checked_states(task.space.num_states, env)
         chosen = hyperparameters_of(agent, env.name, str(task.observation), own)
         config = RunConfig.of_task(task, agent, steps=steps, hyperparameters=chosen).to_dict()
         _check_steps(config)
         for network in _several(networks):
-            title = f"{name}({', '.join(f'{key}={value}' for key, value in options.items())})" if options else name
+            title = f"{name}({', '.join(f'{key}={value}' for key, value in view.items())})" if view else name
             if progress is not None:
                 progress(f"predicting {agent} behind {title}")
             regret, network_name = primary_regret(config, task, network, landmarks)

@@ -16,12 +16,13 @@ from typing import Any
 
 from pharos.agents import agent_kind
 from pharos.agents import hyperparameters as hyperparameters_of
-from pharos.environments import Environment, make
+from pharos.environments import Environment
 from pharos.errors import AllRunsFailed, ParameterError
-from pharos.mdp import ChanceSetting
 from pharos.observations import own_observation
+from pharos.system.options import split
 from pharos.training.batch import Progress, ProgressCallback, TrainingJobs, train_configs
 from pharos.training.config import RunConfig
+from pharos.training.options import TrainingOptions
 from pharos.training.process_pool import parts_of, train_parts
 from pharos.training.run_folder import TrainingResult
 from pharos.training.task import Task, TaskValues
@@ -30,107 +31,71 @@ from pharos.training.task_cache import FailedRun, TaskCache
 RunProgress = Callable[[int, int, Mapping[str, Any]], None]
 
 
-def train(  # noqa: PLR0913
+def train(
     agent: str,
     environment: Environment | str,
     *,
-    steps: int,
-    observation: str = "vector",
-    observation_options: Mapping[str, Any] | None = None,
-    sticky: float = 0.0,
-    random: float = 0.0,
-    lazy: float = 0.0,
-    reward_noise: float = 0.0,
-    reward_delay: int = 0,
-    gamma: float = 1.0,
-    horizon: int | str | None = "default",
     seed: int = 0,
-    evaluation_interval: int | None = None,
-    hyperparameters: Mapping[str, Any] | str | os.PathLike | None = None,
-    engine: str = "sb3",
     out: str | os.PathLike | None = None,
     tensorboard: bool = False,
     progress: RunProgress | None = None,
-    **parameters: Any,
+    **options: Any,
 ) -> TrainingResult:
     """Train an agent, and measure the exact regret of its policy as it learns.
 
     Args:
         agent: "q_learning", "dqn", "ppo", "a2c", or "module:Class" or "file.py:Class" of an algorithm for
             Stable-Baselines3.
-        environment: a name, with its `parameters` as keywords, or an Environment.
-        steps: number of environment steps to learn from.
-        observation, observation_options: what the agent sees, also "module:name" or "file.py:name"; tabular agents see
-            the index of the state.
-        sticky, random, lazy: chance of acting, see `Task`.
-        reward_noise, reward_delay: how the agent is paid; values, returns and regret are of what it earns.
-        gamma, horizon: setting of values and returns, see `Task`; the agent's own discount is a hyperparameter.
-        evaluation_interval: steps between evaluations; None: a hundredth of `steps`.
-        hyperparameters: go before those of agents/hyperparameters.py; or a YAML file of the same form, such as one
-            that `tune` wrote.
-        engine: what trains networks: "sb3", Stable-Baselines3; or "batched", pharos' own DQN and PPO, which trains many
-            runs at once (`train_many`).
+        environment: a name, with its parameters as keywords, or an Environment.
+        seed: decides everything random.
         out: folder of the run; None: nothing is written. A finished run there is returned, an unfinished one resumed.
         tensorboard: write TensorBoard's logs into `out`/tensorboard (algorithms of Stable-Baselines3).
         progress: called after each evaluation with steps done, steps in all, and the row of the curve.
+        options: of `TrainingOptions`: steps, observation, observation_options, sticky, random, lazy, reward_noise,
+            reward_delay, gamma, horizon, evaluation_interval, hyperparameters, engine; and those of the environment.
     Raises:
         ParameterError: an option is wrong, or `out` holds another run. UnknownName: no such name; the nearest is
             suggested.
         MissingExtra: Stable-Baselines3 is not installed.
     """
-    task, (config,) = _runs([seed], **locals())
+    task, (config,) = _runs(environment, {"agent": agent, **options}, [seed])
     members = TaskCache()
     members.adopt(config, task)
     return _train(config, members, None if out is None else Path(out), progress, tensorboard)
 
 
-def train_many(  # noqa: PLR0913
+def train_many(
     agent: str,
     environment: Environment | str,
     *,
     seeds: Iterable[int],
-    steps: int,
-    observation: str = "vector",
-    observation_options: Mapping[str, Any] | None = None,
-    sticky: float = 0.0,
-    random: float = 0.0,
-    lazy: float = 0.0,
-    reward_noise: float = 0.0,
-    reward_delay: int = 0,
-    gamma: float = 1.0,
-    horizon: int | str | None = "default",
-    evaluation_interval: int | None = None,
-    hyperparameters: Mapping[str, Any] | str | os.PathLike | None = None,
-    engine: str = "batched",
     device: str = "cpu",
     workers: int = 1,
     out: str | os.PathLike | None = None,
     progress: ProgressCallback | None = None,
-    **parameters: Any,
+    **options: Any,
 ) -> list[TrainingResult | FailedRun]:
     """Train an agent once for each seed, and measure the exact regret of its policies as they learn.
 
     Args:
         seeds: of the runs, each another.
-        engine: "batched", all runs as one program (dqn, ppo, and q_learning one after the other); or "sb3", one after
-            the other.
         device: of the batched engine: "cpu" or "cuda".
         workers: processes that share whole lanes of the batched engine, where there is a folder for results. Results do
             not depend on it.
         out: a folder, in which each run has its own, seed-0 and so on; None: nothing is written. Finished runs there
             are returned, and what was killed goes on from its last checkpoint.
         progress: called after each evaluation.
-        others: as for `train`.
+        options: as for `train`. The engine is "batched" unless told otherwise: all runs as one program (dqn, ppo, and
+            q_learning one after the other); "sb3": one after the other.
     Returns:
         The result of each run in the order of the seeds; a run that failed says why, and does not stop the others.
     Raises:
         ParameterError: no seed, or one twice; or as `train`. AllRunsFailed: none has a result.
     """
-    options = locals()
     numbers = [int(seed) for seed in seeds]
     if not numbers or len(set(numbers)) != len(numbers):
         raise ParameterError(f"seeds are {numbers}; expected at least one, each once")
-    task, configs = _runs(numbers, **options)
+    task, configs = _runs(environment, {"agent": agent, "engine": "batched", **options}, numbers)
     folder = None if out is None else Path(out)
     folders = None if folder is None else [folder / f"seed-{seed}" for seed in numbers]
     checkpoints = None if folder is None else folder / "checkpoints"
@@ -205,33 +170,22 @@ def _train(
 
 
 def _runs(
-    numbers: Sequence[int],
-    *,
-    agent: str,
-    environment: Environment | str,
-    parameters: Mapping[str, Any],
-    steps: int,
-    evaluation_interval: int | None,
-    hyperparameters: Mapping[str, Any] | str | os.PathLike | None,
-    engine: str,
-    **options: Any,
+    environment: Environment | str, options: Mapping[str, Any], seeds: Sequence[int]
 ) -> tuple[Task, list[RunConfig]]:
     """The task, and the configuration of a run with each of the seeds; `options` as `train` takes them."""
-    names = ("observation", "observation_options", "gamma", "horizon", *vars(ChanceSetting()))
-    task = task_for(agent, environment, parameters, **{name: options[name] for name in names})
-    if hyperparameters is not None and not isinstance(hyperparameters, Mapping):
-        hyperparameters = hyperparameters_of(agent, task.env.name, str(task.observation), table=Path(hyperparameters))
-    setting: dict[str, Any] = {"steps": steps, "evaluation_interval": evaluation_interval, "engine": engine}
-    return task, [
-        RunConfig.of_task(task, agent, seed=number, hyperparameters=hyperparameters, **setting) for number in numbers
-    ]
-
-
-def task_for(
-    agent: str, environment: Environment | str, parameters: Mapping[str, Any], *, observation: str, **setting: Any
-) -> Task:
-    """The task of an agent that asks for an observation, which tables do not get; `setting` as `train` takes it."""
-    sight = agent_kind(agent).observation(observation)
-    options = dict(setting.pop("observation_options") or {})
-    made = make(environment, **parameters) if isinstance(environment, str) else environment
-    return Task(made, observation=own_observation(sight) or sight, observation_options=options, **setting)
+    training, parameters = split(TrainingOptions, options)
+    agent, hyperparameters, table = training.agent, training.hyperparameters, options.get("hyperparameters")
+    sight = agent_kind(agent).observation(training.observation)
+    task = Task.of(
+        environment,
+        parameters,
+        chance=training.chance,
+        observation=own_observation(sight) or sight,
+        observation_options=dict(training.observation_options or {}),
+        gamma=training.gamma,
+        horizon=training.horizon,
+    )
+    if isinstance(table, str | os.PathLike):
+        hyperparameters = hyperparameters_of(agent, task.env.name, str(task.observation), table=Path(table))
+    same = {name: getattr(training, name) for name in ("steps", "evaluation_interval", "engine")}
+    return task, [RunConfig.of_task(task, agent, seed=seed, hyperparameters=hyperparameters, **same) for seed in seeds]

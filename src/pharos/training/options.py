@@ -1,0 +1,83 @@
+"""Options of training, declared once: for keywords of Python, flags of the command line, and configurations of runs."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from pharos.environments import Environment, parameter
+from pharos.errors import ParameterError
+from pharos.mdp import ChanceSetting
+from pharos.system.options import flat
+
+ENGINES = ("sb3", "batched")
+"""What trains networks: Stable-Baselines3, one run in a process; or many runs as one program."""
+
+
+@dataclass(frozen=True)
+class Horizon:
+    """The number of steps of an episode in values and returns: a number, the environment's time limit, or none.
+
+    Attributes:
+        value: a number of steps; "limit": the time limit of the environment; "none": discounted values without a
+            horizon.
+    """
+
+    value: int | str = "limit"
+
+    @staticmethod
+    def of(setting: "Horizon | int | str | None") -> "Horizon":
+        """Read a setting: a number of steps, "limit" (also "default"), or "none" (also None).
+
+        Raises:
+            ParameterError: none of these.
+        """
+        if isinstance(setting, Horizon):
+            return setting
+        if setting in ("limit", "default"):
+            return Horizon("limit")
+        if setting is None or setting == "none":
+            return Horizon("none")
+        if isinstance(setting, int) and not isinstance(setting, bool) and 1 <= setting < 2**31:
+            return Horizon(setting)
+        raise ParameterError(
+            f"horizon: found {setting!r}; expected a number of steps, limit (the environment's), or none"
+            + (" (a number below 2^31)" if isinstance(setting, int) and setting >= 2**31 else "")
+        )
+
+    def steps(self, env: Environment) -> int | None:
+        """The number of steps in an environment; None for discounted values without a horizon."""
+        if self.value == "none":
+            return None
+        return int(env.max_episode_steps if self.value == "limit" else self.value)
+
+
+@flat
+@dataclass(frozen=True, kw_only=True)
+class TrainingOptions:
+    """How an agent is trained, and in which setting its policies are measured.
+
+    Attributes:
+        agent: q_learning, dqn, ppo, a2c, or module:Class for Stable-Baselines3. A file of one's own is `file.py:Class`.
+        observation: vector, simple_image, complex_image, one_hot, index, hash, recorded, or your own. That is
+            `module:name` or `file.py:name`; tables see the index of the state.
+        observation_options: option of the observation, such as size=natural.
+        chance: of acting, and in how rewards are paid. Values, returns and regret are of what is earned.
+        hyperparameters: hyperparameter of the agent, such as learning_rate=0.001. These go before those of
+            agents/hyperparameters.py. `train` also takes a YAML file of the same form, such as one that `tune` wrote.
+        steps: steps to learn from.
+        gamma: discount of values and returns. The agent's own discount is a hyperparameter.
+        horizon: steps of an episode in values and returns, as `Horizon.of` reads it.
+        evaluation_interval: steps between evaluations; a hundredth when not given.
+        engine: sb3 (Stable-Baselines3), or batched: many seeds as one program. The latter is pharos' own DQN and PPO.
+    """
+
+    agent: str = "q_learning"
+    observation: str = "vector"
+    observation_options: Mapping[str, Any] = field(default_factory=dict)
+    chance: ChanceSetting = ChanceSetting()
+    hyperparameters: Mapping[str, Any] | None = None
+    steps: int = parameter(50_000, low=1)
+    gamma: float = parameter(1.0, low=0, high=1)
+    horizon: int | str | None = "limit"
+    evaluation_interval: int | None = parameter(None, kind=int, low=1)
+    engine: str = "sb3"
