@@ -29,7 +29,7 @@ SPECIAL = re.compile(r"[^\w@%+=:,./\[\]-]")  # what a shell would read as more t
 
 
 class Answer(NamedTuple):
-    """What a command answers.
+    """Answer of a command.
 
     Attributes:
         json: the object that `--json` prints.
@@ -196,7 +196,7 @@ def written(value: object) -> str:
 
 
 def compiling_fact() -> list[tuple[str, str]]:
-    """What this command has spent on compiling, a fact or none: where little was compiled there is nothing to tell."""
+    """Seconds of compiling in this command as a fact, or none where they are few."""
     seconds = compiling.seconds()
     suffix = "" if paths.is_temporary() else ", kept for the next time"
     return [("compiling", f"{seconds:.1f} s{suffix}")] if seconds >= NOTABLE_SECONDS else []

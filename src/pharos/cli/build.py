@@ -136,7 +136,7 @@ def _counts_of_space(goal: Target, building: Building) -> dict[str, int]:
 
 
 def counts_of(space: "StateSpace") -> dict[str, int]:
-    """Of a built state space: all of its states can be reached."""
+    """Counts of a built state space: all of its states can be reached."""
     rows = space.manifest["num_transitions"] if space.has_chance else space.num_states * space.num_actions
     return {
         "num_states": space.num_states,
@@ -159,7 +159,7 @@ def _has_regret(mdp: "TabularMDP") -> bool:
 
 
 def counts_of_table(mdp: "TabularMDP") -> dict[str, int]:
-    """Of a table: transitions are possible outcomes in states that are not terminal, the end of an episode included."""
+    """Counts of a table: transitions are possible outcomes in states that are not terminal, ends included."""
     import numpy as np
 
     terminal = np.asarray(mdp.terminal)

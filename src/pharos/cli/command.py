@@ -50,7 +50,7 @@ class Commands(typer.Typer):
 
 
 def command(function: Callable[..., Any]) -> Callable[..., None]:
-    """What Typer takes for a function: a parameter for each argument and option, `--json` the last."""
+    """Return the callback of a function for Typer: a parameter for each argument and option, `--json` the last."""
     parameters: list[inspect.Parameter] = []
     objects: dict[str, tuple[inspect.Parameter, Any, list[str]]] = {}
     texts, signature = meanings(function), inspect.signature(function)

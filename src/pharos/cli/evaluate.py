@@ -149,7 +149,7 @@ def _sees_frames(goal: Target, decisions: Given) -> bool:
 
 
 def _worth_over_histories(goal: Target, mdp: "TabularMDP", decisions: Given, chance: "ChanceSetting") -> Worth:
-    """Of a policy that sees several frames: exact where it reaches few histories, else estimated."""
+    """Value of a policy that sees several frames: exact where it reaches few histories, else estimated."""
     from pharos.training import Task, evaluate_agent
 
     began = time.perf_counter()

@@ -80,7 +80,7 @@ def _serve(server: "Server", with_browser: bool) -> None:
 
 
 def _learnt(policy: str | None, trust: bool) -> "Learnt | None":
-    """What `--policy` names."""
+    """Policy that `--policy` names."""
     if policy is None:
         return None
     from pharos.explorer import Learnt
@@ -91,7 +91,7 @@ def _learnt(policy: str | None, trust: bool) -> "Learnt | None":
 
 
 def _exploration(goal: Target, building: Building, **options: Any) -> "Exploration":
-    """What a target shows; `options` as for `exploration_of`."""
+    """Exploration of a target; `options` as for `exploration_of`."""
     from pharos.explorer import exploration_of
 
     if goal.path is not None and (goal.path / "run.json").is_file():

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Limits:
-    """What a verification allows, and costs at most.
+    """Limits of a verification.
 
     Attributes:
         tolerance: how far an exact number may be from the claimed one, relative to V*.

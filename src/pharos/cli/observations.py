@@ -78,7 +78,7 @@ def observations(
 
 
 class _Price:
-    """What observations cost an agent without memory; the space is solved once, when it is first asked."""
+    """Cost of observations for an agent without memory; the space is solved once, when it is first asked."""
 
     def __init__(self, space: "StateSpace", gamma: float, chance: ChanceSetting, budget: float):
         self.space, self.gamma, self.chance, self.budget = space, gamma, chance, budget
@@ -105,7 +105,7 @@ class _Price:
 
 
 def _entry(space: "StateSpace", name: str, options: dict[str, Any], price: _Price, *, strict: bool) -> dict[str, Any]:
-    """What is said of one observation.
+    """Counts and cost of one observation.
 
     Args:
         strict: whether an observation that the environment does not have is an error; else it is said in the entry.

@@ -19,7 +19,7 @@ from pharos.mdp import ChanceSetting
 
 
 def complete_target(incomplete: str) -> list[str]:
-    """What a shell proposes for TARGET: classes, and once there is a slash or one class is left, named instances."""
+    """Proposals of a shell for TARGET: classes, and once there is a slash or one class is left, named instances."""
     from pharos.environments import BUILT_IN
 
     names = [entry.name for entry in BUILT_IN if entry.name.startswith(incomplete)]
@@ -29,7 +29,7 @@ def complete_target(incomplete: str) -> list[str]:
 
 
 def complete_parameter(context: typer.Context, incomplete: str) -> list[str]:
-    """What a shell proposes after TARGET: its parameters."""
+    """Proposals of a shell after TARGET: its parameters."""
     from pharos.environments import class_called
 
     target = context.params.get("target") or context.params.get("environment") or ""

@@ -74,7 +74,7 @@ class SharedBuilding(Building):
 
 @dataclass
 class Target:
-    """What a command works on: an environment, or a folder or file that holds something already made.
+    """Input of a command: an environment, or a folder or file that holds something already made.
 
     Attributes:
         target: Environment, module:Class, built folder or imported file.

@@ -155,7 +155,7 @@ def _facts_of_many(
 
 
 def _telling_of_many(show: Callable[[int, str], None] | None) -> Callable[[Any], None] | None:
-    """What `train_many` calls after each evaluation: the mean regret of the policies, and the pace."""
+    """Return the callback of `train_many`, which shows the mean regret of the policies, and the pace."""
     if show is None:
         return None
     began: list[tuple[float, int]] = []
@@ -203,7 +203,7 @@ def _plot(out: Path | None) -> Path | None:
 
 
 def _telling(show: Callable[[int, str], None] | None) -> Callable[[int, int, Any], None] | None:
-    """What `train` calls after each evaluation: the value of the policy, beside the bar."""
+    """Return the callback of `train`, which shows the value of the policy, beside the bar."""
     if show is None:
         return None
 

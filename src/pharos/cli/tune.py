@@ -106,5 +106,5 @@ def _space(words: list[str] | None) -> dict[str, tuple[Any, ...]] | None:
 
 
 def _telling(show: Callable[[int, str], None] | None) -> Callable[[int, int, float], None] | None:
-    """What `tune` calls after each trial: the best score so far, beside the bar."""
+    """Return the callback of `tune`, which shows the best score so far, beside the bar."""
     return None if show is None else lambda done, _trials, best: show(done, f"best {best:.4g}")

@@ -109,57 +109,37 @@ def value_iteration(  # noqa: PLR0913
         action) times actions are up to 2 million (up to 500 MB then), or nodes are up to 3000.
     Source: Bellman (1957); in place: Puterman (1994), section 6.3.3; the sticky equation: the pharos paper, appendix A.
     """
-    sharing = DistributedOptions(processes, checkpoint)
     storage: dict[str, Any] = {"values": values, "threads": threads, "dtype": dtype, "blocks": blocks}
-    return solution_of(mdp, BEST, tolerance, horizon, keep_all, progress, sharing=sharing, **storage)
+    storage |= {"processes": processes, "checkpoint": checkpoint, "progress": progress}
+    return solution_of(mdp, BEST, tolerance, horizon=horizon, keep_all=keep_all, **storage)
 
 
 @require_mdp
-def worst_value(
-    mdp: TabularMDP,
-    tolerance: float = 1e-6,
-    *,
-    horizon: int | None = None,
-    processes: int | str = 1,
-    checkpoint: str | os.PathLike | None = None,
-) -> Solution:
-    """The values of the worst policy: as `value_iteration`, minimising."""
-    return solution_of(mdp, WORST, tolerance, horizon, sharing=DistributedOptions(processes, checkpoint))
+def worst_value(mdp: TabularMDP, tolerance: float = 1e-6, **options: Any) -> Solution:
+    """The values of the worst policy: as `value_iteration`, with its options, minimising."""
+    return solution_of(mdp, WORST, tolerance, **options)
 
 
 @require_mdp
-def uniform_value(
-    mdp: TabularMDP,
-    tolerance: float = 1e-6,
-    *,
-    horizon: int | None = None,
-    progress: Callable[[int, float], None] | None = None,
-    values: str | os.PathLike | None = None,
-    processes: int | str = 1,
-    checkpoint: str | os.PathLike | None = None,
-    threads: int = 1,
-    dtype: Any = "float64",
-    blocks: int = 1,
-) -> Solution:
+def uniform_value(mdp: TabularMDP, tolerance: float = 1e-6, **options: Any) -> Solution:
     """The values of the uniformly random policy: every action is replaced by a uniform one, so nothing is chosen.
 
-    The arguments are those of `value_iteration`.
+    The options are those of `value_iteration`.
     """
-    sharing = DistributedOptions(processes, checkpoint)
-    mdp = random_actions(mdp, 1.0)
-    storage: dict[str, Any] = {"values": values, "threads": threads, "dtype": dtype, "blocks": blocks}
-    return solution_of(mdp, BEST, tolerance, horizon, progress=progress, sharing=sharing, **storage)
+    return solution_of(random_actions(mdp, 1.0), BEST, tolerance, **options)
 
 
 def solution_of(  # noqa: PLR0913
     mdp: TabularMDP,
     select: Selection,
     tolerance: float,
-    horizon: int | None,
+    *,
+    horizon: int | None = None,
     keep_all: bool = False,
     progress: Callable[[int, float], None] | None = None,
     values: str | os.PathLike | None = None,
-    sharing: DistributedOptions | None = None,
+    processes: int | str = 1,
+    checkpoint: str | os.PathLike | None = None,
     threads: int = 1,
     dtype: Any = "float64",
     blocks: int = 1,
@@ -167,11 +147,12 @@ def solution_of(  # noqa: PLR0913
     """The values of what is chosen: a fixed point, or those of backward induction where there is a horizon."""
     check_tolerance(tolerance)
     horizon, dtype = checked_horizon(mdp, horizon), checked_dtype(dtype)
-    if dtype == np.float32 and (horizon is not None or (sharing is not None and sharing.is_wanted)):
+    sharing = DistributedOptions(processes, checkpoint)
+    if dtype == np.float32 and (horizon is not None or sharing.is_wanted):
         raise ParameterError("dtype='float32' is for one process and no horizon; expected 'float64' here")
     if not (isinstance(blocks, int | np.integer) and 1 <= blocks <= MOST_BLOCKS):
         raise ParameterError(f"blocks is {blocks!r}; expected a whole number from 1 to {MOST_BLOCKS}")
-    if sharing is not None and sharing.is_wanted:
+    if sharing.is_wanted:
         if keep_all:
             raise ParameterError("keep_all: several processes keep the last step alone; expected processes=1")
         if values is not None:
@@ -396,7 +377,7 @@ def evaluate_policy(
     sharing = DistributedOptions(processes, checkpoint)
     if select.actions is not None and mdp.is_deterministic and horizon is None and not sharing.is_wanted:
         return _on_its_graph(mdp, select, watch)
-    return solution_of(mdp, select, tolerance, horizon, sharing=sharing)
+    return solution_of(mdp, select, tolerance, horizon=horizon, processes=processes, checkpoint=checkpoint)
 
 
 def evaluate_apart(
