@@ -15,10 +15,9 @@ from pathlib import Path
 import pandas as pd
 
 from pharos import study
-from pharos.study.figures import save
-from pharos.study.leave_one_class_out import PERMUTATIONS
-from pharos.study.predictions import Foretold
-from pharos.study.unseen_figures import unseen_figures
+from pharos.plots import save_for_page, unseen_figures
+from pharos.validation import PredictedCells
+from pharos.validation.leave_one_class_out import PERMUTATIONS
 
 OUTCOMES = ("greedy", "played")
 
@@ -34,7 +33,7 @@ def main():
     parser.add_argument("--and", dest="more", nargs=3, action="append", default=[], metavar="FILE")
     given = parser.parse_args()
     studies = [(given.spec, given.runs, given.predictions), *given.more]
-    foretold = Foretold.of([study.read_predictions(file) for _, _, file in studies])
+    foretold = PredictedCells.of([study.read_predictions(file) for _, _, file in studies])
     predictions = foretold.cells
     each = [_finished(spec, runs, given.hardness) for spec, runs, _ in studies]
     runs, points, measures = (pd.concat(parts, ignore_index=True) for parts in zip(*each, strict=True))
@@ -64,7 +63,7 @@ def main():
         folder = Path(given.figures)
         folder.mkdir(parents=True, exist_ok=True)
         for name, draw in unseen_figures(predictions, cells, points, runs).items():
-            save(draw, folder / name)
+            save_for_page(draw, folder / name)
 
 
 def _finished(spec, packed, hardness):

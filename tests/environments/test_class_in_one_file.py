@@ -16,6 +16,7 @@ from pharos.drawing import human, scenery_of, text_drawing
 from pharos.environments import BuiltIn, Scenery, catalog
 from pharos.errors import ParameterError, RuleError, UnknownName
 from pharos.observations import render
+from pharos.plots.style import MORE_COLORS
 
 figures = importlib.import_module("pharos.study.figures")
 registration = importlib.import_module("pharos.interaction.registration")
@@ -139,7 +140,7 @@ def test_it_brings_its_hyperparameters_and_its_colour(corridor):
     assert hyperparameters("dqn", "corridor", "vector") == {**usual, "gamma": 0.5, "batch_size": 7}
     assert hyperparameters("dqn", "corridor", "simple_image", {"gamma": 0.1}) == {**usual, "gamma": 0.1}
     assert figures.class_color("corridor", ["corridor", "another"]) == "#123456"
-    assert figures.class_color("another", ["corridor", "another"]) == figures.MORE_COLORS[0]
+    assert figures.class_color("another", ["corridor", "another"]) == MORE_COLORS[0]
 
 
 def test_its_parameters_are_checked_by_what_it_declares(corridor):

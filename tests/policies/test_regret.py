@@ -13,7 +13,6 @@ import pharos
 from pharos.errors import FileFormatError, ParameterError
 from pharos.mdp import TabularMDP
 from pharos.solvers import regret_scale, uniform_value, value_iteration, worst_value
-from pharos.study.leave_one_class_out import normalized_regrets
 from pharos.training import (
     ReferenceValues,
     RegretCurve,
@@ -23,6 +22,7 @@ from pharos.training import (
     regret,
     train,
 )
+from pharos.validation.leave_one_class_out import normalized_regrets
 from strategies import deterministic_mdps
 
 CHANCE = [{}, {"random": 0.2}, {"sticky": 0.25}]

@@ -5,9 +5,26 @@ are told apart by colour-blind people (Okabe and Ito, 2008). Nothing opens a win
 """
 
 from pharos.plots.grid import value_map
-from pharos.plots.plane import growth, hardness_plane, predictions, states_by_depth
+from pharos.plots.plane import growth, hardness_plane, states_by_depth
 from pharos.plots.policies import policies
+from pharos.plots.predictions import predictions, unseen_figures
 from pharos.plots.regret import regret
-from pharos.plots.style import save
+from pharos.plots.style import (
+    DIAGONAL,
+    agent_name,
+    color_among,
+    label_edges,
+    legend_below,
+    observation_color,
+    panels,
+    save,
+    save_for_page,
+    slug,
+    thousands,
+)
 
 __all__ = ["growth", "hardness_plane", "policies", "predictions", "regret", "save", "states_by_depth", "value_map"]
+_shared = """
+    DIAGONAL agent_name color_among label_edges legend_below observation_color panels save_for_page slug thousands
+    unseen_figures
+"""

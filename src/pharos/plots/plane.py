@@ -1,8 +1,6 @@
 """Instances in the plane of hardness: how long it takes to get around, against how hard it is to tell actions apart.
 
 How a state space grows with the number of steps from the start.
-
-Predicted regrets as bars with their intervals.
 """
 
 from collections.abc import Mapping
@@ -11,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pharos.errors import ParameterError
-from pharos.plots.style import COLORS, GRID, INK, plain_log, single, styled
+from pharos.plots.style import COLORS, plain_log, single, styled
 from pharos.system.wording import many
 
 if TYPE_CHECKING:
@@ -19,7 +17,6 @@ if TYPE_CHECKING:
 
     from pharos.hardness import Report
     from pharos.state_space import StateSpace
-    from pharos.validation import Prediction
 
 MARKERS = "os^Dv<>P*X"
 
@@ -162,37 +159,4 @@ def growth(spaces: Mapping[str, "StateSpace"], *, axes: Any = None) -> "Figure":
     for side in (axis.xaxis, axis.yaxis):
         plain_log(side)
     axis.legend()
-    return drawn
-
-
-# Predictions ----------------------------------------------------------------------------------------------------------
-
-
-@styled
-def predictions(prediction: "Prediction", *, axes: Any = None) -> "Figure":
-    """Draw a bar for each observation and network, from 0 (optimal) towards 1 (uniform play), with its interval.
-
-    Args:
-        axes: where to draw; None for a new figure.
-    """
-    cells = prediction.cells
-    drawn, axis = single(axes, (6.4, 1.1 + 0.42 * len(cells)))
-    rows = range(len(cells))
-    same_network = len({cell.network for cell in cells}) == 1
-    axis.barh(rows, [cell.value for cell in cells], color=COLORS[0], height=0.55)
-    ends = [[cell.value - cell.low for cell in cells], [cell.high - cell.value for cell in cells]]
-    axis.errorbar([cell.value for cell in cells], rows, xerr=ends, fmt="none", ecolor=INK, capsize=3, linewidth=1.2)
-    axis.axvline(1.0, color=INK, linewidth=1, linestyle=(0, (4, 3)))
-    right = max(1.15, *(cell.high + 0.05 for cell in cells))
-    axis.set(
-        yticks=list(rows),
-        yticklabels=[cell.observation if same_network else cell.label for cell in cells],
-        xlim=(0, right),
-        xlabel=f"predicted regret of {prediction.agent.upper()} after {prediction.steps:,} steps"
-        "  (0: optimal, 1: uniform play)",
-        title=f"{prediction.environment}, {prediction.chance}",
-    )
-    axis.grid(axis="y", visible=False)
-    axis.grid(axis="x", color=GRID)
-    axis.invert_yaxis()
     return drawn

@@ -12,7 +12,7 @@ from pharos.agents import agent_kind
 from pharos.environments import as_tuples, class_called, make
 from pharos.errors import ParameterError
 from pharos.observations import title
-from pharos.plots.style import COLORS, INK, figure, styled, thousands
+from pharos.plots.style import COLORS, INK, legend_below, panels, styled, thousands
 from pharos.system.wording import in_words
 from pharos.training import bootstrap_interval, read_curve, read_record
 
@@ -49,7 +49,7 @@ def regret(
     if not folders:
         raise ParameterError("no runs to draw; give at least one folder of a finished run")
     groups = _groups(folders)
-    left, right = axes if axes is not None else figure(1, 2, (4.6, 3.5))[1][0]
+    left, right = axes if axes is not None else panels(2, 4.6, 3.5)[1]
     relative = not any(np.isnan(curve["normalized_regret"]).any() for runs in groups.values() for _, curve in runs)
     column = "normalized_regret" if relative else "expected_regret"
     for number, (label, runs) in enumerate(groups.items()):
@@ -73,9 +73,7 @@ def regret(
     right.yaxis.set_major_formatter(thousands)
     right.plot([], [], ":", color=INK, linewidth=1.2, label="at random")
     if axes is None:
-        handles, labels = right.get_legend_handles_labels()
-        columns = 2 if max(map(len, labels)) <= WIDE else 1
-        left.figure.legend(handles, labels, loc="outside lower center", ncols=columns, fontsize=8)
+        legend_below(left.figure, [right], 2 if max(map(len, right.get_legend_handles_labels()[1])) <= WIDE else 1)
     else:
         right.legend(loc="best")
     return left.figure

@@ -1,5 +1,8 @@
 """From hardness and regret to the paper's models, figures and tables."""
 
+import importlib
+from typing import Any
+
 from pharos.study.analysis import (
     Comparison,
     Models,
@@ -17,9 +20,8 @@ from pharos.study.blocks import Run, Specification
 from pharos.study.clusters import run_on_ray, submit
 from pharos.study.execution import Status, opened, run, status
 from pharos.study.findings import findings
-from pharos.study.leave_one_class_out import outcomes, validation
 from pharos.study.logs import LOGGERS, RunLog, log
-from pharos.study.predictions import predict, read_predictions, write_predictions
+from pharos.study.predictions import predict
 from pharos.study.regression import Fit, aggregate_r_squared, fit, fit_models, leave_one_class_out_r_squared
 from pharos.study.report import StudyReport, report
 from pharos.study.specification import presets, specification
@@ -27,7 +29,6 @@ from pharos.study.statistics import Estimate, interquartile_mean, stratified_int
 from pharos.study.tables import cells, curves, hardness_table, paper_instance, table
 from pharos.study.values import has_regret
 from pharos.training import run_id
-from pharos.validation import POLICY_PREDICTORS, PREDICTORS
 
 __all__ = [
     "Comparison",
@@ -66,7 +67,19 @@ __all__ = [
     "validation",
 ]
 _shared = """
-    LOGGERS POLICY_PREDICTORS PREDICTORS RunLog has_regret intervals leave_one_class_out_r_squared opened
     paper_agreement paper_instance paper_regressions paper_returns read_predictions run_id run_on_ray
     write_predictions
 """
+# Functions of pharos.validation, under the names that they have in studies.
+_VALIDATION = {
+    "outcomes": "outcomes",
+    "read_predictions": "read_predictions",
+    "validation": "unseen_classes",
+    "write_predictions": "write_predictions",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _VALIDATION:
+        raise AttributeError(f"module 'pharos.study' has no attribute {name!r}")
+    return getattr(importlib.import_module("pharos.validation"), _VALIDATION[name])

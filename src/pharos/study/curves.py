@@ -8,16 +8,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pharos.agents import TABULAR_OBSERVATION
+from pharos.plots import agent_name, observation_color, slug
 from pharos.study.analysis import IMAGE, VECTOR, mean_curve
+from pharos.system.wording import in_words
 
 if TYPE_CHECKING:
     import pandas as pd
 
-# Okabe and Ito's colours, which people tell apart whatever their sight; those of classes stand in their `look`
-MORE_COLORS = ("#CC79A7", "#E69F00", "#F0E442", "#999999")
-OBSERVATION_COLORS = {TABULAR_OBSERVATION: "#009E73", VECTOR: "#0072B2", IMAGE: "#D55E00"}
 LINES = {"q_learning": "-", "dqn": "-", "ppo": "--"}
-NAMES = {"q_learning": "tabular Q-learning", "dqn": "DQN", "ppo": "PPO"}
 OBSERVATIONS = {TABULAR_OBSERVATION: "", VECTOR: "vector", IMAGE: "image"}
 # More lines of runs than this are not told apart in one panel: the page does not offer them
 MOST_RUNS = 120
@@ -99,27 +97,6 @@ def label(agent: str, observation: str) -> str:
     return f"{agent_name(agent)}, {words}" if words else agent_name(agent)
 
 
-def agent_name(agent: str) -> str:
-    """`DQN`; of an algorithm from a module or a file, the name of its class."""
-    return NAMES.get(agent, agent.rpartition(":")[2])
-
-
-def slug(name: str) -> str:
-    """A name as part of a file's name."""
-    return "".join(c if c.isalnum() else "_" for c in name)
-
-
-def title(name: str) -> str:
-    """A name for people: `frozen lake`."""
-    return name.replace("_", " ")
-
-
-def observation_color(name: str, names: Sequence[str]) -> str:
-    """The colour of an observation among `names`: its own, or one of MORE_COLORS."""
-    others = [other for other in names if other not in OBSERVATION_COLORS]
-    return OBSERVATION_COLORS.get(name) or MORE_COLORS[others.index(name) % len(MORE_COLORS)]
-
-
 def regret_curves(
     points: "pd.DataFrame", *, by: str | list[str] = "environment", draws_runs: bool = False, resamples: int = 500
 ) -> Curves:
@@ -138,7 +115,7 @@ def regret_curves(
             words, dash = label(agent, observation), LINES.get(agent, ":")
             drawn.append(Line(words, color, dash, steps, mean, lower, upper, runs))
         text = name if isinstance(name, str) else ", ".join(map(str, name))
-        panels.append(Panel(title(text), drawn))
+        panels.append(Panel(in_words(text), drawn))
     return Curves(panels, "steps", "cumulative regret", draws_runs=draws_runs)
 
 
@@ -171,7 +148,7 @@ def performance_profiles(profiles: "pd.DataFrame") -> Curves:
             color = observation_color(observation, observations)
             values = (line[column].to_numpy(np.float64) for column in ("score", "share", "lower", "upper"))
             drawn.append(Line(label(agent, observation), color, LINES.get(agent, ":"), *values))
-        panels.append(Panel(title(str(name)), drawn))
+        panels.append(Panel(in_words(str(name)), drawn))
     return Curves(panels, "score: 1 - normalised regret", "share of runs above it", share=True)
 
 

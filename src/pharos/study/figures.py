@@ -1,39 +1,25 @@
 """The figures of a study, each a function of tables: matplotlib figures without global state, light or dark."""
 
-import io
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pharos.environments import classes
+from pharos.plots import DIAGONAL, agent_name, color_among, label_edges, legend_below, panels, slug, thousands
 from pharos.study.analysis import IMAGE, REGRETS, VECTOR, Models
-from pharos.study.curves import MORE_COLORS, Curves, agent_name, slug, title
+from pharos.study.curves import Curves
 from pharos.study.regression import Fit
-from pharos.system import storage
+from pharos.system.wording import in_words
+from pharos.training import CELL
 
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
-# Okabe and Ito's colours, which people tell apart whatever their sight; those of classes stand in their `look`
 CHANCE_MARKERS = {"plain": "o", "random": "^", "sticky": "s", "lazy": "v", "reward_noise": "P", "reward_delay": "X"}
 OTHER_IMAGE = "complex_image"
-DPI = 120
-
-
-def style(dark: bool) -> dict[str, Any]:
-    """Matplotlib settings of a figure."""
-    ink, ground, grid = ("#d8dbe2", "#1b1e24", "#3a3f4a") if dark else ("#23262d", "#ffffff", "#dfe2e8")
-    return {
-        "figure.facecolor": ground, "axes.facecolor": ground, "savefig.facecolor": ground,
-        "text.color": ink, "axes.labelcolor": ink, "axes.edgecolor": grid, "xtick.color": ink, "ytick.color": ink,
-        "axes.grid": True, "grid.color": grid, "grid.linewidth": 0.6, "axes.axisbelow": True,
-        "axes.spines.top": False, "axes.spines.right": False, "legend.frameon": False,
-        "font.size": 9, "axes.titlesize": 10, "legend.fontsize": 8, "figure.dpi": DPI, "pdf.fonttype": 42,
-    }  # fmt: skip
 
 
 def lines(curves: Curves) -> "Figure | None":
@@ -48,14 +34,12 @@ def lines(curves: Curves) -> "Figure | None":
             for run in line.runs.values() if curves.draws_runs else ():
                 axis.plot(line.x, run, line.dash, color=line.color, lw=0.5, alpha=0.5)
         axis.set_title(panel.title)
-        axis.set_xlabel(curves.x_label)
         if curves.share:
             axis.set_ylim(-0.02, 1.02)
         else:
             axis.set_ylim(bottom=min(0.0, axis.get_ylim()[0]))
-            axis.xaxis.set_major_formatter(_thousands)
-    for axis in axes[:: max(1, _columns(len(axes)))]:
-        axis.set_ylabel(curves.y_label)
+            axis.xaxis.set_major_formatter(thousands)
+    label_edges(axes, curves.x_label, curves.y_label)
     legend_below(figure, axes)
     return figure
 
@@ -63,8 +47,7 @@ def lines(curves: Curves) -> "Figure | None":
 def class_color(name: str, names: Sequence[str]) -> str:
     """The colour of a class of environments among `names`: its own, or one of MORE_COLORS."""
     own = {other: cls.look.color for other, cls in classes().items() if cls.look.color is not None}
-    others = [other for other in names if other not in own]
-    return own.get(name) or MORE_COLORS[others.index(name) % len(MORE_COLORS)]
+    return color_among(name, names, own)
 
 
 def pairs_of(cells: "pd.DataFrame", agents: Sequence[str]) -> list[tuple[str, str]]:
@@ -92,26 +75,40 @@ def agents_figure(one: str, two: str) -> str:
 
 def representations(cells: "pd.DataFrame", *, agent: str = "dqn", image: str = IMAGE) -> "Figure | None":
     """Normalised regret with a vector against that with an image, a point for each task. The paper's figure 3."""
-    wide = cells[cells["agent"] == agent].pivot_table(
-        index=["environment", "instance", "chance"], columns="observation", values="normalized_regret"
-    )
-    if not {image, VECTOR} <= set(wide.columns):
+    words = [f"normalised regret of {agent_name(agent)} with {sight}" for sight in ("an image", "a vector")]
+    figure = _against(cells[cells["agent"] == agent], "observation", "normalized_regret", (image, VECTOR), words)
+    if figure is not None:
+        (axis,) = figure.axes
+        high = max(1.0, axis.get_xlim()[1], axis.get_ylim()[1])
+        axis.plot([0.0, high], [0.0, high], ":", color=DIAGONAL, lw=1.2)
+        axis.set(aspect="equal")
+    return figure
+
+
+def agents_against_each_other(cells: "pd.DataFrame", value: str, agents: tuple[str, str]) -> "Figure | None":
+    """The value of one agent against that of another, a point for each task and observation."""
+    words = [f"{REGRETS.get(value, value)} of {agent_name(agent)}" for agent in agents]
+    return _against(cells, "agent", value, agents, words)
+
+
+def _against(
+    cells: "pd.DataFrame", column: str, value: str, both: tuple[str, str], words: Sequence[str]
+) -> "Figure | None":
+    """The value with one entry of `column` against that with another; None where no cell has both."""
+    index = [name for name in CELL if name != column]
+    wide = cells.pivot_table(index=index, columns=column, values=value)
+    if not {*both} <= {*wide.columns} or not len(wide := wide[list(both)].dropna().reset_index()):
         return None
-    wide = wide[[image, VECTOR]].dropna().reset_index()
-    names = list(dict.fromkeys(wide["environment"]))
-    figure, (axis,) = panels(1, 4.6, 4.2)
-    for (environment, chance), part in wide.groupby(["environment", wide["chance"].str.split().str[0]], sort=True):
-        marker = CHANCE_MARKERS.get(chance, "D")
-        color = class_color(environment, names)
-        axis.scatter(part[image], part[VECTOR], s=34, color=color, marker=marker, alpha=0.85, lw=0)
-    low, high = min(0.0, wide[[image, VECTOR]].min().min()), max(1.0, wide[[image, VECTOR]].max().max())
-    axis.plot([low, high], [low, high], ":", color="#888888", lw=1.2)
-    axis.set(xlabel=f"normalised regret of {agent_name(agent)} with an image", aspect="equal")
-    axis.set_ylabel(f"normalised regret of {agent_name(agent)} with a vector")
+    names, chances = list(dict.fromkeys(wide["environment"])), wide["chance"].str.split().str[0]
+    figure, (axis,) = panels(1, 4.6, 4.0)
+    for (environment, chance), part in wide.groupby(["environment", chances]):
+        color, marker = class_color(environment, names), CHANCE_MARKERS.get(chance, "D")
+        axis.scatter(part[both[0]], part[both[1]], s=32, color=color, marker=marker, alpha=0.85, lw=0)
     for name in names:
-        axis.scatter([], [], color=class_color(name, names), label=title(name))
-    for chance in dict.fromkeys(wide["chance"].str.split().str[0]):
-        axis.scatter([], [], color="#888888", marker=CHANCE_MARKERS.get(chance, "D"), label=chance)
+        axis.scatter([], [], color=class_color(name, names), label=in_words(name))
+    for chance in dict.fromkeys(chances):
+        axis.scatter([], [], color=DIAGONAL, marker=CHANCE_MARKERS.get(chance, "D"), label=chance)
+    axis.set(xlabel=words[0], ylabel=words[1])
     axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
     return figure
 
@@ -124,39 +121,18 @@ def fitted_against_actual(fits: Sequence[Fit], regret: str) -> "Figure":
         for name in names:
             points = np.array([other == name for other in fit.classes] or [True] * len(fit.actual))
             color = class_color(name, names)
-            axis.scatter(fit.actual[points], fit.fitted[points], s=22, color=color, alpha=0.8, lw=0, label=title(name))
+            axis.scatter(
+                fit.actual[points], fit.fitted[points], s=22, color=color, alpha=0.8, lw=0, label=in_words(name)
+            )
         both = np.concatenate((fit.actual, fit.fitted))
         low, high = both.min(), both.max()
-        axis.plot([low, high], [low, high], ":", color="#888888", lw=1.2)
-        axis.set_title(f"{title(fit.subset)}: R² = {fit.r_squared:.2f}, {fit.num_rows} rows")
-        axis.set_xlabel(f"actual {regret}")
-        axis.xaxis.set_major_formatter(_thousands)
-        axis.yaxis.set_major_formatter(_thousands)
-    for axis in axes[:: max(1, _columns(len(fits)))]:
-        axis.set_ylabel(f"fitted {regret}")
+        axis.plot([low, high], [low, high], ":", color=DIAGONAL, lw=1.2)
+        axis.set_title(f"{in_words(fit.subset)}: R² = {fit.r_squared:.2f}, {fit.num_rows} rows")
+        axis.xaxis.set_major_formatter(thousands)
+        axis.yaxis.set_major_formatter(thousands)
+    label_edges(axes, f"actual {regret}", f"fitted {regret}")
     if len({name for fit in fits for name in fit.classes}) > 1:
         legend_below(figure, axes)
-    return figure
-
-
-def agents_against_each_other(cells: "pd.DataFrame", value: str, agents: tuple[str, str]) -> "Figure | None":
-    """The value of one agent against that of another, a point for each task and observation."""
-    wide = cells.pivot_table(index=["environment", "instance", "chance", "observation"], columns="agent", values=value)
-    if not set(agents) <= set(wide.columns):
-        return None
-    wide = wide[list(agents)].dropna().reset_index()
-    if len(wide) == 0:
-        return None
-    names = list(dict.fromkeys(wide["environment"]))
-    figure, (axis,) = panels(1, 4.2, 3.6)
-    for environment, part in wide.groupby("environment", sort=False):
-        color = class_color(str(environment), names)
-        axis.scatter(
-            part[agents[0]], part[agents[1]], s=28, color=color, alpha=0.8, lw=0, label=title(str(environment))
-        )
-    axis.set_xlabel(f"{REGRETS.get(value, value)} of {agent_name(agents[0])}")
-    axis.set_ylabel(f"{REGRETS.get(value, value)} of {agent_name(agents[1])}")
-    axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
     return figure
 
 
@@ -184,58 +160,3 @@ def all_figures(
 
 def _fits(fits: Sequence[Fit], regret: str) -> "Figure | None":
     return fitted_against_actual(fits, regret) if fits else None
-
-
-def save(draw: Callable[[], "Figure | None"], place: Path) -> dict[str, bytes] | None:
-    """Draw a figure into place.png and place.pdf; its PNG for light and for dark pages. None where there is nothing to
-    draw."""
-    import matplotlib
-
-    images = {}
-    for theme in ("light", "dark"):
-        with matplotlib.rc_context(style(theme == "dark")):  # type: ignore[arg-type]
-            figure = draw()
-            if figure is None:
-                return None
-            buffer = io.BytesIO()
-            figure.savefig(buffer, format="png", dpi=DPI, bbox_inches="tight", metadata={"Software": None})
-            images[theme] = buffer.getvalue()
-            if theme == "light":
-                place.parent.mkdir(parents=True, exist_ok=True)
-                storage.replace_file(place.with_suffix(".png"), images[theme])
-                with storage.replacing(place.with_suffix(".pdf")) as file:
-                    figure.savefig(file, format="pdf", bbox_inches="tight", metadata={"CreationDate": None})
-    return images
-
-
-def _columns(count: int) -> int:
-    return min(count, 4) if count <= 4 or count % 3 else 3
-
-
-def panels(count: int, width: float, height: float) -> tuple["Figure", list[Any]]:
-    """A figure of so many axes, each of that width and height in inches."""
-    from matplotlib.figure import Figure
-
-    columns = _columns(count)
-    lines = -(-count // columns)
-    figure = Figure(figsize=(width * columns, height * lines), layout="constrained")
-    axes = np.atleast_1d(figure.subplots(lines, columns, squeeze=False)).ravel().tolist()
-    for axis in axes[count:]:
-        axis.set_visible(False)
-    return figure, axes[:count]
-
-
-def legend_below(figure: "Figure", axes: Sequence[Any]) -> None:
-    """One legend below all panels."""
-    handles: dict[str, Any] = {}
-    for axis in axes:
-        for handle, name in zip(*axis.get_legend_handles_labels(), strict=True):
-            handles.setdefault(name, handle)
-    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=min(5, len(handles)))
-
-
-def _thousands(value: float, _: int) -> str:
-    """`50k`, `0.25`, `1.2M`."""
-    if abs(value) >= 1e6:
-        return f"{value / 1e6:g}M"
-    return f"{value / 1e3:g}k" if abs(value) >= 1e3 else f"{value:g}"

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pharos.agents import TABULAR_OBSERVATION
+from pharos.plots import agent_name
 from pharos.study.analysis import IMAGE, VECTOR, Models
-from pharos.study.curves import agent_name, title
 from pharos.system.wording import in_words
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ def returns_table(cells: "pd.DataFrame", environment: str) -> str:
         entries = rows.setdefault((name, escape(kind)), {})
         entries[row["agent"], row["observation"]] = _entry(row["return"], row["return_deviation"])
     keys = sorted({(row.agent, row.observation) for row in part.itertuples()}, key=lambda key: (key[0] != "ppo", *key))
-    titles = [(escape(agent_name(agent)), escape(title(name))) for agent, name in keys]
+    titles = [(escape(agent_name(agent)), escape(in_words(name))) for agent, name in keys]
     if {key for key in keys if key[1] != TABULAR_OBSERVATION} == set(COLUMNS):
         keys, titles = list(COLUMNS), [(TITLES[agent], TITLES[name]) for agent, name in COLUMNS]
     columns = pd.MultiIndex.from_tuples(titles)

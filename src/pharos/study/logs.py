@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from pharos.errors import FileFormatError, MissingExtra, UnknownName
+from pharos.plots import slug
 from pharos.study import worker as _worker
 from pharos.study.blocks import Run, Specification
-from pharos.study.curves import label, slug
+from pharos.study.curves import label
 from pharos.study.specification import Source
 from pharos.study.status import opened
 from pharos.study.tables import described, read_curve

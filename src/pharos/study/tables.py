@@ -25,7 +25,7 @@ from pharos.study.execution import opened
 from pharos.study.specification import Source
 from pharos.system.storage import ResultCache
 from pharos.system.wording import many
-from pharos.training import ChanceSetting
+from pharos.training import CELL, ChanceSetting
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from pharos.mdp import TabularMDP
 
 PLAIN = {"sticky": 0.0, "random": 0.0}
-CELL = ["environment", "instance", "chance", "agent", "observation"]
 # A proven interval enters as one number if its upper end is at most so many times its lower end
 WIDEST = 2
 # Part of the evaluations at the end over which the return is averaged

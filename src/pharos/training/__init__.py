@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from pharos.mdp import ChanceSetting
     from pharos.solvers import ReferenceValues, cumulative_expected_regret, regret
     from pharos.training.batch import Progress, train_configs
-    from pharos.training.config import RunConfig, run_id
+    from pharos.training.config import CELL, RunConfig, run_id
     from pharos.training.curve import RegretCurve, bootstrap_interval
     from pharos.training.evaluation import Evaluation, evaluate_agent
     from pharos.training.options import ENGINES, Horizon, TrainingOptions
@@ -54,7 +54,7 @@ __all__ = [
     "tune",
 ]
 _shared = """
-    ENGINES FailedRun Progress SPACES TaskCache TaskValues bootstrap_interval check_agent clear_run digest_of_curve
+    CELL ENGINES FailedRun Progress SPACES TaskCache TaskValues bootstrap_interval check_agent clear_run digest_of_curve
     read_curve read_curve_table read_record read_rows read_table run_id write_record write_table
 """
 

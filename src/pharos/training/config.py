@@ -21,6 +21,7 @@ from pharos.training.options import ENGINES, TrainingOptions
 if TYPE_CHECKING:
     from pharos.training.task import Task, TaskValues
 
+CELL = ["environment", "instance", "chance", "agent", "observation"]  # columns that tell the cells of a study
 # In the order of run.json
 KEYS = (
     *("environment", "parameters", "chance", "observation", "observation_options", "agent", "hyperparameters", "steps"),

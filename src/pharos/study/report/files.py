@@ -6,21 +6,22 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pharos.plots import save_for_page, unseen_figures
 from pharos.study.curves import all_curves
-from pharos.study.figures import all_figures, save
+from pharos.study.figures import all_figures
 from pharos.study.latex import tables_of
-from pharos.study.predictions import Foretold, Predictions
 from pharos.study.report.page import render
 from pharos.study.report.results import Results, coefficients, results_of
 from pharos.study.report.sections import sections_of
 from pharos.study.report.unseen_section import doubts, judged, unseen_section
 from pharos.study.specification import Source
 from pharos.study.status import opened
-from pharos.study.unseen_figures import unseen_figures
 from pharos.system.storage import replace_file
 
 if TYPE_CHECKING:
     import pandas as pd
+
+    from pharos.validation import Predictions
 
 MODELS = "Hardness and regret"
 FORMULA = ("=", "+", "-", "@", "\t", "\r")
@@ -66,8 +67,10 @@ def report(
             cell was predicted twice.
     Cost: the measures of hardness of what has finished runs, once, each at most its budget; then seconds.
     """
+    from pharos.validation import PredictedCells
+
     tell = progress or (lambda _: None)
-    foretold = Foretold.of(predictions)
+    predicted = PredictedCells.of(predictions)
     study, place = opened(source, folder, trust=trust)
     results = results_of(study, place, tell)
     target = Path(out) if out is not None else place / "report"
@@ -76,30 +79,30 @@ def report(
     curves = all_curves(results.points, results.profiles)
     for name, draw in all_figures(curves, results.cells, results.models, results.agents).items():
         tell(f"drawing {name}")
-        images = figures[name] = save(draw, target / "figures" / name)
+        images = figures[name] = save_for_page(draw, target / "figures" / name)
         if images and name in curves:
             images["curves"] = curves[name].to_json().encode()
     tell("leaving out classes")
-    judgement, outcomes = judged(results, foretold)
+    judgement, outcomes = judged(results, predicted)
     more = {"outcomes": outcomes}
-    if foretold is not None:
-        more["predicted"] = foretold.cells
-        for name, draw in unseen_figures(foretold.cells, outcomes, results.points, results.runs).items():
-            figures[name] = save(draw, target / "figures" / name)
+    if predicted is not None:
+        more["predicted"] = predicted.cells
+        for name, draw in unseen_figures(predicted.cells, outcomes, results.points, results.runs).items():
+            figures[name] = save_for_page(draw, target / "figures" / name)
     if judgement is not None:
-        more["predictions" if foretold is not None else "unseen_classes"] = judgement
+        more["predictions" if predicted is not None else "unseen_classes"] = judgement
     tables = _write_tables(target / "tables", results, more)
     tell("drawing instances")
     sections = sections_of(results, figures)
     if judgement is not None:
         models = next((i for i, each in enumerate(sections) if each.title == MODELS), len(sections) - 2)
-        sections.insert(models + 1, unseen_section(judgement, results, foretold, figures))
+        sections.insert(models + 1, unseen_section(judgement, results, predicted, figures))
     page = render(f"Study {study.name}", study.description, sections)
     replace_file(target / "report.html", page)
     drawn = [
         target / "figures" / f"{name}.{kind}" for name, images in figures.items() if images for kind in ("png", "pdf")
     ]
-    notes = [*results.notes, *(doubts(results, foretold) if foretold is not None else ())]
+    notes = [*results.notes, *(doubts(results, predicted) if predicted is not None else ())]
     return StudyReport(target / "report.html", drawn, tables, notes)
 
 

@@ -4,8 +4,8 @@ from typing import Any
 
 import numpy as np
 
+from pharos.plots import agent_name
 from pharos.study.analysis import REGRETS, Models, agreement, paper_agreement
-from pharos.study.curves import agent_name
 from pharos.study.figures import agents_figure
 from pharos.study.regression import Fit
 from pharos.study.report.page import Figures, image, table

@@ -11,8 +11,9 @@ import numpy as np
 
 from pharos.environments import start_distribution
 from pharos.errors import PharosError
+from pharos.plots import agent_name, slug
 from pharos.study.analysis import IMAGE, VECTOR
-from pharos.study.curves import agent_name, label, slug, title
+from pharos.study.curves import label
 from pharos.study.figures import pairs_of, representations_figure
 from pharos.study.latex import returns_table
 from pharos.study.report.model_sections import agreement_section, models_section
@@ -21,7 +22,7 @@ from pharos.study.report.results import Results
 from pharos.study.report.section import Section
 from pharos.study.specification import Specification
 from pharos.study.status import duration
-from pharos.system.wording import many
+from pharos.system.wording import in_words, many
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -89,7 +90,7 @@ def _estimated(runs: "pd.DataFrame") -> str | None:
     if len(estimates) == 0:
         return None
     groups = estimates.groupby(["environment", "agent"], sort=True).size()
-    of = ", ".join(f"{agent_name(agent)} on {title(name)} ({count})" for (name, agent), count in groups.items())
+    of = ", ".join(f"{agent_name(agent)} on {in_words(name)} ({count})" for (name, agent), count in groups.items())
     return (
         f"The regret of {many(len(estimates), 'run')} of {len(runs):,} is estimated by playing, because the policy "
         f"reaches too many states for an exact value: {of}. Their normalised regret may be off by up to ± "
@@ -187,7 +188,7 @@ def _representations(results: Results, figures: Figures, left_out: list[str]) ->
         wide = wide[[observation, VECTOR]].dropna()
         harder = (wide[observation] > wide[VECTOR]).groupby(level="environment").agg(["sum", "size"])
         lines = [
-            f"{title(str(name))}: the {title(observation) if observation != IMAGE else 'image'} costs "
+            f"{in_words(str(name))}: the {in_words(observation) if observation != IMAGE else 'image'} costs "
             f"{agent_name(agent)} more regret in {row['sum']} of {row['size']} tasks"
             for name, row in harder.iterrows()
         ]
@@ -258,7 +259,7 @@ def _returns(results: Results) -> Section:
     for environment in dict.fromkeys(results.cells["environment"]):
         part = results.cells[results.cells["environment"] == environment]
         latex = returns_table(results.cells, environment)
-        parts.append({"title": title(environment), "table": table(_wide_returns(part)), "latex": latex})
+        parts.append({"title": in_words(environment), "table": table(_wide_returns(part)), "latex": latex})
     return Section.of("Returns", "returns", parts=parts)
 
 
@@ -339,11 +340,11 @@ def _each_instance(results: Results, figures: Figures) -> Section:
     parts = []
     for environment in dict.fromkeys(results.runs["environment"]):
         caption = (
-            f"Cumulative regret on each instance of {title(environment)} under each kind of chance: the mean, its 95 % "
-            "bootstrap interval, and thin a line for each seed."
+            f"Cumulative regret on each instance of {in_words(environment)} under each kind of chance: the mean, its "
+            "95 % bootstrap interval, and thin a line for each seed."
         )
         drawn = image(figures, f"regret_by_task_{slug(environment)}", caption)
-        parts.append({"title": f"{title(environment)}, each kind of chance and each seed", "figure": drawn})
+        parts.append({"title": f"{in_words(environment)}, each kind of chance and each seed", "figure": drawn})
     text = "Cumulative regret on each instance, all kinds of chance together."
     return Section.of("Each instance", "each_instance", figure=image(figures, "regret_by_instance", text), parts=parts)
 

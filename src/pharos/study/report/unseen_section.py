@@ -6,9 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pharos.errors import ParameterError
-from pharos.study.curves import agent_name, slug
-from pharos.study.leave_one_class_out import OUTCOMES, outcomes, validation
-from pharos.study.predictions import Foretold
+from pharos.plots import agent_name, slug
 from pharos.study.report.page import Figures, image, table
 from pharos.study.report.results import Results
 from pharos.study.report.section import Section
@@ -17,21 +15,25 @@ from pharos.system.wording import in_words, many
 if TYPE_CHECKING:
     import pandas as pd
 
+    from pharos.validation import PredictedCells
+
 FEW_PERMUTATIONS = 499
 
 
-def judged(results: Results, predictions: Foretold | None) -> "tuple[pd.DataFrame | None, pd.DataFrame]":
+def judged(results: Results, predictions: "PredictedCells | None") -> "tuple[pd.DataFrame | None, pd.DataFrame]":
     """(statistics of predictors, or None where there are fewer than two classes; cells with outcomes).
 
     Raises:
         ParameterError: there are predictions, but of other cells, or of fewer than three classes.
     """
+    from pharos.validation import outcomes, unseen_classes
+
     cells = outcomes(results.runs, results.points)
     if predictions is not None:
-        return validation(predictions.cells, cells, measures=results.hardness), cells
+        return unseen_classes(predictions.cells, cells, measures=results.hardness), cells
     own = cells[cells["agent"].isin(results.agents)]
     try:
-        judgement = validation(None, own, measures=results.hardness, least_classes=2, permutations=FEW_PERMUTATIONS)
+        judgement = unseen_classes(None, own, measures=results.hardness, least_classes=2, permutations=FEW_PERMUTATIONS)
     except ParameterError:
         return None, cells
     return (judgement if len(judgement) else None), cells
@@ -40,7 +42,7 @@ def judged(results: Results, predictions: Foretold | None) -> "tuple[pd.DataFram
 def unseen_section(
     judgement: "pd.DataFrame",
     results: Results,
-    predictions: Foretold | None,
+    predictions: "PredictedCells | None",
     figures: Figures,
 ) -> Section:
     """What came true of predictors on classes, MDPs and observations; baselines beside."""
@@ -89,7 +91,7 @@ def winners(judgement: "pd.DataFrame") -> list[str]:
     return sentences
 
 
-def _said(results: Results, predictions: Foretold | None) -> list[str]:
+def _said(results: Results, predictions: "PredictedCells | None") -> list[str]:
     """What files of predictions say of themselves, and whether they came first."""
     if predictions is None:
         return ["Without predictions (pharos study predict), of tabular measures alone."]
@@ -100,7 +102,7 @@ def _said(results: Results, predictions: Foretold | None) -> list[str]:
     return [*lines, *(doubts(results, predictions) or ["All runs began after that."])]
 
 
-def doubts(results: Results, predictions: Foretold) -> list[str]:
+def doubts(results: Results, predictions: "PredictedCells") -> list[str]:
     """Why predictions may be none: runs that had begun when they were written, or that do not say when they were."""
     before, unknown = predictions.late(results.runs)
     total, reasons = f"of {many(len(results.runs), 'run')}", []
@@ -112,6 +114,8 @@ def doubts(results: Results, predictions: Foretold) -> list[str]:
 
 
 def _part(agent: str, outcome: str, rows: "pd.DataFrame", figures: Figures) -> dict[str, Any]:
+    from pharos.validation import OUTCOMES
+
     drawn = []
     if outcome == "greedy":
         texts = {

@@ -22,7 +22,7 @@ def class_weights(classes: np.ndarray) -> np.ndarray:
     return 1.0 / sizes[classes] / len(sizes)
 
 
-def predictions(x: np.ndarray, y: np.ndarray, blocks: np.ndarray, classes: np.ndarray) -> np.ndarray:
+def class_predictions(x: np.ndarray, y: np.ndarray, blocks: np.ndarray, classes: np.ndarray) -> np.ndarray:
     """(N,): each block of rows predicted by least squares through all other rows, classes weighing alike."""
     estimates = np.empty(len(y))
     for block in np.unique(blocks):

@@ -1,28 +1,70 @@
-"""Figures of predictions: by class, by observation of one MDP, and curves of the idealised learner and the agent."""
+"""Predicted regret: bars of one instance; of a study by class, by observation of an MDP, and beside its curves."""
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pharos.study import cross_validation as held_out
-from pharos.study.curves import agent_name, observation_color, slug, title
-from pharos.study.figures import legend_below, panels
-from pharos.study.leave_one_class_out import Cells, normalized_regrets
-from pharos.study.tables import CELL
+from pharos.plots.style import (
+    COLORS,
+    DIAGONAL,
+    GRID,
+    INK,
+    agent_name,
+    label_edges,
+    legend_below,
+    observation_color,
+    panels,
+    single,
+    slug,
+    styled,
+)
+from pharos.system.wording import in_words
+from pharos.training import CELL
 
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
+    from pharos.validation import Prediction
+
 MOST_PANELS = 24
 # Predictors and curves of the idealised learners; the first that there is counts.
 LEARNERS = ("clipped_regret_evaluated", "policy_regret", "kernel_regret")
 CURVES = ("clipped_curve", "policy_curve", "curve")
-DIAGONAL = "#888888"
 LONGEST_TITLE = 34
+
+
+@styled
+def predictions(prediction: "Prediction", *, axes: Any = None) -> "Figure":
+    """Draw a bar for each observation and network, from 0 (optimal) towards 1 (uniform play), with its interval.
+
+    Args:
+        axes: where to draw; None for a new figure.
+    """
+    cells = prediction.cells
+    drawn, axis = single(axes, (6.4, 1.1 + 0.42 * len(cells)))
+    rows = range(len(cells))
+    same_network = len({cell.network for cell in cells}) == 1
+    axis.barh(rows, [cell.value for cell in cells], color=COLORS[0], height=0.55)
+    ends = [[cell.value - cell.low for cell in cells], [cell.high - cell.value for cell in cells]]
+    axis.errorbar([cell.value for cell in cells], rows, xerr=ends, fmt="none", ecolor=INK, capsize=3, linewidth=1.2)
+    axis.axvline(1.0, color=INK, linewidth=1, linestyle=(0, (4, 3)))
+    right = max(1.15, *(cell.high + 0.05 for cell in cells))
+    axis.set(
+        yticks=list(rows),
+        yticklabels=[cell.observation if same_network else cell.label for cell in cells],
+        xlim=(0, right),
+        xlabel=f"predicted regret of {prediction.agent.upper()} after {prediction.steps:,} steps"
+        "  (0: optimal, 1: uniform play)",
+        title=f"{prediction.environment}, {prediction.chance}",
+    )
+    axis.grid(axis="y", visible=False)
+    axis.grid(axis="x", color=GRID)
+    axis.invert_yaxis()
+    return drawn
 
 
 def unseen_figures(
@@ -45,11 +87,13 @@ def unseen_figures(
 
 def predicted_by_class(part: "pd.DataFrame", predictor: str | None = None) -> "Figure | None":
     """A panel for each class: regret against what a line through the other classes predicts for it."""
+    from pharos.validation import Cells, class_predictions
+
     predictor = predictor or _learner(part)
     cells = Cells.of(part, [predictor], "greedy")
     if len(np.unique(cells.classes)) < 2:
         return None
-    frame = cells.frame.assign(predicted=held_out.predictions(cells.x, cells.y, cells.classes, cells.classes))
+    frame = cells.frame.assign(predicted=class_predictions(cells.x, cells.y, cells.classes, cells.classes))
     observations = list(dict.fromkeys(frame["observation"]))
     groups = list(frame.groupby("environment", sort=False))
     figure, axes = panels(len(groups), 2.3, 2.3)
@@ -61,9 +105,9 @@ def predicted_by_class(part: "pd.DataFrame", predictor: str | None = None) -> "F
             color = observation_color(str(observation), observations)
             axis.scatter(some["predicted"], some["greedy"], s=30, color=color, alpha=0.9, lw=0, label=str(observation))
         axis.plot([low, high], [low, high], ":", color=DIAGONAL, lw=1.2)
-        axis.set_title(title(str(name)))
+        axis.set_title(in_words(str(name)))
         axis.set(xlim=(low - 0.05, high + 0.05), ylim=(low - 0.05, high + 0.05))
-    _label_edges(axes, "predicted regret", f"regret of {agent_name(str(part['agent'].iloc[0]))}")
+    label_edges(axes, "predicted regret", f"regret of {agent_name(str(part['agent'].iloc[0]))}")
     legend_below(figure, axes)
     return figure
 
@@ -94,13 +138,15 @@ def observations_of_mdps(part: "pd.DataFrame", predictor: str | None = None) -> 
     said, did = {"facecolors": "none", "edgecolors": DIAGONAL}, {"color": DIAGONAL}
     axes[0].scatter([], [], s=34, lw=1.4, label="predicted", **said)
     axes[0].scatter([], [], s=34, lw=0, label=agent_name(str(part["agent"].iloc[0])), **did)
-    _label_edges(axes, "", "regret")
+    label_edges(axes, "", "regret")
     legend_below(figure, axes)
     return figure
 
 
 def idealised_curves(part: "pd.DataFrame", points: "pd.DataFrame", runs: "pd.DataFrame") -> "Figure | None":
     """A panel for each MDP, up to MOST_PANELS / 2: regret by steps of the agent and of the idealised learner."""
+    from pharos.validation import normalized_regrets
+
     curve = next((name for name in CURVES if name in part and part[name].fillna("").astype(bool).any()), None)
     if curve is None:
         return None
@@ -121,7 +167,7 @@ def idealised_curves(part: "pd.DataFrame", points: "pd.DataFrame", runs: "pd.Dat
         axis.set(ylim=(-0.05, 1.5))
     axes[0].plot([], [], "--", color=DIAGONAL, lw=1.2, label="idealised learner")
     axes[0].plot([], [], color=DIAGONAL, lw=1.5, label=agent_name(str(part["agent"].iloc[0])))
-    _label_edges(axes, "steps", "regret")
+    label_edges(axes, "steps", "regret")
     legend_below(figure, axes)
     return figure
 
@@ -147,21 +193,9 @@ def _short(environment: str, instance: str, chance: str) -> str:
     """`taxi: size 7`, with the chance, where there is some, in a line of its own."""
     inside = instance[instance.find("(") + 1 : -1] if instance.endswith(")") else instance.partition("/")[2] or instance
     first, *others = [part.strip().replace("=", " ").replace("_", " ") for part in inside.split(",")]
-    text = f"{title(environment)}: {first}"
+    text = f"{in_words(environment)}: {first}"
     for word in others:
         if len(text) + len(word) > LONGEST_TITLE:
             break
         text += f", {word}"
     return text + ("" if chance == "plain" else f"\n{chance}")
-
-
-def _label_edges(axes: Sequence[Any], below: str, beside: str) -> None:
-    """Labels on the panels of the first column, and on all of the last row."""
-    first = {round(axis.get_subplotspec().colspan.start) for axis in axes}
-    last = max(axis.get_subplotspec().rowspan.start for axis in axes)
-    for axis in axes:
-        place = axis.get_subplotspec()
-        if place.colspan.start == min(first):
-            axis.set_ylabel(beside)
-        if place.rowspan.start == last:
-            axis.set_xlabel(below)

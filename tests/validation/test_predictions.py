@@ -12,9 +12,17 @@ from pharos import hardness, study
 from pharos.agents import hyperparameters
 from pharos.errors import FileFormatError, ParameterError, ResultCorrupted
 from pharos.hardness import registry
-from pharos.study import POLICY_PREDICTORS, predictions, read_predictions, specification, validation, write_predictions
+from pharos.study import specification
 from pharos.study.report.unseen_section import winners
-from pharos.validation import learners
+from pharos.validation import (
+    POLICY_PREDICTORS,
+    PREDICTORS,
+    learners,
+    prediction_files,
+    read_predictions,
+    write_predictions,
+)
+from pharos.validation import unseen_classes as validation
 
 SPEC = {
     "name": "tiny",
@@ -38,7 +46,7 @@ def predicted(tmp_path_factory):
 def test_every_cell_that_sees_observations_is_predicted(predicted):
     assert predicted["agent"].tolist() == ["dqn", "dqn", "ppo", "ppo"]
     assert predicted["network"].tolist() == ["mlp128x2, pytorch"] * 2 + ["mlp128x2+tanh, sb3"] * 2
-    assert predicted[list(study.PREDICTORS)].notna().all().all()
+    assert predicted[list(PREDICTORS)].notna().all().all()
     of_policies = predicted[list(POLICY_PREDICTORS)].notna()
     assert of_policies.all(axis=1).tolist() == of_policies.any(axis=1).tolist() == [False, False, True, True]
     assert json.loads(predicted.iloc[2]["clipped_curve"])[0] == [0, 1.0]  # it begins as uniform play
@@ -135,7 +143,7 @@ def test_predictions_stay_where_others_cannot_be_written(predicted, tmp_path, mo
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(predictions.training, "write_table", full)
+    monkeypatch.setattr(prediction_files.training, "write_table", full)
     with pytest.raises(OSError, match="No space left"):
         write_predictions(spec, predicted.assign(kernel_regret=1.0), file)
     assert file.read_bytes() == before and list(tmp_path.iterdir()) == [file]
@@ -151,7 +159,7 @@ def made_up(noise, classes=8, instances=3, slope=1.0, seed=0):
         for seen in ("vector", "image", "hash")
     ]
     frame = pd.DataFrame(rows)
-    for name in study.PREDICTORS:
+    for name in PREDICTORS:
         frame[name] = rng.random(len(frame)) + 0.1
     cells = frame[["environment", "instance", "chance", "agent", "observation"]].copy()
     cells["greedy"] = slope * frame["kernel_regret"] + noise * rng.normal(size=len(frame))

@@ -7,11 +7,10 @@ from scipy.stats import rankdata
 
 from pharos import study
 from pharos.errors import ParameterError
-from pharos.study import cross_validation as held_out
-from pharos.study import leave_one_class_out, predictions
-from pharos.study.predictions import Foretold
 from pharos.study.specification import specification
-from pharos.study.tables import CELL
+from pharos.training import CELL
+from pharos.validation import PredictedCells, leave_one_class_out, prediction_files
+from pharos.validation import cross_validation as held_out
 
 
 def design(classes=5, instances=3, predictors=2, seed=0):
@@ -39,7 +38,7 @@ def test_left_out_classes_and_mdps_are_predicted_by_all_other_rows():
     x, y, classes, mdps = design()
     x, y, classes, mdps = x[:-3], y[:-3], classes[:-3], mdps[:-3]  # classes of different sizes
     for blocks in (classes, mdps):
-        np.testing.assert_allclose(held_out.predictions(x, y, blocks, classes), plainly(x, y, blocks, classes))
+        np.testing.assert_allclose(held_out.class_predictions(x, y, blocks, classes), plainly(x, y, blocks, classes))
 
 
 def test_ranks_are_those_of_scipy_with_ties_joined_that_differ_by_rounding():
@@ -86,7 +85,7 @@ def test_permutations_give_each_class_the_predictors_of_another():
     orders = [np.arange(4), *(rng.permutation(4) for _ in range(3))]
     for order, score, correlation in zip(orders, scores, rho, strict=True):
         other = np.concatenate([x[classes == order[c]] for c in range(4)])
-        predicted = held_out.predictions(other, y, classes, classes)
+        predicted = held_out.class_predictions(other, y, classes, classes)
         assert score == pytest.approx(held_out.r_squared(y, predicted, classes))
         assert correlation == pytest.approx(held_out.spearman(predicted, y))
 
@@ -239,7 +238,7 @@ def test_seeds_without_an_outcome_do_not_count_for_its_noise():
 
 def test_runs_that_had_begun_are_told():
     runs = pd.DataFrame({"id": [*"abc"], "began": ["2026-01-01T00:00:00Z", "2026-01-02T00:00:01Z", ""]})
-    assert predictions.late(runs, {"date": "2026-01-02T00:00:00Z"}) == (1, 1)
+    assert prediction_files.late(runs, {"date": "2026-01-02T00:00:00Z"}) == (1, 1)
 
 
 def test_predictions_that_came_after_runs_are_no_predictions():
@@ -247,7 +246,7 @@ def test_predictions_that_came_after_runs_are_no_predictions():
 
     from pharos.study.report.unseen_section import doubts
 
-    about = Foretold([(pd.DataFrame(columns=CELL), {"date": "2026-01-02T00:00:00Z"})])
+    about = PredictedCells([(pd.DataFrame(columns=CELL), {"date": "2026-01-02T00:00:00Z"})])
     results = SimpleNamespace(runs=pd.DataFrame({"id": ["a"], "began": ["2026-01-02T00:00:01Z"]}))
     assert doubts(results, about) == []
     results.runs["began"] = "2026-01-01T00:00:00Z"
@@ -259,13 +258,13 @@ def test_each_run_is_held_to_the_date_of_its_own_prediction():
     runs = cells.assign(id=["a", "b"], began="2026-01-02T00:00:00Z")
     dates = ({"date": "2026-01-01T00:00:00Z"}, {"date": "2026-01-03T00:00:00Z"})
     parts = [(cells.iloc[[i]], about) for i, about in enumerate(dates)]
-    assert Foretold.of(parts).late(runs) == (1, 0)
-    assert Foretold.of(parts).cells.equals(cells)
-    assert Foretold.of(parts[0]).parts == parts[:1]
-    assert Foretold.of(None) is Foretold.of([]) is None
-    assert Foretold.of(parts).late(runs.assign(began=["", "2026-01-04T00:00:00Z"])) == (0, 1)
+    assert PredictedCells.of(parts).late(runs) == (1, 0)
+    assert PredictedCells.of(parts).cells.equals(cells)
+    assert PredictedCells.of(parts[0]).parts == parts[:1]
+    assert PredictedCells.of(None) is PredictedCells.of([]) is None
+    assert PredictedCells.of(parts).late(runs.assign(began=["", "2026-01-04T00:00:00Z"])) == (0, 1)
     with pytest.raises(ParameterError, match="1 cell predicted twice, such as grid, 4x4, plain, dqn, vector; expected"):
-        Foretold.of([*parts, parts[0]])
+        PredictedCells.of([*parts, parts[0]])
 
 
 def test_settings_and_families_make_cells_of_their_own():

@@ -17,9 +17,9 @@ import numpy as np
 
 from pharos.errors import ParameterError
 from pharos.solvers import regret_scale
-from pharos.study import cross_validation as _held_out
-from pharos.study.tables import CELL
-from pharos.validation import POLICY_PREDICTORS, PREDICTORS, SAMPLED_PREDICTORS
+from pharos.training import CELL
+from pharos.validation import cross_validation as _held_out
+from pharos.validation.learners import POLICY_PREDICTORS, PREDICTORS, SAMPLED_PREDICTORS
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -125,7 +125,7 @@ def models_of(frame: "pd.DataFrame", predictors: Sequence[str], measures: Sequen
     return [*models, Model(CLASSES, (), True)]
 
 
-def validation(
+def unseen_classes(
     predictions: "pd.DataFrame | None",
     cells: "pd.DataFrame",
     *,
@@ -287,9 +287,9 @@ def _left_out(cells: Cells, outcome: str, permutations: int, seed: int) -> dict[
         samples = np.stack(_held_out.held_out(x, y, classes, drawn))
         finite = [row[np.isfinite(row)] for row in samples]
         ends = np.array([np.percentile(row, [2.5, 97.5]) if len(row) else [np.nan] * 2 for row in finite])
-    predicted = _held_out.predictions(x, y, classes, classes)
+    predicted = _held_out.class_predictions(x, y, classes, classes)
     dummies = np.eye(count)[classes][:, 1:] if not x.shape[1] else x
-    by_mdp = _held_out.predictions(dummies, y, cells.instances, classes)
+    by_mdp = _held_out.class_predictions(dummies, y, cells.instances, classes)
     slope, offset = _held_out.calibration(y, predicted, classes)
     noise = _noise(cells, outcome)
     floors, p = [np.nan, np.nan], np.nan
