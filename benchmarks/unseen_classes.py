@@ -62,7 +62,7 @@ def main():
     if given.figures:
         folder = Path(given.figures)
         folder.mkdir(parents=True, exist_ok=True)
-        for name, draw in unseen_figures(predictions, cells, points, runs).items():
+        for name, draw in unseen_figures(predictions, cells, points).items():
             save_for_page(draw, folder / name)
 
 

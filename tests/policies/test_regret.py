@@ -2,15 +2,18 @@
 1."""
 
 import math
+from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import command_line
 import pharos
-from pharos.errors import FileFormatError, ParameterError
+from pharos import hardness, leaderboard, study
+from pharos.errors import FileFormatError, ParameterError, UndefinedMeasure
+from pharos.hardness.representation import mean_field
 from pharos.mdp import TabularMDP
 from pharos.solvers import regret_scale, uniform_value, value_iteration, worst_value
 from pharos.training import (
@@ -19,10 +22,12 @@ from pharos.training import (
     Task,
     cumulative_expected_regret,
     evaluate_agent,
+    read_curve,
+    read_record,
     regret,
     train,
+    tune,
 )
-from pharos.validation.leave_one_class_out import normalized_regrets
 from strategies import deterministic_mdps
 
 CHANCE = [{}, {"random": 0.2}, {"sticky": 0.25}]
@@ -193,13 +198,94 @@ def test_regret_has_a_scale_where_the_values_can_tell_the_reference_from_the_opt
     np.testing.assert_array_equal(regret_scale([optimal] * 2, [optimal - lost] * 2, error), [scale] * 2)
 
 
-def test_runs_evaluations_and_tables_of_studies_divide_by_the_same_scale(run_folder):
-    """Of one run: what its record says, what `pharos.training.regret` says of its values, and what a study says."""
-    result, values = run_folder.result, RegretCurve.read(run_folder.folder).values
-    scale = regret_scale(values.optimal, values.uniform)
-    assert result["normalized_regret"] == pytest.approx(result["cumulative_regret"] / (result["episodes"] * scale))
-    last = run_folder.curve[-1]
-    assert last["normalized_regret"] == regret(last["value"], values, normalized_by="uniform")
-    runs = pd.DataFrame([{"id": "a", "value_optimal": values.optimal, "value_uniform": values.uniform}])
-    points = pd.DataFrame([{"id": "a", "value": last["value"]}])
-    assert normalized_regrets(points, runs).tolist() == [last["normalized_regret"]]
+COIN = """
+from dataclasses import dataclass
+from pharos import Environment
+
+@dataclass(frozen=True, kw_only=True)
+class Coin(Environment):
+    name = "coin"
+    actions = ("tails", "heads")
+    max_steps = 4
+    base: float = 0.0
+    gain: float = 1.0
+
+    def variables(self):
+        return {"round": range(5)}
+
+    def initial_state(self):
+        return (0,)
+
+    def transition(self, state, action, out):
+        out[0] = state[0] + 1
+
+    def is_terminal(self, state):
+        return state[0] == 4
+
+    def reward(self, state, action, next_state):
+        return self.base + (self.gain if action == 1 else 0.0)
+"""
+
+
+def last_policy_by_place(run, world, words):
+    """Normalised regret of a run's last policy, wherever the library says it; None where it has no scale."""
+    record, curve, task = read_record(run), read_curve(run), Task.of(world)
+    value, values = record["result"]["final_value"], RegretCurve.read(run).values
+    entry = leaderboard.submit(run, run / "entry.safetensors")
+    try:
+        of_learner = mean_field.Learner(task.mdp, hardness.Schedule(steps=10), 4).regret(value)
+    except UndefinedMeasure:
+        of_learner = math.nan
+    return {
+        "curve": curve["normalized_regret"].iloc[-1],
+        "curve read back": regret(value, values, normalized_by="uniform"),
+        "reference of the task": regret(value, task.reference, normalized_by="uniform"),
+        "pharos evaluate": command_line.answer("evaluate", *words, "--policy", run, "--trust")["normalized_regret"],
+        "leaderboard": leaderboard.verify(entry, trust=True).normalized_regret,
+        "learner of hardness": of_learner,
+    }
+
+
+def whole_run_by_place(run, study_folder):
+    """Normalised cumulative regret of a run, of learnt policies and as played, wherever the library says them."""
+    result, curve, runs = read_record(run)["result"], RegretCurve.read(run), study.table(study_folder)
+    cell = study.outcomes(runs, study.curves(study_folder)).iloc[0]
+    learnt = {
+        "record": result["normalized_regret"],
+        "curve read back": curve.normalized(curve.cumulative_expected)[-1],
+        "table of the study": runs["normalized_regret"].iloc[0],
+        "cells of the study": study.cells(runs)["normalized_regret"].iloc[0],
+    }
+    played = {
+        "record": result["normalized_realised_regret"],
+        "curve read back": curve.normalized(curve.cumulative_realised)[-1],
+        "outcome of validation": cell["played"],
+    }
+    return learnt, played
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("values", [{}, {"base": 1e6, "gain": 1e-6}], ids=["apart", "within the errors"])
+def test_normalised_regret_agrees_in_all_places_at_once(tmp_path, monkeypatch, values):
+    """A world whose policies are apart, and one whose values differ by 2e-6, less than their errors of 8e-6."""
+    monkeypatch.chdir(tmp_path)
+    Path("coin.py").write_text(COIN)
+    world = pharos.make("coin.py:Coin", **values)
+    block = {"environments": [{"name": "coin.py:Coin", "parameters": values}], "agents": ["q_learning"]}
+    spec = {"name": "coins", "steps": 24, "seeds": 1, "blocks": [{**block, "observations": ["vector"]}]}
+    study.run(spec, "coins", workers=1)
+    (run,) = (tmp_path / "coins" / "runs").iterdir()
+    words = ["coin.py:Coin", *(f"{name}={value}" for name, value in values.items())]
+    last = last_policy_by_place(run, world, words)
+    learnt, played = whole_run_by_place(run, tmp_path / "coins")
+    for places in (last, learnt, played):
+        numbers = np.array([math.nan if each is None else each for each in places.values()])
+        assert np.isnan(numbers).all() if values else np.ptp(numbers) <= 1e-9, places
+    undefined = bool(values)
+    assert (learnt["record"] is None) is undefined
+    assert study.has_regret(read_record(run)["config"]) is not undefined
+    if undefined:
+        with pytest.raises(UndefinedMeasure, match="uniform play is optimal"):
+            pharos.predict(world, "vector", steps=2000)
+        with pytest.raises(ParameterError, match="regret cannot be normalised"):
+            tune("q_learning", world, trials=1, steps=20, out=tmp_path / "tuned")

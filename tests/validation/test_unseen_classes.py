@@ -205,6 +205,7 @@ def test_outcomes_are_means_over_evaluations_with_their_noise_over_seeds():
                 "value_uniform": 0.0,
                 "episodes": 10,
                 "cumulative_realised_regret": 5,
+                "normalized_realised_regret": 0.5,
             },
             {
                 **of,
@@ -213,10 +214,11 @@ def test_outcomes_are_means_over_evaluations_with_their_noise_over_seeds():
                 "value_uniform": 0.0,
                 "episodes": 20,
                 "cumulative_realised_regret": 5,
+                "normalized_realised_regret": 0.25,
             },
         ]
     )
-    points = pd.DataFrame({"id": [*"xxxyyy"], "step": [0, 50, 100] * 2, "value": [0, 0.5, 1.0, 0, 0.2, 0.4]})
+    points = pd.DataFrame({"id": [*"xxxyyy"], "step": [0, 50, 100] * 2, "normalized_regret": [1, 0.5, 0, 1, 0.8, 0.6]})
     cell = study.outcomes(runs, points).iloc[0]
     assert cell["greedy"] == pytest.approx((0.5 + 0.8) / 2)
     assert cell["greedy_noise"] == pytest.approx(0.3**2 / 2 / 2)
@@ -229,9 +231,12 @@ def test_seeds_without_an_outcome_do_not_count_for_its_noise():
     of = {"environment": "a", "instance": "a/1", "chance": "plain", "agent": "dqn", "observation": "vector"}
     regrets, ends = (0.3, 0.5, np.nan), {"value_optimal": 1.0, "value_uniform": 0.0, "episodes": 1}
     runs = pd.DataFrame(
-        [{**of, **ends, "id": str(i), "cumulative_realised_regret": each} for i, each in enumerate(regrets)]
+        [
+            {**of, **ends, "id": str(i), "cumulative_realised_regret": each, "normalized_realised_regret": each}
+            for i, each in enumerate(regrets)
+        ]
     )
-    points = pd.DataFrame({"id": ["0", "1", "2"], "step": [0, 0, 0], "value": [0.5, 0.5, 0.5]})
+    points = pd.DataFrame({"id": ["0", "1", "2"], "step": [0, 0, 0], "normalized_regret": [0.5] * 3})
     cell = study.outcomes(runs, points).iloc[0]
     assert cell["played"] == pytest.approx(0.4) and cell["played_noise"] == pytest.approx(0.02 / 2)
 

@@ -55,7 +55,7 @@ def evaluate(
     Args:
         policy: optimal, uniform, worst; FILE.npy: actions (S,), probabilities (S, A); or a finished run's folder.
     """
-    from pharos.solvers import regret_scale
+    from pharos.solvers import ReferenceValues, regret
 
     decisions = None if policy in POLICIES else read_policy(policy, trust=trust)
     source = "given"
@@ -84,15 +84,17 @@ def evaluate(
     rounding = ", for the probabilities that its network computes in 32 bits" if is_network else ""
     best, uniform, worst = (values[name].value for name in POLICIES)
     every = [*values.values(), worth]
-    error = max(values[name].error_bound for name in POLICIES)
-    relative, against_worst = ((best - worth.value) / regret_scale(best, other, error) for other in (uniform, worst))
+    reference = ReferenceValues(best, uniform, worst, max(values[name].error_bound for name in POLICIES))
+    lost, relative, against_worst = (
+        regret(worth.value, reference, normalized_by=name) for name in (None, "uniform", "worst")
+    )
     answer = {
         "policy": policy,
         "value_at_start": worth.value,
         "error_bound": worth.error_bound,
         "exact": worth.episodes == 0,
         "episodes": worth.episodes,
-        "regret": best - worth.value,
+        "regret": lost,
         "normalized_regret": relative,
         "regret_relative_to_worst": against_worst,
         "optimal_value_at_start": best,

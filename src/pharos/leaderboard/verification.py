@@ -23,7 +23,7 @@ from pharos.state_space import build
 from pharos.system import storage
 from pharos.system.memory import available_memory
 from pharos.system.sources import is_reference
-from pharos.training import ReferenceValues, RunConfig, Task, TaskValues, evaluate_agent
+from pharos.training import ReferenceValues, RunConfig, Task, TaskValues, evaluate_agent, regret
 
 TOLERANCE = 1e-6
 MAX_STATES = 10_000_000
@@ -159,10 +159,10 @@ def verify(
     claim = entry.claim
     slack = tolerance * max(1.0, abs(reference.optimal)) + reference.error_bound
     apart = slack + evaluation.error_bound + (min(claim.error_bound, slack) if claim.exact else claim.error_bound)
-    regret, spread = reference.optimal - evaluation.value, reference.spread()
+    lost, spread = regret(evaluation.value, reference), reference.spread()
     checks = (
         Check("value", claim.value, evaluation.value, apart),
-        Check("regret", claim.regret, regret, apart + slack),
+        Check("regret", claim.regret, lost, apart + slack),
         Check("value_optimal", claim.value_optimal, reference.optimal, slack),
         Check("value_uniform", claim.value_uniform, reference.uniform, slack),
     )
@@ -170,8 +170,8 @@ def verify(
         path,
         entry,
         evaluation.value,
-        regret,
-        regret / spread if math.isfinite(spread) else math.nan,
+        lost,
+        regret(evaluation.value, reference, normalized_by="uniform"),
         reference.optimal,
         reference.uniform,
         evaluation.exact,

@@ -68,12 +68,12 @@ def predictions(prediction: "Prediction", *, axes: Any = None) -> "Figure":
 
 
 def unseen_figures(
-    predictions: "pd.DataFrame", cells: "pd.DataFrame", points: "pd.DataFrame", runs: "pd.DataFrame"
+    predictions: "pd.DataFrame", cells: "pd.DataFrame", points: "pd.DataFrame"
 ) -> dict[str, Callable[[], "Figure | None"]]:
     """Name -> function that draws it, three for each agent that has predictions.
 
     Args:
-        predictions: of `predict`. cells: of `outcomes`. points, runs: of `curves` and `table`.
+        predictions: of `predict`. cells: of `outcomes`. points: of `curves`.
     """
     both = predictions.merge(cells, on=CELL, how="inner")
     drawn: dict[str, Callable[[], Figure | None]] = {}
@@ -81,7 +81,7 @@ def unseen_figures(
         name = slug(str(agent))
         drawn[f"predicted_by_class_{name}"] = partial(predicted_by_class, part)
         drawn[f"observations_of_mdps_{name}"] = partial(observations_of_mdps, part)
-        drawn[f"idealised_curves_{name}"] = partial(idealised_curves, part, points, runs)
+        drawn[f"idealised_curves_{name}"] = partial(idealised_curves, part, points)
     return drawn
 
 
@@ -143,22 +143,19 @@ def observations_of_mdps(part: "pd.DataFrame", predictor: str | None = None) -> 
     return figure
 
 
-def idealised_curves(part: "pd.DataFrame", points: "pd.DataFrame", runs: "pd.DataFrame") -> "Figure | None":
+def idealised_curves(part: "pd.DataFrame", points: "pd.DataFrame") -> "Figure | None":
     """A panel for each MDP, up to MOST_PANELS / 2: regret by steps of the agent and of the idealised learner."""
-    from pharos.validation import normalized_regrets
-
     curve = next((name for name in CURVES if name in part and part[name].fillna("").astype(bool).any()), None)
     if curve is None:
         return None
     observations = list(dict.fromkeys(part["observation"]))
     groups = _spread(list(part.groupby(["environment", "instance", "chance"], sort=False)), MOST_PANELS // 2)
-    points = points.assign(regret=normalized_regrets(points, runs))
     figure, axes = panels(len(groups), 3.0, 2.2)
     for axis, (key, rows) in zip(axes, groups, strict=True):
         for row in rows.to_dict("records"):
             color = observation_color(row["observation"], observations)
             own = points[(points[CELL] == [row[name] for name in CELL]).all(axis=1)]
-            mean = own.groupby("step")["regret"].mean()
+            mean = own.groupby("step")["normalized_regret"].mean()
             axis.plot(mean.index, mean.to_numpy(), color=color, lw=1.5, label=row["observation"])
             dashed = json.loads(row[curve] or "[]")
             if dashed:

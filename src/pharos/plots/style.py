@@ -3,7 +3,7 @@
 import functools
 import io
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
@@ -29,7 +29,7 @@ DPI, PAGE_DPI = 160, 120
 DATES: dict[str, Any] = {"png": {"Software": None}, "pdf": {"CreationDate": None}, "svg": {"Date": None}}
 
 
-def style(dark: bool = False) -> Any:
+def style(dark: bool = False) -> dict[Any, Any]:
     """Matplotlib settings of a figure on light or dark ground."""
     ink, ground, grid = ("#d8dbe2", "#1b1e24", "#3a3f4a") if dark else (INK, "#ffffff", GRID)
     return {
@@ -109,7 +109,7 @@ def observation_color(name: str, names: Sequence[str]) -> str:
     return color_among(name, names, OBSERVATION_COLORS)
 
 
-def color_among(name: str, names: Sequence[str], colors: Any) -> str:
+def color_among(name: str, names: Sequence[str], colors: Mapping[str, str]) -> str:
     """The colour of `name`: by the table `colors`, else one of MORE_COLORS by its place among names that it lacks."""
     others = [other for other in names if other not in colors]
     return colors.get(name) or MORE_COLORS[others.index(name) % len(MORE_COLORS)]

@@ -46,8 +46,7 @@ def lines(curves: Curves) -> "Figure | None":
 
 def class_color(name: str, names: Sequence[str]) -> str:
     """The colour of a class of environments among `names`: its own, or one of MORE_COLORS."""
-    own = {other: cls.look.color for other, cls in classes().items() if cls.look.color is not None}
-    return color_among(name, names, own)
+    return color_among(name, names, {other: cls.look.color for other, cls in classes().items() if cls.look.color})
 
 
 def pairs_of(cells: "pd.DataFrame", agents: Sequence[str]) -> list[tuple[str, str]]:

@@ -19,6 +19,7 @@ import numpy as np
 from pharos import training
 from pharos.environments import classes, make
 from pharos.errors import FileFormatError, ParameterError, UnknownName
+from pharos.solvers import regret_scale
 from pharos.study import worker as _worker
 from pharos.study.blocks import Run, Specification
 from pharos.study.execution import opened
@@ -150,8 +151,8 @@ def _exactness(curve: "pd.DataFrame", row: Mapping[str, Any]) -> tuple[bool, flo
         return bool("exact" not in curve or curve["exact"].all()), 0.0
     episodes = curve["episodes"].to_numpy(float)
     bound = curve["error_bound"].where(~curve["exact"].astype(bool), 0.0).to_numpy(float)
-    scale = episodes[-1] * (row["value_optimal"] - row["value_uniform"])
-    return False, float((np.diff(episodes) * bound[:-1]).sum() / scale) if scale > 0 else float("nan")
+    scale = episodes[-1] * regret_scale(row["value_optimal"], row["value_uniform"]) or float("nan")
+    return False, float((np.diff(episodes) * bound[:-1]).sum() / scale)
 
 
 def cells(rows: "pd.DataFrame", measures: "pd.DataFrame | None" = None) -> "pd.DataFrame":

@@ -35,24 +35,22 @@ class Curve:
         """
         evaluation = evaluation or evaluate_agent(agent, self.task, again=True)
         reference = self.task.reference
-        best = reference.optimal
         last = self.rows[-1] if self.rows else None
         finished = episodes - (last["episodes"] if last else 0)
         gained = returns - (last["returns"] if last else 0.0)
         mean = gained / finished if finished else math.nan
-        regret = best - evaluation.value
         row = {
             "step": step,
             "episodes": episodes,
             "value": evaluation.value,
-            "expected_regret": regret,
+            "expected_regret": regret(evaluation.value, reference),
             "cumulative_expected_regret": (
                 last["cumulative_expected_regret"] + finished * last["expected_regret"] if last else 0.0
             ),
-            "normalized_regret": regret / reference.spread(),
+            "normalized_regret": regret(evaluation.value, reference, normalized_by="uniform"),
             "mean_return": mean,
-            "realised_regret": best - mean,
-            "cumulative_realised_regret": episodes * best - returns,
+            "realised_regret": regret(mean, reference),
+            "cumulative_realised_regret": episodes * reference.optimal - returns,
             "exact": evaluation.exact,
             "error_bound": evaluation.error_bound,
             "returns": returns,
@@ -62,12 +60,13 @@ class Curve:
 
     def result(self) -> dict[str, Any]:
         """The summary of a finished run."""
-        task, last = self.task, self.rows[-1]
-        scale = last["episodes"] * task.reference.spread() or math.nan
+        values, last = self.task.reference, self.rows[-1]
+        scale = last["episodes"] * values.spread() or math.nan
         return {
-            "value_optimal": task.reference.optimal,
-            "value_uniform": task.reference.uniform,
-            "value_worst": task.reference.worst,
+            "value_optimal": values.optimal,
+            "value_uniform": values.uniform,
+            "value_worst": values.worst,
+            "value_error_bound": values.error_bound,
             "final_value": last["value"],
             "final_regret": last["expected_regret"],
             "cumulative_regret": last["cumulative_expected_regret"],
@@ -77,7 +76,7 @@ class Curve:
             "mean_return": last["returns"] / last["episodes"] if last["episodes"] else math.nan,
             "episodes": last["episodes"],
             "exact": all(row["exact"] for row in self.rows),
-            "conventions": task.conventions,
+            "conventions": self.task.conventions,
         }
 
 
@@ -107,8 +106,8 @@ class RegretCurve:
         """
         curve, result = _results.read_curve(folder), _results.read_record(folder)["result"]
         episodes = curve["episodes"].to_numpy(np.int64)
-        entries = [result[f"value_{name}"] for name in ("optimal", "uniform", "worst")]
-        values = ReferenceValues(*(math.nan if value is None else value for value in entries))
+        entries = {name: result.get(f"value_{name}", 0.0) for name in ("optimal", "uniform", "worst", "error_bound")}
+        values = ReferenceValues(**{name: math.nan if value is None else value for name, value in entries.items()})
         returns = episodes * values.optimal - curve["cumulative_realised_regret"].to_numpy(np.float64)
         return RegretCurve(curve["step"].to_numpy(np.int64), episodes, curve["value"].to_numpy(float), returns, values)
 

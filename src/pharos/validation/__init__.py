@@ -9,7 +9,7 @@ from pharos.validation.learners import (
     SAMPLED_PREDICTORS,
     predicted,
 )
-from pharos.validation.leave_one_class_out import OUTCOMES, Cells, normalized_regrets, outcomes, unseen_classes
+from pharos.validation.leave_one_class_out import OUTCOMES, Cells, outcomes, unseen_classes
 from pharos.validation.prediction import PredictedRegret, Prediction, Published, predict, published
 from pharos.validation.prediction_files import PredictedCells, Predictions, read_predictions, write_predictions
 
@@ -25,5 +25,5 @@ __all__ = [
 ]
 _shared = """
     Cells OUTCOMES POLICY_CURVES POLICY_PREDICTORS PREDICTORS PredictedCells Predictions SAMPLED_PREDICTORS
-    class_predictions normalized_regrets predicted read_predictions write_predictions
+    class_predictions predicted read_predictions write_predictions
 """

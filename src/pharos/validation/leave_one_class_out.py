@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pharos.errors import ParameterError
-from pharos.solvers import regret_scale
 from pharos.training import CELL
 from pharos.validation import cross_validation as _held_out
 from pharos.validation.learners import POLICY_PREDICTORS, PREDICTORS, SAMPLED_PREDICTORS
@@ -58,7 +57,7 @@ def outcomes(runs: "pd.DataFrame", points: "pd.DataFrame") -> "pd.DataFrame":
         that have it, divided by their number (NaN of one seed); `random_scale`, what random play would lose in as many
         episodes.
     """
-    regret = normalized_regrets(points, runs)
+    regret = points["normalized_regret"]
     cells = runs[[*CELL, "id"]].copy()
     cells["greedy"] = cells["id"].map(regret.groupby(points["id"]).mean())
     reached = points["step"].where(regret <= TENTH).groupby(points["id"]).min()
@@ -66,30 +65,14 @@ def outcomes(runs: "pd.DataFrame", points: "pd.DataFrame") -> "pd.DataFrame":
     cells["steps_to_tenth"] = cells["id"].map(share).where(cells["greedy"].notna())
     for name in ("played", "cumulative", "random_scale"):
         cells[name] = np.nan
-    if {"cumulative_realised_regret", "episodes"} <= {*runs}:
+    if {"cumulative_realised_regret", "normalized_realised_regret"} <= {*runs}:
         cells["cumulative"] = runs["cumulative_realised_regret"]
         cells["random_scale"] = runs["episodes"] * (runs["value_optimal"] - runs["value_uniform"])
-        scale = runs["episodes"] * regret_scale(runs["value_optimal"], runs["value_uniform"])
-        cells["played"] = (cells["cumulative"] / scale).replace([np.inf, -np.inf], np.nan)
+        cells["played"] = runs["normalized_realised_regret"]
     groups = cells.groupby(CELL, sort=False)
     table = groups[[*OUTCOMES, "random_scale"]].mean()
     of_seeds = groups[list(OUTCOMES)]
     return table.join((of_seeds.var(ddof=1) / of_seeds.count()).add_suffix("_noise")).reset_index()
-
-
-def normalized_regrets(points: "pd.DataFrame", runs: "pd.DataFrame") -> "pd.Series":
-    """Of each evaluation the regret of the learnt policy, (V* - V) / (V* - V of uniform play); NaN where that is 0.
-
-    The policy is the greedy one, of actor-critics the distribution over actions: what `evaluate_agent` evaluates.
-
-    Args:
-        points, runs: of `curves` and `table`.
-    """
-    of_run = runs.set_index("id")
-    scale = regret_scale(of_run["value_optimal"], of_run["value_uniform"])
-    scale = dict(zip(of_run.index, scale, strict=True))
-    lost = points["id"].map(of_run["value_optimal"]) - points["value"]
-    return lost / points["id"].map(scale)
 
 
 @dataclass(frozen=True)

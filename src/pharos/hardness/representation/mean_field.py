@@ -156,7 +156,7 @@ class Learner:
         solution = solution or value_iteration(mdp)
         uniform = uniform_value(mdp)
         self.optimal = solution.value_at_start
-        error = solution.error_bound + uniform.error_bound
+        error = max(solution.error_bound, uniform.error_bound)
         self.spread = regret_scale(self.optimal, uniform.value_at_start, error)
         if math.isnan(self.spread):
             raise UndefinedMeasure(f"{self.measure}: uniform play is optimal, so that there is no regret to speak of")

@@ -87,7 +87,7 @@ def report(
     more = {"outcomes": outcomes}
     if predicted is not None:
         more["predicted"] = predicted.cells
-        for name, draw in unseen_figures(predicted.cells, outcomes, results.points, results.runs).items():
+        for name, draw in unseen_figures(predicted.cells, outcomes, results.points).items():
             figures[name] = save_for_page(draw, target / "figures" / name)
     if judgement is not None:
         more["predictions" if predicted is not None else "unseen_classes"] = judgement
