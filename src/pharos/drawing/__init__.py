@@ -31,13 +31,11 @@ __all__ = [
     "episode",
     "human",
     "image",
-    "save_gif",
-    "save_png",
     "text_drawing",
 ]
 _shared = """
-    INK NIGHT Window check_state color_of colored_text glyph_of ground_of inside planes_of scenery_of shade shape_of
-    sprite_of sprite_pixels tile
+    INK NIGHT Window check_state color_of colored_text glyph_of ground_of inside planes_of save_gif save_png scenery_of
+    shade shape_of sprite_of sprite_pixels tile
 """
 
 __getattr__ = lazy.attributes(__name__)

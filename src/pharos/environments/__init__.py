@@ -58,14 +58,10 @@ if TYPE_CHECKING:
     from pharos.environments.worlds.umbrella_chain import UmbrellaChain
 
 __all__ = [
-    "CELL",
-    "CELLS",
-    "VALUED_CELLS",
     "Blackjack",
     "Breakout",
     "Catch",
     "CliffWalking",
-    "Color",
     "CornerGrid",
     "DeepSea",
     "DiscountingChain",
@@ -74,37 +70,31 @@ __all__ = [
     "Freeway",
     "FrozenLake",
     "Game2048",
-    "Ground",
-    "Kind",
     "Layer",
     "Look",
-    "Margin",
     "MemoryChain",
     "MiniGrid",
     "MiniGridEmpty",
     "MiniGridRooms",
-    "Parameter",
     "PocketCube",
     "RiverSwim",
     "Scenery",
-    "Shape",
     "SimpleGrid",
     "SlidingTiles",
     "Sokoban",
-    "Sprite",
     "State",
     "Taxi",
     "UmbrellaChain",
     "classes",
     "list_environments",
     "make",
-    "named_instances",
     "parameter",
     "register",
 ]
 _shared = """
-    BUILT_IN BuiltIn Components as_tuples class_called class_of declared_parameters imported integers
-    on_registration one_of source_of start_distribution
+    BUILT_IN BuiltIn CELL CELLS Color Components Ground Kind Margin Parameter Shape Sprite VALUED_CELLS as_tuples
+    class_called class_of declared_parameters imported integers named_instances on_registration one_of source_of
+    start_distribution
 """
 
 __getattr__ = lazy.attributes(__name__)

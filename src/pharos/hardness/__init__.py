@@ -37,32 +37,19 @@ from pharos.hardness.visitation.mixing_time import MixingTime, distribution_mism
 from pharos.hardness.visitation.occupancy import Occupancy, discounted_visits, occupancy
 
 __all__ = [
-    "ActionGapRegularity",
     "Budget",
     "Certified",
-    "Covering",
     "EffectiveHorizon",
-    "ExplorationTime",
     "Gaps",
-    "GorpBound",
-    "GorpRuns",
     "Interval",
-    "KernelRegret",
-    "LearningCurve",
     "Measure",
-    "MixingTime",
-    "Occupancy",
     "Problem",
     "Report",
     "Representation",
     "Result",
-    "ReturnDistribution",
     "Rollouts",
-    "SampledRegret",
     "Sampling",
     "Schedule",
-    "Spectral",
-    "StationaryHorizon",
     "action_gap_regularity",
     "aliasing_floor",
     "colosseum_diameter",
@@ -93,5 +80,6 @@ __all__ = [
     "sum_of_reciprocal_gaps",
 ]
 _shared = """
-    Certificate Progress chosen discounted_visits
+    ActionGapRegularity Certificate Covering ExplorationTime GorpBound GorpRuns KernelRegret LearningCurve MixingTime
+    Occupancy Progress ReturnDistribution SampledRegret Spectral StationaryHorizon chosen discounted_visits
 """

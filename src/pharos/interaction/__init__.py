@@ -17,14 +17,13 @@ if TYPE_CHECKING:
 
 __all__ = [
     "GymEnv",
-    "SB3VecEnv",
     "VectorEnv",
     "make_sb3_vec",
     "make_vec",
     "to_gymnax",
 ]
 _shared = """
-    Interaction Simulator ids_of register_class
+    Interaction SB3VecEnv Simulator ids_of register_class
 """
 
 __getattr__ = lazy.attributes(__name__)

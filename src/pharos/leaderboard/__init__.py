@@ -6,8 +6,6 @@ from pharos.leaderboard.submission import submit
 from pharos.leaderboard.verification import Check, Verdict, verify
 
 __all__ = [
-    "Claim",
-    "Entry",
     "Verdict",
     "board",
     "read",
@@ -15,5 +13,5 @@ __all__ = [
     "verify",
 ]
 _shared = """
-    Check reason
+    Check Claim Entry reason
 """

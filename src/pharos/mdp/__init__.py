@@ -40,20 +40,17 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Chance",
-    "Minimization",
-    "PaidOutcomes",
     "TabularMDP",
     "lazy_actions",
     "minimize",
-    "paid_outcomes",
     "random_actions",
     "sticky_actions",
 ]
 _shared = """
-    BEST BellmanEquation ChanceSetting Dynamics ExpandedMDP Extreme Lazy Matrices OutcomeTable Outcomes Part PolicyStep
-    PolicyTable Rewards Selection Table WORST chosen_mass count_of executed_actions mass_of nodes_of_outcomes
-    outcomes_of ranged_rewards require_mdp rewards_of_outcomes rewards_of_space rewards_of_staying runs_between
-    runs_of shares_of
+    BEST BellmanEquation ChanceSetting Dynamics ExpandedMDP Extreme Lazy Matrices Minimization OutcomeTable Outcomes
+    PaidOutcomes Part PolicyStep PolicyTable Rewards Selection Table WORST chosen_mass count_of executed_actions mass_of
+    nodes_of_outcomes outcomes_of paid_outcomes ranged_rewards require_mdp rewards_of_outcomes rewards_of_space
+    rewards_of_staying runs_between runs_of shares_of
 """
 
 __getattr__ = lazy.attributes(__name__)

@@ -39,13 +39,10 @@ if TYPE_CHECKING:
     from pharos.observations.tangent_kernels import network_inputs, ntk, tangent_kernel
 
 __all__ = [
-    "Aliasing",
-    "MemorylessLoss",
     "Network",
     "Observation",
     "aliasing",
     "empirical_ntk",
-    "history_aliasing",
     "memoryless_loss",
     "ntk",
     "observation_classes",
@@ -54,9 +51,9 @@ __all__ = [
     "representation",
 ]
 _shared = """
-    ComplexImage FunctionObservation Hash Index NO_ACTION ObservationInContext OneHot OwnObservation RENDERERS
-    SimpleImage Vector counted default_network imported in_blocks names network_inputs observation_of
-    own_observation registered render renderers tangent_kernel title
+    Aliasing ComplexImage FunctionObservation Hash Index MemorylessLoss NO_ACTION ObservationInContext OneHot
+    OwnObservation RENDERERS SimpleImage Vector counted default_network history_aliasing imported in_blocks names
+    network_inputs observation_of own_observation registered render renderers tangent_kernel title
 """
 
 __getattr__ = lazy.attributes(__name__)

@@ -23,8 +23,16 @@ from pharos.plots.style import (
     thousands,
 )
 
-__all__ = ["growth", "hardness_plane", "policies", "predictions", "regret", "save", "states_by_depth", "value_map"]
+__all__ = [
+    "growth",
+    "hardness_plane",
+    "policies",
+    "predictions",
+    "regret",
+    "save",
+    "value_map",
+]
 _shared = """
-    DIAGONAL agent_name color_among label_edges legend_below observation_color panels save_for_page slug thousands
-    unseen_figures
+    DIAGONAL agent_name color_among label_edges legend_below observation_color panels save_for_page slug states_by_depth
+    thousands unseen_figures
 """

@@ -16,10 +16,9 @@ from pharos.policies.value import (
 __all__ = [
     "Evaluation",
     "Policy",
-    "PolicyLike",
     "evaluate_policy",
 ]
 _shared = """
-    DeepPolicy Model PolicyAnswers QueriedPolicy ReachableRows ReachedSolution Sight TableAnswers TabularAgent
-    is_small_table is_walk policy_function policy_value reachable_rows table_values walk_values
+    DeepPolicy Model PolicyAnswers PolicyLike QueriedPolicy ReachableRows ReachedSolution Sight TableAnswers
+    TabularAgent is_small_table is_walk policy_function policy_value reachable_rows table_values walk_values
 """

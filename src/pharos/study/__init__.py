@@ -31,26 +31,18 @@ from pharos.study.values import has_regret
 from pharos.training import run_id
 
 __all__ = [
-    "Comparison",
-    "Estimate",
-    "Fit",
     "Models",
     "Run",
     "Specification",
-    "Status",
     "StudyReport",
-    "aggregate_r_squared",
     "agreement",
     "cells",
     "compare",
     "curves",
     "findings",
     "fit",
-    "fit_models",
     "hardness_table",
-    "interquartile_mean",
     "log",
-    "mean_curve",
     "models",
     "outcomes",
     "pack",
@@ -60,15 +52,15 @@ __all__ = [
     "run",
     "specification",
     "status",
-    "stratified_interval",
     "submit",
     "table",
     "unpack",
     "validation",
 ]
 _shared = """
-    paper_agreement paper_instance paper_regressions paper_returns read_predictions run_id run_on_ray
-    write_predictions
+    Comparison Estimate Fit LOGGERS RunLog Status aggregate_r_squared fit_models has_regret interquartile_mean intervals
+    leave_one_class_out_r_squared mean_curve opened paper_agreement paper_instance paper_regressions paper_returns
+    read_predictions run_id run_on_ray stratified_interval write_predictions
 """
 # Functions of pharos.validation, under the names that they have in studies.
 _VALIDATION = {

@@ -35,14 +35,12 @@ if TYPE_CHECKING:
 __all__ = [
     "ChanceSetting",
     "Evaluation",
-    "Horizon",
     "ReferenceValues",
     "RegretCurve",
     "RunConfig",
     "Task",
     "TrainingOptions",
     "TrainingResult",
-    "TuningResult",
     "cumulative_expected_regret",
     "evaluate_agent",
     "load_agent",
@@ -54,8 +52,9 @@ __all__ = [
     "tune",
 ]
 _shared = """
-    CELL ENGINES FailedRun Progress SPACES TaskCache TaskValues bootstrap_interval check_agent clear_run digest_of_curve
-    read_curve read_curve_table read_record read_rows read_table run_id write_record write_table
+    CELL ENGINES FailedRun Horizon Progress SPACES TaskCache TaskValues TuningResult bootstrap_interval check_agent
+    clear_run digest_of_curve read_curve read_curve_table read_record read_rows read_table run_id write_record
+    write_table
 """
 
 __getattr__ = lazy.attributes(__name__)

@@ -1,4 +1,4 @@
-"""What is predicted of agents before they train, and how far that has been right on published runs."""
+"""Regret of agents predicted before they train, and its accuracy on published runs and on unseen classes."""
 
 from pharos.validation.cross_validation import class_predictions
 from pharos.validation.learners import (
@@ -14,8 +14,6 @@ from pharos.validation.prediction import PredictedRegret, Prediction, Published,
 from pharos.validation.prediction_files import PredictedCells, Predictions, read_predictions, write_predictions
 
 __all__ = [
-    "PRIMARY",
-    "PredictedRegret",
     "Prediction",
     "Published",
     "outcomes",
@@ -24,6 +22,6 @@ __all__ = [
     "unseen_classes",
 ]
 _shared = """
-    Cells OUTCOMES POLICY_CURVES POLICY_PREDICTORS PREDICTORS PredictedCells Predictions SAMPLED_PREDICTORS
-    class_predictions predicted read_predictions write_predictions
+    Cells OUTCOMES POLICY_CURVES POLICY_PREDICTORS PREDICTORS PRIMARY PredictedCells PredictedRegret Predictions
+    SAMPLED_PREDICTORS class_predictions predicted read_predictions write_predictions
 """
