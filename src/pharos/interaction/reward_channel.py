@@ -1,4 +1,4 @@
-"""What agents are paid for what they earn: late, or with noise. Values and regret are of what is earned.
+"""Reward channel: rewards are paid late, or with noise. Values and regret are of what is earned.
 
 Source: the reward delay and reward noise of MDP Playground (Rajan et al. 2023).
 """
@@ -11,7 +11,7 @@ from pharos.mdp import ChanceSetting
 
 
 class RewardChannel:
-    """What N environments pay: what was earned `delay` steps before, and noise.
+    """Pay of N environments: the reward of `delay` steps before, and noise.
 
     At step t of an episode of n steps, t = 1 .. n, r_t being what is earned:
 
@@ -46,7 +46,7 @@ class RewardChannel:
         self._steps[mask] = 0
 
     def pay(self, earned: np.ndarray, is_step: np.ndarray, ended: np.ndarray) -> np.ndarray:
-        """(N,) what a step pays.
+        """Return the pay (N,) of a step.
 
         Args:
             earned: (N,), 0 where nothing is played.
@@ -54,18 +54,6 @@ class RewardChannel:
             ended: (N,) bool, whether its episode is over, so that everything is due.
         """
         self.earned = earned
-        paid = earned.copy()
-        if self.delay:
-            rows = np.flatnonzero(is_step)
-            place = self._steps[rows] % self.delay
-            paid[rows] = self._pending[rows, place]
-            self._pending[rows, place] = earned[rows]
-            self._steps[rows] += 1
-            last = np.flatnonzero(is_step & ended)
-            paid[last] += self._pending[last].sum(axis=1)
-            mask = np.zeros(len(paid), np.bool_)
-            mask[last] = True
-            self.restart(mask)
-        if self.noise:
-            stepping.add_noise(self._rng, self.noise, is_step, paid)
-        return paid
+        amounts = earned.copy()
+        stepping.pay(self._rng, self.noise, self._pending, self._steps, is_step, ended, amounts)
+        return amounts

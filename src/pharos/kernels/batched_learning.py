@@ -1,4 +1,4 @@
-"""What W runs learn from at once: minibatches of a replay memory, losses with their gradients, Adam with clipping.
+"""Learning of W runs at once: minibatches of a replay memory, losses with their gradients, Adam with clipping.
 
 Sources: Mnih et al. (2015); van Hasselt et al. (2016), double; Kingma and Ba (2015). Each function does for every run
 what Stable-Baselines3 does for one; docs/agents.md says where the arithmetic differs.
@@ -35,7 +35,7 @@ def sample(keys, step, draw, place, filled, gammas, num_steps, memory, batch):
 
 @njit(cache=True, nogil=True)
 def sample_histories(keys, step, draw, place, filled, gammas, num_steps, memory, batch):
-    """As `sample`, of the `filled` newest rows, with states and next states (W, B, k): the last k of the episode.
+    """`sample` of the `filled` newest rows, with states and next states (W, B, k): the last k of the episode.
 
     They are read from the rows before; the first state of an episode stands for those before it. Rows that were never
     written have the flag DONE.

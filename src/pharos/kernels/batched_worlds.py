@@ -11,9 +11,9 @@ from numba import njit, uint64
 from numba.extending import overload
 
 from pharos.kernels.bellman import reward_at
-from pharos.kernels.outcomes import is_table, outcome, outcomes_of, size_of
+from pharos.kernels.outcomes import drawn_outcome, outcome, size_of
 from pharos.kernels.philox import below, philox, unit
-from pharos.kernels.stepping import executed_by_number
+from pharos.kernels.stepping import executed_by_number, normal_by_numbers, paid_late, start_by_number
 
 STEP, EXPLORE, SAMPLE, SHUFFLE, WEIGHTS, ACT = range(6)  # streams of random numbers
 DONE, TIMEOUT = 1, 2  # bits of a transition's flags
@@ -98,27 +98,6 @@ def choose(keys, step, explores, q, actions):
                 actions[i, e] = best
 
 
-def drawn_outcome(transitions, s, a, u):
-    """(next state, number of the outcome) of (s, a) that u in (0, 1) falls on."""
-
-
-@overload(drawn_outcome)
-def _drawn_outcome(transitions, s, a, u):
-    if is_table(transitions):
-        return lambda transitions, s, a, u: (np.int64(transitions[s, a]), 0)
-
-    def drawn(transitions, s, a, u):
-        k, passed = 0, 0.0
-        for j in outcomes_of(transitions, s, a):
-            p = outcome(transitions, s, a, j)[1]
-            if p > 0.0 and passed <= u:
-                k = j
-                passed += p
-        return np.int64(outcome(transitions, s, a, k)[0]), k
-
-    return drawn
-
-
 def paid(rewards, s, a, k):
     """The reward of outcome k of (s, a): of the outcome itself, or expected where only that is known."""
 
@@ -135,39 +114,7 @@ def start(keys, members, starts, cumulative, state):
     """state (W, E) of the first episodes of the runs `members`."""
     for i in members:
         for e in range(state.shape[1]):
-            state[i, e] = _start_of(starts, cumulative, philox(1, e, 0, STEP, keys[i])[3])
-
-
-@njit(forceinline=True)
-def _start_of(starts, cumulative, word):
-    k = 0
-    if len(cumulative) > 1:
-        u = unit(word)
-        while k < len(cumulative) - 1 and u >= cumulative[k]:
-            k += 1
-    return starts[k]
-
-
-@njit(forceinline=True)
-def _paid_late(pending, delay, elapsed, earned, is_last):
-    """What is paid where everything comes `delay` steps late, and at the end of an episode at once.
-
-    pending (D,), D >= delay: what the last steps earned; elapsed: steps of the episode before this one.
-    """
-    place = elapsed % delay
-    late = pending[place]
-    pending[place] = earned
-    if is_last:
-        for k in range(delay):
-            late += pending[k]
-            pending[k] = 0.0
-    return late
-
-
-@njit(forceinline=True)
-def _normal(first, second):
-    """A standard normal number of two words (Box and Muller 1958)."""
-    return np.sqrt(-2.0 * np.log(unit(first))) * np.cos(2.0 * np.pi * unit(second))
+            state[i, e] = starts[start_by_number(cumulative, unit(philox(1, e, 0, STEP, keys[i])[3]))]
 
 
 @njit(cache=True, nogil=True)
@@ -181,7 +128,7 @@ def advance(
     (0, 0) where all have one; terminal (S,); starts, cumulative: start states and their cumulated probabilities.
     setting: (keys (W,) uint64, step, chances (W, 4), limits (W,), gammas (W,)), as in `stepping.Setting`.
     knobs (W, 3): the probability that an action has no effect, the deviation of the noise of pay, its delay in steps.
-    pending (W, E, D): what was earned and is due; see `_paid_late`.
+    pending (W, E, D): what was earned and is due; see `paid_late`.
     episodes: (state, previous, elapsed (W, E) int64, return, discount (W, E) float64) of the running episodes, and
     (number, sum of returns (W,)) of the finished ones, which this step adds to where `counts` is true.
     transition: (next state (W, E) int64, reward (W, E) float64, flags (W, E) uint8) of this step, written here; the
@@ -204,7 +151,8 @@ def advance(
             if lazy > 0.0 and unit(more[0]) < lazy:
                 t, earned = s, np.float64(staying[s, action])
             else:
-                t, k = drawn_outcome(transitions, s, action, unit(w[2]))
+                k = drawn_outcome(transitions, s, action, unit(w[2]))[0]
+                t = np.int64(outcome(transitions, s, action, k)[0])
                 earned = np.float64(paid(rewards, s, action, k))
             ended = t < 0 or terminal[t]
             elapsed[i, e] += 1
@@ -213,9 +161,9 @@ def advance(
             flags[i, e] = (DONE if ended or timeout else 0) | (TIMEOUT if timeout else 0)
             reward[i, e] = earned
             if delay > 0:
-                reward[i, e] = _paid_late(pending[i, e], delay, elapsed[i, e] - 1, earned, ended or timeout)
+                reward[i, e] = paid_late(pending[i, e, :delay], elapsed[i, e] - 1, earned, ended or timeout)
             if noise > 0.0:
-                reward[i, e] += noise * _normal(more[1], more[2])
+                reward[i, e] += noise * normal_by_numbers(unit(more[1]), unit(more[2]))
             running[i, e] += discount[i, e] * earned
             discount[i, e] *= gammas[i]
             state[i, e], previous[i, e] = following[i, e], action
@@ -224,7 +172,7 @@ def advance(
                     finished[i] += 1
                     returns[i] += running[i, e]
                 running[i, e], discount[i, e] = 0.0, 1.0
-                state[i, e] = _start_of(starts, cumulative, w[3])
+                state[i, e] = starts[start_by_number(cumulative, unit(w[3]))]
                 previous[i, e], elapsed[i, e] = -1, 0
 
 

@@ -1,43 +1,33 @@
 """Tabular Q-learning on the transitions of an MDP: the loop that agents/q_learning.py describes, compiled.
 
-Random numbers: SplitMix64 (Steele, Lea and Flood 2014), whose whole state is one 64-bit word that can be stored and
-restored.
+Random numbers: the stream of stepping.py, whose whole state is one 64-bit word that can be stored and restored.
 """
 
 import numpy as np
-from numba import njit, uint64
+from numba import njit
 from numba.extending import overload
 
 from pharos.kernels.bellman import reward_at
 from pharos.kernels.outcomes import drawn, is_table, size_of
-from pharos.kernels.stepping import normal_number
+from pharos.kernels.stepping import (
+    integer_below,
+    normal_number,
+    paid_late,
+    redrawn_action,
+    start_by_number,
+    uniform_number,
+)
 
 
-@njit(forceinline=True)
-def _random(word):
-    """A number uniform in [0, 1); moves word[0] on."""
-    word[0] += uint64(0x9E3779B97F4A7C15)
-    z = word[0]
-    z = (z ^ (z >> uint64(30))) * uint64(0xBF58476D1CE4E5B9)
-    z = (z ^ (z >> uint64(27))) * uint64(0x94D049BB133111EB)
-    z = z ^ (z >> uint64(31))
-    return (z >> uint64(11)) * 2.0**-53
-
-
-@njit(forceinline=True)
-def _below(word, n):
-    return min(int(_random(word) * n), n - 1)
-
-
-def _following(transitions, s, a, word):
+def _next_state(transitions, s, a, word):
     """A next state of (s, a), -1 for the end; draws a number only where there are several outcomes."""
 
 
-@overload(_following)
-def _following_of(transitions, s, a, word):
+@overload(_next_state)
+def _next_state_of(transitions, s, a, word):
     if is_table(transitions):
         return lambda transitions, s, a, word: np.int64(transitions[s, a])
-    return lambda transitions, s, a, word: drawn(transitions, s, a, _random(word))
+    return lambda transitions, s, a, word: drawn(transitions, s, a, uniform_number(word, 0))
 
 
 @njit(cache=True, nogil=True)
@@ -75,12 +65,11 @@ def q_learning(
     noise_word: uint64 (1,). Returns are of what is earned.
     """
     num_states, num_actions = size_of(transitions)
-    chosen_weight, previous_weight, _, first_chosen = chance
     rate, exponent, gamma, first_epsilon, last_epsilon, exploration, exponential, measure_gamma = schedule
     sees_previous = len(q) > num_states
     for _ in range(steps):
         if place[0] < 0:
-            place[0] = starts[np.searchsorted(cumulative, _random(word), side="right")]
+            place[0] = starts[start_by_number(cumulative, uniform_number(word, 0))]
             place[1] = num_actions
             place[2] = 0
             sums[0] = 0.0
@@ -92,8 +81,8 @@ def q_learning(
             epsilon = first_epsilon * (last_epsilon / first_epsilon) ** share
         else:
             epsilon = first_epsilon + share * (last_epsilon - first_epsilon)
-        if _random(word) < epsilon:
-            action = _below(word, num_actions)
+        if uniform_number(word, 0) < epsilon:
+            action = integer_below(word, 0, num_actions)
         else:  # greedy, ties at random
             best, ties, action = q[row, 0], 1, 0
             for a in range(1, num_actions):
@@ -101,17 +90,11 @@ def q_learning(
                     best, ties, action = q[row, a], 1, a
                 elif q[row, a] == best:
                     ties += 1
-                    if _random(word) * ties < 1.0:
+                    if uniform_number(word, 0) * ties < 1.0:
                         action = a
-        executed = action
-        u = _random(word)
-        if b == num_actions:
-            if u >= first_chosen:
-                executed = _below(word, num_actions)
-        elif u >= chosen_weight:
-            executed = b if u < chosen_weight + previous_weight else _below(word, num_actions)
+        executed = redrawn_action(action, b if b < num_actions else -1, chance, num_actions, word)
         reward = reward_at(table, palette, s, executed)
-        t = _following(transitions, s, executed, word)
+        t = _next_state(transitions, s, executed, word)
         ended = t < 0 or terminal[t]
         value = 0.0
         if not ended:
@@ -121,12 +104,7 @@ def q_learning(
                 value = max(value, q[after, a])
         paid = reward
         if len(pending) > 0:
-            slot = place[2] % len(pending)
-            paid, pending[slot] = pending[slot], reward
-            if ended or place[2] + 1 >= limit:
-                for k in range(len(pending)):
-                    paid += pending[k]
-                    pending[k] = 0.0
+            paid = paid_late(pending, place[2], reward, ended or place[2] + 1 >= limit)
         if noise > 0.0:
             paid += noise * normal_number(noise_word, 0)
         visits[row, action] += 1

@@ -254,21 +254,36 @@ def arrive(transitions, states, out):
                     out[t, a] = True
 
 
+def drawn_outcome(transitions, s, a, u):
+    """(number, probability) of the outcome of (s, a) that u in [0, 1) falls on: the first with which the probabilities
+    so far are more than u, else the last possible one.
+    """
+
+
+@overload(drawn_outcome)
+def _drawn_outcome(transitions, s, a, u):
+    if is_table(transitions):
+        return lambda transitions, s, a, u: (0, 1.0)
+
+    def several(transitions, s, a, u):
+        number, probability, total = 0, 0.0, 0.0
+        for k in outcomes_of(transitions, s, a):
+            p = outcome(transitions, s, a, k)[1]
+            if p > 0.0 and total <= u:
+                number, probability = k, p
+                total += p
+        return number, probability
+
+    return several
+
+
 @njit(cache=True, nogil=True)
 def drawn(transitions, s, a, u):
-    """The next state, -1 for the end, of the outcome of (s, a) that u, uniform in [0, 1), falls on."""
+    """The next state, -1 for the end, of (s, a) that u in [0, 1) falls on; probabilities need not sum to 1."""
     total = 0.0
     for k in outcomes_of(transitions, s, a):
         total += outcome(transitions, s, a, k)[1]
-    passed, successor = 0.0, np.int64(-1)
-    for k in outcomes_of(transitions, s, a):
-        t, p = outcome(transitions, s, a, k)
-        if p > 0.0:
-            successor = np.int64(t)
-            passed += p
-            if passed > u * total:
-                break
-    return successor
+    return np.int64(outcome(transitions, s, a, drawn_outcome(transitions, s, a, u * total)[0])[0])
 
 
 @njit(cache=True, nogil=True)

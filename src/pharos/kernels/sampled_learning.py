@@ -1,14 +1,13 @@
 """Q-learning in a kernel from drawn transitions: the loop of `hardness.sampled_regret`, compiled.
 
 Q(c, a) of observation c is q[a, c] where the kernel is a matrix K, else F[c] . W[a] + q[a, c] for features F and a
-diagonal. Random numbers: SplitMix64, as in kernels/learning.py.
+diagonal. Random numbers: the stream of stepping.py.
 """
 
 import numpy as np
 from numba import njit
 
-from pharos.kernels.learning import _below, _random
-from pharos.kernels.stepping import normal_number
+from pharos.kernels.stepping import integer_below, normal_number, redrawn_action, start_by_number, uniform_number
 
 
 @njit(forceinline=True)
@@ -82,7 +81,7 @@ def learn(
     batch, errors = np.zeros(size, np.int64), np.zeros(size)
     for _ in range(steps):
         if place[0] < 0:
-            place[0] = starts[np.searchsorted(cumulative, _random(word), side="right")]
+            place[0] = starts[start_by_number(cumulative, uniform_number(word, 0))]
             place[1] = -1
             place[2] = 0
         s, t = place[0], place[3]
@@ -90,8 +89,8 @@ def learn(
         share = min(1.0, t / exploration) if exploration > 0 else 1.0
         epsilon = first_epsilon + share * (last_epsilon - first_epsilon) if t >= begin else 1.0
         action = 0
-        if _random(word) < epsilon:
-            action = _below(word, num_actions)
+        if uniform_number(word, 0) < epsilon:
+            action = integer_below(word, 0, num_actions)
         else:  # greedy, ties at random
             best, ties = _value(kernel, learnt, c, 0), 1
             for a in range(1, num_actions):
@@ -100,18 +99,13 @@ def learn(
                     best, ties, action = q, 1, a
                 elif q == best:
                     ties += 1
-                    if _random(word) * ties < 1.0:
+                    if uniform_number(word, 0) * ties < 1.0:
                         action = a
-        executed, u = action, _random(word)
-        if place[1] < 0:
-            if u >= chance[3]:
-                executed = _below(word, num_actions)
-        elif u >= chance[0]:
-            executed = place[1] if u < chance[0] + chance[1] else _below(word, num_actions)
+        executed = redrawn_action(action, place[1], chance, num_actions, word)
         row = s * num_actions + executed
         k, last = offsets[row], offsets[row + 1] - 1
         if k < last:
-            u = _random(word)
+            u = uniform_number(word, 0)
             while k < last and u >= likely[k]:
                 k += 1
         new = next_states[k]
@@ -133,7 +127,7 @@ def learn(
         due = (t + 1 - begin) * gradient_steps // period - (t - begin) * gradient_steps // period
         for _ in range(due):
             for i in range(size):
-                j = _below(word, held)
+                j = integer_below(word, 0, held)
                 batch[i] = j
                 y = paid[j]
                 if after[j] >= 0:

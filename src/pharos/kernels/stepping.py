@@ -1,4 +1,9 @@
-"""Chance and the table walk of vector environments: loops over N environments, each with a stream of random numbers."""
+"""Knobs of interaction, for every loop that steps: executed action, laziness, outcome, start, late and noisy pay.
+
+Each knob takes its random numbers as arguments, or from a stream rng[i]: of vector environments (here and in
+rules/interaction.py), of Q-learning (learning.py, sampled_learning.py), of the batched engine (batched_worlds.py). The
+table walk of vector environments.
+"""
 
 from typing import Any, NamedTuple
 
@@ -6,19 +11,19 @@ import numpy as np
 from numba import float64, njit, uint64
 from numba.extending import overload
 
-from pharos.kernels.outcomes import is_table, outcome, outcomes_of, size_of
+from pharos.kernels.outcomes import drawn_outcome, is_table, outcome, size_of
 
 NEXT_STEP, SAME_STEP, DISABLED = range(3)  # when an environment that has ended is reset
 
 
 class Setting(NamedTuple):
-    """What stays the same from step to step.
+    """Constants of a walk.
 
     Attributes:
         ranges: (2, D) int64, lowest and highest value of each component; (2, 0) on a table.
         scale: (D,) float64, of the vectors that `step_many` writes.
-        chance: (chosen, previous, uniform, first_chosen), weights of the executed action; the last is that of the
-            chosen one where there is no previous action. With lazy actions, also the probability that it has no effect.
+        chance: (chosen, previous, uniform, first_chosen, lazy), weights of the executed action, the fourth that of the
+            chosen one where there is no previous action; and the probability that it has no effect.
         limit: steps after which an episode is truncated.
         mode: NEXT_STEP, SAME_STEP or DISABLED.
         first_previous: the previous action on the first step of an episode, -1 for none.
@@ -84,18 +89,52 @@ def next_number(rng):
 
 
 @njit(forceinline=True)
+def integer_below(rng, i, n):
+    """An integer in [0, n) of stream i."""
+    return min(int(uniform_number(rng, i) * n), n - 1)
+
+
+@njit(forceinline=True)
+def normal_by_numbers(u, v):
+    """A standard normal number of two uniform ones, u > 0 (Box and Muller 1958)."""
+    return np.sqrt(-2.0 * np.log(u)) * np.cos(2.0 * np.pi * v)
+
+
+@njit(forceinline=True)
 def normal_number(rng, i):
-    """A standard normal number of stream i, of two uniform ones (Box and Muller 1958)."""
-    radius = np.sqrt(-2.0 * np.log(1.0 - uniform_number(rng, i)))
-    return radius * np.cos(2.0 * np.pi * uniform_number(rng, i))
+    """A standard normal number of stream i."""
+    return normal_by_numbers(1.0 - uniform_number(rng, i), uniform_number(rng, i))
+
+
+@njit(forceinline=True)
+def paid_late(pending, elapsed, earned, is_last):
+    """Pay of a step where rewards come D steps late, and at the end of an episode at once.
+
+    pending (D,): what the last steps earned; elapsed: steps of the episode before this one.
+    """
+    place = elapsed % len(pending)
+    late = pending[place]
+    pending[place] = earned
+    if is_last:
+        for k in range(len(pending)):
+            late += pending[k]
+            pending[k] = 0.0
+    return late
 
 
 @njit(cache=True, nogil=True)
-def add_noise(rng, deviation, mask, out):
-    """out[i] += deviation times a standard normal number of stream i, for every i in `mask`."""
+def pay(rng, deviation, pending, elapsed, is_step, ended, out):
+    """Replace what environments (N,) earned by what they are paid, late (pending (N, D)) and with noise of streams rng.
+
+    elapsed (N,): steps of their episodes so far; those that are reset and not stepped are paid nothing.
+    """
     for i in range(len(out)):
-        if mask[i]:
-            out[i] += deviation * normal_number(rng, i)
+        if is_step[i]:
+            if pending.shape[1] > 0:
+                out[i] = paid_late(pending[i], elapsed[i], out[i], ended[i])
+                elapsed[i] = 0 if ended[i] else elapsed[i] + 1
+            if deviation > 0.0:
+                out[i] += deviation * normal_number(rng, i)
 
 
 @njit(cache=True, nogil=True)
@@ -124,6 +163,17 @@ def executed_by_number(chosen, previous, chance, num_actions, u):
 
 
 @njit(forceinline=True)
+def redrawn_action(chosen, previous, chance, num_actions, rng):
+    """The executed action as `executed_by_number`, where a uniform one takes a second number of the stream rng (1,)."""
+    u = uniform_number(rng, 0)
+    if previous < 0:
+        return chosen if u < chance[3] else integer_below(rng, 0, num_actions)
+    if u < chance[0]:
+        return chosen
+    return previous if u < chance[0] + chance[1] else integer_below(rng, 0, num_actions)
+
+
+@njit(forceinline=True)
 def executed_action(chosen, previous, chance, num_actions, rng, i):
     """The executed action of stream i; nothing is drawn where the chosen action is always executed."""
     if chance[0] >= 1.0:
@@ -131,39 +181,25 @@ def executed_action(chosen, previous, chance, num_actions, rng, i):
     return executed_by_number(chosen, previous, chance, num_actions, uniform_number(rng, i))
 
 
-def laziness(chance):
-    """The probability that an executed action has no effect."""
-
-
-@overload(laziness, inline="always")
-def _laziness(chance):
-    if len(chance) == 4:
-        return lambda chance: 0.0
-    return lambda chance: chance[4]
-
-
+@njit(forceinline=True)
 def has_no_effect(chance, rng, i):
-    """Whether the executed action of stream i changes nothing; nothing is drawn where each has an effect, and the
-    compiler knows it.
-    """
+    """Whether the executed action of stream i changes nothing; nothing is drawn where each has an effect."""
+    return chance[4] > 0.0 and uniform_number(rng, i) < chance[4]
 
 
-@overload(has_no_effect, inline="always")
-def _has_no_effect(chance, rng, i):
-    if len(chance) == 4:
-        return lambda chance, rng, i: False
-    return lambda chance, rng, i: uniform_number(rng, i) < chance[4]
+@njit(forceinline=True)
+def start_by_number(cumulative, u):
+    """The number of a start state, by one uniform number u in [0, 1)."""
+    k = 0
+    while k < len(cumulative) - 1 and u >= cumulative[k]:
+        k += 1
+    return k
 
 
 @njit(forceinline=True)
 def drawn_start(cumulative, rng, i):
     """The number of a start state; nothing is drawn where there is one."""
-    k = 0
-    if len(cumulative) > 1:
-        u = uniform_number(rng, i)
-        while k < len(cumulative) - 1 and u >= cumulative[k]:
-            k += 1
-    return k
+    return start_by_number(cumulative, uniform_number(rng, i)) if len(cumulative) > 1 else 0
 
 
 @njit(cache=True, nogil=True)
@@ -194,15 +230,9 @@ def _outcome_on_table(transitions, rewards, s, a, rng, i):
     if is_table(transitions):
         return lambda transitions, rewards, s, a, rng, i: (transitions[s, a], rewards[s, a], 1.0)
 
-    def drawn(transitions, rewards, s, a, rng, i):  # as the rules draw it, see rules/interaction.py
-        u = uniform_number(rng, i)
-        k, likely, passed = 0, 0.0, 0.0
-        for j in outcomes_of(transitions, s, a):
-            p = outcome(transitions, s, a, j)[1]
-            if p > 0.0 and passed <= u:
-                k, likely = j, p
-                passed += p
-        return outcome(transitions, s, a, k)[0], outcome(rewards, s, a, k)[0], likely
+    def drawn(transitions, rewards, s, a, rng, i):
+        k, probability = drawn_outcome(transitions, s, a, uniform_number(rng, i))
+        return outcome(transitions, s, a, k)[0], outcome(rewards, s, a, k)[0], probability
 
     return drawn
 
@@ -218,24 +248,24 @@ def walk_table(transitions, table_rewards, staying, is_terminal, setting, batch,
     """
     _, _, chance, limit, mode, first_previous, starts, cumulative = setting
     rng, actions, index, previous, elapsed, ended, rewards, terminated, truncated, executed, final = batch[:11]
-    likely = batch[12]
+    probabilities = batch[12]
     num_actions = size_of(transitions)[1]
     for i in range(first, last):
         rewards[i], terminated[i], truncated[i], executed[i] = 0.0, False, False, -1
-        if len(likely) > 0:
-            likely[i] = 1.0
+        if len(probabilities) > 0:
+            probabilities[i] = 1.0
         if ended[i]:
             index[i] = starts[drawn_start(cumulative, rng, i)]
             previous[i], elapsed[i], ended[i] = first_previous, 0, False
             continue
         action = executed_action(actions[i], previous[i], chance, num_actions, rng, i)
         if has_no_effect(chance, rng, i):
-            rewards[i], p = staying[index[i], action], laziness(chance)
+            rewards[i], p = staying[index[i], action], chance[4]
         else:
             index[i], rewards[i], p = outcome_on_table(transitions, table_rewards, index[i], action, rng, i)
-            p *= 1.0 - laziness(chance)
-        if len(likely) > 0:
-            likely[i] = p
+            p *= 1.0 - chance[4]
+        if len(probabilities) > 0:
+            probabilities[i] = p
         previous[i] = executed[i] = action
         elapsed[i] += 1
         terminated[i] = is_terminal[index[i]]

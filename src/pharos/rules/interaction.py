@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import int64
 
-from pharos.kernels.stepping import SAME_STEP, drawn_start, executed_action, has_no_effect, laziness, uniform_number
+from pharos.kernels.stepping import SAME_STEP, drawn_start, executed_action, has_no_effect, uniform_number
 
 
 class InteractionKernels(NamedTuple):
@@ -243,12 +243,12 @@ def step_many_kernel(
                 if has_no_effect(chance, rng, i):
                     value, code = stay(self, states[i], action, following)
                     if K > 1:
-                        likely[i] = laziness(chance)
+                        likely[i] = chance[4]
                 else:
                     branch = action
                     if K > 1:  # nothing is drawn where an action has one outcome
                         outcome, p = drawn_outcome(self, states[i], action, uniform_number(rng, i))
-                        likely[i] = p * (1.0 - laziness(chance))
+                        likely[i] = p * (1.0 - chance[4])
                         branch = action * K + outcome
                     value, code = advance(self, ranges, states[i], branch, following)
                 if code > 1:

@@ -71,7 +71,7 @@ class InterpretedStepping:
                 action = self._executed(int(actions[i]), int(previous[i]), chance, rng, i)
                 before = tuple(states[i].tolist())
                 outcome, after = 0, before
-                lazy = chance[4] if len(chance) > 4 else 0.0
+                lazy = chance[4]
                 if stays := lazy > 0 and _uniform_number(rng, i) < lazy:
                     likely[i : i + 1] = lazy
                 elif self.env.has_chance:

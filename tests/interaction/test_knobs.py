@@ -1,0 +1,338 @@
+"""A knob means the same everywhere: each implementation of it against the same enumeration of a small world.
+
+What is enumerated is the definition of docs/knobs.md, by the rules of the world and nothing else. Exact solvers have to
+agree with it to 1e-9; what draws has to pass a chi-square (or Kolmogorov-Smirnov) test at LEVEL, with fixed seeds.
+"""
+
+import itertools
+from collections import Counter
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from scipy.stats import chisquare, kstest
+
+import pharos
+from naive.learning import paid as paid_of
+from pharos.agents import QLearning
+from pharos.agents.batched import BatchRun
+from pharos.agents.batched.lane import BatchedEpisodes
+from pharos.environments import Environment
+from pharos.interaction import GymEnv, VectorEnv
+from pharos.mdp import rewards_of_staying
+from pharos.policies.query import TableAnswers
+from pharos.policies.value import estimate
+from pharos.rules.stepping import InterpretedStepping
+from pharos.training import Task, evaluate_agent
+
+LEVEL = 1e-4  # probability that a right implementation fails
+KNOBS = {
+    "none": {},
+    "sticky": {"sticky": 0.4},
+    "random": {"random": 0.4},
+    "lazy": {"lazy": 0.3},
+    "sticky and random": {"sticky": 0.5, "random": 0.5},
+    "all": {"sticky": 0.3, "random": 0.4, "lazy": 0.2},
+}
+POLICY = np.array([2, 0, 1, 2])
+HORIZON = 3
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ring(Environment):
+    """Four cells in a ring: an action goes back, stays or goes on, and one time in four a cell further."""
+
+    name = "ring_of_knobs"
+    actions = ("back", "stay", "on")
+    outcomes = 2
+
+    def variables(self):
+        return {"cell": range(4)}
+
+    def initial_state(self):
+        return (0,)
+
+    def probability(self, state, action, outcome):
+        return 0.75 if outcome == 0 else 0.25
+
+    def transition(self, state, action, outcome, out):
+        out[0] = (state[0] + action - 1 + outcome) % 4
+
+    def is_terminal(self, state):
+        return False
+
+    def reward(self, state, action, next_state):
+        return (state[0] + 1) * (action + 1) / 8
+
+
+RING = Ring()
+
+
+@pytest.fixture(scope="module")
+def space():
+    return pharos.build(RING, progress=False)
+
+
+def paths(policy, steps, *, sticky=0.0, random=0.0, lazy=0.0):
+    """{(s0, e0, s1, e1, ..., sn): probability} of states and executed actions; policy: states so far -> action."""
+    law = {(0,): 1.0}
+    for _ in range(steps):
+        longer = Counter()
+        for path, mass in law.items():
+            s, executed = path[-1], np.full(3, random / 3)
+            executed[policy(path[::2])] += 1 - random
+            if len(path) > 1:
+                executed *= 1 - sticky
+                executed[path[-2]] += sticky
+            for e, outcome in itertools.product(range(3), range(2)):
+                moved = mass * executed[e] * (1 - lazy) * RING.probability((s,), e, outcome)
+                longer[(*path, e, RING.next_state((s,), e, outcome)[0])] += moved
+            for e in range(3):
+                longer[(*path, e, s)] += mass * executed[e] * lazy
+        law = longer
+    return law
+
+
+def value(law):
+    """Expected return of paths."""
+    return sum(mass * returned(path) for path, mass in law.items())
+
+
+def returned(path):
+    return sum(RING.reward((s,), e, None) for s, e in zip(path[:-1:2], path[1::2], strict=True))
+
+
+def of_a_table(states):
+    return POLICY[states[-1]]
+
+
+# Two steps of many episodes by each implementation: (N, 3) states --------------------------------------------------
+
+
+def by_rules(knobs, space):
+    return in_vectors(VectorEnv(RING, 6000, time_limit=HORIZON, **knobs))
+
+
+def by_table(knobs, space):
+    return in_vectors(VectorEnv(RING, 6000, time_limit=HORIZON, space=space, **knobs))
+
+
+def by_interpreted_rules(knobs, space):
+    env = VectorEnv(RING, 3000, time_limit=HORIZON, **knobs)
+    env._walk._step_many = InterpretedStepping(RING).step_many
+    return in_vectors(env)
+
+
+def in_vectors(env):
+    env.reset(seed=11)
+    states = [env.states[:, 0]]
+    for _ in range(2):
+        env.step(POLICY[states[-1]])
+        states.append(env.states[:, 0])
+    return np.stack(states, axis=1)
+
+
+def one_by_one(knobs, space):
+    env, episodes = GymEnv(RING, time_limit=HORIZON, **knobs), []
+    env.reset(seed=12)
+    for _ in range(3000):
+        states = [int(env.reset()[1]["state"][0])]
+        for _ in range(2):
+            states.append(int(env.step(POLICY[states[-1]])[4]["state"][0]))
+        episodes.append(states)
+    return np.array(episodes)
+
+
+def learner(knobs, space, limit=HORIZON):
+    """Q-learning that always acts by POLICY, and whose entry is what it was paid last."""
+    task = Task.of(RING, horizon=limit, **knobs)
+    pay = {"reward_noise": task.reward_noise, "reward_delay": task.reward_delay}
+    greedy = {"exploration_initial_eps": 0.0, "exploration_final_eps": 0.0, "learning_rate": 1.0, "gamma": 0.0}
+    return QLearning(task.mdp, total_steps=1, seed=13, time_limit=limit, **pay, **greedy)
+
+
+def step_of(learner):
+    """(state, what is paid) of a step: (-1, ...) at the end."""
+    learner.q[:] = -1e9
+    learner.q[np.arange(4), POLICY] = 0.0
+    state = 0 if learner.place[0] < 0 else int(learner.place[0])
+    learner.learn(1)
+    return int(learner.place[0]), float(learner.q[state, POLICY[state]])
+
+
+def by_q_learning(knobs, space):
+    agent, episodes = learner(knobs, space), []
+    for _ in range(3000):
+        episodes.append([0, *(step_of(agent)[0] for _ in range(HORIZON))][:HORIZON])
+    return np.array(episodes)
+
+
+def batch(knobs, space, copies, limit=HORIZON, frames=1):
+    lazy = knobs.get("lazy", 0.0)
+    task = Task.of(RING, horizon=limit, **{name: p for name, p in knobs.items() if name != "lazy"})
+    run = BatchRun(task.mdp, None, limit, {}, 1, 0, 99)
+    pay = {"reward_noise": task.reward_noise, "reward_delay": task.reward_delay}
+    run = replace(run, laziness=lazy, staying=rewards_of_staying(space).array.astype(float), **pay)
+    return BatchedEpisodes([run], np.array([run.key], np.uint64), copies, frames)
+
+
+def by_batches(knobs, space):
+    episodes = batch(knobs, space, 6000)
+    states = [episodes.state[0].copy()]
+    for step in range(2):
+        episodes.step(step, POLICY[episodes.state], counts=True)
+        states.append(episodes.state[0].copy())
+    return np.stack(states, axis=1)
+
+
+DRAWN = [by_rules, by_interpreted_rules, by_table, one_by_one, by_q_learning, by_batches]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("implementation", DRAWN, ids=lambda function: function.__name__)
+@pytest.mark.parametrize("knobs", KNOBS.values(), ids=KNOBS)
+def test_states_are_as_probable_as_the_definition_of_the_knobs_says(implementation, knobs, space):
+    law = Counter()
+    for path, mass in paths(of_a_table, 2, **knobs).items():
+        law[path[::2]] += mass
+    episodes = implementation(knobs, space)
+    counts = Counter(map(tuple, episodes.tolist()))
+    possible = [states for states, mass in law.items() if mass > 0]
+    assert set(counts) <= set(possible)
+    expected = len(episodes) * np.array([law[states] for states in possible])
+    assert chisquare([counts[states] for states in possible], expected).pvalue > LEVEL
+
+
+@pytest.mark.parametrize("knobs", KNOBS.values(), ids=KNOBS)
+def test_values_are_those_of_the_enumerated_paths(knobs):
+    """Exact evaluation, and the mean of simulated episodes within four standard errors."""
+    law = paths(of_a_table, HORIZON, **knobs)
+    mdp = Task.of(RING, horizon=HORIZON, **knobs).mdp
+    assert pharos.evaluate_policy(mdp, POLICY).value_at_start == pytest.approx(value(law), abs=1e-9)
+    mean, _ = estimate(TableAnswers(mdp, POLICY), (0.0, 5.0), 20_000, np.random.default_rng(14))
+    variance = sum(mass * (returned(path) - value(law)) ** 2 for path, mass in law.items())
+    assert mean == pytest.approx(value(law), abs=4 * np.sqrt(variance / 20_000))
+
+
+# What is paid -------------------------------------------------------------------------------------------------------
+
+
+def pay_by_vectors(knobs, space, steps, limit, copies=50):
+    env = VectorEnv(RING, copies, time_limit=limit, autoreset_mode="SAME_STEP", **knobs)
+    env.reset(seed=15)
+    for _ in range(steps):
+        states = env.states[:, 0]
+        _, pay, _, truncated, info = env.step(POLICY[states])
+        np.testing.assert_array_equal(info["earned_reward"], earned_in(states))
+        yield states, pay, truncated
+
+
+def pay_by_tables(knobs, space, steps, limit):
+    yield from pay_by_vectors({**knobs, "space": space}, space, steps, limit)
+
+
+def pay_one_by_one(knobs, space, steps, limit):
+    env = GymEnv(RING, time_limit=limit, **knobs)
+    env.reset(seed=16)
+    for _ in range(50 * steps):
+        state = np.array(env.state)
+        _, pay, _, truncated, info = env.step(POLICY[state[0]])
+        assert info["earned_reward"] == earned_in(state)
+        yield state, np.array([pay]), np.array([truncated])
+        if truncated:
+            env.reset()
+
+
+def pay_by_q_learning(knobs, space, steps, limit):
+    agent = learner(knobs, space, limit)
+    for _ in range(50 * steps):
+        state = max(agent.place[0], 0)
+        after, pay = step_of(agent)
+        yield np.array([state]), np.array([pay]), np.array([after < 0])
+
+
+def pay_by_batches(knobs, space, steps, limit):
+    episodes = batch(knobs, space, 50, limit)
+    for step in range(steps):
+        states = episodes.state[0].copy()
+        episodes.step(step, POLICY[episodes.state], counts=True)
+        yield states, episodes.reward[0].copy(), episodes.flags[0] > 0
+
+
+def earned_in(states):
+    return (states + 1) * (POLICY[states] + 1) / 8
+
+
+PAID = [pay_by_vectors, pay_by_tables, pay_one_by_one, pay_by_q_learning, pay_by_batches]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("delay", [1, 2, 5])
+@pytest.mark.parametrize("implementation", PAID, ids=lambda function: function.__name__)
+def test_what_is_earned_is_paid_so_many_steps_later_and_at_the_end_at_once(implementation, delay, space):
+    ends, due = 0, None
+    for states, pay, ended in implementation({"reward_delay": delay}, space, 13, 4):
+        due = due or [[] for _ in states]
+        for i, rewards in enumerate(due):
+            rewards.append(earned_in(states)[i])
+            assert pay[i] == paid_of(rewards, delay, ended[i])
+        due = [[] if over else rewards for rewards, over in zip(due, ended, strict=True)]
+        ends += int(ended.sum())
+    assert ends >= 100
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("implementation", PAID, ids=lambda function: function.__name__)
+def test_noise_is_normal_about_what_is_earned(implementation, space):
+    noise = [pay - earned_in(states) for states, pay, _ in implementation({"reward_noise": 0.5}, space, 60, 4)]
+    assert kstest(np.concatenate(noise) / 0.5, "norm").pvalue > LEVEL
+
+
+def test_values_do_not_know_how_rewards_are_paid():
+    plain, other = (Task.of(RING, horizon=4, **pay) for pay in ({}, {"reward_noise": 0.5, "reward_delay": 2}))
+    assert plain.optimal.value_at_start == other.optimal.value_at_start
+
+
+# Frames ---------------------------------------------------------------------------------------------------------------
+
+
+def in_frames(frames):
+    """Going on where both frames are the same, else back: (N, ...) vectors of two frames, in [0, 1] -> actions."""
+    frames = np.asarray(frames).reshape(len(frames), 2)
+    return np.where(frames[:, 0] == frames[:, 1], 2, 0)
+
+
+def of_two_states(states):
+    return 2 if len(states) == 1 or states[-1] == states[-2] else 0
+
+
+@pytest.mark.parametrize("knobs", KNOBS.values(), ids=KNOBS)
+def test_a_policy_of_two_frames_has_the_value_of_the_enumerated_paths(knobs):
+    task = Task.of(RING, horizon=HORIZON, observation_options={"frames": 2}, **knobs)
+    evaluation = evaluate_agent(in_frames, task)
+    assert evaluation.exact
+    assert evaluation.value == pytest.approx(value(paths(of_two_states, HORIZON, **knobs)), abs=1e-9)
+
+
+@pytest.mark.slow
+def test_frames_are_the_last_states_of_the_episode_and_its_first_one_before(space):
+    options = {"time_limit": 5, "observation_options": {"frames": 2}}
+    many, one = VectorEnv(RING, 20, autoreset_mode="SAME_STEP", **options), GymEnv(RING, **options)
+    seen, alone, episodes = many.reset(seed=17)[0], one.reset(seed=17)[0], batch({}, space, 20, 5, frames=2)
+    before, state, batched = many.states[:, 0], one.state[0], episodes.state[0].copy()
+    np.testing.assert_array_equal(seen.reshape(20, 2) * 3, np.stack([before, before], axis=1))
+    np.testing.assert_array_equal(alone.reshape(2) * 3, [state, state])
+    np.testing.assert_array_equal(episodes.seen[0], np.stack([batched, batched], axis=1))
+    for step in range(12):
+        seen, _, _, ended, _ = many.step(np.full(20, 2))
+        now = many.states[:, 0]
+        np.testing.assert_allclose(seen.reshape(20, 2) * 3, np.stack([np.where(ended, now, before), now], axis=1))
+        alone, _, _, over, _ = one.step(2)
+        np.testing.assert_allclose(alone.reshape(2) * 3, [state, one.state[0]])
+        if over:
+            alone = one.reset()[0]
+            np.testing.assert_allclose(alone.reshape(2) * 3, [one.state[0]] * 2)
+        episodes.step(step, np.full((1, 20), 2), counts=True)
+        first, current = (episodes.flags[0] > 0), episodes.state[0].copy()
+        np.testing.assert_array_equal(episodes.seen[0], np.stack([np.where(first, current, batched), current], axis=1))
+        before, state, batched = now, one.state[0], current
