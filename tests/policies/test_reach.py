@@ -38,7 +38,7 @@ def test_rows_that_are_asked_about_at_once_are_those_that_are_met_level_by_level
     for policy in policies:
         slow, quick = TableAnswers(policy, mdp), TableAnswers(policy, mdp)
         is_whole = slow.reach(most, mdp.horizon)
-        assert quick.take(lambda: reachable_rows(mdp, most, mdp.horizon)) is is_whole
+        assert quick.query_all(lambda: reachable_rows(mdp, most, mdp.horizon)) is is_whole
         assert is_whole == (most == 1000)
         assert quick.rows.tolist() == slow.rows.tolist()
         assert quick.probabilities.tobytes() == slow.probabilities.tobytes()
@@ -52,7 +52,7 @@ def test_a_policy_that_gives_an_action_no_chance_is_not_asked_so(chance):
     partly[17] = [1.0, 0.0, 0.0]  # not where episodes start
     for policy, is_asked in ((greedy(mdp), False), (partly, True)):
         answers, calls = TableAnswers(policy, mdp), []
-        assert answers.take(lambda calls=calls: calls.append(1) or reachable_rows(mdp, 1000, 6)) is None
+        assert answers.query_all(lambda calls=calls: calls.append(1) or reachable_rows(mdp, 1000, 6)) is None
         assert len(answers.rows) == 0 and bool(calls) == is_asked
 
 

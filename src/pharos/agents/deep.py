@@ -92,7 +92,7 @@ def _title(agent: str | type) -> str:
 
 
 def _expected(name: str, value: Any) -> str | None:
-    """What a hyperparameter should be where `value` is not that; schedules and the like pass."""
+    """Expected type of a hyperparameter where `value` has another one; schedules and the like pass."""
     if not isinstance(value, int | float | str):
         return None
     number = value if not isinstance(value, bool | str) else math.nan
@@ -182,7 +182,7 @@ TABULAR_OBSERVATION = "index"
 
 @dataclass(frozen=True)
 class AgentKind:
-    """What the rest of pharos needs to know of an agent before it exists.
+    """Properties of an agent that are known before it is made.
 
     Attributes:
         name: as `train` takes it.
@@ -216,7 +216,7 @@ BATCHED = ("dqn", "ppo")
 
 
 def agent_kind(name: str) -> AgentKind:
-    """What the agent called `name` is; a class of an algorithm for Stable-Baselines3 is a network."""
+    """Kind of the agent called `name`; a class of an algorithm for Stable-Baselines3 is a network."""
     return AGENTS.get(name) or AgentKind(name, name.rpartition(":")[2])
 
 
@@ -230,7 +230,7 @@ def is_known(name: str) -> bool:
 
 
 def agent_source(name: str, folder: str | Path | None = None, *, check: bool = True) -> Source | None:
-    """Where an agent of the user's own is; None for all others.
+    """Place of the code of a user's own agent; None for all others.
 
     Args:
         folder: relative files and modules are looked for there first; None: in the current directory.

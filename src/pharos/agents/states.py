@@ -13,6 +13,6 @@ def joined_states(states: Iterable[State]) -> dict[str, np.ndarray]:
 
 
 def state_of(joined: State, i: int) -> dict[str, np.ndarray]:
-    """That of learner i."""
+    """State of learner i."""
     prefix = f"{i}/"
     return {name[len(prefix) :]: array for name, array in joined.items() if name.startswith(prefix)}

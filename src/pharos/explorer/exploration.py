@@ -1,4 +1,4 @@
-"""What a page asks of an MDP: states with their values, gaps and successors, paths, layers, maps.
+"""Data of a page about an MDP: states with their values, gaps and successors, paths, layers, maps.
 
 Answers are plain dictionaries, ready for JSON; numbers that JSON cannot say are None. A position is a state and, under
 sticky actions, the action executed before; there is none before the first step.
@@ -31,7 +31,7 @@ from pharos.state_space import StateSpace
 
 
 class Visits:
-    """How often policies are in states, discounted, from the start: d(s) = sum over t of gamma^t P(s_t = s)."""
+    """Discounted visits of states by policies, from the start: d(s) = sum over t of gamma^t P(s_t = s)."""
 
     def __init__(self, exploration: "Exploration"):
         self.exploration, self._known = exploration, dict[str, np.ndarray]()
@@ -177,7 +177,7 @@ class Exploration:
 
     @cached_property
     def visits(self) -> Visits:
-        """How often policies are in states."""
+        """Visits of states by policies."""
         return Visits(self)
 
     # Of one state ---------------------------------------------------------------------------------------------------
@@ -261,9 +261,9 @@ class Exploration:
             before, listed = self._variables_of(state), []
             for outcome in range(env.outcomes):
                 if (probability := float(env.probability(before, action, outcome))) > 0:
-                    following = env.next_state(before, action, outcome)
-                    reward = float(env.reward_of(before, action, following, outcome))
-                    after = self.states.number(following) if following[0] < mdp.num_states or self.space else None
+                    next_state = env.next_state(before, action, outcome)
+                    reward = float(env.reward_of(before, action, next_state, outcome))
+                    after = self.states.number(next_state) if next_state[0] < mdp.num_states or self.space else None
                     listed.append((after, probability, reward))
             return listed
         mean = float(mdp.reward_table.rows(np.array([state]))[0, action])
@@ -364,7 +364,7 @@ class Exploration:
     # Where a policy goes wrong --------------------------------------------------------------------------------------
 
     def wrong(self, policy: str = LEARNT) -> dict[str, Any]:
-        """Where a policy loses: along its likeliest way, and in all.
+        """Losses of a policy: along its most probable path, and in all states.
 
         Returns:
             `regret`, V* minus its value at the start; `lost`, the sum of what it loses in all states; `first`, the
@@ -391,7 +391,7 @@ class Exploration:
     # The page as a whole --------------------------------------------------------------------------------------------
 
     def about(self) -> dict[str, Any]:
-        """What the page says of the whole, and needs for what it draws."""
+        """Page metadata: title, sizes, policies, map axes."""
         from pharos.explorer.maps import about_maps
 
         mdp, starts = self.mdp, np.argsort(-self.mdp.start_probabilities, kind="stable")[:MOST_STARTS]
@@ -472,7 +472,7 @@ class Pictures:
 
 
 def kit_of(env: Environment) -> dict[str, Any]:
-    """What the drawings of an environment are composed of.
+    """Parts that the drawings of an environment are composed of.
 
     Returns:
         `rows`, `columns`, `cell` (pixels) and `margin` (pixels) of the drawing; `ground`, the URL of what lies below
@@ -502,7 +502,7 @@ def kit_of(env: Environment) -> dict[str, Any]:
 
 
 def num_kinds(layer: Layer) -> int:
-    """How many values of a layer look different; higher ones look like the last."""
+    """Number of values of a layer that look different; higher ones look like the last."""
     colors = len(layer.color) if np.ndim(layer.color) == 2 else 1
     sprites = len(layer.sprite) if layer.sprite is not None and not isinstance(layer.sprite[0], str) else 1
     return max(len(layer.glyph), colors, sprites)

@@ -116,7 +116,7 @@ def exploration_of(
     in_one_page: bool = False,
     progress: Callable[[str], None] = lambda text: None,
 ) -> Exploration:
-    """What `explore` shows. `title`, `progress`: as for `Exploration`; `env`: draws the states of an MDP.
+    """Exploration that `explore` shows. `title`, `progress`: as for `Exploration`; `env`: draws the states of an MDP.
 
     Args:
         in_one_page: whether it is for a page of its own; what is too large for that is refused before it is solved.
@@ -185,12 +185,12 @@ def _of_run(
     space = task.space
     mdp = task.chance.of(space.mdp(gamma=GAMMA if gamma is None else gamma))
     title = title or _title(task.env)
-    said = described(task.chance, mdp)
-    return Exploration(mdp, env=task.env, space=space, learnt=learnt, title=title, chance=said, progress=progress)
+    setting = described(task.chance, mdp)
+    return Exploration(mdp, env=task.env, space=space, learnt=learnt, title=title, chance=setting, progress=progress)
 
 
 def _facts(record: Any, task: Any) -> dict[str, str]:
-    """What the run says of itself, in its own setting."""
+    """Facts that the run recorded, in its own setting."""
     result, config = record.get("result", {}), record["config"]
     limit = "discounted, no horizon" if task.horizon_steps is None else f"episodes of {task.horizon_steps} steps"
     facts = {"trained": f"{config.get('steps', 0):,} steps, observation {task.observation}", "its setting": limit}

@@ -73,9 +73,9 @@ def _largest_successors(dynamics: Dynamics) -> np.ndarray:
         actions = np.tile(np.arange(dynamics.num_actions), len(states))
         outcomes = dynamics.outcomes(np.repeat(states, dynamics.num_actions), actions)
         inside = np.where(outcomes.states < dynamics.num_states, outcomes.states, -1)
-        each = np.full(len(states), -1)
-        np.maximum.at(each, outcomes.which // dynamics.num_actions, inside)
-        result[states] = each
+        largest = np.full(len(states), -1)
+        np.maximum.at(largest, outcomes.which // dynamics.num_actions, inside)
+        result[states] = largest
     return result
 
 
@@ -86,8 +86,8 @@ def _distances(mdp: TabularMDP) -> np.ndarray:
     result[frontier] = 0
     live = ~np.append(np.asarray(mdp.terminal), True)
     while frontier.size:
-        following = mdp.dynamics.successors_of(frontier[live[frontier]])
-        frontier = following[(result[following] < 0) & (following < mdp.num_states)]
+        next_states = mdp.dynamics.successors_of(frontier[live[frontier]])
+        frontier = next_states[(result[next_states] < 0) & (next_states < mdp.num_states)]
         layer += 1
         result[frontier] = layer
     return result[:-1]

@@ -1,4 +1,4 @@
-"""What was learnt: the policy as a table, what it is worth, and where it goes wrong."""
+"""Learnt policy of a run: its table, its value, and its losses."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field

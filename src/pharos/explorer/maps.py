@@ -93,11 +93,11 @@ def heat_map(
         raise UnknownName("summary", how, HOW)
     if what not in quantities(world):
         raise UnknownName("quantity", what, quantities(world))
-    chosen = {_variable(world, name): value for name, value in (fixed or {}).items()}
+    slices = {_variable(world, name): value for name, value in (fixed or {}).items()}
     cells = _Cells(down.count, across.count)
     for start in range(0, world.mdp.num_states, BLOCK):
         block = slice(start, min(start + BLOCK, world.mdp.num_states))
-        states = np.flatnonzero(world.states.matching(chosen, block))
+        states = np.flatnonzero(world.states.matching(slices, block))
         if not states.size:
             continue
         places = [axis.places(world.states.column(axis.variable, block)[states]) for axis in (down, across)]
@@ -114,7 +114,7 @@ def _variable(world: Exploration, name: str) -> int:
 
 
 class _Cells:
-    """What was seen in each cell so far."""
+    """Values met in each cell so far."""
 
     def __init__(self, rows: int, columns: int):
         self.shape, size = (rows, columns), rows * columns
@@ -159,7 +159,7 @@ class _Cells:
 
 
 def about_maps(world: Exploration) -> dict[str, Any]:
-    """What the page offers: `axes`, `quantities`, and which are drawn first, `first`: x, y."""
+    """Choices of the page: `axes`, `quantities`, and which are drawn first, `first`: x, y."""
     axes = axes_of(world.states)
     return {
         "axes": [asdict(axis) for axis in axes.values()],

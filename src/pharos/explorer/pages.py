@@ -41,7 +41,7 @@ def _digest(text: str) -> str:
 
 
 def _policy(connect: str) -> str:
-    """What a browser may do for the page: execute this very script, show pictures that it holds, ask `connect`."""
+    """Content security policy of the page: execute this very script, show pictures that it holds, ask `connect`."""
     code, look = _digest(script()), _digest(_read("page.css"))
     return (
         f"default-src 'none'; script-src 'sha256-{code}'; style-src 'sha256-{look}'; "
@@ -67,7 +67,7 @@ def page(world: Exploration, data: dict[str, Any] | None = None) -> str:
 
 
 def contents(world: Exploration) -> dict[str, Any]:
-    """What a page of its own holds: all positions, and all quantities of all states.
+    """Data of a page in one file: all positions, and all quantities of all states.
 
     Raises:
         ParameterError: there are more than MOST_POSITIONS.

@@ -1,4 +1,4 @@
-"""What the numbers of states stand for: the variables of a state space, or where there are none the number itself."""
+"""Meaning of state numbers: the variables of a state space, or where there are none the number itself."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -149,7 +149,7 @@ def _folded(name: str, low: int, size: int) -> tuple[Axis, Axis]:
 
 
 def _intervals(size: int) -> tuple[int, int]:
-    """How many intervals of how many values."""
+    """(number of intervals, values in each)."""
     width = -(-size // MOST)
     return -(-size // width), width
 

@@ -1,4 +1,4 @@
-"""What agents see beyond the current state: the frames before, and coins that mean nothing."""
+"""Observations beyond the current state: the frames before, and irrelevant coins."""
 
 from typing import Any
 
@@ -30,7 +30,7 @@ class FrameStack:
             if seed is not None:
                 self._rng[i] = stream_of(seed, 2)[0]
 
-    def follow(self, states: np.ndarray, moves: np.ndarray, begins: np.ndarray) -> None:
+    def push(self, states: np.ndarray, moves: np.ndarray, begins: np.ndarray) -> None:
         """Environments are in states (N, D) now; (N,) bool: `moves` by a step, `begins` at the start of an episode."""
         if self.observation.frames > 1:
             frames = self.observation.frame(states)
@@ -38,12 +38,12 @@ class FrameStack:
             self._frames[moves, -1] = frames[moves]
             self._frames[begins] = frames[begins, None]
 
-    def now(self, states: np.ndarray, previous: np.ndarray, elapsed: np.ndarray) -> Any:
-        """A batch of N observations of where they are; `follow` has been told."""
+    def current(self, states: np.ndarray, previous: np.ndarray, elapsed: np.ndarray) -> Any:
+        """A batch of N observations of where they are; after `push`."""
         return self._in_context(self._frames, slice(None), states, previous, elapsed)
 
-    def final(self, rows: np.ndarray, states: np.ndarray, previous: np.ndarray, elapsed: np.ndarray) -> Any:
-        """The last observations of the episodes of environments `rows`, in states (len(rows), D) that `follow` is not
+    def terminal(self, rows: np.ndarray, states: np.ndarray, previous: np.ndarray, elapsed: np.ndarray) -> Any:
+        """The last observations of the episodes of environments `rows`, in states (len(rows), D) that `push` is not
         told.
         """
         frames = self._frames[rows]

@@ -88,9 +88,9 @@ class GymEnv(SimulatedEnv, gymnasium.Env):
         self._outcome_one = simulator.rules.outcome_one
         self._stream: Stream | None = None  # of random numbers, where the rules have chance
         self._is_index = simulator.context.is_plain and isinstance(observation, Index)
-        self._seeing = FrameStack(simulator, 1) if simulator.context.has_more else None
+        self._frame_stack = FrameStack(simulator, 1) if simulator.context.has_more else None
         self._last: Any = None  # the observation, where it is more than a function of the state
-        self._payment = RewardChannel(interaction.chance, 1) if simulator.modifies_rewards else None
+        self._reward_channel = RewardChannel(interaction.chance, 1) if simulator.modifies_rewards else None
         space = simulator.state_space
         self._successors = None if space is None or self._has_outcomes else space.successors
 
@@ -113,11 +113,11 @@ class GymEnv(SimulatedEnv, gymnasium.Env):
         """Start an episode; `options={"state": ...}` says where (D integers)."""
         super().reset(seed=seed)
         simulator = self.simulator
-        if self._payment is not None:
-            self._payment.seed([seed])
-            self._payment.restart(_ONE)
-        if self._seeing is not None:
-            self._seeing.seed([seed])
+        if self._reward_channel is not None:
+            self._reward_channel.seed([seed])
+            self._reward_channel.restart(_ONE)
+        if self._frame_stack is not None:
+            self._frame_stack.seed([seed])
         if self._has_outcomes and (seed is not None or self._stream is None):
             self._stream = Stream(int(self.np_random.integers(1 << 63)) if seed is None else seed)
         if options is not None and options.get("state") is not None:
@@ -135,61 +135,61 @@ class GymEnv(SimulatedEnv, gymnasium.Env):
             self._index = self._index_of(self._state)
         if self._window is not None:
             self.render()
-        if observation is None or self._seeing is not None:
+        if observation is None or self._frame_stack is not None:
             observation = self._observation(begins=True)
         return observation, self._info(self._state)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Choose an action. After a terminal state nothing changes and nothing is paid."""
-        chosen = operator.index(action)
-        if not 0 <= chosen < self._num_actions:
+        executed = operator.index(action)
+        if not 0 <= executed < self._num_actions:
             raise ParameterError(f"{self.environment}: action {action!r}; expected 0 to {self._num_actions - 1}")
         state = self._state
         if state is None or self._terminated:
             return self._step_after_the_end()
         if self._has_chance and (u := (self._stream or self.np_random).random()) >= self._stays:
-            chosen = self.simulator.executed(chosen, self._previous, u)
-        branch, likely = chosen, 1.0
+            executed = self.simulator.executed(executed, self._previous, u)
+        branch, probability = executed, 1.0
         if self._lazy and (self._stream or self.np_random).random() < self._lazy:
-            branch, likely = -1 - chosen, self._lazy
+            branch, probability = -1 - executed, self._lazy
         elif self._stream is not None:
-            outcome, likely = self._outcome_one(self._parameters, state, chosen, self._stream.random())
-            branch, likely = chosen * self._num_outcomes + outcome, likely * (1.0 - self._lazy)
-        following = self._spare
+            outcome, probability = self._outcome_one(self._parameters, state, executed, self._stream.random())
+            branch, probability = executed * self._num_outcomes + outcome, probability * (1.0 - self._lazy)
+        next_state = self._spare
         observation: Any = self._blank.copy()
         if self._step_and_draw is not None:
             reward, code = self._step_and_draw(
-                self._parameters, self._ranges, state, branch, following, self._shades, observation
+                self._parameters, self._ranges, state, branch, next_state, self._shades, observation
             )
         else:
             reward, code = self._step_one(
-                self._parameters, self._ranges, self._scale, state, branch, following, observation
+                self._parameters, self._ranges, self._scale, state, branch, next_state, observation
             )
         if code:
             if code > 1:
-                self.simulator.raise_fault(state, chosen, code - 2)
+                self.simulator.raise_fault(state, executed, code - 2)
             self._terminated = True
-        self._state, self._spare = following, state
-        self._previous = chosen
+        self._state, self._spare = next_state, state
+        self._previous = executed
         self._elapsed += 1
-        info: dict[str, Any] = {"state": following.copy(), "executed_action": chosen}
+        info: dict[str, Any] = {"state": next_state.copy(), "executed_action": executed}
         if self._successors is not None:
             if branch >= 0:
-                self._index = int(self._successors[self._index, chosen])
+                self._index = int(self._successors[self._index, executed])
             info["index"] = self._index
         if self._has_outcomes:
-            info["prob"] = likely
+            info["prob"] = probability
             if self.simulator.state_space is not None:
-                info["index"] = self._index = self._index_of(following)
+                info["index"] = self._index = self._index_of(next_state)
         if not self._is_written:
             observation = self._observation()
         if self._window is not None:
             self.render()
         is_truncated = self._elapsed >= self._limit
-        if self._payment is not None:
+        if self._reward_channel is not None:
             info["earned_reward"] = reward
             ended = np.array([self._terminated or is_truncated])
-            reward = float(self._payment.pay(np.array([reward]), _ONE, ended)[0])
+            reward = float(self._reward_channel.pay(np.array([reward]), _ONE, ended)[0])
         return observation, reward, self._terminated, is_truncated, info
 
     def _step_after_the_end(self) -> tuple[Any, float, bool, bool, dict[str, Any]]:
@@ -224,7 +224,7 @@ class GymEnv(SimulatedEnv, gymnasium.Env):
             info["index"] = self._index
         if self._has_outcomes:
             info["prob"] = 1.0
-        if self._payment is not None:
+        if self._reward_channel is not None:
             info["earned_reward"] = 0.0
         return info
 
@@ -240,10 +240,10 @@ class GymEnv(SimulatedEnv, gymnasium.Env):
     def _observation(self, *, begins: bool = False) -> Any:
         if self._is_index:
             return np.int64(self._index)
-        if self._seeing is not None:
+        if self._frame_stack is not None:
             states, context = self._started()[None], (np.array([self._previous]), np.array([self._elapsed]))
-            self._seeing.follow(states, _ONE, np.array([begins]))
-            batch = self._seeing.now(states, *context)
+            self._frame_stack.push(states, _ONE, np.array([begins]))
+            batch = self._frame_stack.current(states, *context)
             self._last = {k: v[0] for k, v in batch.items()} if isinstance(batch, dict) else batch[0]
             return self._last
         return self.simulator.context.one(self._started(), self._previous, self._elapsed)

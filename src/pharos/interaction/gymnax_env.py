@@ -18,7 +18,7 @@ from pharos.mdp import TabularMDP
 
 @struct.dataclass
 class EnvState(environment.EnvState):
-    """Where an episode is.
+    """State of an episode.
 
     Attributes:
         time: steps so far.
@@ -98,7 +98,7 @@ class GymnaxEnv(environment.Environment):
 
     @property
     def name(self) -> str:
-        """As pharos writes the environment."""
+        """Name of the environment as pharos writes it."""
         return self._name
 
     @property
@@ -116,10 +116,10 @@ class GymnaxEnv(environment.Environment):
         first = jnp.where(u < first_chosen, action, uniform)
         executed = jnp.where(state.previous == self._num_actions, first, later).astype(jnp.int32)
         outcome = _drawn(params.cumulative[state.index, executed], jax.random.uniform(key_outcome))
-        following = params.successors[state.index, executed, outcome]
+        next_index = params.successors[state.index, executed, outcome]
         reward = params.rewards[state.index, executed]
-        after = EnvState(time=state.time + 1, index=following, previous=executed)
-        is_over = params.ends[following]
+        after = EnvState(time=state.time + 1, index=next_index, previous=executed)
+        is_over = params.ends[next_index]
         info = {"discount": jnp.where(is_over, 0.0, 1.0), "executed": executed}
         return self.get_obs(after, params), after, reward, is_over, info
 
@@ -132,7 +132,7 @@ class GymnaxEnv(environment.Environment):
         return self.get_obs(state, params), state
 
     def get_obs(self, state: Any, params: Any = None, key: Any = None) -> Any:
-        """What is seen of a state."""
+        """Observation of a state."""
         return (self._params if params is None else params).observations[state.index]
 
     def is_terminated(self, state: Any, params: Any) -> Any:

@@ -59,7 +59,7 @@ class Simulator:
         chance: (chosen, previous, uniform), weights of the executed action; they sum to 1.
         first_chosen: the weight of the chosen action where there is no previous one; the rest is uniform.
         lazy: the probability that the executed action has no effect.
-        pays_otherwise: whether rewards are paid late or with noise.
+        modifies_rewards: whether rewards are paid late or with noise.
         has_chance: whether another than the chosen action may be executed.
         has_outcomes: whether the rules have chance, so that an outcome is drawn after the action.
         start_states (K, D), start_cumulative (K,): start states and the cumulative sum of their probabilities.
@@ -82,7 +82,7 @@ class Simulator:
         chance = Chance.of(options.chance.sticky, options.chance.random)
         self.chance, self.first_chosen = chance.triple, float(chance.first_chosen)
         self.lazy = float(options.chance.lazy)
-        self._weights = (*self.chance, self.first_chosen, *([self.lazy] if self.lazy else []))
+        self._weights = (*self.chance, self.first_chosen, self.lazy)
         self.modifies_rewards = options.chance.modifies_rewards
         self.has_chance = self.chance != (1.0, 0.0, 0.0)
         self.has_outcomes = self.env.has_chance
@@ -96,7 +96,7 @@ class Simulator:
         self.rules = rules_of(self.env).stepping
 
     def setting(self, mode: int, ranges: np.ndarray, scale: np.ndarray, starts: np.ndarray) -> Setting:
-        """What the kernels of many environments take; `starts` are states, or their indices in a state space."""
+        """Arguments of the kernels of many environments; `starts` are states, or their indices in a state space."""
         limit = self.limit if self.limit is not None else 1 << 62
         return Setting(ranges, scale, self._weights, limit, mode, self.first_previous, starts, self.start_cumulative)
 
@@ -160,7 +160,7 @@ def stream_of(seed: int | None, *purpose: int) -> np.ndarray:
 
 
 class SimulatedEnv:
-    """What single and vector environments say of their `simulator` in the same words."""
+    """Base of single and vector environments: properties of their `simulator`."""
 
     simulator: Simulator
     action_names: tuple[str, ...]
@@ -237,12 +237,12 @@ def _indexed(env: Environment) -> "StateSpace":
 
 
 def _time_limit(limit: int | str | None, env: Environment) -> int | None:
-    chosen = env.max_episode_steps if limit == "default" else limit
-    if chosen is None:
+    steps = env.max_episode_steps if limit == "default" else limit
+    if steps is None:
         return None
-    if isinstance(chosen, bool) or not isinstance(chosen, int | np.integer) or chosen < 1:
+    if isinstance(steps, bool) or not isinstance(steps, int | np.integer) or steps < 1:
         raise ParameterError(f"time_limit is {limit!r}; expected a number of steps of at least 1, None or 'default'")
-    return int(chosen)
+    return int(steps)
 
 
 def _first_previous(action: int | None, env: Environment) -> int:

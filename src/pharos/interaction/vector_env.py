@@ -86,8 +86,8 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
         self._previous = np.full(n, NO_ACTION, np.int64)
         self._elapsed = np.zeros(n, np.int64)
         self._ended = np.zeros(n, np.bool_)
-        self._seeing = FrameStack(simulator, n) if simulator.context.has_more else None
-        self._payment = RewardChannel(interaction.chance, n) if simulator.modifies_rewards else None
+        self._frame_stack = FrameStack(simulator, n) if simulator.context.has_more else None
+        self._reward_channel = RewardChannel(interaction.chance, n) if simulator.modifies_rewards else None
         self._num_drawn = n if simulator.has_outcomes else 0  # outcomes that are drawn in a step
         walk = RulesWalk if simulator.state_space is None else TableWalk
         self._walk: Any = walk(simulator, n, self._mode)
@@ -124,8 +124,8 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
         self._previous[mask] = self.simulator.first_previous
         self._elapsed[mask] = 0
         self._ended[mask] = False
-        if self._payment is not None:
-            self._payment.restart(mask)
+        if self._reward_channel is not None:
+            self._reward_channel.restart(mask)
         executed = np.full(self.num_envs, NO_ACTION, np.int64)
         info = self._info(executed, np.ones(self._num_drawn))
         return self._observations(mask, mask), info
@@ -141,34 +141,34 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
                 f"call reset(options={{'reset_mask': terminated | truncated}}), or choose another autoreset_mode"
             )
         n = self.num_envs
-        rewards, executed, likely = np.empty(n), np.empty(n, np.int64), np.empty(self._num_drawn)
+        rewards, executed, probabilities = np.empty(n), np.empty(n, np.int64), np.empty(self._num_drawn)
         terminated, truncated = np.empty(n, np.bool_), np.empty(n, np.bool_)
         walk = self._walk
         walk.step(
             Batch(
                 self._rng, actions, walk.current, self._previous, self._elapsed, self._ended,
-                rewards, terminated, truncated, executed, walk.final, walk.vectors(), likely,
+                rewards, terminated, truncated, executed, walk.final, walk.vectors(), probabilities,
             )
         )  # fmt: skip
-        info = self._info(executed, likely)
+        info = self._info(executed, probabilities)
         done = terminated | truncated
-        if self._payment is not None:
-            rewards = self._payment.pay(rewards, executed != NO_ACTION, done)
-            info["earned_reward"] = self._payment.earned
+        if self._reward_channel is not None:
+            rewards = self._reward_channel.pay(rewards, executed != NO_ACTION, done)
+            info["earned_reward"] = self._reward_channel.earned
         if self._mode == SAME_STEP and done.any():
             self._add_final(info, done)
         begins = done if self._mode == SAME_STEP else executed == NO_ACTION
         return self._observations(np.ones_like(done), begins), rewards, terminated, truncated, info
 
     def _observations(self, moves: np.ndarray, begins: np.ndarray) -> Any:
-        """Of the current states; `moves` and `begins` (N,) bool: where there was a step, or an episode begins."""
-        if self._seeing is None:
+        """Observations of the current states; `moves`, `begins` (N,) bool: after a step, at the start of an episode."""
+        if self._frame_stack is None:
             return self._walk.observations(self._previous, self._elapsed)
         states = self.states
-        self._seeing.follow(states, moves, begins)
-        return self._seeing.now(states, self._previous, self._elapsed)
+        self._frame_stack.push(states, moves, begins)
+        return self._frame_stack.current(states, self._previous, self._elapsed)
 
-    def _info(self, executed: np.ndarray, likely: np.ndarray) -> dict[str, Any]:
+    def _info(self, executed: np.ndarray, probabilities: np.ndarray) -> dict[str, Any]:
         everywhere = np.ones(self.num_envs, np.bool_)
         name = self._walk.name
         info = {
@@ -177,9 +177,9 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
             "executed_action": executed,
             "_executed_action": everywhere,
         }
-        if len(likely):
-            info["prob"], info["_prob"] = likely, everywhere
-        if self._payment is not None:
+        if len(probabilities):
+            info["prob"], info["_prob"] = probabilities, everywhere
+        if self._reward_channel is not None:
             info["earned_reward"], info["_earned_reward"] = np.zeros(self.num_envs), everywhere
         return info
 
@@ -187,10 +187,10 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
         """The last observations and infos, as Gymnasium's own vector environments give them."""
         rows, executed = np.flatnonzero(done), info["executed_action"]
         context = executed[rows], self._walk.final_elapsed[rows]
-        if self._seeing is None:
+        if self._frame_stack is None:
             last = self._walk.final_observations(rows, *context)
         else:
-            last = self._seeing.final(rows, self._walk.final_states(rows), *context)
+            last = self._frame_stack.terminal(rows, self._walk.final_states(rows), *context)
         final = np.full(self.num_envs, None, object)
         for row, observation in zip(rows, _rows_of(last, len(rows)), strict=True):
             final[row] = observation
@@ -223,7 +223,7 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
             raise ParameterError(f"seed has {len(seeds)} entries; expected one integer, or {n}")
         if self._rng is None:
             self._rng = np.random.SeedSequence().generate_state(n, np.uint64)
-        for streams in (self._payment, self._seeing):
+        for streams in (self._reward_channel, self._frame_stack):
             if streams is not None:
                 streams.seed(seeds)
         for i, one in enumerate(seeds):
@@ -243,19 +243,20 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
         return mask
 
     def _checked_actions(self, actions: Any) -> np.ndarray:
-        chosen = np.asarray(actions)
-        if chosen.shape != (self.num_envs,) or chosen.dtype.kind not in "iu":
+        indices = np.asarray(actions)
+        if indices.shape != (self.num_envs,) or indices.dtype.kind not in "iu":
             raise ParameterError(
-                f"{self.environment}: actions have shape {chosen.shape} and dtype {chosen.dtype}; "
+                f"{self.environment}: actions have shape {indices.shape} and dtype {indices.dtype}; "
                 f"expected ({self.num_envs},) integers"
             )
-        chosen = np.ascontiguousarray(chosen, np.int64)
-        i = first_outside(chosen, len(self.action_names))
+        indices = np.ascontiguousarray(indices, np.int64)
+        i = first_outside(indices, len(self.action_names))
         if i >= 0:
             raise ParameterError(
-                f"{self.environment}: action {chosen[i]} of environment {i}; expected 0 to {len(self.action_names) - 1}"
+                f"{self.environment}: action {indices[i]} of environment {i}; "
+                f"expected 0 to {len(self.action_names) - 1}"
             )
-        return chosen
+        return indices
 
 
 def make_vec(name_or_env: Environment | str, num_envs: int = 1, **options: Any) -> VectorEnv:

@@ -1,4 +1,4 @@
-"""How the N states of a vector environment advance: by the rules, or by looking successors up in a built state space.
+"""Steps of N states of a vector environment: by the rules, or by looking successors up in a built state space.
 
 Kernels get Setting and Batch as plain tuples: named ones cost Numba a microsecond a call more.
 """
@@ -56,9 +56,9 @@ class RulesWalk:
         if state is not None:
             self.current[mask] = _states_of(self.simulator, state, len(mask))[mask]
             return
-        chosen = np.zeros(len(mask), np.int64)
-        stepping.draw_starts(self.simulator.start_cumulative, rng, mask, chosen)
-        self.current[mask] = self.simulator.start_states[chosen[mask]]
+        numbers = np.zeros(len(mask), np.int64)
+        stepping.draw_starts(self.simulator.start_cumulative, rng, mask, numbers)
+        self.current[mask] = self.simulator.start_states[numbers[mask]]
 
     def vectors(self) -> np.ndarray:
         """Room for the vectors of the next step; without rows where the compiled step does not write them."""
@@ -125,9 +125,9 @@ class TableWalk:
             states = _states_of(self.simulator, state, len(mask))
             self.current[mask] = self.space.indices(states[mask])
             return
-        chosen = np.zeros(len(mask), np.int64)
-        stepping.draw_starts(self.simulator.start_cumulative, rng, mask, chosen)
-        self.current[mask] = self._starts[chosen[mask]]
+        numbers = np.zeros(len(mask), np.int64)
+        stepping.draw_starts(self.simulator.start_cumulative, rng, mask, numbers)
+        self.current[mask] = self._starts[numbers[mask]]
 
     def vectors(self) -> np.ndarray:
         """No room: tables know no vectors."""
@@ -163,7 +163,7 @@ class TableWalk:
 
 
 def _tables(space: "StateSpace") -> tuple[Any, Any]:
-    """What executing an action leads to, and what that pays, as `stepping.walk_table` takes them."""
+    """(successors, rewards) of executed actions, as `stepping.walk_table` takes them."""
     if not space.has_chance:
         return as_array(space.successors), np.ascontiguousarray(space.mdp().rewards, np.float64)
     dynamics: Any = space.dynamics

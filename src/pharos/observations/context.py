@@ -12,7 +12,7 @@ NO_ACTION = -1  # the previous action on the first step of an episode
 
 
 class ObservationInContext:
-    """What the agent gets: an observation of the state; with the previous action, the remaining time where wanted.
+    """Input of an agent: an observation of the state, with the previous action and the remaining time where wanted.
 
     Without either, the observation itself. A `vector` is extended: one entry for each action (1 for the previous one,
     all 0 on the first step), then the remaining time. Any other observation becomes a Dict of "observation",

@@ -1,4 +1,4 @@
-"""What simple and complex images share: the rules' `draw`, compiled where possible, over blocks of states.
+"""Common part of simple and complex images: the rules' `draw`, compiled where possible, over blocks of states.
 
 Several frames in one image: the last k pictures of an episode, as agents of Atari games see them.
 
@@ -17,7 +17,7 @@ from pharos.observations.observation import Observation
 
 
 def num_values(layer: Layer) -> int:
-    """How many values a plane of this layer may have besides 0."""
+    """Number of values that a plane of this layer may have besides 0."""
     colors = len(layer.color) if np.ndim(layer.color) == 2 else 1
     sprites = len(layer.sprite) if layer.sprite is not None and not isinstance(layer.sprite[0], str) else 1
     return max(len(layer.glyph), colors, sprites)

@@ -1,4 +1,4 @@
-"""What an agent is not to see: names that the option `hide` of an observation takes."""
+"""Hidden parts of an observation: names that the option `hide` takes."""
 
 from collections.abc import Collection, Sequence
 

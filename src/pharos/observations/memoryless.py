@@ -1,4 +1,4 @@
-"""What an agent without memory loses by an observation that several states share.
+"""Loss of an agent without memory by observations that several states share.
 
 A deterministic memoryless policy chooses an action for each observation. The best one is looked for by branch and
 bound: some observations get an action, all other states choose freely, and the optimal value of this relaxed MDP is an
@@ -28,7 +28,7 @@ MOST_ENTRIES = 2_000_000
 
 @dataclass(frozen=True)
 class MemorylessLoss:
-    """How much less than the optimum the best deterministic memoryless policy on an observation is worth at the start.
+    """Optimal value minus that of the best deterministic memoryless policy on an observation, at the start.
 
     Attributes:
         lower, upper: bounds of the loss, proven; in units of return.
@@ -65,9 +65,9 @@ def memoryless_loss(
     search = _Search(mdp, np.asarray(classes), time.monotonic() + budget)
     lower, upper = search.bounds(optimal)
     best, error = float(optimal.value_at_start), optimal.error_bound
-    least = max(0.0, best - error - upper)
-    most = max(least, best + error - lower)
-    return MemorylessLoss(least, most, most - least <= 10 * (TOLERANCE + error), search.solved)
+    lower_loss = max(0.0, best - error - upper)
+    upper_loss = max(lower_loss, best + error - lower)
+    return MemorylessLoss(lower_loss, upper_loss, upper_loss - lower_loss <= 10 * (TOLERANCE + error), search.solved)
 
 
 class _Search:
@@ -128,7 +128,7 @@ class _Search:
 
     @cached_property
     def chosen(self) -> tuple[Any, np.ndarray]:
-        """What choosing an action does, random actions included: (S A, S) probabilities, (S, A) rewards."""
+        """Transitions by chosen action, random actions included: (S A, S) probabilities, (S, A) rewards."""
         mdp, choices = self.mdp, np.eye(self.mdp.num_actions)
         matrix, rewards = mdp.dynamics.matrix()[:, : mdp.num_states], mdp.rewards
         if not mdp.is_random:

@@ -1,4 +1,4 @@
-"""What an observation is: a pure function of the state with a Gymnasium space, for one environment.
+"""Observation: a pure function of the state with a Gymnasium space, for one environment.
 
 Observations of the user's own, named as `module:name` or `file.py:name` like environments and agents.
 
@@ -295,7 +295,7 @@ def observation_of(source: Source, *, trust: bool = False, strict: bool = False)
 
 
 def own_observation(observation: Any, folder: str | Path | None = None) -> OwnObservation | None:
-    """What the user named, where it is of the user's own: imported, or registered before; None for all else."""
+    """The user's own observation of this name, imported or registered before; None for all others."""
     if isinstance(observation, OwnObservation):
         return observation
     if sources.is_reference(observation):

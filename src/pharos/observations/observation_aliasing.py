@@ -21,7 +21,7 @@ Progress = Callable[[int, str], None]
 
 @dataclass(frozen=True)
 class Aliasing:
-    """How many of the reachable states share their observation with another state.
+    """Number of reachable states that share their observation with another state.
 
     Attributes:
         num_states: reachable states, terminal ones included.
@@ -116,10 +116,10 @@ def history_aliasing(
     return Aliasing(space.num_states, int(classes.max()) + 1, sharing(everything), sharing(~terminal[ends]))
 
 
-def _histories(space: "StateSpace", length: int, most: int) -> np.ndarray:
+def _histories(space: "StateSpace", length: int, max_histories: int) -> np.ndarray:
     """(H, length) int64, all histories that play can have."""
     starts = np.unique(np.repeat(space.start_states[:, None], length, axis=1), axis=0).astype(np.int64)
-    met, frontier, terminal = set(map(tuple, starts.tolist())), starts, np.asarray(space.terminal)
+    visited, frontier, terminal = set(map(tuple, starts.tolist())), starts, np.asarray(space.terminal)
     while len(frontier):
         going = frontier[~terminal[frontier[:, -1]]]
         rows = np.repeat(np.arange(len(going)), space.num_actions)
@@ -128,14 +128,16 @@ def _histories(space: "StateSpace", length: int, most: int) -> np.ndarray:
         inside = outcomes.states < space.num_states
         before = going[rows[outcomes.which[inside]], 1:]
         after = np.unique(np.concatenate([before, outcomes.states[inside][:, None]], axis=1), axis=0)
-        frontier = np.array([each for each in after.tolist() if tuple(each) not in met], np.int64).reshape(-1, length)
-        met.update(map(tuple, frontier.tolist()))
-        if len(met) > most:
+        frontier = np.array([each for each in after.tolist() if tuple(each) not in visited], np.int64).reshape(
+            -1, length
+        )
+        visited.update(map(tuple, frontier.tolist()))
+        if len(visited) > max_histories:
             raise ParameterError(
-                f"{space} has more than {most:,} histories of {length} states; expected fewer, so that they can be "
-                f"counted: look at a smaller instance, or at fewer frames"
+                f"{space} has more than {max_histories:,} histories of {length} states; expected fewer, so that they "
+                f"can be counted: look at a smaller instance, or at fewer frames"
             )
-    return np.array(sorted(met), np.int64)
+    return np.array(sorted(visited), np.int64)
 
 
 def _numbered(

@@ -1,4 +1,4 @@
-"""What the source of an imported MDP shows of each state: looked up in what the import has recorded."""
+"""Recorded observations of an imported MDP: those of its source, looked up by state."""
 
 import numpy as np
 

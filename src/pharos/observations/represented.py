@@ -114,7 +114,7 @@ def _own_network(network: Any, shape: tuple[int, ...]) -> tuple[Callable[..., np
 
 
 def _digest(inputs: Any, num_states: int) -> str:
-    """Of what the network sees of up to SAMPLE states all over the space."""
+    """Digest of the network's input in up to SAMPLE states all over the space."""
     import xxhash
 
     states = np.unique(np.linspace(0, num_states - 1, min(SAMPLE, num_states)).astype(np.int64))

@@ -258,7 +258,7 @@ class _Convolved:
 
 
 class _Patches:
-    """What N images have at one position: different patches (U, K) float64, their squares (U,), which one (N,)."""
+    """Patches of N images at one position: different ones (U, K) float64, their squares (U,), which one (N,)."""
 
     def __init__(self, patches: np.ndarray):
         rows = np.ascontiguousarray(patches).view(f"V{patches.shape[1] * patches.itemsize}").ravel()
@@ -300,10 +300,10 @@ class _Head:
 
     def __init__(self, network: Network, first: "_Flat | _Convolved"):
         hidden = network.hidden
-        following = [*hidden[1:], 1]
+        next_sizes = [*hidden[1:], 1]
         pairs = [
             network.weight_variances(n, m, is_output=layer == len(hidden) - 1)
-            for layer, (n, m) in enumerate(zip(hidden, following, strict=True))
+            for layer, (n, m) in enumerate(zip(hidden, next_sizes, strict=True))
         ]
         self.widths = np.array(hidden, np.float64)
         self.weights, self.biases = (np.array(each, np.float64) for each in zip(*pairs, strict=True))

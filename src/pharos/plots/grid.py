@@ -110,16 +110,16 @@ def _draw_arrows(
     """Arrows as long as the actions are probable: one alone in the middle of its cell, several from there; a letter for
     each action that leads nowhere."""
     column, row = cell
-    chosen = [int(action) for action in np.flatnonzero(lengths > 0.02)]
-    if still := "".join(letters[action] for action in chosen if actions[action] not in ARROWS):
+    indices = [int(action) for action in np.flatnonzero(lengths > 0.02)]
+    if still := "".join(letters[action] for action in indices if actions[action] not in ARROWS):
         axis.text(column, row, still, ha="center", va="center", color=color, fontsize=8)
-    for action in chosen:
+    for action in indices:
         if actions[action] not in ARROWS:
             continue
         x, y = ARROWS[actions[action]]
         head: Any = {"arrowstyle": "->", "color": color, "lw": 1.3, "shrinkA": 0, "shrinkB": 0}
         length = 0.1 + 0.26 * lengths[action]
-        back = length if len(chosen) == 1 else 0.0
+        back = length if len(indices) == 1 else 0.0
         end = (column + length * x, row + length * y)
         axis.annotate("", end, (column - back * x, row - back * y), arrowprops=head)
 
@@ -209,5 +209,5 @@ def _lengths(solution: "Solution") -> np.ndarray:
 def _reward_on_entering(mdp: Any, terminal: int) -> str:
     """The reward of the transitions that lead into a terminal state; empty where they differ or there are none."""
     into = mdp.dynamics.leads_to(terminal) & ~np.asarray(mdp.terminal)[:, None]
-    paid = np.unique(mdp.rewards[into])
-    return f"{paid[0]:g}" if len(paid) == 1 else ""
+    rewards = np.unique(mdp.rewards[into])
+    return f"{rewards[0]:g}" if len(rewards) == 1 else ""

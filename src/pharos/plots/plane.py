@@ -131,8 +131,8 @@ def states_by_depth(space: "StateSpace") -> np.ndarray:
     counts = []
     while frontier.size:
         counts.append(frontier.size)
-        following = space.dynamics.successors_of(frontier)
-        frontier = following[~reached[following]]
+        next_states = space.dynamics.successors_of(frontier)
+        frontier = next_states[~reached[next_states]]
         reached[frontier] = True
     return np.array(counts, np.int64)
 

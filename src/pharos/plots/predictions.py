@@ -123,7 +123,7 @@ def observations_of_mdps(part: "pd.DataFrame", predictor: str | None = None) -> 
         return None
     groups = _spread(groups)
     figure, axes = panels(len(groups), 2.3, 1.9)
-    most = max(1.0, part[[predictor, "greedy"]].max().max())
+    top = max(1.0, part[[predictor, "greedy"]].max().max())
     for axis, (key, rows) in zip(axes, groups, strict=True):
         rows = rows.set_index("observation").reindex(observations)
         places = np.arange(len(observations))
@@ -134,10 +134,10 @@ def observations_of_mdps(part: "pd.DataFrame", predictor: str | None = None) -> 
             axis.scatter([i], pair[:1], s=34, facecolors="none", edgecolors=color, lw=1.4)
             axis.scatter([i], pair[1:], s=34, color=color, lw=0, label=observation)
         axis.set_title(_short(*map(str, key)), fontsize=8)
-        axis.set(xticks=places, xticklabels=[], ylim=(-0.05, most + 0.08), xlim=(-0.6, len(observations) - 0.4))
-    said, did = {"facecolors": "none", "edgecolors": DIAGONAL}, {"color": DIAGONAL}
-    axes[0].scatter([], [], s=34, lw=1.4, label="predicted", **said)
-    axes[0].scatter([], [], s=34, lw=0, label=agent_name(str(part["agent"].iloc[0])), **did)
+        axis.set(xticks=places, xticklabels=[], ylim=(-0.05, top + 0.08), xlim=(-0.6, len(observations) - 0.4))
+    hollow, full = {"facecolors": "none", "edgecolors": DIAGONAL}, {"color": DIAGONAL}
+    axes[0].scatter([], [], s=34, lw=1.4, label="predicted", **hollow)
+    axes[0].scatter([], [], s=34, lw=0, label=agent_name(str(part["agent"].iloc[0])), **full)
     label_edges(axes, "", "regret")
     legend_below(figure, axes)
     return figure
@@ -154,8 +154,8 @@ def idealised_curves(part: "pd.DataFrame", points: "pd.DataFrame") -> "Figure | 
     for axis, (key, rows) in zip(axes, groups, strict=True):
         for row in rows.to_dict("records"):
             color = observation_color(row["observation"], observations)
-            own = points[(points[CELL] == [row[name] for name in CELL]).all(axis=1)]
-            mean = own.groupby("step")["normalized_regret"].mean()
+            curve_points = points[(points[CELL] == [row[name] for name in CELL]).all(axis=1)]
+            mean = curve_points.groupby("step")["normalized_regret"].mean()
             axis.plot(mean.index, mean.to_numpy(), color=color, lw=1.5, label=row["observation"])
             dashed = json.loads(row[curve] or "[]")
             if dashed:
@@ -175,15 +175,15 @@ def _learner(part: "pd.DataFrame") -> str:
     return next(has, LEARNERS[-1])
 
 
-def _spread(groups: list[Any], most: int = MOST_PANELS) -> list[Any]:
+def _spread(groups: list[Any], max_panels: int = MOST_PANELS) -> list[Any]:
     """All of them, or as many, one class after the other, so that each class has some; in their order."""
-    if len(groups) <= most:
+    if len(groups) <= max_panels:
         return groups
     by_class: dict[str, list[int]] = {}
     for i, (key, _) in enumerate(groups):
         by_class.setdefault(key[0], []).append(i)
     turns = sorted((turn, i) for rows in by_class.values() for turn, i in enumerate(rows))
-    return [groups[i] for i in sorted(i for _, i in turns[:most])]
+    return [groups[i] for i in sorted(i for _, i in turns[:max_panels])]
 
 
 def _short(environment: str, instance: str, chance: str) -> str:

@@ -92,10 +92,10 @@ def _groups(folders: Sequence[str | os.PathLike]) -> dict[str, list[tuple[dict[s
 
 def _labels(configs: list[dict[str, Any]]) -> list[str]:
     """The label of each group of runs; where two are alike, with discount and horizon, or a number."""
-    alike = [_label(config, configs) for config in configs]
+    plain_labels = [_label(config, configs) for config in configs]
     labels: list[str] = []
-    for config, label in zip(configs, alike, strict=True):
-        if alike.count(label) > 1:
+    for config, label in zip(configs, plain_labels, strict=True):
+        if plain_labels.count(label) > 1:
             episode = f"{config['horizon']} steps an episode" if config["horizon"] else "no horizon"
             label += f", discount {config['gamma']:g}, {episode}"
         labels.append(f"{label} ({len(labels) + 1})" if label in labels else label)
@@ -115,8 +115,8 @@ def _label(config: dict[str, Any], configs: list[dict[str, Any]]) -> str:
     if differ("chance"):
         parts.append(" ".join(f"{name}={p:g}" for name, p in config["chance"].items() if p) or "no chance")
     if differ("hyperparameters"):
-        own = config["hyperparameters"]
-        parts.append(" ".join(f"{name}={own[name]}" for name in own if _varies(name, configs)))
+        hyperparameters = config["hyperparameters"]
+        parts.append(" ".join(f"{name}={hyperparameters[name]}" for name in hyperparameters if _varies(name, configs)))
     return ", ".join(part for part in parts if part)
 
 

@@ -33,12 +33,12 @@ class QueriedHistories(PolicyAnswers):
     def first_rows(self, states: np.ndarray) -> np.ndarray:
         return self._numbers([(int(s),) * self.sight.frames for s in states])
 
-    def next_rows(self, rows: np.ndarray, executed: np.ndarray, following: np.ndarray) -> np.ndarray:
-        pairs, inverse = np.unique(np.stack([rows, following], axis=1), axis=0, return_inverse=True)
+    def next_rows(self, rows: np.ndarray, executed: np.ndarray, next_states: np.ndarray) -> np.ndarray:
+        pairs, inverse = np.unique(np.stack([rows, next_states], axis=1), axis=0, return_inverse=True)
         numbers = self._numbers([(*self._histories[row][1:], t) for row, t in pairs.tolist()])
         return numbers[inverse.reshape(-1)]
 
-    def take(self, reach: Callable[[], ReachableRows]) -> bool | None:
+    def query_all(self, reach: Callable[[], ReachableRows]) -> bool | None:
         """Never: rows are histories."""
         return None
 
@@ -46,10 +46,10 @@ class QueriedHistories(PolicyAnswers):
         return np.array([self._histories[row][-1] for row in rows], np.int64)
 
     def reach(self, max_rows: int | None = None, steps: int | None = None) -> bool:
-        """As of `QueriedPolicy`; under sticky actions a history is looked at once with each previous action."""
+        """See `QueriedPolicy.reach`; under sticky actions a history is visited once with each previous action."""
         mdp, width = self.mdp, self.mdp.policy_width
         frontier = np.unique(self.start_rows()) * width + (width - 1)
-        met, level = set(frontier.tolist()), 0
+        visited, level = set(frontier.tolist()), 0
         while frontier.size and (steps is None or level < steps):
             level += 1
             rows, previous = np.divmod(frontier, width)
@@ -64,16 +64,16 @@ class QueriedHistories(PolicyAnswers):
             origin = outcomes.which[live]
             after = self.next_rows(rows[which[origin]], actions[origin], outcomes.states[live])
             pairs = np.unique(after * width + (actions[origin] if width > 1 else 0))
-            frontier = np.array([pair for pair in pairs.tolist() if pair not in met], np.int64)
-            met.update(frontier.tolist())
+            frontier = np.array([pair for pair in pairs.tolist() if pair not in visited], np.int64)
+            visited.update(frontier.tolist())
         return True
 
     def reached_mdp(self) -> tuple[TabularMDP, np.ndarray]:
         """The MDP on the histories that are reached, and the policy on it."""
         rows = self.rows
 
-        def number(following: np.ndarray, executed: np.ndarray, origin: np.ndarray) -> np.ndarray:
-            return self.index(self.next_rows(rows[origin], executed, following))
+        def number(next_states: np.ndarray, executed: np.ndarray, origin: np.ndarray) -> np.ndarray:
+            return self.index(self.next_rows(rows[origin], executed, next_states))
 
         return self._mdp_on(self.states_of(rows), self.index(self.start_rows()), number), self.probabilities
 
@@ -91,7 +91,7 @@ class QueriedHistories(PolicyAnswers):
             more = np.zeros(2 * len(self._histories) - len(self._place), np.int32)
             self._place = np.concatenate([self._place, more])
 
-    def _ask(self, rows: np.ndarray) -> np.ndarray:
+    def _query(self, rows: np.ndarray) -> np.ndarray:
         answers = []
         context: Any = self.sight.observe
         for start in range(0, len(rows), BATCH):

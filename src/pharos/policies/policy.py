@@ -1,4 +1,4 @@
-"""What a policy is: a table over the states, or something that answers observations with probabilities or actions."""
+"""Kinds of policies: a table over the states, or a function of observations that returns probabilities or actions."""
 
 import inspect
 from collections.abc import Callable

@@ -1,6 +1,6 @@
-"""What a policy does in the states that it reaches: it is asked about each of them once, in batches.
+"""Answers of a policy in the states that it reaches: it is queried once about each of them, in batches.
 
-Two kinds of policy are asked in the same way: functions of observations (`PolicyAnswers`) and tables (`TableAnswers`).
+Two kinds of policy are queried alike: functions of observations (`PolicyAnswers`) and tables (`TableAnswers`).
 """
 
 from collections.abc import Callable, Mapping
@@ -17,13 +17,13 @@ from pharos.observations import ObservationInContext, observe
 from pharos.policies.policy import PolicyLike, policy_function
 from pharos.state_space import StateSpace
 
-# Observations that a policy is asked about at once.
+# Observations in one query of a policy.
 BATCH = 4096
 
 
 @dataclass(frozen=True, eq=False)
 class Sight:
-    """What a policy sees of the states of an environment.
+    """Observations of the states of an environment, as a policy sees them.
 
     Attributes:
         space: the states.
@@ -50,16 +50,16 @@ class Sight:
 
     @property
     def frames(self) -> int:
-        """How many states are seen at once, the last ones of the episode."""
+        """Number of states that are seen at once, the last ones of the episode."""
         return self.observe.observation.frames
 
 
 class ReachableRows(NamedTuple):
-    """What every policy reaches that gives each action a chance.
+    """Rows that every policy reaches in which each action has a positive probability.
 
     Attributes:
         rows: (N,) in the order in which `QueriedPolicy.reach` meets them.
-        is_whole: whether that is all of it; False: it is more than `reach` was to look at.
+        is_whole: whether these are all; False: there are more than `reach` was allowed to visit.
     """
 
     rows: np.ndarray
@@ -67,7 +67,7 @@ class ReachableRows(NamedTuple):
 
 
 class QueriedPolicy:
-    """What a policy answered so far, by row: a state s, or s (A + 1) + b where the previous action b matters (A: none).
+    """Answers of a policy so far, by row: a state s, or s (A + 1) + b where the previous action b matters (A: none).
 
     Attributes:
         by_pairs: whether rows are pairs of state and previous action.
@@ -86,20 +86,20 @@ class QueriedPolicy:
 
     @property
     def rows(self) -> np.ndarray:
-        """(N,) the rows that the policy was asked about."""
+        """(N,) rows that were queried."""
         return self._rows[: self._count]
 
     @property
     def probabilities(self) -> np.ndarray:
-        """(N, A) what it answered."""
+        """(N, A) the answers."""
         return self._answers[: self._count]
 
     def index(self, rows: np.ndarray) -> np.ndarray:
-        """Where each row stands in `rows` and `probabilities`; -1 where it was not asked about."""
+        """(N,) place of each row in `rows` and `probabilities`; -1 for rows that were not queried."""
         return self._place[rows] - 1
 
     def of(self, rows: np.ndarray) -> np.ndarray:
-        """(N, A) probabilities of distinct or repeated rows; the policy is asked about new ones only."""
+        """(N, A) probabilities of distinct or repeated rows; only new ones are queried."""
         unknown = np.unique(rows[self._place[rows] == 0])
         if unknown.size:
             count = self._count + unknown.size
@@ -110,12 +110,12 @@ class QueriedPolicy:
             for start in range(0, unknown.size, BATCH):
                 block = unknown[start : start + BATCH]
                 place = slice(self._count + start, self._count + start + len(block))
-                self._rows[place], self._answers[place] = block, self._ask(block)
+                self._rows[place], self._answers[place] = block, self._query(block)
             self._place[unknown] = np.arange(self._count, count) + 1
             self._count = count
         return self.probabilities[self.index(rows)]
 
-    def _ask(self, rows: np.ndarray) -> np.ndarray:
+    def _query(self, rows: np.ndarray) -> np.ndarray:
         """(N, A) probabilities in rows that are new."""
         raise NotImplementedError
 
@@ -127,9 +127,9 @@ class QueriedPolicy:
         """(N,) the rows of states in which episodes start."""
         return states * self.width + (self.num_actions if self.by_pairs else 0)
 
-    def next_rows(self, rows: np.ndarray, executed: np.ndarray, following: np.ndarray) -> np.ndarray:
-        """(N,) where executing actions in rows leads that come to the states `following`."""
-        return self._arrivals(following, executed)
+    def next_rows(self, rows: np.ndarray, executed: np.ndarray, next_states: np.ndarray) -> np.ndarray:
+        """(N,) where executing actions in rows leads that come to the states `next_states`."""
+        return self._arrivals(next_states, executed)
 
     def reach(self, max_rows: int | None = None, steps: int | None = None) -> bool:
         """Ask the policy in all rows that it reaches within `steps`, level by level; False beyond `max_rows` rows."""
@@ -151,16 +151,17 @@ class QueriedPolicy:
             frontier = rows[self.index(rows) < 0]
         return True
 
-    def take(self, reach: Callable[[], ReachableRows]) -> bool | None:
-        """As `reach`, but the policy is asked in all rows at once; None, and nothing is remembered, where it gives an
-        action no chance, so that it may reach less.
+    def query_all(self, reach: Callable[[], ReachableRows]) -> bool | None:
+        """Query the policy in all rows of `reach` at once; return whether these are all.
+
+        None, and nothing is stored, where an action has probability 0, so that the policy may reach less.
         """
         chance = self.mdp.chance
         always = chance.uniform > 0 and chance.first_uniform > 0
-        if not always and not (self._ask(self.start_rows()) > 0).all():
+        if not always and not (self._query(self.start_rows()) > 0).all():
             return None
         rows, is_whole = reach()
-        blocks = [self._ask(rows[start : start + BATCH]) for start in range(0, len(rows), BATCH)]
+        blocks = [self._query(rows[start : start + BATCH]) for start in range(0, len(rows), BATCH)]
         probabilities = np.concatenate(blocks)
         if not always and not (probabilities > 0).all():
             return None
@@ -178,7 +179,7 @@ class QueriedPolicy:
         if not mdp.is_sticky:  # a row is a state of the new MDP
             states, starts = self.rows // self.width, self.index(self.start_rows())
             return self._mdp_on(
-                states, starts, lambda following, executed, _: self.index(self._arrivals(following, executed))
+                states, starts, lambda next_states, executed, _: self.index(self._arrivals(next_states, executed))
             ), self.probabilities
         states = np.unique(self.rows // self.width)
         place = np.full(mdp.num_states, -1, np.int64)
@@ -186,7 +187,7 @@ class QueriedPolicy:
         policy = np.zeros((states.size, self.width, mdp.num_actions))
         policy[:, :, 0] = 1.0  # of pairs that are not reached
         policy[place[self.rows // self.width], self.rows % self.width] = self.probabilities
-        return self._mdp_on(states, place[mdp.start_states], lambda following, *_: place[following]), policy
+        return self._mdp_on(states, place[mdp.start_states], lambda next_states, *_: place[next_states]), policy
 
     def _mdp_on(
         self, states: np.ndarray, starts: np.ndarray, number: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
@@ -206,16 +207,16 @@ class QueriedPolicy:
         actions = np.tile(np.arange(num_actions), count)
         outcomes = mdp.dynamics.outcomes(np.repeat(states, num_actions), actions)
         inside = outcomes.states < mdp.num_states
-        following = np.full(len(inside), -1, np.int64)
+        next_states = np.full(len(inside), -1, np.int64)
         which = outcomes.which[inside]
-        following[inside] = number(outcomes.states[inside], actions[which], which // num_actions)
+        next_states[inside] = number(outcomes.states[inside], actions[which], which // num_actions)
         if mdp.dynamics.is_deterministic:
-            reached = TabularMDP.from_arrays(following.reshape(count, num_actions), rewards, **setting)
+            reached = TabularMDP.from_arrays(next_states.reshape(count, num_actions), rewards, **setting)
         else:
             from scipy import sparse
 
-            stays = following >= 0
-            entries = (outcomes.probabilities[stays], (outcomes.which[stays], following[stays]))
+            stays = next_states >= 0
+            entries = (outcomes.probabilities[stays], (outcomes.which[stays], next_states[stays]))
             reached = TabularMDP.from_matrices(
                 sparse.csr_matrix(entries, (count * num_actions, count)), rewards, **setting
             )
@@ -225,16 +226,16 @@ class QueriedPolicy:
 
 
 class AnyAnswers(QueriedPolicy):
-    """Those of a policy that gives each action a chance."""
+    """Answers of the uniform policy, which reaches what any policy can reach."""
 
-    def _ask(self, rows: np.ndarray) -> np.ndarray:
+    def _query(self, rows: np.ndarray) -> np.ndarray:
         return np.full((len(rows), self.num_actions), 1 / self.num_actions)
 
 
 def reachable_rows(
     mdp: TabularMDP, max_rows: int, steps: int | None, *, sees_previous_action: bool = False
 ) -> ReachableRows:
-    """What every policy reaches in so many steps that gives each action a chance."""
+    """Rows reached within so many steps by every policy in which each action has a positive probability."""
     answers = AnyAnswers(mdp, sees_previous_action=sees_previous_action)
     is_whole = answers.reach(max_rows, steps)
     return ReachableRows(answers.rows.copy(), is_whole)
@@ -255,7 +256,7 @@ class PolicyAnswers(QueriedPolicy):
         self.policy, self.sight, self.deterministic = policy_function(policy), sight, deterministic
         _check_observation(policy, sight.observe.space, sight.observation)
 
-    def _ask(self, rows: np.ndarray) -> np.ndarray:
+    def _query(self, rows: np.ndarray) -> np.ndarray:
         states, previous = np.divmod(rows, self.width)
         previous = np.where(previous == self.num_actions, -1, previous) if self.by_pairs else np.full(len(rows), -1)
         context = self.sight.space.states(states), previous, np.zeros(len(rows), np.int64)
@@ -310,7 +311,7 @@ class TableAnswers(QueriedPolicy):
             raise ParameterError(f"the policy has shape {table.shape}; expected one of {', '.join(map(str, shapes))}")
         self.table = table
 
-    def _ask(self, rows: np.ndarray) -> np.ndarray:
+    def _query(self, rows: np.ndarray) -> np.ndarray:
         states, previous = np.divmod(rows, self.width)
         by_previous = self.table.ndim == 3 or self.table.shape == (self.mdp.num_states, self.num_actions + 1)
         answers = self.table[states, previous] if by_previous else self.table[states]

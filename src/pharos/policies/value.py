@@ -86,7 +86,7 @@ def policy_value(
     else:
         answers = answers_of(policy, mdp, sight(), deterministic=deterministic)
     steps, error = steps_that_matter(mdp)
-    is_whole = None if reach is None else answers.take(lambda: reach(max_states, steps))
+    is_whole = None if reach is None else answers.query_all(lambda: reach(max_states, steps))
     if answers.reach(max_states, steps) if is_whole is None else is_whole:
         solution = solvers.evaluate_policy(*answers.reached_mdp())
         return Evaluation(solution.value_at_start, True, solution.error_bound + error, len(answers.rows))
@@ -202,9 +202,9 @@ def _solution_of_reached(
         )
     answers = PolicyAnswers(policy, mdp, sight, deterministic=deterministic)
     answers.reach()
-    sub, chosen = answers.reached_mdp()
-    solution = solvers.evaluate_policy(sub, chosen, tolerance)
-    x, following = (_on_all_states(answers, each) for each in (solution.x, solution.next_x))
+    sub, reached_policy = answers.reached_mdp()
+    solution = solvers.evaluate_policy(sub, reached_policy, tolerance)
+    x, next_x = (_on_all_states(answers, values) for values in (solution.x, solution.next_x))
     if mdp.is_sticky:
         table = np.full((mdp.num_states, answers.width, mdp.num_actions), np.nan)
         table[answers.rows // answers.width, answers.rows % answers.width] = answers.probabilities
@@ -218,7 +218,7 @@ def _solution_of_reached(
         mdp.horizon,
         PolicyTable(mdp.num_actions, table),
         x,
-        following,
+        next_x,
         start=solution.value_at_start,
         states_reached=len(np.unique(answers.rows // answers.width)),
     )
@@ -303,10 +303,10 @@ def _copies(mdp: TabularMDP, number: int) -> TabularMDP:
     """The MDP beside itself: state s of copy i has the number i S + s."""
     table, rewards = np.asarray(mdp.dynamics.deterministic_table(), np.int64), mdp.reward_table
     first = np.arange(number) * mdp.num_states
-    following = np.where(table < 0, -1, table + first[:, None, None]).reshape(-1, mdp.num_actions)
+    next_states = np.where(table < 0, -1, table + first[:, None, None]).reshape(-1, mdp.num_actions)
     return replace(
         mdp,
-        dynamics=Table(following),
+        dynamics=Table(next_states),
         reward_table=Rewards(np.tile(rewards.table, (number, 1)), rewards.palette),
         terminal=np.tile(np.asarray(mdp.terminal), number),
         start_states=(mdp.start_states + first[:, None]).ravel(),
@@ -356,20 +356,20 @@ def walk_values(
         for key, (table, terminal, rewards) in worlds.items():
             i = members[key][~is_over[members[key]]]
             s, a = state[i], actions[i]
-            following, entries = table[s, a], rewards.table[s, a]
+            next_states, entries = table[s, a], rewards.table[s, a]
             reward = discount[i] * (rewards.palette[entries] if len(rewards.palette) else entries)
             value[i] += reward
             size[i] += np.abs(reward)
-            is_over[i] = (following < 0) | terminal[following]
-            state[i] = np.where(following < 0, s, following)
+            is_over[i] = (next_states < 0) | terminal[next_states]
+            state[i] = np.where(next_states < 0, s, next_states)
         history = np.concatenate([history[:, 1:], state[:, None]], axis=1)
         discount *= gammas
     bounds = [tail for _, tail in ahead] + 2 * _UNIT * (len(path) + 1) * size
-    met = [
+    visited = [
         len(np.unique(column[column[:, 0] >= 0], axis=None if frames == 1 else 0))
         for column in np.array(path, np.int64).reshape(-1, len(mdps), frames).swapaxes(0, 1)
     ]
-    parts = zip(value.tolist(), bounds.tolist(), met, strict=True)
+    parts = zip(value.tolist(), bounds.tolist(), visited, strict=True)
     return [Evaluation(each, True, bound, states) for each, bound, states in parts]
 
 
@@ -397,14 +397,14 @@ def estimate(
     for step in range(steps):
         s, b = states[alive], previous[alive]
         probabilities = answers.of(rows[alive])
-        chosen = (probabilities.cumsum(axis=1) < rng.random((alive.size, 1))).sum(axis=1).clip(max=mdp.num_actions - 1)
-        executed = chance.draw(chosen, b, mdp.num_actions, rng)
+        actions = (probabilities.cumsum(axis=1) < rng.random((alive.size, 1))).sum(axis=1).clip(max=mdp.num_actions - 1)
+        executed = chance.draw(actions, b, mdp.num_actions, rng)
         returns[alive] += mdp.gamma**step * mdp.reward_table.rows(s)[np.arange(alive.size), executed]
-        following = mdp.dynamics.sample(s, executed, rng)
-        states[alive], previous[alive] = following, executed
-        goes_on = (following >= 0) & ~np.asarray(mdp.terminal)[following]
+        next_states = mdp.dynamics.sample(s, executed, rng)
+        states[alive], previous[alive] = next_states, executed
+        goes_on = (next_states >= 0) & ~np.asarray(mdp.terminal)[next_states]
         before, alive = rows[alive][goes_on], alive[goes_on]
-        rows[alive] = answers.next_rows(before, executed[goes_on], following[goes_on])
+        rows[alive] = answers.next_rows(before, executed[goes_on], next_states[goes_on])
         if not alive.size:
             break
     return float(returns.mean()), _half_width(returns, *return_range)

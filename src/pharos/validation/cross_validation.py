@@ -110,7 +110,7 @@ def held_out(x: np.ndarray, y: np.ndarray, classes: np.ndarray, counts: Counts) 
 def _moments(
     design: np.ndarray, y: np.ndarray, classes: np.ndarray, sizes: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Of each class the means of x x' (C, P, P) and x y (C, P)."""
+    """Means of x x' (C, P, P) and x y (C, P) of each class."""
     number, width = len(sizes), design.shape[1]
     products, targets = np.zeros((number, width, width)), np.zeros((number, width))
     np.add.at(products, classes, design[:, :, None] * design[:, None, :])

@@ -60,8 +60,8 @@ def predicted(config: Mapping[str, Any]) -> dict[str, Any]:
         name, initialisation = network_of(config, task)
         options = _options(task, name, initialisation)
         schedule = schedule_of(config)
-        own = own_measures()
-        measures = report(task.mdp, (*MEASURES, *own), schedule=schedule, **options)
+        user_measures = own_measures()
+        measures = report(task.mdp, (*MEASURES, *user_measures), schedule=schedule, **options)
         rescaled = report(task.mdp, ["kernel_regret"], schedule=replace(schedule, optimizer="adam"), **options)
         if config["agent"] in ACTOR_CRITICS:
             row |= _of_policy(config, task.mdp, options)
@@ -78,7 +78,7 @@ def predicted(config: Mapping[str, Any]) -> dict[str, Any]:
     regret = rescaled["kernel_regret"].value
     if regret is not None:
         row |= {"adam_regret": regret["value"], "adam_regret_played": regret["played"], "adam_curve": _curve(regret)}
-    for measure in (*MEASURES[1:], *own):
+    for measure in (*MEASURES[1:], *user_measures):
         value = measures[measure].value
         if value is not None:
             row[measure] = float(value["value"] if isinstance(value, Mapping) else value)
@@ -94,7 +94,7 @@ def own_measures() -> list[str]:
 
 
 def _options(task: "Task", network: Any, initialisation: str, landmarks: int | None = None) -> dict[str, Any]:
-    """What `pharos.hardness.report` needs of a task to measure what a network makes of its observation."""
+    """Options of `pharos.hardness.report` that measure a network's representation of a task's observation."""
     from pharos.observations import representation
 
     features = representation(
@@ -118,11 +118,11 @@ def _of_walks(config: Mapping[str, Any], mdp: "TabularMDP", options: Mapping[str
 
 
 def sampling_of(config: Mapping[str, Any]) -> "Sampling":
-    """What a DQN draws, by its hyperparameters and the noise of its rewards."""
+    """Sampling of a DQN by its hyperparameters and the noise of its rewards."""
     from pharos.hardness import Sampling
 
-    own, noise = config["hyperparameters"], config["chance"].get("reward_noise", 0.0)
-    sizes = {name: int(own[name]) for name in ("batch_size", "buffer_size") if name in own}
+    hyperparameters, noise = config["hyperparameters"], config["chance"].get("reward_noise", 0.0)
+    sizes = {name: int(hyperparameters[name]) for name in ("batch_size", "buffer_size") if name in hyperparameters}
     return Sampling(reward_noise=float(noise), **sizes)
 
 
@@ -217,14 +217,16 @@ def _of_policy(config: Mapping[str, Any], mdp: "TabularMDP", options: Mapping[st
 
 
 def rollouts_of(config: Mapping[str, Any]) -> tuple["Rollouts", float | None]:
-    """Those of an actor-critic, without clipping; and how far its agent clips."""
+    """Rollouts of an actor-critic without clipping, and the clip range of its agent."""
     from pharos.hardness import Rollouts
 
-    own = {**ACTOR_CRITICS[config["agent"]], **config["hyperparameters"]}
-    steps = int(own["n_steps"]) * int(own.get("n_envs", 1))
-    minibatches = math.ceil(steps / int(own["batch_size"])) if own.get("batch_size") else 1
-    gradient_steps = minibatches * int(own.get("n_epochs", 1))
-    return Rollouts(steps=steps, gradient_steps=gradient_steps, gae_lambda=own["gae_lambda"]), own["clip_range"]
+    hyperparameters = {**ACTOR_CRITICS[config["agent"]], **config["hyperparameters"]}
+    steps = int(hyperparameters["n_steps"]) * int(hyperparameters.get("n_envs", 1))
+    minibatches = math.ceil(steps / int(hyperparameters["batch_size"])) if hyperparameters.get("batch_size") else 1
+    gradient_steps = minibatches * int(hyperparameters.get("n_epochs", 1))
+    return Rollouts(
+        steps=steps, gradient_steps=gradient_steps, gae_lambda=hyperparameters["gae_lambda"]
+    ), hyperparameters["clip_range"]
 
 
 def _evaluated(regret: Mapping[str, Any]) -> float:
@@ -260,10 +262,10 @@ def _hidden_layers(hyperparameters: Mapping[str, Any]) -> list[int]:
     Raises:
         ParameterError: they differ, or the network is not of the kind that has a closed form.
     """
-    own = dict(hyperparameters.get("policy_kwargs") or {})
-    layers = own.pop("net_arch", hyperparameters.get("net_arch", [128]))
-    if own:
-        raise ParameterError(f"policy_kwargs has {min(own)!r}; only net_arch may differ for predictions")
+    arguments = dict(hyperparameters.get("policy_kwargs") or {})
+    layers = arguments.pop("net_arch", hyperparameters.get("net_arch", [128]))
+    if arguments:
+        raise ParameterError(f"policy_kwargs has {min(arguments)!r}; only net_arch may differ for predictions")
     if isinstance(layers, Mapping):
         if layers.get("pi") != layers.get("vf"):
             raise ParameterError(f"net_arch is {dict(layers)}; predictions need the same layers for policy and value")
@@ -272,7 +274,7 @@ def _hidden_layers(hyperparameters: Mapping[str, Any]) -> list[int]:
 
 
 def schedule_of(config: Mapping[str, Any]) -> "Schedule":
-    """That of a DQN by its hyperparameters; of others the steps alone."""
+    """Schedule of a DQN by its hyperparameters; of other agents the steps alone."""
     from pharos.hardness import Schedule
 
     hyperparameters = config["hyperparameters"]

@@ -77,7 +77,7 @@ def outcomes(runs: "pd.DataFrame", points: "pd.DataFrame") -> "pd.DataFrame":
 
 @dataclass(frozen=True)
 class Model:
-    """What is held against an outcome.
+    """Predictors that are held against an outcome.
 
     Attributes:
         name: of the predictor, or of several together.
@@ -118,7 +118,7 @@ def unseen_classes(
     permutations: int = PERMUTATIONS,
     seed: int = 0,
 ) -> "pd.DataFrame":
-    """How well each predictor orders and predicts each outcome of each agent; a row each, baselines among them.
+    """Return how well each predictor orders and predicts each outcome of each agent; a row each, baselines included.
 
     Args:
         predictions: of `predict`; None: the measures alone are judged.
@@ -179,8 +179,8 @@ def _predictors_of(predictions: "pd.DataFrame") -> list[str]:
     """Our predictors, and numbers of other names than those of our files."""
     ours = (*PREDICTORS, SAMPLED_PREDICTORS[0], *POLICY_PREDICTORS)
     others = {*CELL, *SAMPLED_PREDICTORS, "estimated_error"}
-    own = [name for name in predictions if name not in (*ours, *others) and predictions[name].dtype.kind in "fiu"]
-    return [*ours, *own]
+    added = [name for name in predictions if name not in (*ours, *others) and predictions[name].dtype.kind in "fiu"]
+    return [*ours, *added]
 
 
 def _corrected(table: "pd.DataFrame") -> "pd.DataFrame":
@@ -225,7 +225,7 @@ class Cells:
 
     @property
     def places(self) -> list[tuple[int, str, str]]:
-        """Of each row: the position of its instance in its class, chance and observation."""
+        """(Position of the instance in its class, chance, observation) of each row."""
         position: dict[int, int] = {}
         counts: dict[int, int] = {}
         for family, instance in zip(self.classes, self.instances, strict=True):
@@ -447,7 +447,7 @@ class Pairs:
 
     @staticmethod
     def of(y: np.ndarray, mdps: np.ndarray, clear: float = CLEAR) -> "Pairs":
-        """Those of outcomes y (N,) and MDPs (N,)."""
+        """Pairs of outcomes y (N,) and MDPs (N,)."""
         first, second = np.triu_indices(len(y), 1)
         same = mdps[first] == mdps[second]
         first, second = first[same], second[same]
@@ -455,9 +455,9 @@ class Pairs:
         first, second = first[counts], second[counts]
         return Pairs(first, second, np.sign(y[first] - y[second]))
 
-    def only(self, chosen: np.ndarray) -> "Pairs":
+    def only(self, mask: np.ndarray) -> "Pairs":
         """Some of them: chosen (M,) bool."""
-        return Pairs(self.first[chosen], self.second[chosen], self.sign[chosen])
+        return Pairs(self.first[mask], self.second[mask], self.sign[mask])
 
     def right(self, x: np.ndarray) -> np.ndarray:
         """(M,) 1 where x (N,) orders the pair as the outcome does, 1/2 where it says that both are alike, else 0."""

@@ -1,4 +1,4 @@
-"""How hard a world is for an agent behind an observation, before anything is trained: regret, interval, order.
+"""Predicted regret of an agent behind an observation, before anything is trained: value, interval, order.
 
 Published cells, predicted and then run: how wide an interval has to be, and which differences were ordered rightly.
 
@@ -86,9 +86,9 @@ class Published:
         number = np.searchsorted(BINS, abs(difference), side="right")
         first, second, _ = self.pairs
         apart = self.predicted[first] - self.predicted[second]
-        alike = np.searchsorted(BINS, np.abs(apart), side="right") == number
+        same_bin = np.searchsorted(BINS, np.abs(apart), side="right") == number
         right = np.sign(apart) == np.sign(self.observed[first] - self.observed[second])
-        return int((right & alike).sum()), int(alike.sum())
+        return int((right & same_bin).sum()), int(same_bin.sum())
 
     @property
     def pairs(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -125,7 +125,7 @@ MOST_STATES = 100_000
 
 @dataclass(frozen=True)
 class PredictedRegret:
-    """What is predicted of an agent with one network behind one observation.
+    """Predicted regret of an agent with one network behind one observation.
 
     Attributes:
         observation: what the agent sees, with its options. network: name of the network.
@@ -230,7 +230,7 @@ class Prediction:
         return orders
 
     def _names(self, first: PredictedRegret, second: PredictedRegret) -> tuple[str, str]:
-        """What tells two cells apart."""
+        """Shortest names that tell two cells apart."""
         if first.observation == second.observation:
             return first.network, second.network
         is_named_by_both = len(self.cells) > len({cell.observation for cell in self.cells})
@@ -296,12 +296,12 @@ def predict(
     training = TrainingOptions(**{name: value for name, value in options.items() if name in TAKEN})
     parameters = {name: value for name, value in options.items() if name not in TAKEN}
     env, chance = Task.of(environment, parameters).env, training.chance
-    width, cells, states, own = calibration.half_width(), [], 0, dict(training.hyperparameters or {})
+    width, cells, states, overrides = calibration.half_width(), [], 0, dict(training.hyperparameters or {})
     for name, view in _observations(observations):
         task = Task.of(env, chance=chance, observation=name, observation_options=view, horizon=training.horizon)
         states = _checked_states(task.space.num_states, env)
-        chosen = hyperparameters_of(agent, env.name, str(task.observation), own)
-        config = RunConfig.of_task(task, agent, steps=steps, hyperparameters=chosen).to_dict()
+        settings = hyperparameters_of(agent, env.name, str(task.observation), overrides)
+        config = RunConfig.of_task(task, agent, steps=steps, hyperparameters=settings).to_dict()
         _check_steps(config)
         for network in _several(networks):
             title = f"{name}({', '.join(f'{key}={value}' for key, value in view.items())})" if view else name
@@ -327,7 +327,7 @@ def predict(
         published_cells=len(calibration.predicted),
         published_classes=len(set(calibration.classes)),
         warnings=tuple(_warnings(calibration, states, steps, chance)),
-        hyperparameters=chosen,
+        hyperparameters=settings,
     )
 
 
@@ -356,17 +356,22 @@ def _checked_states(states: int, env: Environment) -> int:
 
 def _check_steps(config: Mapping[str, Any]) -> None:
     """Refuse a training that ends before anything is learnt."""
-    own, steps = config["hyperparameters"], config["steps"]
+    hyperparameters, steps = config["hyperparameters"], config["steps"]
     if config["agent"] == "dqn":
-        least, what = int(own.get("learning_starts", 0)) + 1, "learning begins"
+        min_steps, what = int(hyperparameters.get("learning_starts", 0)) + 1, "learning begins"
     else:
-        least, what = int(own["n_steps"]) * int(own.get("n_envs", 1)), "the first rollout ends"
-    if steps < least:
-        raise ParameterError(f"steps is {steps}, but {what} after {least - 1:,} steps; expected at least {least:,}")
+        min_steps, what = (
+            int(hyperparameters["n_steps"]) * int(hyperparameters.get("n_envs", 1)),
+            "the first rollout ends",
+        )
+    if steps < min_steps:
+        raise ParameterError(
+            f"steps is {steps}, but {what} after {min_steps - 1:,} steps; expected at least {min_steps:,}"
+        )
 
 
 def _warnings(calibration: Published, states: int, steps: int, chance: Any) -> Iterable[str]:
-    """Where the instance lies outside of the published cells."""
+    """Warnings that the instance lies outside of the published cells."""
     low, high = int(calibration.states.min()), int(calibration.states.max())
     if not low <= states <= high:
         yield f"{states:,} states: tested were {low:,} to {high:,}, so the interval is not calibrated here"

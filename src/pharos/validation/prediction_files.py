@@ -41,21 +41,21 @@ def write_predictions(study: Any, predictions: "pd.DataFrame", file: str | os.Pa
 
     from pharos import __version__
 
-    said = {
+    about = {
         "study": study.name,
         "sha256": _hash(predictions),
         "date": datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ"),
         "version": __version__,
     }
     older = _description(Path(file))
-    if older is not None and older["sha256"] == said["sha256"]:
+    if older is not None and older["sha256"] == about["sha256"]:
         return older
     table = pa.Table.from_pandas(predictions, preserve_index=False)
-    table = table.replace_schema_metadata({_KEY: json.dumps(said).encode()})
+    table = table.replace_schema_metadata({_KEY: json.dumps(about).encode()})
     Path(file).parent.mkdir(parents=True, exist_ok=True)
     if older is None:
         training.write_table(Path(file), table)
-        return said
+        return about
     beside = _place_beside(Path(file), older["date"])
     os.replace(file, beside)
     try:
@@ -63,11 +63,11 @@ def write_predictions(study: Any, predictions: "pd.DataFrame", file: str | os.Pa
     except BaseException:
         os.replace(beside, file)
         raise
-    return said
+    return about
 
 
 def _description(file: Path) -> dict[str, str] | None:
-    """What a file of predictions says of itself; None where there is none, or it is no such file."""
+    """Study, hash, date and version of a file of predictions; None where there is no such file."""
     try:
         return read_predictions(file)[1]
     except PharosError:
@@ -91,11 +91,11 @@ def read_predictions(file: str | os.PathLike) -> "tuple[pd.DataFrame, dict[str, 
     if not Path(file).is_file():
         raise FileFormatError(f"{file}: no such file; expected predictions: {remedy}")
     table = training.read_table(Path(file), "write it again")
-    said = (table.schema.metadata or {}).get(_KEY)
-    if said is None or not {*PREDICTORS, *CELL} <= {*table.column_names}:
+    text = (table.schema.metadata or {}).get(_KEY)
+    if text is None or not {*PREDICTORS, *CELL} <= {*table.column_names}:
         raise FileFormatError(f"{file}: holds no predictions; {remedy}")
     try:
-        about = json.loads(said)
+        about = json.loads(text)
     except ValueError:
         about = None
     if not isinstance(about, dict) or not all(isinstance(about.get(name), str) for name in _SAID):
@@ -114,7 +114,7 @@ def _hash(frame: "pd.DataFrame") -> str:
 
 @dataclass(frozen=True, eq=False)
 class PredictedCells:
-    """What was predicted of the cells of a study, at once or in parts.
+    """Predictions for the cells of a study, in one file or several.
 
     Attributes:
         parts: as `read_predictions` returns them, of different cells.
@@ -140,7 +140,7 @@ class PredictedCells:
 
     @staticmethod
     def of(predictions: "Predictions | Sequence[Predictions] | None") -> "PredictedCells | None":
-        """Of one file, of several, or of none."""
+        """Predictions of one file or of several; None of none."""
         parts = [predictions] if isinstance(predictions, tuple) else list(predictions or ())
         return PredictedCells(parts) if parts else None
 

@@ -71,7 +71,7 @@ class TensorArithmetic(CompiledArithmetic):
     def huber(
         self, q: Tensor, q_next: Tensor, q_choice: Tensor, minibatch: Any, dq: Tensor, loss: PinnedBuffer
     ) -> None:
-        """As `CompiledArithmetic` says."""
+        """See `CompiledArithmetic`."""
         actions, rewards, discounts = minibatch
         best = q_choice.argmax(2, keepdim=True)
         target = rewards + discounts * q_next.gather(2, best)[..., 0]
@@ -85,7 +85,7 @@ class TensorArithmetic(CompiledArithmetic):
         self, scores: Tensor, values: Tensor, minibatch: Any, weights: Any, gradients: Any, loss: PinnedBuffer,
         divergence: PinnedBuffer,
     ) -> None:  # fmt: skip
-        """As `CompiledArithmetic` says."""
+        """See `CompiledArithmetic`."""
         actions, old, advantages, returns = minibatch
         clip, of_entropy, of_value = (part.float()[:, None] for part in weights)
         dscores, dvalues = gradients
@@ -108,7 +108,7 @@ class TensorArithmetic(CompiledArithmetic):
         dvalues.copy_((2.0 * of_value * error / number)[..., None])
 
     def plan(self, counts: np.ndarray, is_active: np.ndarray, rates: Any, max_norms: Any, eps: float) -> None:
-        """As `CompiledArithmetic` says."""
+        """See `CompiledArithmetic`."""
         counts += is_active
         steps = np.maximum(counts, 1)
         root = np.sqrt(1.0 - 0.999**steps)
@@ -118,7 +118,7 @@ class TensorArithmetic(CompiledArithmetic):
             row[:, 0] = values
 
     def adam(self, state: Any) -> None:
-        """As `CompiledArithmetic` says."""
+        """See `CompiledArithmetic`."""
         parameters, gradients, means, squares = state
         self._planned.send()
         max_norms, first, second, step, eps = self._planned.tensor

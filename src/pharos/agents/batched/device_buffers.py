@@ -1,4 +1,4 @@
-"""What the processor and a device hand each other: arrays that stay in their places, and programs that are recorded."""
+"""Pinned host and device buffers, and recorded CUDA graphs."""
 
 import warnings
 from collections.abc import Callable

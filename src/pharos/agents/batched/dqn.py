@@ -43,7 +43,7 @@ class DQNLane(Lane):
         self._target_calls = np.maximum(self.own["target_update_interval"].astype(np.int64) // self.copies, 1)
 
     def network_seeing(self, shape: tuple[int, ...]) -> QNetworks:
-        """As `Lane` says."""
+        """See `Lane`."""
         return QNetworks(shape, self.seen.is_image, self.shared["net_arch"], self.num_actions)
 
     def probabilities(self, scores: np.ndarray) -> np.ndarray:
@@ -51,7 +51,7 @@ class DQNLane(Lane):
         return np.eye(self.num_actions)[scores.argmax(axis=1)]
 
     def step(self) -> None:
-        """As `Lane` says."""
+        """See `Lane`."""
         worlds, scores = self.worlds, self._no_scores
         is_warming = self.steps < self.own["learning_starts"]
         kernels.exploring(self.keys, self.calls, self.epsilon, is_warming, self._explores)
@@ -88,7 +88,7 @@ class DQNLane(Lane):
         self.target[rows] = self.target[rows].mul_(1.0 - tau) + self.parameters[rows] * tau
 
     def update(self) -> None:
-        """As `Lane` says."""
+        """See `Lane`."""
         number = int(self.shared["gradient_steps"])
         if number < 0:
             number = int(self.shared["train_freq"]) * self.copies
@@ -141,7 +141,7 @@ class DQNLane(Lane):
         self._known = None
 
     def own_arrays(self) -> dict[str, np.ndarray]:
-        """As `Lane` says."""
+        """See `Lane`."""
         return {"epsilon": self.epsilon, **self.replay.arrays(self.calls)}
 
     def stored(self, i: int) -> dict[str, np.ndarray]:

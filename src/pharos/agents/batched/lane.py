@@ -94,7 +94,7 @@ class Lane:
         raise NotImplementedError
 
     def own_arrays(self) -> dict[str, np.ndarray]:
-        """What the agent has to remember besides `arrays`."""
+        """State of the agent besides `arrays`, by name."""
         raise NotImplementedError
 
     def probabilities(self, scores: np.ndarray) -> np.ndarray:
@@ -214,9 +214,9 @@ class Lane:
         """name -> one run's part of some views of parameters or gradients, in Stable-Baselines3's shapes."""
         shapes: list[Shape] = self._own_networks[self.seen.which[i]].parameters.shapes
         arrays = {}
-        for each in shapes:
-            own = views[each.name][i].cpu().numpy()[tuple(slice(n) for n in each.shape)]
-            arrays[each.name] = np.array(each.stored(own), order="C")
+        for shape in shapes:
+            part = views[shape.name][i].cpu().numpy()[tuple(slice(n) for n in shape.shape)]
+            arrays[shape.name] = np.array(shape.stored(part), order="C")
         return {name: value for own_name, value in arrays.items() for name in names_of(own_name)}
 
 

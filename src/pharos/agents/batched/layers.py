@@ -173,7 +173,7 @@ class Linear(Layer):
         return y
 
     def backward(self, values: Values, gradients: Values, x: Tensor, dy: Tensor, *, onward: bool) -> Tensor | None:
-        """As `Layer` says."""
+        """See `Layer`."""
         y, dx = self._room(x, onward=onward)
         dy = self._before_activation(dy, y)
         torch.sum(dy, 1, keepdim=True, out=gradients[f"{self.name}.bias"])
@@ -214,7 +214,7 @@ class PatchConvolution(Layer):
         return y
 
     def backward(self, values: Values, gradients: Values, x: Tensor, dy: Tensor, *, onward: bool) -> None:
-        """As `Layer` says; nothing goes on from here."""
+        """See `Layer`; there is no gradient of the input."""
         y, _ = self._room(x)
         rows = self._rows(self._before_activation(dy, y))
         torch.sum(rows, 1, keepdim=True, out=gradients[f"{self.name}.bias"])
@@ -266,7 +266,7 @@ class Convolution(Layer):
         return y
 
     def backward(self, values: Values, gradients: Values, x: Tensor, dy: Tensor, *, onward: bool) -> Tensor | None:
-        """As `Layer` says."""
+        """See `Layer`."""
         y, dx = self._room(x, onward=onward)
         dy = self._before_activation(dy, y)
         if is_one_by_one(x):

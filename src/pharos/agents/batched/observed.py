@@ -1,4 +1,4 @@
-"""What W runs see of their states, as tensors: gathered from one table where it fits, else drawn for those who ask."""
+"""Observations of W runs as tensors: gathered from one table where it fits, else drawn for those who ask."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -17,7 +17,7 @@ SHARE_OF_DEVICE = 0.5  # of a GPU's free memory that a table may take
 
 
 class Sight:
-    """What the states of one source look like to a network.
+    """Observations of one source as a network sees them.
 
     An observation is one frame, or k frames one after another along the channels.
 
@@ -58,7 +58,7 @@ class Sight:
 
 
 def places_of(shape: tuple[int, ...], is_small: bool) -> np.ndarray:
-    """Where what the first layer takes is in an observation of a shape with a 0 behind it."""
+    """Places of the first layer's input in an observation of a shape with a 0 behind it."""
     places = np.arange(int(np.prod(shape)))
     if not is_small:
         return places
@@ -123,8 +123,8 @@ class ObservationTable:
         else:
             for i, sight in enumerate(self.sights):
                 members = np.flatnonzero(self.which == i)
-                chosen = states.array[members].reshape(-1, *states.array.shape[2:])
-                kernels.write_drawn(sight.raw(sight.source.at(chosen)), sight.places, members, target)
+                rows = states.array[members].reshape(-1, *states.array.shape[2:])
+                kernels.write_drawn(sight.raw(sight.source.at(rows)), sight.places, members, target)
         return out
 
     def encoded(self, observations: np.ndarray, i: int) -> torch.Tensor:
@@ -178,7 +178,7 @@ class DeviceObservationTable(ObservationTable):
         self._places = torch.from_numpy(places[self.which][:, None]).to(self.device)
 
     def at(self, states: PinnedBuffer, out: torch.Tensor) -> torch.Tensor:
-        """As `ObservationTable` says; a GPU can record it."""
+        """See `ObservationTable`; a GPU can record it."""
         assert self._table is not None
         rows = (states.tensor + self._offsets).view(-1)
         raw = self._table.index_select(0, rows).view(*states.tensor.shape[:2], -1)

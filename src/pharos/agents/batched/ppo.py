@@ -50,11 +50,11 @@ class PPOLane(Lane):
         self._lessons: dict[int, MinibatchUpdate] = {}
 
     def network_seeing(self, shape: tuple[int, ...]) -> ActorCritics:
-        """As `Lane` says."""
+        """See `Lane`."""
         return ActorCritics(shape, self.seen.is_image, self.shared["net_arch"], self.num_actions)
 
     def evaluate(self, x: torch.Tensor) -> torch.Tensor:
-        """As `Lane` says; the values of the states are written, too."""
+        """See `Lane`; writes the values of the states, too."""
         scores, values = self.network.both(self.values, x)
         self._valued.tensor.copy_(values)
         self._valued.fetch()
@@ -66,7 +66,7 @@ class PPOLane(Lane):
         return weights / weights.sum(axis=1, keepdims=True)
 
     def step(self) -> None:
-        """As `Lane` says."""
+        """See `Lane`."""
         worlds, t = self.worlds, self.collected
         scores = self.scores_of(worlds.seen)
         kernels.act(self.keys, self.calls, scores, self.actions, self._log_p)
@@ -83,7 +83,7 @@ class PPOLane(Lane):
         self.is_due = self.collected == 0
 
     def update(self) -> None:
-        """As `Lane` says."""
+        """See `Lane`."""
         self.add_values_of_cut_episodes()
         last = self.values_of(self.worlds.seen)
         rollouts.advantages(
@@ -111,14 +111,14 @@ class PPOLane(Lane):
         if not len(runs):
             return
         rank = np.arange(len(runs)) - np.searchsorted(runs, runs)  # of each among those of its run
-        rewards, following = (
+        rewards, next_values = (
             part.reshape(self.width, -1, *part.shape[3:]) for part in (self.rewards, self.next_states)
         )
         for block in range(int(rank.max()) // self.copies + 1):
             now = rank // self.copies == block
             i, place, column = runs[now], places[now], rank[now] % self.copies
             states = self.worlds.seen.copy()
-            states[i, column] = following[i, place]
+            states[i, column] = next_values[i, place]
             value = self.own["gamma"][i] * self.values_of(states)[i, column].astype(np.float64)
             rewards[i, place] = (rewards[i, place] + value).astype(np.float32)
 
@@ -152,13 +152,13 @@ class PPOLane(Lane):
         return is_active
 
     def own_arrays(self) -> dict[str, np.ndarray]:
-        """As `Lane` says."""
+        """See `Lane`."""
         names = ("states", "next_states", "actions_taken", "log_probabilities", "kept_values", "rewards", "begins")
         return {f"rollout_{name}": getattr(self, name) for name in (*names, "timeouts")} | {"begin": self.begin}
 
 
 class MinibatchUpdate:
-    """What PPO learns from minibatches of one size: forwards with the loss, backwards with Adam; a GPU records both.
+    """Update of PPO from minibatches of one size: forwards with the loss, backwards with Adam; a GPU records both.
 
     Attributes:
         minibatch: states (W, B, *depth), actions (W, B) int64, old logarithms of probabilities, advantages, returns

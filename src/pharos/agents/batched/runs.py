@@ -1,4 +1,4 @@
-"""What a run is before it exists: its MDP, what it sees of the states, its hyperparameters; and which share a batch."""
+"""Specification of one run: MDP, observations, hyperparameters; and which runs can share a batch."""
 
 import math
 from collections.abc import Hashable, Mapping
@@ -81,7 +81,7 @@ BLOCK = 4096  # states that are observed at once
 
 
 class ObservationSource:
-    """What the states of a space look like, by their numbers.
+    """Observations of the states of a space, by their numbers.
 
     Attributes:
         frames: k, how many states an observation shows, the last ones of the episode.
@@ -280,9 +280,9 @@ def lane_widths(number: int, is_image: bool, device: str = "cpu") -> list[int]:
     On the processor a width is even and at least NARROWEST, as products of single runs add up in another order;
     elsewhere it is one of a few.
     """
-    most = lane_width(is_image, device)
-    full, rest = divmod(number, most)
+    widest = lane_width(is_image, device)
+    full, rest = divmod(number, widest)
     last = max(rest + rest % 2, NARROWEST)
     if device != "cpu":
         last = next(width for width in WIDTHS_ELSEWHERE if width >= rest)
-    return [most] * full + ([last] if rest else [])
+    return [widest] * full + ([last] if rest else [])
