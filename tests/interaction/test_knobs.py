@@ -17,7 +17,7 @@ from naive.learning import paid as paid_of
 from pharos.agents import QLearning
 from pharos.agents.batched import BatchRun
 from pharos.agents.batched.lane import BatchedEpisodes
-from pharos.environments import Environment
+from pharos.environments import Environment, Layer
 from pharos.interaction import GymEnv, VectorEnv
 from pharos.mdp import rewards_of_staying
 from pharos.policies.query import TableAnswers
@@ -40,10 +40,10 @@ HORIZON = 3
 
 @dataclass(frozen=True, kw_only=True)
 class Ring(Environment):
-    """Four cells in a ring: an action goes back, stays or goes on, and one time in four a cell further."""
+    """Four cells in a ring, numbered as a search meets them: an action goes on, one time in four a cell further."""
 
     name = "ring_of_knobs"
-    actions = ("back", "stay", "on")
+    actions = ("one", "two", "three")
     outcomes = 2
 
     def variables(self):
@@ -56,10 +56,18 @@ class Ring(Environment):
         return 0.75 if outcome == 0 else 0.25
 
     def transition(self, state, action, outcome, out):
-        out[0] = (state[0] + action - 1 + outcome) % 4
+        out[0] = (state[0] + action + 1 + outcome) % 4
 
     def is_terminal(self, state):
         return False
+
+    layers = {"agent": Layer("A", (0, 0, 255))}
+
+    def grid(self):
+        return (1, 4)
+
+    def draw(self, state, planes):
+        planes[0, 0, state[0]] = 1
 
     def reward(self, state, action, next_state):
         return (state[0] + 1) * (action + 1) / 8
@@ -209,7 +217,7 @@ def test_values_are_those_of_the_enumerated_paths(knobs):
     law = paths(of_a_table, HORIZON, **knobs)
     mdp = Task.of(RING, horizon=HORIZON, **knobs).mdp
     assert pharos.evaluate_policy(mdp, POLICY).value_at_start == pytest.approx(value(law), abs=1e-9)
-    mean, _ = estimate(TableAnswers(mdp, POLICY), (0.0, 5.0), 20_000, np.random.default_rng(14))
+    mean, _ = estimate(TableAnswers(POLICY, mdp), (0.0, 5.0), 20_000, np.random.default_rng(14))
     variance = sum(mass * (returned(path) - value(law)) ** 2 for path, mass in law.items())
     assert mean == pytest.approx(value(law), abs=4 * np.sqrt(variance / 20_000))
 
@@ -296,10 +304,19 @@ def test_values_do_not_know_how_rewards_are_paid():
 # Frames ---------------------------------------------------------------------------------------------------------------
 
 
+FRAMES = {"observation": "simple_image", "observation_options": {"frames": 2}}
+
+
+def cells_in(frames):
+    """(N, 2) the cells of both frames, of images (N, 2, H, W) or of one."""
+    columns = np.asarray(frames).max(axis=-2)
+    return np.atleast_2d(columns.argmax(axis=-1) // (columns.shape[-1] // 4))
+
+
 def in_frames(frames):
-    """Going on where both frames are the same, else back: (N, ...) vectors of two frames, in [0, 1] -> actions."""
-    frames = np.asarray(frames).reshape(len(frames), 2)
-    return np.where(frames[:, 0] == frames[:, 1], 2, 0)
+    """Three on where both frames are the same, else one."""
+    cells = cells_in(frames)
+    return np.where(cells[:, 0] == cells[:, 1], 2, 0)
 
 
 def of_two_states(states):
@@ -308,7 +325,7 @@ def of_two_states(states):
 
 @pytest.mark.parametrize("knobs", KNOBS.values(), ids=KNOBS)
 def test_a_policy_of_two_frames_has_the_value_of_the_enumerated_paths(knobs):
-    task = Task.of(RING, horizon=HORIZON, observation_options={"frames": 2}, **knobs)
+    task = Task.of(RING, horizon=HORIZON, **FRAMES, **knobs)
     evaluation = evaluate_agent(in_frames, task)
     assert evaluation.exact
     assert evaluation.value == pytest.approx(value(paths(of_two_states, HORIZON, **knobs)), abs=1e-9)
@@ -316,22 +333,22 @@ def test_a_policy_of_two_frames_has_the_value_of_the_enumerated_paths(knobs):
 
 @pytest.mark.slow
 def test_frames_are_the_last_states_of_the_episode_and_its_first_one_before(space):
-    options = {"time_limit": 5, "observation_options": {"frames": 2}}
+    options = {"time_limit": 5, **FRAMES}
     many, one = VectorEnv(RING, 20, autoreset_mode="SAME_STEP", **options), GymEnv(RING, **options)
     seen, alone, episodes = many.reset(seed=17)[0], one.reset(seed=17)[0], batch({}, space, 20, 5, frames=2)
     before, state, batched = many.states[:, 0], one.state[0], episodes.state[0].copy()
-    np.testing.assert_array_equal(seen.reshape(20, 2) * 3, np.stack([before, before], axis=1))
-    np.testing.assert_array_equal(alone.reshape(2) * 3, [state, state])
+    np.testing.assert_array_equal(cells_in(seen), np.stack([before, before], axis=1))
+    np.testing.assert_array_equal(cells_in(alone), [[state, state]])
     np.testing.assert_array_equal(episodes.seen[0], np.stack([batched, batched], axis=1))
     for step in range(12):
         seen, _, _, ended, _ = many.step(np.full(20, 2))
         now = many.states[:, 0]
-        np.testing.assert_allclose(seen.reshape(20, 2) * 3, np.stack([np.where(ended, now, before), now], axis=1))
+        np.testing.assert_array_equal(cells_in(seen), np.stack([np.where(ended, now, before), now], axis=1))
         alone, _, _, over, _ = one.step(2)
-        np.testing.assert_allclose(alone.reshape(2) * 3, [state, one.state[0]])
+        np.testing.assert_array_equal(cells_in(alone), [[state, one.state[0]]])
         if over:
             alone = one.reset()[0]
-            np.testing.assert_allclose(alone.reshape(2) * 3, [one.state[0]] * 2)
+            np.testing.assert_array_equal(cells_in(alone), [[one.state[0]] * 2])
         episodes.step(step, np.full((1, 20), 2), counts=True)
         first, current = (episodes.flags[0] > 0), episodes.state[0].copy()
         np.testing.assert_array_equal(episodes.seen[0], np.stack([np.where(first, current, batched), current], axis=1))

@@ -246,10 +246,10 @@ def last_policy_by_place(run, world, words):
     }
 
 
-def whole_run_by_place(run, study_folder):
+def whole_run_by_place(run, spec, study_folder):
     """Normalised cumulative regret of a run, of learnt policies and as played, wherever the library says them."""
-    result, curve, runs = read_record(run)["result"], RegretCurve.read(run), study.table(study_folder)
-    cell = study.outcomes(runs, study.curves(study_folder)).iloc[0]
+    result, curve, runs = read_record(run)["result"], RegretCurve.read(run), study.table(spec, study_folder)
+    cell = study.outcomes(runs, study.curves(spec, study_folder)).iloc[0]
     learnt = {
         "record": result["normalized_regret"],
         "curve read back": curve.normalized(curve.cumulative_expected)[-1],
@@ -277,7 +277,7 @@ def test_normalised_regret_agrees_in_all_places_at_once(tmp_path, monkeypatch, v
     (run,) = (tmp_path / "coins" / "runs").iterdir()
     words = ["coin.py:Coin", *(f"{name}={value}" for name, value in values.items())]
     last = last_policy_by_place(run, world, words)
-    learnt, played = whole_run_by_place(run, tmp_path / "coins")
+    learnt, played = whole_run_by_place(run, spec, tmp_path / "coins")
     for places in (last, learnt, played):
         numbers = np.array([math.nan if each is None else each for each in places.values()])
         assert np.isnan(numbers).all() if values else np.ptp(numbers) <= 1e-9, places
