@@ -64,7 +64,7 @@ def sketched(monkeypatch):
     def save(draw, place):
         return None if draw() is None else {"light": b"light", "dark": b"dark"}
 
-    monkeypatch.setattr(files, "save", save)
+    monkeypatch.setattr(files, "save_for_page", save)
 
 
 class Reader(HTMLParser):
