@@ -137,13 +137,13 @@ def said_of(cells, resamples):
 def draw(file, picture):
     """Predicted against observed on the sealed classes, a panel for each agent."""
     from pharos.plots import save
-    from pharos.plots.style import COLORS, GRID, figure, styled
+    from pharos.plots.style import COLORS, GRID, panels, styled
 
     @styled
-    def panels():
+    def by_agent():
         frame = pd.read_csv(file)
-        drawn, axes = figure(1, 2, (3.4, 3.3))
-        for axis, agent in zip(axes[0], PRIMARY, strict=True):
+        drawn, axes = panels(2, 3.4, 3.3)
+        for axis, agent in zip(axes, PRIMARY, strict=True):
             cells = frame[(frame["agent"] == agent) & (frame["study"] == "sealed-1")]
             axis.plot([0, 1.8], [0, 1.8], color=GRID, zorder=0)
             for number, (name, some) in enumerate(cells.groupby(cells["observation"].str.split("[(,]").str[0])):
@@ -154,11 +154,11 @@ def draw(file, picture):
             axis.set(
                 xlim=(0, 1.8), ylim=(0, 1.8), xlabel="predicted regret", title=f"{agent.upper()}, {len(cells)} cells"
             )
-        axes[0, 0].set_ylabel("observed regret")
-        axes[0, 0].legend(loc="upper left", handletextpad=0.2)
+        axes[0].set_ylabel("observed regret")
+        axes[0].legend(loc="upper left", handletextpad=0.2)
         return drawn
 
-    print(save(panels(), picture))
+    print(save(by_agent(), picture))
 
 
 def of(cells):
