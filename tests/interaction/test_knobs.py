@@ -6,7 +6,7 @@ agree with it to 1e-9; what draws has to pass a chi-square (or Kolmogorov-Smirno
 
 import itertools
 from collections import Counter
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ from pharos.agents.batched import BatchRun
 from pharos.agents.batched.lane import BatchedEpisodes
 from pharos.environments import Environment, Layer
 from pharos.interaction import GymEnv, VectorEnv
-from pharos.mdp import rewards_of_staying
+from pharos.mdp import ChanceSetting, rewards_of_staying
 from pharos.policies.query import TableAnswers
 from pharos.policies.value import estimate
 from pharos.rules.stepping import InterpretedStepping
@@ -154,7 +154,7 @@ def one_by_one(knobs, space):
 def learner(knobs, space, limit=HORIZON):
     """Q-learning that always acts by POLICY, and whose entry is what it was paid last."""
     task = Task.of(RING, horizon=limit, **knobs)
-    pay = {"reward_noise": task.reward_noise, "reward_delay": task.reward_delay}
+    pay = {"reward_noise": task.chance.reward_noise, "reward_delay": task.chance.reward_delay}
     greedy = {"exploration_initial_eps": 0.0, "exploration_final_eps": 0.0, "learning_rate": 1.0, "gamma": 0.0}
     return QLearning(task.mdp, total_steps=1, seed=13, time_limit=limit, **pay, **greedy)
 
@@ -176,11 +176,9 @@ def by_q_learning(knobs, space):
 
 
 def batch(knobs, space, copies, limit=HORIZON, frames=1):
-    lazy = knobs.get("lazy", 0.0)
-    task = Task.of(RING, horizon=limit, **{name: p for name, p in knobs.items() if name != "lazy"})
-    run = BatchRun(task.mdp, None, limit, {}, 1, 0, 99)
-    pay = {"reward_noise": task.reward_noise, "reward_delay": task.reward_delay}
-    run = replace(run, laziness=lazy, staying=rewards_of_staying(space).array.astype(float), **pay)
+    mdp = Task.of(RING, horizon=limit, **{name: p for name, p in knobs.items() if name != "lazy"}).mdp
+    staying = rewards_of_staying(space).array.astype(float)
+    run = BatchRun(mdp, None, limit, {}, 1, 0, 99, chance=ChanceSetting(**knobs), staying=staying)
     return BatchedEpisodes([run], np.array([run.key], np.uint64), copies, frames)
 
 
