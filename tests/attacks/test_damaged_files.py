@@ -372,7 +372,7 @@ def test_searches(attack, tmp_path):
         return len(command("tune", *options, "--trials", 4, "--out", folder)["trials"]) >= 4
 
     names = ("tuning.json", "hyperparameters.yaml")
-    attack("searches", 40, tmp_path / "search", names, read, fewer=2)
+    attack("searches", 30, tmp_path / "search", names, read, fewer=2)
 
 
 # Entries of leaderboards ---------------------------------------------------------------------------------------------

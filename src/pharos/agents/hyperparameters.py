@@ -56,7 +56,7 @@ def _read(path: Path) -> dict[str, Any]:
     return table
 
 
-def _is_table(entry: Any, levels: int) -> bool:
+def _is_table(entry: object, levels: int) -> bool:
     """Whether names lead to names, so many levels deep; a default has one level, and what is empty none."""
     if not isinstance(entry, dict) or not all(isinstance(name, str) for name in entry):
         return False

@@ -58,7 +58,7 @@ class QLearning:
         time_limit: int | None = None,
         reward_noise: float = 0.0,
         reward_delay: int = 0,
-        **options: Any,
+        **options: object,
     ):
         table = mdp.dynamics.deterministic_table()
         self._transitions = mdp.dynamics.for_kernels if table is None else table

@@ -289,7 +289,7 @@ class Environment:
             raise ParameterError(f"{self}: an action has one outcome; found outcome {outcome}, expected 0")
         return tuple(int(value) for value in out)
 
-    def reward_of(self, state: Any, action: int, next_state: Any, outcome: int = 0) -> Any:
+    def reward_of(self, state: object, action: int, next_state: object, outcome: int = 0) -> Any:
         """What a step pays, whichever form of `reward` the class has; interpreted."""
         if type(self).pays_by_outcome():
             return self.reward(state, action, next_state, outcome)

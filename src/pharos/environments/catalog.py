@@ -26,7 +26,7 @@ _OWN = _CLASS_NAMES | _IMPORTED
 _REGISTERED: dict[str, type[Environment]] = {}
 
 
-def make(name: str, **parameters: Any) -> Environment:
+def make(name: str, **parameters: object) -> Environment:
     """Return the environment called `name`, with `parameters` for its class.
 
     Args:
@@ -125,7 +125,7 @@ def source_of(cls: type[Environment]) -> Source | None:
     return None if _is_built_in(cls) else sources.source_of(cls)
 
 
-def _known_class(source: Source, cls: Any) -> type[Environment]:
+def _known_class(source: Source, cls: object) -> type[Environment]:
     if cls is None:
         raise ParameterError(
             f"{source.name!r}: AttributeError: there is no {source.attribute!r}; expected 'module:Class' or "

@@ -174,7 +174,7 @@ class ImportedWorld(Environment):
             raise FileFormatError(f"{self.folder}: {len(shown)} observations for {self.manifest['num_states']} states")
         return self._with_end(shown, 0)
 
-    def _with_end(self, rows: np.ndarray, value: Any) -> np.ndarray:
+    def _with_end(self, rows: np.ndarray, value: object) -> np.ndarray:
         more = len(self.successors) - len(rows)
         return rows if more == 0 else np.concatenate([rows, np.full((more, *rows.shape[1:]), value, rows.dtype)])
 

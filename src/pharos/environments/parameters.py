@@ -69,7 +69,7 @@ class Parameter:
             return f"{name} in [{low:g}, {high:g}]"
         return name + (f" >= {low:g}" if low is not None else f" <= {high:g}" if high is not None else "")
 
-    def checked(self, env: Any, name: str, value: Any) -> Any:
+    def checked(self, env: object, name: str, value: object) -> Any:
         """The value as it is stored; ParameterError where it is out of range."""
         if value is None and self.optional:
             return None
@@ -85,7 +85,7 @@ class Parameter:
 
 
 def parameter(
-    default: Any, *, low: Any = None, high: Any = None, kind: type | Kind | None = None, added: bool = False
+    default: object, *, low: object = None, high: object = None, kind: type | Kind | None = None, added: bool = False
 ) -> Any:
     """A field of an environment's dataclass, with the values that it may take.
 
@@ -110,14 +110,14 @@ def declared_parameters(cls: type) -> dict[str, Parameter]:
     return declared
 
 
-def check_parameters(env: Any) -> None:
+def check_parameters(env: object) -> None:
     """Check and store the parameters of an environment being made; ParameterError names the first wrong one."""
     declared = declared_parameters(type(env))
     for name in sorted(declared, key=lambda name: declared[name].is_bounded_by_others):
         store(env, name, declared[name].checked(env, name, getattr(env, name)))
 
 
-def store(env: Any, name: str, value: Any) -> Any:
+def store(env: object, name: str, value: object) -> Any:
     """Set a field of a frozen dataclass while it is being made."""
     object.__setattr__(env, name, value)
     return value
@@ -152,7 +152,7 @@ def integers(expected: str, allowed: Callable[[int], bool]) -> Kind:
 def one_of(*names: str) -> Kind:
     """Texts, each one of `names`."""
 
-    def checked(env: Any, name: str, value: Any) -> str:
+    def checked(env: object, name: str, value: object) -> str:
         if value not in names:
             raise ParameterError(f"{type(env).__name__}: {name}={value!r}; expected {' or '.join(names)}")
         return str(value)
@@ -194,7 +194,7 @@ def _valued_cells(env: Any, name: str, value: Any) -> tuple[tuple[tuple[int, int
     return tuple((_cell(env, name, place), float(number)) for place, number in pairs)
 
 
-def _cells(env: Any, name: str, value: Any) -> tuple[tuple[int, int], ...]:
+def _cells(env: object, name: str, value: object) -> tuple[tuple[int, int], ...]:
     """Cells, from pairs (row, column) or text such as "0,1; 2,3"."""
     places = [part for part in value.split(";") if part.strip()] if isinstance(value, str) else value
     if not isinstance(places, Iterable):
@@ -236,12 +236,12 @@ def _number(env: Any, name: str, value: Any, low: float, high: float) -> float:
     return float(value)
 
 
-def _truth(env: Any, name: str, value: Any) -> bool:
+def _truth(env: object, name: str, value: object) -> bool:
     if isinstance(value, str) or value not in (True, False):
         raise ParameterError(f"{type(env).__name__}: {name}={value!r}; expected True or False")
     return bool(value)
 
 
-def as_tuples(value: Any) -> Any:
+def as_tuples(value: object) -> Any:
     """Lists as tuples, all the way down: parameters as JSON or YAML writes them become those of a class."""
     return tuple(as_tuples(item) for item in value) if isinstance(value, list | tuple) else value

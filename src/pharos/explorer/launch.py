@@ -53,7 +53,7 @@ class Explorer:
     def __enter__(self) -> "Explorer":
         return self
 
-    def __exit__(self, *_: Any) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def __repr__(self) -> str:
@@ -68,7 +68,7 @@ def explore(  # noqa: PLR0913
     sticky: float = 0.0,
     random: float = 0.0,
     lazy: float = 0.0,
-    observation: Any = "vector",
+    observation: object = "vector",
     trust: bool = False,
     out: str | os.PathLike | None = None,
     port: int = 0,
@@ -105,7 +105,7 @@ def explore(  # noqa: PLR0913
 
 
 def exploration_of(
-    target: Any,
+    target: object,
     *,
     learnt: Learnt | None = None,
     gamma: float | None = None,

@@ -122,7 +122,7 @@ def _plain(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
-def _shortened(data: Any) -> Any:
+def _shortened(data: object) -> Any:
     """The same with numbers of DIGITS significant digits."""
     if isinstance(data, dict):
         return {name: _shortened(value) for name, value in data.items()}

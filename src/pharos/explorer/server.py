@@ -150,7 +150,7 @@ class _Http(ThreadingHTTPServer):
         finally:
             self.places.release()
 
-    def handle_error(self, request: Any, client_address: Any) -> None:
+    def handle_error(self, request: object, client_address: object) -> None:
         """A browser that went away in the middle of an answer is no error."""
 
 
@@ -206,5 +206,5 @@ class _Handler(BaseHTTPRequestHandler):
             return _said(HTTPStatus.FORBIDDEN, "the address lacks the token that `pharos explore` printed")
         return owner.answer(rest, parts.query)
 
-    def log_message(self, format: str, *args: Any) -> None:
+    def log_message(self, format: str, *args: object) -> None:
         """Nothing is logged."""

@@ -24,7 +24,7 @@ LEAST_PROBABILITY = 1e-6
 """A table is refused where outcomes as rare as those sampled were less likely than this, all comparisons together."""
 
 
-def gymnasium(env: Any, *, gamma: float = 0.99, horizon: int | None = None, check: bool = True) -> TabularMDP:
+def gymnasium(env: object, *, gamma: float = 0.99, horizon: int | None = None, check: bool = True) -> TabularMDP:
     """Return the MDP of an environment with a `P` table, such as FrozenLake, Taxi or CliffWalking.
 
     Args:
@@ -69,7 +69,7 @@ def gymnasium(env: Any, *, gamma: float = 0.99, horizon: int | None = None, chec
     return TabularMDP.from_matrices(matrix, rewards, gamma=gamma, initial=initial, horizon=horizon)
 
 
-def gymnasium_outcomes(env: Any) -> Outcomes | None:
+def gymnasium_outcomes(env: object) -> Outcomes | None:
     """Return the outcomes of the same table with the reward of each, for `importers.save(..., outcomes=)`.
 
     None where no action pays different rewards, so that the MDP says it all.
@@ -108,7 +108,7 @@ def _rows(env: Any) -> tuple[Any, list[list[list]]]:
         ) from None
 
 
-def _checked(env: Any, s: int, a: int, outcomes: list, states: int) -> dict[tuple[int, bool], tuple[float, float]]:
+def _checked(env: object, s: int, a: int, outcomes: list, states: int) -> dict[tuple[int, bool], tuple[float, float]]:
     """{(next state, terminated): (probability, probability x reward)}, equal outcomes added up."""
     merged: dict[tuple[int, bool], tuple[float, float]] = {}
     total = 0.0
@@ -128,7 +128,7 @@ def _checked(env: Any, s: int, a: int, outcomes: list, states: int) -> dict[tupl
     return merged
 
 
-def _start(env: Any, inner: Any, states: int) -> np.ndarray:
+def _start(env: object, inner: object, states: int) -> np.ndarray:
     """(S,) the start distribution: `initial_state_distrib`, or state 0."""
     try:
         start = np.asarray(getattr(inner, "initial_state_distrib", np.eye(states)[0]), np.float64)
@@ -139,7 +139,7 @@ def _start(env: Any, inner: Any, states: int) -> np.ndarray:
     return start
 
 
-def _compare_with_steps(env: Any, inner: Any, rows: list[list[list]]) -> None:
+def _compare_with_steps(env: object, inner: object, rows: list[list[list]]) -> None:
     """FileFormatError where the environment, stepped, does what its table does not say.
 
     Each state's actions are tried in turn, so that few steps try many of them.
@@ -182,7 +182,7 @@ def _likely(options: list) -> dict[tuple[int, float, bool], float]:
     return likely
 
 
-def _compare_frequencies(env: Any, inner: Any, likely: list, met: dict[tuple[int, int], Counter]) -> None:
+def _compare_frequencies(env: object, inner: object, likely: list, met: dict[tuple[int, int], Counter]) -> None:
     """FileFormatError where the sampled frequencies of a state and action, or of all with the same probabilities in the
     table, are too unlikely.
 
@@ -216,7 +216,7 @@ def _compare_frequencies(env: Any, inner: Any, likely: list, met: dict[tuple[int
             )
 
 
-def _native(inner: Any) -> str:
+def _native(inner: object) -> str:
     """What pharos has in place of an environment, for the end of a message."""
     name = type(inner).__name__.removesuffix("Env")
     if name not in NATIVE:
@@ -225,7 +225,7 @@ def _native(inner: Any) -> str:
     return f"; pharos has it as `{NATIVE[name]}{option}`"
 
 
-def _copy(inner: Any) -> Any:
+def _copy(inner: object) -> Any:
     try:
         return copy.deepcopy(inner)
     except Exception:  # a window, a generator of its own: whatever cannot be copied is stepped itself
@@ -240,6 +240,8 @@ def _state_number(observation: Any, states: int) -> int | None:
     return number if 0 <= number < states and number == observation else None
 
 
-def matrices(P: Any, R: Any, *, gamma: float = 0.99, initial: Any = 0, horizon: int | None = None) -> TabularMDP:
+def matrices(
+    P: object, R: object, *, gamma: float = 0.99, initial: object = 0, horizon: int | None = None
+) -> TabularMDP:
     """Return the MDP of transition probabilities P and rewards R; as `TabularMDP.from_matrices`."""
     return TabularMDP.from_matrices(P, R, gamma=gamma, initial=initial, horizon=horizon)

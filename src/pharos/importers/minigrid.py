@@ -37,7 +37,7 @@ _NOT_STATE = frozenset(
 
 
 def minigrid(
-    env: Any,
+    env: object,
     *,
     seed: int = 0,
     actions: Sequence[int] | None = None,
@@ -77,7 +77,7 @@ def minigrid(
 
 
 def minigrid_recording(
-    env: Any,
+    env: object,
     *,
     seed: int = 0,
     gamma: float = 1.0,
@@ -97,7 +97,7 @@ def minigrid_recording(
 
 
 def minigrid_grids(
-    env: Any,
+    env: object,
     *,
     seed: int = 0,
     actions: Sequence[int] | None = None,
@@ -221,7 +221,7 @@ class _Driver:
             delattr(self.env, name)
         vars(self.env).update(attributes)
 
-    def _number_of_fixed(self, value: Any) -> int | None:
+    def _number_of_fixed(self, value: object) -> int | None:
         """What is no part of a state and stays where it is: the environment itself, its spaces, its generator."""
         if value is not self.env and not isinstance(value, self.fixed_types):
             return None
@@ -257,7 +257,7 @@ class _Driver:
             if name not in _NOT_STATE:
                 yield name, attributes[name]
 
-    def _flatten(self, value: Any, flat: list[Any], places: dict[int, int]) -> None:
+    def _flatten(self, value: object, flat: list[Any], places: dict[int, int]) -> None:
         if isinstance(value, np.ndarray | np.generic):
             value = value.tolist()
         if value is None or isinstance(value, bool | int | float | str):

@@ -235,11 +235,11 @@ def _row(rank: int, verdict: Verdict, copies: str) -> list[Cell]:
     ]
 
 
-def _number(value: Any, style: str) -> Cell:
+def _number(value: object, style: str) -> Cell:
     return Cell(format(value, style), repr(value))
 
 
-def _name_of(environment: str, parameters: Any) -> str:
+def _name_of(environment: str, parameters: object) -> str:
     """The named instance that has these parameters, or the class with what is not its default."""
     if ":" in environment:
         return environment

@@ -180,7 +180,7 @@ def _entry(record: Mapping[str, Any], arrays: dict[str, np.ndarray]) -> Entry:
     return entry
 
 
-def _check_values(value: Any, name: str = "record", depth: int = 0) -> None:
+def _check_values(value: object, name: str = "record", depth: int = 0) -> None:
     """Refuse texts that would do something to a terminal, or hide what they say, and numbers that no float holds."""
     if depth > DEEPEST:
         raise ValueError(f"its {name} is nested deeper than {DEEPEST} times")

@@ -219,7 +219,7 @@ def _time_limit(seconds: float) -> Iterator[None]:
         yield
         return
 
-    def stop(*_: Any) -> None:
+    def stop(*_: object) -> None:
         raise TimeLimit(f"takes more than {seconds:g} s")
 
     before = signal.signal(signal.SIGALRM, stop)
@@ -292,7 +292,7 @@ def task_key(config: RunConfig) -> str:
     return storage.digest_of_json(_as_floats(storage.plain(task)))
 
 
-def _as_floats(value: Any) -> Any:
+def _as_floats(value: object) -> Any:
     if isinstance(value, dict):
         return {name: _as_floats(item) for name, item in value.items()}
     if isinstance(value, list):

@@ -38,7 +38,7 @@ class ComplexImage(Frames):
         self,
         env: Environment,
         *,
-        size: Any = (84, 84),
+        size: object = (84, 84),
         grey: bool = False,
         channels_first: bool = False,
         motion: bool = False,

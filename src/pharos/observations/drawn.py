@@ -53,7 +53,7 @@ class Drawing:
         self._interpreted = interpreted
         self._compiled: Any = None
 
-    def __call__(self, states: np.ndarray, out: np.ndarray, *tables: Any) -> None:
+    def __call__(self, states: np.ndarray, out: np.ndarray, *tables: object) -> None:
         """Draw states (N, D) into out (N, ...), with the tables that the kernel takes between the planes and `out`."""
         if self._compiled is None:
             self._compiled = self._function(states, out, tables)
@@ -63,7 +63,7 @@ class Drawing:
             self._block,
         )
 
-    def one(self, state: np.ndarray, out: np.ndarray, *tables: Any) -> None:
+    def one(self, state: np.ndarray, out: np.ndarray, *tables: object) -> None:
         """Draw one state (D,) into out (1, ...); as the call for many, without its cost."""
         if self._compiled is None:
             self._compiled = self._function(state[None], out, tables)
@@ -112,7 +112,7 @@ class Frames(Observation):
         channel_axis: of an observation, on which frames lie one after another.
     """
 
-    def _stack(self, frames: Any, channels: int) -> None:
+    def _stack(self, frames: object, channels: int) -> None:
         """Take `space` for that of one frame, whose axis `channels` is that of its channels, and stack k of them.
 
         Raises:

@@ -149,7 +149,7 @@ def _words(value: Any) -> str:
     return str(value) if isinstance(value, str | bool | int) else "+".join(map(str, value))
 
 
-def register(name: str, function: Function, space: Any) -> None:
+def register(name: str, function: Function, space: object) -> None:
     """Make a user's observation known as `observation=name`, so that a spec, a study or a command can name it.
 
     Args:
@@ -175,7 +175,11 @@ def is_built_in(name: str) -> bool:
 
 
 def observe(
-    env: Environment | str, observation: Any = "vector", *, state_space: "StateSpace | None" = None, **options: Any
+    env: Environment | str,
+    observation: object = "vector",
+    *,
+    state_space: "StateSpace | None" = None,
+    **options: object,
 ) -> Observation:
     """Return an observation of `env`.
 
@@ -245,7 +249,7 @@ def _own(observation: Any) -> Any:
     return imported(observation) if is_reference(observation) else None
 
 
-def _short(value: Any) -> str:
+def _short(value: object) -> str:
     text = repr(value)
     return text if len(text) <= 80 else text[:77] + "..."
 
@@ -307,7 +311,7 @@ def own_observation(observation: Any, folder: str | Path | None = None) -> OwnOb
     return None
 
 
-def _observation(source: Source, value: Any) -> OwnObservation:
+def _observation(source: Source, value: object) -> OwnObservation:
     name = source.attribute
     if is_built_in(name):
         raise ParameterError(f"{source.name!r}: {name!r} is the name of a built-in observation; choose another name")

@@ -17,7 +17,7 @@ RENDERERS: dict[str, Renderer] = {"human": human}
 """Name of an observation -> function (environment, state) -> (H, W, 3) or (H, W) uint8. Packages add theirs."""
 
 
-def render(env: Environment, state: Sequence[int], observation: str = "human", **options: Any) -> np.ndarray:
+def render(env: Environment, state: Sequence[int], observation: str = "human", **options: object) -> np.ndarray:
     """Return the picture of `state` under an observation, (H, W, 3) uint8.
 
     Args:

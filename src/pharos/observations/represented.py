@@ -26,12 +26,12 @@ SAMPLE = 4096  # states whose observations the digest is of
 
 def representation(
     space: "StateSpace",
-    observation: Any = "vector",
+    observation: object = "vector",
     network: Network | str | Callable[[tuple[int, ...]], Any] | None = None,
     *,
     initialisation: str = "pytorch",
     landmarks: int | None = None,
-    **options: Any,
+    **options: object,
 ) -> Representation:
     """Return what a network makes of the states of a state space, for `pharos.hardness.report` and its measures.
 
@@ -89,7 +89,7 @@ def representation(
     )
 
 
-def _own_network(network: Any, shape: tuple[int, ...]) -> tuple[Callable[..., np.ndarray], dict[str, Any]]:
+def _own_network(network: object, shape: tuple[int, ...]) -> tuple[Callable[..., np.ndarray], dict[str, Any]]:
     """(kernel of inputs x, y; what it is), of a function of the shape or of its name."""
     source = sources.find(network) if isinstance(network, str) else sources.source_of(network)
     function = sources.load(source) if isinstance(network, str) and source is not None else network

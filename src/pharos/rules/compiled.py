@@ -82,7 +82,7 @@ class CompiledExploration(_Compiled):
         """What the kernels write of each row beside its successors."""
         return terminal if self._is_plain else (terminal, probabilities)
 
-    def _expand(self, *arrays: Any) -> None:
+    def _expand(self, *arrays: object) -> None:
         self.kernels.expand_and_find(self.parameters, self.layout.tables, *arrays)
 
     def component_at_fault(self, states, i: int, keys, terminal, probabilities) -> int | None:
@@ -126,7 +126,7 @@ class CompiledRewards(_Compiled):
             "expected_block", self._expected_rewards_of, states, outcomes, terminal, start, stop, ranks
         )
 
-    def _rewards_or_error(self, name: str, compiled: Callable[..., np.ndarray], *arguments: Any) -> np.ndarray:
+    def _rewards_or_error(self, name: str, compiled: Callable[..., np.ndarray], *arguments: object) -> np.ndarray:
         try:
             return compiled(*arguments)
         except Exception as error:  # of the rule, such as a division by zero: name the state
@@ -196,7 +196,7 @@ class CompiledStepping:
     def __reduce__(self):
         return CompiledStepping, (self.env,)
 
-    def step_and_draw_one(self, *arguments: Any) -> Any:
+    def step_and_draw_one(self, *arguments: object) -> Any:
         """The kernel that steps and draws, made ready for these arguments; None where `draw` does not compile."""
         try:
             self._step_and_draw_one(self.parameters, *arguments)
@@ -214,13 +214,13 @@ class CompiledDrawing:
 
     is_compiled, motion = True, False
 
-    def __init__(self, env: Environment, kernel: str, *arguments: Any):
+    def __init__(self, env: Environment, kernel: str, *arguments: object):
         names, self.parameters = numeric_attributes(env)
         kernels = interaction_kernels(_class_of(env), names, env.num_actions, int(env.outcomes), self.motion)
         self._kernel = getattr(kernels, kernel)
         self(*arguments)
 
-    def __call__(self, *arguments: Any) -> None:
+    def __call__(self, *arguments: object) -> None:
         self._kernel(self.parameters, *arguments)
 
 

@@ -75,7 +75,7 @@ def numeric_attributes(env: Environment) -> tuple[tuple[str, ...], tuple[Any, ..
     return tuple(numeric), tuple(numeric.values())
 
 
-def _is_numeric(value: Any) -> bool:
+def _is_numeric(value: object) -> bool:
     if isinstance(value, np.ndarray):
         return value.dtype.kind in "biuf"
     if isinstance(value, tuple):
@@ -83,7 +83,7 @@ def _is_numeric(value: Any) -> bool:
     return isinstance(value, bool | int | float | np.number)
 
 
-def _plain(value: Any) -> Any:
+def _plain(value: object) -> Any:
     if isinstance(value, np.ndarray):
         return np.ascontiguousarray(value)
     if isinstance(value, np.number):
@@ -203,7 +203,7 @@ class _RuleCompiler:
     def __init__(self):
         self._done: dict[Any, Any] = {}
 
-    def compiled(self, function: Any) -> Any:
+    def compiled(self, function: object) -> Any:
         function = plain_function(function)
         if not isinstance(function, python_types.FunctionType):
             return function  # Numba will say what it thinks of it
@@ -238,7 +238,7 @@ def _float_of_truth(value):
     return None
 
 
-def type_text(value: Any) -> str:
+def type_text(value: object) -> str:
     """The Numba type of a parameter, as text."""
     try:
         return str(numba.typeof(value))

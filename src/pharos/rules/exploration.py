@@ -35,7 +35,7 @@ class Words(NamedTuple):
     same: Any
 
 
-def exploration(compiler: Any, rules: Any, Parameters: Any, W: int, A: int) -> ExplorationKernels:
+def exploration(compiler: Any, rules: object, Parameters: object, W: int, A: int) -> ExplorationKernels:
     """The kernels of a class of environments whose states take W words and which has A actions."""
     search = compiler.calling("transition", "is_terminal")
     words = words_functions(search, W)

@@ -28,7 +28,7 @@ _STABLE = (
 )
 
 
-def fingerprint_of_rules(env: Any, rules: Iterable[str]) -> str:
+def fingerprint_of_rules(env: object, rules: Iterable[str]) -> str:
     """SHA-256 of these rules of `env` and of the attributes of the instance that they mention."""
     numbers: dict[Any, int] = {}
     functions = [getattr(type(env), rule) for rule in rules]
@@ -40,7 +40,7 @@ def fingerprint_of_rules(env: Any, rules: Iterable[str]) -> str:
     return hashlib.sha256(repr(parts).encode()).hexdigest()
 
 
-def mutable_attributes(env: Any, rules: Iterable[str]) -> list[str]:
+def mutable_attributes(env: object, rules: Iterable[str]) -> list[str]:
     """Names of attributes of `env` that these rules mention, and whose content can be changed after they were read."""
     names = mentioned_names((getattr(type(env), rule) for rule in rules), type(env))
     return sorted(n for n in names if isinstance(getattr(env, n, None), list | dict | set | bytearray))
@@ -66,7 +66,7 @@ def mentioned_names(functions: Iterable[Any], owner: type | None = None) -> set[
     return names
 
 
-def plain_function(value: Any) -> Any:
+def plain_function(value: object) -> Any:
     """The Python function behind one that Numba has compiled; anything else as it is."""
     return getattr(value, "py_func", value)
 
@@ -91,7 +91,7 @@ def closure_of(function: types.FunctionType) -> dict[str, Any]:
     return variables
 
 
-def function_text(function: Any, numbers: dict[Any, int]) -> str:
+def function_text(function: object, numbers: dict[Any, int]) -> str:
     """A text for a function and for everything that it reaches by name."""
     function = plain_function(function)
     if not isinstance(function, types.FunctionType):
@@ -107,7 +107,7 @@ def function_text(function: Any, numbers: dict[Any, int]) -> str:
     return "\n".join(parts)
 
 
-def value_text(value: Any, names: set[str], numbers: dict[Any, int]) -> str:
+def value_text(value: object, names: set[str], numbers: dict[Any, int]) -> str:
     """A text for a value; of a module, for those of its attributes that are among `names`."""
     value = plain_function(value)
     home = getattr(value, "__module__", None) or ""
@@ -147,7 +147,7 @@ def value_text(value: Any, names: set[str], numbers: dict[Any, int]) -> str:
     return repr(value)
 
 
-def _first_time(value: Any, numbers: dict[Any, int]) -> bool:
+def _first_time(value: object, numbers: dict[Any, int]) -> bool:
     first = value not in numbers
     numbers.setdefault(value, len(numbers))
     return first
@@ -158,7 +158,7 @@ def _code_text(code: types.CodeType) -> str:
     return f"{sys.version_info[:2]}{code.co_code.hex()}{constants}{code.co_names}{code.co_varnames}{code.co_freevars}"
 
 
-def _constant_text(constant: Any) -> str:
+def _constant_text(constant: object) -> str:
     if isinstance(constant, types.CodeType):
         return _code_text(constant)
     if isinstance(constant, frozenset):  # whose order may vary from process to process

@@ -223,7 +223,7 @@ class Rules:
         return InterpretedStepping(self.env)
 
     def drawing(
-        self, kernel: str, interpreted: Callable[..., None], *arguments: Any, motion: bool = False
+        self, kernel: str, interpreted: Callable[..., None], *arguments: object, motion: bool = False
     ) -> Callable[..., None]:
         """A function that draws states.
 
@@ -259,7 +259,7 @@ _reasons: dict[tuple[Any, type], dict[Any, str]] = {}
 _warned: set[tuple[type, Any]] = set()
 
 
-def compiled_or_none(engine: Callable[..., Engine], env: Environment, *arguments: Any) -> Engine | None:
+def compiled_or_none(engine: Callable[..., Engine], env: Environment, *arguments: object) -> Engine | None:
     """The compiled engine; None, after one warning for each class, where Numba cannot compile it."""
     compiled, reason = _reason(engine, env, *arguments)
     if reason and (type(env), engine) not in _warned:
@@ -274,7 +274,7 @@ def not_compiled(reason: str) -> str:
     return f"Numba cannot compile its rules, so they run {how}: {reason}"
 
 
-def _reason(engine: Callable[..., Engine], env: Environment, *arguments: Any) -> tuple[Engine | None, str]:
+def _reason(engine: Callable[..., Engine], env: Environment, *arguments: object) -> tuple[Engine | None, str]:
     """The engine and "", or None and why there is none; what failed to compile once is not tried again."""
     failed = _reasons.setdefault((engine, type(env)), {})
     try:

@@ -174,6 +174,6 @@ def _is_ours(name: str) -> bool:
     return name in OUR_FILES or storage.is_temporary(name)
 
 
-def _short(value: Any) -> str:
+def _short(value: object) -> str:
     text = str(value)
     return text if len(text) <= 120 else text[:117] + "..."

@@ -94,7 +94,7 @@ def check_layers(env: Environment, notes: list[str]) -> None:
         )
 
 
-def _check_layer(where: str, name: Any, layer: Any) -> None:
+def _check_layer(where: str, name: object, layer: object) -> None:
     """RuleError where a layer, which a message calls `where`, is not as the contract says."""
     if not isinstance(name, str) or not isinstance(layer, Layer):
         raise RuleError(f"{where} is {layer!r}; expected a Layer")

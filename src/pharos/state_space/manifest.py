@@ -249,7 +249,7 @@ def _checked_size(name: str, entry: dict[str, Any]) -> int:
     return size
 
 
-def _whole(value: Any, name: str, least: int) -> int:
+def _whole(value: object, name: str, least: int) -> int:
     if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= 2**63:
         raise ValueError(f"{name} is {repr(value)[:200]}; expected a whole number of at least {least}")
     return value

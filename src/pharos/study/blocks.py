@@ -104,11 +104,11 @@ class Run:
         return (config.environment, config.agent, config.observation, config.engine)
 
 
-def _entry(value: Any) -> Any:
+def _entry(value: object) -> Any:
     return {"name": value} if isinstance(value, str) else value
 
 
-def _chance(value: Any) -> ChanceSetting:
+def _chance(value: object) -> ChanceSetting:
     if isinstance(value, Mapping):
         return ChanceSetting.from_dict({name: float(p) if type(p) is int else p for name, p in value.items()})
     if value not in ("plain", None):
@@ -116,7 +116,7 @@ def _chance(value: Any) -> ChanceSetting:
     return ChanceSetting()
 
 
-def _seeds(value: Any) -> Any:
+def _seeds(value: object) -> Any:
     if isinstance(value, list):
         return value
     if isinstance(value, bool) or not isinstance(value, int) or value < 1:
@@ -219,7 +219,7 @@ class Hardness(_Part):
         return [name for name in names if name in self.measures] or list(self.measures)
 
 
-def _engines(value: Any) -> Any:
+def _engines(value: object) -> Any:
     for engine in value.values() if isinstance(value, dict) else [value]:
         if engine not in ENGINES:
             raise UnknownName("engine", engine, ENGINES)
@@ -356,5 +356,5 @@ def registered() -> list[str]:
     return list(measures())
 
 
-def _jsonable(value: Any) -> Any:
+def _jsonable(value: object) -> Any:
     return json.loads(json.dumps(value))

@@ -220,7 +220,7 @@ class Execution:
                 if run.id not in there or run.id in self.repeated or not self.note(run)
             )
 
-    def _start(self, context: Any) -> None:
+    def _start(self, context: object) -> None:
         for _ in range(len(self.pending)):
             if len(self.running) >= self.options.workers:
                 return

@@ -98,7 +98,7 @@ class RunLog:
         except ImportError as error:
             raise MissingExtra("logs for TensorBoard", "tensorboard", "agents") from error
 
-        def write(run: Run, name: str, record: Mapping[str, Any], curve: Any) -> None:
+        def write(run: Run, name: str, record: Mapping[str, Any], curve: object) -> None:
             folder = self.place / self.to / name
             for old in folder.glob("events.out.tfevents.*"):  # of an attempt that was killed
                 old.unlink()
@@ -120,7 +120,7 @@ class RunLog:
         except ImportError as error:
             raise MissingExtra("logs for Weights & Biases", "wandb", "wandb") from error
 
-        def write(run: Run, name: str, record: Mapping[str, Any], curve: Any) -> None:
+        def write(run: Run, name: str, record: Mapping[str, Any], curve: object) -> None:
             (self.place / self.to).mkdir(parents=True, exist_ok=True)
             logged = wandb.init(
                 project=self.project or self.study.name,
@@ -173,5 +173,5 @@ def _points(curve: Any) -> Iterator[tuple[int, float, dict[str, float]]]:
         )
 
 
-def _is_number(value: Any) -> bool:
+def _is_number(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)

@@ -311,7 +311,7 @@ def parse(
 
 
 def _validated(
-    data: Mapping[str, Any], name: str, root: Any, folder: Path, trust: bool, entries: list[Any] | None = None
+    data: Mapping[str, Any], name: str, root: object, folder: Path, trust: bool, entries: list[Any] | None = None
 ) -> Specification:
     data = _with_environments(data, name, entries)
     references = [*_references(data)]
@@ -411,7 +411,7 @@ def _wrong(specification: Specification) -> Iterator[tuple[Loc, str]]:
                 yield loc, str(UnknownName("set of hyperparameters", own, specification.hyperparameters))
 
 
-def _messages(error: ValidationError, name: str, root: Any) -> str:
+def _messages(error: ValidationError, name: str, root: object) -> str:
     said: dict[str, None] = {}
     for problem in error.errors():
         loc = problem["loc"]

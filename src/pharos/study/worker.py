@@ -257,7 +257,7 @@ def end_cleanly() -> None:
     A process that SIGTERM kills leaves its semaphores behind, of which Python then warns.
     """
 
-    def leave(*_: Any) -> None:
+    def leave(*_: object) -> None:
         sys.exit(128 + signal.SIGTERM)
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -97,7 +97,7 @@ def _listen() -> None:
                 _running += 1
             _tell(event.data["dispatcher"].py_func)
 
-        def on_end(self, event: Any) -> None:
+        def on_end(self, event: object) -> None:
             global _running, _total
             with _lock:
                 _running -= 1

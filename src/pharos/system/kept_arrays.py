@@ -11,9 +11,10 @@ import os
 import weakref
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 import numpy as np
+from numpy.typing import DTypeLike
 
 from pharos.errors import FileFormatError, FolderLocked, ParameterError
 from pharos.system import storage
@@ -25,7 +26,7 @@ except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
 
-def kept_array(path: str | os.PathLike, shape: tuple[int, ...], dtype: Any, what: str = "values") -> np.ndarray:
+def kept_array(path: str | os.PathLike, shape: tuple[int, ...], dtype: DTypeLike, what: str = "values") -> np.ndarray:
     """The array of a file: what is there, or zeros in a new one.
 
     Args:

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
+from numpy.typing import DTypeLike
 
 from pharos.errors import DiskFull
 from pharos.system import memory as machine
@@ -67,7 +68,7 @@ def huge_pages(length: int, dtype: np.dtype) -> np.ndarray:
     return np.frombuffer(memory, dtype)
 
 
-def large_zeros(shape: tuple[int, ...], dtype: Any, share: float = SHARE) -> np.ndarray:
+def large_zeros(shape: tuple[int, ...], dtype: DTypeLike, share: float = SHARE) -> np.ndarray:
     """An array of zeros: in memory, or, where it would take more than 1 / share of what is free, a mapped file.
 
     The file is in the cache's folder and has no name: it is gone with the array, whatever becomes of the process. What
@@ -116,7 +117,7 @@ def append_zeros(file: BinaryIO, size: int) -> None:
         file.flush()
 
 
-def ranges_from_the_end(rows: Any, low: int, high: int, have_room: bool = False) -> Iterator[tuple[int, int]]:
+def ranges_from_the_end(rows: object, low: int, high: int, have_room: bool = False) -> Iterator[tuple[int, int]]:
     """Ranges [start, stop) that make up [low, high), the last one first: how rows are swept from the last to the first.
 
     Rows in memory are one range. Of a mapped array, `RANGE` rows are swept while the system reads those before them: it
@@ -137,7 +138,7 @@ def ranges_from_the_end(rows: Any, low: int, high: int, have_room: bool = False)
             _advise(rows, start, stop, _COLD)
 
 
-def rows_with_room(rows: Any, low: int, high: int) -> int:
+def rows_with_room(rows: object, low: int, high: int) -> int:
     """Of rows [low, high) of an array, memory has room for those below this one: all, but for mapped files."""
     if sys.platform != "linux" or not isinstance(rows, np.memmap) or not isinstance(_mapping_of(rows), mmap.mmap):
         return high

@@ -14,7 +14,7 @@ from typing import Any, TypeVar, get_type_hints
 T = TypeVar("T")
 
 
-def meanings(documented: Any) -> dict[str, str]:
+def meanings(documented: object) -> dict[str, str]:
     """Name -> text, of entries such as `height, width: of the grid` in the section Attributes or Args of a docstring;
     also of the classes that a class extends.
     """
@@ -69,7 +69,7 @@ def flat(cls: type[T]) -> type[T]:
     init = cls.__init__
 
     @functools.wraps(init)
-    def flat_init(self: T, *args: Any, **options: Any) -> None:
+    def flat_init(self: T, *args: object, **options: object) -> None:
         init(self, *args, **joined(cls, options))
 
     cls.__init__ = flat_init  # type: ignore[method-assign, assignment]

@@ -45,7 +45,7 @@ class PackedIndices:
         return PackedIndices(np.empty(shape, PACKED))
 
     @staticmethod
-    def of(values: Any) -> "PackedIndices":
+    def of(values: object) -> "PackedIndices":
         """From integers."""
         return PackedIndices(packed(np.asarray(values)))
 
@@ -106,7 +106,7 @@ def unpacked(entries: Any) -> Any:
     return (entries["high"].astype(np.int64) << 32) | entries["low"]
 
 
-def as_array(indices: Any) -> Indices:
+def as_array(indices: object) -> Indices:
     """What is no `PackedIndices` as an array of NumPy."""
     return indices if isinstance(indices, PackedIndices) else np.asarray(indices)
 

@@ -74,7 +74,7 @@ class Source:
         return f"{self.name} ({self.file})"
 
 
-def is_reference(name: Any) -> bool:
+def is_reference(name: object) -> bool:
     """Whether a name is that of the user's own code, `module:Name` or `file.py:Name`."""
     return isinstance(name, str) and ":" in name
 
@@ -154,7 +154,7 @@ def resolve(source: Source, *, trust: bool = False, strict: bool = False) -> Any
     return load(now)
 
 
-def source_of(value: Any, attribute: str | None = None) -> Source | None:
+def source_of(value: object, attribute: str | None = None) -> Source | None:
     """Where a class or function comes from, which others can import; None where they cannot, as in a notebook.
 
     Args:

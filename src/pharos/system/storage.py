@@ -91,12 +91,12 @@ def replace_file(path: str | os.PathLike, data: bytes | str, *, durable: bool = 
         file.write(data.encode() if isinstance(data, str) else data)
 
 
-def replace_json(path: str | os.PathLike, value: Any, *, durable: bool = True) -> None:
+def replace_json(path: str | os.PathLike, value: object, *, durable: bool = True) -> None:
     """Replace a file by a value in JSON (see `json_text`), in one step; what is no file there too."""
     replace_file(path, json_text(value) + "\n", durable=durable, devices=False)
 
 
-def replace_array(path: str | os.PathLike, array: Any) -> None:
+def replace_array(path: str | os.PathLike, array: object) -> None:
     """Replace a file by an array as .npy, in one step; see `replacing`.
 
     NumPy writes to a real file by C's `fwrite` and does not notice a full disk at its end, so it gets no real file
@@ -393,7 +393,7 @@ def _text(path: Path) -> str | None:
 # JSON and digests -----------------------------------------------------------------------------------------------------
 
 
-def json_text(value: Any) -> str:
+def json_text(value: object) -> str:
     """A value in JSON: arrays are lists, and numbers that JSON cannot say (NaN, infinity) are null.
 
     Raises:
@@ -402,7 +402,7 @@ def json_text(value: Any) -> str:
     return json.dumps(plain(value), indent=1, allow_nan=False)
 
 
-def plain(value: Any) -> Any:
+def plain(value: object) -> Any:
     """A value as JSON has it: mappings with names, lists, text, finite numbers and None."""
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
@@ -449,7 +449,7 @@ def read_json(path: str | os.PathLike, error: type[PharosError] = FileFormatErro
         raise error(f"{path}: is no JSON, or was cut short: {' '.join(str(problem).split())}{advice}") from None
 
 
-def digest_of_json(value: Any) -> str:
+def digest_of_json(value: object) -> str:
     """XXH3-128 of a value as compact JSON with sorted keys; NaN and infinity are null."""
     text = json.dumps(plain(value), sort_keys=True, separators=(",", ":"), allow_nan=False)
     return xxhash.xxh3_128_hexdigest(text.encode())
@@ -505,7 +505,7 @@ class ResultCache:
         except (FileNotFoundError, FileFormatError, AttributeError, TypeError):
             return None
 
-    def put(self, dependencies: Mapping[str, Any], **entries: Any) -> None:
+    def put(self, dependencies: Mapping[str, Any], **entries: object) -> None:
         """Keep a result."""
         self.folder.mkdir(parents=True, exist_ok=True)
         replace_json(self.file(dependencies), sealed({**dependencies, **entries}))

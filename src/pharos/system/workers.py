@@ -26,7 +26,7 @@ NO_GUARD = 78
 
 
 @contextlib.contextmanager
-def without_main(*definitions: Any) -> Iterator[None]:
+def without_main(*definitions: object) -> Iterator[None]:
     """Processes that are started within do not import the user's script, which therefore needs no guard.
 
     multiprocessing lets each new process import the `__main__` of the first one, under another name. Code of the user's

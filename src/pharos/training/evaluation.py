@@ -64,7 +64,7 @@ def evaluate_agent(
     )
 
 
-def values_together(batch: Any, members: "Sequence[Member]") -> dict[int, Evaluation]:
+def values_together(batch: object, members: "Sequence[Member]") -> dict[int, Evaluation]:
     """place in the batch -> value of the run's policy, where that is had for less than one by one; others are left out.
 
     These are DQN where nothing is random, and runs that share a task of few states and see one frame.

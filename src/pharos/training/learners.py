@@ -211,7 +211,7 @@ class Deep:
             if step == last:
                 model.logger.dump(model.num_timesteps)
 
-        def after_step(local: dict[str, Any], _: Any) -> bool:
+        def after_step(local: dict[str, Any], _: object) -> bool:
             if model.num_timesteps > last:
                 return True
             running[:] += discount * self.env.earned

@@ -313,6 +313,6 @@ def _expected_checksums(folder: Path) -> dict[str, str]:
     return checksums
 
 
-def write_policy(folder: Path, policy: Any) -> None:
+def write_policy(folder: Path, policy: object) -> None:
     """Replace policy.npy: what a tabular agent has learnt, as `pharos evaluate --policy` takes it."""
     storage.replace_array(folder / POLICY, policy)

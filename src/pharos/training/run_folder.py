@@ -67,7 +67,7 @@ class Record:
         if (rules := class_called(config.environment)) is not None:
             self.run["rules_version"] = rules.version
 
-    def write(self, status: str, **entries: Any) -> None:
+    def write(self, status: str, **entries: object) -> None:
         """Replace it: the run is "running", "failed" or "finished"."""
         if self.folder is None:
             return

@@ -22,6 +22,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -331,7 +332,7 @@ def _default_value(agent: str, name: str) -> Any:
     return None if parameter is None or parameter.default is parameter.empty else parameter.default
 
 
-def _allows(choices: tuple[Any, ...], value: Any) -> bool:
+def _allows(choices: tuple[Any, ...], value: object) -> bool:
     """Whether a value lies in the part of the space that `choices` describe."""
     kind, *values = choices
     if kind == "one of":
@@ -339,7 +340,7 @@ def _allows(choices: tuple[Any, ...], value: Any) -> bool:
     return isinstance(value, int | float) and values[0] <= value <= values[1]
 
 
-def _study(optuna: Any, search: _Search, records: Sequence[Mapping[str, Any]]) -> Any:
+def _study(optuna: ModuleType, search: _Search, records: Sequence[Mapping[str, Any]]) -> Any:
     """Optuna's study with the trials that are over; its first trial is what the table says."""
     optuna.logging.set_verbosity(optuna.logging.ERROR)  # what fails is raised
     pruner = optuna.pruners.MedianPruner(n_startup_trials=5, n_warmup_steps=10)
@@ -366,7 +367,7 @@ def _study(optuna: Any, search: _Search, records: Sequence[Mapping[str, Any]]) -
     return study
 
 
-def _sampler(optuna: Any, search: _Search, done: int, trials: int) -> Any:
+def _sampler(optuna: ModuleType, search: _Search, done: int, trials: int) -> Any:
     """What proposes the next trial, from those that are done: a search that was killed goes on as it would have."""
     seed = int(np.random.SeedSequence([search.search_seed, done]).generate_state(1)[0])
     return optuna.samplers.TPESampler(
@@ -398,7 +399,7 @@ def _class_of(instances: Sequence[Environment]) -> str:
 # Files ----------------------------------------------------------------------------------------------------------------
 
 
-def _earlier_trials(optuna: Any, search: _Search, folder: Path) -> list[dict[str, Any]]:
+def _earlier_trials(optuna: ModuleType, search: _Search, folder: Path) -> list[dict[str, Any]]:
     """The trials of a search that goes on, also of an earlier pharos, which kept them in a journal of Optuna's.
 
     Raises:

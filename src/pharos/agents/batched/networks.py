@@ -82,7 +82,7 @@ class QNetworks:
 
     eps = 1e-8  # of Adam
 
-    def __init__(self, shape: tuple[int, ...], is_image: bool, net_arch: Any, num_actions: int):
+    def __init__(self, shape: tuple[int, ...], is_image: bool, net_arch: object, num_actions: int):
         self.parameters = parameters = Parameters()
         sizes = sizes_of(net_arch)
         layers = extractor(parameters, "q_net.features_extractor", shape, is_image)
@@ -112,7 +112,7 @@ class ActorCritics:
 
     eps = 1e-5
 
-    def __init__(self, shape: tuple[int, ...], is_image: bool, net_arch: Any, num_actions: int):
+    def __init__(self, shape: tuple[int, ...], is_image: bool, net_arch: object, num_actions: int):
         self.parameters = parameters = Parameters()
         self.trunk = Stack(extractor(parameters, "features_extractor", shape, is_image))
         actor, critic = sizes_of(net_arch, "pi"), sizes_of(net_arch, "vf")

@@ -136,7 +136,7 @@ def spreadsheet_safe(data: "pd.DataFrame") -> "pd.DataFrame":
     return safe
 
 
-def _no_formula(value: Any) -> Any:
+def _no_formula(value: object) -> Any:
     """Text that a spreadsheet would run gets an apostrophe, which spreadsheets take for "this is text"."""
     if not isinstance(value, str) or not value.startswith(FORMULA):
         return value

@@ -14,7 +14,7 @@ class Section:
     context: Mapping[str, Any] = field(default_factory=dict)
 
     @staticmethod
-    def of(title: str, template: str, **context: Any) -> "Section":
+    def of(title: str, template: str, **context: object) -> "Section":
         """The section that `template`.html.j2 prints with this context."""
         return Section(title, f"{template}.html.j2", context)
 
