@@ -43,8 +43,8 @@ def stop(done, *_):
 @given(config=st.dictionaries(st.text(max_size=5), values, max_size=5))
 def test_an_identifier_depends_on_what_a_configuration_says_and_not_on_its_order(config):
     turned = dict(reversed(list(config.items())))
-    assert _results.identifier(config) == _results.identifier(turned)
-    assert _results.identifier({**config, "seed of the test": 1}) != _results.identifier(config)
+    assert _results.run_id(config) == _results.run_id(turned)
+    assert _results.run_id({**config, "seed of the test": 1}) != _results.run_id(config)
 
 
 def test_the_same_rows_give_the_same_bytes_and_come_back(tmp_path):

@@ -14,8 +14,7 @@ from optuna.storages.journal import JournalFileBackend
 from command_line import run
 from pharos.agents import hyperparameters
 from pharos.errors import FileFormatError, ParameterError
-from pharos.training import SPACES, read_record, train, tune
-from pharos.training.results import identifier
+from pharos.training import SPACES, read_record, run_id, train, tune
 
 LAKE = "frozen_lake/4x4"
 ONE = {"learning_rate": ("log", 0.001, 1.0)}
@@ -192,7 +191,7 @@ def journal(tmp_path):
     old.mkdir()
     (old / "tuning.json").write_text(json.dumps(record))
     storage = optuna.storages.JournalStorage(JournalFileBackend(str(old / "journal.log")))
-    study = optuna.create_study(study_name=identifier(record["config"]), storage=storage)
+    study = optuna.create_study(study_name=run_id(record["config"]), storage=storage)
     space = {
         "one of": lambda values: optuna.distributions.CategoricalDistribution(values),
         "linear": lambda values: optuna.distributions.FloatDistribution(*values),

@@ -29,6 +29,7 @@ from pharos.study.execution import (
     train,
 )
 from pharos.study.specification import Source, specification
+from pharos.system.wording import in_one_line
 
 
 def submit(
@@ -169,7 +170,7 @@ def _follow(ray: Any, remote: Any, execution: Execution) -> Status:
                 execution.batches.halve(left)
             elif error is not None:
                 for run in left:
-                    execution.fail(run, _worker.describe(error))
+                    execution.fail(run, in_one_line(error))
             if left and (error is None or len(left) > 1):
                 time.sleep(BUSY_SECONDS)  # another process may be at them
                 execution.pending.extend((0.0, run) for run in left)

@@ -31,7 +31,7 @@ from pharos.study.processes import end_processes, one_thread, processors, ready,
 from pharos.study.specification import Source
 from pharos.study.status import Forecast, Status, claim, duration, opened, status
 from pharos.system.storage import replace_json
-from pharos.system.wording import many
+from pharos.system.wording import in_one_line, many
 from pharos.system.workers import check_guard, without_interrupts, without_main
 
 __all__ = ["Execution", "Options", "Status", "claim", "duration", "opened", "processors", "run", "shard_of", "status"]
@@ -247,7 +247,7 @@ class Execution:
         if self.lost_servers > LOST_SERVERS:
             raise PharosError(
                 f"the process that starts runs died {many(self.lost_servers, 'time')} in a row "
-                f"({_worker.describe(error)}); was there memory enough?"
+                f"({in_one_line(error)}); was there memory enough?"
             ) from error
         time.sleep(BUSY_SECONDS)
 

@@ -25,7 +25,7 @@ from pharos.study.blocks import Run, Specification
 from pharos.study.execution import opened
 from pharos.study.specification import Source
 from pharos.system.storage import ResultCache
-from pharos.system.wording import many
+from pharos.system.wording import in_one_line, many
 from pharos.training import CELL, ChanceSetting
 
 if TYPE_CHECKING:
@@ -321,7 +321,7 @@ def _measure(
         except UnknownName as error:
             raise ParameterError(f"study {study.name!r}: {error}") from error
         except Exception as error:  # whatever it is, a report without this measure is better than none
-            failed[name] = {"why": _worker.describe(error)}
+            failed[name] = {"why": in_one_line(error)}
     stored = {**stored, "measures": measures, "num_states": mdp.num_states}
     return stored, {**stored, "measures": {**measures, **failed}}
 

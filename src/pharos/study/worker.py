@@ -21,8 +21,9 @@ from pathlib import Path
 from typing import Any
 
 from pharos import training
-from pharos.errors import FileFormatError, FolderLocked, PharosError
+from pharos.errors import FileFormatError, FolderLocked
 from pharos.system import storage
+from pharos.system.wording import in_one_line
 
 FINISHED, FAILED, BUSY = "finished", "failed", "busy"
 EXIT_BUSY = 75
@@ -124,7 +125,7 @@ def _execute(runner: BatchRunner, todo: Sequence[tuple[Mapping[str, Any], str, P
             errors = list(runner([config for config, _, _ in todo], places, folder / BATCHES))
         except Exception as error:
             traceback.print_exc()
-            errors = [describe(error)] * len(todo)
+            errors = [in_one_line(error)] * len(todo)
     for place in others:
         shutil.copyfile(first / "log.txt", place / "log.txt")
     seconds = (time.perf_counter() - began) / len(todo)
@@ -141,12 +142,6 @@ def run_alone(
     """A runner of one run as one of batches, for `functools.partial`."""
     runner(configs[0], folders[0])
     return [None]
-
-
-def describe(error: BaseException) -> str:
-    """An error in one line: as pharos says it, or with its type."""
-    text = " ".join(str(error).split())
-    return text if isinstance(error, PharosError) else f"{type(error).__name__}: {text}"
 
 
 def write_failure(folder: Path, config: Mapping[str, Any], id: str, error: str, seconds: float) -> None:

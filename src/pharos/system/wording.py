@@ -1,4 +1,6 @@
-"""How messages say numbers and names."""
+"""How messages say numbers, names and errors."""
+
+from pharos.errors import PharosError
 
 
 def many(count: int, one: str, several: str | None = None) -> str:
@@ -9,3 +11,9 @@ def many(count: int, one: str, several: str | None = None) -> str:
 def in_words(name: str) -> str:
     """A name as prose spells it: `normalized_regret` is "normalised regret"."""
     return name.replace("_", " ").replace("normalized", "normalised")
+
+
+def in_one_line(error: BaseException) -> str:
+    """An error as pharos says it, or with its type."""
+    text = " ".join(str(error).split())
+    return text if isinstance(error, PharosError) else f"{type(error).__name__}: {text}"

@@ -23,13 +23,13 @@ from pharos.errors import FileFormatError, FolderLocked, ParameterError, PharosE
 from pharos.policies import is_small_table
 from pharos.system import compiling
 from pharos.system.storage import digest_of_json, lock, read_json, remove_leftovers, replace_json
-from pharos.system.wording import many
+from pharos.system.wording import in_one_line, many
 from pharos.training import results as _results
 from pharos.training.config import RunConfig
 from pharos.training.evaluation import values_together
 from pharos.training.learners import make_learner
 from pharos.training.run_folder import Checkpoint, Record, TrainingResult, clear_run, finished_result
-from pharos.training.task_cache import FailedRun, Member, TaskCache, in_one_line
+from pharos.training.task_cache import FailedRun, Member, TaskCache
 
 # What a member is begun anew from, where its batch is halved.
 BEGINNING = ("place", "config", "folder", "task", "hyperparameters", "run", "key")

@@ -46,11 +46,6 @@ _TYPES: dict[str, Callable[[Any], Any]] = {"int64": int, "float64": float, "bool
 _TRUTHS = {"True": True, "False": False}
 
 
-def identifier(config: Mapping[str, Any]) -> str:
-    """The name of a run: a digest of its configuration, the same on every machine."""
-    return run_id(config)
-
-
 def versions() -> dict[str, str]:
     """Versions of what a result depends on."""
     import platform
@@ -124,7 +119,7 @@ def read_record(folder: str | os.PathLike) -> dict[str, Any]:
         raise FileFormatError(f"{path}: is not the record of a run in format {FORMAT}")
     if not storage.is_intact(record):
         raise ResultCorrupted(f"{path}: was changed after it was written; {AGAIN}")
-    id, name = identifier(record["config"]), path.absolute().parent.name
+    id, name = run_id(record["config"]), path.absolute().parent.name
     if (
         storage.DIGEST in record and "id" in record
     ):  # what was written says so; a configuration may hold infinite numbers

@@ -8,7 +8,8 @@ from typing import Any
 
 from pharos.agents import QLearning, check_hyperparameters
 from pharos.agents import hyperparameters as hyperparameters_of
-from pharos.errors import ParameterError, PharosError
+from pharos.errors import ParameterError
+from pharos.system.wording import in_one_line
 from pharos.training.config import RunConfig
 from pharos.training.curve import Curve
 from pharos.training.run_folder import Record
@@ -32,12 +33,6 @@ class FailedRun:
     def error(self) -> str:
         """The reason in one line."""
         return in_one_line(self.exception)
-
-
-def in_one_line(error: BaseException) -> str:
-    """An error as pharos says it, or with its type."""
-    text = " ".join(str(error).split())
-    return text if isinstance(error, PharosError) else f"{type(error).__name__}: {text}"
 
 
 @dataclass(eq=False)

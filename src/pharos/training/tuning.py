@@ -37,7 +37,7 @@ from pharos.system import storage
 from pharos.system.wording import many
 from pharos.training import results as _results
 from pharos.training.batch import Progress, train_configs
-from pharos.training.config import RunConfig
+from pharos.training.config import RunConfig, run_id
 from pharos.training.task import Task
 from pharos.training.task_cache import FailedRun, TaskCache
 
@@ -425,7 +425,7 @@ def _earlier_trials(optuna: ModuleType, search: _Search, folder: Path) -> list[d
     try:
         storage.check_regular(journal)
         backend = optuna.storages.JournalStorage(JournalFileBackend(str(journal)))
-        old = optuna.load_study(study_name=_results.identifier(search.config), storage=backend)
+        old = optuna.load_study(study_name=run_id(search.config), storage=backend)
         return [_record(trial) for trial in old.trials if trial.state.name in _STATUS]
     except Exception as error:  # Optuna trusts what it reads
         said = f"{type(error).__name__}: {' '.join(str(error).split())}"
