@@ -31,6 +31,8 @@ UNCOMPARED = ("log.txt", "status.json", "lock")
 REMADE = ("cache/values",)
 """What is computed again where it is not there, and then not kept."""
 LONGEST = 60.0
+PYTHON = "python"
+"""A command of this name is code of Python, its second word."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +43,7 @@ class End:
         code: exit code; negative: the signal that ended it.
         text: what it printed.
         changes: how often it changed files. is_killed: whether it, or a process that it started, was killed.
+        is_of_worker: whether it was one that it started.
         seconds: that it took.
     """
 
@@ -48,6 +51,7 @@ class End:
     text: str
     changes: int
     is_killed: bool
+    is_of_worker: bool
     seconds: float
 
 
@@ -109,6 +113,9 @@ def _command(words: list[str]) -> tuple[int, str]:
 
     from pharos.cli import app
 
+    if words[0] == PYTHON:
+        exec(words[1], {})
+        return 0, ""
     done = CliRunner().invoke(app, words)
     if done.exception is not None and not isinstance(done.exception, SystemExit):
         raise done.exception
@@ -117,7 +124,7 @@ def _command(words: list[str]) -> tuple[int, str]:
 
 def _execute(words: list[str], folder: Path, change: int, seconds: float) -> End:
     """Execute a command in a fork of this process."""
-    shared, began = mmap.mmap(-1, 16), time.monotonic()  # changes so far, and whether one of them was the last
+    shared, began = mmap.mmap(-1, 16), time.monotonic()  # changes so far, and the process that was killed at the last
     with tempfile.TemporaryFile() as output:
         process = os.fork()
         if process == 0:
@@ -134,9 +141,9 @@ def _execute(words: list[str], folder: Path, change: int, seconds: float) -> End
         took = time.monotonic() - began
         output.seek(0)
         text = output.read().decode(errors="replace")
-    code, (changes, was_last) = os.waitstatus_to_exitcode(status), struct.unpack("qq", shared)
+    code, (changes, killed) = os.waitstatus_to_exitcode(status), struct.unpack("qq", shared)
     assert took < LONGEST, (words, text)
-    return End(code, text, changes, bool(was_last) or code == -signal.SIGKILL, took)
+    return End(code, text, changes, bool(killed) or code == -signal.SIGKILL, killed not in (0, process), took)
 
 
 def _child(words: list[str], folder: Path, change: int, shared: mmap.mmap, output: int) -> None:
@@ -150,7 +157,11 @@ def _child(words: list[str], folder: Path, change: int, shared: mmap.mmap, outpu
         _count_changes(str(folder), change, shared)
         from pharos.cli import app
 
-        app(words)
+        if words[0] == PYTHON:
+            exec(words[1], {})
+            code = 0
+        else:
+            app(words)
     except SystemExit as end:
         code = end.code if isinstance(end.code, int) else 0
     except BaseException:
@@ -169,7 +180,7 @@ def _count_changes(folder: str, last: int, shared: mmap.mmap) -> None:
         done = struct.unpack_from("q", shared)[0] + 1
         struct.pack_into("q", shared, 0, done)
         if done == last:
-            struct.pack_into("q", shared, 8, 1)
+            struct.pack_into("q", shared, 8, os.getpid())
             os.kill(os.getpid(), signal.SIGKILL)
 
     def hook(event: str, arguments: tuple[Any, ...]) -> None:

@@ -18,6 +18,15 @@ DQN = "--agent dqn --set learning_starts=20 --set buffer_size=200 --set net_arch
 SHORT = "--steps 128 --interval 32"
 BLOCK = {"environments": ["frozen_lake/4x4"], "agents": ["q_learning"], "chance": ["plain"], "seeds": [0, 1]}
 STUDY = {"name": "mine", "steps": 64, "evaluations": 4, "blocks": [BLOCK]}
+SEEDS = """\
+import pharos
+from pharos.training import process_pool
+process_pool.lane_width = lambda *_: 1  # so that three seeds are work for two processes
+small = {"n_steps": 16, "n_envs": 2, "batch_size": 16, "net_arch": [8]}
+options = {"steps": 128, "evaluation_interval": 32, "hyperparameters": small, "workers": 2, "out": "runs"}
+runs = pharos.train_many("ppo", "frozen_lake/4x4", seeds=range(3), **options)
+assert all(run.result for run in runs), runs
+"""
 BUILD = "build breakout height=7 columns=4 brick_rows=1 --out space"
 
 
@@ -48,6 +57,7 @@ CASES = {
     "train, batched": Case(f"train frozen_lake/4x4 {PPO} {SHORT} --out run", changes=6, moments=2),
     "train, Stable-Baselines3": Case(f"train frozen_lake/4x4 {DQN} {SHORT} --out run", (), 3, 2, is_same=False),
     "train --seeds": Case(f"train frozen_lake/4x4 {PPO} {SHORT} --seeds 0:2 --out runs", changes=6, moments=4),
+    "train_many with two workers": Case(shlex.join(["python", SEEDS]), changes=10, moments=4),
     "study run": Case("study run study.yaml --out study --workers 1", changes=8, moments=4),
     "study pack": Case("study pack study --to mine.parquet", ("study run study.yaml --out study",)),
     "study unpack": Case(
@@ -104,8 +114,10 @@ def test_a_command_that_is_killed_and_repeated_ends_as_if_it_had_not_been(name, 
         folder = shutil.copytree(tmp_path / "given", tmp_path / "killed")
         for again in range(min(len(kills), rng.choice([1, 2]))):
             ((how, when),) = (kill := kills.pop()).items()
-            if execute(folder, **kill).is_killed:
+            end = execute(folder, **kill)
+            if end.is_killed:
                 done[how] += 1
+                done["worker"] += end.is_of_worker
             elif how == "seconds":
                 kills.append({how: when / 2})
             elif again:  # less was left to do than before
@@ -116,7 +128,9 @@ def test_a_command_that_is_killed_and_repeated_ends_as_if_it_had_not_been(name, 
         shutil.rmtree(folder)
     assert done["seconds"] == case.moments and done["change"] >= 0.8 * min(case.changes, undisturbed.changes)
     what = "bytes" if case.is_same else "results"
-    count(f"{done.total()} kills of {name}, {case.moments} of them at any moment: nothing lost, same {what}")
+    kills = done["change"] + done["seconds"]
+    where = f"{case.moments} of them at any moment, {done['worker']} of a worker"
+    count(f"{kills} kills of {name}, {where}: nothing lost, same {what}")
 
 
 def assert_same(found, expected, case):
