@@ -9,14 +9,14 @@ import pharos
 from naive.learning import q_learning
 from pharos.agents import QLearning
 from pharos.errors import ParameterError, UnknownName
-from pharos.mdp import TabularMDP, random_actions, sticky_actions
-from strategies import FEW, deterministic_mdps, outcome_mdps, probabilities
+from pharos.mdp import random_actions, sticky_actions
+from strategies import FEW, deterministic_mdps, general_mdps, outcome_mdps, probabilities
 
 
 @pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(
-    st.one_of(deterministic_mdps(), outcome_mdps(FEW)),
+    st.one_of(deterministic_mdps(), outcome_mdps(FEW), general_mdps()),
     probabilities,
     probabilities,
     st.integers(0, 2**32),
@@ -119,9 +119,6 @@ def test_hyperparameters_out_of_range_are_refused(options, message):
         QLearning(mdp_of("frozen_lake/4x4"), total_steps=10, **options)
 
 
-def test_unknown_hyperparameters_and_general_mdps_are_refused():
+def test_unknown_hyperparameters_are_refused():
     with pytest.raises(UnknownName, match="did you mean 'learning_rate'"):
         QLearning(mdp_of("frozen_lake/4x4"), total_steps=10, learning_rat=0.1)
-    general = TabularMDP.from_matrices(np.full((2, 1, 2), 0.5), np.ones((2, 1)))
-    with pytest.raises(ParameterError, match="no table of next states"):
-        QLearning(general, total_steps=10)

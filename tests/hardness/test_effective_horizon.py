@@ -14,8 +14,8 @@ import pharos
 from naive.horizon import analysis
 from pharos import hardness
 from pharos.errors import ParameterError, PrecisionError, UndefinedMeasure
-from pharos.hardness.planning.effective_horizon import LargeHorizon, _compiled, _vectorized
-from pharos.hardness.planning.steps import TIE, FiniteHorizonValues
+from pharos.hardness.planning.effective_horizon import LargeHorizon, SmallHorizon, parts_of
+from pharos.hardness.planning.steps import TIE
 from pharos.mdp import TabularMDP, random_actions, sticky_actions
 from strategies import FEW, deterministic_mdps, general_mdps, outcome_mdps
 
@@ -108,8 +108,8 @@ def test_it_is_what_its_definition_says(mdp, chance, steps):
 @settings(max_examples=150, deadline=None)
 @given(deterministic_mdps(max_states=6, max_actions=3), st.integers(1, 7))
 def test_the_compiled_analysis_is_the_other_one(mdp, steps):
-    one = _vectorized(FiniteHorizonValues(mdp, steps))
-    other = _compiled(LargeHorizon(mdp, steps, TIE))
+    one = parts_of(SmallHorizon(mdp, steps))
+    other = parts_of(LargeHorizon(mdp, steps, TIE))
     assert one.keys() == other.keys()
     for name in one:
         assert one[name] == pytest.approx(other[name], rel=1e-12, abs=1e-12), name
@@ -117,7 +117,7 @@ def test_the_compiled_analysis_is_the_other_one(mdp, steps):
 
 @pytest.mark.slow
 def test_the_compiled_analysis_of_key_corridor_is_the_published_one():
-    found = _compiled(LargeHorizon(key_corridor(), 100, TIE))
+    found = parts_of(LargeHorizon(key_corridor(), 100, TIE))
     expected = published("_analyzed")
     assert (found["k_min"], found["effective_planning_window"]) == (expected["min_k"], expected["epw"])
     assert found["ms"] == expected["effective_horizon_results"]["ms"]
@@ -200,11 +200,11 @@ def test_a_report_with_a_horizon_has_it_and_one_without_says_what_is_missing():
 )
 def test_states_that_no_episode_meets_do_not_matter(mdp, chance, steps):
     mdp = random_actions(sticky_actions(mdp, chance.get("sticky", 0.0)), chance.get("random", 0.0))
-    whole, part = (_vectorized(FiniteHorizonValues(each, steps)) for each in (mdp, mdp.within(steps)))
+    whole, part = (parts_of(SmallHorizon(each, steps)) for each in (mdp, mdp.within(steps)))
     for name in whole:
         assert part[name] == pytest.approx(whole[name], rel=1e-9, abs=1e-12), name
     if not chance and mdp.next_states is not None:
-        whole, part = (_compiled(LargeHorizon(each, steps, TIE)) for each in (mdp, mdp.within(steps)))
+        whole, part = (parts_of(LargeHorizon(each, steps, TIE)) for each in (mdp, mdp.within(steps)))
         assert part == whole
 
 
@@ -232,8 +232,8 @@ def test_actions_that_rounding_or_less_than_the_tie_tolerance_tells_apart_are_bo
     )
     expected = 1 if less < TIE else 2
     assert 0.1 + 0.2 > 0.3
-    assert _vectorized(FiniteHorizonValues(mdp, 2))["k_min"] == expected
-    assert _compiled(LargeHorizon(mdp, 2, TIE))["k_min"] == expected
+    assert parts_of(SmallHorizon(mdp, 2))["k_min"] == expected
+    assert parts_of(LargeHorizon(mdp, 2, TIE))["k_min"] == expected
 
 
 @pytest.mark.parametrize("function", [hardness.effective_horizon, hardness.gorp_bound])

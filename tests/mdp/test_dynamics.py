@@ -13,11 +13,11 @@ from pharos.mdp import (
     Chance,
     Dynamics,
     Matrices,
-    Outcomes,
     PolicyStep,
     PolicyTable,
     Table,
     TabularMDP,
+    chosen_mass,
     random_actions,
     sticky_actions,
 )
@@ -43,16 +43,20 @@ class Listed(Dynamics):
         self.lists, self.num_states, self.num_actions = lists, num_states, num_actions
         self.operations, self.mass = 10, 1.0 + 1e-12
         self.is_deterministic = False
-        self.has_ends = any(t == num_states for row in lists for t, _ in row)
+        self.has_ends = any(t < 0 for row in lists for t, _ in row)
 
     @classmethod
     def of(cls, mdp):
-        lists = [
-            [(t if t >= 0 else mdp.num_states, p) for t, p in naive_mdp.outcomes(mdp, s, a) if p > 1e-12]
-            for s in range(mdp.num_states)
-            for a in range(mdp.num_actions)
-        ]
+        pairs = np.ndindex(mdp.num_states, mdp.num_actions)
+        lists = [[(t, p) for t, p in naive_mdp.outcomes(mdp, s, a) if p > 1e-12] for s, a in pairs]
         return cls(lists, mdp.num_states, mdp.num_actions)
+
+    @property
+    def for_kernels(self):
+        counts = list(map(len, self.lists))
+        successors, likely = zip(*(outcome for row in self.lists for outcome in row), strict=True)
+        arrays = np.array(successors, np.int32), np.append(0, np.cumsum(counts)), None, np.array(likely)
+        return *arrays, (self.num_states, self.num_actions), max(counts)
 
     def expected(self, x, states=slice(None)):
         x = x[:, None] if x.ndim == 1 else x
@@ -72,23 +76,31 @@ class Listed(Dynamics):
                 after[t, a if width > 1 else 0] += p * mass[s, a]
         return after[:-1]
 
-    def outcomes(self, states, actions):
+    def entries(self, states, actions):
         rows = [
             (i, t, p)
             for i, (s, a) in enumerate(zip(states, actions, strict=True))
             for t, p in self.lists[s * self.num_actions + a]
         ]
         which, following, weights = zip(*rows, strict=True) if rows else ((), (), ())
-        return Outcomes(np.array(which, int), np.array(following, int), np.array(weights, float))
+        return np.array(which, int), np.array(following, int), np.array(weights, float)
 
-    def restricted_to(self, states):
+    def no_such_method(self, *_):
         raise NotImplementedError
 
-    def merged(self, classes, representatives):
-        raise NotImplementedError
+    sample = part = restricted_to = merged = arrays = no_such_method
 
-    def arrays(self):
-        raise NotImplementedError
+
+def backed_up(dynamics, equation, x):
+    """T x, as the formula has it."""
+    q = equation.rewards.rows(slice(None)) + equation.gamma * dynamics.expected(x)
+    return np.vstack([np.broadcast_to(equation.value(q), x[:-1].shape), np.zeros_like(x[:1])])
+
+
+def moved(dynamics, play, now, width):
+    """The mass one step later, as the formula has it."""
+    mass = np.where(play.live[:, None], now, 0.0)
+    return dynamics.pushed(play.chance.executed(mass, chosen_mass(play.policy, mass)), width)
 
 
 def as_matrices(mdp):
@@ -159,28 +171,25 @@ def test_compiled_backups_and_moves_are_those_of_the_formulas(mdp, seed):
     x[-1] = 0
     for select in (BEST, WORST, policy):
         equation = BellmanEquation(mdp.reward_table, mdp.gamma, mdp.chance, select)
-        fast, slow = np.empty_like(x), np.empty_like(x)
+        fast = np.empty_like(x)
         mdp.dynamics.backup(equation, x, fast)
-        Dynamics.backup(Listed.of(mdp), equation, x, slow)
-        np.testing.assert_allclose(fast, slow, atol=1e-12)
-        swept = x.copy()
-        assert Dynamics.sweep(Listed.of(mdp), equation, swept) == np.abs(slow - x).max()
-        assert (swept == slow).all()
+        np.testing.assert_allclose(fast, backed_up(Listed.of(mdp), equation, x), atol=1e-12)
     live = ~np.asarray(mdp.terminal)
     for play, width in (
         (PolicyStep(live, policy.later, mdp.chance), mdp.width),
         (PolicyStep(live, policy.first, mdp.chance.first), 1),
     ):
         now = rng.random((mdp.num_states, width))
-        fast, slow = (np.empty((mdp.num_states, mdp.width)) for _ in range(2))
-        assert mdp.dynamics.move(play, now, fast) == pytest.approx(Dynamics.move(Listed.of(mdp), play, now, slow))
+        fast, slow = np.empty((mdp.num_states, mdp.width)), moved(Listed.of(mdp), play, now, mdp.width)
+        assert mdp.dynamics.move(play, now, fast) == pytest.approx(slow[live].sum())
         np.testing.assert_allclose(fast, slow, atol=1e-12)
     play = PolicyStep(live, policy.later, mdp.chance)
     fast, slow = (np.zeros((mdp.num_states, mdp.width)) for _ in range(2))
     fast[mdp.starts] = slow[mdp.starts] = 1.0
     fast[~live] = slow[~live] = 0.0
     mdp.dynamics.support(play, fast)
-    Dynamics.support(Listed.of(mdp), play, slow)
+    for _ in range(slow.size):
+        slow[moved(Listed.of(mdp), play, slow, mdp.width) > 0] = 1.0
     assert ((fast > 0) == (slow > 0))[live].all()
 
 

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 import pharos
 from pharos.errors import ParameterError, PrecisionError
-from pharos.mdp import BEST, WORST, Matrices, PolicyTable, TabularMDP
+from pharos.mdp import BEST, WORST, PolicyTable, TabularMDP
 from pharos.ranks import RankFailed
 from pharos.solvers import checkpoint as checkpoints
 from pharos.solvers import evaluate_policy, ranked, uniform_value, value_iteration
@@ -80,8 +80,7 @@ def test_values_of_a_horizon_are_the_same_bits(mdp, size, horizon):
     shared = solved(mdp, min(size, mdp.num_states), horizon=horizon)
     assert (shared.x == alone.x).all()
     assert (shared.next_x == alone.next_x).all()
-    if not isinstance(mdp.dynamics, Matrices):  # whose parts are tables of outcomes, which count operations otherwise
-        assert shared.error_bound == alone.error_bound
+    assert shared.error_bound == alone.error_bound
 
 
 @pytest.mark.long

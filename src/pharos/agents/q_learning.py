@@ -45,7 +45,7 @@ class QLearning:
         initial_q: every entry at the start; larger than any value: optimistic.
         sees_previous_action: a row for each (state, previously executed action) instead of for each state.
     Raises:
-        ParameterError: an option is unknown or out of range, or the MDP has no table of next states.
+        ParameterError: an option is unknown or out of range.
     Cost: 15 to 60 ns a step; memory 16 bytes for each state and action.
     """
 
@@ -62,11 +62,6 @@ class QLearning:
     ):
         table = mdp.dynamics.deterministic_table()
         self._transitions = mdp.dynamics.for_kernels if table is None else table
-        if self._transitions is None:
-            raise ParameterError(
-                f"q_learning: {mdp} has no table of next states; expected one next state a pair, or a table of "
-                "outcomes (TabularMDP.from_outcomes)"
-            )
         unknown = set(options) - set(DEFAULTS)
         if unknown:
             raise UnknownName("hyperparameter of q_learning", sorted(unknown)[0], DEFAULTS)

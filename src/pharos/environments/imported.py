@@ -15,6 +15,7 @@ from pharos.environments.look import Layer
 from pharos.environments.parameters import store
 from pharos.errors import FileFormatError, ParameterError
 from pharos.system import mdp_files, storage
+from pharos.system.outcome_rows import OutcomeRows
 
 TIME_LIMIT = 1000  # of an MDP that has no horizon, and whose source has no limit
 MOST_ENTRIES = 1 << 28  # of a table of outcomes, written out
@@ -219,16 +220,8 @@ def outcomes_of(
         successors = arrays[mdp_files.TABLE[0]].reshape(number)
         return np.arange(number), successors, np.ones(number)
     if mdp_files.OUTCOMES[0] in arrays:
-        successors = arrays["successors"]
-        most = successors.size // number  # K, where there are no offsets
-        counts = np.diff(arrays["offsets"]) if "offsets" in arrays else np.full(number, most)
-        rows = np.repeat(np.arange(number), counts)
-        if "probabilities" in arrays:
-            likely = arrays["probabilities"].reshape(-1)
-        else:
-            place = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
-            likely = arrays["palette"][arrays["codes"].reshape(-1)[rows], place]
-        return rows, successors.reshape(-1), likely
+        stored = OutcomeRows(**{name: array for name, array in arrays.items() if name in OutcomeRows.NAMES})
+        return stored.possible(np.arange(number))
     data, indices, indptr = (arrays[name] for name in mdp_files.MATRIX)
     rows = np.repeat(np.arange(number), np.diff(indptr))
     rest = 1.0 - np.bincount(rows, data, minlength=number)

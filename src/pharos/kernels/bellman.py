@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit, types, uint64
 
 from pharos.kernels.interpreted import interpreted_first, overload
-from pharos.kernels.outcomes import expectation, expectation_of_pair, fetch_values, size_of
+from pharos.kernels.outcomes import expectation, fetch_values, size_of
 from pharos.kernels.paths import state_at
 
 UNROLLED = 128  # actions
@@ -106,7 +106,7 @@ def _sticky_values(transitions, table, palette, gamma, choice, v, actions, q, s)
     """q[a] = r(s, a) + gamma v(next, a). Returns (that of what is chosen, their sum)."""
     total = 0.0
     for a in range(len(actions)):
-        q[a] = reward_at(table, palette, s, a) + gamma * expectation_of_pair(transitions, v, s, a)
+        q[a] = reward_at(table, palette, s, a) + gamma * expectation(transitions, v, s, a)
         total += q[a]
     return _chosen(choice, q, actions, s), total
 
@@ -201,7 +201,7 @@ def sticky_policy_sweep(transitions, table, palette, gamma, weights, policy, v, 
     for i in range(stop - 1, start - 1, -1):
         s = state_at(order, i)
         for a in range(num_actions):
-            q[a] = reward_at(table, palette, s, a) + gamma * expectation_of_pair(transitions, v, s, a)
+            q[a] = reward_at(table, palette, s, a) + gamma * expectation(transitions, v, s, a)
         shared = 0.0
         for b in range(num_actions):
             if b == 0 or looks_back:

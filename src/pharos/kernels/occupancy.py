@@ -1,9 +1,9 @@
 """Distributions of states, pushed one step forward.
 
 transitions: see kernels/outcomes.py; live (S,) bool: states that play goes on in; now, after (S, W) float64:
-the distribution over states, W = 1, or over pairs (state, previously executed action), W = A, where `previous` > 0;
-policy (S, B, A) probabilities, B = 1 or, for policies that look at the previous action, A; weights: (chosen, previous,
-uniform).
+the distribution over states, W = 1, or over pairs (state, previously executed action), W = A; that of the first step
+has W = 1. policy (S, B, A) probabilities, B = 1 or, for policies that look at the previous action, A; weights: (chosen,
+previous, uniform).
 """
 
 import numpy as np
@@ -52,7 +52,7 @@ def push(transitions, live, policy, weights, now, after):
     """
     num_states, num_actions = size_of(transitions)
     after[:] = 0.0
-    sticky = weights[1] > 0.0
+    by_action = after.shape[1] > 1
     executed = np.empty(num_actions)
     for s in range(num_states):
         if not live[s]:
@@ -65,7 +65,7 @@ def push(transitions, live, policy, weights, now, after):
             for i in outcomes_of(transitions, s, a):
                 t, p = outcome(transitions, s, a, i)
                 if t >= 0:
-                    after[t, a if sticky else 0] += p * executed[a]
+                    after[t, a if by_action else 0] += p * executed[a]
     total = 0.0
     for s in range(num_states):
         if live[s]:
@@ -83,7 +83,7 @@ def settle(transitions, live, policy, weights, gamma, least, waiting, visits):
     far as it has gone on. Masses below `least` stay. Returns what waits in the end.
     """
     num_states, num_actions = size_of(transitions)
-    sticky = weights[1] > 0.0
+    by_action = waiting.shape[1] > 1
     leaving = np.empty(num_actions)
     for s in range(num_states):
         mass = 0.0
@@ -99,7 +99,7 @@ def settle(transitions, live, policy, weights, gamma, least, waiting, visits):
             for i in outcomes_of(transitions, s, a):
                 t, p = outcome(transitions, s, a, i)
                 if t >= 0 and live[t]:
-                    waiting[t, a if sticky else 0] += p * (gamma * leaving[a])
+                    waiting[t, a if by_action else 0] += p * (gamma * leaving[a])
     total = 0.0
     for s in range(num_states):
         for b in range(waiting.shape[1]):
@@ -112,7 +112,7 @@ def support(transitions, live, policy, weights, met):
     """Add to met (S, W), 1 where play may be and else 0, whatever may come after."""
     num_actions = size_of(transitions)[1]
     width = met.shape[1]
-    sticky = weights[1] > 0.0
+    by_action = width > 1
     alone = np.zeros_like(met)  # a row is 1 at one place while its node is looked at
     todo = np.flatnonzero(met.reshape(-1) > 0.0)
     stack = np.empty(met.size, np.int64)
@@ -129,7 +129,7 @@ def support(transitions, live, policy, weights, met):
         for a in range(num_actions):
             if executed[a] <= 0.0:
                 continue
-            c = a if sticky else 0
+            c = a if by_action else 0
             for i in outcomes_of(transitions, s, a):
                 t, _ = outcome(transitions, s, a, i)
                 if t >= 0 and live[t] and met[t, c] == 0.0:

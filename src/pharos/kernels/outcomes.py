@@ -131,7 +131,7 @@ def _place_of(transitions, row, k):
 
 
 def expectation(transitions, v, s, a):
-    """The mean of v (S + 1,) over what (s, a) leads to; -1 reads the last entry."""
+    """The mean of v (S + 1,), or of v (S + 1, A) at a, over what (s, a) leads to; -1 reads the last entry."""
 
 
 @overload(expectation)
@@ -139,51 +139,33 @@ def _expectation(transitions, v, s, a):
     if _is_lazy(transitions):
 
         def moves_or_stays(transitions, v, s, a):
-            return (1.0 - transitions[1]) * expectation(transitions[0], v, s, a) + transitions[1] * v[s]
+            return (1.0 - transitions[1]) * expectation(transitions[0], v, s, a) + transitions[1] * _value(v, s, a)
 
         return moves_or_stays
     if is_table(transitions):
-        return lambda transitions, v, s, a: v[transitions[uint64(s), uint64(a)]]
+        return lambda transitions, v, s, a: _value(v, transitions[uint64(s), uint64(a)], uint64(a))
 
     def several(transitions, v, s, a):
         total = 0.0
         for k in outcomes_of(transitions, s, a):
             t, p = outcome(transitions, s, a, k)
-            total += p * v[t]
+            total += p * _value(v, t, a)
         return total
 
     return several
 
 
-def expectation_of_pair(transitions, v, s, a):
-    """The mean of v (S + 1, A) at a over what (s, a) leads to; -1 reads the last row."""
+def _value(v, s, a):
+    """v of a state, after an action where v tells them apart."""
 
 
-@overload(expectation_of_pair)
-def _expectation_of_pair(transitions, v, s, a):
-    if _is_lazy(transitions):
-
-        def moves_or_stays(transitions, v, s, a):
-            return (1.0 - transitions[1]) * expectation_of_pair(transitions[0], v, s, a) + transitions[1] * v[s, a]
-
-        return moves_or_stays
-    if is_table(transitions):
-        return lambda transitions, v, s, a: v[transitions[uint64(s), uint64(a)], uint64(a)]
-
-    def several(transitions, v, s, a):
-        total = 0.0
-        for k in outcomes_of(transitions, s, a):
-            t, p = outcome(transitions, s, a, k)
-            total += p * v[t, a]
-        return total
-
-    return several
+@overload(_value, jit_options={"forceinline": True})
+def _value_of(v, s, a):
+    return (lambda v, s, a: v[s]) if v.ndim == 1 else (lambda v, s, a: v[s, a])
 
 
 def fetch_values(transitions, v, actions, s):
-    """Ask the processor for what `expectation` or `expectation_of_pair` will read of v for state s, where one reads a
-    table. actions: see kernels/bellman.py.
-    """
+    """Ask the processor for what `expectation` will read of v for state s, of a table; actions: see bellman.py."""
 
 
 @overload(fetch_values)
@@ -214,6 +196,21 @@ def expected(transitions, x, states, out):
                 if p > 0.0:
                     for m in range(x.shape[2]):
                         out[i, a, m] += p * x[t, a if by_action else 0, m]
+
+
+@njit(cache=True, nogil=True)
+def entries(transitions, states, actions, which, following, likely):
+    """The possible outcomes of (states[i], actions[i]), in order: which[j] = i, following[j], likely[j] their
+    probabilities; returns how many there are.
+    """
+    n = 0
+    for i in range(len(states)):
+        for k in outcomes_of(transitions, states[i], actions[i]):
+            t, p = outcome(transitions, states[i], actions[i], k)
+            if p > 0.0:
+                which[n], following[n], likely[n] = i, t, p
+                n += 1
+    return n
 
 
 @interpreted_first()

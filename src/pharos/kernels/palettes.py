@@ -113,28 +113,3 @@ def padded(values, counts, fill_with_first, out):
         for k in range(out.shape[1]):
             out[row, k] = values[first + k] if k < n else rest
         first += n
-
-
-@njit(cache=True, nogil=True)
-def entries_of_padded(successors, vectors, codes, which, following, likely):
-    """The possible outcomes of R rows, padded to equal length; returns how many.
-
-    successors (R, K); codes (R,), which of the vectors (P, K) float64 has a row's probabilities. Outcome j is of row
-    which[j], leads to following[j] and has the probability likely[j].
-    """
-    n = 0
-    for row in range(len(codes)):
-        for k in range(successors.shape[1]):
-            if vectors[codes[row], k] > 0:
-                which[n], following[n], likely[n] = row, successors[row, k], vectors[codes[row], k]
-                n += 1
-    return n
-
-
-@njit(cache=True, nogil=True)
-def entries_of_ragged(offsets, vectors, codes, which, likely):
-    """The same of rows that lie one after another, from offsets[row] on (R + 1,), without where they lead."""
-    for row in range(len(codes)):
-        for j in range(offsets[row], offsets[row + 1]):
-            place = j - offsets[0]
-            which[place], likely[place] = row, vectors[codes[row], j - offsets[row]]

@@ -11,7 +11,6 @@ if TYPE_CHECKING:
     from pharos.mdp.arguments import require_mdp
     from pharos.mdp.bisimulation import Minimization, minimize
     from pharos.mdp.chance import Chance, ChanceSetting, lazy_actions, random_actions, sticky_actions
-    from pharos.mdp.compiled import Lazy, Table
     from pharos.mdp.dynamics import (
         BellmanEquation,
         Dynamics,
@@ -36,6 +35,7 @@ if TYPE_CHECKING:
         rewards_of_space,
         rewards_of_staying,
     )
+    from pharos.mdp.table import Lazy, Table
     from pharos.mdp.tabular import TabularMDP
 
 __all__ = [

@@ -4,9 +4,9 @@
 chance of choosing, no policy and no terminal states; a `BellmanEquation` brings them along where a whole backup is
 wanted.
 
-A way of storing transitions is one class: `Table` (compiled.py) and `Matrices` (matrices.py). It needs the methods that
-are abstract here and four attributes; the rest follows from these, and is overridden where the representation allows
-something faster, as `Table` does. docs/decisions/0008-one-operator.md says why, and where the next class goes.
+A way of storing transitions is one class: `Table` (table.py), `OutcomeTable` (outcome_table.py). It needs the methods
+that are abstract here, four attributes, and arrays that kernels/outcomes.py can read: all loops are compiled, each
+written once for all of them. docs/decisions/0008-one-operator.md says why, and where the next class goes.
 
 States are numbered 0 .. S - 1; S stands for the end of an episode, which has no value and no successors.
 
@@ -14,27 +14,26 @@ Runs: some rows of a range, as a few contiguous stretches of it.
 """
 
 import itertools
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
-from functools import partial
+from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from pharos.errors import ParameterError
-from pharos.kernels import paths
+from pharos.kernels import bellman, graph, occupancy, outcomes, paths
 from pharos.mdp.chance import Chance
 from pharos.mdp.rewards import Rewards
-from pharos.mdp.selection import Selection, chosen_mass
-from pharos.system.packed_indices import Indices, blocks_of, room_for_indices
+from pharos.mdp.selection import Extreme, PolicyTable, Selection
+from pharos.system.large_arrays import pieces_from_the_end, rows_with_room
+from pharos.system.packed_indices import Indices, room_for_indices
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
 Blocks = Callable[[], Iterator[tuple[int, np.ndarray]]]
-
-# Rows of a table that are looked at in one go.
-_BLOCK = 1 << 16
 
 
 class BellmanEquation(NamedTuple):
@@ -117,7 +116,6 @@ class Dynamics(ABC):
         has_ends: whether some execution ends the episode without a next state.
         laziness: probability that nothing happens, as far as `lazy` has added it.
         workers: threads of a backup, where it has several; None for all processors.
-        sweeps_ranges: whether `sweep` takes a range of the states, `part=(start, stop)`.
     """
 
     num_states: int
@@ -128,7 +126,6 @@ class Dynamics(ABC):
     has_ends: bool
     laziness: float = 0.0
     workers: int | None = None
-    sweeps_ranges: bool = False
 
     # What each representation says of itself ------------------------------------------------------------------------
 
@@ -141,16 +138,23 @@ class Dynamics(ABC):
                 there, or 1.
         """
 
+    @property
     @abstractmethod
-    def pushed(self, mass: np.ndarray, width: int = 1) -> np.ndarray:
-        """(S, W): where the mass (S, A) of executed actions goes, without what ends; W = A by executed action, or 1.
+    def for_kernels(self) -> Any:
+        """The argument `transitions` of kernels, see kernels/outcomes.py."""
 
-        The adjoint of `expected`: sum(mass * expected(x)) = sum(pushed(mass) * x) where x is 0 at the end.
-        """
+    @property
+    def for_sweeps(self) -> Any:
+        """The same for the loops in which solvers spend their time: what the compiler knows more of."""
+        return self.for_kernels
 
     @abstractmethod
-    def outcomes(self, states: np.ndarray, actions: np.ndarray) -> Outcomes:
-        """What executing actions (N,) in states (N,) may lead to."""
+    def entries(self, states: np.ndarray, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(index of the execution, next state or -1, probability > 0) of all outcomes of executions (N,), in order."""
+
+    @abstractmethod
+    def sample(self, states: np.ndarray, actions: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """(N,): a next state of each execution, -1 for the end. Draws nothing where each has one outcome."""
 
     @abstractmethod
     def restricted_to(self, states: np.ndarray) -> "Dynamics":
@@ -164,24 +168,9 @@ class Dynamics(ABC):
     def arrays(self) -> dict[str, np.ndarray]:
         """What it is made of, by name, as files keep it."""
 
+    @abstractmethod
     def part(self, start: int, stop: int) -> "tuple[Dynamics, np.ndarray]":
         """The states [start, stop) alone, and the states outside that they may lead to; numbers as part.py says."""
-        from pharos.mdp.outcome_table import OutcomeTable  # which derives from this class
-
-        states = np.arange(start, stop)
-        outcomes = self.outcomes(*self._all_actions(states))
-        following = np.where(outcomes.states == self.num_states, -1, outcomes.states)
-        local, halo = split(partial(blocks_of, following), following.shape, start, stop)
-        rows = np.bincount(outcomes.which, minlength=len(states) * self.num_actions)
-        offsets = np.concatenate([[0], np.cumsum(rows)])
-        table = OutcomeTable(local, self.num_actions, offsets=offsets, probabilities=outcomes.probabilities)
-        return table, halo
-
-    def lazy(self, p: float) -> "Dynamics":
-        """The same, but with probability p the state stays what it is, whatever is executed; 0 < p < 1."""
-        from pharos.mdp.matrices import Matrices  # which derives from this class
-
-        return Matrices(self.matrix()[:, : self.num_states], self.num_actions).lazy(p)
 
     def deterministic_table(self) -> Indices | None:
         """(S, A) next states, -1 for the end, where each execution has one outcome; else None."""
@@ -192,11 +181,6 @@ class Dynamics(ABC):
         """Whether an action that has an effect may have several outcomes."""
         return not self.is_deterministic
 
-    @property
-    def for_kernels(self) -> Any:
-        """The argument `transitions` of kernels, see kernels/outcomes.py; None where they cannot read it."""
-        return self.deterministic_table()
-
     # What follows from it -------------------------------------------------------------------------------------------
 
     def backup(self, equation: BellmanEquation, x: np.ndarray, out: np.ndarray, runs: np.ndarray | None = None) -> None:
@@ -204,74 +188,104 @@ class Dynamics(ABC):
 
         runs: the states of some runs (R, 2) alone, see `runs_of`; None: all.
         """
-        states = slice(None) if runs is None else slice(*runs[0]) if len(runs) == 1 else rows_of(runs)
-        q = equation.rewards.rows(states) + equation.gamma * self.expected(x, states)
-        out[: self.num_states][states] = equation.value(q, states)
+        rewards, gamma, chance, select = equation
+        choice = _choice(select)
         out[-1] = 0.0
+        if choice is None:
+            states = slice(None) if runs is None else slice(*runs[0]) if len(runs) == 1 else rows_of(runs)
+            q = rewards.rows(states) + gamma * self.expected(x, states)
+            out[: self.num_states][states] = equation.value(q, states)
+            return
+        kernel, weights, x_, out_ = (
+            (bellman.sticky_backup, chance.triple, x, out)
+            if chance.is_sticky
+            else (bellman.optimal_backup, chance.uniform, x[:, 0], out[:, 0])
+        )
+        tables = (self.for_sweeps, rewards.table, rewards.palette, gamma)
+        arrays = (*tables, weights, choice, x_, out_, bellman.actions_of(self.num_actions))
+        whole = np.array([[0, self.num_states]])
+        _shared(lambda part: kernel(*arrays, part), self, whole if runs is None else runs)
 
-    def sweep(self, equation: BellmanEquation, x: np.ndarray, threads: int = 1) -> float:
+    def sweep(
+        self, equation: BellmanEquation, x: np.ndarray, threads: int = 1, part: tuple[int, int] | None = None
+    ) -> float:
         """Replace each entry of x by its backup, from entries that are old or already new; once each.
 
         Args:
             threads: that may share the entries; which of two is first is theirs then, so that x is not the same to the
                 last bit in every run.
+            part: the states [start, stop) alone.
         Returns the largest change.
         """
-        new = np.empty_like(x)
-        self.backup(equation, x, new)
-        change = float(np.abs(new - x).max())
-        x[:] = new
-        return change
+        return swept(self.for_sweeps, self.num_actions, equation, x, None, threads, part)
+
+    def sweep_once(self, equation: BellmanEquation, x: np.ndarray, order: Order) -> None:
+        """Replace each entry of x by its backup, from the last state of an order to the first: the fixed point."""
+        swept(self.for_sweeps, self.num_actions, equation, x, order.states)
 
     def move(self, play: PolicyStep, now: np.ndarray, after: np.ndarray) -> float:
         """after (S, W) = the mass now (S, W') one step later, without what has ended.
 
         Returns the sum over live states.
         """
-        mass = np.where(play.live[:, None], now, 0.0)
-        executed = play.chance.executed(mass, chosen_mass(play.policy, mass))
-        after[:] = self.pushed(executed, after.shape[1])
-        return float(after[play.live].sum())
+        return occupancy.push(self.for_kernels, play.live, play.policy, play.chance.triple, now, after)
+
+    def pushed(self, mass: np.ndarray, width: int = 1) -> np.ndarray:
+        """(S, W): where the mass (S, A) of executed actions goes, without what ends; W = A by executed action, or 1.
+
+        The adjoint of `expected`: sum(mass * expected(x)) = sum(pushed(mass) * x) where x is 0 at the end.
+        """
+        after = np.zeros((self.num_states, width))
+        outcomes.pushed(self.for_kernels, np.ascontiguousarray(mass, np.float64), after)
+        return after
 
     def settle(self, play: PolicyStep, gamma: float, least: float, waiting: np.ndarray, visits: np.ndarray) -> float:
         """Count the waiting mass (S, W) as visits (S, W) and move it on, discounted. Returns what waits afterwards.
 
         Masses below `least` may stay.
         """
-        after = np.empty_like(waiting)
-        visits[play.live] += waiting[play.live]
-        self.move(play, waiting, after)
-        waiting[:] = gamma * after
-        waiting[~play.live] = 0.0
-        return float(waiting.sum())
+        weights = play.chance.triple
+        return occupancy.settle(self.for_kernels, play.live, play.policy, weights, gamma, least, waiting, visits)
 
     def support(self, play: PolicyStep, reached: np.ndarray) -> None:
         """Set reached (S, W), 1 where mass may be and else 0, to 1 wherever it may come to."""
-        after = np.empty_like(reached)
-        while True:
-            self.move(play, reached, after)
-            new = (after > 0) & (reached == 0)
-            if not new.any():
-                return
-            reached[new] = 1.0
+        occupancy.support(self.for_kernels, play.live, play.policy, play.chance.triple, reached)
+
+    def entries_of(self, states: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """`entries` of each action in each of some states; the first is i A + a."""
+        return self.entries(*self._all_actions(states))
+
+    def outcomes(self, states: np.ndarray, actions: np.ndarray) -> Outcomes:
+        """What executing actions (N,) in states (N,) may lead to: ascending by next state, each of them once."""
+        from scipy import sparse
+
+        which, following, probabilities = self.entries(states, actions)
+        small = np.int32 if max(len(following), self.num_states + 1) < 2**31 else np.int64
+        columns = np.where(following < 0, self.num_states, following).astype(small)
+        indptr = np.append(0, np.cumsum(np.bincount(which, minlength=len(states)))).astype(small)
+        matrix = sparse.csr_matrix((probabilities, columns, indptr), shape=(len(states), self.num_states + 1))
+        matrix.sum_duplicates()
+        which = np.repeat(np.arange(len(states)), np.diff(matrix.indptr))
+        return Outcomes(which, matrix.indices.astype(np.int64), matrix.data)
 
     def successors_of(self, states: np.ndarray) -> np.ndarray:
         """The states that some action may lead to from some of these, ascending; S stands for the end."""
-        return np.unique(self.outcomes(*self._all_actions(states)).states)
+        following = self.entries_of(states)[1]
+        return np.unique(np.where(following < 0, self.num_states, following))
 
     def largest(self, x: np.ndarray, states: Any = slice(None)) -> np.ndarray:
         """(N, A): the largest of x (S + 1,) over what executing an action may lead to."""
-        if self.is_deterministic:
-            return self.expected(x, states)
-        rows = np.arange(self.num_states)[states]
-        outcomes = self.outcomes(*self._all_actions(rows))
-        result = np.full(len(rows) * self.num_actions, -np.inf)
-        np.maximum.at(result, outcomes.which, x[outcomes.states])
-        return result.reshape(len(rows), self.num_actions)
+        return self._extreme(x, states, 1.0)
 
     def smallest(self, x: np.ndarray, states: Any = slice(None)) -> np.ndarray:
         """(N, A): the smallest of x (S + 1,) over what executing an action may lead to."""
-        return -self.largest(-np.asarray(x), states)
+        return self._extreme(x, states, -1.0)
+
+    def _extreme(self, x: np.ndarray, states: Any, sign: float) -> np.ndarray:
+        rows = np.arange(self.num_states)[states]
+        out = np.empty((len(rows), self.num_actions))
+        outcomes.largest(self.for_kernels, np.ascontiguousarray(x, np.float64), rows, sign, out)
+        return out
 
     def leads_to(self, state: int) -> np.ndarray:
         """(S, A) bool: whether executing an action may lead to a state."""
@@ -279,46 +293,45 @@ class Dynamics(ABC):
         indicator[state] = 1.0
         return self.largest(indicator) > 0
 
-    def sample(self, states: np.ndarray, actions: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """(N,): a next state of each execution, -1 for the end. Draws nothing where each has one outcome."""
-        outcomes = self.outcomes(np.asarray(states), np.asarray(actions))
-        first = np.searchsorted(outcomes.which, np.arange(len(states)))
-        passed = np.cumsum(outcomes.probabilities)
-        before = np.where(first > 0, passed[first - 1], 0.0)
-        last = np.append(first[1:], len(outcomes.which)) - 1
-        place = np.searchsorted(passed, before + rng.random(len(states)) * (passed[last] - before), side="right")
-        drawn = outcomes.states[np.clip(place, first, last)]
-        return np.where(drawn == self.num_states, -1, drawn)
-
     def reachable(self, starts: np.ndarray, steps: int | None = None) -> np.ndarray:
         """(S,) bool: the states that can be met within `steps` steps (None: any number) from the start states."""
-        reached_states = np.zeros(self.num_states + 1, np.bool_)
-        reached_states[starts], reached_states[-1] = True, True
-        frontier, level = np.unique(starts), 0
-        while len(frontier) and (steps is None or level < steps):
-            following = self.successors_of(frontier)
-            frontier = following[~reached_states[following]]
-            reached_states[frontier] = True
+        is_reached = np.zeros(self.num_states, np.bool_)
+        frontier = np.unique(starts)
+        is_reached[frontier] = True
+        small = np.int32 if self.num_states < 2**31 else np.int64
+        now, following = (np.empty(self.num_states, small) for _ in range(2))
+        count, level = len(frontier), 0
+        now[:count] = frontier
+        while count and (steps is None or level < steps):
+            count = graph.onwards(self.for_kernels, now, count, following, is_reached)
+            now, following = following, now
             level += 1
-        return reached_states[:-1]
+        return is_reached
 
     def arrivals(self, states: np.ndarray) -> np.ndarray:
         """(S, A) bool: whether executing action a in some of these states may lead to s."""
-        result = np.zeros((self.num_states + 1, self.num_actions), np.bool_)
-        for start in range(0, len(states), _BLOCK):
-            rows, actions = self._all_actions(states[start : start + _BLOCK])
-            outcomes = self.outcomes(rows, actions)
-            result[outcomes.states, actions[outcomes.which]] = True
-        return result[:-1]
+        result = np.zeros((self.num_states, self.num_actions), np.bool_)
+        outcomes.arrive(self.for_kernels, np.asarray(states), result)
+        return result
 
-    def components(self, live: np.ndarray, least: int) -> Components | None:
-        """The strongly connected components of the states, of which live ones (S,) bool lead on; None: not looked for.
+    def components(self, live: np.ndarray, least: int) -> Components:
+        """The strongly connected components of the states, of which live ones (S,) bool lead on.
 
         Args:
             least: small components with cycles are put together until a group has as many states.
         Cost: one look at each transition, and 33 bytes a state.
         """
-        return None
+        from pharos.kernels import components  # which few need
+
+        dtype = np.int32 if self.num_states < 2**31 else np.int64
+        number, path, waiting = (np.empty(self.num_states, dtype) for _ in range(3))
+        count = components.number_components(self.for_kernels, live, number, path, waiting)
+        first, is_cyclic = np.zeros(count + 1, np.int64), np.zeros(count, np.bool_)
+        order = np.empty(self.num_states, np.int64)
+        components.component_order(self.for_kernels, live, number, first, is_cyclic, order)
+        largest = int(np.diff(first).max(initial=0, where=is_cyclic))
+        starts, has_cycle = components.joined(first, is_cyclic, least)
+        return Components(order, starts, has_cycle, count, largest)
 
     def settle_components(
         self, equation: BellmanEquation, x: np.ndarray, parts: Components, target: float, settled: float, most: float
@@ -329,28 +342,37 @@ class Dynamics(ABC):
             target: a sweep of a group changes it by at most as much in the end, or by `settled` times its values.
             most: backups, after which each group that is left is swept once.
         """
-        raise NotImplementedError
+        choice, before = _choice(equation.select), float(max(x.max(), -x.min()))
+        if choice is not None and not equation.chance.is_sticky:
+            from pharos.kernels import components
 
-    def sweep_once(self, equation: BellmanEquation, x: np.ndarray, order: Order) -> None:
-        """Replace each entry of x by its backup, from the last state of an order to the first: the fixed point."""
-        states = np.arange(self.num_states) if order.states is None else order.states
-        for s in states[::-1]:
-            q = equation.rewards.rows(s[None]) + equation.gamma * self.expected(x, s[None])
-            x[s] = equation.value(q, s[None])[0]
+            tables = (self.for_sweeps, equation.rewards.table, equation.rewards.palette, equation.gamma)
+            actions, chance = bellman.actions_of(self.num_actions), equation.chance.uniform
+            groups = (parts.order, parts.starts, parts.has_cycle)
+            components.settle(*tables, chance, choice, x[:, 0], actions, *groups, target, settled, most, before)
+            return
+        for group in range(len(parts.has_cycle) - 1, -1, -1):
+            start, stop = int(parts.starts[group]), int(parts.starts[group + 1])
+            change, largest = math.inf, before
+            while change > max(target, settled * largest):
+                change = swept(self.for_sweeps, self.num_actions, equation, x, parts.order, part=(start, stop))
+                largest += change
+                most -= stop - start
+                if most < 0 or not parts.has_cycle[group]:
+                    break
 
     def order(self, live: np.ndarray) -> Order | None:
         """An order of states in which each live one (S,) bool stands before those it leads to; None: there is none."""
-        transitions = self._edges(live)
         states = None
-        if paths.is_increasing(transitions, live, None)[0] >= 0:
-            states = paths.topological_order(transitions, live)
+        if paths.is_increasing(self.for_kernels, live, None)[0] >= 0:
+            states = paths.topological_order(self.for_kernels, live)
             if len(states) < self.num_states:
                 return None
-        return Order(states, int(paths.longest_path(transitions, live, states)))
+        return Order(states, int(paths.longest_path(self.for_kernels, live, states)))
 
     def check_age(self, live: np.ndarray, age: np.ndarray) -> None:
         """ParameterError unless each transition of a live state (S,) bool leads to one of larger age (S,)."""
-        s, a, t = paths.is_increasing(self._edges(live), live, age)
+        s, a, t = paths.is_increasing(self.for_kernels, live, age)
         if s >= 0:
             raise ParameterError(
                 f"age: state {s}, of age {age[s]}, leads by action {a} to state {t}, of age {age[t]}; expected more"
@@ -361,12 +383,6 @@ class Dynamics(ABC):
         order = self.order(live)
         return -1 if order is None else order.longest
 
-    def _edges(self, live: np.ndarray) -> Any:
-        """The argument `transitions` of kernels, where the end may be missing and probabilities do not matter."""
-        matrix = self.matrix(live)
-        inside = np.where(matrix.indices < self.num_states, matrix.indices, -1)
-        return inside, matrix.indptr, None, matrix.data, (self.num_states, self.num_actions), 0
-
     def matrix(self, live: np.ndarray | None = None) -> "csr_matrix":
         """(S A, S + 1): the probabilities of all outcomes, row s A + a, column S for the end.
 
@@ -376,12 +392,12 @@ class Dynamics(ABC):
 
         states = np.arange(self.num_states) if live is None else np.flatnonzero(live)
         rows, actions = self._all_actions(states)
-        outcomes = self.outcomes(rows, actions)
-        row = (rows * self.num_actions + actions)[outcomes.which]
+        entries = self.outcomes(rows, actions)
+        row = (rows * self.num_actions + actions)[entries.which]
         counts = np.bincount(row, minlength=self.num_states * self.num_actions)
         indptr = np.concatenate([[0], np.cumsum(counts)])
         shape = (self.num_states * self.num_actions, self.num_states + 1)
-        return sparse.csr_matrix((outcomes.probabilities, outcomes.states, indptr), shape=shape)
+        return sparse.csr_matrix((entries.probabilities, entries.states, indptr), shape=shape)
 
     def to_classes(self, classes: np.ndarray, count: int) -> "csr_matrix":
         """(S A, C): the probability of coming to each class (S,) of states; columns in order."""
@@ -396,6 +412,76 @@ class Dynamics(ABC):
     def _all_actions(self, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Each state with each action."""
         return np.repeat(states, self.num_actions), np.tile(np.arange(self.num_actions), len(states))
+
+
+# Sweeps ---------------------------------------------------------------------------------------------------------------
+
+
+def swept(
+    transitions: Any,
+    num_actions: int,
+    equation: BellmanEquation,
+    x: np.ndarray,
+    order: np.ndarray | None,
+    threads: int = 1,
+    part: tuple[int, int] | None = None,
+) -> float:
+    """Replace each entry of x by its backup, from the last state of an order to the first; the largest change.
+
+    Args:
+        threads: each has a part of the states, where that is possible.
+        part: the places [start, stop) of the order that are swept; None: all.
+    """
+    rewards, gamma, chance, select = equation
+    others = (rewards.table, rewards.palette, gamma)
+    tables = (transitions, *others)
+    actions, scratch = bellman.actions_of(num_actions), np.empty(num_actions)
+    choice, places = _choice(select), part or (0, rewards.shape[0])
+    if choice is None:
+        assert isinstance(select, PolicyTable)
+        if chance.is_sticky:
+            return bellman.sticky_policy_sweep(*tables, chance.triple, select.later, x, scratch, order, *places)
+        weights = (float(chance.chosen), float(chance.uniform))
+        return bellman.policy_sweep(*tables, *weights, select.later[:, 0], x[:, 0], order, *places)
+    if chance.is_sticky:
+        return bellman.sticky_sweep(*tables, chance.triple, choice, x, actions, scratch, order, *places)
+    v, border = x[:, 0], rows_with_room(transitions, *places)
+
+    def change_of(low: int, high: int) -> float:
+        change = 0.0
+        for piece, start, stop in pieces_from_the_end(transitions, low, high, border):
+            largest = bellman.optimal_sweep(piece, *others, chance.uniform, choice, v, actions, order, start, stop)
+            change = float(np.maximum(change, largest))
+        return change
+
+    low, high = places
+    cuts = [low + (high - low) * i // threads for i in range(threads + 1)]
+    if threads == 1:
+        return change_of(*cuts)
+    with ThreadPoolExecutor(threads) as pool:
+        return float(np.max([*pool.map(change_of, cuts[:-1], cuts[1:])]))
+
+
+def _choice(select: Selection) -> "float | np.ndarray | None":
+    """The argument `choice` of kernels; None for policies that draw actions, or look back."""
+    if isinstance(select, Extreme):
+        return select.sign
+    assert isinstance(select, PolicyTable)
+    return None if select.actions is None else np.ascontiguousarray(select.actions, np.int64)
+
+
+def _shared(block: Callable[[np.ndarray], None], dynamics: Dynamics, runs: np.ndarray) -> None:
+    """block(part) over the states of runs (R, 2), on all processors where there are enough states to share."""
+    from pharos.system.workers import usable_workers
+
+    workers = usable_workers(dynamics.workers) if count_of(runs) >= 1 << 16 else 1
+    if workers == 1:
+        return block(runs)
+    with ThreadPoolExecutor(workers) as pool:
+        list(pool.map(block, shares_of(runs, workers)))
+
+
+# Parts ----------------------------------------------------------------------------------------------------------------
 
 
 def as_indices(table: np.ndarray, num_states: int) -> np.ndarray:

@@ -1,135 +1,45 @@
-"""Dynamics with any number of outcomes, and the forms in which users write them."""
+"""Dynamics with any number of outcomes, from a sparse matrix, and the forms in which users write them."""
 
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pharos.errors import ParameterError
-from pharos.mdp.compiled import swept
-from pharos.mdp.dynamics import BellmanEquation, Dynamics, Order, Outcomes, as_indices
+from pharos.mdp.outcome_table import OutcomeTable
 from pharos.mdp.tabular_arrays import as_array
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
 
-class Matrices(Dynamics):
-    """Any number of outcomes, as a sparse matrix.
+class Matrices(OutcomeTable):
+    """A table of outcomes, row after row, that was given as a sparse matrix, and is kept in files as one.
 
     Attributes:
         transitions: (S A, S) CSR float64, row s A + a; what a row lacks to 1 is the probability that the episode ends,
             but for 4 (n + 2) units of 2^-53 where rows have n entries: as much as their own rounding may lack.
     """
 
-    def __init__(self, transitions: "csr_matrix", num_actions: int, entries: int = 0):
-        """`entries`: of the longest row of which these were made, where rounding of its entries was added up."""
-        from scipy import sparse
-
-        self.transitions = sparse.csr_matrix(transitions)
-        if not self.transitions.data.all():
-            self.transitions = self.transitions.copy()
-            self.transitions.eliminate_zeros()
-        self.num_states, self.num_actions = transitions.shape[1], num_actions
-        counts = np.diff(self.transitions.indptr)
-        sums = np.asarray(self.transitions.sum(axis=1)).ravel()
-        self.operations = max(int(counts.max(initial=0)), entries) + 1
-        self.mass = max(1.0, float(sums.max(initial=0.0)) * (1 + self.operations * 2.0**-53))
-        lacking = 1 - sums
-        self._ends = np.where(lacking > 4 * (self.operations + 1) * 2.0**-53, lacking, 0.0)
-        self.has_ends = bool(self._ends.any())
-        self.is_deterministic = bool(((counts == 0) | ((counts == 1) & (sums == 1.0))).all())
-        self._table: np.ndarray | None = None
-        self._columns_by_action: Any = None
-
-    @property
-    def _by_action(self) -> "csr_matrix":
-        """(S A, S A): the transitions into pairs of a next state and the action that led there."""
-        from scipy import sparse
-
-        if self._columns_by_action is None:
-            matrix = self.transitions
-            action = np.repeat(np.arange(len(matrix.indptr) - 1) % self.num_actions, np.diff(matrix.indptr))
-            columns = matrix.indices.astype(np.int64) * self.num_actions + action
-            size = matrix.shape[0]
-            self._columns_by_action = sparse.csr_matrix((matrix.data, columns, matrix.indptr), shape=(size, size))
-        return self._columns_by_action
+    def __init__(self, transitions: "csr_matrix", num_actions: int):
+        if not transitions.data.all():
+            transitions = transitions.copy()
+            transitions.eliminate_zeros()
+        self.transitions = transitions
+        counts = np.diff(transitions.indptr)
+        lacking = 1 - np.asarray(transitions.sum(axis=1)).ravel()
+        ending = np.flatnonzero(lacking > 4 * (int(counts.max(initial=0)) + 2) * 2.0**-53)
+        places, offsets = transitions.indptr[ending + 1], transitions.indptr
+        successors, probabilities = transitions.indices, transitions.data
+        if len(ending):
+            successors = np.insert(successors, places, -1)
+            probabilities = np.insert(probabilities, places, lacking[ending])
+            offsets = offsets + np.searchsorted(ending, np.arange(len(offsets)))
+        super().__init__(successors, num_actions, offsets=offsets, probabilities=probabilities)
 
     def arrays(self) -> dict[str, np.ndarray]:
         matrix = self.transitions
         names = ("transitions_data", "transitions_indices", "transitions_indptr")
         return dict(zip(names, (matrix.data, matrix.indices, matrix.indptr), strict=True))
-
-    def lazy(self, p: float) -> "Matrices":
-        from scipy import sparse
-
-        rows = np.arange(self.transitions.shape[0])
-        stays = sparse.csr_matrix((np.full(len(rows), p), (rows, rows // self.num_actions)), self.transitions.shape)
-        result = Matrices(((1.0 - p) * self.transitions + stays).tocsr(), self.num_actions, self.operations + 2)
-        result.laziness = 1.0 - (1.0 - self.laziness) * (1.0 - p)
-        return result
-
-    def deterministic_table(self) -> np.ndarray | None:
-        if self._table is None and self.is_deterministic:
-            table = np.full(self.num_states * self.num_actions, -1, np.int64)
-            table[np.diff(self.transitions.indptr) > 0] = self.transitions.indices
-            self._table = as_indices(table.reshape(self.num_states, self.num_actions), self.num_states)
-        return self._table
-
-    def expected(self, x: np.ndarray, states: Any = slice(None)) -> np.ndarray:
-        by_action = x.ndim > 1 and x.shape[1] > 1
-        matrix = self._by_action if by_action else self.transitions
-        ends: Any = self._ends
-        rows = self._rows(states)
-        if rows is not None:
-            matrix, ends = matrix[rows], ends[rows]
-        trailing = x.shape[2:]
-        flat = x[:-1].reshape((matrix.shape[1], -1) if trailing else (matrix.shape[1],))
-        result = matrix @ flat
-        last = x[-1] if x.ndim > 1 else x[-1:]
-        result = np.asarray(result).reshape(-1, self.num_actions, *trailing)
-        if last.any():
-            result = result + ends.reshape(-1, self.num_actions, *(1,) * len(trailing)) * last
-        return result
-
-    def pushed(self, mass: np.ndarray, width: int = 1) -> np.ndarray:
-        matrix = self._by_action if width > 1 else self.transitions
-        return np.asarray(matrix.T @ mass.ravel()).reshape(self.num_states, width)
-
-    def outcomes(self, states: np.ndarray, actions: np.ndarray) -> Outcomes:
-        rows = np.asarray(states) * self.num_actions + actions
-        part = self.transitions[rows]
-        which = np.repeat(np.arange(len(rows)), np.diff(part.indptr))
-        following, probabilities = part.indices.astype(np.int64), part.data
-        ended = np.flatnonzero(self._ends[rows])
-        if len(ended):
-            which = np.append(which, ended)
-            following = np.append(following, np.full(len(ended), self.num_states))
-            probabilities = np.append(probabilities, self._ends[rows][ended])
-            order = np.argsort(which, kind="stable")
-            which, following, probabilities = which[order], following[order], probabilities[order]
-        return Outcomes(which, following, probabilities)
-
-    def sweep_once(self, equation: BellmanEquation, x: np.ndarray, order: Order) -> None:
-        swept(self._edges(np.empty(0)), self.num_actions, equation, x, order.states)
-
-    def _edges(self, live: np.ndarray) -> Any:
-        matrix = self.transitions  # what rows lack to 1 ends, and the end has no value
-        return matrix.indices, matrix.indptr, None, matrix.data, (self.num_states, self.num_actions), 0
-
-    def restricted_to(self, states: np.ndarray) -> "Matrices":
-        """These states alone; what leads out of them ends."""
-        return Matrices(self.transitions[self._rows(states)][:, states].tocsr(), self.num_actions, self.operations)
-
-    def merged(self, classes: np.ndarray, representatives: np.ndarray) -> "Matrices":
-        transitions = self.to_classes(classes, len(representatives))[self._rows(representatives)]
-        return Matrices(transitions, self.num_actions, self.operations)
-
-    def _rows(self, states: Any) -> np.ndarray | None:
-        """The rows of some states; None: all."""
-        if isinstance(states, slice) and states == slice(None):
-            return None
-        chosen = np.arange(self.num_states)[states]
-        return (chosen[:, None] * self.num_actions + np.arange(self.num_actions)).ravel()
 
 
 def transitions_of(P: Any) -> tuple["csr_matrix", int]:

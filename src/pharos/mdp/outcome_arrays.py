@@ -7,13 +7,12 @@ import numpy as np
 from pharos.errors import ParameterError
 from pharos.mdp.dynamics import as_indices
 from pharos.mdp.tabular_arrays import as_array
+from pharos.system.outcome_rows import SUM_TOLERANCE
 
 # The share of a dense table that may be padding before successors are kept one row after another.
 MOST_PADDING = 0.3
 # Vectors of probabilities that codes of one and of two bytes tell apart.
 FEW, MANY = 1 << 8, 1 << 16
-# What the probabilities of a row may lack to 1, or have beyond it.
-SUM_TOLERANCE = 1e-9
 
 
 def checked_outcomes(successors: Any, probabilities: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -84,80 +83,6 @@ def compact_outcomes(
     else:
         result.update(codes=codes.reshape(num_states, num_actions), palette=palette)
     return result
-
-
-def check_outcome_arrays(
-    successors: np.ndarray,
-    shape: tuple[int, int],
-    *,
-    offsets: np.ndarray | None = None,
-    codes: np.ndarray | None = None,
-    palette: np.ndarray | None = None,
-    probabilities: np.ndarray | None = None,
-) -> None:
-    """ParameterError unless the arrays are those of an OutcomeTable of (S, A) rows."""
-    rows = shape[0] * shape[1]
-    if successors.dtype.kind not in "iu" or not (
-        (successors.ndim == 1 and offsets is not None) or (successors.ndim == 3 and successors.shape[:2] == shape)
-    ):
-        raise ParameterError(
-            f"successors have shape {successors.shape} and type {successors.dtype}; expected integers of shape {shape} "
-            "and the outcomes, or one axis with offsets"
-        )
-    if offsets is not None:
-        fits = offsets.shape == (rows + 1,) and offsets.dtype.kind in "iu"
-        if not fits or offsets[0] != 0 or offsets[-1] != len(successors) or (offsets[1:] <= offsets[:-1]).any():
-            raise ParameterError(f"offsets do not cut {len(successors)} successors into {rows} rows of one or more")
-    outside = (successors < -1) | (successors >= shape[0])
-    if outside.any():
-        raise ParameterError(f"a successor is {successors[outside][0]}; expected a state below {shape[0]}, or -1")
-    if palette is None:
-        assert probabilities is not None
-        vectors = _as_rows(probabilities, successors, offsets)
-    else:
-        assert codes is not None
-        _check_codes(codes, palette, shape)
-        vectors = palette
-    sums = vectors.sum(axis=1)
-    possible = vectors > 0
-    if not ((vectors >= 0).all() and (np.abs(sums - 1) <= SUM_TOLERANCE).all()):
-        raise ParameterError("a vector of probabilities has entries below 0, or does not sum to 1")
-    if not possible[:, 0].all() or (possible[:, 1:] > possible[:, :-1]).any():
-        raise ParameterError("a vector of probabilities has zeros before others; expected them last")
-    counts = possible.sum(axis=1)
-    each = counts if codes is None else counts[codes.reshape(-1)]
-    if offsets is not None:
-        if (each != np.diff(offsets)).any():
-            raise ParameterError("a row has another number of successors than of probabilities")
-    elif (
-        (successors != successors[..., :1]).reshape(rows, -1) & (np.arange(successors.shape[2]) >= each[:, None])
-    ).any():
-        raise ParameterError("what is impossible is not the first successor of its row again")
-
-
-def _check_codes(codes: np.ndarray, palette: np.ndarray, shape: tuple[int, int]) -> None:
-    if codes.shape != shape or codes.dtype.kind != "u" or palette.ndim != 2 or palette.dtype != np.float64:
-        raise ParameterError(
-            f"codes have shape {codes.shape} and type {codes.dtype}, the palette {palette.shape} and {palette.dtype}; "
-            f"expected {shape}, unsigned, and vectors of float64"
-        )
-    if codes.max(initial=0) >= len(palette):
-        raise ParameterError(f"a code is {codes.max()}; expected less than {len(palette)}, the size of the palette")
-
-
-def _as_rows(probabilities: np.ndarray, successors: np.ndarray, offsets: np.ndarray | None) -> np.ndarray:
-    """(S A, K), zeros last, of probabilities in the shape of successors."""
-    if probabilities.shape != successors.shape or probabilities.dtype != np.float64:
-        raise ParameterError(
-            f"probabilities have shape {probabilities.shape} and type {probabilities.dtype}; expected "
-            f"{successors.shape} and float64"
-        )
-    if offsets is None:
-        return probabilities.reshape(-1, probabilities.shape[2])
-    counts = np.diff(offsets)
-    vectors = np.zeros((len(counts), int(counts.max())))
-    vectors[np.arange(vectors.shape[1]) < counts[:, None]] = probabilities
-    return vectors
 
 
 def _palette(vectors: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray | None]:

@@ -2,65 +2,31 @@
 
 import math
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from pharos.errors import ParameterError
 from pharos.kernels import outcomes as kernels
-from pharos.mdp.compiled import CompiledDynamics
-from pharos.mdp.dynamics import Outcomes, as_indices, split
-from pharos.mdp.outcome_arrays import check_outcome_arrays, checked_outcomes, compact_outcomes
-from pharos.system.packed_indices import Indices, PackedIndices, as_array, blocks_of, holds_end, rows_of
-
-if TYPE_CHECKING:
-    from scipy.sparse import csr_matrix
+from pharos.mdp.dynamics import Dynamics, as_indices, split
+from pharos.mdp.outcome_arrays import checked_outcomes, compact_outcomes
+from pharos.system.outcome_rows import OutcomeCheck, OutcomeRows, WrongOutcomes
+from pharos.system.packed_indices import Indices, blocks_of, holds_end, rows_of
 
 _UNIT = 2.0**-53
+# Executions whose outcomes NumPy lists sooner than a kernel is compiled.
+_FEW = 1 << 14
 
 
-class OutcomeTable(CompiledDynamics):
-    """Several next states for each state and action, and their probabilities, as tables.
+class OutcomeTable(OutcomeRows, Dynamics):
+    """Several next states for each state and action, and their probabilities, as the tables of `OutcomeRows`."""
 
-    Attributes:
-        successors: (S, A, K) int32, int64 or `PackedIndices`, -1 where the episode ends; or (N,), the rows s A + a one
-            after another.
-        offsets: (S A + 1,) where the rows begin; None where successors are (S, A, K).
-        codes: (S, A) uint8 or uint16, which vector of the palette has the probabilities; None without a palette.
-        palette: (P, K) float64, the probabilities of the outcomes in their order, then zeros; None without one.
-        probabilities: float64 in the shape of successors; None where there is a palette.
-        num_outcomes: K, the most outcomes of a row.
-    In (S, A, K) the last successors of a row may have probability 0: they repeat its first one.
-    """
-
-    def __init__(
-        self,
-        successors: Indices,
-        num_actions: int,
-        *,
-        offsets: np.ndarray | None = None,
-        codes: np.ndarray | None = None,
-        palette: np.ndarray | None = None,
-        probabilities: np.ndarray | None = None,
-    ):
-        """From arrays as the files of a state space hold them: nothing is copied, so they may be memory maps.
-
-        Raises:
-            ParameterError: there is neither a palette with codes, nor probabilities.
-        """
-        if (palette is None) != (codes is None) or (palette is None) == (probabilities is None):
-            raise ParameterError("an OutcomeTable takes codes with a palette, or probabilities; found both or neither")
-        self.successors, self.offsets = as_array(successors), None if offsets is None else np.asarray(offsets)
-        self.codes, self.palette, self.probabilities = (
-            None if array is None else np.asarray(array) for array in (codes, palette, probabilities)
-        )
+    def __init__(self, successors: Indices, num_actions: int, **others: Any):
+        """others: offsets, codes, palette, probabilities; see `OutcomeRows`, which also raises."""
+        super().__init__(successors, **others)
         self.num_actions = num_actions
-        if offsets is None:
-            self.num_states, self.num_outcomes = successors.shape[0], successors.shape[2]
-        else:
-            self.num_states = (len(offsets) - 1) // num_actions
-            self.num_outcomes = int(np.diff(offsets).max()) if palette is None else palette.shape[1]
-        self.operations = 2 * self.num_outcomes
+        rows = len(successors) * num_actions if self.offsets is None else len(self.offsets) - 1
+        self.num_states = rows // num_actions
 
     @staticmethod
     def from_arrays(successors: Any, probabilities: Any) -> "OutcomeTable":
@@ -77,9 +43,31 @@ class OutcomeTable(CompiledDynamics):
 
     def check(self) -> None:
         """ParameterError where the arrays, whoever wrote them, are not what the attributes say. Cost: O(S A K)."""
-        check_outcome_arrays(**self.arrays(), shape=(self.num_states, self.num_actions))
+        pairs, size = (self.num_states, self.num_actions), self.successors.shape
+        fitting = {
+            "successors": ("iu", size if len(size) == 1 else (*pairs, *size[2:3])),
+            "offsets": ("iu", (self.num_states * self.num_actions + 1,)),
+            "codes": ("u", pairs),
+            "palette": ("f", (*self.by_name.get("palette", self.successors).shape[:1], self.num_outcomes)),
+            "probabilities": ("f", size),
+        }
+        for name, array in self.by_name.items():
+            kinds, shape = fitting[name]
+            is_float = kinds != "f" or array.dtype == np.float64
+            if array.shape != shape or array.dtype.kind not in kinds or not is_float or not array.size:
+                kind = {"iu": "integers", "u": "unsigned integers", "f": "float64"}[kinds]
+                text = f"shape {array.shape} and type {array.dtype}"
+                raise ParameterError(f"{name}: {text}; expected {kind} of shape {shape}")
+        try:
+            OutcomeCheck(self, pairs, self.num_outcomes, -1).block(0, self.num_states)
+        except WrongOutcomes as error:
+            raise ParameterError(f"{error.name}: {error}") from None
 
     # What it says of itself -----------------------------------------------------------------------------------------
+
+    @property
+    def operations(self) -> int:  # type: ignore[override]
+        return 2 * self.num_outcomes
 
     @cached_property
     def for_kernels(self) -> tuple[Any, ...]:  # type: ignore[override]
@@ -87,17 +75,16 @@ class OutcomeTable(CompiledDynamics):
         if self.probabilities is not None:
             weights = self.probabilities.reshape(-1)
         shape = (self.num_states, self.num_actions)
-        flat = None if codes is None else codes.reshape(-1)
-        return self.successors.reshape(-1), self.offsets, flat, weights, shape, self.num_outcomes
+        return self.flat, self.offsets, None if codes is None else codes.reshape(-1), weights, shape, self.num_outcomes
 
     def for_kernels_with(self, values: np.ndarray) -> tuple[Any, ...]:
         """`for_kernels` with other values, (N,) of all possible outcomes in order, in the place of the successors."""
-        if self.offsets is None:
-            chances = self.probabilities
-            if chances is None:
-                chances = np.asarray(self.palette)[np.asarray(self.codes)]
-            padded = np.zeros(self.successors.shape, values.dtype)
-            padded[np.asarray(chances) > 0] = values
+        if len(values) < self.successors.size:  # padding
+            rows = np.arange(self.num_states * self.num_actions)
+            which = self.possible(rows)[0]
+            counts = np.bincount(which, minlength=len(rows))
+            padded = np.zeros((len(rows), self.num_outcomes), values.dtype)
+            padded[np.arange(self.num_outcomes) < counts[:, None]] = values
             values = padded.reshape(-1)
         return (values, *self.for_kernels[1:])
 
@@ -110,11 +97,7 @@ class OutcomeTable(CompiledDynamics):
         if self.palette is not None:  # the sign of a sum by fsum is that of the exact one
             beyond = max(math.fsum([*vector, -1.0]) for vector in np.asarray(self.palette).tolist())
             return 1.0 if beyond <= 0 else math.nextafter(1.0 + beyond, 2.0)
-        assert self.probabilities is not None
-        if self.offsets is None:
-            sums = self.probabilities.sum(axis=2)
-        else:
-            sums = np.add.reduceat(self.probabilities, self.offsets[:-1])
+        sums = self.expected(np.ones(self.num_states + 1))
         return max(1.0, float(sums.max()) * (1 + self.num_outcomes * _UNIT))
 
     @cached_property
@@ -127,17 +110,16 @@ class OutcomeTable(CompiledDynamics):
 
     @cached_property
     def _table(self) -> Indices:
-        if isinstance(self.successors, PackedIndices) and self.successors.size == self.num_states * self.num_actions:
-            return self.successors.reshape(self.num_states, self.num_actions)
-        first = self.successors if self.offsets is not None else self.successors[..., 0]
-        return np.ascontiguousarray(first.reshape(self.num_states, self.num_actions))
+        pairs = self.num_states, self.num_actions
+        if self.successors.size == self.num_states * self.num_actions:
+            return self.successors.reshape(pairs)
+        return np.ascontiguousarray(self.successors[..., 0])
 
     def deterministic_table(self) -> Indices | None:
         return self._table if self.is_deterministic else None
 
     def arrays(self) -> dict[str, np.ndarray]:
-        names = ("successors", "offsets", "codes", "palette", "probabilities")
-        return {name: np.asarray(array) for name in names if (array := getattr(self, name)) is not None}
+        return {name: np.asarray(array) for name, array in self.by_name.items()}
 
     # What executing does --------------------------------------------------------------------------------------------
 
@@ -148,32 +130,16 @@ class OutcomeTable(CompiledDynamics):
         kernels.expected(self.for_kernels, flat, rows, out)
         return out.reshape(len(rows), self.num_actions, *x.shape[2:])
 
-    def outcomes(self, states: np.ndarray, actions: np.ndarray) -> Outcomes:
-        """Ascending by next state; outcomes that lead to the same one are one."""
-        rows = np.asarray(states) * self.num_actions + np.asarray(actions)
-        which, following, probabilities = self._entries(rows)
-        matrix = self._merged_entries(np.bincount(which, minlength=len(rows)), following, probabilities)
-        which = np.repeat(np.arange(len(rows)), np.diff(matrix.indptr))
-        return Outcomes(which, matrix.indices.astype(np.int64), matrix.data)
-
-    def matrix(self, live: np.ndarray | None = None) -> "csr_matrix":
-        states = np.arange(self.num_states) if live is None else np.flatnonzero(live)
-        rows = self._rows(states)
-        which, following, probabilities = self._entries(rows)
-        counts = np.zeros(self.num_states * self.num_actions, np.int64)
-        counts[rows] = np.bincount(which, minlength=len(rows))
-        return self._merged_entries(counts, following, probabilities)
-
-    def _merged_entries(self, counts: np.ndarray, following: np.ndarray, probabilities: np.ndarray) -> "csr_matrix":
-        """(N, S + 1), column S for the end; counts (N,) of the entries of each row, which lie one after another."""
-        from scipy import sparse
-
-        small = np.int32 if max(len(following), self.num_states + 1) < 2**31 else np.int64
-        columns = np.where(following < 0, self.num_states, following).astype(small, copy=False)
-        indptr = np.concatenate([[0], np.cumsum(counts)]).astype(small)
-        matrix = sparse.csr_matrix((probabilities, columns, indptr), shape=(len(counts), self.num_states + 1))
-        matrix.sum_duplicates()
-        return matrix
+    def entries(self, states: np.ndarray, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        states, actions = np.asarray(states, np.int64), np.asarray(actions, np.int64)
+        rows = states * self.num_actions + actions
+        if len(rows) < _FEW:
+            return self.possible(rows)
+        size = int((self.begins(rows + 1) - self.begins(rows)).sum())
+        columns = np.empty(size, np.int64), np.empty(size, np.int64), np.empty(size)
+        count = kernels.entries(self.for_kernels, states, actions, *columns)
+        which, following, probabilities = (column[:count] for column in columns)
+        return which, following, probabilities
 
     def sample(self, states: np.ndarray, actions: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         if self.is_deterministic:
@@ -182,40 +148,11 @@ class OutcomeTable(CompiledDynamics):
         kernels.draw(self.for_kernels, np.asarray(states), np.asarray(actions), rng.random(len(states)), drawn)
         return drawn
 
-    def largest(self, x: np.ndarray, states: Any = slice(None)) -> np.ndarray:
-        return self._extreme(x, states, 1.0)
-
-    def smallest(self, x: np.ndarray, states: Any = slice(None)) -> np.ndarray:
-        return self._extreme(x, states, -1.0)
-
-    def _extreme(self, x: np.ndarray, states: Any, sign: float) -> np.ndarray:
-        rows = np.arange(self.num_states)[states]
-        out = np.empty((len(rows), self.num_actions))
-        kernels.largest(self.for_kernels, np.ascontiguousarray(x, np.float64), rows, sign, out)
-        return out
-
-    def successors_of(self, states: np.ndarray) -> np.ndarray:
-        _, following, _ = self._entries(self._rows(states))
-        return np.unique(np.where(following < 0, self.num_states, following))
-
-    def arrivals(self, states: np.ndarray) -> np.ndarray:
-        result = np.zeros((self.num_states, self.num_actions), np.bool_)
-        kernels.arrive(self.for_kernels, np.asarray(states), result)
-        return result
-
     def part(self, start: int, stop: int) -> tuple["OutcomeTable", np.ndarray]:
-        rows = slice(start * self.num_actions, stop * self.num_actions)
-        where, arrays = slice(start, stop), {}
-        if self.offsets is not None:
-            offsets = self.offsets[rows.start : rows.stop + 1].astype(np.int64)
-            where, arrays["offsets"] = slice(int(offsets[0]), int(offsets[-1])), offsets - offsets[0]
-        if self.probabilities is not None:
-            arrays["probabilities"] = np.array(self.probabilities[where])
-        else:
-            arrays.update(codes=np.array(self.codes[start:stop]), palette=self.palette)  # type: ignore[index]
-        entries = rows_of(self.successors, where.start, where.stop)
+        first, last = self.begins(np.array([start, stop]) * self.num_actions).tolist()
+        entries = rows_of(self.flat, first, last)
         local, halo = split(partial(blocks_of, entries), entries.shape, start, stop)
-        return OutcomeTable(local, self.num_actions, **arrays), halo
+        return self._of_states(slice(start, stop), slice(first, last), local), halo
 
     def restricted_to(self, states: np.ndarray) -> "OutcomeTable":
         """These states alone; what leads out of them leads back to where it came from."""
@@ -228,64 +165,34 @@ class OutcomeTable(CompiledDynamics):
 
     def ends_and_stays(self) -> tuple[np.ndarray, np.ndarray]:
         """(S,) bool each: whether all that a state leads to is the end; and whether it is the end or the state."""
-        successors = np.asarray(self.successors)
-        own = np.arange(self.num_states, dtype=successors.dtype)
-        if self.offsets is None:
-            ends = successors == -1
-            stays = ends | (successors == own[:, None, None])
-            return ends.all(axis=(1, 2)), stays.all(axis=(1, 2))
-        first = self.offsets[:: self.num_actions]
+        successors, states = np.asarray(self.flat), np.arange(self.num_states + 1)
+        first = self.begins(states * self.num_actions)
         ends = successors == -1
-        stays = ends | (successors == np.repeat(own, np.diff(first)))
+        stays = ends | (successors == np.repeat(states[:-1].astype(successors.dtype), np.diff(first)))
         return np.logical_and.reduceat(ends, first[:-1]), np.logical_and.reduceat(stays, first[:-1])
 
     # Parts of it ----------------------------------------------------------------------------------------------------
 
-    def _entries(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(which row, next state or -1, probability > 0) of all outcomes of some rows s A + a, in order."""
-        if self.offsets is None:
-            following = self.successors.reshape(-1, self.num_outcomes)[rows]
-            if self.palette is not None:
-                chances = np.asarray(self.palette)[np.asarray(self.codes).reshape(-1)[rows]]
-            else:
-                chances = np.asarray(self.probabilities).reshape(-1, self.num_outcomes)[rows]
-            which, k = np.nonzero(chances)
-            return which, following[which, k], chances[which, k]
-        which, places = self._places(rows)
-        if self.palette is not None:
-            k = places - self.offsets[rows][which]
-            chances = np.asarray(self.palette)[np.asarray(self.codes).reshape(-1)[rows][which], k]
+    def _renumbered(self, states: np.ndarray, number: np.ndarray) -> "OutcomeTable":
+        """The rows of some states; number (S + 1,) of each next state, -1 for the end, -2 for where it came from."""
+        which, places = self.places(self._rows(np.asarray(states)))
+        following = number[self.flat[places]]
+        following = np.where(following == -2, which // self.num_actions, following)
+        return self._of_states(states, places, as_indices(following, len(states)))
+
+    def _of_states(self, states: Any, places: Any, successors: Indices) -> "OutcomeTable":
+        """The rows of some states, with other successors (N,); places (N,) of their entries, all and in order."""
+        arrays: dict[str, Any] = {"successors": successors.reshape(-1, *self.successors.shape[1:])}
+        if self.offsets is not None:
+            rows = self._rows(np.arange(self.num_states)[states])
+            arrays["offsets"] = np.append(0, np.cumsum(self.begins(rows + 1) - self.begins(rows)))
+        if self.probabilities is None:
+            arrays.update(codes=np.array(np.asarray(self.codes)[states]), palette=self.palette)
         else:
-            chances = np.asarray(self.probabilities)[places]
-        return which, self.successors[places], chances
+            probabilities = np.array(self.probabilities.reshape(-1)[places])
+            arrays["probabilities"] = probabilities.reshape(arrays["successors"].shape)
+        return OutcomeTable(num_actions=self.num_actions, **arrays)
 
     def _rows(self, states: np.ndarray) -> np.ndarray:
         """The rows s A + a of some states."""
-        return (np.asarray(states)[:, None] * self.num_actions + np.arange(self.num_actions)).ravel()
-
-    def _places(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(which row, place in `successors`) of all outcomes of some rows, where they lie one after another."""
-        assert self.offsets is not None
-        first = self.offsets[rows].astype(np.int64)
-        counts = self.offsets[rows + 1] - first
-        which = np.repeat(np.arange(len(rows)), counts)
-        return which, np.arange(len(which)) + np.repeat(first - (np.cumsum(counts) - counts), counts)
-
-    def _renumbered(self, states: np.ndarray, number: np.ndarray) -> "OutcomeTable":
-        """The rows of some states; number (S + 1,) of each next state, -1 for the end, -2 for where it came from."""
-        rows = self._rows(states)
-        arrays: dict[str, Any] = {}
-        if self.offsets is None:
-            places = np.asarray(states)
-            own = np.arange(len(states))[:, None, None]
-        else:
-            which, places = self._places(rows)
-            own = which // self.num_actions
-            arrays["offsets"] = np.append(0, np.cumsum(np.bincount(which, minlength=len(rows))))
-        following = number[self.successors[places]]
-        arrays["successors"] = as_indices(np.where(following == -2, own, following), len(states))
-        if self.probabilities is not None:
-            arrays["probabilities"] = np.asarray(self.probabilities[places])
-        else:
-            arrays.update(codes=np.asarray(self.codes)[states], palette=self.palette)  # type: ignore[index]
-        return OutcomeTable(num_actions=self.num_actions, **arrays)
+        return (states[:, None] * self.num_actions + np.arange(self.num_actions)).ravel()

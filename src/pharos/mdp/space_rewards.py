@@ -122,11 +122,11 @@ def rewards_of_outcomes(space: "StateSpace") -> np.ndarray:
     from pharos.rules import rules_of
 
     assert space.environment is not None
-    rules, num_actions = rules_of(space.environment).rewards_of(space.num_states), space.num_actions
+    rules = rules_of(space.environment).rewards_of(space.num_states)
     blocks = [np.empty(0)]
     for start in range(0, space.num_states, _ROWS):
         stop = min(start + _ROWS, space.num_states)
-        which, successors, _ = space.outcomes.entries(start, stop, num_actions)
+        which, successors, _ = space.dynamics.entries_of(np.arange(start, stop))
         number = np.arange(len(which)) - np.searchsorted(which, which)  # of each outcome within its row
         paid = np.zeros(len(which))
         for k in range(int(number.max(initial=-1)) + 1):  # as if the k-th were the only one
@@ -193,7 +193,7 @@ def _outcomes_of_environment(mdp: "TabularMDP") -> PaidOutcomes | None:
         return None
     rows, stays = np.arange(space.num_states * space.num_actions), mdp.laziness
     if space.has_chance:
-        which, successors, probabilities = space.outcomes.entries(0, space.num_states, space.num_actions)
+        which, successors, probabilities = space.dynamics.entries_of(np.arange(space.num_states))
         columns = [which, successors, rewards_of_outcomes(space), (1.0 - stays) * probabilities]
     else:  # lazy actions alone
         paid = rewards_of_space(space).array.ravel()
@@ -228,14 +228,13 @@ def _blocks(
     end = space.num_states if last is None else last
     starts = range(first, end, _ROWS)
     states, terminal = space.packed_states, space.terminal
-    successors = None if space.has_chance else space.successors
+    successors, dynamics = None if space.has_chance else space.successors, space.dynamics
 
     def block(start: int) -> np.ndarray:
         stop = min(start + _ROWS, end)
         if successors is not None:
             return rules.block(states, successors, terminal, start, stop)
-        outcomes = space.outcomes.entries(start, stop, space.num_actions)
-        return rules.expected_block(states, outcomes, terminal, start, stop)
+        return rules.expected_block(states, dynamics.entries_of(np.arange(start, stop)), terminal, start, stop)
 
     threads = rules.threads(usable_workers(workers))
     with ThreadPoolExecutor(threads) as pool:

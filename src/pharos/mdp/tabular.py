@@ -12,12 +12,12 @@ import numpy as np
 
 from pharos.errors import ParameterError
 from pharos.mdp.chance import Chance
-from pharos.mdp.compiled import Table
 from pharos.mdp.dynamics import Dynamics, Order
 from pharos.mdp.matrices import Matrices, expected_rewards, transitions_of
 from pharos.mdp.outcome_arrays import checked_outcomes, compact_outcomes
 from pharos.mdp.outcome_table import OutcomeTable
 from pharos.mdp.rewards import Rewards
+from pharos.mdp.table import Lazy, Table
 from pharos.mdp.tabular_arrays import (
     check_gamma,
     check_horizon,
@@ -326,6 +326,22 @@ class TabularMDP:
         """
         return pairs_within(self, steps)
 
+    def nodes_within(self, steps: int | None = None) -> np.ndarray:
+        """(S, W) bool: what values belong to and can be met within `steps` steps from a start: `pairs_within` under
+        sticky actions, else `states_within`. Start states without a previous action are not among them."""
+        return self.pairs_within(steps) if self.is_sticky else self.states_within(steps)[:, None]
+
+    def nodes_after(self, nodes: np.ndarray, lone: np.ndarray) -> np.ndarray:
+        """(S, W) bool: the nodes that can be met one step after these (S, W), or after starts (S,) with no action."""
+        return nodes_after(self, nodes, lone)
+
+    @property
+    def lone_starts(self) -> np.ndarray:
+        """(S,) bool: start states that are no state and previous action, but nodes of their own."""
+        lone = np.zeros(self.num_states, np.bool_)
+        lone[self.starts] = self.is_sticky
+        return lone
+
     # Variants -------------------------------------------------------------------------------------------------------
 
     def with_gamma(self, gamma: float) -> "TabularMDP":
@@ -353,7 +369,7 @@ class TabularMDP:
             stays = self.reward_table if self.staying is None else self.staying()
         mixed = self.reward_table if stays is self.reward_table else self.reward_table.mixed(stays, p)
         return replace(
-            self, dynamics=self.dynamics.lazy(p), reward_table=mixed, staying=partial(_as_is, stays), age=None
+            self, dynamics=Lazy(self.dynamics, p), reward_table=mixed, staying=partial(_as_is, stays), age=None
         )
 
     def with_initial(self, initial: Any) -> "TabularMDP":
@@ -427,27 +443,32 @@ def _as_is(rewards: Rewards) -> Rewards:
 
 def pairs_within(mdp: "TabularMDP", steps: int | None) -> np.ndarray:
     """(S, A) bool: what `TabularMDP.pairs_within` says."""
-    num_states, num_actions, terminal = mdp.num_states, mdp.num_actions, np.asarray(mdp.terminal)
+    reached = now = np.zeros((mdp.num_states, mdp.num_actions), np.bool_)
     if mdp.chance.executes_any:
-        if steps == 0:
-            return np.zeros((num_states, num_actions), np.bool_)
-        before = mdp.states_within(None if steps is None else steps - 1) & ~terminal
-        return mdp.dynamics.arrivals(np.flatnonzero(before))
-    is_reached = np.zeros((num_states + 1, num_actions), np.bool_)
-    is_reached[-1] = True
-    states, actions = np.repeat(mdp.starts, num_actions), np.tile(np.arange(num_actions), len(mdp.starts))
-    level = 0
-    while len(states) and (steps is None or level < steps):
-        live = ~terminal[states]
-        states, actions = states[live], actions[live]
-        outcomes = mdp.dynamics.outcomes(states, actions)
-        pairs = np.unique(outcomes.states * num_actions + actions[outcomes.which])
-        states, actions = np.divmod(pairs, num_actions)
-        new = ~is_reached[states, actions]
-        states, actions = states[new], actions[new]
-        is_reached[states, actions] = True
-        level += 1
-    return is_reached[:-1]
+        return reached if steps == 0 else _arrivals(mdp, mdp.states_within(None if steps is None else steps - 1))
+    lone, level = np.zeros(mdp.num_states, np.bool_), 0
+    lone[mdp.starts] = True
+    while (lone.any() or now.any()) and (steps is None or level < steps):
+        now = nodes_after(mdp, now, lone) & ~reached
+        reached, lone, level = reached | now, np.zeros_like(lone), level + 1
+    return reached
+
+
+def nodes_after(mdp: "TabularMDP", nodes: np.ndarray, lone: np.ndarray) -> np.ndarray:
+    """(S, W) bool: the nodes that can be met one step after these (S, W), or after starts (S,) with no action."""
+    if nodes.shape[1] < mdp.num_actions or mdp.chance.executes_any:
+        after = _arrivals(mdp, nodes.any(axis=1) | lone)
+        return after if nodes.shape[1] == mdp.num_actions else np.asarray(after.any(axis=1, keepdims=True))
+    states, actions = np.nonzero(nodes & ~np.asarray(mdp.terminal)[:, None])  # every action is a repetition
+    outcomes = mdp.dynamics.outcomes(states, actions)
+    after = np.vstack([_arrivals(mdp, lone), np.zeros_like(nodes[:1])])
+    after[outcomes.states, actions[outcomes.which]] = True
+    return after[:-1]
+
+
+def _arrivals(mdp: "TabularMDP", is_met: np.ndarray) -> np.ndarray:
+    """(S, A) bool: the pairs (state, executed action) one step after some states (S,) bool."""
+    return mdp.dynamics.arrivals(np.flatnonzero(is_met & ~np.asarray(mdp.terminal)))
 
 
 def restricted_to(mdp: "TabularMDP", states: np.ndarray) -> "TabularMDP":

@@ -356,7 +356,7 @@ class ComponentSolver:
         """
         mdp, self._is_tried = self.mdp, True
         components = mdp.dynamics.components(~np.asarray(mdp.terminal), LEAST if mdp.is_sticky else 1)
-        if components is None or components.largest > mdp.num_states // 2:
+        if components.largest > mdp.num_states // 2:
             return False
         target = SHARE * tolerance * (1 - mdp.gamma)
         with np.errstate(over="ignore", invalid="ignore"):

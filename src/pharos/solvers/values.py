@@ -268,7 +268,7 @@ _REPEATS, _ENOUGH = 4, 0.1
 
 def can_be_swept_by_blocks(mdp: TabularMDP) -> bool:
     """Whether a range of its states can be swept alone, and more than once."""
-    return mdp.gamma < 1 and mdp.age is None and mdp.dynamics.sweeps_ranges
+    return mdp.gamma < 1 and mdp.age is None
 
 
 def blocked_fixed_point(

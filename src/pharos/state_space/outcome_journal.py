@@ -28,9 +28,9 @@ from pharos.state_space.manifest import (
     TERMINAL,
     successors_name,
 )
-from pharos.state_space.outcome_checks import check_outcome_rules
 from pharos.state_space.outcome_parts import OutcomeParts
 from pharos.state_space.plan import Plan
+from pharos.state_space.stored_outcomes import check_outcome_rules
 from pharos.state_space.table import Block
 from pharos.system.packed_indices import dtype_of
 

@@ -16,7 +16,7 @@ import numpy as np
 from pharos.kernels import palettes
 from pharos.state_space.files import GrowingFile, cannot_write
 from pharos.state_space.manifest import CODES, INDEX_TYPES, OFFSETS, PALETTE, PARTS, PROBABILITIES
-from pharos.state_space.stored_outcomes import OutcomesOfState
+from pharos.system.outcome_rows import OutcomesOfState
 from pharos.system.packed_indices import as_stored, dtype_of, from_stored
 
 MOST_PADDING = (3, 10)

@@ -31,10 +31,15 @@ from pharos.state_space.manifest import (
     read_manifest,
     successors_name,
 )
-from pharos.state_space.outcome_checks import check_outcome_rules, check_outcomes, outcomes_to_check
 from pharos.state_space.plan import Plan
 from pharos.state_space.shards import blocks_of, check_files, mapped, parts_of
-from pharos.state_space.stored_outcomes import StoredOutcomes
+from pharos.state_space.stored_outcomes import (
+    check_outcome_rules,
+    check_outcomes,
+    outcomes_to_check,
+    stored_outcomes,
+)
+from pharos.system.outcome_rows import OutcomeRows
 from pharos.system.packed_indices import Indices, dtype_of, from_stored
 
 if TYPE_CHECKING:
@@ -98,7 +103,7 @@ class StateSpace:
         return self._stored_successors
 
     @cached_property
-    def outcomes(self) -> StoredOutcomes:
+    def outcomes(self) -> OutcomeRows:
         """What each action may lead to, where it has several outcomes, as the files hold it; `dynamics` hides the form.
 
         Raises:
@@ -116,7 +121,7 @@ class StateSpace:
 
         if not self.has_chance:
             return Table(self.successors)
-        return OutcomeTable(num_actions=self.num_actions, **self.outcomes._asdict())
+        return OutcomeTable(num_actions=self.num_actions, **self.outcomes.by_name)
 
     @cached_property
     def ages(self) -> np.ndarray:
@@ -137,10 +142,10 @@ class StateSpace:
         return ages
 
     @cached_property
-    def _stored_outcomes(self) -> StoredOutcomes:
+    def _stored_outcomes(self) -> OutcomeRows:
         if not self.has_chance:
             raise StateSpaceError(f"{self}: each action has one outcome, in `successors`; there are no `outcomes`")
-        return StoredOutcomes.of_folder(self.folder, self.manifest)
+        return stored_outcomes(self.folder, self.manifest)
 
     @cached_property
     def _stored_states(self) -> np.ndarray:

@@ -1,108 +1,137 @@
-"""The outcomes of a finished state space, as its files hold them: two layouts, and two ways to keep probabilities."""
+"""The outcomes of a finished state space, as its files hold them, and what a reader checks of them."""
 
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from pharos.state_space.manifest import CODES, OFFSETS, PALETTE, PROBABILITIES, successors_name
+from pharos.environments import Environment
+from pharos.errors import StateSpaceCorrupted, StateSpaceMismatch
+from pharos.rules import Layout, unpack
+from pharos.state_space.manifest import AGAIN, CODES, OFFSETS, PALETTE, PROBABILITIES, TERMINAL, successors_name
 from pharos.state_space.shards import mapped, parts_of
-from pharos.system.packed_indices import Indices, dtype_of, from_stored
+from pharos.system.outcome_rows import SUM_TOLERANCE, OutcomeCheck, OutcomeRows, OutcomesOfState, WrongOutcomes
+from pharos.system.packed_indices import dtype_of, from_stored
 
-OutcomesOfState = list[tuple[np.ndarray, np.ndarray]]
-"""For each action the next states and their probabilities, possible outcomes alone."""
+_BLOCK_ENTRIES = 1 << 17
 
 
-class StoredOutcomes(NamedTuple):
-    """What executing actions may lead to, for S states, A actions and at most K outcomes; memory maps.
+def stored_outcomes(folder: Path, manifest: dict[str, Any]) -> OutcomeRows:
+    """The arrays of a folder, memory maps; nothing is read yet."""
+    arrays, successors = manifest["arrays"], successors_name(manifest["arrays"])
+    pairs = manifest["num_states"], manifest["num_actions"]
+    of_outcomes = (manifest["num_transitions"],) if OFFSETS in arrays else (*pairs, manifest["num_outcomes"])
+    shapes = {
+        successors: of_outcomes,
+        OFFSETS: (pairs[0] * pairs[1] + 1,),
+        CODES: pairs,
+        PALETTE: (-1, manifest["num_outcomes"]),
+        PROBABILITIES: of_outcomes,
+    }
+    maps = {
+        name: mapped(parts_of(folder, manifest, name), dtype_of(arrays[name]["dtype"])).reshape(shape)
+        for name, shape in shapes.items()
+        if name in arrays
+    }
+    others = {name.removesuffix(".bin"): array for name, array in maps.items() if name != successors}
+    return OutcomeRows(from_stored(maps[successors]), **others)
 
-    Attributes:
-        successors: (S, A, K), of which impossible outcomes repeat the first; or (N,), the rows s A + a one after
-            another.
-        offsets: (S A + 1,) where the rows begin; None where successors are (S, A, K).
-        codes: (S, A) uint8 or uint16, which vector of the palette has the probabilities; None without a palette.
-        palette: (P, K) float64, the probabilities of possible outcomes in their order, then zeros; None without one.
-        probabilities: float64 in the shape of successors; None where there is a palette.
+
+def check_outcomes(folder: Path, manifest: dict[str, Any], stored: OutcomeRows, terminal_bits: np.ndarray) -> None:
+    """StateSpaceCorrupted where the arrays are not those of a state space.
+
+    Cost: one pass over them, in blocks that fit into a processor's cache.
     """
+    num_states, num_actions, most = (manifest[name] for name in ("num_states", "num_actions", "num_outcomes"))
+    step = max(8, _BLOCK_ENTRIES // (num_actions * most) // 8 * 8)
+    terminals = transitions = 0
+    try:
+        check = OutcomeCheck(stored, (num_states, num_actions), most, 0)
+        for start in range(0, num_states, step):
+            stop = min(start + step, num_states)
+            counts, first = check.block(start, stop)
+            bits = terminal_bits[start // 8 : (start + step) // 8]
+            ended = np.flatnonzero(np.unpackbits(bits, count=stop - start, bitorder="little"))
+            terminals += len(ended)
+            transitions += int(counts.sum())
+            leaving = first.reshape(-1, num_actions)[ended] != (start + ended)[:, None]
+            leaving |= counts.reshape(-1, num_actions)[ended] != 1
+            if leaving.any():
+                state = start + int(ended[leaving.any(axis=1).argmax()])
+                raise WrongOutcomes("successors", f"terminal state {state} leads to another state")
+        if terminals != manifest["num_terminal_states"]:
+            expected = manifest["num_terminal_states"]
+            raise WrongOutcomes("terminal", f"marks {terminals} terminal states; expected {expected}")
+        if transitions != manifest["num_transitions"]:
+            expected = manifest["num_transitions"]
+            raise WrongOutcomes("successors", f"has {transitions} transitions; expected {expected}")
+    except WrongOutcomes as error:
+        raise _corrupted(folder, manifest, error) from None
 
-    successors: Indices
-    offsets: np.ndarray | None
-    codes: np.ndarray | None
-    palette: np.ndarray | None
-    probabilities: np.ndarray | None
 
-    @staticmethod
-    def of_folder(folder: Path, manifest: dict[str, Any]) -> "StoredOutcomes":
-        """The arrays of a folder; nothing is read yet."""
-        arrays = manifest["arrays"]
-        pairs = manifest["num_states"], manifest["num_actions"]
-        shapes = {
-            successors_name(arrays): (*pairs, manifest["num_outcomes"]),
-            OFFSETS: (pairs[0] * pairs[1] + 1,),
-            CODES: pairs,
-            PALETTE: (-1, manifest["num_outcomes"]),
-            PROBABILITIES: (*pairs, manifest["num_outcomes"]),
-        }
-        if OFFSETS in arrays:
-            shapes[successors_name(arrays)] = shapes[PROBABILITIES] = (manifest["num_transitions"],)
+def _corrupted(folder: Path, manifest: dict[str, Any], error: WrongOutcomes) -> StateSpaceCorrupted:
+    names = {"successors": successors_name(manifest["arrays"]), "terminal": TERMINAL}
+    return StateSpaceCorrupted(f"{folder / names.get(error.name, f'{error.name}.bin')}: {error}; {AGAIN}")
 
-        def array(name: str) -> np.ndarray | None:
-            if name not in arrays:
-                return None
-            return mapped(parts_of(folder, manifest, name), dtype_of(arrays[name]["dtype"])).reshape(shapes[name])
 
-        successors = array(successors_name(arrays))
-        assert successors is not None
-        others = (array(name) for name in (OFFSETS, CODES, PALETTE, PROBABILITIES))
-        return StoredOutcomes(from_stored(successors), *others)
+def outcomes_to_check(
+    folder: Path, manifest: dict[str, Any], stored: OutcomeRows, states: np.ndarray
+) -> dict[int, OutcomesOfState]:
+    """The outcomes of some states, of arrays that nobody has looked at yet; StateSpaceCorrupted where they are none."""
+    shape = manifest["num_states"], manifest["num_actions"]
+    try:
+        check = OutcomeCheck(stored, shape, manifest["num_outcomes"], 0)
+        for s in states.tolist():
+            check.block(s, s + 1)
+    except WrongOutcomes as error:
+        raise _corrupted(folder, manifest, error) from None
+    return stored.of_states(states, manifest["num_actions"])
 
-    def entries(self, start: int, stop: int, num_actions: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """All possible outcomes of states [start, stop), N of them.
 
-        Returns:
-            which (N,) int64, ascending, (s - start) A + a; successors (N,) int64; probabilities (N,) float64.
-        """
-        from pharos.kernels import palettes
+def check_outcome_rules(
+    folder: Path,
+    env: Environment,
+    layout: Layout,
+    states: np.ndarray,
+    outcomes: dict[int, OutcomesOfState],
+    bits: np.ndarray,
+) -> None:
+    """StateSpaceMismatch where the rules of `env` disagree with the stored outcomes of some states.
 
-        if self.offsets is None:
-            following = np.asarray(self.successors[start:stop])
-            rows, most = following.shape[0] * following.shape[1], following.shape[2]
-            if self.palette is None:
-                assert self.probabilities is not None
-                vectors, codes = np.asarray(self.probabilities[start:stop]).reshape(-1, most), np.arange(rows)
-            else:
-                vectors, codes = np.asarray(self.palette), np.asarray(self.codes[start:stop]).ravel()  # type: ignore[index]
-            which, successors = np.empty(rows * most, np.int64), np.empty(rows * most, np.int64)
-            likely = np.empty(rows * most)
-            arrays = which, successors, likely
-            n = palettes.entries_of_padded(following.reshape(-1, most), vectors, codes, *arrays)
-            return which[:n], successors[:n], likely[:n]
-        offsets = np.asarray(self.offsets[start * num_actions : stop * num_actions + 1])
-        part = slice(int(offsets[0]), int(offsets[-1]))
-        successors = np.asarray(self.successors[part], np.int64)
-        if self.palette is None:
-            assert self.probabilities is not None
-            which = np.repeat(np.arange(len(offsets) - 1), np.diff(offsets))
-            return which, successors, np.asarray(self.probabilities[part])
-        which, likely = np.empty(len(successors), np.int64), np.empty(len(successors))
-        codes = np.asarray(self.codes[start:stop]).ravel()  # type: ignore[index]
-        palettes.entries_of_ragged(offsets, np.asarray(self.palette), codes, which, likely)
-        return which, successors, likely
+    Args:
+        states: (S, W), packed. bits: which ones are terminal.
+        outcomes: those of the states that are looked at.
+    """
+    for i, of_actions in outcomes.items():
+        state = tuple(unpack(layout, states[i : i + 1])[0].tolist())
+        try:
+            ended = bool(env.is_terminal(state))
+            expected = [_outcomes_of(env, state, a, ended) for a in range(env.num_actions)]
+        except Exception as error:
+            raise StateSpaceMismatch(
+                f"{folder}: was built with other rules: those of this {env.name} fail in state {state}: {error!r}; "
+                f"build in another folder"
+            ) from error
+        for action, (successors, probabilities) in enumerate(of_actions):
+            following = [tuple(row) for row in unpack(layout, states[successors]).tolist()]
+            wanted, likely = expected[action]
+            agree = following == wanted and np.abs(probabilities - likely).max() <= SUM_TOLERANCE
+            if not agree or ended != bool(bits[i // 8] >> (i % 8) & 1):
+                raise StateSpaceMismatch(
+                    f"{folder}: was built with other rules: from state {state} action {env.actions[action]!r} leads to "
+                    f"{_text(following, probabilities)}, by the rules of this {env.name} to {_text(wanted, likely)}; "
+                    f"build in another folder, and raise `version` when you change rules"
+                )
 
-    def of_states(self, states: np.ndarray, num_actions: int) -> dict[int, OutcomesOfState]:
-        """The outcomes of some states."""
-        return {int(s): [self._of_pair(int(s), a, num_actions) for a in range(num_actions)] for s in states}
 
-    def _of_pair(self, s: int, a: int, num_actions: int) -> tuple[np.ndarray, np.ndarray]:
-        if self.offsets is None:
-            successors, place = np.asarray(self.successors[s, a]), (s, a)
-            likely = self.probabilities[place] if self.palette is None else self.palette[self.codes[place]]  # type: ignore[index]
-            possible = np.asarray(likely) != 0
-            return successors[possible], np.asarray(likely)[possible]
-        row = s * num_actions + a
-        part = slice(int(self.offsets[row]), int(self.offsets[row + 1]))
-        successors = np.asarray(self.successors[part])
-        if self.palette is None:
-            assert self.probabilities is not None
-            return successors, np.asarray(self.probabilities[part])
-        return successors, np.asarray(self.palette[self.codes[s, a]])[: len(successors)]  # type: ignore[index]
+def _outcomes_of(env: Environment, state: tuple, action: int, ended: bool) -> tuple[list[tuple], np.ndarray]:
+    """Next states and their probabilities, possible outcomes alone."""
+    if ended:
+        return [state], np.ones(1)
+    likely = [float(env.probability(state, action, outcome)) for outcome in range(env.outcomes)]
+    possible = [outcome for outcome, probability in enumerate(likely) if probability > 0]
+    return [env.next_state(state, action, outcome) for outcome in possible], np.array(likely)[possible]
+
+
+def _text(states: list[tuple], probabilities: np.ndarray) -> str:
+    return ", ".join(f"{state} ({p:.6g})" for state, p in zip(states, probabilities.tolist(), strict=True))

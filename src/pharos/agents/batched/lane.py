@@ -15,7 +15,6 @@ from pharos.agents.batched.layers import MASK, Shape, Values, room
 from pharos.agents.batched.networks import names_of, spread
 from pharos.agents.batched.observed import DeviceObservationTable, ObservationTable
 from pharos.agents.batched.runs import BatchRun, resolved
-from pharos.errors import ParameterError
 from pharos.kernels import batched_worlds as kernels
 from pharos.kernels import philox
 
@@ -253,11 +252,6 @@ class World:
         self.members = np.array(members, np.int64)
         table = dynamics.deterministic_table()
         self.transitions = dynamics.for_kernels if table is None else table
-        if self.transitions is None:
-            raise ParameterError(
-                f"the batched engine: {mdp} has no table of next states; expected one next state a pair, or a table "
-                "of outcomes (TabularMDP.from_outcomes)"
-            )
         self.rewards: tuple[Any, ...] = (mdp.reward_table.table, mdp.reward_table.palette)
         if run.outcome_rewards is not None and table is None:
             self.rewards = dynamics.for_kernels_with(run.outcome_rewards)  # type: ignore[attr-defined]

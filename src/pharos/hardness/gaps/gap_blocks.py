@@ -82,44 +82,21 @@ def _gaps_of_step(mdp: TabularMDP, step: Step, number: int, everywhere: bool) ->
 def steps_of(mdp: TabularMDP, solution: Solution) -> Iterator[Step]:
     """For each step t = 1, ..., T, or once: values, and how many times each state counts.
 
-    later (S,): 1, or True, for a reachable state, under sticky actions the number of actions by which it can be
+    later (S,): 1 for a reachable state, under sticky actions the number of actions by which it can be
     reached; first (S,) bool: start states, which count once more under sticky actions, without a previous action.
     """
-    nothing = np.zeros(mdp.num_states, np.bool_)
-    starts = nothing.copy()
-    starts[mdp.starts] = True
+    lone = mdp.lone_starts
     if solution.horizon is None:
-        if mdp.is_sticky:
-            yield Step(solution.x, solution.x, mdp.pairs_within().sum(axis=1), starts)
-        else:
-            yield Step(solution.x, solution.x, mdp.states_within(), nothing)
+        yield Step(solution.x, solution.x, mdp.nodes_within().sum(axis=1), lone)
         return
     all_steps = _all_steps(mdp, solution)
-    pairs = np.zeros((mdp.num_states, mdp.num_actions), np.bool_)
-    reached = starts
+    nodes = np.zeros((mdp.num_states, mdp.width), np.bool_)
+    nodes[mdp.starts[~lone[mdp.starts]]] = True
     for step in range(1, solution.horizon + 1):
         to_go = solution.horizon - step + 1
         own, following = (_with_end(all_steps[n]) for n in (to_go, to_go - 1))
-        if mdp.is_sticky:
-            yield Step(own, following, pairs.sum(axis=1), starts if step == 1 else nothing)
-            pairs = _pairs_after(mdp, pairs, step == 1)
-        else:
-            yield Step(own, following, reached, nothing)
-            arrived = mdp.dynamics.arrivals(np.flatnonzero(reached & ~np.asarray(mdp.terminal)))
-            reached = np.asarray(arrived.any(axis=1))
-
-
-def _pairs_after(mdp: TabularMDP, pairs: np.ndarray, is_first: bool) -> np.ndarray:
-    """(S, A) bool: the pairs (state, previously executed action) one step after these, or after the start."""
-    live = ~np.asarray(mdp.terminal)
-    if is_first or mdp.chance.executes_any:
-        states = mdp.starts if is_first else np.flatnonzero(pairs.any(axis=1))
-        return mdp.dynamics.arrivals(states[live[states]])
-    states, actions = np.nonzero(pairs & live[:, None])  # every action is a repetition
-    outcomes = mdp.dynamics.outcomes(states, actions)
-    after = np.zeros((mdp.num_states + 1, mdp.num_actions), np.bool_)
-    after[outcomes.states, actions[outcomes.which]] = True
-    return after[:-1]
+        yield Step(own, following, nodes.sum(axis=1), lone)
+        nodes, lone = mdp.nodes_after(nodes, lone), np.zeros_like(lone)
 
 
 def _all_steps(mdp: TabularMDP, solution: Solution) -> np.ndarray:

@@ -53,24 +53,16 @@ def certified_value_norm(mdp: TabularMDP, solution: Solution | None = None) -> C
     if mdp.is_deterministic:
         return Certified(0.0, 0.0, 0.0, True)
     live = ~np.asarray(mdp.terminal)
-    starts = np.zeros(mdp.num_states, np.bool_)
-    starts[mdp.starts] = True
-    pairs = mdp.pairs_within() if mdp.is_sticky else None
-    reached = mdp.states_within()
-    if pairs is not None:
-        reached = starts | pairs.any(axis=1)
-    states, largest = np.flatnonzero(reached & live), 0.0
+    nodes, lone = mdp.nodes_within(), mdp.lone_starts
+    states, largest = np.flatnonzero((lone | nodes.any(axis=1)) & live), 0.0
     size = float(np.abs(solution.x).max(initial=0.0))
     scale = 2.0 ** math.frexp(size)[1] if 0 < size < math.inf else 1.0  # squares of 1e160 and 1e-170 are no floats
     for block in np.array_split(states, max(1, -(-states.size // _BLOCK))):
         means, within = _outcomes(mdp, solution.x, block, scale)
-        if pairs is None:
-            largest = max(largest, _largest_variance(mdp.chance, means, within))
-            continue
-        first = starts[block]
-        largest = max(largest, _largest_variance(mdp.chance.first, means[first], within[first]))
-        for previous in range(mdp.num_actions):
-            met = pairs[block, previous]
+        first = lone[block]
+        largest = max(largest, _largest_variance(mdp.chance.first, means[first], within[first], 0))
+        for previous in range(mdp.width):
+            met = nodes[block, previous]
             largest = max(largest, _largest_variance(mdp.chance, means[met], within[met], previous))
     value = math.sqrt(largest) * scale
     error = solution.error_bound + (3 * mdp.num_actions + mdp.dynamics.operations + 16) * _UNIT * size
@@ -93,10 +85,10 @@ def _outcomes(mdp: TabularMDP, x: np.ndarray, states: np.ndarray, scale: float) 
     return means - means.mean(axis=1, keepdims=True), within
 
 
-def _largest_variance(chance: Chance, means: np.ndarray, within: np.ndarray, previous: int | None = None) -> float:
+def _largest_variance(chance: Chance, means: np.ndarray, within: np.ndarray, previous: int) -> float:
     """The largest variance of what follows a choice: within the outcomes of what is executed, and between their
     means."""
-    repeated = 0.0 if previous is None else means[:, previous : previous + 1]
+    repeated = means[:, previous : previous + 1]
     mean = chance.chosen * means + chance.uniform * means.mean(axis=1, keepdims=True) + chance.previous * repeated
     result = chance.chosen * (within + (means - mean) ** 2)
     if chance.uniform:
@@ -104,8 +96,7 @@ def _largest_variance(chance: Chance, means: np.ndarray, within: np.ndarray, pre
         spread = (within + centred**2).mean(axis=1, keepdims=True)
         result += chance.uniform * (spread + (mean - means.mean(axis=1, keepdims=True)) ** 2)
     if chance.previous:
-        own = 0.0 if previous is None else within[:, previous : previous + 1]
-        result += chance.previous * (own + (repeated - mean) ** 2)
+        result += chance.previous * (within[:, previous : previous + 1] + (repeated - mean) ** 2)
     return float(result.max(initial=0.0))
 
 

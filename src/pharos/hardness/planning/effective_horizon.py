@@ -13,8 +13,9 @@ What both effective horizons consist of. Source: Laidlaw, Russell and Dragan (20
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -128,7 +129,7 @@ def effective_horizon(mdp: TabularMDP, *, horizon: int | None = None, tight: int
     check_returns("effective_horizon", mdp, steps)
     mdp = mdp.within(steps)
     compiled = applies(mdp) and 40 * steps * mdp.num_states * mdp.num_actions > COMPILED
-    parts = _compiled(LargeHorizon(mdp, steps, TIE)) if compiled else _vectorized(FiniteHorizonValues(mdp, steps))
+    parts = parts_of(LargeHorizon(mdp, steps, TIE) if compiled else SmallHorizon(mdp, steps))
     bound = gorp_bound(mdp, horizon=steps, max_k=tight).value if tight else None
     conventions = {
         "horizon": steps,
@@ -140,130 +141,129 @@ def effective_horizon(mdp: TabularMDP, *, horizon: int | None = None, tight: int
     return EffectiveHorizon(**parts, tight=bound, conventions=conventions)
 
 
-def _vectorized(tree: FiniteHorizonValues) -> dict[str, Any]:
-    steps = tree.steps
-    bound = _simple_bound(tree)
-    return {
-        **dict(zip(("value", "ks", "ms", "gaps", "vars"), bound, strict=True)),
-        "k_min": _first_greedy(tree, tree.explored, steps),
-        "effective_planning_window": _first_greedy(tree, np.broadcast_to(tree.rewards, tree.explored.shape), steps),
-        "greedy_returns": [_greedy_return(tree, k) for k in range(1, GREEDY_RETURNS + 1)],
-        "optimal_return": tree.at_start(tree.best.max(axis=2)[0]),
-        "random_return": tree.at_start(tree.explored_value[0]),
-        "worst_return": tree.at_start(tree.worst.min(axis=2)[0]),
-        "num_states": tree.num_visitable,
-    }
+def parts_of(play: "SmallHorizon | LargeHorizon") -> dict[str, Any]:
+    """What an `EffectiveHorizon` consists of."""
+    ahead, greedy = look_ahead(play, play.steps, play.num_actions, play.greedy_return)
+    returns = dict(zip(("optimal_return", "random_return", "worst_return"), play.returns, strict=True))
+    return {**vars(ahead), **returns, "greedy_returns": greedy, "num_states": play.num_visitable}
 
 
-def _compiled(table: Any) -> dict[str, Any]:
-    """The same, for each k in turn."""
-    steps, best = table.steps, float(table.steps)
+class Play(Protocol):
+    """Q^k for one k after the other, k = 1 at first: what both effective horizons ask."""
+
+    def samples(self, log: float) -> tuple[int, float, float] | None:
+        """(m_k, gap, variance where it is attained), log = ln(2 T A^k); None where k fails."""
+
+    def is_greedy_optimal(self) -> bool:
+        """Whether all actions greedy in Q^k, from the start on, are optimal."""
+
+    def advance(self, spread: bool = True) -> None:
+        """From k to k + 1; spread: of the variances, too."""
+
+    def look_at_rewards(self) -> None:
+        """Begin again with Q^1 = r."""
+
+
+def look_ahead(
+    play: Play,
+    steps: int,
+    num_actions: int,
+    greedy_return: Callable[[], float] | None = None,
+    tell: Callable[[str], object] = str,
+) -> tuple[LookAhead, list[float]]:
+    """How far ahead one must look in episodes of `steps` steps, and `greedy_return` for k = 1, ..., 5, where asked."""
+    best, log_actions = float(steps), math.log(num_actions)
     rows: list[tuple[int, int, float, float]] = []
     greedy: list[float] = []
+    last = 0 if greedy_return is None else GREEDY_RETURNS
     k_min, k = 0, 1
-    while k < best or k <= GREEDY_RETURNS or not k_min:
-        if k < best and (needed := table.samples(k)) is not None:
+    while k < best or k <= last or not k_min:
+        tell(f"k = {k}, bound {best:.4g}")
+        if k < best and (needed := play.samples(math.log(2 * steps) + k * log_actions)) is not None:
             rows.append((k, *needed))
-            best = min(best, k + (math.log(needed[0]) / math.log(table.num_actions) if table.num_actions > 1 else 0.0))
-        if not k_min and (table.is_greedy_optimal() or k == steps):
+            best = min(best, k + (math.log(needed[0]) / log_actions if num_actions > 1 else 0.0))
+        if not k_min and (k >= steps or play.is_greedy_optimal()):
             k_min = k
-        if k <= GREEDY_RETURNS:
-            greedy.append(table.greedy_return())
-        table.advance()
+        if greedy_return is not None and k <= last:
+            greedy.append(greedy_return())
+        play.advance()
         k += 1
-    table.look_at_rewards()
+    play.look_at_rewards()
     window = 1
-    while not table.is_greedy_optimal() and window < steps:
-        table.advance(spread=False)
+    while window < steps and not play.is_greedy_optimal():
+        tell(f"window {window}")
+        play.advance(spread=False)
         window += 1
     ks, ms, gaps, variances = (list(each) for each in zip(*rows, strict=True)) if rows else ([], [], [], [])
-    optimal, random, worst = table.returns
-    return {
-        **{"value": best, "ks": ks, "ms": ms, "gaps": gaps, "vars": variances, "k_min": k_min},
-        **{"effective_planning_window": window, "greedy_returns": greedy, "num_states": table.num_visitable},
-        **{"optimal_return": optimal, "random_return": random, "worst_return": worst},
-    }
+    return LookAhead(best, k_min, window, ks, ms, gaps, variances), greedy
 
 
-def _first_greedy(tree: FiniteHorizonValues, values: np.ndarray, most: int) -> int:
-    """The smallest k for which all actions greedy in Q^k, from the start on, are optimal."""
-    for k in range(1, most + 1):
-        met = tree.first
-        for t in range(tree.steps):
-            greedy = values[t] == values[t].max(axis=1, keepdims=True)
-            if (greedy & ~tree.optimal[t])[met].any():
-                break
-            met = tree.following(met, greedy)
-        else:
-            return k
-        values = tree.lookahead(values)
-    return most
+class SmallHorizon(FiniteHorizonValues):
+    """`Play` of MDPs whose action values of all steps are written out.
+
+    Attributes:
+        values: (T, N, A) Q^k. variance: (T, N, A) var^k.
+    """
+
+    def __init__(self, mdp: TabularMDP, steps: int):
+        super().__init__(mdp, steps)
+        self.values, self.variance = self.explored, (self.explored - self.worst) * (self.best - self.worst)
+        values = (self.best.max(axis=2)[0], self.explored_value[0], self.worst.min(axis=2)[0])
+        self.returns = tuple(map(self.at_start, values))
+
+    def samples(self, log: float) -> tuple[int, float, float] | None:
+        worst: tuple[int, float, float] | None = None
+        met = self.first
+        for t in range(self.steps):
+            nodes = np.flatnonzero(met)
+            best = self.values[t, nodes].max(axis=1)
+            second = np.where(self.optimal[t, nodes], -math.inf, self.values[t, nodes]).max(axis=1)
+            if (best == second).any():
+                return None
+            samples, gap, spread = most_samples(best - second, self.variance[t, nodes].max(axis=1), log)
+            if worst is None or samples > worst[0]:
+                worst = (samples, gap, spread)
+            better = np.zeros((self.num_nodes, self.num_actions), np.bool_)
+            better[nodes] = self.values[t, nodes] > second[:, None]
+            met = self.following(met, better)
+        return worst
+
+    def is_greedy_optimal(self) -> bool:
+        met = self.first
+        for t in range(self.steps):
+            greedy = self.values[t] == self.values[t].max(axis=1, keepdims=True)
+            if (greedy & ~self.optimal[t])[met].any():
+                return False
+            met = self.following(met, greedy)
+        return True
+
+    def advance(self, spread: bool = True) -> None:
+        self.values = self.lookahead(self.values)
+        if spread:
+            after = np.zeros_like(self.variance)
+            for t in range(self.steps - 1):
+                after[t] = self.following_max(self.variance[t + 1].max(axis=1))
+            self.variance = after
+
+    def look_at_rewards(self) -> None:
+        self.values = np.broadcast_to(self.rewards, self.explored.shape)
+
+    def greedy_return(self) -> float:
+        """J_k: the return of the policy greedy in Q^k, its ties broken as badly as possible."""
+        value = np.zeros(self.num_nodes)
+        for t in range(self.steps - 1, -1, -1):
+            greedy = self.values[t] == self.values[t].max(axis=1, keepdims=True)
+            followed = self.backup(value) if t < self.steps - 1 else self.rewards
+            value = np.where(greedy, followed, math.inf).min(axis=1)
+        return self.at_start(value)
 
 
-def _simple_bound(tree: FiniteHorizonValues) -> tuple[float, list[int], list[int], list[float], list[float]]:
-    """(H, ks, ms, gaps, vars) of theorem 5.4."""
-    actions, horizon = tree.num_actions, tree.steps
-    values, best = tree.explored, float(horizon)
-    variance = (tree.explored - tree.worst) * (tree.best - tree.worst)
-    ks: list[int] = []
-    ms: list[int] = []
-    gaps: list[float] = []
-    variances: list[float] = []
-    k = 1
-    while k < best:
-        requirement = _samples(tree, values, variance, math.log(2 * horizon) + k * math.log(actions))
-        if requirement is not None:
-            samples, gap, spread = requirement
-            ks.append(k)
-            ms.append(samples)
-            gaps.append(gap)
-            variances.append(spread)
-            best = min(best, k + (math.log(samples) / math.log(actions) if actions > 1 else 0.0))
-        values = tree.lookahead(values)
-        after = np.zeros_like(variance)
-        for t in range(tree.steps - 1):
-            after[t] = tree.following_max(variance[t + 1].max(axis=1))
-        variance = after
-        k += 1
-    return best, ks, ms, gaps, variances
-
-
-def _samples(
-    tree: FiniteHorizonValues, values: np.ndarray, variance: np.ndarray, log: float
-) -> tuple[int, float, float] | None:
-    """(m_k, gap, var where it is attained); None where k fails."""
-    worst: tuple[int, float, float] | None = None
-    met = tree.first
-    for t in range(tree.steps):
-        nodes = np.flatnonzero(met)
-        best = values[t, nodes].max(axis=1)
-        second = np.where(tree.optimal[t, nodes], -math.inf, values[t, nodes]).max(axis=1)
-        if (best == second).any():
-            return None
-        gap, spread = best - second, variance[t, nodes].max(axis=1)
-        with np.errstate(invalid="ignore"):
-            needed = np.where(np.isinf(gap), 0.0, 16 * spread / gap**2 * log)
-        i = int(needed.argmax())
-        samples = max(1, math.ceil(needed[i]))  # the first among equals
-        if worst is None or samples > worst[0]:
-            worst = (samples, float(gap[i]), float(spread[i]))
-        better = np.zeros((tree.num_nodes, tree.num_actions), np.bool_)
-        better[nodes] = values[t, nodes] > second[:, None]
-        met = tree.following(met, better)
-    return worst
-
-
-def _greedy_return(tree: FiniteHorizonValues, k: int) -> float:
-    """J_k: the return of the policy greedy in Q^k, its ties broken as badly as possible."""
-    values = tree.explored
-    for _ in range(k - 1):
-        values = tree.lookahead(values)
-    value = np.zeros(tree.num_nodes)
-    for t in range(tree.steps - 1, -1, -1):
-        greedy = values[t] == values[t].max(axis=1, keepdims=True)
-        followed = tree.backup(value) if t < tree.steps - 1 else tree.rewards
-        value = np.where(greedy, followed, math.inf).min(axis=1)
-    return tree.at_start(value)
+def most_samples(gap: np.ndarray, variance: np.ndarray, log: float) -> tuple[int, float, float]:
+    """(max(1, ceil(16 variance / gap^2 log)), gap, variance) of the node that needs most, the first among equals."""
+    with np.errstate(invalid="ignore"):
+        needed = np.where(np.isinf(gap), 0.0, 16 * variance / gap**2 * log)
+    i = int(needed.argmax())
+    return max(1, math.ceil(needed[i])), float(gap[i]), float(variance[i])
 
 
 # Large horizon --------------------------------------------------------------------------------------------------------
@@ -278,7 +278,7 @@ def applies(mdp: TabularMDP) -> bool:
 
 
 class LargeHorizon:
-    """Values at every step of an episode.
+    """`Play` of deterministic MDPs of millions of states: values of states at every step.
 
     Attributes:
         ahead: (T + 1, S) W^{k-1}, for the present k; row T is 0.
@@ -332,9 +332,7 @@ class LargeHorizon:
         self.nodes[0][: len(first)] = first
         return len(first)
 
-    def samples(self, k: int) -> tuple[int, float, float] | None:
-        """(m_k, gap, variance where it is attained); None where k fails."""
-        log = math.log(2 * self.steps) + k * math.log(self.num_actions)
+    def samples(self, log: float) -> tuple[int, float, float] | None:
         worst: tuple[int, float, float] | None = None
         for needed, gap, variance in self._walk(log, near=True):
             if needed is None:
@@ -345,7 +343,6 @@ class LargeHorizon:
         return worst
 
     def is_greedy_optimal(self) -> bool:
-        """Whether all actions greedy in Q^k, from the start on, are optimal."""
         return all(needed is not None for needed, _, _ in self._walk(0.0, near=False))
 
     def _walk(self, log: float, near: bool) -> Any:
@@ -365,7 +362,6 @@ class LargeHorizon:
                 return
 
     def advance(self, spread: bool = True) -> None:
-        """From k to k + 1."""
         nothing = np.zeros(len(self.next_states))
         for t in range(self.steps):
             self.kernels.lookahead(self.next_states, self.rewards, 1.0, self.ahead[t + 1], self.ahead[t])
@@ -374,7 +370,6 @@ class LargeHorizon:
                 self.kernels.largest(self.next_states, after, self.spread[t])
 
     def look_at_rewards(self) -> None:
-        """Begin again with Q^1 = r."""
         self.ahead[:] = 0.0
 
     def greedy_return(self) -> float:

@@ -13,7 +13,7 @@ import numpy as np
 
 from pharos.errors import ParameterError, PrecisionError, UndefinedMeasure
 from pharos.hardness.gaps.gaps import optimal_solution, solved
-from pharos.hardness.planning.effective_horizon import LookAhead
+from pharos.hardness.planning.effective_horizon import LookAhead, look_ahead, most_samples
 from pharos.hardness.planning.steps import expected_rewards, single_outcomes
 from pharos.mdp import ExpandedMDP, TabularMDP, require_mdp
 from pharos.solvers import Solution, uniform_value, value_iteration, worst_value
@@ -90,31 +90,8 @@ def stationary_effective_horizon(
             "it, or solve with a smaller tolerance"
         )
     slack = max(1e-12, 2 * floor)
-    optimal = nodes.best >= nodes.best.max(axis=1, keepdims=True) - tie
-    k_min = window = 0
-    result: list[tuple[int, int, float, float]] = []
-    best, k = float(limit), 1
-    values: _StoredQ | _LookaheadQ = _StoredQ(nodes.explored)
-    spread = ((nodes.explored - nodes.worst) * (nodes.best - nodes.worst)).max(axis=1)
-    log_actions = math.log(mdp.num_actions)
-    while k < best or not k_min:
-        tell(f"k = {k}, bound {best:.4g}")
-        if k < best and (
-            needed := _samples(nodes, values, spread, optimal, slack, math.log(2 * limit) + k * log_actions)
-        ):
-            result.append((k, *needed))
-            best = min(best, k + (math.log(needed[0]) / log_actions if mdp.num_actions > 1 else 0.0))
-        if not k_min and (k >= limit or _is_greedy_optimal(nodes, values, optimal, slack)):
-            k_min = k
-        values = nodes.backup(values.best)
-        spread = mdp.gamma**2 * nodes.following_max(spread)
-        k += 1
-    values, window = _StoredQ(nodes.rewards), 1
-    while window < limit and not _is_greedy_optimal(nodes, values, optimal, slack):
-        tell(f"window {window}")
-        values = nodes.backup(values.best)
-        window += 1
-    ks, ms, gaps, variances = (list(each) for each in zip(*result, strict=True)) if result else ([], [], [], [])
+    nodes.compare(tie, slack)
+    ahead, _ = look_ahead(nodes, int(limit), mdp.num_actions, tell=tell)
     conventions = {
         "gamma": mdp.gamma,
         "steps": int(limit),
@@ -123,7 +100,7 @@ def stationary_effective_horizon(
         "slack": slack,
         "states": mdp.nodes,
     }
-    return StationaryHorizon(best, k_min, window, ks, ms, gaps, variances, conventions)
+    return StationaryHorizon(**vars(ahead), conventions=conventions)
 
 
 class _StoredQ:
@@ -164,7 +141,7 @@ class _LookaheadQ:
 
 
 class _Nodes:
-    """Values of optimal, worst and uniform play on nodes that can be met: states, or pairs with the previous action.
+    """`Play` without time, on nodes that can be met: states, or pairs with the previous action.
 
     Attributes:
         rewards, best, worst, explored: (N, A) of choosing an action. error: the largest error of any of them.
@@ -195,6 +172,45 @@ class _Nodes:
         self.best, self.worst, self.explored = (
             self.backup(_on_nodes(each, choices, mdp)).at(everywhere) for each in (best, worst, explored)
         )
+
+    def compare(self, tie: float, slack: float) -> None:
+        """Begin with Q^1 of uniform play; what is within `tie` of the best is optimal, within `slack` equal."""
+        self.slack, self.optimal = slack, self.best >= self.best.max(axis=1, keepdims=True) - tie
+        self.values: _StoredQ | _LookaheadQ = _StoredQ(self.explored)
+        self.spread = ((self.explored - self.worst) * (self.best - self.worst)).max(axis=1)
+
+    def samples(self, log: float) -> tuple[int, float, float] | None:
+        def second(n: np.ndarray, q: np.ndarray) -> np.ndarray:
+            return np.asarray(np.where(self.optimal[n], -math.inf, q).max(axis=1))
+
+        def better(n: np.ndarray) -> np.ndarray | None:
+            q = self.values.at(n)
+            others = second(n, q)
+            if (q.max(axis=1) - others <= self.slack).any():
+                return None
+            return self.optimal[n] & (q > others[:, None] - self.slack)
+
+        nodes = self.closure(better)
+        if nodes is None:
+            return None
+        q = self.values.at(nodes)
+        return most_samples(q.max(axis=1) - second(nodes, q), self.spread[nodes], log)
+
+    def is_greedy_optimal(self) -> bool:
+        def greedy(n: np.ndarray) -> np.ndarray | None:
+            q = self.values.at(n)
+            is_greedy = q >= q.max(axis=1, keepdims=True) - self.slack
+            return None if (is_greedy & ~self.optimal[n]).any() else is_greedy
+
+        return self.closure(greedy) is not None
+
+    def advance(self, spread: bool = True) -> None:
+        self.values = self.backup(self.values.best)
+        if spread:
+            self.spread = self.gamma**2 * self.following_max(self.spread)
+
+    def look_at_rewards(self) -> None:
+        self.values = _StoredQ(self.rewards)
 
     def backup(self, value: np.ndarray) -> _StoredQ | _LookaheadQ:
         """r + gamma E value(next)."""
@@ -261,38 +277,3 @@ def _on_nodes(solution: Solution, choices: Any, mdp: TabularMDP) -> np.ndarray:
     else:
         result = v[np.where(inside, choices.underlying, 0)]
     return np.where(inside, result, 0.0)
-
-
-def _is_greedy_optimal(nodes: _Nodes, values: _StoredQ | _LookaheadQ, optimal: np.ndarray, slack: float) -> bool:
-    def greedy(n: np.ndarray) -> np.ndarray | None:
-        q = values.at(n)
-        is_greedy = q >= q.max(axis=1, keepdims=True) - slack
-        return None if (is_greedy & ~optimal[n]).any() else is_greedy
-
-    return nodes.closure(greedy) is not None
-
-
-def _samples(
-    nodes: _Nodes, values: _StoredQ | _LookaheadQ, spread: np.ndarray, optimal: np.ndarray, slack: float, log: float
-) -> tuple[int, float, float] | None:
-    """(m_k, gap, variance where it is attained); None where k fails."""
-
-    def second(n: np.ndarray, q: np.ndarray) -> np.ndarray:
-        return np.where(optimal[n], -math.inf, q).max(axis=1)
-
-    def better(n: np.ndarray) -> np.ndarray | None:
-        q = values.at(n)
-        others = second(n, q)
-        if (q.max(axis=1) - others <= slack).any():
-            return None
-        return optimal[n] & (q > others[:, None] - slack)
-
-    reached_nodes = nodes.closure(better)
-    if reached_nodes is None:
-        return None
-    q, largest = values.at(reached_nodes), spread[reached_nodes]
-    gap = q.max(axis=1) - second(reached_nodes, q)
-    with np.errstate(invalid="ignore"):
-        needed = np.where(np.isinf(gap), 0.0, 16 * largest / gap**2 * log)
-    i = int(needed.argmax())
-    return max(1, math.ceil(needed[i])), float(gap[i]), float(largest[i])

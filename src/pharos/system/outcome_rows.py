@@ -1,0 +1,210 @@
+"""Outcomes of actions as files and memory hold them: two layouts, two ways to keep probabilities, and one way to read.
+
+Row s A + a is that of action a in state s. Nobody else asks which layout it is; kernels/outcomes.py says the same to
+compiled loops.
+"""
+
+from collections.abc import Callable
+from functools import cached_property
+from typing import NoReturn
+
+import numpy as np
+
+from pharos.errors import ParameterError
+from pharos.system.packed_indices import Indices, as_array, rows_of
+
+SUM_TOLERANCE = 1e-9
+"""By how much the probabilities of the outcomes of an action may sum to something else than 1."""
+
+OutcomesOfState = list[tuple[np.ndarray, np.ndarray]]
+"""For each action the next states and their probabilities, possible outcomes alone."""
+
+
+class OutcomeRows:
+    """What executing actions may lead to, for S states, A actions and at most K outcomes of each.
+
+    Attributes:
+        successors: (S, A, K) int32, int64 or `PackedIndices`, -1 where the episode ends, of which impossible outcomes
+            repeat the first; or (N,), the rows one after another.
+        offsets: (S A + 1,) where the rows begin; None where successors are (S, A, K).
+        codes: (S, A) uint8 or uint16, which vector of the palette has the probabilities; None without a palette.
+        palette: (P, K) float64, the probabilities of possible outcomes in their order, then zeros; None without one.
+        probabilities: float64 in the shape of successors; None where there is a palette.
+    """
+
+    NAMES = ("successors", "offsets", "codes", "palette", "probabilities")
+
+    def __init__(
+        self,
+        successors: Indices,
+        *,
+        offsets: np.ndarray | None = None,
+        codes: np.ndarray | None = None,
+        palette: np.ndarray | None = None,
+        probabilities: np.ndarray | None = None,
+    ):
+        """From arrays as files hold them: nothing is copied, so they may be memory maps.
+
+        Raises:
+            ParameterError: there is neither a palette with codes, nor probabilities.
+        """
+        if (palette is None) != (codes is None) or (palette is None) == (probabilities is None):
+            raise ParameterError("outcomes take codes with a palette, or probabilities; found both or neither")
+        self.successors = as_array(successors)
+        self.offsets, self.codes, self.palette, self.probabilities = (
+            None if array is None else np.asarray(array) for array in (offsets, codes, palette, probabilities)
+        )
+
+    @cached_property
+    def num_outcomes(self) -> int:
+        """K, the most outcomes of a row."""
+        if self.offsets is None:
+            return self.successors.shape[2]
+        return int(np.diff(self.offsets).max()) if self.palette is None else self.palette.shape[1]
+
+    @property
+    def by_name(self) -> dict[str, Indices]:
+        """The arrays that there are, by name."""
+        return {name: array for name in self.NAMES if (array := getattr(self, name)) is not None}
+
+    @property
+    def flat(self) -> Indices:
+        """(N,) successors, row after row."""
+        return self.successors.reshape(-1)
+
+    def begins(self, rows: np.ndarray) -> np.ndarray:
+        """Where some rows begin among the successors."""
+        return rows * self.num_outcomes if self.offsets is None else self.offsets[rows].astype(np.int64)
+
+    def places(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(index in `rows`, place among the successors) of all entries of some rows."""
+        first = self.begins(rows)
+        counts = self.begins(rows + 1) - first
+        which = np.repeat(np.arange(len(rows)), counts)
+        return which, np.arange(len(which)) + np.repeat(first - (np.cumsum(counts) - counts), counts)
+
+    def possible(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(index in `rows`, next state, probability) of all possible outcomes of some rows, in order."""
+        codes = None if self.codes is None else self.codes.reshape(-1)[rows]
+        palette, likely = np.asarray(self.palette), np.asarray(self.probabilities)  # one of which is there
+        if self.offsets is None:
+            vectors = likely.reshape(-1, self.num_outcomes)[rows] if codes is None else palette[codes]
+            which, k = np.nonzero(vectors)
+            return which, self.successors.reshape(-1, self.num_outcomes)[rows][which, k], vectors[which, k]
+        which, places = self.places(rows)
+        if codes is None:
+            return which, self.flat[places], likely[places]
+        first = np.searchsorted(which, np.arange(len(rows)))
+        return which, self.flat[places], palette[codes[which], np.arange(len(which)) - first[which]]
+
+    def of_states(self, states: np.ndarray, num_actions: int) -> dict[int, OutcomesOfState]:
+        """The outcomes of some states."""
+        rows = (states[:, None] * num_actions + np.arange(num_actions)).ravel()
+        which, successors, likely = self.possible(rows)
+        ends = np.searchsorted(which, np.arange(1, len(rows)))
+        pairs = list(zip(np.split(successors, ends), np.split(likely, ends), strict=True))
+        return {int(s): pairs[i * num_actions : (i + 1) * num_actions] for i, s in enumerate(states)}
+
+
+class WrongOutcomes(ValueError):
+    """Arrays are no outcomes.
+
+    Attributes:
+        name: of the array that is wrong.
+    """
+
+    def __init__(self, name: str, why: str):
+        super().__init__(why)
+        self.name = name
+
+
+class OutcomeCheck:
+    """Looks at outcomes that anybody may have written, some states at a time.
+
+    Attributes:
+        most: the outcomes that a row may have, at most. least: the least index of a next state, -1 where episodes may
+            end without one.
+    """
+
+    def __init__(self, stored: OutcomeRows, shape: tuple[int, int], most: int, least: int):
+        """WrongOutcomes where what belongs to no state is wrong. shape: (S, A)."""
+        self.stored, self.most, self.least = stored, most, least
+        self.num_states, self.num_actions = shape
+        offsets, size = stored.offsets, stored.successors.size
+        if offsets is not None and (offsets[0] != 0 or offsets[-1] != size):
+            self._refuse("offsets", f"begins with {offsets[0]} and ends with {offsets[-1]}; expected 0 and {size}")
+        self._sizes_of_palette = np.zeros(0, np.int64)
+        if stored.palette is not None:
+            self._sizes_of_palette = self._sizes(stored.palette, "palette", lambda row: f"vector {row}")
+
+    def block(self, start: int, stop: int) -> tuple[np.ndarray, np.ndarray]:
+        """How many outcomes each row of states [start, stop) has, and the first one's next state.
+
+        Raises:
+            WrongOutcomes: they are no outcomes; the first row that is wrong is named.
+        """
+        stored, rows, counts = self.stored, np.arange(start * self.num_actions, stop * self.num_actions), None
+        if stored.codes is not None:
+            codes = stored.codes[start:stop].ravel()
+            if codes.max() >= len(self._sizes_of_palette):
+                row, last = int((codes >= len(self._sizes_of_palette)).argmax()), len(self._sizes_of_palette) - 1
+                self._refuse("codes", f"{self._pair(rows[row])} has the code {codes[row]}; expected 0 to {last}")
+            counts = self._sizes_of_palette[codes]
+        begins = stored.begins(np.append(rows, rows[-1] + 1))
+        lengths = np.diff(begins)
+        if stored.offsets is not None:
+            wrong = (lengths < 1) | (lengths > self.most) if counts is None else lengths != counts
+            if wrong.any():
+                row = int(wrong.argmax())
+                expected = f"1 to {self.most}" if counts is None else f"{counts[row]}"
+                self._refuse("offsets", f"{self._pair(rows[row])} has {lengths[row]} outcomes; expected {expected}")
+            if begins[0] < 0 or begins[-1] > stored.successors.size:
+                text = f"{self._pair(rows[0])} begins at {begins[0]}; expected 0 to {stored.successors.size}"
+                self._refuse("offsets", text)
+        following = np.asarray(rows_of(stored.flat, int(begins[0]), int(begins[-1])))
+        self._check_range(following, np.repeat(rows, lengths))
+        if counts is None:
+            likely = np.zeros((len(rows), self.most))
+            likely[np.arange(self.most) < lengths[:, None]] = np.asarray(stored.probabilities).reshape(-1)[
+                begins[0] : begins[-1]
+            ]
+            counts = self._sizes(likely, "probabilities", lambda row: self._pair(rows[row]))
+            if stored.offsets is not None and (counts != lengths).any():
+                row = int((counts != lengths).argmax())
+                self._refuse("probabilities", f"{self._pair(rows[row])} has an outcome of probability 0")
+        first = following[begins[:-1] - begins[0]]
+        if stored.offsets is None:
+            padding = np.arange(self.most) >= counts[:, None]
+            wrong = (padding & (following.reshape(padding.shape) != first[:, None])).any(axis=1)
+            if wrong.any():
+                pair = self._pair(rows[int(wrong.argmax())])
+                self._refuse("successors", f"{pair} has padding that does not repeat its first outcome")
+        return counts, first
+
+    def _sizes(self, likely: np.ndarray, name: str, whose: Callable[[int], str]) -> np.ndarray:
+        """(R,) how many of the probabilities (R, K) of each row are not 0; they come first and sum to 1."""
+        with np.errstate(invalid="ignore", over="ignore"):
+            possible = likely > 0
+            total = np.cumsum(likely, axis=1)[:, -1]
+            good = (likely >= 0).all(axis=1) & (abs(total - 1) <= SUM_TOLERANCE)
+        good &= (possible[:, 1:] <= possible[:, :-1]).all(axis=1)
+        if not good.all():
+            row = int((~good).argmax())
+            shown = ", ".join(map(str, likely[row, :8].tolist())) + (", ..." if self.most > 8 else "")
+            expected = "expected positive ones that sum to 1, then 0"
+            self._refuse(name, f"{whose(row)} has the probabilities {shown}; {expected}")
+        return np.asarray(possible.sum(axis=1))
+
+    def _check_range(self, following: np.ndarray, rows: np.ndarray) -> None:
+        if following.min() < self.least or following.max() >= self.num_states:
+            j = int(((following < self.least) | (following >= self.num_states)).argmax())
+            expected = f"expected {self.least} to {self.num_states - 1}"
+            s, a = divmod(int(rows[j]), self.num_actions)
+            self._refuse("successors", f"action {a} leads from state {s} to state {following[j]}; {expected}")
+
+    def _pair(self, row: int) -> str:
+        s, a = divmod(int(row), self.num_actions)
+        return f"action {a} in state {s}"
+
+    def _refuse(self, name: str, why: str) -> NoReturn:
+        raise WrongOutcomes(name, why)
