@@ -3,6 +3,7 @@
     python benchmarks/prediction_cells.py compute --out cells.csv [--block NAME ...]
     python benchmarks/prediction_cells.py judge [--cells cells.csv] [--resamples 1000]
     python benchmarks/prediction_cells.py draw [--cells cells.csv] [--picture docs/images/sealed.png]
+    python benchmarks/prediction_cells.py cost
 
 `compute` reads the packed runs of docs/studies (twelve development classes: hardness-dev; fourteen sealed ones:
 sealed-1) and computes the primary predictor of each cell, `sampled_regret` of a DQN; that of a PPO is in the files of
@@ -10,11 +11,15 @@ predictions. A row that is there already is not computed again. `judge` prints h
 set and agent: number of cells, R2 of classes left out after a line, Spearman's rank correlation, the share of pairs of
 observations that are ordered rightly, R2 without a fit, half the width of the 80 % interval and the share of classes
 left out that it covers; in brackets 95 % intervals over classes drawn anew. Classes weigh alike. `draw` draws predicted
-against observed regret of the sealed classes.
+against observed regret of the sealed classes. `cost` prints the seconds of a cell and the memory that it adds, each in
+a process of its own that has compiled, by states of a grid, agent and observation.
 """
 
 import argparse
 import csv
+import os
+import subprocess
+import sys
 import tempfile
 from pathlib import Path
 
@@ -161,6 +166,38 @@ def draw(file, picture):
     print(save(by_agent(), picture))
 
 
+SIDES = (4, 10, 18, 32, 64)
+OBSERVATIONS = ("vector", "one_hot", "hash", "simple_image")
+CELL_OF_A_GRID = """
+import resource, sys, time
+import pharos
+agent, observation, side = sys.argv[1], sys.argv[2], int(sys.argv[3])
+pharos.predict("simple_grid", observation, agent=agent, height=3, width=3)
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+began = time.perf_counter()
+pharos.predict("simple_grid", observation, agent=agent, height=side, width=side)
+seconds = time.perf_counter() - began
+print(f"{seconds:.1f} s, {(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024:.0f} MB")
+"""
+
+
+def cost():
+    print(f"| agent | states | {' | '.join(OBSERVATIONS)} |")
+    print("|---|---|" + "---|" * len(OBSERVATIONS))
+    for agent in PRIMARY:
+        for side in SIDES:
+            with tempfile.TemporaryDirectory() as folder:
+                environment = {**os.environ, "PHAROS_CACHE_DIR": folder}
+                texts = [
+                    subprocess.run(
+                        [sys.executable, "-c", CELL_OF_A_GRID, agent, observation, str(side)],
+                        env=environment, capture_output=True, text=True, check=True,
+                    ).stdout.strip()
+                    for observation in OBSERVATIONS
+                ]  # fmt: skip
+            print(f"| {agent.upper()} | {side * side:,} | {' | '.join(texts)} |", flush=True)
+
+
 def of(cells):
     mdps = cells["study"] + " " + cells["instance"] + " " + cells["chance"]
     numbers = (cells[name].to_numpy(float) for name in ("predicted", "observed", "states", "steps"))
@@ -193,7 +230,7 @@ def statistics(known):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("task", choices=("compute", "judge", "draw"))
+    parser.add_argument("task", choices=("compute", "judge", "draw", "cost"))
     parser.add_argument("--out", type=Path, default=FILE)
     parser.add_argument("--cells", type=Path, default=FILE)
     parser.add_argument("--block", action="append", choices=[*BLOCKS])
@@ -204,6 +241,8 @@ def main():
         compute(arguments.out, arguments.block or [*BLOCKS])
     elif arguments.task == "judge":
         judge(arguments.cells, arguments.resamples)
+    elif arguments.task == "cost":
+        cost()
     else:
         draw(arguments.cells, arguments.picture)
 

@@ -10,8 +10,9 @@ drawn once from a grid over what the idealised learner knows (a DQN's discount, 
 discount, rollouts, epochs, clipping). Networks: three widths and depths behind ten observations, of a DQN.
 
 `judge` prints for each world and over all the rank correlation of both orders, pairs that are ordered rightly among
-those whose regrets differ by more than 0.05, and what would be lost by taking what is predicted best: its regret less
-that of the best one, beside the same of one taken at random. Brackets are 95 % intervals over worlds drawn anew.
+those whose regrets differ by more than 0.05, what would be lost by taking what is predicted best (its regret less that
+of the best one, beside the same of one taken at random), and the regret of the predicted best of any four. Brackets are
+95 % intervals over worlds drawn anew.
 """
 
 import argparse
@@ -154,12 +155,15 @@ def group_of(cell):
 
 
 def scores(said, seen):
-    """(rank correlation, pairs in order, clear pairs, lost by the predicted best, lost at random)."""
+    """(rank correlation, pairs in order, clear pairs, lost by the predicted best, at random; regrets of shortlists)."""
     first, second = np.triu_indices(len(said), 1)
     clear = np.abs(seen[first] - seen[second]) > CLEAR
     right = (np.sign(said[first] - said[second]) == np.sign(seen[first] - seen[second]))[clear]
     rank = spearmanr(said, seen).statistic if np.ptp(said) and np.ptp(seen) else np.nan
-    return rank, right.sum(), clear.sum(), seen[said.argmin()] - seen.min(), seen.mean() - seen.min()
+    fours = np.array([*itertools.combinations(range(len(said)), min(4, len(said)))])
+    of_four = seen[fours[np.arange(len(fours)), said[fours].argmin(axis=1)]].mean()
+    lost = seen[said.argmin()] - seen.min(), seen.mean() - seen.min()
+    return rank, right.sum(), clear.sum(), *lost, of_four, seen.mean()
 
 
 def judge():
@@ -171,8 +175,9 @@ def judge():
             groups.setdefault(group_of(cell), []).append(cell)
     for kind, agent in dict.fromkeys(name[:2] for name in groups):
         print(f"\n### {kind}s of {agent}\n")
-        print("| world | cells | rank correlation | pairs in order | lost by the predicted best | at random |")
-        print("|---|---|---|---|---|---|")
+        columns = ("cells", "rank correlation", "pairs in order", "lost by the predicted best", "at random")
+        print(f"| world | {' | '.join(columns)} | regret of the predicted best of four | at random |")
+        print("|---" * 8 + "|")
         rows = {}
         for name, members in groups.items():
             if name[:2] == (kind, agent):
@@ -180,13 +185,7 @@ def judge():
                 seen = np.array([float(runs[cell]["observed"]) for cell in members])
                 rows[name] = row = np.array(scores(said, seen), float)
                 title = name[2] if kind == "setting" else " ".join((*name[2:4], name[4].strip("{}")))
-                words = (
-                    len(members),
-                    f"{row[0]:.2f}",
-                    f"{row[1]:.0f} of {row[2]:.0f}",
-                    f"{row[3]:.3f}",
-                    f"{row[4]:.3f}",
-                )
+                words = (len(members), f"{row[0]:.2f}", f"{row[1]:.0f} of {row[2]:.0f}", *(f"{x:.3f}" for x in row[3:]))
                 print(f"| {title} | {' | '.join(map(str, words))} |")
         table, rng = np.array(list(rows.values())), np.random.default_rng(0)
         worlds = np.array([name[2] for name in rows])

@@ -68,6 +68,37 @@ def test_a_search_goes_on_and_writes_what_train_reads(tmp_path):
         tune("q_learning", LAKE, steps=3000, trials=4, seeds=[7, 8], out=tmp_path / "found")
 
 
+@pytest.mark.slow
+def test_of_a_shortlist_what_is_predicted_best_is_tried(tmp_path):
+    asked = []
+
+    def predicted(proposal):
+        asked.append(proposal["learning_rate"])
+        return abs(proposal["learning_rate"] - 0.1)
+
+    whole = search(4, tmp_path / "whole", space=ONE, shortlist=5, predicted=predicted)
+    assert len(asked) == 3 * 5 and len(set(asked)) == 15  # the first trial is the table's
+    tried = [trial["hyperparameters"]["learning_rate"] for trial in whole.trials[1:]]
+    assert tried == [min(asked[5 * k : 5 * k + 5], key=lambda rate: abs(rate - 0.1)) for k in range(3)]
+    search(2, tmp_path / "parts", space=ONE, shortlist=5, predicted=predicted)
+    assert told(search(4, tmp_path / "parts", space=ONE, shortlist=5, predicted=predicted)) == told(whole)
+    with pytest.raises(ParameterError, match="holds a search with another shortlist"):
+        search(4, tmp_path / "whole", space=ONE)
+    with pytest.raises(ParameterError, match="shortlist is 5; expected at least 1, and `predicted`"):
+        search(4, space=ONE, shortlist=5)
+
+
+@pytest.mark.slow
+def test_the_command_shortlists_by_prediction():
+    words = ("tune", "simple_grid/4x4-plain", "--agent", "ppo", "--engine", "batched", "--steps", "2048", "--trials=2")
+    space = ("--search", "gamma=0.5,0.9,0.99", "--seeds", "3", "--shortlist-by-prediction", "2", "--json")
+    done = run(*words, *space)
+    assert done.exit_code == 0, done.output
+    assert len(json.loads(done.stdout)["trials"]) == 2
+    done = run(*words[:3], "q_learning", *words[4:], *space[2:])
+    assert done.exit_code == 2 and "no published runs to calibrate on" in done.output
+
+
 def test_algorithms_of_stable_baselines3_are_searched_too():
     few = {"learning_rate": ("log", 1e-4, 1e-3), "batch_size": ("one of", 16, 32)}
     result = tune("dqn", "simple_grid/4x4-plain", steps=200, trials=2, seeds=[3], space=few)

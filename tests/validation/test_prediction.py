@@ -1,6 +1,9 @@
 """`pharos.predict`: the measure that it names, an interval that holds what it promises, and the order in words."""
 
+import csv
+import itertools
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +15,8 @@ from pharos.errors import ParameterError, UndefinedMeasure
 from pharos.observations import representation
 from pharos.validation import PRIMARY, Published, prediction, published
 from pharos.validation.prediction import Order
+
+CHOICES = Path(__file__).parents[2] / "docs" / "studies" / "choices"
 
 SHORT = {"learning_starts": 100, "target_update_interval": 100, "batch_size": 8}
 OPTIONS = {"steps": 1000, "hyperparameters": SHORT}
@@ -128,6 +133,19 @@ def test_a_ppo_is_predicted_as_it_is_evaluated():
 
 
 @pytest.mark.slow
+def test_a_shortlist_is_of_the_same_predictions():
+    worlds = [pharos.make("simple_grid", height=3, width=side) for side in (3, 4)]
+    own = pharos.agents.hyperparameters("ppo", "simple_grid", "vector") | {"gamma": 0.9}
+    predicted = prediction.regret_predictor("ppo", worlds, steps=4000, chances=[{}, {"random": 0.1}])
+    cells = [
+        pharos.predict(world, agent="ppo", steps=4000, hyperparameters=own, random=random).cells[0].value
+        for world in worlds
+        for random in (0.0, 0.1)
+    ]
+    assert predicted(own) == pytest.approx(np.mean(cells), abs=1e-12)
+
+
+@pytest.mark.slow
 def test_noise_of_rewards_makes_it_harder_to_learn():
     quiet, loud = (
         pharos.predict("deep_sea", size=4, steps=3000, hyperparameters=SHORT, reward_noise=noise).cells[0].tabular
@@ -161,6 +179,24 @@ def test_orders_are_told_in_words():
     )
     assert "too close" in str(Order("vector", "hash", 0.3, 5, 10))
     assert "too close" in str(Order("vector", "hash", 0.3, 0, 0))
+
+
+@pytest.mark.slow
+def test_the_order_of_networks_is_not_called():
+    answer = pharos.predict("simple_grid", networks=["mlp8x2", "mlp128x2"], steps=6000, height=3, width=3)
+    (order,) = answer.orders
+    assert order.of_networks and not order.is_called and "predictions do not order networks" in str(order)
+    texts = [(CHOICES / f"{name}.csv").read_text().splitlines() for name in ("predictions", "runs")]
+    cells = [{tuple(r.values())[:6]: r for r in csv.DictReader(lines) if r["kind"] == "network"} for lines in texts]
+    right = []
+    for a, b in itertools.combinations(cells[0], 2):
+        if a[1:5] == b[1:5]:
+            said, seen = (
+                float(c[a][n]) - float(c[b][n]) for c, n in zip(cells, ("predicted", "observed"), strict=True)
+            )
+            if abs(seen) > 0.05:
+                right.append(said * seen > 0)
+    assert (sum(right), len(right)) == prediction.NETWORKS_IN_ORDER
 
 
 def test_what_cannot_be_predicted_is_one_line(monkeypatch):

@@ -25,6 +25,7 @@ def tune(
     search_seed: Seed = 0,
     out: Path | None = None,
     chance: Annotated[list[str] | None, typer.Option(metavar="plain|NAME=P,...")] = None,
+    shortlist_by_prediction: Count = 1,
 ) -> Answer:
     """Search hyperparameters of an agent for one class of environments.
 
@@ -39,10 +40,23 @@ def tune(
         engine: sb3; or batched: all runs of a trial that fit together as one program.
         out: Folder for the YAML and the record; a search there goes on.
         chance: A kind of chance, for every instance: --chance plain --chance random=0.1 --chance sticky=0.25.
+        shortlist_by_prediction: Proposals for each trial, of which the one with the least predicted regret is run; for
+            dqn and ppo.
     """
     instances = [Target(target).found_environment() for target in targets]
     from pharos.training import tune as find
 
+    kinds, predicted = _chances(chance), None
+    if shortlist_by_prediction > 1:
+        from pharos.validation import regret_predictor
+
+        predicted = regret_predictor(
+            training.agent,
+            instances,
+            steps=training.steps,
+            observation=training.observation,
+            chances=kinds or [{"sticky": training.chance.sticky, "random": training.chance.random}],
+        )
     with progress_bar("tuning", trials) as show:
         result = find(
             training.agent,
@@ -53,10 +67,12 @@ def tune(
             seeds=parse_seeds(seeds),
             sticky=training.chance.sticky,
             random=training.chance.random,
-            chances=_chances(chance),
+            chances=kinds,
             space=_space(search),
             search_seed=search_seed,
             engine=training.engine,
+            shortlist=shortlist_by_prediction,
+            predicted=predicted,
             out=out,
             progress=_telling(show),
         )

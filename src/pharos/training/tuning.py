@@ -123,6 +123,8 @@ def tune(  # noqa: PLR0913
     space: Mapping[str, Sequence[Any]] | None = None,
     search_seed: int = 0,
     engine: str = "sb3",
+    shortlist: int = 1,
+    predicted: Callable[[Mapping[str, Any]], float] | None = None,
     out: str | os.PathLike | None = None,
     progress: Callable[[int, int, float], None] | None = None,
 ) -> TuningResult:
@@ -139,6 +141,8 @@ def tune(  # noqa: PLR0913
         space: what is searched, in the form of `SPACES`; None: what that says of the agent.
         search_seed: of the search.
         engine: "sb3": the runs of a trial one after the other; "batched": at once.
+        shortlist, predicted: of so many proposals the one is tried whose hyperparameters this function gives the least
+            number, such as `pharos.validation.regret_predictor`; the first trial is what the table says.
         out: folder; a search there goes on. None: nothing is written.
         progress: called after each trial with trials done, trials in all, and the best score so far.
     Raises:
@@ -156,6 +160,8 @@ def tune(  # noqa: PLR0913
     seeds = [int(seed) for seed in seeds]
     if not seeds or trials < 1:
         raise ParameterError(f"{len(seeds)} seeds and {trials} trials; expected at least one of each")
+    if shortlist < 1 or (shortlist > 1 and predicted is None):
+        raise ParameterError(f"shortlist is {shortlist}; expected at least 1, and `predicted` where it is more")
     search = _Search(
         agent=agent,
         instances=instances,
@@ -167,6 +173,7 @@ def tune(  # noqa: PLR0913
         steps=steps,
         search_seed=search_seed,
         engine=engine,
+        shortlist=shortlist,
     )
     folder = None if out is None else Path(out)
     with contextlib.ExitStack() as held:
@@ -178,6 +185,8 @@ def tune(  # noqa: PLR0913
         study = _study(optuna, search, records)
         while len(records) < trials:
             study.sampler = _sampler(optuna, search, len(records), trials)
+            if records and predicted is not None:
+                study.enqueue_trial(_most_promising(optuna, search, records, trials, predicted))
             study.optimize(lambda trial: search.score(trial, optuna.TrialPruned), n_trials=1)
             records.append(_record(study.trials[-1]))
             if folder is not None:
@@ -215,6 +224,7 @@ class _Search:
     steps: int
     search_seed: int
     engine: str
+    shortlist: int
 
     @cached_property
     def observation_name(self) -> str:
@@ -252,6 +262,8 @@ class _Search:
         }
         if self.engine != "sb3":
             config["engine"] = self.engine
+        if self.shortlist > 1:
+            config["shortlist"] = self.shortlist
         return json.loads(json.dumps(config))
 
     def check_tasks(self) -> None:
@@ -262,9 +274,13 @@ class _Search:
                     f"{task.env}: acting at random is optimal, so regret cannot be normalised; leave it out"
                 )
 
+    def proposal(self, trial: Any) -> dict[str, Any]:
+        """The hyperparameters that Optuna's trial proposes."""
+        return {key: suggested_value(trial, key, choices) for key, choices in self.space.items()}
+
     def score(self, trial: Any, pruned: type[Exception]) -> float:
         """The mean normalised regret of evaluations after the first, over all runs; `pruned` is raised on the way."""
-        chosen = {key: suggested_value(trial, key, choices) for key, choices in self.space.items()}
+        chosen = self.proposal(trial)
         configs: list[RunConfig] = []
         regrets: list[float] = []
         for task, options in self._runs(chosen):
@@ -367,9 +383,24 @@ def _study(optuna: ModuleType, search: _Search, records: Sequence[Mapping[str, A
     return study
 
 
-def _sampler(optuna: ModuleType, search: _Search, done: int, trials: int) -> Any:
+def _most_promising(
+    optuna: ModuleType,
+    search: _Search,
+    records: Sequence[Mapping[str, Any]],
+    trials: int,
+    predicted: Callable[[Mapping[str, Any]], float],
+) -> dict[str, Any]:
+    """Of `search.shortlist` proposals for the next trial the one of the least predicted number; the first of equals."""
+    scratch, proposals = _study(optuna, search, records), []
+    for number in range(search.shortlist):
+        scratch.sampler = _sampler(optuna, search, len(records), trials, number)
+        proposals.append(search.proposal(scratch.ask()))
+    return min(proposals, key=lambda proposal: predicted({**search.table, **proposal}))
+
+
+def _sampler(optuna: ModuleType, search: _Search, done: int, trials: int, *number: int) -> Any:
     """What proposes the next trial, from those that are done: a search that was killed goes on as it would have."""
-    seed = int(np.random.SeedSequence([search.search_seed, done]).generate_state(1)[0])
+    seed = int(np.random.SeedSequence([search.search_seed, done, *number]).generate_state(1)[0])
     return optuna.samplers.TPESampler(
         seed=seed,
         n_startup_trials=min(10, max(2, trials // 4)),
@@ -410,7 +441,8 @@ def _earlier_trials(optuna: ModuleType, search: _Search, folder: Path) -> list[d
         stored = storage.read_json(file, advice=_AGAIN)
         if not storage.is_intact(stored):
             raise FileFormatError(f"{file}: was changed after it was written; {_AGAIN}")
-        different = [key for key in search.config if stored["config"].get(key) != search.config[key]]
+        before, now = stored["config"], search.config
+        different = [key for key in {**now, **before} if before.get(key) != now.get(key)]
         trials = [trial for trial in stored["trials"] if trial["status"] in _STATUS.values()]
     except FileNotFoundError:
         trials, different = [], []

@@ -10,7 +10,14 @@ from pharos.validation.learners import (
     predicted,
 )
 from pharos.validation.leave_one_class_out import OUTCOMES, Cells, outcomes, unseen_classes
-from pharos.validation.prediction import PredictedRegret, Prediction, Published, predict, published
+from pharos.validation.prediction import (
+    PredictedRegret,
+    Prediction,
+    Published,
+    predict,
+    published,
+    regret_predictor,
+)
 from pharos.validation.prediction_files import PredictedCells, Predictions, read_predictions, write_predictions
 
 __all__ = [
@@ -19,6 +26,7 @@ __all__ = [
     "outcomes",
     "predict",
     "published",
+    "regret_predictor",
     "unseen_classes",
 ]
 _shared = """

@@ -117,6 +117,10 @@ def published(agent: str) -> Published:
     return Published(np.array([row["environment"] for row in rows]), np.array(mdps), *numbers)
 
 
+NETWORKS_IN_ORDER = (3, 16)
+"""(ordered rightly, in all) of the pairs of a DQN's networks, three widths and depths behind each of ten observations,
+whose regrets differ: benchmarks/prediction_choices.py. What a wider network gains its kernel does not see.
+"""
 LEAST_RIGHT = 0.75
 """Share of published pairs of an order below which it is too close to call."""
 MOST_STATES = 100_000
@@ -166,7 +170,8 @@ class Order:
 
     Attributes:
         easier, harder: labels. difference: of the predicted regrets.
-        right, pairs: of the published pairs whose predictions differ about as much.
+        right, pairs: of the published pairs whose predictions differ about as much; of networks, of all their pairs.
+        of_networks: whether the cells differ in their networks.
     """
 
     easier: str
@@ -174,6 +179,7 @@ class Order:
     difference: float
     right: int
     pairs: int
+    of_networks: bool = False
 
     @property
     def is_called(self) -> bool:
@@ -184,6 +190,11 @@ class Order:
         share = f"right in {self.right} of {self.pairs} such pairs"
         if self.is_called:
             return f"{self.easier} is easier than {self.harder}: {share}"
+        if self.of_networks:
+            return (
+                f"{self.easier} or {self.harder}: not to be called, as predictions do not order networks (right in "
+                f"{self.right} of {self.pairs} pairs)"
+            )
         return f"{self.easier} or {self.harder}: too close to call ({share})"
 
     def to_dict(self) -> dict[str, Any]:
@@ -226,7 +237,9 @@ class Prediction:
         easiest, orders = ranked[0], []
         for cell in ranked[1:]:
             difference, (easier, harder) = cell.value - easiest.value, self._names(easiest, cell)
-            orders.append(Order(easier, harder, difference, *calibration.ordered(difference)))
+            of_networks = easiest.network != cell.network and easiest.observation == cell.observation
+            counts = NETWORKS_IN_ORDER if of_networks else calibration.ordered(difference)
+            orders.append(Order(easier, harder, difference, *counts, of_networks))
         return orders
 
     def _names(self, first: PredictedRegret, second: PredictedRegret) -> tuple[str, str]:
@@ -329,6 +342,43 @@ def predict(
         warnings=tuple(_warnings(calibration, states, steps, chance)),
         hyperparameters=settings,
     )
+
+
+def regret_predictor(
+    agent: str,
+    environments: Iterable[Environment],
+    *,
+    steps: int,
+    observation: str = "vector",
+    chances: Iterable[Mapping[str, float]] = ({},),
+) -> Callable[[Mapping[str, Any]], float]:
+    """Return the function of hyperparameters that gives the predicted regret, a mean over environments and chances.
+
+    For `pharos.training.tune(predicted=...)`: what the idealised learner knows is the discount, the exploration, the
+    target network and the layers of a DQN; the discount, the rollouts, epochs, lambda, clipping and layers of a PPO.
+
+    Args:
+        agent: "dqn" or "ppo". environments, observation, steps: of the runs. chances: as for `tune`.
+    Raises:
+        ParameterError: another agent, or an environment of more than MOST_STATES states.
+    Cost: as `predict`, for each environment and chance.
+    """
+    from pharos.training import ChanceSetting, RunConfig, Task
+
+    published(agent)
+    kinds = [ChanceSetting.from_dict(chance) for chance in chances]
+    tasks = [Task(env, chance=kind, observation=observation) for env in environments for kind in kinds]
+    for task in tasks:
+        _checked_states(task.space.num_states, task.env)
+
+    def predicted(hyperparameters: Mapping[str, Any]) -> float:
+        def regret(task: Task) -> float:
+            config = RunConfig.of_task(task, agent, steps=steps, hyperparameters=dict(hyperparameters))
+            return primary_regret(config.to_dict(), task)[0].value
+
+        return float(np.mean([regret(task) for task in tasks]))
+
+    return predicted
 
 
 def _observations(observations: Any) -> list[tuple[str, dict[str, Any]]]:

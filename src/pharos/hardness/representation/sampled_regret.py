@@ -15,13 +15,11 @@ import numpy as np
 from pharos.errors import ParameterError
 from pharos.hardness.representation.kernel_operator import Exact, Identity, KernelOperator, Landmarks
 from pharos.hardness.representation.mean_field import MARGIN, WORST_GREEDY, Learner, Schedule, greedy_policy
-from pharos.hardness.representation.representation import LANDMARKS, Grouped, Representation
+from pharos.hardness.representation.representation import LANDMARKS, MOST_EXACT, Grouped, Representation
 from pharos.hardness.visitation.occupancy import drawn, standard_occupancy
 from pharos.mdp import TabularMDP, paid_outcomes, require_mdp
 from pharos.solvers import Solution
 
-MOST_EXACT = 2048
-"""Different observations up to which the kernel is a matrix, whose root takes C^3 operations; beyond, by landmarks."""
 LOOKS = 30
 """Evaluations at equal distances, beside the one before the first step."""
 
