@@ -123,7 +123,7 @@ def test_many_environments_draw_outcomes_compiled_as_interpreted():
     env = ChanceWorld(num_positions=40, seed=5)
     ranges = np.stack([env.components.low, env.components.high])
     starts = np.array([state for state, _ in env.initial_states()])
-    setting = (ranges, np.zeros(0), (0.7, 0.2, 0.1, 0.8), 50, 0, -1, starts, np.ones(1))
+    setting = (ranges, np.zeros(0), (0.7, 0.2, 0.1, 0.8, 0.0), 50, 0, -1, starts, np.ones(1))
     visited = []
     for engine in (rules.rules_of(env).stepping, stepping.InterpretedStepping(env)):
         rng, integers = np.arange(8, dtype=np.uint64), [np.zeros(8, np.int64) for _ in range(3)]
