@@ -1,13 +1,15 @@
 """Options that travel together: read flat, documented once."""
 
+import inspect
 from dataclasses import dataclass, replace
 
 import pytest
 
+import pharos
 from pharos.errors import ParameterError
 from pharos.interaction import Interaction
 from pharos.mdp import ChanceSetting
-from pharos.system.options import flat, meanings, split
+from pharos.system.options import flat, meanings, split, takes
 
 
 @flat
@@ -46,3 +48,15 @@ def test_what_an_option_means_stands_in_the_docstring():
         "chance": "on the way.",
     }
     assert set(meanings(ChanceSetting)) == set(ChanceSetting.__dataclass_fields__)
+
+
+def test_the_signature_of_a_function_shows_the_options_that_it_takes():
+    @takes(Trip, width=5)
+    def walk(name, *, seed=0, **options):
+        return name, seed, options
+
+    shown = inspect.signature(walk).parameters
+    assert [*shown][:5] == ["name", "seed", "length", "width", "sticky"] and [*shown][-1] == "options"
+    assert (shown["width"].default, shown["length"].default, shown["sticky"].default) == (5, None, 0.0)
+    assert "random" in inspect.signature(pharos.train).parameters
+    assert inspect.signature(pharos.train_many).parameters["engine"].default == "batched"

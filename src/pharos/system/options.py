@@ -7,11 +7,12 @@ import functools
 import inspect
 import operator
 import re
-from collections.abc import Mapping
-from dataclasses import fields, is_dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import MISSING, fields, is_dataclass, replace
 from typing import Any, TypeVar, get_type_hints
 
 T = TypeVar("T")
+F = TypeVar("F", bound=Callable[..., Any])
 
 
 def meanings(documented: object) -> dict[str, str]:
@@ -77,6 +78,27 @@ def flat(cls: type[T]) -> type[T]:
         for each in fields(part):  # type: ignore[arg-type]
             setattr(cls, each.name, property(operator.attrgetter(f"{name}.{each.name}")))
     return cls
+
+
+def takes(cls: Any, **defaults: object) -> Callable[[F], F]:
+    """Decorator: the signature of a function shows the options of a dataclass and its parts before `**options`."""
+    own = [each for each in fields(cls) if each.name not in parts(cls)]
+    leaves = [*own, *(each for part in parts(cls).values() for each in fields(part))]  # type: ignore[arg-type]
+
+    def shown(function: F) -> F:
+        signature = inspect.signature(function)
+        *before, rest = signature.parameters.values()
+        names = {each.name for each in before}
+        values = {each.name: None if each.default is MISSING else each.default for each in leaves} | defaults
+        made = [
+            inspect.Parameter(each.name, rest.KEYWORD_ONLY, default=values[each.name], annotation=each.type)
+            for each in leaves
+            if each.name not in names
+        ]
+        function.__signature__ = signature.replace(parameters=[*before, *made, rest])  # type: ignore[attr-defined]
+        return function
+
+    return shown
 
 
 def split(cls: type[T], options: Mapping[str, Any]) -> tuple[T, dict[str, Any]]:

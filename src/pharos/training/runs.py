@@ -19,7 +19,7 @@ from pharos.agents import hyperparameters as hyperparameters_of
 from pharos.environments import Environment
 from pharos.errors import AllRunsFailed, ParameterError
 from pharos.observations import own_observation
-from pharos.system.options import split
+from pharos.system.options import split, takes
 from pharos.training.batch import Progress, ProgressCallback, TrainingJobs, train_configs
 from pharos.training.config import RunConfig
 from pharos.training.options import TrainingOptions
@@ -31,6 +31,7 @@ from pharos.training.task_cache import FailedRun, TaskCache
 RunProgress = Callable[[int, int, Mapping[str, Any]], None]
 
 
+@takes(TrainingOptions)
 def train(
     agent: str,
     environment: Environment | str,
@@ -64,6 +65,7 @@ def train(
     return _train(config, members, None if out is None else Path(out), progress, tensorboard)
 
 
+@takes(TrainingOptions, engine="batched")
 def train_many(
     agent: str,
     environment: Environment | str,
