@@ -411,7 +411,7 @@ print(len(runs), {run.result["exact"] for run in runs})
 """
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_script_needs_no_guard_for_workers(tmp_path):
     """Workers do not import the script again: what it prints, it prints once."""
     (tmp_path / "script.py").write_text(SCRIPT)

@@ -73,6 +73,7 @@ def test_the_code_of_pages_prints_what_they_say(name):
     assert compared >= 3
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "name",
     [pytest.param(path.stem, marks=pytest.mark.long if path.stem in LONG else pytest.mark.slow) for path in TUTORIALS],

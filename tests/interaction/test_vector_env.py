@@ -35,7 +35,7 @@ def breakout(tmp_path_factory):
     return pharos.build(pharos.make("breakout", height=7, columns=4), tmp_path_factory.mktemp("one") / "space")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("chance", CHANCES)
 @pytest.mark.parametrize("tabulated", [False, True])
 def test_a_walk_agrees_with_the_table_at_every_step(space, chance, tabulated):

@@ -47,7 +47,7 @@ def random_states(env, number, seed=0):
     return components.low + rng.integers(0, components.size, (number, len(components)))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(("name", "options"), OPTIONS)
 def test_compiled_frames_are_the_interpreted_ones(env, name, options):
     states = random_states(env, 150)

@@ -167,7 +167,7 @@ def test_latex_tables_have_the_papers_columns_and_balanced_environments(written)
     assert escape("a_b & 50%") == r"a\_b \& 50\%"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_report_made_again_is_the_same_but_for_its_date(written, again):
     page = written[1].html.read_text()
     date = re.compile(r"\d{4}-\d{2}-\d{2} \d{2}:\d{2}")
