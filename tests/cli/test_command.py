@@ -3,6 +3,7 @@
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any
 
 from typer.main import get_command
@@ -49,6 +50,12 @@ def walk(
     return Answer({**said, "steps": training.steps, "seen": training.observation_options}, f"{name} walked", fail)
 
 
+@app.command("keep")
+def keep(*, values: Path | None = None, json: bool = False) -> None:
+    """Keep."""
+    print(type(values).__name__, values.name, json)
+
+
 @app.command("rest")
 def rest() -> Answer:
     """Rest."""
@@ -83,3 +90,7 @@ def test_people_get_text_or_facts_and_failures_a_code():
     assert run("walk", "far").stdout == "far walked\n"
     assert run("walk", "far", "--fail").exit_code == 1
     assert "hours  8" in run("rest").stdout
+
+
+def test_an_option_may_have_any_name():
+    assert run("keep", "--values", "a/b").output.split() == [type(Path()).__name__, "b", "False"]

@@ -22,7 +22,6 @@ ROOT = Path(__file__).parents[2]
 DOCS, SCRIPTS = ROOT / "docs", ROOT / "scripts"
 BLOCK = re.compile(r"^```python\n(.*?)^```\n(?:```text\n(.*?)^```\n)?", re.MULTILINE | re.DOTALL)
 TUTORIALS = sorted((DOCS / "tutorials").glob("*.ipynb"))
-LONG = ("3-study", "4-own-observation-and-agent", "5-own-loop")
 
 
 @pytest.fixture(scope="module")
@@ -74,10 +73,7 @@ def test_the_code_of_pages_prints_what_they_say(name):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    "name",
-    [pytest.param(path.stem, marks=pytest.mark.long if path.stem in LONG else pytest.mark.slow) for path in TUTORIALS],
-)
+@pytest.mark.parametrize("name", [path.stem for path in TUTORIALS])
 def test_tutorials_print_what_they_show(name):
     done = subprocess.run(
         [sys.executable, str(SCRIPTS / "notebooks.py"), "--check", name],

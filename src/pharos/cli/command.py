@@ -84,6 +84,7 @@ def command(function: Callable[..., Any]) -> Callable[..., None]:
 
     parameters.append(inspect.Parameter("json", inspect.Parameter.KEYWORD_ONLY, default=JSON, annotation=bool))
     run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    run.__annotations__ = {}  # which Typer would read before the signature: a command may have an option `values`
     run.__doc__, run.__name__ = inspect.cleandoc(function.__doc__ or "").partition("\n\nArgs:")[0], function.__name__
     return run
 
