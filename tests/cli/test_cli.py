@@ -349,6 +349,13 @@ def test_solving_a_folder_is_solving_its_environment(answer, tmp_path):
     assert solved[0]["value_at_start"] < answer("solve", tmp_path / "court")["value_at_start"]
 
 
+def test_solve_keeps_values_in_a_folder_and_goes_on_from_them(answer, tmp_path):
+    words = ("solve", "frozen_lake/4x4", "--values", str(tmp_path / "values"))
+    assert answer(*words)["sweeps"] > 1
+    assert {path.name for path in (tmp_path / "values").glob("*.npy")} == {"optimal.npy", "uniform.npy"}
+    assert answer(*words)["sweeps"] == 1
+
+
 def test_solve_writes_values_and_policy(answer, tmp_path):
     import numpy as np
 
