@@ -11,7 +11,7 @@ from typing import NoReturn
 import numpy as np
 
 from pharos.errors import ParameterError
-from pharos.system.packed_indices import Indices, as_array, rows_of
+from pharos.system.packed_indices import Indices, as_array
 
 SUM_TOLERANCE = 1e-9
 """By how much the probabilities of the outcomes of an action may sum to something else than 1."""
@@ -161,7 +161,7 @@ class OutcomeCheck:
             if begins[0] < 0 or begins[-1] > stored.successors.size:
                 text = f"{self._pair(rows[0])} begins at {begins[0]}; expected 0 to {stored.successors.size}"
                 self._refuse("offsets", text)
-        following = np.asarray(rows_of(stored.flat, int(begins[0]), int(begins[-1])))
+        following = np.asarray(stored.flat[int(begins[0]) : int(begins[-1])])  # unpacked, where indices are packed
         self._check_range(following, np.repeat(rows, lengths))
         if counts is None:
             likely = np.zeros((len(rows), self.most))
