@@ -2,6 +2,7 @@
 
 import shlex
 import shutil
+import time
 from collections import Counter
 from dataclasses import dataclass
 
@@ -123,6 +124,7 @@ def test_a_command_that_is_killed_and_repeated_ends_as_if_it_had_not_been(name, 
             elif again:  # less was left to do than before
                 kills.append(kill)
                 break
+        time.sleep(0.1)  # for workers of a process that was killed, which end with it
         execute(folder)
         assert_same(content(folder), expected, case)
         shutil.rmtree(folder)

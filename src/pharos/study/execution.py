@@ -32,7 +32,7 @@ from pharos.study.specification import Source
 from pharos.study.status import Forecast, Status, claim, duration, opened, status
 from pharos.system.storage import replace_json
 from pharos.system.wording import in_one_line, many
-from pharos.system.workers import check_guard, without_interrupts, without_main
+from pharos.system.workers import check_guard, end_with_parent, without_interrupts, without_main
 
 __all__ = ["Execution", "Options", "Status", "claim", "duration", "opened", "processors", "run", "shard_of", "status"]
 
@@ -468,7 +468,7 @@ def _prepare_all(
 ) -> None:
     """Prepare instances one after the other; send "" after each, and why where it waits."""
     _worker.end_cleanly()
-    _worker.end_with_parent()
+    end_with_parent()
     for config in configs:
         with contextlib.suppress(Exception):  # the runs of this instance will fail with the same error, and say so
             unless_locked(prepare, config, sender.send)

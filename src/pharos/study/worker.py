@@ -13,7 +13,6 @@ import os
 import shutil
 import signal
 import sys
-import threading
 import time
 import traceback
 from collections.abc import Callable, Container, Mapping, Sequence
@@ -24,13 +23,12 @@ from pharos import training
 from pharos.errors import FileFormatError, FolderLocked
 from pharos.system import storage
 from pharos.system.wording import in_one_line
+from pharos.system.workers import end_with_parent
 
 FINISHED, FAILED, BUSY = "finished", "failed", "busy"
 EXIT_BUSY = 75
-PARENT_GONE = 76
 # Seconds in a record that no run can take: ten thousand years
 LONGEST = 3e11
-CLEAN_SECONDS = 2.0
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
 
 BATCHES = "batches"
@@ -262,25 +260,6 @@ def end_cleanly() -> None:
 def is_ending() -> None:
     """Ignore SIGTERM from now on: this process ends by itself, and an exception among what is given back is printed."""
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
-
-
-def end_with_parent() -> None:
-    """End this process when the one that started it is gone, however it went: cleanly, and if that takes long, at
-    once."""
-    from multiprocessing import connection, parent_process
-
-    parent = parent_process()
-    if parent is None:
-        return
-
-    def watch() -> None:
-        connection.wait([parent.sentinel])
-        if signal.getsignal(signal.SIGTERM) not in (signal.SIG_DFL, signal.SIG_IGN):
-            os.kill(os.getpid(), signal.SIGTERM)
-            time.sleep(CLEAN_SECONDS)
-        os._exit(PARENT_GONE)
-
-    threading.Thread(target=watch, daemon=True, name="watch").start()
 
 
 def use_one_thread() -> None:

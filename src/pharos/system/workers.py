@@ -6,10 +6,14 @@ import os
 import signal
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from typing import Any
 
 from pharos.errors import ParameterError
+
+PARENT_GONE = 76  # the exit status of a worker that nobody waits for
+CLEAN_SECONDS = 2.0  # until it ends at once
 
 
 def usable_workers(workers: int | None) -> int:
@@ -69,3 +73,22 @@ def without_interrupts() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGINT, signal.default_int_handler if before is None else before)
+
+
+def end_with_parent() -> None:
+    """End this process when the one that started it is gone, however it went: cleanly, and if that takes long, at
+    once."""
+    from multiprocessing import connection, parent_process
+
+    parent = parent_process()
+    if parent is None:
+        return
+
+    def watch() -> None:
+        connection.wait([parent.sentinel])
+        if signal.getsignal(signal.SIGTERM) not in (signal.SIG_DFL, signal.SIG_IGN):
+            os.kill(os.getpid(), signal.SIGTERM)
+            time.sleep(CLEAN_SECONDS)
+        os._exit(PARENT_GONE)
+
+    threading.Thread(target=watch, daemon=True, name="watch").start()

@@ -13,7 +13,7 @@ from typing import Any
 
 from pharos.agents.batched import lane_width
 from pharos.errors import FileFormatError, ParameterError, PharosError
-from pharos.system.workers import check_guard, without_interrupts, without_main
+from pharos.system.workers import check_guard, end_with_parent, without_interrupts, without_main
 from pharos.training import results as _results
 from pharos.training.batch import Progress, ProgressCallback, train_configs
 from pharos.training.config import RunConfig
@@ -82,6 +82,7 @@ def train_parts(
 def _train(entries: Sequence[tuple[dict[str, Any], Path]], checkpoints: Path | None, device: str, sender: Any) -> None:
     """What a process does: it tells how far it is, and ends when nobody listens; interrupts are for the first one."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    end_with_parent()
 
     def tell(now: Progress) -> None:
         try:
