@@ -26,7 +26,6 @@ import numpy as np
 from scipy.stats import spearmanr
 
 import pharos
-from pharos.solvers import regret_scale
 
 FOLDER = Path(__file__).parents[1] / "docs" / "studies" / "choices"
 WORLDS = {
@@ -140,11 +139,7 @@ def observed(agent, world, observation, options, hyperparameters):
         hyperparameters=hyperparameters,
         **WORLDS[world],
     )
-    regrets = [
-        np.mean([row["expected_regret"] for row in run.curve])
-        / regret_scale(run.result["value_optimal"], run.result["value_uniform"])
-        for run in results
-    ]
+    regrets = [np.mean([row["normalized_regret"] for row in run.curve]) for run in results]
     return round(float(np.mean(regrets)), 6), round(float(np.std(regrets, ddof=1)), 6)
 
 

@@ -399,16 +399,6 @@ class Dynamics(ABC):
         shape = (self.num_states * self.num_actions, self.num_states + 1)
         return sparse.csr_matrix((entries.probabilities, entries.states, indptr), shape=shape)
 
-    def to_classes(self, classes: np.ndarray, count: int) -> "csr_matrix":
-        """(S A, C): the probability of coming to each class (S,) of states; columns in order."""
-        from scipy import sparse
-
-        place = (np.arange(self.num_states), classes)
-        members = sparse.csr_matrix((np.ones(self.num_states), place), shape=(self.num_states + 1, count))
-        result = sparse.csr_matrix(self.matrix() @ members)
-        result.sort_indices()
-        return result
-
     def _all_actions(self, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Each state with each action."""
         return np.repeat(states, self.num_actions), np.tile(np.arange(self.num_actions), len(states))

@@ -142,10 +142,6 @@ class TrainingJobs:
         """Train all; their results in order."""
         for group in self._groups():
             TrainingGroup(self, group).train()
-        finished = {self.configs[k].id for k, end in self.results.items() if isinstance(end, TrainingResult)}
-        for folder, configs in self._stored_batches():  # of a process that was killed after its last run was written
-            if {config.id for config in configs} <= finished:
-                shutil.rmtree(folder, ignore_errors=True)
         if self.checkpoints is not None and self.checkpoints.is_dir():
             for folder in (*self.checkpoints.iterdir(), self.checkpoints):
                 with contextlib.suppress(OSError):  # it is not empty

@@ -185,7 +185,7 @@ def tune(  # noqa: PLR0913
         study = _study(optuna, search, records)
         while len(records) < trials:
             study.sampler = _sampler(optuna, search, len(records), trials)
-            if records and predicted is not None:
+            if records and shortlist > 1 and predicted is not None:
                 study.enqueue_trial(_most_promising(optuna, search, records, trials, predicted))
             study.optimize(lambda trial: search.score(trial, optuna.TrialPruned), n_trials=1)
             records.append(_record(study.trials[-1]))
