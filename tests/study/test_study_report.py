@@ -15,9 +15,9 @@ from pharos import study
 from pharos.study import worker as _worker
 from pharos.study.curves import same_steps
 from pharos.study.execution import claim
-from pharos.study.latex import escape
 from pharos.study.report import files, number
 from pharos.study.report.page import table
+from pharos.system.wording import latex_text
 
 SPECIFICATION = {
     "name": "lakes",
@@ -164,7 +164,7 @@ def test_latex_tables_have_the_papers_columns_and_balanced_environments(written)
     assert len(lines) == 2 and all(line.count("&") == 5 for line in lines)
     assert text.count(r"\begin{") == text.count(r"\end{") == 1
     assert text.count("{") == text.count("}")
-    assert escape("a_b & 50%") == r"a\_b \& 50\%"
+    assert latex_text("a_b & 50%") == r"a\_b \& 50\%"
 
 
 @pytest.mark.long

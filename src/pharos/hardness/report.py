@@ -18,6 +18,7 @@ from pharos.hardness.representation.sampled_regret import Sampling
 from pharos.hardness.results_file import ResultsFile
 from pharos.mdp import TabularMDP, require_mdp
 from pharos.system.compiling import Stopwatch
+from pharos.system.wording import latex_text
 
 
 @dataclass(frozen=True)
@@ -98,7 +99,7 @@ class Report:
         lines = [r"\begin{tabular}{lr}", r"\toprule", r"measure & value \\", r"\midrule"]
         for result in self.results.values():
             value = result.text if not result.undefined else "--"
-            lines.append(f"{_escape(result.name.replace('_', ' '))} & {_escape(value)} \\\\")
+            lines.append(f"{latex_text(result.name.replace('_', ' '))} & {latex_text(value)} \\\\")
         return "\n".join([*lines, r"\bottomrule", r"\end{tabular}"])
 
     def __str__(self) -> str:
@@ -225,10 +226,6 @@ def _finite(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_finite(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def _escape(text: str) -> str:
-    return text.replace("\\", r"\textbackslash{}").replace("_", r"\_").replace("%", r"\%").replace("&", r"\&")
 
 
 def _conventions(problem: Problem) -> dict[str, Any]:

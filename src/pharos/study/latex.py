@@ -9,7 +9,7 @@ import numpy as np
 from pharos.agents import TABULAR_OBSERVATION
 from pharos.plots import agent_name
 from pharos.study.analysis import IMAGE, VECTOR, Models
-from pharos.system.wording import in_words
+from pharos.system.wording import in_words, latex_text
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -44,11 +44,11 @@ def returns_table(cells: "pd.DataFrame", environment: str) -> str:
     rows: dict[tuple[str, str], dict[tuple[str, str], str]] = {}
     for row in part.to_dict("records"):
         kind = row["chance"] if "," in row["chance"] else CHANCES.get(row["chance"].split()[0], row["chance"])
-        name = rf"{{\small {escape(row['instance'])}}}"
-        entries = rows.setdefault((name, escape(kind)), {})
+        name = rf"{{\small {latex_text(row['instance'])}}}"
+        entries = rows.setdefault((name, latex_text(kind)), {})
         entries[row["agent"], row["observation"]] = _entry(row["return"], row["return_deviation"])
     keys = sorted({(row.agent, row.observation) for row in part.itertuples()}, key=lambda key: (key[0] != "ppo", *key))
-    titles = [(escape(agent_name(agent)), escape(in_words(name))) for agent, name in keys]
+    titles = [(latex_text(agent_name(agent)), latex_text(in_words(name))) for agent, name in keys]
     if {key for key in keys if key[1] != TABULAR_OBSERVATION} == set(COLUMNS):
         keys, titles = list(COLUMNS), [(TITLES[agent], TITLES[name]) for agent, name in COLUMNS]
     columns = pd.MultiIndex.from_tuples(titles)
@@ -62,9 +62,9 @@ def returns_table(cells: "pd.DataFrame", environment: str) -> str:
 def hardness_table(measured: "pd.DataFrame") -> str:
     """The measures of each instance under each kind of chance."""
     names = [name for name in measured.columns if name not in ("environment", "instance", "chance", "notes")]
-    texts = measured[["instance", "chance"]].map(escape)
+    texts = measured[["instance", "chance"]].map(latex_text)
     numbers = measured[names].map(lambda x: "--" if x is None or not np.isfinite(x) else f"{x:.6g}")
-    table = texts.join(numbers).rename(columns=lambda name: escape(in_words(name)))
+    table = texts.join(numbers).rename(columns=lambda name: latex_text(in_words(name)))
     return _latex(table, "ll" + "r" * len(names), is_indexed=False)
 
 
@@ -76,14 +76,8 @@ def models_table(models: Models) -> str:
     lines = []
     for fit in models.fits:
         numbers = (f"{value:.2f}" for value in (fit.r_squared, fit.adjusted_r_squared, fit.cross_validated_r_squared))
-        lines.append([fit.model, escape(fit.subset), str(fit.num_rows), *numbers])
+        lines.append([fit.model, latex_text(fit.subset), str(fit.num_rows), *numbers])
     return _latex(pd.DataFrame(lines, columns=names), "llrrrr", is_indexed=False)
-
-
-def escape(text: str) -> str:
-    """Text as LaTeX prints it."""
-    special = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
-    return "".join(special.get(letter, "\\" + letter if letter in "&%$#_{}" else letter) for letter in text)
 
 
 def _latex(

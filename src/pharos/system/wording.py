@@ -1,4 +1,4 @@
-"""How messages say numbers, names and errors."""
+"""How messages and tables say numbers, names and errors."""
 
 from pharos.errors import PharosError
 
@@ -17,3 +17,9 @@ def in_one_line(error: BaseException) -> str:
     """An error as pharos says it, or with its type."""
     text = " ".join(str(error).split())
     return text if isinstance(error, PharosError) else f"{type(error).__name__}: {text}"
+
+
+def latex_text(text: str) -> str:
+    """Text as LaTeX prints it: its special letters escaped."""
+    special = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
+    return "".join(special.get(letter, "\\" + letter if letter in "&%$#_{}" else letter) for letter in text)
