@@ -44,6 +44,7 @@ ORDER = (
         "leaderboard",
         "plots",
         "study",
+        "benchmark",
         "sb3_env",
         "bisimulation",
         "explorer",

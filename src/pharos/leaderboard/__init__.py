@@ -1,7 +1,7 @@
 """Entries of a leaderboard: what a run has learnt and what it claims, in one file that anybody can verify."""
 
 from pharos.leaderboard.board import board, reason
-from pharos.leaderboard.entry import Claim, Entry, read
+from pharos.leaderboard.entry import Claim, Entry, check_values, in_file, read, read_sealed, write_sealed
 from pharos.leaderboard.submission import submit
 from pharos.leaderboard.verification import Check, Verdict, verify
 
@@ -13,5 +13,5 @@ __all__ = [
     "verify",
 ]
 _shared = """
-    Check Claim Entry reason
+    Check Claim Entry check_values in_file read_sealed reason write_sealed
 """

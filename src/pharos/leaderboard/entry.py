@@ -14,10 +14,10 @@ import json
 import os
 import sys
 import unicodedata
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from safetensors import SafetensorError, safe_open
@@ -42,6 +42,8 @@ LOOKALIKES = "АВЕЅІЈКМНОРСТУХаеорсухѕіјΑΒΕΖΗΙΚΜ
 """Cyrillic and Greek letters that look like Latin ones: refused in names and authors that have Latin letters too."""
 MOST_MARKS = 4
 _RECORD, _ARRAYS = "pharos", "arrays"
+ENTRY = "entry of a leaderboard"
+T = TypeVar("T")
 _AGAIN = "fetch it again, or ask for it again"
 
 
@@ -100,7 +102,6 @@ class Entry:
 
 def write(entry: Entry, file: str | os.PathLike) -> None:
     """Replace a file by an entry, in one step; the same entry gives the same bytes."""
-    arrays = {name: _checked(name, array) for name, array in entry.arrays.items()}
     record = {
         "format": FORMAT,
         "name": entry.name,
@@ -113,12 +114,20 @@ def write(entry: Entry, file: str | os.PathLike) -> None:
         "rules_version": entry.rules_version,
         "claim": asdict(entry.claim),
         "training": dict(entry.training),
-        _ARRAYS: {name: _digest(array) for name, array in arrays.items()},
     }
-    text = json.dumps(storage.sealed(record), sort_keys=True, allow_nan=False)
-    data = save(arrays, {_RECORD: text})
+    write_sealed(file, record, entry.arrays)
+
+
+def write_sealed(
+    file: str | os.PathLike, record: Mapping[str, Any], arrays: Mapping[str, np.ndarray], what: str = ENTRY
+) -> None:
+    """Replace a file by a record and arrays with their digests, in one step; the same ones give the same bytes."""
+    checked = {name: _checked(name, array) for name, array in arrays.items()}
+    digests = {name: _digest(array) for name, array in checked.items()}
+    text = json.dumps(storage.sealed({**record, _ARRAYS: digests}), sort_keys=True, allow_nan=False)
+    data = save(checked, {_RECORD: text})
     if len(data) > LARGEST_FILE:
-        raise ParameterError(f"{file}: the entry would have {len(data):,} bytes; expected at most {LARGEST_FILE:,}")
+        raise ParameterError(f"{file}: the {what} would have {len(data):,} bytes; expected at most {LARGEST_FILE:,}")
     storage.replace_file(file, data)
 
 
@@ -130,6 +139,22 @@ def read(file: str | os.PathLike) -> Entry:
         ResultCorrupted: it was cut short, or changed after it was written.
     """
     path = Path(file)
+    record, arrays = read_sealed(path)
+    return in_file(path, lambda: _entry(record, arrays))
+
+
+def in_file(path: Path, make: Callable[[], T]) -> T:
+    """What is made of the record of a file; whatever is wrong with that, as one line that names the file."""
+    try:
+        return make()
+    except (FileFormatError, ParameterError) as error:
+        raise FileFormatError(f"{path}: {str(error)[:LONGEST_TEXT]}") from None
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise FileFormatError(f"{path}: its record is damaged: {_reason(error)}; {_AGAIN}") from None
+
+
+def read_sealed(path: Path, what: str = ENTRY) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """The record and the arrays that `write_sealed` wrote, whose digests are right; raises as `read`."""
     if not path.is_file():
         raise ParameterError(f"{path}: no such file")
     try:
@@ -141,21 +166,18 @@ def read(file: str | os.PathLike) -> Entry:
             raise TypeError("its record is no object")
         is_intact = storage.DIGEST in record and storage.is_intact(record)
     except SafetensorError as error:
-        raise ResultCorrupted(f"{path}: is no entry, or was cut short or changed: {_reason(error)}; {_AGAIN}") from None
+        raise ResultCorrupted(
+            f"{path}: is no {what}, or was cut short or changed: {_reason(error)}; {_AGAIN}"
+        ) from None
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError, ParameterError) as error:
-        raise FileFormatError(f"{path}: is no entry of a leaderboard: {_reason(error)}; {_AGAIN}") from None
+        raise FileFormatError(f"{path}: is no {what}: {_reason(error)}; {_AGAIN}") from None
     if not is_intact:
         raise ResultCorrupted(f"{path}: what it says was changed after it was written; {_AGAIN}")
     if record.get("format") != FORMAT:
         raise FileFormatError(f"{path}: is in format {record.get('format')!r}; this version of pharos reads {FORMAT}")
     if record.get(_ARRAYS) != {name: _digest(array) for name, array in arrays.items()}:
         raise ResultCorrupted(f"{path}: its arrays were changed after it was written; {_AGAIN}")
-    try:
-        return _entry(record, arrays)
-    except (FileFormatError, ParameterError) as error:
-        raise FileFormatError(f"{path}: {str(error)[:LONGEST_TEXT]}") from None
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise FileFormatError(f"{path}: its record is damaged: {_reason(error)}; {_AGAIN}") from None
+    return record, arrays
 
 
 def _check_sizes(path: Path) -> None:
@@ -170,7 +192,7 @@ def _check_sizes(path: Path) -> None:
 
 
 def _entry(record: Mapping[str, Any], arrays: dict[str, np.ndarray]) -> Entry:
-    _check_values(record)
+    check_values(record)
     said = {name: value for name, value in record.items() if name not in ("format", "id", storage.DIGEST)}
     entry = records.read(Entry, {**said, _ARRAYS: arrays}, "its record")
     if record["id"] != run_id(record["config"]):
@@ -180,17 +202,17 @@ def _entry(record: Mapping[str, Any], arrays: dict[str, np.ndarray]) -> Entry:
     return entry
 
 
-def _check_values(value: object, name: str = "record", depth: int = 0) -> None:
+def check_values(value: object, name: str = "record", depth: int = 0) -> None:
     """Refuse texts that would do something to a terminal, or hide what they say, and numbers that no float holds."""
     if depth > DEEPEST:
         raise ValueError(f"its {name} is nested deeper than {DEEPEST} times")
     if isinstance(value, Mapping):
         for key, item in value.items():
-            _check_values(key, name)
-            _check_values(item, key, depth + 1)
+            check_values(key, name)
+            check_values(item, key, depth + 1)
     elif isinstance(value, list):
         for item in value:
-            _check_values(item, name, depth + 1)
+            check_values(item, name, depth + 1)
     elif isinstance(value, str):
         if not all(character.isprintable() or character == "\n" for character in value):
             raise ValueError(f"a text of its {name} has characters that cannot be printed")

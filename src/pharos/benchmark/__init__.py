@@ -1,0 +1,21 @@
+"""The Pharos Benchmark: frozen tasks that are known to the last state, agents on them, and scores with units.
+
+A file is loaded when something in it is first used.
+"""
+
+from typing import TYPE_CHECKING
+
+from pharos.system import lazy
+
+if TYPE_CHECKING:
+    from pharos.benchmark.results import AgentResults, baselines, read_results
+
+__all__ = [
+    "AgentResults",
+    "baselines",
+    "read_results",
+]
+_shared = """
+"""
+
+__getattr__ = lazy.attributes(__name__)

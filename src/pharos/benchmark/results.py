@@ -1,0 +1,110 @@
+"""Results of an agent in a benchmark: a curve of normalised regret for each task and seed, in one small file.
+
+The file has the layout of an entry of the leaderboard (`leaderboard/entry.py`): the record as JSON, and under the name
+of each task a float64 array (seeds, evaluations), with digests of all. The same results give the same bytes.
+"""
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pharos.errors import FileFormatError, ParameterError
+from pharos.leaderboard import check_values, in_file, read_sealed, write_sealed
+
+FORMAT = 1
+FILE = "results.safetensors"
+WHAT = "result of a benchmark"
+BASELINES = Path(__file__).parent / "baselines"
+
+
+@dataclass(frozen=True, eq=False)
+class AgentResults:
+    """What one agent, with one setting, did on the tasks of a suite.
+
+    Attributes:
+        agent: label of the agent.
+        suite, digest: name and digest of the suite.
+        seeds: of the runs, in the order of the rows.
+        curves: name of a task -> (seeds, evaluations) normalised regret (V* - V) / (V* - U) of the policy after each
+            equal part of the steps: 0 is optimal, 1 is uniform play, not clipped. Tasks that were not run, or of which
+            a run failed, are left out.
+        record: JSON-able: form, source, hyperparameters and versions, as in agent.json, and `exact` by task.
+    Raises:
+        ParameterError: a curve has another shape, or a number is not finite.
+    """
+
+    agent: str
+    suite: str
+    digest: str
+    seeds: tuple[int, ...]
+    curves: Mapping[str, np.ndarray]
+    record: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        curves = {name: np.asarray(self.curves[name], np.float64) for name in sorted(self.curves)}
+        object.__setattr__(self, "curves", curves)
+        object.__setattr__(self, "seeds", tuple(int(seed) for seed in self.seeds))
+        if not self.seeds or len(set(self.seeds)) != len(self.seeds):
+            raise ParameterError(f"seeds of {self.agent} are {self.seeds}; expected at least one, each once")
+        widths = {curve.shape[1:] for curve in curves.values()}
+        for name, curve in curves.items():
+            if curve.ndim != 2 or len(curve) != len(self.seeds) or not curve.shape[1] or len(widths) != 1:
+                raise ParameterError(
+                    f"curves of {self.agent} on {name} have shape {curve.shape}; expected ({len(self.seeds)} seeds, "
+                    f"evaluations), as many evaluations on each task"
+                )
+            if not np.isfinite(curve).all():
+                raise ParameterError(f"curves of {self.agent} on {name} hold NaN or infinity; expected finite numbers")
+
+    @staticmethod
+    def read(source: str | os.PathLike) -> "AgentResults":
+        """Results of the folder of a run, of a file, or of a shipped baseline, by name (`dqn`, of v1; or `v1/dqn`).
+
+        Nothing is executed, and nothing is allocated before sizes in the file were held against the size of the file.
+
+        Raises:
+            ParameterError: there are none. FileFormatError: it is another file. ResultCorrupted: it was cut short or
+                changed after it was written.
+        """
+        path = Path(source)
+        suite, _, label = (f"v1/{source}" if "/" not in str(source) else str(source)).rpartition("/")
+        if path.is_dir():
+            path = path / FILE
+            if not path.is_file():
+                raise ParameterError(f"{path}: no such file; `pharos benchmark run` writes it when its runs have ended")
+        elif not path.exists() and "/" not in suite and label in baselines(suite):
+            path = BASELINES / suite / f"{label}.safetensors"
+        elif not path.is_file():
+            raise ParameterError(
+                f"{source}: no results; expected the folder of a run, its {FILE}, or a baseline: "
+                f"{', '.join(baselines()) or 'none is shipped'}"
+            )
+        record, arrays = read_sealed(path, WHAT)
+        return in_file(path, lambda: _results(record, arrays))
+
+    def write(self, file: str | os.PathLike) -> None:
+        """Replace a file by these results, in one step; the same results give the same bytes."""
+        own = {"agent": self.agent, "suite": self.suite, "suite_digest": self.digest, "seeds": list(self.seeds)}
+        write_sealed(file, {"format": FORMAT, **own, "record": dict(self.record)}, self.curves, WHAT)
+
+
+def baselines(suite: str = "v1") -> tuple[str, ...]:
+    """Names of the results that are shipped for a suite; each is the results file of a run with ten seeds."""
+    return tuple(sorted(file.stem for file in (BASELINES / suite).glob("*.safetensors")))
+
+
+def _results(record: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> AgentResults:
+    check_values(record)
+    kinds = {"agent": str, "suite": str, "suite_digest": str, "seeds": list, "record": dict}
+    wrong = [name for name, kind in kinds.items() if not isinstance(record.get(name), kind)]
+    if wrong or not all(type(seed) is int for seed in record["seeds"]):
+        raise FileFormatError(f"is no {WHAT}: its {', '.join(wrong) or 'seeds'} are missing or of another type")
+    agent, suite, digest, seeds, more = (record[name] for name in kinds)
+    return AgentResults(agent, suite, digest, tuple(seeds), arrays, more)
+
+
+read_results = AgentResults.read
