@@ -75,6 +75,7 @@ _PACKAGES = (
     "leaderboard",
     "plots",
     "study",
+    "benchmark",
     "explorer",
 )
 

@@ -29,6 +29,7 @@ LINES = (
     "import gymnasium FrozenLake-v1 --out imported",
     "cache list",
     "study show quick",
+    "benchmark show",
     "study status quick",
 )
 

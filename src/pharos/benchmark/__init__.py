@@ -9,10 +9,16 @@ from pharos.system import lazy
 
 if TYPE_CHECKING:
     from pharos.benchmark.results import AgentResults, baselines, read_results
+    from pharos.benchmark.suite import BenchmarkTask, Ladder, Protocol, Suite, load_suite
 
 __all__ = [
     "AgentResults",
+    "BenchmarkTask",
+    "Ladder",
+    "Protocol",
+    "Suite",
     "baselines",
+    "load_suite",
     "read_results",
 ]
 _shared = """

@@ -10,6 +10,7 @@ import typer
 from typer.core import TyperGroup
 
 from pharos.cli import (
+    benchmark,
     build,
     cache,
     check,
@@ -172,6 +173,7 @@ app.command("board")(leaderboard.board)
 app.command("warm")(warm.warm)
 app.add_typer(plot.app, name="plot")
 app.add_typer(study.app, name="study")
+app.add_typer(benchmark.app, name="benchmark")
 app.command("export")(import_.export)
 app.add_typer(import_.app, name="import")
 app.add_typer(cache.app, name="cache")

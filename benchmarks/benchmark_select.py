@@ -1,0 +1,238 @@
+"""The suite v1, by its rule: which tasks its core has, from predictions alone, and what is known of each task.
+
+python benchmarks/benchmark_select.py                print the file of the suite
+python benchmarks/benchmark_select.py --write        write it
+python benchmarks/benchmark_select.py --freeze       the same, with levels, values and digests computed anew
+
+The core: of CANDIDATES, a table of predictions that is in the repository, those in the WINDOW, where the idealised
+DQN and PPO neither both solve a task nor both fail. First the one nearest to the middle of FEATURES, ranked; then again
+and again the one that is farthest from all chosen ones; at most PER_CLASS of a class and one of an instance; ties by
+name; until there are TASKS. No result of any agent enters.
+
+Ladders are taken from the file: environment, parameters, observation and chance of each rung are written by hand, the
+rest is filled in by --freeze. Numbers of tasks that are in the file are kept; new tasks are always frozen.
+"""
+
+import argparse
+import csv
+import hashlib
+import json
+import math
+import re
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from pharos.benchmark.suite import CORE, FOLDER, BenchmarkTask, Protocol, Suite, digest_of_suite, digest_of_task
+
+CANDIDATES = Path(__file__).parent / "benchmark_candidates.csv"
+FILE = FOLDER / "v1.yaml"
+TASKS, PER_CLASS, MOST_STATES = 24, 3, 2_000
+SOLVED, FAILED = 0.1, 0.9  # the window
+OBSERVATIONS = {"hash": {"bits": 64}, "simple_image": {"motion": True}}
+HEAD = """\
+# The suite {name} of `pharos benchmark`, by `python benchmarks/benchmark_select.py`: only rungs are written by hand.
+# The core is selected from benchmarks/benchmark_candidates.csv of {date}, SHA-256 {sha256}.
+"""
+DATE = "2026-11-24"
+TASK_KEYS = [each.name for each in fields(BenchmarkTask) if each.name != "axis"]
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--write", action="store_true")
+    parser.add_argument("--freeze", action="store_true")
+    options = parser.parse_args()
+    text = suite_text(yaml.safe_load(FILE.read_text()), freeze=options.freeze)
+    if options.write or options.freeze:
+        FILE.write_text(text)
+    else:
+        print(text, end="")
+
+
+def suite_text(entry, *, freeze=False):
+    """The file of the suite, from the one before, of which protocol, hyperparameters and ladders are taken."""
+    protocol = Protocol(**entry["protocol"])
+    known = {each["name"]: each for each in entry["core"]}
+    core = [kept({**known.get(each["name"], {}), **each}, CORE, protocol, freeze) for each in selected()]
+    ladders = []
+    for ladder in entry["ladders"]:
+        tasks = [kept(each, ladder["axis"], protocol, freeze, LEVELS[ladder["measure"]]) for each in ladder["tasks"]]
+        ladders.append({**ladder, "tasks": tasks})
+    made = {"name": entry["name"], "digest": "", "protocol": entry["protocol"]}
+    made |= {"hyperparameters": entry["hyperparameters"], "core": core, "ladders": ladders}
+    every = [BenchmarkTask(**each, axis=CORE) for each in core]
+    every += [BenchmarkTask(**each, axis=ladder["axis"]) for ladder in ladders for each in ladder["tasks"]]
+    made["digest"] = digest_of_suite(Suite(entry["name"], protocol, tuple(every), (), ""))
+    return written(made)
+
+
+def kept(entry, axis, protocol, freeze, level=None):
+    """The entry of a task, with its values and its digest, and its level where it is a rung."""
+    if not freeze and entry.get("digest"):
+        return entry
+    task = BenchmarkTask(**{**entry, "axis": axis, "digest": ""})
+    learnt = task.training_task(protocol)
+    reference = learnt.reference
+    print(f"# {task.name}: {learnt.space.num_states:,} states", flush=True)
+    made = {**entry, "value_optimal": significant(reference.optimal), "value_uniform": significant(reference.uniform)}
+    if level is not None:
+        made["level"] = significant(level(task, learnt))
+    return {**made, "digest": digest_of_task(learnt)}
+
+
+# Levels of ladders: function(task, what an agent learns) -> number ----------------------------------------------
+
+
+def exploration_bits(task, learnt):
+    """log2 of the episodes that uniform play needs until it has met every transition of some optimal policy."""
+    from pharos.hardness import report
+
+    result = report(learnt.mdp, ["exploration_time"], horizon=learnt.time_limit)["exploration_time"]
+    return math.log2(result.value["episodes"])
+
+
+def noise_over_gap(task, learnt):
+    """Standard deviation of the noise in rewards / the smallest loss of an action that loses something."""
+    q = learnt.optimal.q
+    gaps = q.max(axis=1, keepdims=True) - q
+    return task.chance.get("reward_noise", 0.0) / gaps[gaps > 1e-6].min()
+
+
+def log10_states(task, learnt):
+    """Decimal logarithm of the number of states."""
+    return math.log10(learnt.space.num_states)
+
+
+def parameter(name):
+    """A parameter of the environment that is a number of steps."""
+    return lambda task, learnt: float(task.parameters[name])
+
+
+LEVELS = {
+    "exploration_bits": exploration_bits,
+    "noise_over_gap": noise_over_gap,
+    "log10_states": log10_states,
+    "chain_length": parameter("chain_length"),
+    "memory_length": parameter("memory_length"),
+}
+
+
+# The core -------------------------------------------------------------------------------------------------------
+
+
+def candidates():
+    """Rows of CANDIDATES; numbers where a column holds numbers, None where one is unknown."""
+    with CANDIDATES.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    texts = ("name", "environment", "parameters", "observation", "chance")
+    return [{key: text if key in texts else float(text) if text else None for key, text in row.items()} for row in rows]
+
+
+def selected(rows=None, tasks=TASKS):
+    """Entries of the core's tasks, in the order in which the rule takes them."""
+    rows = sorted(candidates() if rows is None else rows, key=lambda row: row["name"])
+    rows = [row for row in rows if is_in_window(row) and row["num_states"] <= MOST_STATES]
+    places = features(rows)
+    chosen = [int(np.argmin((places**2).sum(axis=1)))]
+    while len(chosen) < tasks:
+        distance = np.min([((places - places[each]) ** 2).sum(axis=1) for each in chosen], axis=0)
+        for i, row in enumerate(rows):
+            of_class = sum(rows[each]["environment"] == row["environment"] for each in chosen)
+            if of_class >= PER_CLASS or any(instance(rows[each]) == instance(row) for each in chosen):
+                distance[i] = -1
+        farthest = int(np.argmax(np.round(distance, 12)))  # the first of equal ones, by name
+        if distance[farthest] <= 0:
+            break
+        chosen.append(farthest)
+    return [task_entry(rows[each]) for each in chosen]
+
+
+def is_in_window(row):
+    """Whether the idealised learners neither both solve it nor both fail."""
+    learners = [row[name] for name in ("dqn", "ppo") if row[name] is not None]
+    return bool(learners) and max(learners) > SOLVED and min(learners) < FAILED
+
+
+def features(rows):
+    """(N, 6) in [-1/2, 1/2]: ranks of exploration, table, representation, kind of learner, states; then chance."""
+    ppo = [row["dqn"] if row["ppo"] is None else row["ppo"] for row in rows]
+    columns = [
+        [None if row["exploration_time"] is None else math.log2(max(1, row["exploration_time"])) for row in rows],
+        [row["table"] for row in rows],
+        [row["dqn"] - row["table"] for row in rows],
+        [row["dqn"] - other for row, other in zip(rows, ppo, strict=True)],
+        [math.log10(row["num_states"]) for row in rows],
+    ]
+    chance = [0.25 if row["chance"] != "{}" else -0.25 for row in rows]
+    return np.column_stack([*(ranks(column) for column in columns), chance])
+
+
+def ranks(values):
+    """Mean ranks of a column in [-1/2, 1/2], to 9 digits; 0, the median, where a value is unknown."""
+    known = np.array([value for value in values if value is not None])
+    known = np.array([float(f"{value:.9g}") for value in known])
+    below = {value: ((known < value).sum() + (known <= value).sum() + 1) / 2 for value in known}
+    return [0.0 if v is None else below[float(f"{v:.9g}")] / len(known) - 0.5 for v in values]
+
+
+def instance(row):
+    return row["environment"], row["parameters"]
+
+
+def task_entry(row):
+    """The entry of a candidate in the file of a suite."""
+    parts = {name: json.loads(row[name]) for name in ("parameters", "chance")}
+    entry = {"name": row["name"], "environment": row["environment"], "parameters": parts["parameters"]}
+    entry["observation"] = row["observation"]
+    if row["observation"] in OBSERVATIONS:
+        entry["observation_options"] = OBSERVATIONS[row["observation"]]
+    if parts["chance"]:
+        entry["chance"] = parts["chance"]
+    entry["predicted"] = {name: row[name] for name in ("dqn", "ppo", "table") if row[name] is not None}
+    seconds = {name: row[f"{name}_seconds"] for name in ("dqn", "ppo") if row[f"{name}_seconds"] is not None}
+    return {**entry, "seconds": seconds}
+
+
+# The file -------------------------------------------------------------------------------------------------------
+
+
+def written(entry):
+    """The text of a suite's file: an entry of a task on a line, but for its numbers."""
+    sha256 = hashlib.sha256(CANDIDATES.read_bytes()).hexdigest()
+    lines = [HEAD.format(name=entry["name"], date=DATE, sha256=sha256)]
+    lines += [f"{name}: {flow(entry[name])}\n" for name in ("name", "digest", "protocol")]
+    lines.append("hyperparameters:  # of the baselines, one setting for all tasks\n")
+    lines += [f"  {agent}: {flow(setting)}\n" for agent, setting in entry["hyperparameters"].items()]
+    lines += ["core:\n", *(task_text(task, "  ") for task in entry["core"]), "ladders:\n"]
+    for ladder in entry["ladders"]:
+        keys = [f"{name}: {flow(ladder[name])}\n" for name in ("axis", "unit", "quantity", "measure")]
+        lines += ["  - " + "    ".join([*keys, "tasks:\n"]), *(task_text(task, "      ") for task in ladder["tasks"])]
+    return "".join(lines)
+
+
+def task_text(entry, indent):
+    keys = [each for each in TASK_KEYS if entry.get(each) not in (None, {})]
+    return f"{indent}- " + f"{indent}  ".join(f"{key}: {flow(entry[key])}\n" for key in keys)
+
+
+def flow(value):
+    """A value of YAML on one line: words bare where they may be, numbers as Python writes them, with a point."""
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{key}: {flow(each)}" for key, each in value.items()) + "}"
+    if isinstance(value, float):
+        text = repr(value)
+        return text if "e" not in text or "." in text else text.replace("e", ".0e")
+    if isinstance(value, str) and re.fullmatch(r"[A-Za-z_][\w ./*()-]*", value) and yaml.safe_load(value) == value:
+        return value
+    return json.dumps(value)
+
+
+def significant(value):
+    return float(f"{value:.12g}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,306 @@
+"""Suites: frozen lists of tasks in a file, with a digest of what each task is once it is solved.
+
+    name: v1
+    digest: ...                 of the protocol and of the digests of all tasks
+    protocol: {steps: 30000, evaluations: 15, seeds: 10, gamma: 1.0, horizon: limit}
+    hyperparameters: {dqn: {...}, ppo: {...}}
+    core: [tasks]
+    ladders: [{axis, unit, quantity, measure, tasks: [tasks, the easiest first]}]
+
+A task is an entry with the fields of `BenchmarkTask`, but its axis; empty ones are left out. Names say little about a
+world: two libraries had a deep_sea whose actions meant other things. So a task is known by its arrays.
+"""
+
+import hashlib
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pharos.errors import FileFormatError, MissingExtra, ParameterError, UnknownName
+from pharos.mdp import ChanceSetting, TabularMDP
+from pharos.system.records import read
+from pharos.training import Task
+
+FOLDER = Path(__file__).parent / "suites"
+CORE = "core"
+BITS = 40
+"""Of a mantissa that enter a digest, 12 digits: what compilers and processors may round differently is beyond."""
+TOLERANCE = 1e-6
+"""Of values, relative to V* less that of uniform play: solvers may sum in another order."""
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """How agents are run on the tasks of a suite.
+
+    Attributes:
+        steps: of an agent, on each task. evaluations: points of the curve, equally far apart, the last one at the end.
+        seeds: runs of each task that a score which is not preliminary has; 0 to seeds - 1.
+        gamma, horizon: of values, as `pharos.training.Task` takes them.
+    """
+
+    steps: int = 30_000
+    evaluations: int = 15
+    seeds: int = 10
+    gamma: float = 1.0
+    horizon: int | str | None = "limit"
+
+    @property
+    def evaluation_interval(self) -> int:
+        """Steps between evaluations."""
+        return self.steps // self.evaluations
+
+
+@dataclass(frozen=True)
+class BenchmarkTask:
+    """One task of a suite: a world, what is seen of it, and what is known of it before any run.
+
+    Attributes:
+        name: unique in its suite, and fit for a file name.
+        environment, parameters: as `pharos.make` takes them. observation, observation_options: as `pharos.observe`.
+        chance: the kinds of `ChanceSetting` that are not 0.
+        axis: "core", or that of its ladder.
+        level: on a ladder: the measured quantity, in the ladder's unit; None in the core.
+        predicted: normalised regret, 0 optimal and 1 uniform play, of idealised learners: "dqn", "ppo", and "table",
+            that of the DQN with a table; some may be missing.
+        value_optimal, value_uniform: at the start, of the optimal policy and of uniform play.
+        digest: SHA-256 of the task as it was frozen; see `digest_of_task`.
+        seconds: processor time of one run of a baseline that was measured, by its name; a guide.
+    """
+
+    name: str
+    environment: str
+    parameters: Mapping[str, Any] = field(default_factory=dict)
+    observation: str = "vector"
+    observation_options: Mapping[str, Any] = field(default_factory=dict)
+    chance: Mapping[str, float] = field(default_factory=dict)
+    axis: str = CORE
+    level: float | None = None
+    predicted: Mapping[str, float] = field(default_factory=dict)
+    value_optimal: float = float("nan")
+    value_uniform: float = float("nan")
+    digest: str = ""
+    seconds: Mapping[str, float] = field(default_factory=dict)
+
+    def training_task(self, protocol: Protocol) -> Task:
+        """What an agent learns; nothing is built before it is needed."""
+        return Task.of(
+            self.environment,
+            self.parameters,
+            observation=self.observation,
+            observation_options=dict(self.observation_options),
+            chance=ChanceSetting.from_dict(self.chance),
+            gamma=protocol.gamma,
+            horizon=protocol.horizon,
+        )
+
+    def check(self, protocol: Protocol) -> None:
+        """ParameterError where the task is another one on this installation. Cost: its states are built and solved."""
+        task = self.training_task(protocol)
+        if (found := digest_of_task(task)) != self.digest:
+            raise ParameterError(
+                f"task {self.name}: its digest is {found[:16]}... on this installation; expected "
+                f"{self.digest[:16]}...: rules, rewards, chance or observations differ; install the version of pharos "
+                f"that the suite is of"
+            )
+        reference = task.reference
+        for name in ("optimal", "uniform"):
+            value, expected = getattr(reference, name), getattr(self, f"value_{name}")
+            if not abs(value - expected) <= TOLERANCE * (self.value_optimal - self.value_uniform):
+                raise ParameterError(
+                    f"task {self.name}: the value of {name} play is {value!r} on this installation; expected "
+                    f"{expected!r}; install the version of pharos that the suite is of"
+                )
+
+
+@dataclass(frozen=True)
+class Ladder:
+    """One world that gets harder along one quantity.
+
+    Attributes:
+        axis: such as "exploration". unit: of the levels, such as "bits". quantity: what a level is, in words.
+        tasks: with increasing levels.
+        measure: by which `benchmarks/benchmark_select.py` finds the levels.
+    """
+
+    axis: str
+    unit: str
+    quantity: str
+    tasks: tuple[BenchmarkTask, ...]
+    measure: str = ""
+
+
+@dataclass(frozen=True)
+class Suite:
+    """Tasks that stay what they are, and the protocol of runs on them.
+
+    Attributes:
+        name: such as "v1". protocol: of all tasks.
+        core: tasks that a score is the mean of. ladders: one for each axis.
+        digest: SHA-256 of the protocol and of the tasks; see `digest_of_suite`.
+        hyperparameters: of baselines by name, one setting for all tasks.
+    """
+
+    name: str
+    protocol: Protocol
+    core: tuple[BenchmarkTask, ...]
+    ladders: tuple[Ladder, ...]
+    digest: str
+    hyperparameters: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+
+    @property
+    def tasks(self) -> tuple[BenchmarkTask, ...]:
+        """All tasks: the core, then ladder after ladder."""
+        return (*self.core, *(task for ladder in self.ladders for task in ladder.tasks))
+
+    @cached_property
+    def _by_name(self) -> dict[str, BenchmarkTask]:
+        return {task.name: task for task in self.tasks}
+
+    def task(self, name: str) -> BenchmarkTask:
+        """The task of this name; UnknownName where there is none."""
+        if name not in self._by_name:
+            raise UnknownName(f"task of suite {self.name}", name, self._by_name)
+        return self._by_name[name]
+
+    def check(self) -> None:
+        """ParameterError, by name, for the first task that is another one on this installation. Cost: seconds."""
+        for task in self.tasks:
+            task.check(self.protocol)
+
+
+def load_suite(name_or_file: str | Path = "v1") -> Suite:
+    """Read a suite: one of pharos' own by its name, or a file of the same form.
+
+    Raises:
+        UnknownName: no such suite. FileFormatError: the file is no suite, or not what its digest says.
+        MissingExtra: PyYAML is not installed.
+    """
+    try:
+        import yaml
+    except ImportError as error:
+        raise MissingExtra("reading a suite", "pyyaml", "study") from error
+    path = Path(name_or_file)
+    if path.suffix not in (".yaml", ".yml"):
+        path = FOLDER / f"{name_or_file}.yaml"
+        known = sorted(each.stem for each in FOLDER.glob("*.yaml"))
+        if str(name_or_file) not in known:
+            raise UnknownName("suite", str(name_or_file), known)
+    try:
+        entry = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise FileFormatError(f"{path}: is no YAML: {str(error).splitlines()[0]}") from error
+    return suite_of(entry, str(path))
+
+
+def suite_of(entry: object, whose: str) -> Suite:
+    """A suite from its entries, as a file has them, whole and of the digest that it names.
+
+    Raises:
+        FileFormatError: an entry is missing, unknown, of another type or damaged; `whose` says of which file.
+    """
+    keys = [each.name for each in fields(Suite)]
+    if not isinstance(entry, dict) or {*entry} != {*keys}:
+        raise FileFormatError(f"{whose}: is no suite; expected the entries {', '.join(keys)}")
+    ladders = []
+    for each in _list(entry["ladders"], f"{whose}: ladders"):
+        of = f"{whose}: ladder {each.get('axis')}"
+        tasks = _tasks(each.get("tasks"), str(each.get("axis")), of)
+        ladders.append(replace(read(Ladder, {**each, "tasks": ()}, of, ("measure",)), tasks=tasks))
+    suite = Suite(
+        str(entry["name"]),
+        read(Protocol, entry["protocol"], f"{whose}: protocol"),
+        _tasks(entry["core"], CORE, f"{whose}: core"),
+        tuple(ladders),
+        str(entry["digest"]),
+        entry["hyperparameters"],
+    )
+    if len(suite._by_name) < len(suite.tasks):
+        raise FileFormatError(f"{whose}: two tasks have the same name; expected a name of its own for each")
+    if (found := digest_of_suite(suite)) != suite.digest:
+        raise FileFormatError(
+            f"{whose}: its tasks and protocol have the digest {found[:16]}...; the file says {suite.digest[:16]}...: "
+            f"it was changed; take the file as it was published"
+        )
+    return suite
+
+
+def _list(value: object, whose: str) -> list[dict[str, Any]]:
+    if not isinstance(value, list) or not all(isinstance(each, dict) for each in value):
+        raise FileFormatError(f"{whose}: expected a list of objects")
+    return value
+
+
+def _tasks(entries: object, axis: str, whose: str) -> tuple[BenchmarkTask, ...]:
+    optional = [each.name for each in fields(BenchmarkTask) if each.name not in ("name", "environment", "digest")]
+    return tuple(
+        read(BenchmarkTask, {**each, "axis": axis}, f"{whose}: task {each.get('name')}", optional)
+        for each in _list(entries, whose)
+    )
+
+
+def digest_of_suite(suite: Suite) -> str:
+    """SHA-256 of the protocol, and of name, axis, level and digest of each task, as canonical JSON."""
+    tasks = [[task.name, task.axis, task.level, task.digest] for task in suite.tasks]
+    return hashlib.sha256(_canonical({"protocol": vars(suite.protocol), "tasks": tasks})).hexdigest()
+
+
+def digest_of_task(task: Task) -> str:
+    """SHA-256 of a task as it is solved: what it is made of, by name, and its arrays.
+
+    The names: environment, all its parameters, version of its rules, observation with its options, chance, gamma and
+    time limit. The arrays, little-endian: of each state and action the possible next states, -1 for the end, in
+    increasing order, and their probabilities; rewards (S, A), the probability that an episode begins in each state,
+    which states are terminal, and the observation of each state. States are in the order in which they are found from
+    the start, which is the same everywhere. Numbers count by their first 40 bits.
+    """
+    space, mdp = task.space, task.space.mdp(gamma=task.gamma)
+    env, observe = task.env, task.sight.observe.observation
+    said = {
+        "environment": env.name,
+        "parameters": env.parameters,
+        "rules_version": env.version,
+        "observation": str(task.observation),
+        "observation_options": dict(task.observation_options),
+        "chance": {name: float(value) for name, value in task.chance.to_dict().items()},
+        **task.conventions,
+    }
+    digest = hashlib.sha256(_canonical(said))
+    for array in (*_arrays(mdp), observe(space.states())):
+        kind = "<f8" if array.dtype.kind == "f" else "<i8"
+        values = (rounded(array) if kind == "<f8" else array).astype(kind)
+        digest.update(_canonical([kind, list(array.shape)]))
+        digest.update(values.tobytes())
+    return digest.hexdigest()
+
+
+def _arrays(mdp: TabularMDP) -> Iterable[np.ndarray]:
+    """Rows s A + a, next states and probabilities of all that can happen; rewards, start, ends."""
+    num_states, num_actions = mdp.num_states, mdp.num_actions
+    pairs = np.arange(num_states * num_actions)
+    which, following, probabilities = mdp.dynamics.entries(pairs // num_actions, pairs % num_actions)
+    keys, inverse = np.unique(which * (num_states + 1) + following + 1, return_inverse=True)
+    yield keys // (num_states + 1)
+    yield keys % (num_states + 1) - 1
+    yield np.bincount(inverse, probabilities, len(keys))
+    start = np.zeros(num_states)
+    if isinstance(mdp.initial, np.ndarray):
+        start[:] = mdp.initial
+    else:
+        start[mdp.initial] = 1.0
+    yield from (np.asarray(mdp.rewards, np.float64), start, np.asarray(mdp.terminal, bool))
+
+
+def rounded(values: np.ndarray) -> np.ndarray:
+    """Numbers with mantissas of BITS bits; zero has no sign."""
+    mantissa, exponent = np.frexp(np.asarray(values, np.float64))
+    return np.ldexp(np.round(np.ldexp(mantissa, BITS)), exponent - BITS) + 0.0
+
+
+def _canonical(value: object) -> bytes:
+    return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()

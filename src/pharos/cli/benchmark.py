@@ -1,0 +1,80 @@
+"""pharos benchmark: agents on frozen tasks whose every state is known, and scores with units."""
+
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from pharos.cli.answers import Answer, console
+from pharos.cli.command import Commands
+from pharos.system.wording import many
+
+if TYPE_CHECKING:
+    from pharos.benchmark import BenchmarkTask, Suite
+
+app = Commands(no_args_is_help=True, help="Run agents on a frozen suite of solved tasks, and compare them.")
+
+SuiteName = Annotated[str, typer.Argument(metavar="[SUITE]", help="Name of a suite, or FILE.yaml.")]
+
+
+@app.command("show")
+def show(suite: SuiteName = "v1") -> Answer:
+    """Show the tasks of a suite, what is predicted of them, and how long baselines take."""
+    from pharos.benchmark import load_suite
+
+    found = load_suite(suite)
+    ladders: list[dict[str, Any]] = [
+        {
+            "axis": each.axis,
+            "unit": each.unit,
+            "quantity": each.quantity,
+            "tasks": [_entry(task) for task in each.tasks],
+        }
+        for each in found.ladders
+    ]
+    answer: dict[str, Any] = {"name": found.name, "digest": found.digest, "protocol": vars(found.protocol)}
+    answer |= {"core": [_entry(task) for task in found.core], "ladders": ladders, "minutes": _minutes(found)}
+    return Answer(answer, lambda: _print(found))
+
+
+def _entry(task: "BenchmarkTask") -> dict[str, Any]:
+    return {name: value for name, value in vars(task).items() if name != "axis"}
+
+
+def _minutes(suite: "Suite") -> dict[str, float]:
+    """Minutes of one processor that all seeds of all tasks take, by baseline; tasks without a time are left out."""
+    agents = dict.fromkeys(agent for task in suite.tasks for agent in task.seconds)
+    seeds = suite.protocol.seeds
+    return {agent: sum(task.seconds.get(agent, 0.0) for task in suite.tasks) * seeds / 60 for agent in agents}
+
+
+def _print(suite: "Suite") -> None:
+    from rich.markup import escape
+    from rich.table import Table
+
+    protocol, screen = suite.protocol, console()
+    tasks = many(len(suite.tasks), "task")
+    screen.print(f"[bold]{escape(suite.name)}[/bold], {tasks}: {suite.digest}", soft_wrap=True)
+    screen.print(
+        f"{protocol.steps:,} steps, {many(protocol.evaluations, 'evaluation')}, {many(protocol.seeds, 'seed')}, "
+        f"gamma {protocol.gamma:g}, horizon {protocol.horizon}"
+    )
+    screen.print()
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for name in ("axis", "task", "level"):
+        table.add_column(name)
+    for name in ("DQN", "PPO", "table"):
+        table.add_column(name, justify="right")
+    axis = ""
+    for ladder in [None, *suite.ladders]:
+        for task in suite.core if ladder is None else ladder.tasks:
+            level = "" if task.level is None or ladder is None else f"{task.level:.3g} {ladder.unit}"
+            numbers = (task.predicted.get(name) for name in ("dqn", "ppo", "table"))
+            cells = ("" if value is None else f"{value:.2f}" for value in numbers)
+            table.add_row("" if task.axis == axis else escape(task.axis), escape(task.name), escape(level), *cells)
+            axis = task.axis
+    screen.print(table)
+    text = "Regret as predicted before any run: 0 is optimal, 1 is uniform play."
+    if minutes := _minutes(suite):
+        times = ", ".join(f"{agent.upper()} {value:.0f}" for agent, value in minutes.items())
+        text += f" Minutes of one processor for all seeds: {times}"
+    screen.print(f"[dim]{text}[/dim]", soft_wrap=True)
