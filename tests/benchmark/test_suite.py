@@ -46,15 +46,15 @@ def test_levels_of_a_ladder_increase():
 def test_another_task_of_the_same_name_is_refused_by_it(other):
     frozen = replace(SEA, digest=GOLDEN, value_optimal=0.99, value_uniform=0.010625)
     frozen.check(Protocol())
-    with pytest.raises(ParameterError, match="^task deep_sea-6: its digest is"):
+    with pytest.raises(ParameterError, match=r"^task deep_sea-6: its digest is"):
         replace(frozen, **other).check(Protocol())
 
 
 def test_another_setting_of_values_is_refused():
     frozen = replace(SEA, digest=GOLDEN, value_optimal=0.99, value_uniform=0.010625)
-    with pytest.raises(ParameterError, match="^task deep_sea-6"):
+    with pytest.raises(ParameterError, match=r"^task deep_sea-6"):
         frozen.check(Protocol(gamma=0.9))
-    with pytest.raises(ParameterError, match="^task deep_sea-6: the value of uniform play is"):
+    with pytest.raises(ParameterError, match=r"^task deep_sea-6: the value of uniform play is"):
         replace(frozen, value_uniform=0.0107).check(Protocol())
 
 
@@ -82,18 +82,18 @@ def test_a_file_that_was_changed_is_refused(entry):
     ):
         changed = yaml.safe_load(yaml.safe_dump(entry))
         change(changed)
-        with pytest.raises(FileFormatError, match="^file: its tasks and protocol have the digest .*it was changed"):
+        with pytest.raises(FileFormatError, match=r"^file: its tasks and protocol have the digest .*it was changed"):
             suite_of(changed, "file")
 
 
 def test_errors_say_where(entry, tmp_path):
     with pytest.raises(UnknownName, match="v0"):
         load_suite("v0")
-    with pytest.raises(FileFormatError, match="^file: is no suite; expected the entries name"):
+    with pytest.raises(FileFormatError, match=r"^file: is no suite; expected the entries name"):
         suite_of({"name": "v1"}, "file")
     del entry["core"][1]["digest"]
-    with pytest.raises(FileFormatError, match=f"^file: core: task {entry['core'][1]['name']} lacks digest"):
+    with pytest.raises(FileFormatError, match=rf"^file: core: task {entry['core'][1]['name']} lacks digest"):
         suite_of(entry, "file")
     (tmp_path / "bad.yaml").write_text("a: [")
-    with pytest.raises(FileFormatError, match="bad.yaml: is no YAML"):
+    with pytest.raises(FileFormatError, match=r"bad\.yaml: is no YAML"):
         load_suite(tmp_path / "bad.yaml")
