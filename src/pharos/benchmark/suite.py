@@ -102,9 +102,9 @@ class BenchmarkTask:
     def check(self, protocol: Protocol) -> None:
         """ParameterError where the task is another one on this installation. Cost: its states are built and solved."""
         task = self.training_task(protocol)
-        if (found := digest_of_task(task)) != self.digest:
+        if (digest := digest_of_task(task)) != self.digest:
             raise ParameterError(
-                f"task {self.name}: its digest is {found[:16]}... on this installation; expected "
+                f"task {self.name}: its digest is {digest[:16]}... on this installation; expected "
                 f"{self.digest[:16]}...: rules, rewards, chance or observations differ; install the version of pharos "
                 f"that the suite is of"
             )
@@ -188,9 +188,9 @@ def load_suite(name_or_file: str | Path = "v1") -> Suite:
     path = Path(name_or_file)
     if path.suffix not in (".yaml", ".yml"):
         path = FOLDER / f"{name_or_file}.yaml"
-        known = sorted(each.stem for each in FOLDER.glob("*.yaml"))
-        if str(name_or_file) not in known:
-            raise UnknownName("suite", str(name_or_file), known)
+        names = sorted(each.stem for each in FOLDER.glob("*.yaml"))
+        if str(name_or_file) not in names:
+            raise UnknownName("suite", str(name_or_file), names)
     try:
         entry = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (yaml.YAMLError, UnicodeDecodeError) as error:
@@ -222,9 +222,9 @@ def suite_of(entry: object, whose: str) -> Suite:
     )
     if len(suite._by_name) < len(suite.tasks):
         raise FileFormatError(f"{whose}: two tasks have the same name; expected a name of its own for each")
-    if (found := digest_of_suite(suite)) != suite.digest:
+    if (digest := digest_of_suite(suite)) != suite.digest:
         raise FileFormatError(
-            f"{whose}: its tasks and protocol have the digest {found[:16]}...; the file says {suite.digest[:16]}...: "
+            f"{whose}: its tasks and protocol have the digest {digest[:16]}...; the file says {suite.digest[:16]}...: "
             f"it was changed; take the file as it was published"
         )
     return suite

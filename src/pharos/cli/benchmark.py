@@ -21,7 +21,7 @@ def show(suite: SuiteName = "v1") -> Answer:
     """Show the tasks of a suite, what is predicted of them, and how long baselines take."""
     from pharos.benchmark import load_suite
 
-    found = load_suite(suite)
+    loaded = load_suite(suite)
     ladders: list[dict[str, Any]] = [
         {
             "axis": each.axis,
@@ -29,11 +29,11 @@ def show(suite: SuiteName = "v1") -> Answer:
             "quantity": each.quantity,
             "tasks": [_entry(task) for task in each.tasks],
         }
-        for each in found.ladders
+        for each in loaded.ladders
     ]
-    answer: dict[str, Any] = {"name": found.name, "digest": found.digest, "protocol": vars(found.protocol)}
-    answer |= {"core": [_entry(task) for task in found.core], "ladders": ladders, "minutes": _minutes(found)}
-    return Answer(answer, lambda: _print(found))
+    answer: dict[str, Any] = {"name": loaded.name, "digest": loaded.digest, "protocol": vars(loaded.protocol)}
+    answer |= {"core": [_entry(task) for task in loaded.core], "ladders": ladders, "minutes": _minutes(loaded)}
+    return Answer(answer, lambda: _print(loaded))
 
 
 def _entry(task: "BenchmarkTask") -> dict[str, Any]:
