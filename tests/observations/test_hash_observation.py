@@ -1,4 +1,4 @@
-"""The observation `hash`: a random binary code that tells the state, and nothing of which states are alike."""
+"""The observations `hash` and `mixed`: random codes that tell the state, and nothing of which states are alike."""
 
 import itertools
 
@@ -47,3 +47,47 @@ def test_wrong_options_are_a_line(options):
     with pytest.raises(ParameterError, match=f"hash of simple_grid: {next(iter(options))} is") as error:
         observe(GRID, "hash", **options)
     assert "\n" not in str(error.value)
+
+
+def test_mixed_is_one_hot_and_words_at_its_ends():
+    one_hot, mixed = observe(GRID, "one_hot")(CELLS), observe(GRID, "mixed", share=0)(CELLS)
+    assert (mixed == one_hot).all()
+    signs = 2 * observe(GRID, "hash", bits=32, seed=3)(CELLS) - 1
+    words = observe(GRID, "mixed", share=1, seed=3)(CELLS)
+    np.testing.assert_allclose(words, signs * np.sqrt(2 / 32), rtol=1e-6)
+    with pytest.raises(ParameterError, match="mixed of simple_grid: share is 1.5"):
+        observe(GRID, "mixed", share=1.5)
+    with pytest.raises(ParameterError, match="mixed of simple_grid: seed is -1"):
+        observe(GRID, "mixed", seed=-1)
+
+
+@settings(deadline=None, max_examples=20)
+@given(share=st.floats(0, 1), more=st.floats(0, 1), seed=st.integers(0, 2**70))
+def test_mixed_tells_all_states_keeps_the_length_of_codes_and_grows_by_states(share, more, seed):
+    less, larger = sorted((share, more))
+    first, second = (observe(GRID, "mixed", share=each, seed=seed)(CELLS) for each in (less, larger))
+    assert len(np.unique(first, axis=0)) == len(CELLS)
+    np.testing.assert_allclose((first**2).sum(axis=1), 2, rtol=1e-5)
+    is_word, is_word_later = (codes.min(axis=1) < 0 for codes in (first, second))
+    assert (is_word <= is_word_later).all()
+    assert (first[is_word] == second[is_word]).all()
+    deviation = np.sqrt(less * (1 - less) / len(CELLS))
+    assert abs(is_word.mean() - less) <= 6 * deviation + 1 / len(CELLS)
+
+
+def test_a_vector_environment_and_a_kernel_take_mixed():
+    grid = pharos.make("simple_grid", height=3, width=3)
+    vec = pharos.make_vec(grid, 2, observation="mixed", observation_options={"share": 0.5}, seed=0)
+    seen, _ = vec.reset(seed=0)
+    space = pharos.build(grid, progress=False)
+    mixed = observe(grid, "mixed", share=0.5)
+    assert (seen == mixed(np.zeros((2, 2), np.int64))).all()
+    every = np.arange(space.num_states)
+    kernels = [
+        pharos.observations.representation(space, *seen, **options).kernel(every, every)
+        for seen, options in ((["one_hot"], {}), (["mixed"], {"share": 0.0}), (["mixed"], {"share": 1.0}))
+    ]
+    assert (kernels[0] == kernels[1]).all()
+    np.testing.assert_allclose(np.diag(kernels[2]), np.diag(kernels[0]), rtol=1e-5)
+    likeness = [kernel[~np.eye(len(every), dtype=bool)] / kernel[0, 0] for kernel in kernels]
+    assert likeness[2].mean() < likeness[0].mean()

@@ -124,3 +124,30 @@ def test_environments_may_be_given_by_name():
     assert observations.observe("breakout/12x8x1", "vector").env == pharos.make("breakout/12x8x1")
     with pytest.raises(ParameterError, match="env is 3; expected a pharos Environment, or a name"):
         observations.observe(3, "vector")
+
+
+def test_what_is_seen_first_is_told_by_start_states_alone():
+    chain = pharos.make("memory_chain", memory_length=2, num_bits=2)
+    whole, once = observations.observe(chain, "one_hot"), observations.observe(chain, "one_hot", seen_first="bits")
+    states = np.array([(step, query, *bits) for step in range(4) for query in range(2) for bits in np.ndindex(2, 2)])
+    bits = np.array([name.startswith("bits") for name in once.names])
+    first = states[:, 0] == 0
+    expected = whole(states)
+    expected[np.ix_(~first, bits)] = 0
+    assert (once(states) == expected).all()
+    assert once.space == whole.space
+    one = observations.observe(chain, "one_hot", seen_first=["bits[1]"])(states)
+    assert one[~first].sum(axis=1).tolist() == [3] * (~first).sum()
+    with pytest.raises(ParameterError, match="one_hot of memory_chain: there is no 'bit' to hide; expected some of"):
+        observations.observe(chain, "one_hot", seen_first="bit")
+    with pytest.raises(ParameterError, match="one_hot of memory_chain: seen_first is 3; expected names"):
+        observations.observe(chain, "one_hot", seen_first=3)
+
+
+def test_without_memory_a_chain_whose_bit_is_seen_first_is_a_guess():
+    """Every policy of the observation is worth 0, the optimum 1: aliased states, as the loss says."""
+    space = pharos.build(pharos.make("memory_chain", memory_length=3), progress=False)
+    once = observations.observe(space.environment, "one_hot", seen_first="bits")
+    classes = observations.observation_classes(space, once)
+    loss = observations.memoryless_loss(space.mdp(gamma=1.0), classes)
+    assert loss.lower == pytest.approx(1) == loss.upper

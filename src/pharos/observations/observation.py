@@ -120,12 +120,13 @@ _BUILT_IN = {
     "one_hot": "vector:OneHot",
     "index": "vector:Index",
     "hash": "hash:Hash",
+    "mixed": "hash:Mixed",
     "recorded": "recorded:Recorded",
 }
 _registered: dict[str, tuple[Function, Any]] = {}
 
 # Options that change what an agent is told, not how
-TELLING = ("motion", "hide", "frames", "irrelevant")
+TELLING = ("motion", "hide", "seen_first", "frames", "irrelevant")
 
 
 def names() -> list[str]:

@@ -41,7 +41,7 @@ def render(env: Environment, state: Sequence[int], observation: str = "human", *
 
 def renderers() -> list[str]:
     """The names that `render` knows; of the observations, those that may be images."""
-    return [*RENDERERS, *(name for name in names() if name not in ("vector", "one_hot", "index", "hash"))]
+    return [*RENDERERS, *(name for name in names() if name not in ("vector", "one_hot", "index", "hash", "mixed"))]
 
 
 @cache

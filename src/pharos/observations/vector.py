@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 MOST_EXACT = 1 << 24  # integers up to here are told apart in float32
 MOST_ONE_HOT = 1 << 20
 MOST_IRRELEVANT = 10
+MOST_STARTS = 4096
 
 
 class Vector(Observation):
@@ -78,11 +79,17 @@ class Vector(Observation):
 class OneHot(Observation):
     """A one for the value of every component and zeros elsewhere: (sum of the sizes of the ranges,) uint8. Complete.
 
+    Args:
+        seen_first: variables that the agent sees in start states only, or single components of them, named as for
+            `hide` of a vector: their entries stay, and are 0 in all other states. So what an episode is about can be
+            told once, and has to be remembered.
     Raises:
-        ParameterError: it would have more than MOST_ONE_HOT entries.
+        ParameterError: it would have more than MOST_ONE_HOT entries, `seen_first` names no variable, or there are more
+            than MOST_STARTS start states to compare with.
+    Source: seen_first: memory_chain of bsuite, which shows its bits in the first step alone.
     """
 
-    def __init__(self, env: Environment):
+    def __init__(self, env: Environment, *, seen_first: str | Sequence[str] = ()):
         from gymnasium.spaces import MultiBinary
 
         components = env.components
@@ -101,12 +108,27 @@ class OneHot(Observation):
         self.space = MultiBinary(length)
         self._low = components.low
         self._offset = np.cumsum(components.size) - components.size
+        self._first = np.zeros(length, bool)  # entries that start states alone show
+        whose = f"one_hot of {env.name}"
+        for name in hidden_names(seen_first, whose, components.variables, components.names, "seen_first"):
+            columns = components.variables.get(name) or components.names.index(name)
+            for i in np.arange(len(components))[columns].ravel():
+                self._first[self._offset[i] : self._offset[i] + components.size[i]] = True
+        starts = env.initial_states() if self._first.any() else []
+        if len(starts) > MOST_STARTS:
+            raise ParameterError(f"{whose}: seen_first with {len(starts)} start states; expected at most {MOST_STARTS}")
+        self._starts = np.array([state for state, _ in starts], np.int64)
 
     def __call__(self, states: np.ndarray) -> np.ndarray:
         from pharos.kernels.observation_kernels import mark_components
 
         out = np.zeros((len(states), len(self.names or ())), np.int8)
         mark_components(states, self._low, self._offset, out)
+        if len(self._starts):
+            is_start = np.zeros(len(states), bool)
+            for start in self._starts:
+                is_start |= (states == start).all(axis=1)
+            out[np.ix_(~is_start, self._first)] = 0
         return out
 
 
