@@ -55,7 +55,7 @@ def test_mixed_is_one_hot_and_words_at_its_ends():
     signs = 2 * observe(GRID, "hash", bits=32, seed=3)(CELLS) - 1
     words = observe(GRID, "mixed", share=1, seed=3)(CELLS)
     np.testing.assert_allclose(words, signs * np.sqrt(2 / 32), rtol=1e-6)
-    with pytest.raises(ParameterError, match="mixed of simple_grid: share is 1.5"):
+    with pytest.raises(ParameterError, match=r"share is 1\.5"):
         observe(GRID, "mixed", share=1.5)
     with pytest.raises(ParameterError, match="mixed of simple_grid: seed is -1"):
         observe(GRID, "mixed", seed=-1)
