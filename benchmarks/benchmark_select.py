@@ -31,6 +31,7 @@ CANDIDATES = Path(__file__).parent / "benchmark_candidates.csv"
 FILE = FOLDER / "v1.yaml"
 TASKS, PER_CLASS, MOST_STATES = 24, 3, 2_000
 SOLVED, FAILED = 0.1, 0.9  # the window
+TIE = 1e-6  # of values
 OBSERVATIONS = {"hash": {"bits": 64}, "simple_image": {"motion": True}}
 HEAD = """\
 # The suite {name} of `pharos benchmark`, by `python benchmarks/benchmark_select.py`: only rungs are written by hand.
@@ -106,17 +107,85 @@ def log10_states(task, learnt):
     return math.log10(learnt.space.num_states)
 
 
-def parameter(name):
-    """A parameter of the environment that is a number of steps."""
-    return lambda task, learnt: float(task.parameters[name])
+def advantage_lag(task, learnt):
+    """Longest mean delay, in steps, between an action that loses something and what it loses.
+
+    The delay is a mean over the rewards that are lost, weighted by what is lost: the derivative of ln(V - Q) by the
+    discount, at 1, where actions after the first are the same. With D = dQ / d discount of these actions,
+    D(s, a) = sum over s' of P(s' | s, a) (V(s') + D(s', best)).
+    """
+    q = learnt.optimal.q
+    best = (np.arange(len(q)), q.argmax(axis=1))
+    v, slope = np.append(q[best], 0.0), np.zeros_like(q)
+    for _ in range(learnt.time_limit):
+        slope = learnt.mdp.dynamics.expected(v + np.append(slope[best], 0.0))
+    gaps = q[best][:, None] - q
+    loses = gaps > TIE
+    return float(((slope[best][:, None] - slope)[loses] / gaps[loses]).max(initial=0.0))
+
+
+def network_less_table(task, learnt):
+    """Predicted regret of the idealised DQN with a network, less that of the same with a table."""
+    predicted = task.predicted or predicted_regret(task)
+    return predicted["dqn"] - predicted["table"]
+
+
+def predicted_regret(task):
+    """Predictions for the DQN of the suite, as an entry has them."""
+    from pharos import predict
+
+    protocol = Protocol()
+    hyperparameters = yaml.safe_load(FILE.read_text())["hyperparameters"]["dqn"]
+    [cell] = predict(
+        task.environment,
+        (task.observation, task.observation_options),
+        steps=protocol.steps,
+        horizon=protocol.horizon,
+        hyperparameters=hyperparameters,
+        **task.chance,
+        **task.parameters,
+    ).cells
+    return {"dqn": cell.value, "table": cell.tabular}
+
+
+def memory_steps(task, learnt):
+    """Steps back to the observation that says which action is best; 0 where the present one does.
+
+    Two states are alike for k steps if they share their observation, and after the same actions k steps long, as do
+    states on the way. Counted are the steps until all that are alike have a best action in common. Worlds with one
+    outcome only; infinite where no number of steps suffices.
+    """
+    from pharos.observations import observation_classes, observe
+
+    space, q = learnt.space, learnt.optimal.q
+    seen = observe(space.environment, task.observation, state_space=space, **task.observation_options)
+    classes = observation_classes(space, seen)
+    if len(np.unique(classes)) == len(classes):
+        return 0.0
+    best = q > q.max(axis=1, keepdims=True) - TIE
+    is_same = (classes[:, None] == classes) & ~np.eye(len(classes), dtype=bool)
+    is_same &= ~(learnt.mdp.terminal[:, None] | learnt.mdp.terminal)
+    successors, alike = np.asarray(space.successors), is_same
+    for steps in range(len(classes) ** 2):
+        first, second = np.nonzero(alike)
+        if (best[first] & best[second]).any(axis=1).all():
+            return float(steps)
+        after = np.zeros_like(alike)
+        for action in range(q.shape[1]):
+            after[successors[first, action], successors[second, action]] = True
+        if steps and (after & is_same == alike).all():
+            return math.inf
+        alike = after & is_same
+    return math.inf
 
 
 LEVELS = {
     "exploration_bits": exploration_bits,
     "noise_over_gap": noise_over_gap,
     "log10_states": log10_states,
-    "chain_length": parameter("chain_length"),
-    "memory_length": parameter("memory_length"),
+    "advantage_lag": advantage_lag,
+    "network_less_table": network_less_table,
+    "memory_steps": memory_steps,
 }
 
 
