@@ -146,10 +146,12 @@ def make_model(
         "net_arch": options.pop("net_arch", [FEATURES]),
         **options.pop("policy_kwargs", {}),
     }
-    many = hasattr(env.observation_space, "spaces")
+    policy = "MultiInputPolicy" if hasattr(env.observation_space, "spaces") else "MlpPolicy"
+    if (with_memory := policy.replace("Policy", "LstmPolicy")) in getattr(algorithm(agent), "policy_aliases", {}):
+        policy = with_memory
     try:
         model = algorithm(agent)(
-            hyperparameters.get("policy", "MultiInputPolicy" if many else "MlpPolicy"),
+            hyperparameters.get("policy", policy),
             env,
             seed=seed,
             device="cpu",

@@ -11,7 +11,7 @@ from pharos.agents import AGENTS, algorithm, extractor, make_model
 from pharos.errors import FileFormatError, ParameterError, UntrustedCode
 from pharos.leaderboard.entry import POLICY, Entry
 from pharos.observations import observe
-from pharos.policies import DeepPolicy
+from pharos.policies import PolicyLike, deep_policy
 from pharos.training import Task
 
 LIBRARIES = ("stable_baselines3", "sb3_contrib")
@@ -22,7 +22,7 @@ SMALLEST = ({"buffer_size": 1}, {"n_steps": 2, "batch_size": 2})
 """What takes memory, and does not matter to a policy that learns no more: of replay, or of rollouts."""
 
 
-def policy_of(entry: Entry, task: Task, *, trust: bool = False) -> np.ndarray | DeepPolicy:
+def policy_of(entry: Entry, task: Task, *, trust: bool = False) -> PolicyLike:
     """The policy of an entry, as `training.evaluate_agent` takes it.
 
     Args:
@@ -50,7 +50,7 @@ def _table(entry: Entry, task: Task) -> np.ndarray:
     )
 
 
-def _network(entry: Entry, task: Task, trust: bool) -> DeepPolicy:
+def _network(entry: Entry, task: Task, trust: bool) -> PolicyLike:
     config = entry.config
     if trust:
         agent, hyperparameters = config.algorithm(trust=True, strict=True), dict(entry.hyperparameters)
@@ -77,7 +77,7 @@ def _network(entry: Entry, task: Task, trust: bool) -> DeepPolicy:
     except (RuntimeError, TypeError, ValueError, KeyError, AttributeError) as error:
         first = " ".join(str(error).split())[:200]
         raise FileFormatError(f"its network is none of {config.agent} on this task: {first}") from None
-    return DeepPolicy(model)
+    return deep_policy(model)
 
 
 def _known_agent(name: str) -> str:

@@ -1,6 +1,15 @@
 """Policies: tables, and functions of observations; asked in the states that they reach, and evaluated."""
 
-from pharos.policies.policy import DeepPolicy, Model, Policy, PolicyLike, TabularAgent, policy_function
+from pharos.policies.policy import (
+    DeepPolicy,
+    Model,
+    Policy,
+    PolicyLike,
+    RecurrentPolicy,
+    TabularAgent,
+    deep_policy,
+    policy_function,
+)
 from pharos.policies.query import PolicyAnswers, QueriedPolicy, ReachableRows, Sight, TableAnswers, reachable_rows
 from pharos.policies.value import (
     Evaluation,
@@ -19,6 +28,7 @@ __all__ = [
     "evaluate_policy",
 ]
 _shared = """
-    DeepPolicy Model PolicyAnswers PolicyLike QueriedPolicy ReachableRows ReachedSolution Sight TableAnswers
-    TabularAgent is_small_table is_walk policy_function policy_value reachable_rows table_values walk_values
+    DeepPolicy Model PolicyAnswers PolicyLike QueriedPolicy ReachableRows ReachedSolution RecurrentPolicy Sight
+    TableAnswers TabularAgent deep_policy is_small_table is_walk policy_function policy_value reachable_rows
+    table_values walk_values
 """

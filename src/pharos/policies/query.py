@@ -254,7 +254,7 @@ class PolicyAnswers(QueriedPolicy):
     def __init__(self, policy: PolicyLike, mdp: TabularMDP, sight: Sight, *, deterministic: bool = False):
         super().__init__(mdp, sees_previous_action=sight.previous_action)
         self.policy, self.sight, self.deterministic = policy_function(policy), sight, deterministic
-        _check_observation(policy, sight.observe.space, sight.observation)
+        check_observation(policy, sight.observe.space, sight.observation)
 
     def _query(self, rows: np.ndarray) -> np.ndarray:
         states, previous = np.divmod(rows, self.width)
@@ -270,8 +270,12 @@ class PolicyAnswers(QueriedPolicy):
         return total / 2**irrelevant
 
     def answer(self, observations: Any, count: int = 1) -> np.ndarray:
-        """(N, A) probabilities for a batch of `count` observations; ParameterError for any other answer."""
-        answer = np.asarray(self.policy(observations))
+        """(N, A) probabilities for a batch of `count` observations."""
+        return self.checked(self.policy(observations), count)
+
+    def checked(self, answer: Any, count: int) -> np.ndarray:
+        """(N, A) probabilities of an answer to `count` observations; ParameterError for any other."""
+        answer = np.asarray(answer)
         if answer.dtype.kind in "iu" and answer.shape == (count,):
             if (answer < 0).any() or (answer >= self.num_actions).any():
                 raise ParameterError(
@@ -318,7 +322,7 @@ class TableAnswers(QueriedPolicy):
         return np.eye(self.num_actions)[answers] if answers.ndim == 1 else np.asarray(answers, np.float64)
 
 
-def _check_observation(policy: Any, space: Any, name: Any) -> None:
+def check_observation(policy: Any, space: Any, name: Any) -> None:
     """ParameterError where a model was trained on observations of another shape."""
     model = getattr(policy, "model", policy)
     expected = getattr(getattr(model, "observation_space", None), "shape", None)

@@ -19,7 +19,7 @@ from pharos import solvers
 from pharos.errors import DivergenceError, ParameterError
 from pharos.mdp import PolicyTable, Rewards, Table, TabularMDP, require_mdp
 from pharos.policies.histories import answers_of
-from pharos.policies.policy import Model, Policy, PolicyLike, TabularAgent
+from pharos.policies.policy import Model, Policy, PolicyLike, RecurrentPolicy, TabularAgent
 from pharos.policies.query import PolicyAnswers, QueriedPolicy, ReachableRows, Sight, TableAnswers
 from pharos.solvers import Solution
 from pharos.state_space import load
@@ -115,7 +115,7 @@ def evaluate_policy(
             integers or (S, A + 1, A) probabilities, for each previously executed action and, last, for none; or a
             function from an array of state indices to either. Or a policy that sees observations: a model of
             Stable-Baselines3, or, with `observation`, a function of a batch of observations that returns (N, A)
-            probabilities or (N,) actions.
+            probabilities or (N,) actions. One with a memory has no values of states, see `training.evaluate_agent`.
         tolerance: every value is within this of the true one, proven.
         horizon: number of steps to go, instead of the MDP's own.
         observation: what the policy sees, a name or an Observation; of models "vector" when not given.
@@ -134,7 +134,7 @@ def evaluate_policy(
     """
     if isinstance(policy, TabularAgent):
         policy = policy.policy_table()
-    if observation is not None or isinstance(policy, Policy | Model):
+    if observation is not None or isinstance(policy, Policy | RecurrentPolicy | Model):
         if processes != 1:
             raise ParameterError("a policy that sees observations is evaluated by one process; expected processes=1")
         timed = mdp if horizon is None else mdp.with_horizon(horizon)

@@ -40,9 +40,12 @@ def evaluate_agent(
     Args:
         agent: has `policy_table()` (S,), (S, A) or as `pharos.evaluate_policy` takes it; or
             `action_probabilities(observations)` -> (N, A); or is a model of Stable-Baselines3; or an array like the
-            table; or a function of observations that returns (N, A) probabilities or (N,) actions.
+            table; or a function of observations that returns (N, A) probabilities or (N,) actions; or one with a
+            memory: `initial_state(n)` and `(observations, state, starts)` -> (probabilities or actions, next state),
+            the state an array or nested tuples of arrays whose first axis is n. It is asked in histories.
         deterministic: whether the most probable action is taken (the first among equals) instead of one at random.
-        max_states: how many states (pairs, where previous actions matter) the policy may reach for an exact value.
+        max_states: how many states (pairs, where previous actions matter; histories, of a memory) the policy may
+            reach for an exact value.
         episodes, seed: of the estimate beyond that.
         again: whether more policies of the task will be evaluated: what they share is remembered. Changes no value.
     Raises:

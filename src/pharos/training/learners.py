@@ -13,7 +13,7 @@ import numpy as np
 
 from pharos.agents import QLearning, check_hyperparameters, joined_states, make_model, state_of
 from pharos.errors import FileFormatError
-from pharos.policies import DeepPolicy
+from pharos.policies import PolicyLike, deep_policy
 from pharos.training import results
 from pharos.training.task import Task
 
@@ -176,7 +176,7 @@ class Deep:
         self.gamma, self.steps = task.gamma, steps
         self.env = vector_environment(task, int(hyperparameters.get("n_envs", 1)), seed)
         self.model = make_model(agent, self.env, hyperparameters, seed=seed, tensorboard=tensorboard)
-        self.agent = DeepPolicy(self.model)
+        self.agent = deep_policy(self.model)
         self.finished = (0, 0.0)  # episodes, and the sum of their returns
 
     @property
@@ -187,7 +187,7 @@ class Deep:
     def returns(self) -> np.ndarray:
         return np.array([self.finished[1]])
 
-    def policy(self, i: int) -> DeepPolicy:
+    def policy(self, i: int) -> PolicyLike:
         return self.agent
 
     def greedy_actions(self, places: Sequence[int]) -> None:
