@@ -30,6 +30,7 @@ LINES = (
     "cache list",
     "study show quick",
     "benchmark show",
+    "benchmark run --agent oracle --out benchmark --tasks exploration --seeds 1",
     "study status quick",
 )
 

@@ -60,6 +60,10 @@ class AgentResults:
             if not np.isfinite(curve).all():
                 raise ParameterError(f"curves of {self.agent} on {name} hold NaN or infinity; expected finite numbers")
 
+    def mean(self) -> float:
+        """Normalised regret, the mean of all tasks, seeds and evaluations."""
+        return float(np.mean([curve.mean() for curve in self.curves.values()]))
+
     @staticmethod
     def read(source: str | os.PathLike) -> "AgentResults":
         """Results of the folder of a run, of a file, or of a shipped baseline, by name (`dqn`, of v1; or `v1/dqn`).

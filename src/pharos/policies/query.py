@@ -283,6 +283,10 @@ class PolicyAnswers(QueriedPolicy):
                 )
             return np.eye(self.num_actions)[answer]
         answer = answer.astype(np.float64)
+        if np.isnan(answer).any():
+            raise ParameterError(
+                f"the policy answered NaN for {count} observations; expected probabilities, or actions"
+            )
         if answer.shape != (count, self.num_actions) or not (answer >= 0).all():
             raise ParameterError(
                 f"the policy answered with shape {answer.shape} for {count} observations; expected "

@@ -12,9 +12,10 @@ if TYPE_CHECKING:
     from pharos.solvers import ReferenceValues, cumulative_expected_regret, regret
     from pharos.training.batch import Progress, train_configs
     from pharos.training.config import CELL, RunConfig, run_id
-    from pharos.training.curve import RegretCurve, bootstrap_interval
+    from pharos.training.curve import Curve, RegretCurve, bootstrap_interval
     from pharos.training.evaluation import Evaluation, evaluate_agent
     from pharos.training.options import ENGINES, Horizon, TrainingOptions
+    from pharos.training.process_pool import train_parts
     from pharos.training.results import (
         check_agent,
         digest_of_curve,
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
         read_record,
         read_rows,
         read_table,
+        versions,
+        write_curve,
         write_record,
         write_table,
     )
@@ -52,9 +55,9 @@ __all__ = [
     "tune",
 ]
 _shared = """
-    CELL ENGINES FailedRun Horizon Progress SPACES TaskCache TaskValues TuningResult bootstrap_interval check_agent
-    clear_run digest_of_curve read_curve read_curve_table read_record read_rows read_table run_id write_record
-    write_table
+    CELL Curve ENGINES FailedRun Horizon Progress SPACES TaskCache TaskValues TuningResult bootstrap_interval
+    check_agent clear_run digest_of_curve read_curve read_curve_table read_record read_rows read_table run_id
+    train_parts versions write_curve write_record write_table
 """
 
 __getattr__ = lazy.attributes(__name__)

@@ -142,7 +142,7 @@ class TaskCache:
             return Member(place, config, folder, task, chosen, make, key, is_alone)
         from pharos.agents.batched import BatchRun, ObservationSource, group_key, supports
 
-        check_hyperparameters(config.agent, chosen)
+        check_hyperparameters(config.agent, {name: chosen[name] for name in chosen if name != "double"})  # ours alone
         lacking = supports(config.agent, chosen)
         if lacking is not None:
             raise ParameterError(f"the batched engine: {lacking}; the engine sb3 has it")

@@ -1,0 +1,352 @@
+"""Forms in which an agent plugs in. All leave the same: a curve of exact normalised regret for each task and seed.
+
+    engine       q_learning, dqn, ppo (the batched engine), a2c: pharos trains them, with one setting for all tasks
+    class        module:Class or file.py:Class, with Stable-Baselines3's interface
+    generator    file.py:learn or a function: learn(env, steps, seed), see budget.py
+    exact        oracle and random: the optimal policy and uniform play, solved and not run
+
+`agent_form` chooses; a further form is a subclass of `Form`, and a line there.
+"""
+
+import contextlib
+import hashlib
+import inspect
+import multiprocessing
+import os
+from collections import defaultdict
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pharos.agents import AGENTS, BATCHED, batched, check_hyperparameters, is_known
+from pharos.agents import hyperparameters as hyperparameters_of
+from pharos.benchmark.budget import Learn, generated_curve, uniform_policy
+from pharos.benchmark.suite import BenchmarkTask, Protocol, Suite
+from pharos.errors import ParameterError, PharosError
+from pharos.system.sources import Source, find, is_reference, load, source_of
+from pharos.system.wording import in_one_line
+from pharos.system.workers import check_guard, end_with_parent, without_interrupts, without_main
+from pharos.training import (
+    RunConfig,
+    Task,
+    TaskCache,
+    clear_run,
+    evaluate_agent,
+    read_record,
+    read_rows,
+    regret,
+    run_id,
+    train_configs,
+    train_parts,
+    write_curve,
+    write_record,
+)
+
+EXACT = ("oracle", "random")
+# What only some classes of environments declare for an agent: with these, the setting is one for all tasks
+ALSO: Mapping[str, Mapping[str, Any]] = {"dqn": {"n_envs": 1, "n_steps": 1}}
+THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+
+Tell = Callable[[float, str], None]
+"""tell(share of the steps that are done, text)."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """One run: an agent on a task, with a seed; its files go into a folder."""
+
+    task: BenchmarkTask
+    seed: int
+    folder: Path
+
+
+@dataclass(frozen=True)
+class Form:
+    """An agent, and how it is run.
+
+    Attributes:
+        label: of the agent, for tables. kind: of form, as in the table above.
+        hyperparameters: all that are known; one setting for all tasks.
+        source: where code of the user's own comes from.
+        checksum: SHA-256 of that file, or of the text of a function that is in none; empty where pharos has the code.
+    """
+
+    label: str
+    kind: str
+    hyperparameters: Mapping[str, Any] = field(default_factory=dict)
+    source: Source | None = None
+    checksum: str = ""
+
+    def train(self, jobs: Sequence[Job], protocol: Protocol, workers: int, checkpoints: Path, tell: Tell) -> None:
+        """Let each run leave a finished run.json and a curve in its folder, or a run.json that says why not."""
+        raise NotImplementedError
+
+    def curve(self, job: Job, protocol: Protocol) -> tuple[np.ndarray, bool]:
+        """(evaluations,) normalised regret, and whether all of it is exact.
+
+        Raises:
+            PharosError: the run has not finished; why not.
+        """
+        record = read_record(job.folder) if (job.folder / "run.json").exists() else {}
+        if record.get("status") != "finished":
+            raise PharosError(record.get("error") or "its process ended without a result; the same command goes on")
+        rows = {row["step"]: row for row in read_rows(job.folder)}
+        points = [protocol.evaluation_interval * (i + 1) for i in range(protocol.evaluations)]
+        exact = all(rows[point]["exact"] for point in points)
+        return np.array([rows[point]["normalized_regret"] for point in points]), exact
+
+
+def agent_form(agent: str | Callable[..., Any], suite: Suite, hyperparameters: Mapping[str, Any] | None = None) -> Form:
+    """The form of an agent; its code is imported.
+
+    Args:
+        agent: a name, `module:Name`, `file.py:Name`, or a generator function.
+        hyperparameters: go before those of the suite, and these before the agent's own.
+    Raises:
+        UnknownName, ParameterError: there is no such agent, file or hyperparameter.
+        MissingExtra: the library that it needs is not installed.
+    """
+    setting = dict(hyperparameters or {})
+    if not isinstance(agent, str):
+        return _generator(agent, source_of(agent), setting)
+    if agent in EXACT:
+        if setting:
+            raise ParameterError(f"agent {agent!r} has no hyperparameters; found {', '.join(setting)}")
+        return Exact(agent, "exact")
+    if is_reference(agent) and not is_known(agent):
+        source = find(agent)
+        code = load(source)
+        if not isinstance(code, type):
+            return _generator(code, source, setting)
+        check_hyperparameters(code, setting)
+        return Trained(agent, "class", setting, source, sha256(source.file))
+    defaults = {**hyperparameters_of(agent, "", ""), **ALSO.get(agent, {})} if agent in AGENTS else {}
+    chosen = {**defaults, **suite.hyperparameters.get(agent, {}), **setting}
+    lacking = batched.supports(agent, chosen) if agent in BATCHED else None
+    if lacking is not None:
+        raise ParameterError(f"the batched engine: {lacking}")
+    if agent not in AGENTS or not AGENTS[agent].is_tabular:
+        check_hyperparameters(
+            agent, {each: chosen[each] for each in chosen if each != "double" or agent not in BATCHED}
+        )
+    return Trained(agent, "engine" if agent in AGENTS else "class", chosen)
+
+
+def sha256(file: str | os.PathLike) -> str:
+    """SHA-256 of a file; empty where there is none."""
+    return hashlib.sha256(Path(file).read_bytes()).hexdigest() if Path(file).is_file() else ""
+
+
+# What pharos trains ---------------------------------------------------------------------------------------------------
+
+
+class Trained(Form):
+    """An agent that `pharos.training` trains: runs of the batched engine that fit together as one program."""
+
+    def train(self, jobs: Sequence[Job], protocol: Protocol, workers: int, checkpoints: Path, tell: Tell) -> None:
+        configs = [self._config(job, protocol) for job in jobs]
+        for job, config in zip(jobs, configs, strict=True):
+            # Stable-Baselines3 goes on from a checkpoint, but not to the same bytes: a killed run is begun anew
+            if config.engine == "sb3" and not config.is_tabular:
+                clear_run(job.folder)
+        folders, parts = [job.folder for job in jobs], self._parts(jobs, configs, protocol, workers)
+
+        def progress(now: Any) -> None:
+            said = f", {now.failed} failed" if now.failed else ""
+            tell(now.done / now.total, f"{now.finished} of {len(jobs)} runs{said}")
+
+        if len(parts) > 1:
+            train_parts(configs, folders, parts, checkpoints=checkpoints, device="cpu", progress=progress)
+            return
+        members = TaskCache(trust=True)  # the user has named the code
+        train_configs(configs, folders, checkpoints=checkpoints, progress=progress, members=members)
+
+    def _config(self, job: Job, protocol: Protocol) -> RunConfig:
+        task = job.task.training_task(protocol)
+        if self.label == "q_learning":
+            task = replace(task, observation="index", observation_options={})
+        return RunConfig.of_task(
+            task,
+            self.label,
+            steps=protocol.steps,
+            seed=job.seed,
+            evaluation_interval=protocol.evaluation_interval,
+            hyperparameters=self.hyperparameters,
+            engine="batched" if self.label in BATCHED else "sb3",
+        )
+
+    def _parts(
+        self, jobs: Sequence[Job], configs: Sequence[RunConfig], protocol: Protocol, workers: int
+    ) -> list[list[int]]:
+        """Places by process: whole lanes of runs that fit together, the longest first, each to the least busy."""
+        kinds: dict[str, Hashable] = {}
+        groups: dict[Hashable, list[int]] = defaultdict(list)
+        for place, (job, config) in enumerate(zip(jobs, configs, strict=True)):
+            if config.engine != "batched":
+                groups[place].append(place)
+                continue
+            if job.task.name not in kinds:
+                task = job.task.training_task(protocol)
+                kinds[job.task.name] = task.sight.observe.space.shape, task.env.num_actions
+            groups[kinds[job.task.name]].append(place)
+        lanes = []
+        for kind, group in groups.items():
+            width = batched.lane_width(isinstance(kind, tuple) and len(kind[0] or ()) == 3)
+            lanes += [group[first : first + width] for first in range(0, len(group), width)]
+        costs = [sum(jobs[place].task.seconds.get(self.label, 1.0) for place in lane) for lane in lanes]
+        parts: list[list[int]] = [[] for _ in range(min(workers, len(lanes)))]
+        busy = [0.0] * len(parts)
+        for i in sorted(range(len(lanes)), key=lambda i: -costs[i]):
+            least = busy.index(min(busy))
+            parts[least] += lanes[i]
+            busy[least] += costs[i]
+        return parts
+
+
+# Generators -----------------------------------------------------------------------------------------------------------
+
+
+def _generator(code: object, source: Source | None, setting: Mapping[str, Any]) -> Form:
+    name = source.name if source is not None else getattr(code, "__qualname__", repr(code))
+    if not callable(code):
+        raise ParameterError(
+            f"agent {name!r} is {code!r}; expected a class for Stable-Baselines3, or a function learn(env, steps, seed)"
+        )
+    if setting:
+        raise ParameterError(
+            f"agent {name!r} is a generator, which has its hyperparameters in its code; found {', '.join(setting)}"
+        )
+    try:
+        inspect.signature(code).bind(None, 0, 0)
+    except (TypeError, ValueError) as error:
+        raise ParameterError(f"agent {name!r}: {error}; expected a function learn(env, steps, seed)") from None
+    checksum = sha256(source.file) if source is not None else _text_checksum(code)
+    return Generated(name, "generator", source=source, checksum=checksum, learn=code)
+
+
+def _text_checksum(code: Callable[..., Any]) -> str:
+    with contextlib.suppress(OSError, TypeError):
+        return hashlib.sha256(inspect.getsource(code).encode()).hexdigest()
+    return ""
+
+
+@dataclass(frozen=True)
+class Generated(Form):
+    """A generator, run in processes of its own with one thread each; in this one where no other can import it.
+
+    Attributes:
+        learn: the function.
+    """
+
+    learn: Learn | None = None
+
+    def train(self, jobs: Sequence[Job], protocol: Protocol, workers: int, checkpoints: Path, tell: Tell) -> None:
+        missing, failed = [job for job in jobs if not _is_finished(job)], 0
+
+        def told(left: int) -> None:
+            said = f"{len(jobs) - left - failed} of {len(jobs)} runs{f', {failed} failed' * (failed > 0)}"
+            tell(1 - left / len(jobs), said)
+
+        told(len(missing))
+        ends = (
+            self._in_processes(missing, protocol, workers) if self.source is not None else self._here(missing, protocol)
+        )
+        for left, error in zip(range(len(missing) - 1, -1, -1), ends, strict=False):
+            failed += error is not None
+            told(left)
+
+    def _here(self, jobs: Sequence[Job], protocol: Protocol) -> Iterator[str | None]:
+        assert self.learn is not None
+        for job in jobs:
+            yield _generate(self.learn, self.label, job, protocol)
+
+    def _in_processes(self, jobs: Sequence[Job], protocol: Protocol, workers: int) -> Iterator[str | None]:
+        """Ends of the runs, in the order in which they end."""
+        if not jobs:
+            return
+        assert self.source is not None
+        context = multiprocessing.get_context("spawn")
+        pool = ProcessPoolExecutor(min(workers, len(jobs)), context, _begin, (dict.fromkeys(THREADS, "1"),))
+        try:
+            with without_main(self.learn), without_interrupts():
+                ends = [pool.submit(_generate_from, self.source, self.label, job, protocol) for job in jobs]
+            for end in as_completed(ends):
+                error = end.exception()  # its process is gone; its folder says nothing
+                yield end.result() if error is None else in_one_line(error)
+        finally:
+            processes = list((pool._processes or {}).values())
+            pool.shutdown(wait=False, cancel_futures=True)
+            for process in processes:
+                process.terminate()
+                process.join()
+            for process in processes:
+                check_guard(process.exitcode)
+
+
+def _begin(variables: Mapping[str, str]) -> None:
+    """What a process begins with: it ends with its parent, and what user code prints goes where errors go."""
+    end_with_parent()
+    os.environ.update(variables)
+    os.dup2(2, 1)
+
+
+def _generate_from(source: Source, label: str, job: Job, protocol: Protocol) -> str | None:
+    try:
+        learn = load(source)
+    except Exception as error:
+        return in_one_line(error)
+    return _generate(learn, label, job, protocol)
+
+
+def _generate(learn: Learn, label: str, job: Job, protocol: Protocol) -> str | None:
+    """One run, into its folder; None, or why it failed."""
+    config = {
+        "benchmark": {"task": job.task.name, "digest": job.task.digest},
+        "agent": label,
+        "steps": protocol.steps,
+        "seed": job.seed,
+        "evaluations": protocol.evaluations,
+    }
+    job.folder.mkdir(parents=True, exist_ok=True)
+    record = {"format": 1, "id": run_id(config), "config": config}
+    try:
+        task = job.task.training_task(protocol)
+        curve = generated_curve(learn, task, steps=protocol.steps, evaluations=protocol.evaluations, seed=job.seed)
+    except Exception as error:
+        said = f"{label} on {job.task.name}, seed {job.seed}: {type(error).__name__}: {in_one_line(error)}"
+        write_record(job.folder, {**record, "status": "failed", "error": said})
+        return said
+    write_curve(job.folder, curve.rows)
+    write_record(job.folder, {**record, "status": "finished", "result": curve.result()})
+    return None
+
+
+def _is_finished(job: Job) -> bool:
+    return (job.folder / "run.json").exists() and read_record(job.folder).get("status") == "finished"
+
+
+# Exact ----------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Exact(Form):
+    """The optimal policy, whose value solving gives, and uniform play, evaluated: nothing is run."""
+
+    regrets: dict[str, float] = field(default_factory=dict)
+
+    def train(self, jobs: Sequence[Job], protocol: Protocol, workers: int, checkpoints: Path, tell: Tell) -> None:
+        """Nothing is to be learnt."""
+
+    def curve(self, job: Job, protocol: Protocol) -> tuple[np.ndarray, bool]:
+        if job.task.name not in self.regrets:
+            self.regrets[job.task.name] = self._regret(job.task.training_task(protocol))
+        return np.full(protocol.evaluations, self.regrets[job.task.name]), True
+
+    def _regret(self, task: Task) -> float:
+        if self.label == "oracle":
+            return 0.0
+        return float(regret(evaluate_agent(uniform_policy(task), task).value, task.reference, normalized_by="uniform"))

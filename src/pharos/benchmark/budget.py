@@ -1,0 +1,175 @@
+"""An agent as a generator: it steps an environment that counts, and yields policies, which are evaluated exactly.
+
+    def learn(env, steps, seed):
+        observation, _ = env.reset(seed=seed)
+        ...
+        yield policy
+
+A policy is a function from a batch of N observations to (N,) actions or (N, A) probabilities, or whatever else
+`pharos.training.evaluate_agent` takes. It is asked about every state at the moment when it is yielded, and never again,
+so that what it is made of may change afterwards: one forward pass for all states, some thousand observations. An agent
+that yields about as often as it is evaluated, every `steps` / 15 steps, loses nothing by yielding more often.
+
+At an evaluation point the policy counts that was yielded last, at that step or before; none yet: uniform play. The end
+of the generator, and `BudgetSpent`, are the end of training; its last policy counts from there on.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from pharos.errors import ParameterError
+from pharos.interaction import GymEnv
+from pharos.policies import PolicyAnswers, PolicyLike
+from pharos.training import Curve, Evaluation, Task, evaluate_agent
+
+BLOCK = 4096  # observations that a policy is asked about at once
+LARGEST = 100_000  # states that it is asked about in advance
+KEPT = 1 << 28  # bytes of observations that are kept between snapshots
+
+Learn = Callable[[gymnasium.Env, int, int], Iterator[PolicyLike]]
+"""learn(env, steps, seed) -> policies, as it learns."""
+
+
+class BudgetSpent(Exception):
+    """The environment was stepped more often than the budget allows: training is over."""
+
+
+@dataclass
+class Budget:
+    """Steps of all copies of an environment together.
+
+    Attributes:
+        limit: steps that may be taken. interval: between evaluation points.
+        steps, episodes, returns: taken; finished; the sum of the returns of finished ones, without noise and delay.
+        at: episodes and returns at the evaluation points so far.
+    """
+
+    limit: int
+    interval: int
+    steps: int = 0
+    episodes: int = 0
+    returns: float = 0.0
+    at: list[tuple[int, float]] = field(default_factory=list)
+
+
+class CountedEnv(gymnasium.Wrapper):
+    """The environment of a task, whose steps count against a budget.
+
+    Without a seed in its first `reset` it has that of the run, so that a run is the same again. `copy()` gives another
+    one with the same budget, for vector environments: `gymnasium.vector.SyncVectorEnv([env.copy] * 8)`.
+    """
+
+    def __init__(self, task: Task, budget: Budget, seed: int):
+        super().__init__(GymEnv(task.env, **task.interaction))
+        self.task, self.budget, self.seed = task, budget, seed
+        self.seeds = np.random.SeedSequence(seed)
+        self._return, self._is_seeded = 0.0, False
+
+    def copy(self) -> "CountedEnv":
+        """Another environment of the same task and budget, with random numbers of its own."""
+        (child,) = self.seeds.spawn(1)
+        return CountedEnv(self.task, self.budget, int(child.generate_state(1)[0]))
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """As Gymnasium's; the seed of the run, where the first reset has none."""
+        if seed is None and not self._is_seeded:
+            seed = self.seed
+        self._return, self._is_seeded = 0.0, True
+        return self.env.reset(seed=seed, options=options)
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """As Gymnasium's. BudgetSpent: all steps are taken."""
+        budget = self.budget
+        if budget.steps >= budget.limit:
+            raise BudgetSpent(f"{budget.limit:,} steps are taken")
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        budget.steps += 1
+        self._return += float(info.get("earned_reward", reward))
+        if terminated or truncated:
+            budget.episodes += 1
+            budget.returns += self._return
+            self._return = 0.0
+        if budget.steps % budget.interval == 0:
+            budget.at.append((budget.episodes, budget.returns))
+        return observation, float(reward), terminated, truncated, info
+
+
+class Snapshots:
+    """Policies of a task as tables: each is asked about all states at once."""
+
+    def __init__(self, task: Task):
+        self.task = task
+        self._kept: list[tuple[int, Any]] | None = None
+
+    def taken(self, policy: PolicyLike) -> PolicyLike | Evaluation:
+        """The policy as it is now: (S, A) probabilities, or its value where it sees more than the state, or there are
+        too many.
+
+        Raises:
+            ParameterError: it answers something else than actions or probabilities.
+        """
+        task = self.task
+        if task.sight.frames > 1 or task.mdp.num_states > LARGEST or isinstance(policy, np.ndarray):
+            return evaluate_agent(policy, task)
+        answers = PolicyAnswers(policy, task.mdp, task.sight)
+        if task.sight.observe.observation.irrelevant:
+            states = np.arange(task.mdp.num_states)
+            return answers.of(states * answers.width + (answers.width - 1))
+        return np.concatenate([answers.answer(observations, count) for count, observations in self._observations()])
+
+    def _observations(self) -> Iterator[tuple[int, Any]]:
+        """Blocks of observations of all states, kept where they are small."""
+        if self._kept is not None:
+            yield from self._kept
+            return
+        blocks, size = [], 0
+        for first in range(0, self.task.mdp.num_states, BLOCK):
+            states = np.arange(first, min(first + BLOCK, self.task.mdp.num_states))
+            context = self.task.sight.space.states(states), np.full(len(states), -1), np.zeros(len(states), np.int64)
+            block = len(states), self.task.sight.observe(*context)
+            size += getattr(block[1], "nbytes", KEPT)
+            blocks.append(block)
+            yield block
+        if size < KEPT:
+            self._kept = blocks
+
+
+def generated_curve(learn: Learn, task: Task, *, steps: int, evaluations: int, seed: int) -> Curve:
+    """Let a generator learn, and evaluate the policy that counts at each of the evaluation points, and before.
+
+    Returns:
+        A row before the first step, that of uniform play, and one for each point.
+    Raises:
+        ParameterError: it is no generator of policies; or whatever its code raises.
+    """
+    budget = Budget(steps, steps // evaluations)
+    snapshots = Snapshots(task)
+    last: PolicyLike | Evaluation = uniform_policy(task)
+    counting: list[PolicyLike | Evaluation] = [last]
+    try:
+        policies = learn(CountedEnv(task, budget, seed), steps, seed)
+        if not isinstance(policies, Iterator):
+            raise ParameterError(f"learn(env, steps, seed) returned {policies!r}; expected a generator: yield policies")
+        for policy in policies:
+            passed = (budget.steps - 1) // budget.interval  # points before this step
+            counting += [last] * (passed + 1 - len(counting))
+            last = snapshots.taken(policy)
+    except BudgetSpent:
+        pass
+    counting += [last] * (evaluations + 1 - len(counting))
+    budget.at += [(budget.episodes, budget.returns)] * (evaluations - len(budget.at))
+    curve, values = Curve(task), {}
+    for place, (counted, ended) in enumerate(zip(counting, [(0, 0.0), *budget.at], strict=True)):
+        if id(counted) not in values:
+            values[id(counted)] = counted if isinstance(counted, Evaluation) else evaluate_agent(counted, task)
+        curve.add(place * budget.interval, *ended, counted, values[id(counted)])
+    return curve
+
+
+def uniform_policy(task: Task) -> np.ndarray:
+    """(S, A) probabilities of uniform play."""
+    return np.full((task.mdp.num_states, task.mdp.num_actions), 1 / task.mdp.num_actions)

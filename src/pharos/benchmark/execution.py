@@ -1,0 +1,189 @@
+"""Runs of an agent on a suite: all tasks and seeds into one folder; what is finished stays, what is missing goes on.
+
+DIR/suite.json             name, digest and protocol of the suite
+DIR/agent.json             form, source, hyperparameters, versions
+DIR/runs/TASK/seed-N/      run.json and curve of each run
+DIR/checkpoints/           of runs of the batched engine, while they learn
+DIR/results.safetensors    all curves of what was asked for, when the runs have ended
+"""
+
+import os
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pharos.benchmark.agents import Form, Job, Tell, agent_form
+from pharos.benchmark.results import FILE, AgentResults
+from pharos.benchmark.suite import CORE, BenchmarkTask, Suite, load_suite
+from pharos.errors import AllRunsFailed, FolderLocked, ParameterError, PharosError, UnknownName
+from pharos.system import storage
+from pharos.system.wording import in_one_line
+from pharos.system.workers import usable_workers
+from pharos.training import versions
+
+QUICK = 3  # seeds
+SUITE, AGENT = "suite.json", "agent.json"
+SHOWN = 200  # characters of what differs
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What `run` gave.
+
+    Attributes:
+        results: curves of the tasks of which all runs have finished.
+        folder: of the runs.
+        missing: "task, seed" -> why that run has no result.
+    """
+
+    results: AgentResults
+    folder: Path
+    missing: Mapping[str, str]
+
+
+def run(
+    agent: str | Callable[..., Any],
+    suite: str | Path | Suite = "v1",
+    *,
+    out: str | os.PathLike,
+    seeds: Iterable[int] = range(10),
+    quick: bool = False,
+    tasks: str | Iterable[str] | None = None,
+    name: str | None = None,
+    hyperparameters: Mapping[str, Any] | None = None,
+    workers: int | None = None,
+    progress: Tell | None = None,
+) -> Outcome:
+    """Run an agent on the tasks of a suite, with one setting for all of them.
+
+    Finished runs in `out` are kept, so that the same call goes on where it was killed, and to the same bytes of
+    results; runs of the batched engine and of tables go on from their last checkpoint, others begin anew.
+
+    Args:
+        agent: a name (q_learning, dqn, ppo, a2c; oracle, random), `module:Class` or `file.py:Class` with
+            Stable-Baselines3's interface, `file.py:learn`, or a generator function `learn(env, steps, seed)` that
+            yields policies. Code that is named here is imported.
+        suite: name, file, or a suite that was loaded.
+        out: folder of one agent with one setting, of one suite.
+        seeds: of the runs of each task.
+        quick: the first three seeds of the core alone; what is made of it is preliminary.
+        tasks: "core", axes and names of tasks; None: all.
+        name: label of the agent in tables; its own when not given.
+        hyperparameters: of all tasks; they go before those of the suite and the agent.
+        workers: processes; as many as processors when not given. Changes no result.
+        progress: called with the share of all steps that is done, and a text.
+    Raises:
+        ParameterError: an option is wrong, a task is another one on this installation, or the folder holds another
+            agent, setting or suite. AllRunsFailed: no run has finished. FolderLocked: another process is at it.
+    Cost: of v1, 30,000 steps a task and seed.
+    """
+    chosen = suite if isinstance(suite, Suite) else load_suite(suite)
+    form = agent_form(agent, chosen, hyperparameters)
+    numbers = [int(seed) for seed in seeds][: QUICK if quick else None]
+    if not numbers or len(set(numbers)) < len(numbers) or min(numbers) < 0:
+        raise ParameterError(f"seeds are {numbers}; expected whole numbers of at least 0, each once")
+    entries = selected(chosen, CORE if quick and tasks is None else tasks)
+    folder, protocol = Path(out), chosen.protocol
+    if protocol.steps % protocol.evaluations:
+        raise ParameterError(
+            f"suite {chosen.name}: {protocol.steps} steps with {protocol.evaluations} evaluations; expected a multiple"
+        )
+    for task in entries:
+        task.check(protocol)
+    folder.mkdir(parents=True, exist_ok=True)
+    with storage.lock(folder, FolderLocked, "running a benchmark"):
+        record = _claimed(folder, form, chosen, name or form.label)
+        jobs = [Job(task, seed, folder / "runs" / task.name / f"seed-{seed}") for task in entries for seed in numbers]
+        form.train(jobs, protocol, usable_workers(workers), folder / "checkpoints", progress or _silent)
+        return _collected(folder, form, chosen, record, jobs)
+
+
+def selected(suite: Suite, tasks: str | Iterable[str] | None) -> tuple[BenchmarkTask, ...]:
+    """Tasks of a suite, in its order.
+
+    Args:
+        tasks: "core", axes and names; None: all.
+    Raises:
+        UnknownName: there is no such axis or task.
+    """
+    if tasks is None:
+        return suite.tasks
+    words = [tasks] if isinstance(tasks, str) else list(tasks)
+    names = {CORE, *(ladder.axis for ladder in suite.ladders), *(task.name for task in suite.tasks)}
+    for word in words:
+        if word not in names:
+            raise UnknownName(f"axis or task of suite {suite.name}", word, sorted(names))
+    return tuple(task for task in suite.tasks if task.axis in words or task.name in words)
+
+
+def _silent(_done: float, _text: str) -> None:
+    """Nobody is told."""
+
+
+def _claimed(folder: Path, form: Form, suite: Suite, label: str) -> Mapping[str, Any]:
+    """What agent.json says: of this agent, with this setting; it is written where there is none.
+
+    Raises:
+        ParameterError: the folder is of another agent, setting, suite or installation.
+    """
+    source = None if not form.checksum else {"name": form.label, "sha256": form.checksum}
+    numbers = versions()
+    if form.label.startswith("sb3_contrib"):
+        numbers["sb3-contrib"] = metadata.version("sb3-contrib")
+    said: dict[str, dict[str, Any]] = storage.plain(
+        {
+            SUITE: {"suite": suite.name, "suite_digest": suite.digest, "protocol": vars(suite.protocol)},
+            AGENT: {
+                "agent": label,
+                "form": form.kind,
+                "source": source,
+                "hyperparameters": form.hyperparameters,
+                "versions": numbers,
+            },
+        }
+    )
+    for file, entry in said.items():
+        try:
+            stored = storage.read_json(folder / file)
+        except FileNotFoundError:
+            storage.replace_json(folder / file, {"format": 1, **entry})
+            continue
+        before = stored if isinstance(stored, dict) else {}
+        different = [name for name in entry if before.get(name) != entry[name]]
+        if different:
+            raise ParameterError(
+                f"{folder}: holds runs with another {different[0]}: {str(before.get(different[0]))[:SHOWN]}, now "
+                f"{str(entry[different[0]])[:SHOWN]}; choose another folder, or delete it"
+            )
+    return said[AGENT]
+
+
+def _collected(folder: Path, form: Form, suite: Suite, record: Mapping[str, Any], jobs: Iterable[Job]) -> Outcome:
+    """The curves of all runs, in a file."""
+    curves: dict[str, list[np.ndarray]] = {}
+    exact: dict[str, bool] = {}
+    missing: dict[str, str] = {}
+    seeds = tuple(dict.fromkeys(job.seed for job in jobs))
+    for job in jobs:
+        task = job.task.name
+        try:
+            curve, is_exact = form.curve(job, suite.protocol)
+        except PharosError as error:
+            missing[f"{task}, seed {job.seed}"] = in_one_line(error)
+            continue
+        curves.setdefault(task, []).append(curve)
+        exact[task] = exact.get(task, True) and is_exact
+    whole = {task: np.stack(each) for task, each in curves.items() if len(each) == len(seeds)}
+    said = {**record, "exact": {task: exact[task] for task in whole}}
+    results = AgentResults(str(record["agent"]), suite.name, suite.digest, seeds, whole, said)
+    outcome = Outcome(results, folder, missing)
+    if not whole:
+        reason, _ = Counter(missing.values()).most_common(1)[0]
+        raise AllRunsFailed(folder, {reason: reason}, outcome)
+    results.write(folder / FILE)
+    return outcome

@@ -1,0 +1,326 @@
+"""Runs of agents on a small suite: forms, budget, misuse, and folders that go on."""
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pharos import benchmark, evaluate_policy
+from pharos.benchmark import BenchmarkTask, BudgetSpent, Ladder, Protocol, Suite
+from pharos.benchmark.budget import generated_curve
+from pharos.benchmark.suite import digest_of_suite, digest_of_task
+from pharos.errors import AllRunsFailed, ParameterError, UnknownName
+
+PROTOCOL = Protocol(steps=300, evaluations=3, seeds=2)
+SEA = {"size": 4, "mapping_seed": 1}
+TASKS = (
+    BenchmarkTask("sea", "deep_sea", SEA, "one_hot"),
+    BenchmarkTask("lake", "frozen_lake", {}, "vector", chance={"sticky": 0.25}),
+    BenchmarkTask("sea-5", "deep_sea", {**SEA, "size": 5}, "one_hot", axis="exploration", level=5.0),
+)
+LEARN = """
+import numpy as np
+
+def learn(env, steps, seed):
+    draw = np.random.default_rng(seed)
+    env.reset(seed=seed)
+    wins = np.zeros(env.action_space.n)
+    while True:
+        action = int(draw.integers(len(wins)))
+        _, reward, terminated, truncated, _ = env.step(action)
+        wins[action] += reward
+        if terminated or truncated:
+            env.reset()
+            yield lambda observations: np.full(len(observations), wins.argmax())
+"""
+
+
+@pytest.fixture(scope="module")
+def suite():
+    made = []
+    for task in TASKS:
+        solved = task.training_task(PROTOCOL)
+        values = {"value_optimal": solved.reference.optimal, "value_uniform": solved.reference.uniform}
+        made.append(replace(task, digest=digest_of_task(solved), **values))
+    ladder = Ladder("exploration", "bits", "size", (made[2],))
+    whole = Suite("small", PROTOCOL, tuple(made[:2]), (ladder,), "", {})
+    return replace(whole, digest=digest_of_suite(whole))
+
+
+@pytest.fixture
+def file(tmp_path):
+    path = tmp_path / "mine.py"
+    path.write_text(LEARN)
+    return path
+
+
+def always(action):
+    return lambda observations: np.full(len(observations), action)
+
+
+def curve_of(learn, task=TASKS[0], **changes):
+    protocol = replace(PROTOCOL, **changes)
+    solved = task.training_task(protocol)
+    return solved, generated_curve(learn, solved, steps=protocol.steps, evaluations=protocol.evaluations, seed=0)
+
+
+# Reference policies ---------------------------------------------------------------------------------------------------
+
+
+def test_the_oracle_has_no_regret_and_random_play_all_of_it(suite, tmp_path):
+    for name, expected in (("oracle", 0.0), ("random", 1.0)):
+        found = benchmark.run(name, suite, out=tmp_path / name, seeds=range(2))
+        assert list(found.results.curves) == ["lake", "sea", "sea-5"]
+        for curve in found.results.curves.values():
+            assert curve.shape == (2, 3)
+            np.testing.assert_allclose(curve, expected, atol=1e-6)
+        assert all(found.results.record["exact"].values()) and not found.missing
+
+
+# Generators -----------------------------------------------------------------------------------------------------------
+
+
+def test_the_last_snapshot_counts_as_it_was_when_it_was_yielded():
+    """Points are at 100, 200 and 300 steps: nothing yet, then action 1; what is yielded at a point counts there."""
+    choice = [1]
+
+    def learn(env, steps, seed):
+        env.reset()
+        for step in range(1, steps + 1):
+            _, _, terminated, truncated, _ = env.step(0)
+            if terminated or truncated:
+                env.reset()
+            if step == 150:
+                yield lambda observations: np.full(len(observations), choice[0])
+                choice[0] = 0  # the policy that was yielded is another one from here on
+            if step == 300:
+                yield always(0)
+
+    solved, curve = curve_of(learn)
+    states = solved.mdp.num_states
+    values = [evaluate_policy(solved.mdp, np.full(states, action)).value_at_start for action in (0, 1)]
+    uniform = solved.reference.uniform
+    assert values[0] != values[1]
+    np.testing.assert_allclose([row["value"] for row in curve.rows], [uniform, uniform, values[1], values[0]])
+    assert [row["step"] for row in curve.rows] == [0, 100, 200, 300]
+    assert curve.rows[-1]["episodes"] == 300 // 4 and all(row["exact"] for row in curve.rows)
+
+
+def test_the_budget_ends_what_would_go_on_for_ever():
+    taken = []
+
+    def learn(env, steps, seed):
+        env.reset()
+        try:
+            while True:
+                _, _, terminated, truncated, _ = env.step(0)
+                taken.append(1)
+                if terminated or truncated:
+                    env.reset()
+                yield always(0)
+        except BudgetSpent:
+            taken.append("spent")
+            raise
+
+    curve_of(learn)
+    assert taken.count(1) == 300 and taken[-1] == "spent"
+
+
+def test_an_agent_that_ends_early_keeps_its_last_policy():
+    def learn(env, steps, seed):
+        yield always(1)
+
+    _, curve = curve_of(learn)
+    values = [row["value"] for row in curve.rows]
+    assert values[1] == values[2] == values[3] and curve.rows[-1]["episodes"] == 0
+
+
+def test_copies_share_the_budget_and_have_other_random_numbers():
+    import gymnasium
+
+    seen = {}
+
+    def learn(env, steps, seed):
+        envs = gymnasium.vector.SyncVectorEnv([env.copy] * 4)
+        envs.reset()
+        states = []
+        while True:
+            envs.step(np.full(4, len(states) % 4))
+            states.append([tuple(each.unwrapped.state) for each in envs.envs])
+            seen["steps"], seen["states"] = env.budget.steps, states
+            yield always(0)
+
+    curve_of(learn, TASKS[1])
+    assert 290 <= seen["steps"] <= 300
+    assert any(len(set(row)) > 1 for row in seen["states"])
+
+
+def test_tables_probabilities_and_networks_in_a_wrapper_are_policies():
+    def yielding(policy):
+        def learn(env, steps, seed):
+            yield policy
+
+        return curve_of(learn, TASKS[1])
+
+    solved, curve = yielding(lambda seen: np.full((len(seen), 4), 0.25))
+    np.testing.assert_allclose(curve.rows[-1]["normalized_regret"], 1.0)
+    _, same = yielding(np.full((solved.mdp.num_states, 4), 0.25))
+    assert same.rows[-1]["value"] == pytest.approx(curve.rows[-1]["value"])
+
+
+@pytest.mark.parametrize(
+    ("policy", "said"),
+    [
+        (lambda seen: np.full((len(seen), 2), np.nan), "NaN"),
+        (lambda seen: np.zeros((len(seen), 3)), r"shape \(\d+, 3\)"),
+        (lambda seen: np.full((len(seen), 2), 0.3), "sum to 0.6"),
+        (lambda seen: np.full(len(seen), 7), "action 7"),
+        (lambda seen: np.zeros(1), "shape"),
+        (3, "expected a policy"),
+    ],
+)
+def test_answers_that_are_no_policy_are_said(suite, tmp_path, policy, said):
+    def learn(env, steps, seed):
+        yield policy
+
+    with pytest.raises(AllRunsFailed, match=said) as error:
+        benchmark.run(learn, suite, out=tmp_path, seeds=[5], tasks="sea")
+    assert "on sea, seed 5" in str(error.value)
+
+
+def test_a_run_that_fails_stops_no_other(suite, tmp_path):
+    def learn(env, steps, seed):
+        if env.action_space.n == 4 and seed == 1:
+            raise RuntimeError("no idea")
+        yield always(0)
+
+    found = benchmark.run(learn, suite, out=tmp_path, seeds=range(2))
+    assert list(found.results.curves) == ["sea", "sea-5"]
+    assert list(found.missing) == ["lake, seed 1"] and "RuntimeError: no idea" in found.missing["lake, seed 1"]
+
+
+def test_what_is_no_generator_is_refused(suite, tmp_path):
+    with pytest.raises(ParameterError, match="learn"):
+        benchmark.run(lambda env: None, suite, out=tmp_path)
+    with pytest.raises(AllRunsFailed, match="expected a generator"):
+        benchmark.run(lambda env, steps, seed: None, suite, out=tmp_path, seeds=[0])
+
+
+# Folders --------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_a_file_runs_in_processes_to_the_same_bytes(suite, file, tmp_path):
+    found = [
+        benchmark.run(f"{file}:learn", suite, out=tmp_path / str(workers), seeds=range(2), workers=workers)
+        for workers in (1, 2)
+    ]
+    first, second = ((tmp_path / str(workers) / "results.safetensors").read_bytes() for workers in (1, 2))
+    assert first == second and not found[0].missing
+    agent = json.loads((tmp_path / "1" / "agent.json").read_text())
+    assert agent["form"] == "generator" and agent["agent"] == "mine.py:learn"
+    assert agent["source"]["sha256"] == benchmark.agents.sha256(file)
+
+
+def test_a_folder_holds_one_agent_with_one_setting_of_one_suite(suite, file, tmp_path):
+    out = tmp_path / "out"
+    benchmark.run("oracle", suite, out=out, seeds=[0], tasks="sea")
+    benchmark.run("oracle", suite, out=out, seeds=range(3))  # more of the same
+    with pytest.raises(ParameterError, match=r"holds runs with another agent: oracle, now random"):
+        benchmark.run("random", suite, out=out, seeds=[0])
+    other = replace(suite, core=suite.core[:1])
+    with pytest.raises(ParameterError, match="another suite_digest"):
+        benchmark.run("oracle", replace(other, digest=digest_of_suite(other)), out=out, seeds=[0])
+    out = tmp_path / "mine"
+    benchmark.run(f"{file}:learn", suite, out=out, seeds=[0], tasks="sea", workers=1)
+    file.write_text(LEARN + "# changed\n")
+    with pytest.raises(ParameterError, match="another source"):
+        benchmark.run(f"{file}:learn", suite, out=out, seeds=[0], tasks="sea")
+
+
+def test_what_is_wrong_is_said_before_anything_runs(suite, file, tmp_path):
+    for options, error, said in (
+        ({"agent": "dqm"}, UnknownName, "did you mean 'dqn'"),
+        ({"agent": f"{file}:nothing"}, ParameterError, "mine.py:nothing"),
+        ({"agent": "dqn", "hyperparameters": {"learning_rat": 1}}, ParameterError, "learning_rat"),
+        ({"agent": "oracle", "hyperparameters": {"a": 1}}, ParameterError, "no hyperparameters"),
+        ({"agent": f"{file}:learn", "hyperparameters": {"a": 1}}, ParameterError, "in its code"),
+        ({"seeds": [1, 1]}, ParameterError, "each once"),
+        ({"tasks": "explorations"}, UnknownName, "did you mean 'exploration'"),
+    ):
+        with pytest.raises(error, match=said):
+            benchmark.run(**{"agent": "oracle", "suite": suite, "out": tmp_path / "out", **options})
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_task_that_is_another_one_here_is_refused_by_name(suite, tmp_path):
+    other = replace(suite, core=(replace(suite.core[0], digest="0" * 64), *suite.core[1:]))
+    with pytest.raises(ParameterError, match="task sea"):
+        benchmark.run("oracle", other, out=tmp_path)
+
+
+def test_quick_is_three_seeds_of_the_core(suite, tmp_path):
+    found = benchmark.run("oracle", suite, out=tmp_path, quick=True)
+    assert found.results.seeds == (0, 1, 2) and list(found.results.curves) == ["lake", "sea"]
+
+
+# What pharos trains ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_q_learning_leaves_run_folders_of_training(suite, tmp_path):
+    found = benchmark.run("q_learning", suite, out=tmp_path, seeds=range(2), workers=1)
+    assert (found.results.curves["sea"][:, -1] < 1).all()
+    record = json.loads((tmp_path / "runs" / "sea" / "seed-1" / "run.json").read_text())
+    assert record["status"] == "finished" and record["config"]["seed"] == 1
+    before = (tmp_path / "results.safetensors").read_bytes()
+    benchmark.run("q_learning", suite, out=tmp_path, seeds=range(2), workers=2)
+    assert (tmp_path / "results.safetensors").read_bytes() == before
+
+
+@pytest.mark.long
+def test_named_agents_have_one_setting_whatever_classes_declare(suite, tmp_path):
+    pytest.importorskip("torch")
+    setting = {"learning_starts": 50, "double": True}
+    found = benchmark.run("dqn", suite, out=tmp_path, seeds=range(2), hyperparameters=setting)
+    settings = {
+        json.dumps(json.loads(file.read_text())["hyperparameters"], sort_keys=True)
+        for file in tmp_path.glob("runs/*/*/run.json")
+    }
+    assert len(settings) == 1 and json.loads(settings.pop()) == found.results.record["hyperparameters"]
+
+
+@pytest.mark.long
+def test_killed_at_random_and_repeated_it_gives_the_same_bytes(file, tmp_path):
+    command = [sys.executable, "-m", "pharos", "benchmark", "run", "--tasks", "exploration", "--seeds", "2"]
+    draw, environment = random.Random(0), {**os.environ, "PHAROS_CACHE_DIR": str(tmp_path / "cache")}
+
+    def start(out):
+        line = [*command, "--agent", f"{file}:learn", "--out", str(out)]
+        return subprocess.Popen(line, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+
+    whole = start(tmp_path / "whole")
+    text, _ = whole.communicate(timeout=600)
+    assert whole.returncode == 0, text
+    kills = 0
+    for _ in range(30):
+        process = start(tmp_path / "killed")
+        time.sleep(draw.uniform(2.0, 6.0 + kills))
+        if process.poll() is not None:
+            break
+        process.send_signal(draw.choice([signal.SIGKILL, signal.SIGTERM, signal.SIGINT]))
+        process.communicate(timeout=60)
+        kills += 1
+    text, _ = (last := start(tmp_path / "killed")).communicate(timeout=600)
+    assert last.returncode == 0 and kills, text
+    results = [(tmp_path / name / "results.safetensors").read_bytes() for name in ("whole", "killed")]
+    assert results[0] == results[1]
+    assert Path(tmp_path / "killed" / "agent.json").read_bytes() == (tmp_path / "whole" / "agent.json").read_bytes()
