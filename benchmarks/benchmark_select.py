@@ -3,14 +3,20 @@
 python benchmarks/benchmark_select.py                print the file of the suite
 python benchmarks/benchmark_select.py --write        write it
 python benchmarks/benchmark_select.py --freeze       the same, with levels, values and digests computed anew
+python benchmarks/benchmark_select.py --foretell     the same, with the regret that is predicted for each task
+python benchmarks/benchmark_select.py --candidates   predict candidates that the table of them lacks
 
 The core: of CANDIDATES, a table of predictions that is in the repository, those in the WINDOW, where the idealised
-DQN and PPO neither both solve a task nor both fail. First the one nearest to the middle of FEATURES, ranked; then again
-and again the one that is farthest from all chosen ones; at most PER_CLASS of a class and one of an instance; ties by
-name; until there are TASKS. No result of any agent enters.
+DQN and PPO neither both solve a task nor both fail. First the one nearest to the middle of the features, ranked; then
+again and again the one that is farthest from all chosen ones; at most PER_CLASS of a class and one of an instance; ties
+by name; until there are TASKS. No result of any agent enters.
+
+Candidates are cells of the study `hardness-dev` with its predictions, pictures where a run takes at most 6 s; and
+INSTANCES with three observations, and with random and sticky actions behind one each. They have at most MOST_STATES
+states, and what is seen tells the state.
 
 Ladders are taken from the file: environment, parameters, observation and chance of each rung are written by hand, the
-rest is filled in by --freeze. Numbers of tasks that are in the file are kept; new tasks are always frozen.
+rest is filled in. Numbers of tasks that the file has are kept; new tasks are always frozen.
 """
 
 import argparse
@@ -25,14 +31,50 @@ from pathlib import Path
 import numpy as np
 import yaml
 
+import pharos
 from pharos.benchmark.suite import CORE, FOLDER, BenchmarkTask, Protocol, Suite, digest_of_suite, digest_of_task
+from pharos.mdp import ChanceSetting
+from pharos.training import RunConfig, Task
 
 CANDIDATES = Path(__file__).parent / "benchmark_candidates.csv"
 FILE = FOLDER / "v1.yaml"
-TASKS, PER_CLASS, MOST_STATES = 24, 3, 2_000
+TASKS, PER_CLASS, MOST_STATES, STEPS = 24, 3, 2_000, 30_000
 SOLVED, FAILED = 0.1, 0.9  # the window
 TIE = 1e-6  # of values
 OBSERVATIONS = {"hash": {"bits": 64}, "simple_image": {"motion": True}}
+VIEWS = ("vector", "one_hot", "hash")
+INSTANCES = [
+    ("frozen_lake", {"size": 6, "seed": 0}),
+    ("taxi", {"size": 3}),
+    ("breakout", {"height": 5, "columns": 3, "brick_rows": 1}),
+    ("mini_grid", {"kind": "lava_gap", "size": 5, "seed": 0}),
+    ("sokoban/corner", {}),
+    ("sliding_tiles/2x3", {}),
+    ("corner_grid/8x8", {}),
+    ("blackjack/sutton-barto", {}),
+    ("catch", {"rows": 6, "columns": 6}),
+    ("mini_grid_rooms/4x3", {}),
+    ("freeway", {"num_cars": 4, "lane_length": 3}),
+    ("discounting_chain/bonus-1", {}),
+    ("endless_sea/10x10", {}),
+    ("memory_chain", {"memory_length": 3, "num_bits": 3}),
+    ("sokoban/corridor", {}),
+    ("frozen_lake", {"size": 8, "seed": 0}),
+    ("mini_grid/simple-crossing-s9n1", {}),
+    ("mini_grid/multi-room-n2-s4", {}),
+    ("taxi", {"size": 4}),
+    ("deep_sea", {"size": 8}),
+    ("sokoban/two-rooms", {}),
+    ("sliding_tiles/2x2", {}),
+    ("mini_grid_empty/8x8", {}),
+    ("umbrella_chain", {"chain_length": 10}),
+    ("simple_grid/8x8-decoy", {}),
+    ("game_2048/2x2-to-32", {}),
+]
+COLUMNS = (
+    *("name", "environment", "parameters", "observation", "chance"),
+    *("num_states", "exploration_time", "dqn", "ppo", "table", "dqn_seconds", "ppo_seconds"),
+)
 HEAD = """\
 # The suite {name} of `pharos benchmark`, by `python benchmarks/benchmark_select.py`: only rungs are written by hand.
 # The core is selected from benchmarks/benchmark_candidates.csv of {date}, SHA-256 {sha256}.
@@ -45,23 +87,31 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--write", action="store_true")
     parser.add_argument("--freeze", action="store_true")
+    parser.add_argument("--foretell", action="store_true")
+    parser.add_argument("--candidates", action="store_true")
     options = parser.parse_args()
-    text = suite_text(yaml.safe_load(FILE.read_text()), freeze=options.freeze)
-    if options.write or options.freeze:
+    entry = yaml.safe_load(FILE.read_text())
+    if options.candidates:
+        add_candidates(entry["hyperparameters"])
+        return
+    text = suite_text(entry, freeze=options.freeze, foretell=options.foretell)
+    if options.write or options.freeze or options.foretell:
         FILE.write_text(text)
     else:
         print(text, end="")
 
 
-def suite_text(entry, *, freeze=False):
+def suite_text(entry, *, freeze=False, foretell=False):
     """The file of the suite, from the one before, of which protocol, hyperparameters and ladders are taken."""
     protocol = Protocol(**entry["protocol"])
     known = {each["name"]: each for each in entry["core"]}
     core = [kept({**known.get(each["name"], {}), **each}, CORE, protocol, freeze) for each in selected()]
+    settings = entry["hyperparameters"] if foretell else {}
+    core = [predicted_entry(each, settings, protocol) for each in core]
     ladders = []
     for ladder in entry["ladders"]:
         tasks = [kept(each, ladder["axis"], protocol, freeze, LEVELS[ladder["measure"]]) for each in ladder["tasks"]]
-        ladders.append({**ladder, "tasks": tasks})
+        ladders.append({**ladder, "tasks": [predicted_entry(each, settings, protocol) for each in tasks]})
     made = {"name": entry["name"], "digest": "", "protocol": entry["protocol"]}
     made |= {"hyperparameters": entry["hyperparameters"], "core": core, "ladders": ladders}
     every = [BenchmarkTask(**each, axis=CORE) for each in core]
@@ -82,6 +132,33 @@ def kept(entry, axis, protocol, freeze, level=None):
     if level is not None:
         made["level"] = significant(level(task, learnt))
     return {**made, "digest": digest_of_task(learnt)}
+
+
+def predicted_entry(entry, settings, protocol):
+    """The entry of a task with its predicted regret: of idealised agents with these hyperparameters, and of a table."""
+    from pharos.errors import PharosError
+    from pharos.validation import predict
+
+    values = {}
+    for agent, hyperparameters in settings.items():
+        view = [(entry["observation"], entry.get("observation_options", {}))]
+        options = {"steps": protocol.steps, "horizon": protocol.horizon, "hyperparameters": hyperparameters}
+        chance = ChanceSetting.from_dict(entry.get("chance", {}))
+        try:
+            cell = predict(
+                pharos.make(entry["environment"], **entry.get("parameters", {})),
+                view,
+                agent=agent,
+                chance=chance,
+                **options,
+            )
+        except PharosError as error:
+            print(f"# {entry['name']}: {agent} is not predicted: {error}", flush=True)
+            continue
+        values[agent] = round(cell.cells[0].value, 4)
+        if agent == "dqn":
+            values["table"] = round(cell.cells[0].tabular, 4)
+    return {**entry, "predicted": values} if settings else entry
 
 
 # Levels of ladders: function(task, what an agent learns) -> number ----------------------------------------------
@@ -192,6 +269,50 @@ LEVELS = {
 # The core -------------------------------------------------------------------------------------------------------
 
 
+def cells():
+    """(environment, parameters, observation, chance) of the candidates from INSTANCES."""
+    for environment, parameters in INSTANCES:
+        yield from ((environment, parameters, view, {}) for view in VIEWS)
+    for i, (environment, parameters) in enumerate(INSTANCES):
+        yield environment, parameters, VIEWS[i % 3], {"random": 0.1}
+        yield environment, parameters, VIEWS[(i + 1) % 3], {"sticky": 0.25}
+
+
+def add_candidates(settings):
+    """Append rows to CANDIDATES: of the cells that it lacks. Cost: seconds each."""
+    names = {row["name"] for row in candidates()}
+    for cell in cells():
+        name = name_of(*cell)
+        if name not in names and pharos.build(pharos.make(cell[0], **cell[1])).num_states <= MOST_STATES:
+            row = predicted_row(name, *cell, settings)
+            if row is not None:
+                with CANDIDATES.open("a", newline="") as file:
+                    csv.DictWriter(file, COLUMNS, lineterminator="\n").writerow(row)
+
+
+def name_of(environment, parameters, view, chance):
+    values = [*parameters.values(), view, *(f"{kind}-{p}" for kind, p in chance.items())]
+    return "-".join([environment.replace("/", "-"), *map(str, values)])
+
+
+def predicted_row(name, environment, parameters, view, chance, settings):
+    """The row of a candidate, of idealised learners; None where states are not told apart."""
+    from pharos.validation import predicted
+
+    options = {"observation_options": OBSERVATIONS.get(view, {}), "chance": ChanceSetting(**chance)}
+    learnt = Task(pharos.make(environment, **parameters), observation=view, **options)
+    configs = (RunConfig.of_task(learnt, agent, steps=STEPS, hyperparameters=settings[agent]) for agent in settings)
+    rows = {config.agent: predicted(config.to_dict()) for config in configs}
+    if not rows["dqn"]["aliasing_floor"] <= 1e-6:
+        return None
+    numbers = {each: rows["dqn"][each] for each in ("exploration_time",)}
+    numbers |= {"dqn": rows["dqn"]["kernel_regret"], "ppo": rows["ppo"]["policy_regret_played"]}
+    numbers["table"] = rows["dqn"]["tabular_regret"]
+    texts = {"parameters": json.dumps(parameters), "observation": view, "chance": json.dumps(chance)}
+    row = {"name": name, "environment": environment, **texts, "num_states": learnt.mdp.num_states}
+    return row | {key: "" if math.isnan(value) else f"{value:.9g}" for key, value in numbers.items()}
+
+
 def candidates():
     """Rows of CANDIDATES; numbers where a column holds numbers, None where one is unknown."""
     with CANDIDATES.open(newline="") as file:
@@ -209,7 +330,7 @@ def selected(rows=None, tasks=TASKS):
     while len(chosen) < tasks:
         distance = np.min([((places - places[each]) ** 2).sum(axis=1) for each in chosen], axis=0)
         for i, row in enumerate(rows):
-            of_class = sum(rows[each]["environment"] == row["environment"] for each in chosen)
+            of_class = sum(class_of(rows[each]) == class_of(row) for each in chosen)
             if of_class >= PER_CLASS or any(instance(rows[each]) == instance(row) for each in chosen):
                 distance[i] = -1
         farthest = int(np.argmax(np.round(distance, 12)))  # the first of equal ones, by name
@@ -243,8 +364,12 @@ def ranks(values):
     """Mean ranks of a column in [-1/2, 1/2], to 9 digits; 0, the median, where a value is unknown."""
     known = np.array([value for value in values if value is not None])
     known = np.array([float(f"{value:.9g}") for value in known])
-    below = {value: ((known < value).sum() + (known <= value).sum() + 1) / 2 for value in known}
+    below = {value: ((known < value).sum() + (known <= value).sum()) / 2 for value in known}
     return [0.0 if v is None else below[float(f"{v:.9g}")] / len(known) - 0.5 for v in values]
+
+
+def class_of(row):
+    return row["environment"].partition("/")[0]
 
 
 def instance(row):
@@ -260,7 +385,6 @@ def task_entry(row):
         entry["observation_options"] = OBSERVATIONS[row["observation"]]
     if parts["chance"]:
         entry["chance"] = parts["chance"]
-    entry["predicted"] = {name: row[name] for name in ("dqn", "ppo", "table") if row[name] is not None}
     seconds = {name: row[f"{name}_seconds"] for name in ("dqn", "ppo") if row[f"{name}_seconds"] is not None}
     return {**entry, "seconds": seconds}
 
