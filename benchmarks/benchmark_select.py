@@ -242,15 +242,16 @@ def memory_steps(task, learnt):
     best = q > q.max(axis=1, keepdims=True) - TIE
     is_same = (classes[:, None] == classes) & ~np.eye(len(classes), dtype=bool)
     is_same &= ~(learnt.mdp.terminal[:, None] | learnt.mdp.terminal)
+    is_start = np.isin(np.arange(len(classes)), learnt.mdp.start_states)
     successors, alike = np.asarray(space.successors), is_same
     for steps in range(len(classes) ** 2):
         first, second = np.nonzero(alike)
         if (best[first] & best[second]).any(axis=1).all():
             return float(steps)
-        after = np.zeros_like(alike)
+        after = is_start[:, None] & is_start  # nothing came before
         for action in range(q.shape[1]):
             after[successors[first, action], successors[second, action]] = True
-        if steps and (after & is_same == alike).all():
+        if (after & is_same == alike).all():
             return math.inf
         alike = after & is_same
     return math.inf

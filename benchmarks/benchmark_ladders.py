@@ -1,0 +1,88 @@
+"""Which ladders the suite v1 may have: every axis' quantity on every rung, from measures alone, before any run.
+
+python benchmarks/benchmark_ladders.py               print the table, and which ladders are admitted
+
+Quantities are those of benchmark_select.py: exploration in bits, noise in gaps, credit in steps, representation as
+predicted regret of a network less that of a table, memory in steps, states as a logarithm. A quantity is placed among
+the rungs of its own ladder: at 1.5 it lies in the middle between the second and the third rung (counted from 0). What
+is easier than the first rung counts as the first; beyond the last one the last step goes on.
+
+A ladder is admitted if its own quantity rises with every rung, and in rungs moves at least TIMES as far as any other
+quantity does. "No other moves by more than one rung" would refuse seas and umbrellas for what no world avoids: a longer
+way has more states and later rewards. Twice is what lesions are held to as well: on its own axis an agent must lose at
+least twice as much as on any other.
+"""
+
+import argparse
+
+import numpy as np
+
+from benchmark_select import LEVELS
+from pharos.benchmark import load_suite
+from pharos.errors import PharosError
+
+TIMES = 2.0
+AXES = {
+    "exploration": "exploration_bits",
+    "estimation": "noise_over_gap",
+    "credit": "advantage_lag",
+    "representation": "network_less_table",
+    "memory": "memory_steps",
+    "scale": "log10_states",
+}
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--suite", default="v1")
+    suite = load_suite(parser.parse_args().suite)
+    rungs = {ladder.axis: [task.level for task in ladder.tasks] for ladder in suite.ladders}
+    verdicts = []
+    print(f"| task | {' | '.join(AXES)} |\n|---|{'---|' * len(AXES)}", flush=True)
+    for ladder in suite.ladders:
+        rows = []
+        for task in ladder.tasks:
+            rows.append(quantities(task, suite.protocol))
+            print(f"| {task.name} | {' | '.join(shown(value) for value in rows[-1].values())} |", flush=True)
+        verdicts.append(verdict(ladder, rows, rungs))
+    print(f"\n| ladder | {' | '.join(AXES)} | admitted |\n|---|{'---|' * (len(AXES) + 1)}")
+    print("\n".join(verdicts))
+
+
+def quantities(task, protocol):
+    """Axis -> its quantity for this task; NaN where nothing is predicted, as beyond 4,096 states."""
+    learnt, found = task.training_task(protocol), {}
+    for axis, measure in AXES.items():
+        try:
+            found[axis] = float(LEVELS[measure](task, learnt))
+        except (PharosError, KeyError):
+            found[axis] = np.nan
+    return found
+
+
+def verdict(ladder, rows, rungs):
+    """A row of the second table: how far each quantity moves, in rungs of its own ladder, and what follows."""
+    moves = {}
+    for axis in AXES:
+        places = [place(row[axis], rungs[axis]) for row in rows if not np.isnan(row[axis])] if axis in rungs else []
+        moves[axis] = np.ptp(places) if places else np.nan
+    own = [row[ladder.axis] for row in rows]
+    others = [move for axis, move in moves.items() if axis != ladder.axis and not np.isnan(move)]
+    is_admitted = bool(np.all(np.diff(own) > 0)) and moves[ladder.axis] >= TIMES * max(others)
+    cells = [shown(move) for move in moves.values()]
+    return f"| {ladder.axis} | {' | '.join(cells)} | {'yes' if is_admitted else 'no'} |"
+
+
+def place(value, levels):
+    """Where a quantity lies among the rungs of its ladder, counted from 0."""
+    if value <= levels[-1]:
+        return float(np.interp(value, levels, range(len(levels))))
+    return len(levels) - 1 + (value - levels[-1]) / (levels[-1] - levels[-2])
+
+
+def shown(value):
+    return "-" if np.isnan(value) else f"{value:.2f}".rstrip("0").rstrip(".")
+
+
+if __name__ == "__main__":
+    main()
