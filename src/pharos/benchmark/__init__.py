@@ -9,21 +9,33 @@ from pharos.system import lazy
 
 if TYPE_CHECKING:
     from pharos.benchmark.budget import BudgetSpent
+    from pharos.benchmark.comparison import AxisComparison, Comparison, Difference, Power, compare, power
     from pharos.benchmark.execution import run
     from pharos.benchmark.results import AgentResults, baselines, read_results
+    from pharos.benchmark.scores import AxisScore, BenchmarkScore, Interval, score
     from pharos.benchmark.suite import BenchmarkTask, Ladder, Protocol, Suite, load_suite
 
 __all__ = [
     "AgentResults",
+    "AxisComparison",
+    "AxisScore",
+    "BenchmarkScore",
     "BenchmarkTask",
     "BudgetSpent",
+    "Comparison",
+    "Difference",
+    "Interval",
     "Ladder",
+    "Power",
     "Protocol",
     "Suite",
     "baselines",
+    "compare",
     "load_suite",
+    "power",
     "read_results",
     "run",
+    "score",
 ]
 _shared = """
 """

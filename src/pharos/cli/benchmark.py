@@ -10,11 +10,11 @@ import typer
 from pharos.cli.answers import Answer, complain, console, progress_bar, termination
 from pharos.cli.command import Commands
 from pharos.cli.options import Count, parse_seeds
-from pharos.errors import AllRunsFailed
+from pharos.errors import AllRunsFailed, ParameterError
 from pharos.system.wording import many
 
 if TYPE_CHECKING:
-    from pharos.benchmark import BenchmarkTask, Suite
+    from pharos.benchmark import BenchmarkTask, Comparison, Difference, Power, Suite
 
 app = Commands(no_args_is_help=True, help="Run agents on a frozen suite of solved tasks, and compare them.")
 
@@ -150,3 +150,117 @@ def _print(suite: "Suite") -> None:
         times = ", ".join(f"{agent.upper()} {value:.0f}" for agent, value in minutes.items())
         text += f" Minutes of one processor for all seeds: {times}"
     screen.print(f"[dim]{text}[/dim]", soft_wrap=True)
+
+
+SuiteOption = Annotated[str | None, typer.Option(metavar="NAME|FILE.yaml", help="The results' own when not given.")]
+
+
+@app.command("compare")
+def compare(
+    results: Annotated[list[str], typer.Argument(metavar="A B...")], *, suite: SuiteOption = None, tasks: bool = False
+) -> Answer:
+    """Compare an agent with others: per axis, per task and on the core, with 95 % intervals over seeds.
+
+    Args:
+        results: Folders of runs, files of results, or baselines by name; the first against each of the others.
+        tasks: Print each task as well.
+    """
+    from pharos import benchmark
+
+    if len(results) < 2:
+        raise ParameterError(f"compare {' '.join(results)}; expected two results or more, such as results/mine dqn")
+    comparisons = [benchmark.compare(results[0], other, suite=suite) for other in results[1:]]
+
+    def text() -> None:
+        for each in comparisons:
+            _print_comparison(each, tasks)
+
+    return Answer({"comparisons": comparisons}, text)
+
+
+def _print_comparison(comparison: "Comparison", tasks: bool) -> None:
+    from rich.markup import escape
+    from rich.table import Table
+
+    screen = console()
+    screen.print(
+        f"[bold]{escape(comparison.ours)}[/bold] against [bold]{escape(comparison.theirs)}[/bold]", soft_wrap=True
+    )
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for title in (
+        "",
+        escape(comparison.ours),
+        escape(comparison.theirs),
+        "difference",
+        "P(improvement)",
+        "p (Holm)",
+        "verdict",
+    ):
+        table.add_column(title, justify="left" if title in ("", "verdict") else "right")
+
+    def add(name: str, each: "Difference") -> None:
+        numbers = (f"{each.ours:.3f}", f"{each.theirs:.3f}", str(each.interval), f"{each.improvement.value:.2f}")
+        p_value = (
+            "< 0.0001" if each.adjusted < 1e-4 else "" if each.adjusted != each.adjusted else f"{each.adjusted:.2g}"
+        )
+        table.add_row(escape(name), *numbers, p_value, each.verdict)
+
+    if comparison.core is not None:
+        add("core", comparison.core)
+    for axis, each in comparison.axes.items():
+        add(axis, each.score)
+        frontiers = [frontier.text(ends=False) for frontier in each.frontiers]
+        table.add_row(f"  frontier, {escape(each.unit)}", *frontiers, str(each.frontier))
+    for name, difference in comparison.tasks.items() if tasks else ():
+        add(name, difference)
+    screen.print(table)
+    if comparison.left_out:
+        left_out = ", ".join(comparison.left_out)
+        screen.print(f"[dim]without what one of them has not run: {escape(left_out)}[/dim]", soft_wrap=True)
+    if any(each.p_value != each.p_value for each in comparison.tasks.values()):
+        screen.print("[dim]one seed has no interval; run two or more of both[/dim]")
+
+
+@app.command("power")
+def power(
+    results: Annotated[str, typer.Argument(metavar="RESULTS")],
+    *,
+    suite: SuiteOption = None,
+    difference: float | None = None,
+) -> Answer:
+    """Show how precise scores are, and which difference from an agent that varies as much would be found.
+
+    Args:
+        results: Folder of a run, file of results, or a baseline by name.
+        difference: Of scores: how many seeds find it with power 0.8.
+    """
+    from pharos import benchmark
+
+    agent = benchmark.read_results(results)
+    scores = benchmark.power(agent, suite=suite, difference=difference)
+    answer = {"agent": agent.agent, "seeds": len(agent.seeds), "scores": scores}
+    return Answer(answer, lambda: _print_power(agent.agent, len(agent.seeds), scores, difference))
+
+
+def _print_power(agent: str, seeds: int, scores: "dict[str, Power]", difference: float | None) -> None:
+    from rich.markup import escape
+    from rich.table import Table
+
+    screen = console()
+    screen.print(f"[bold]{escape(agent)}[/bold], {many(seeds, 'seed')}", soft_wrap=True)
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    table.add_column("score")
+    least = [f"{number} seeds" for number in next(iter(scores.values())).least_differences]
+    for title in ("standard error", *least, *([f"seeds for {difference:g}"] if difference is not None else [])):
+        table.add_column(title, justify="right")
+    for name, each in scores.items():
+        numbers = [f"{each.standard_error:.4f}", *(f"{value:.3f}" for value in each.least_differences.values())]
+        if difference is not None:
+            numbers.append("more than 100,000" if each.seeds_needed is None else f"{each.seeds_needed:,}")
+        table.add_row(escape(name), *numbers)
+    screen.print(table)
+    screen.print(
+        "[dim]Under a number of seeds: the least difference between two agents of so many seeds each that is found "
+        "with power 0.8 (Welch's t, 5 %).[/dim]",
+        soft_wrap=True,
+    )

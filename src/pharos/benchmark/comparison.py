@@ -1,0 +1,275 @@
+"""Comparisons of two agents on a suite, and how many seeds a difference needs.
+
+All differences are of the first agent less the second. A p-value is that of Welch's t over seeds within tasks, which
+belongs to the interval: the interval excludes 0 where p < 0.05. Holm's correction covers the axes, and for themselves
+the tasks; the core is one question and stands alone.
+
+Sources: Welch (1947), The generalization of Student's problem when several different population variances are involved;
+Holm (1979), A simple sequentially rejective multiple test procedure; Mann and Whitney (1947), with the variance from
+placements of DeLong et al. (1988), for the probability of improvement of Agarwal et al. (2021); Newcombe (1998),
+Interval estimation for the difference between independent proportions, for differences of frontiers.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from pharos.benchmark.results import AgentResults
+from pharos.benchmark.scores import (
+    CONFIDENCE,
+    Interval,
+    axis_score,
+    check_suite,
+    interval_around,
+    run_scores,
+    standard_error,
+)
+from pharos.benchmark.suite import Suite, load_suite
+from pharos.errors import ParameterError
+
+SIGNIFICANCE = 1.0 - CONFIDENCE
+POWER = 0.8
+SEEDS = (3, 5, 10, 20)
+MOST_SEEDS = 100_000
+BETTER, WORSE, UNDECIDED = "better", "worse", "not shown to differ"
+
+
+@dataclass(frozen=True)
+class Difference:
+    """Difference of two agents' mean scores.
+
+    Attributes:
+        ours, theirs: the scores, in [0, 1].
+        interval: first agent less second, with its 95 % interval; NaN ends where one of them has one seed.
+        improvement: how probable it is that a run of the first scores higher, ties half, mean over the tasks.
+        p_value: two-sided; NaN with one seed.
+        adjusted: the same after Holm's correction in its family.
+        verdict: "better" or "worse" where adjusted < 0.05, else "not shown to differ".
+    """
+
+    ours: float
+    theirs: float
+    interval: Interval
+    improvement: Interval
+    p_value: float
+    adjusted: float
+    verdict: str
+
+
+@dataclass(frozen=True)
+class AxisComparison:
+    """Difference on one ladder: of the scores, and of the frontiers in the ladder's unit.
+
+    Attributes:
+        frontiers: first agent's and second's.
+        frontier: their difference: NaN where both lie beyond the same end, a bound ("above", "below") where one does.
+    """
+
+    axis: str
+    unit: str
+    score: Difference
+    frontiers: tuple[Interval, Interval]
+    frontier: Interval
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """One agent against another on the tasks that both have run.
+
+    Attributes:
+        ours, theirs: labels. core: None where no core task is common to both.
+        axes: by axis; tasks: by name.
+        left_out: tasks of the suite that one of them lacks, which nothing here contains.
+    """
+
+    ours: str
+    theirs: str
+    core: Difference | None
+    axes: Mapping[str, AxisComparison]
+    tasks: Mapping[str, Difference]
+    left_out: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Power:
+    """Precision of a score, and of its comparison with an agent that varies as much.
+
+    Attributes:
+        standard_error: over the seeds that there are.
+        least_differences: number of seeds -> least difference that is found with power 0.8.
+        seeds_needed: of each agent, for the difference that was asked for; None where none was, or beyond 100,000.
+    """
+
+    standard_error: float
+    least_differences: Mapping[int, float]
+    seeds_needed: int | None
+
+
+def compare(
+    ours: AgentResults | Path | str, theirs: AgentResults | Path | str, *, suite: Suite | str | None = None
+) -> Comparison:
+    """Return per task, per axis and for the core how two agents differ.
+
+    Args:
+        ours, theirs: results, a folder or file of them, or the name of a shipped baseline.
+        suite: the one that `ours` was run on, where that is not shipped.
+    Raises:
+        ParameterError: the suites' digests differ, or no task is common to both.
+    Cost: milliseconds.
+    """
+    ours, theirs = _results(ours), _results(theirs)
+    suite = _suite(ours, suite)
+    for each in (ours, theirs):
+        check_suite(each, suite)
+    x, y = run_scores(ours), run_scores(theirs)
+    common = [task.name for task in suite.tasks if task.name in x and task.name in y]
+    if not common:
+        raise ParameterError(
+            f"{ours.agent} and {theirs.agent} have no task of {suite.name} in common; run one for both"
+        )
+    left_out = tuple(task.name for task in suite.tasks if task.name not in common)
+    x, y = ({name: runs[name] for name in common} for runs in (x, y))
+    core = sorted(task.name for task in suite.core if task.name in common)
+    axes, differences = {}, {}
+    for ladder in suite.ladders:
+        mine, other = axis_score(ladder, x), axis_score(ladder, y)
+        if mine is not None and other is not None:
+            axes[ladder.axis] = mine.frontier, other.frontier
+            names = sorted(task.name for task in ladder.tasks if task.name in common)
+            differences[ladder.axis] = _difference(x, y, names)
+    units = {ladder.axis: ladder.unit for ladder in suite.ladders}
+    return Comparison(
+        ours.agent,
+        theirs.agent,
+        _judged({"": _difference(x, y, core)})[""] if core else None,
+        {
+            axis: AxisComparison(axis, units[axis], each, axes[axis], frontier_difference(*axes[axis]))
+            for axis, each in _judged(differences).items()
+        },
+        _judged({name: _difference(x, y, [name]) for name in common}),
+        left_out,
+    )
+
+
+def power(
+    results: AgentResults | Path | str, *, suite: Suite | str | None = None, difference: float | None = None
+) -> dict[str, Power]:
+    """Return for the core ("core") and each axis how precise the score is, and what a comparison would find.
+
+        t = difference / se,  se^2 = 2 sum of w_t^2 s_t^2 / n: noncentral t with power 0.8 at a level of 0.05
+
+    Args:
+        results, suite: as for `compare`.
+        difference: of scores, to be found with power 0.8.
+    Raises:
+        ParameterError: fewer than two seeds, a difference that is not positive, or another suite.
+    """
+    results = _results(results)
+    suite = _suite(results, suite)
+    check_suite(results, suite)
+    if len(results.seeds) < 2:
+        raise ParameterError(f"results of {results.agent} have one seed; expected two or more, to see how seeds vary")
+    if difference is not None and not difference > 0:
+        raise ParameterError(f"difference {difference}; expected a number above 0, such as 0.05")
+    runs = run_scores(results)
+    families = {"core": suite.core, **{ladder.axis: ladder.tasks for ladder in suite.ladders}}
+    scores = {}
+    for family, tasks in families.items():
+        own = [runs[task.name] for task in tasks if task.name in runs]
+        if own:
+            variances = np.array([np.var(each, ddof=1) for each in own]) / len(own) ** 2
+            least = {number: float(least_difference(variances, number)) for number in SEEDS}
+            error = math.sqrt(variances.sum() / len(results.seeds))
+            scores[family] = Power(error, least, None if difference is None else _seeds_for(variances, difference))
+    return scores
+
+
+def least_difference(variances: np.ndarray, seeds: int) -> float:
+    """Return the least difference of two agents that Welch's t finds with power 0.8 at a level of 0.05.
+
+    Args:
+        variances: (T,) for each task w_t^2 s_t^2, of a run of either agent.
+        seeds: of each agent, two or more.
+    """
+    from scipy.special import nctdtrinc, stdtrit
+
+    total = variances.sum()
+    if total == 0.0:
+        return 0.0
+    degrees = 2.0 * (seeds - 1) * total**2 / (variances**2).sum()
+    return float(nctdtrinc(degrees, 1.0 - POWER, stdtrit(degrees, 1.0 - SIGNIFICANCE / 2))) * math.sqrt(
+        2 * total / seeds
+    )
+
+
+def holm(p_values: Sequence[float]) -> list[float]:
+    """Return p-values after Holm's step-down correction; NaN, of what has one seed, stays and does not count."""
+    values = np.asarray(p_values, np.float64)
+    order = [index for index in np.argsort(values, kind="stable") if not np.isnan(values[index])]
+    adjusted, largest = values.copy(), 0.0
+    for rank, index in enumerate(order):
+        largest = max(largest, min(1.0, (len(order) - rank) * values[index]))
+        adjusted[index] = largest
+    return adjusted.tolist()
+
+
+def frontier_difference(ours: Interval, theirs: Interval) -> Interval:
+    """Return the difference of two frontiers, with the interval that follows from theirs (Newcombe's, or MOVER).
+
+    low = d - sqrt((v1 - l1)^2 + (u2 - v2)^2),   high = d + sqrt((u1 - v1)^2 + (v2 - l2)^2)
+    """
+    if ours.censored and ours.censored == theirs.censored:
+        return Interval(math.nan, -math.inf, math.inf, ours.censored)
+    value = ours.value - theirs.value
+    low = value - math.hypot(ours.value - ours.low, theirs.high - theirs.value)
+    high = value + math.hypot(ours.high - ours.value, theirs.value - theirs.low)
+    above = ours.censored == "above" or theirs.censored == "below"
+    return Interval(value, low, high, "above" if above else "below" if ours.censored or theirs.censored else "")
+
+
+def _difference(x: Mapping[str, np.ndarray], y: Mapping[str, np.ndarray], names: Sequence[str]) -> Difference:
+    from scipy.special import stdtr
+
+    one, other = [x[name] for name in names], [y[name] for name in names]
+    weights = [1.0 / len(names)] * (2 * len(names))
+    first, second = (float(np.mean([runs.mean() for runs in tasks])) for tasks in (one, other))
+    value = first - second
+    error, degrees = standard_error([*one, *other], weights)
+    p_value = float(2.0 * stdtr(degrees, -abs(value) / error)) if error else float(abs(value) < 1e-12)
+    pairs = [(mine[:, None] > their) + 0.5 * (mine[:, None] == their) for mine, their in zip(one, other, strict=True)]
+    placements = [pair.mean(axis=1) for pair in pairs] + [pair.mean(axis=0) for pair in pairs]
+    probability = float(np.mean([pair.mean() for pair in pairs]))
+    improvement = interval_around(probability, *standard_error(placements, weights), (0.0, 1.0))
+    return Difference(first, second, interval_around(value, error, degrees), improvement, p_value, p_value, UNDECIDED)
+
+
+def _judged(differences: Mapping[str, Difference]) -> dict[str, Difference]:
+    """The differences of one family, with Holm's correction and verdicts."""
+    judged = {}
+    adjusted = holm([each.p_value for each in differences.values()])
+    for (name, each), p in zip(differences.items(), adjusted, strict=True):
+        verdict = UNDECIDED if not p < SIGNIFICANCE else BETTER if each.interval.value > 0 else WORSE
+        judged[name] = replace(each, adjusted=p, verdict=verdict)
+    return judged
+
+
+def _seeds_for(variances: np.ndarray, difference: float) -> int | None:
+    """Least number of seeds whose least difference is at most this one, by bisection: it falls with seeds."""
+    low, high = 2, MOST_SEEDS
+    if least_difference(variances, high) > difference:
+        return None
+    while low < high:
+        middle = (low + high) // 2
+        low, high = (low, middle) if least_difference(variances, middle) <= difference else (middle + 1, high)
+    return low
+
+
+def _results(results: AgentResults | Path | str) -> AgentResults:
+    return results if isinstance(results, AgentResults) else AgentResults.read(results)
+
+
+def _suite(results: AgentResults, suite: Suite | str | None) -> Suite:
+    return suite if isinstance(suite, Suite) else load_suite(suite or results.suite)

@@ -1,0 +1,291 @@
+"""Scores of an agent: of each task, of each axis with its frontier, and of the core, with intervals over seeds.
+
+The score of a run is 1 minus the mean over its evaluations of the normalised regret (V* - V) / (V* - U), that mean
+clipped to [0, 1] as a whole: evaluations are not clipped one by one, and what lies below 0 by rounding becomes 0. Runs
+(seeds) alone are replications, and tasks are fixed; all else is a mean over runs, then over tasks of equal weight.
+
+Intervals are Student's t with the standard error over seeds within each task and the degrees of freedom of Welch and
+Satterthwaite. The percentile bootstrap of seeds within tasks is too narrow with few seeds: its spread lacks the factor
+sqrt(n / (n - 1)) and it has normal quantiles: it covers 89 to 94 % with 10 seeds, t 93 to 98 %, in
+docs/evidence/benchmark.md. No random numbers are drawn: equal results give equal intervals, to the last digit.
+
+Sources: Agarwal et al. (2021), Deep reinforcement learning at the edge of the statistical precipice, for the
+interquartile mean, the optimality gap and the strata; Satterthwaite (1946), An approximate distribution of estimates of
+variance components; Tukey and McLaughlin (1963) for the standard error of a trimmed mean from winsorised values;
+Fieller (1954), Some problems in interval estimation, for the interval of a crossing.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pharos.errors import ParameterError
+
+if TYPE_CHECKING:
+    from pharos.benchmark.results import AgentResults
+    from pharos.benchmark.suite import Ladder, Suite
+
+CONFIDENCE = 0.95
+CROSSING = 0.5  # normalised regret at the frontier
+ENOUGH_SEEDS = 10  # scores of fewer are preliminary
+GRID = 256  # points of a segment between two rungs, where the band is compared with the crossing
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A value and its 95 % interval over seeds.
+
+    Attributes:
+        value: of a frontier that the ladder does not reach: its last or first level.
+        low, high: NaN with one seed; an infinite end of a frontier lies beyond the ladder.
+        censored: "above" or "below" where the value lies beyond the last or before the first rung, else empty.
+    """
+
+    value: float
+    low: float = math.nan
+    high: float = math.nan
+    censored: str = ""
+
+    def text(self, *, ends: bool = True) -> str:
+        """The value, and its interval where `ends` are wanted and there are some: `9.4 (8.3 to 10.8)`, `> 24 (19.2 or
+        more)`.
+        """
+        sign = {"above": "> ", "below": "< "}.get(self.censored, "")
+        text = "not comparable" if math.isnan(self.value) else sign + _digits(self.value)
+        if not ends or math.isnan(self.low) or (math.isinf(self.low) and math.isinf(self.high)):
+            return text
+        if math.isinf(self.low):
+            return f"{text} ({_digits(self.high)} or less)"
+        return f"{text} ({_digits(self.low)} {'or more' if math.isinf(self.high) else f'to {_digits(self.high)}'})"
+
+    __str__ = text
+
+
+def _digits(number: float) -> str:
+    return f"{number:.3f}" if abs(number) < 1.0005 else f"{number:.3g}"
+
+
+@dataclass(frozen=True)
+class AxisScore:
+    """Result on one ladder.
+
+    Attributes:
+        unit: of the frontier.
+        score: mean over the rungs, in [0, 1].
+        frontier: level where the mean normalised regret crosses 0.5.
+    """
+
+    axis: str
+    unit: str
+    score: Interval
+    frontier: Interval
+
+
+@dataclass(frozen=True)
+class BenchmarkScore:
+    """All scores of an agent on a suite.
+
+    Attributes:
+        core: mean over the tasks of the core of the mean score over the run.
+        final: the same of the last evaluation alone.
+        iqm: mean of the middle half of all runs of all core tasks, pooled as in Agarwal et al. (2021).
+        optimality_gap: mean over core runs of max(0, regret): 1 - core, but runs below random count in full.
+        axes: by axis; tasks: score by name, the core's and the ladders'.
+        preliminary: fewer than 10 seeds, or tasks without results.
+        below_random: tasks whose mean normalised regret exceeds 1 by its whole interval.
+        missing: tasks of the suite without results, which no score contains.
+    """
+
+    core: Interval
+    final: Interval
+    iqm: Interval
+    optimality_gap: Interval
+    axes: Mapping[str, AxisScore]
+    tasks: Mapping[str, Interval]
+    preliminary: bool
+    below_random: tuple[str, ...]
+    missing: tuple[str, ...] = field(default=())
+
+
+def score(results: "AgentResults", suite: "Suite") -> BenchmarkScore:
+    """Return the scores of an agent's results on a suite; oracle scores 1 and uniform play 0.
+
+    Raises:
+        ParameterError: the results are those of another suite, or none is of a core task.
+    Cost: milliseconds.
+    """
+    check_suite(results, suite)
+    runs, finals, regrets = run_scores(results), run_scores(results, last=True), run_regrets(results)
+    core = sorted(task.name for task in suite.core if task.name in runs)
+    if not core:
+        raise ParameterError(f"results of {results.agent}: no run of a core task of {suite.name}; run its core first")
+    names = sorted(task.name for task in suite.tasks if task.name in runs)
+    missing = tuple(task.name for task in suite.tasks if task.name not in runs)
+    regret_intervals = {name: mean_interval([regrets[name]]) for name in names}
+    return BenchmarkScore(
+        core=mean_interval([runs[name] for name in core], (0.0, 1.0)),
+        final=mean_interval([finals[name] for name in core], (0.0, 1.0)),
+        iqm=interquartile_interval([runs[name] for name in core]),
+        optimality_gap=mean_interval([np.maximum(regrets[name], 0.0) for name in core], (0.0, math.inf)),
+        axes={ladder.axis: axis for ladder in suite.ladders if (axis := axis_score(ladder, runs)) is not None},
+        tasks={name: mean_interval([runs[name]], (0.0, 1.0)) for name in names},
+        preliminary=len(results.seeds) < ENOUGH_SEEDS or bool(missing),
+        below_random=tuple(name for name in names if regret_intervals[name].low > 1.0),
+        missing=missing,
+    )
+
+
+def axis_score(ladder: "Ladder", runs: Mapping[str, np.ndarray]) -> AxisScore | None:
+    """Return score and frontier over the rungs that have runs; None where none has.
+
+    Args:
+        runs: task name -> (seeds,) scores of its runs.
+    """
+    rungs = [task for task in ladder.tasks if task.name in runs]
+    if not rungs:
+        return None
+    own = [runs[task.name] for task in rungs]
+    levels = np.array([task.level for task in rungs], np.float64)
+    return AxisScore(ladder.axis, ladder.unit, mean_interval(own, (0.0, 1.0)), frontier(levels, [1.0 - x for x in own]))
+
+
+def check_suite(results: "AgentResults", suite: "Suite") -> None:
+    """Refuse results of another suite, by name.
+
+    Raises:
+        ParameterError: the digest is another one.
+    """
+    if results.digest != suite.digest:
+        raise ParameterError(
+            f"results of {results.agent} are of suite {results.suite} with digest {results.digest[:12]}; expected "
+            f"{suite.name} with {suite.digest[:12]}: run the agent on that suite"
+        )
+
+
+def run_regrets(results: "AgentResults", *, last: bool = False) -> dict[str, np.ndarray]:
+    """Return for each task the mean over evaluations of its runs' normalised regret, (seeds,); or its last one."""
+    return {name: curves[:, -1] if last else curves.mean(axis=1) for name, curves in results.curves.items()}
+
+
+def run_scores(results: "AgentResults", *, last: bool = False) -> dict[str, np.ndarray]:
+    """Return for each task the scores of its runs, (seeds,) in [0, 1]: 1 minus the clipped regret of `run_regrets`."""
+    return {name: 1.0 - np.clip(regret, 0.0, 1.0) for name, regret in run_regrets(results, last=last).items()}
+
+
+# Intervals ------------------------------------------------------------------------------------------------------------
+
+
+def standard_error(strata: Sequence[np.ndarray], weights: Sequence[float]) -> tuple[float, float]:
+    """Return the standard error of a weighted sum of means, and its degrees of freedom (Welch, Satterthwaite).
+
+        se^2 = sum of v_t,  v_t = w_t^2 s_t^2 / n_t;   df = (sum of v_t)^2 / sum of v_t^2 / (n_t - 1)
+
+    Args:
+        strata: for each task the values of its runs.
+    Returns:
+        NaN and NaN where a stratum has one run; 0 and infinity where the runs of every one agree.
+    """
+    sizes = np.array([len(own) for own in strata])
+    if sizes.min() < 2:
+        return math.nan, math.nan
+    variances = np.array(
+        [weight**2 * np.var(own, ddof=1) / len(own) for own, weight in zip(strata, weights, strict=True)]
+    )
+    variances[variances < 1e-30] = 0.0  # equal numbers whose mean is rounded
+    total = variances.sum()
+    if total == 0.0:
+        return 0.0, math.inf
+    shares = variances / total
+    return math.sqrt(total), float(1.0 / (shares**2 / (sizes - 1)).sum())
+
+
+def interval_around(
+    value: float, error: float, degrees: float, bounds: tuple[float, float] = (-math.inf, math.inf)
+) -> Interval:
+    """Return value ± t error, its ends clipped to `bounds`."""
+    from scipy.special import stdtrit
+
+    half = error * float(stdtrit(degrees, (1.0 + CONFIDENCE) / 2.0)) if error else error
+    return Interval(value, max(value - half, bounds[0]), min(value + half, bounds[1]))
+
+
+def mean_interval(strata: Sequence[np.ndarray], bounds: tuple[float, float] = (-math.inf, math.inf)) -> Interval:
+    """Return the mean over tasks of the mean over runs, with Student's interval."""
+    value = float(np.mean([own.mean() for own in strata]))
+    return interval_around(value, *standard_error(strata, [1.0 / len(strata)] * len(strata)), bounds)
+
+
+def interquartile_interval(strata: Sequence[np.ndarray]) -> Interval:
+    """Return the interquartile mean of all runs of all tasks pooled, with Student's interval.
+
+    The standard error is that of twice the mean of runs winsorised at the pooled quartiles, over seeds within tasks.
+    """
+    pooled = np.sort(np.concatenate(strata))
+    cut = len(pooled) // 4
+    value = float(pooled[cut : len(pooled) - cut].mean())
+    inner = [np.clip(own, pooled[cut], pooled[-1 - cut]) for own in strata]
+    weights = [2.0 * len(own) / len(pooled) for own in strata]
+    return interval_around(value, *standard_error(inner, weights), (0.0, 1.0))
+
+
+# Frontier -------------------------------------------------------------------------------------------------------------
+
+
+def frontier(levels: np.ndarray, regrets: Sequence[np.ndarray]) -> Interval:
+    """Return the level where mean normalised regret crosses 0.5, linear between rungs, with its interval.
+
+    Means over seeds are made increasing along the rungs (isotonic regression, equal weights). The interval holds the
+    levels where Student's interval of the mean, interpolated between two rungs, contains 0.5 (Fieller): from the first
+    level whose upper limit reaches it to the last whose lower limit does not exceed it.
+
+    Args:
+        levels: (R,) increasing. regrets: for each rung the mean regret of its runs in [0, 1].
+    Returns:
+        Censored "above" with the last level where even that rung stays below 0.5, "below" with the first one where that
+        exceeds it; an end of the interval beyond the ladder is infinite.
+    """
+    from scipy.optimize import isotonic_regression
+    from scipy.special import stdtrit
+
+    means = np.array([own.mean() for own in regrets])
+    value, censored = _crossing(levels, isotonic_regression(means).x)
+    sizes = np.array([len(own) for own in regrets])
+    if sizes.min() < 2:
+        return Interval(value, censored=censored)
+    variances = np.array([np.var(own, ddof=1) / len(own) for own in regrets])
+    variances[variances < 1e-30] = 0.0
+    grid, position = levels, np.arange(len(levels), dtype=np.float64)
+    if len(levels) > 1:
+        position = np.linspace(0.0, len(levels) - 1.0, GRID * (len(levels) - 1) + 1)
+        grid = np.interp(position, np.arange(len(levels)), levels)
+    left = np.minimum(position.astype(int), max(len(levels) - 2, 0))
+    right = np.minimum(left + 1, len(levels) - 1)
+    share = position - left
+    parts = np.stack([(1.0 - share) ** 2 * variances[left], share**2 * variances[right]])
+    total = parts.sum(axis=0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        degrees = total**2 / (parts[0] ** 2 / (sizes[left] - 1) + parts[1] ** 2 / (sizes[right] - 1))
+        half = np.where(total > 0.0, stdtrit(degrees, (1.0 + CONFIDENCE) / 2.0) * np.sqrt(total), 0.0)
+    mean = (1.0 - share) * means[left] + share * means[right]
+    reaching, staying = np.flatnonzero(mean + half >= CROSSING), np.flatnonzero(mean - half <= CROSSING)
+    low = -math.inf if reaching.size and reaching[0] == 0 else grid[reaching[0]] if reaching.size else levels[-1]
+    high = (
+        math.inf if staying.size and staying[-1] == len(grid) - 1 else grid[staying[-1]] if staying.size else levels[0]
+    )
+    return Interval(value, min(float(low), value), max(float(high), value), censored)
+
+
+def _crossing(levels: np.ndarray, regrets: np.ndarray) -> tuple[float, str]:
+    """First level where increasing regrets reach 0.5, and how it is censored."""
+    if regrets[0] > CROSSING:
+        return float(levels[0]), "below"
+    reached = int(np.searchsorted(regrets, CROSSING))
+    if reached == len(regrets):
+        return float(levels[-1]), "above"
+    if reached == 0:
+        return float(levels[0]), ""
+    below, above = regrets[reached - 1 : reached + 1]
+    return float(np.interp(CROSSING, (below, above), levels[reached - 1 : reached + 1])), ""
