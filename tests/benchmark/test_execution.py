@@ -18,6 +18,7 @@ from pharos.benchmark import BenchmarkTask, BudgetSpent, Ladder, Protocol, Suite
 from pharos.benchmark.budget import generated_curve
 from pharos.benchmark.suite import digest_of_suite, digest_of_task
 from pharos.errors import AllRunsFailed, ParameterError, UnknownName
+from pharos.system.sources import find, load
 
 PROTOCOL = Protocol(steps=300, evaluations=3, seeds=2)
 SEA = {"size": 4, "mapping_seed": 1}
@@ -324,3 +325,14 @@ def test_killed_at_random_and_repeated_it_gives_the_same_bytes(file, tmp_path):
     results = [(tmp_path / name / "results.safetensors").read_bytes() for name in ("whole", "killed")]
     assert results[0] == results[1]
     assert Path(tmp_path / "killed" / "agent.json").read_bytes() == (tmp_path / "whole" / "agent.json").read_bytes()
+
+
+@pytest.mark.long
+def test_the_dqn_of_cleanrl_learns_with_ten_other_lines(tmp_path):
+    pytest.importorskip("stable_baselines3")
+    example = Path(__file__).parents[2] / "docs" / "examples" / "cleanrl_dqn.py"
+    assert example.read_text().count("  # pharos") == 10
+    for task, steps in ((TASKS[0], 4500), (replace(TASKS[0], observation="simple_image"), 1500)):
+        _, curve = curve_of(load(find(f"{example}:learn")), task, steps=steps)
+        assert [row["step"] for row in curve.rows] == [0, steps // 3, 2 * steps // 3, steps]
+        assert steps < 4500 or curve.rows[-1]["normalized_regret"] < 0.1

@@ -1,0 +1,67 @@
+"""The baselines that are shipped with a suite: results files of ten seeds of some agents, each with one setting.
+
+python benchmarks/benchmark_baselines.py --out DIR                  all of them; what is finished in DIR stays
+python benchmarks/benchmark_baselines.py --out DIR --only dqn       one of them
+
+A baseline, src/pharos/benchmark/baselines/SUITE/NAME.safetensors, is results.safetensors of `pharos benchmark run`, and
+nothing else: `pharos benchmark run --agent dqn --set double=true --name double_dqn --out DIR/double_dqn` gives that of
+double_dqn. Settings of dqn and ppo are those of the suite; QR-DQN and recurrent PPO have them too. On one core of 2025
+named agents take some 2 s a run, those of Stable-Baselines3 10 to 60 s.
+"""
+
+import argparse
+import shutil
+from pathlib import Path
+from typing import Any
+
+from pharos import benchmark
+from pharos.benchmark.results import BASELINES, FILE
+from pharos.errors import AllRunsFailed
+
+
+def settings(suite: benchmark.Suite) -> dict[str, tuple[str, dict[str, Any]]]:
+    """Name of a baseline -> agent, and hyperparameters beside those of the suite."""
+    dqn, ppo = (dict(suite.hyperparameters[name]) for name in ("dqn", "ppo"))
+    return {
+        **{name: (name, {}) for name in ("oracle", "random", "dqn", "ppo", "q_learning")},
+        "double_dqn": ("dqn", {"double": True}),
+        "n_step_dqn": ("dqn", {"n_steps": 3}),
+        "a2c": ("a2c", {}),
+        "qrdqn": ("sb3_contrib:QRDQN", {**dqn, "policy_kwargs": {"n_quantiles": 50}}),
+        "recurrent_ppo": ("sb3_contrib:RecurrentPPO", {**ppo, "policy": "MlpLstmPolicy"}),
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, required=True, help="folder for the runs, one below it for each baseline")
+    parser.add_argument("--only", action="append", help="name of a baseline; several times for more")
+    parser.add_argument("--suite", default="v1")
+    parser.add_argument("--workers", type=int)
+    options = parser.parse_args()
+    suite = benchmark.load_suite(options.suite)
+    agents = settings(suite)
+    for name in options.only or agents:
+        if name not in agents:
+            parser.error(f"--only {name}: expected one of {', '.join(agents)}")
+    for name in options.only or agents:
+        agent, hyperparameters = agents[name]
+        out = options.out / name
+        try:
+            outcome = benchmark.run(
+                agent, suite, out=out, name=name, hyperparameters=hyperparameters, workers=options.workers
+            )
+        except AllRunsFailed as all_failed:
+            outcome = all_failed.outcome
+        if outcome.missing:
+            place, why = next(iter(outcome.missing.items()))
+            print(f"{name}: {len(outcome.missing)} runs are missing; the first, {place}: {why}", flush=True)
+            continue
+        file = BASELINES / suite.name / f"{name}.safetensors"
+        file.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(out / FILE, file)
+        print(f"{name}: mean regret {outcome.results.mean():.3f}, {file.stat().st_size:,} bytes", flush=True)
+
+
+if __name__ == "__main__":
+    main()
