@@ -6,9 +6,14 @@ import numpy as np
 import pytest
 import yaml
 
+import pharos
+from pharos import importers
 from pharos.benchmark import BenchmarkTask, Protocol, load_suite
 from pharos.benchmark.suite import FOLDER, digest_of_task, rounded, suite_of
 from pharos.errors import FileFormatError, ParameterError, UnknownName
+from pharos.mdp import TabularMDP
+from pharos.state_space import build
+from pharos.training import Task
 
 SEA = BenchmarkTask("deep_sea-6", "deep_sea", {"size": 6, "mapping_seed": 1}, "one_hot")
 GOLDEN = "2adcdf195088af7a62a30504d7da6715b15251b22f6dba377dac22192adebccc"  # made on Linux, Python 3.11
@@ -97,3 +102,77 @@ def test_errors_say_where(entry, tmp_path):
     (tmp_path / "bad.yaml").write_text("a: [")
     with pytest.raises(FileFormatError, match=r"bad\.yaml: is no YAML"):
         load_suite(tmp_path / "bad.yaml")
+
+
+def outcomes(**changes):
+    """Arrays of a small world with several outcomes: two states, two actions, and the end, a third state."""
+    arrays = {
+        "successors": [[[0, 1], [1, -1]], [[-1, 0], [1, 0]]],
+        "probabilities": [[[0.25, 0.75], [0.5, 0.5]], [[1.0, 0.0], [0.125, 0.875]]],
+        "rewards": [[0.0, 1.0], [0.5, -1.0]],
+        "initial": [0.5, 0.5],
+    }
+    return {name: np.array(changes.get(name, values)) for name, values in arrays.items()}
+
+
+@pytest.fixture
+def digest_of(monkeypatch):
+    def digest(observation="index", **changes):
+        mdp = TabularMDP.from_outcomes(**outcomes(**changes)).with_horizon(5)
+        task = Task(importers.environment(mdp), observation=observation, horizon=5)
+        assert task.mdp.num_states == 3 and task.sight.observe.observation.space is not None
+        with monkeypatch.context() as patch:  # its folder, which is named by what it holds
+            patch.setattr(type(task.env), "parameters", {"folder": "world"})
+            return digest_of_task(task)
+
+    return digest
+
+
+def test_every_array_of_the_world_counts(digest_of):
+    digests = [
+        digest_of(),
+        digest_of(successors=[[[0, 1], [1, -1]], [[-1, 0], [0, 1]]]),
+        digest_of(probabilities=[[[0.25, 0.75], [0.5, 0.5]], [[1.0, 0.0], [0.25, 0.75]]]),
+        digest_of(rewards=[[0.0, 1.0], [0.5, -1.0 + 1e-9]]),
+        digest_of(initial=[0.25, 0.75]),
+        digest_of("one_hot"),
+    ]
+    assert len(set(digests)) == len(digests)
+
+
+def test_the_order_of_outcomes_does_not_count(digest_of):
+    other = {"successors": [[[1, 0], [-1, 1]], [[-1, 0], [0, 1]]]}
+    other["probabilities"] = [[[0.75, 0.25], [0.5, 0.5]], [[1.0, 0.0], [0.875, 0.125]]]
+    assert digest_of(**other) == digest_of()
+    assert digest_of(rewards=[[-0.0, 1.0], [0.5, -1.0]]) == digest_of()
+
+
+def test_every_observation_counts():
+    from gymnasium import spaces
+
+    def picture(env, states):
+        return np.concatenate([states, np.where(states[:, :1] == unseen, 1, 0)], axis=1).astype(np.float32)
+
+    def digest():
+        task = SEA.training_task(Protocol())
+        box = spaces.Box(0, 10, (task.space.states().shape[1] + 1,), np.float32)
+        return digest_of_task(replace(task, observation=(picture, box)))
+
+    unseen = 99
+    before = digest()
+    assert digest() == before
+    unseen = 3
+    assert digest() != before
+
+
+@pytest.mark.slow
+def test_a_table_on_disk_has_the_digest_of_one_in_memory(tmp_path):
+    task = BenchmarkTask("lake", "frozen_lake", {"size": 5, "seed": 0}).training_task(Protocol())
+    other = BenchmarkTask("lake", "frozen_lake", {"size": 5, "seed": 0}).training_task(Protocol())
+    other.__dict__["space"] = pharos.load(build(task.env, tmp_path / "lake", memory=1 << 24, workers=2).folder)
+    assert digest_of_task(other) == digest_of_task(task)
+
+
+@pytest.mark.long
+def test_every_task_of_v1_is_what_it_was():
+    load_suite().check()

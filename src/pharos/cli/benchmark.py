@@ -113,10 +113,13 @@ def _entry(task: "BenchmarkTask") -> dict[str, Any]:
 
 
 def _minutes(suite: "Suite") -> dict[str, float]:
-    """Minutes of one processor that all seeds of all tasks take, by baseline; tasks without a time are left out."""
-    agents = dict.fromkeys(agent for task in suite.tasks for agent in task.seconds)
-    seeds = suite.protocol.seeds
-    return {agent: sum(task.seconds.get(agent, 0.0) for task in suite.tasks) * seeds / 60 for agent in agents}
+    """Minutes of one processor for all seeds of all tasks, by baseline; a task without a time counts as the mean."""
+    times: dict[str, list[float]] = {}
+    for task in suite.tasks:
+        for agent, seconds in task.seconds.items():
+            times.setdefault(agent, []).append(seconds)
+    runs = len(suite.tasks) * suite.protocol.seeds
+    return {agent: runs * sum(each) / len(each) / 60 for agent, each in times.items()}
 
 
 def _print(suite: "Suite") -> None:
