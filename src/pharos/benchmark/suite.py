@@ -66,7 +66,7 @@ class BenchmarkTask:
         chance: the kinds of `ChanceSetting` that are not 0.
         axis: "core", or that of its ladder.
         level: on a ladder: the measured quantity, in the ladder's unit; None in the core.
-        predicted: normalised regret, 0 optimal and 1 uniform play, of idealised learners: "dqn", "ppo", and "table",
+        predicted: by `pharos.predict`, normalised regret, 0 optimal and 1 uniform play: "dqn", "ppo", and "table",
             that of the DQN with a table; some may be missing.
         value_optimal, value_uniform: at the start, of the optimal policy and of uniform play.
         digest: SHA-256 of the task as it was frozen; see `digest_of_task`.
