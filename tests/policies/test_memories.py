@@ -150,12 +150,16 @@ def test_estimates_agree_with_exact_values_within_their_bound(chance):
         assert abs(estimate.value - exact.value) <= estimate.error_bound + exact.error_bound
 
 
-def test_a_policy_that_remembers_the_bit_has_no_regret():
-    task = Task.of("memory_chain/length-10")
-    bit = list(task.sight.observe.names).index("bits[0]")
+@pytest.mark.parametrize("length", [1, 4, 32])
+def test_a_policy_that_remembers_what_is_seen_first_has_no_regret(length):
+    env = pharos.make("memory_chain", memory_length=length)
+    task = Task(env, observation="one_hot", observation_options={"seen_first": ["bits"]})
+    (bit,) = [i for i, name in enumerate(task.sight.observe.names) if "bits" in name and name.endswith("1")]
     found = evaluate_agent(Rememberer(bit), task)
     assert found.exact and found.value == task.optimal.value_at_start == 1.0
-    assert found.states == 2 * 11
+    assert found.states == 2 * (length + 1)
+    forgetful = evaluate_agent(Forgetful(lambda seen: np.round(seen[:, bit]).astype(int)), task)
+    assert forgetful.value == 0.0  # when it is asked for, the bit is no longer seen
 
 
 def test_the_most_probable_action_of_a_memory_is_that_of_its_maximum():
