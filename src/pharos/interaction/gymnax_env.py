@@ -67,10 +67,21 @@ class GymnaxEnv(environment.Environment):
         low, high: of the observations.
         time_limit: steps of an episode.
         name: of the environment.
+        reward_noise: standard deviation of what is added to each reward.
     """
 
-    def __init__(self, mdp: TabularMDP, observations: np.ndarray, low: Any, high: Any, time_limit: int, name: str):
+    def __init__(
+        self,
+        mdp: TabularMDP,
+        observations: np.ndarray,
+        low: float,
+        high: float,
+        time_limit: int,
+        name: str,
+        reward_noise: float = 0.0,
+    ):
         super().__init__()
+        self._reward_noise = reward_noise
         self._name, self._num_actions, self._num_states = name, mdp.num_actions, mdp.num_states
         self._space = spaces.Box(low, high, observations.shape[1:], observations.dtype)
         nothing = np.zeros_like(observations[:1])
@@ -118,6 +129,8 @@ class GymnaxEnv(environment.Environment):
         outcome = _drawn(params.cumulative[state.index, executed], jax.random.uniform(key_outcome))
         next_index = params.successors[state.index, executed, outcome]
         reward = params.rewards[state.index, executed]
+        if self._reward_noise:  # its key leaves those of the steps what they are
+            reward += self._reward_noise * jax.random.normal(jax.random.fold_in(key, 3))
         after = EnvState(time=state.time + 1, index=next_index, previous=executed)
         is_over = params.ends[next_index]
         info = {"discount": jnp.where(is_over, 0.0, 1.0), "executed": executed}

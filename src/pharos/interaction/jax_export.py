@@ -23,6 +23,7 @@ def to_gymnax(
     observation_options: Mapping[str, Any] | None = None,
     time_limit: int | None = None,
     joined_ends: bool = False,
+    reward_noise: float = 0.0,
 ) -> "GymnaxEnv":
     """Return a state space or an MDP as an environment of gymnax: `jit`, `vmap` and `scan` go through `reset` and
     `step`.
@@ -37,6 +38,7 @@ def to_gymnax(
         time_limit: steps of an episode; None: those of the MDP's horizon, else of the environment.
         joined_ends: whether `step` returns one `done` in place of terminated and truncated, as before gymnax 1.0 and
             as rejax 0.1 expects.
+        reward_noise: standard deviation of what is added to each reward.
     Raises:
         MissingExtra: JAX or gymnax is not installed. ParameterError: nothing says what is seen, or how long episodes
             are.
@@ -69,7 +71,8 @@ def to_gymnax(
     else:
         observations, low, high = _observed(space, env, observation, dict(observation_options or {}))
     made = JoinedEnds if joined_ends else GymnaxEnv
-    return made(mdp, observations, low, high, int(limit), str(env if env is not None else mdp))
+    name = str(env if env is not None else mdp)
+    return made(mdp, observations, low, high, int(limit), name, reward_noise)
 
 
 def _observed(space: StateSpace, env: Any, name: Any, options: dict[str, Any]) -> tuple[np.ndarray, float, float]:
