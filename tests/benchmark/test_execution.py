@@ -134,6 +134,36 @@ def test_the_budget_ends_what_would_go_on_for_ever():
     assert taken.count(1) == 300 and taken[-1] == "spent"
 
 
+def test_a_policy_with_a_memory_counts_as_it_was_when_it_was_yielded():
+    """It plays `moves[t]` at step t, which the agent overwrites after each snapshot."""
+
+    class Moves:
+        moves = np.zeros(5, np.int64)
+
+        def initial_state(self, n):
+            return np.zeros(n, np.int64)
+
+        def __call__(self, observations, state, starts):
+            return self.moves[state], state + 1
+
+    policy = Moves()
+
+    def learn(env, steps, seed):
+        for part in range(3):
+            env.reset()
+            for _ in range(100):
+                _, _, terminated, truncated, _ = env.step(0)
+                if terminated or truncated:
+                    env.reset()
+            policy.moves = np.full(5, part % 2)
+            yield policy
+        policy.moves = np.full(5, 7)
+
+    solved, curve = curve_of(learn, replace(TASKS[0], chance={"sticky": 0.25}))
+    values = [evaluate_policy(solved.mdp, np.full(solved.mdp.num_states, a)).value_at_start for a in (0, 1, 0)]
+    assert [row["value"] for row in curve.rows[1:]] == pytest.approx(values, abs=1e-12)
+
+
 def test_an_agent_that_ends_early_keeps_its_last_policy():
     def learn(env, steps, seed):
         yield always(1)

@@ -2,7 +2,8 @@
 
     engine       q_learning, dqn, ppo (the batched engine), a2c: pharos trains them, with one setting for all tasks
     class        module:Class or file.py:Class, with Stable-Baselines3's interface
-    generator    file.py:learn or a function: learn(env, steps, seed), see budget.py
+    generator    file.py:learn or a function: learn(env, steps, seed), see budget.py; its policies may have a memory
+    jax          the same with learn(env, params, steps, key) -> (apply, snapshots), see jax_agents.py
     exact        oracle and random: the optimal policy and uniform play, solved and not run
 
 `agent_form` chooses; a further form is a subclass of `Form`, and a line there.
@@ -25,12 +26,14 @@ import numpy as np
 from pharos.agents import AGENTS, BATCHED, batched, check_hyperparameters, is_known
 from pharos.agents import hyperparameters as hyperparameters_of
 from pharos.benchmark.budget import Learn, generated_curve, uniform_policy
+from pharos.benchmark.jax_agents import LearnCompiled, compiled_curves
 from pharos.benchmark.suite import BenchmarkTask, Protocol, Suite
 from pharos.errors import ParameterError, PharosError
 from pharos.system.sources import Source, find, is_reference, load, source_of
 from pharos.system.wording import in_one_line
 from pharos.system.workers import check_guard, end_with_parent, without_interrupts, without_main
 from pharos.training import (
+    Curve,
     RunConfig,
     Task,
     TaskCache,
@@ -112,7 +115,7 @@ def agent_form(agent: str | Callable[..., Any], suite: Suite, hyperparameters: M
     """
     setting = dict(hyperparameters or {})
     if not isinstance(agent, str):
-        return _generator(agent, source_of(agent), setting)
+        return _function(agent, source_of(agent), setting)
     if agent in EXACT:
         if setting:
             raise ParameterError(f"agent {agent!r} has no hyperparameters; found {', '.join(setting)}")
@@ -121,7 +124,7 @@ def agent_form(agent: str | Callable[..., Any], suite: Suite, hyperparameters: M
         source = find(agent)
         code = load(source)
         if not isinstance(code, type):
-            return _generator(code, source, setting)
+            return _function(code, source, setting)
         check_hyperparameters(code, setting)
         return Trained(agent, "class", setting, source, sha256(source.file))
     defaults = {**hyperparameters_of(agent, "", ""), **ALSO.get(agent, {})} if agent in AGENTS else {}
@@ -210,7 +213,7 @@ class Trained(Form):
 # Generators -----------------------------------------------------------------------------------------------------------
 
 
-def _generator(code: object, source: Source | None, setting: Mapping[str, Any]) -> Form:
+def _function(code: object, source: Source | None, setting: Mapping[str, Any]) -> Form:
     name = source.name if source is not None else getattr(code, "__qualname__", repr(code))
     if not callable(code):
         raise ParameterError(
@@ -218,13 +221,19 @@ def _generator(code: object, source: Source | None, setting: Mapping[str, Any]) 
         )
     if setting:
         raise ParameterError(
-            f"agent {name!r} is a generator, which has its hyperparameters in its code; found {', '.join(setting)}"
+            f"agent {name!r} is a function, which has its hyperparameters in its code; found {', '.join(setting)}"
         )
+    checksum = sha256(source.file) if source is not None else _text_checksum(code)
+    with contextlib.suppress(TypeError, ValueError):
+        inspect.signature(code).bind(None, None, 0, None)
+        return Compiled(name, "jax", source=source, checksum=checksum, learn=code)
     try:
         inspect.signature(code).bind(None, 0, 0)
     except (TypeError, ValueError) as error:
-        raise ParameterError(f"agent {name!r}: {error}; expected a function learn(env, steps, seed)") from None
-    checksum = sha256(source.file) if source is not None else _text_checksum(code)
+        raise ParameterError(
+            f"agent {name!r}: {error}; expected a function learn(env, steps, seed), or learn(env, params, steps, key) "
+            f"of JAX"
+        ) from None
     return Generated(name, "generator", source=source, checksum=checksum, learn=code)
 
 
@@ -304,6 +313,16 @@ def _generate_from(source: Source, label: str, job: Job, protocol: Protocol) -> 
 
 def _generate(learn: Learn, label: str, job: Job, protocol: Protocol) -> str | None:
     """One run, into its folder; None, or why it failed."""
+    try:
+        task = job.task.training_task(protocol)
+        curve = generated_curve(learn, task, steps=protocol.steps, evaluations=protocol.evaluations, seed=job.seed)
+    except Exception as error:
+        return _record(label, job, protocol, error)
+    return _record(label, job, protocol, curve)
+
+
+def _record(label: str, job: Job, protocol: Protocol, end: Curve | Exception) -> str | None:
+    """What a run has led to, into its folder; None, or why it failed."""
     config = {
         "benchmark": {"task": job.task.name, "digest": job.task.digest},
         "agent": label,
@@ -313,20 +332,52 @@ def _generate(learn: Learn, label: str, job: Job, protocol: Protocol) -> str | N
     }
     job.folder.mkdir(parents=True, exist_ok=True)
     record = {"format": 1, "id": run_id(config), "config": config}
-    try:
-        task = job.task.training_task(protocol)
-        curve = generated_curve(learn, task, steps=protocol.steps, evaluations=protocol.evaluations, seed=job.seed)
-    except Exception as error:
-        said = f"{label} on {job.task.name}, seed {job.seed}: {type(error).__name__}: {in_one_line(error)}"
+    if isinstance(end, Exception):
+        said = f"{label} on {job.task.name}, seed {job.seed}: {type(end).__name__}: {in_one_line(end)}"
         write_record(job.folder, {**record, "status": "failed", "error": said})
         return said
-    write_curve(job.folder, curve.rows)
-    write_record(job.folder, {**record, "status": "finished", "result": curve.result()})
+    write_curve(job.folder, end.rows)
+    write_record(job.folder, {**record, "status": "finished", "result": end.result()})
     return None
 
 
 def _is_finished(job: Job) -> bool:
     return (job.folder / "run.json").exists() and read_record(job.folder).get("status") == "finished"
+
+
+# JAX ------------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Compiled(Form):
+    """A function of JAX: one program for all seeds of a task, which is run again where one of them is missing.
+
+    Attributes:
+        learn: the function.
+    """
+
+    learn: LearnCompiled | None = None
+
+    def train(self, jobs: Sequence[Job], protocol: Protocol, workers: int, checkpoints: Path, tell: Tell) -> None:
+        assert self.learn is not None
+        groups: dict[str, list[Job]] = defaultdict(list)
+        for job in jobs:
+            groups[job.task.name].append(job)
+        for number, group in enumerate(groups.values()):
+            tell(number / len(groups), f"{number} of {len(groups)} tasks")
+            if all(_is_finished(job) for job in group):
+                continue
+            task, seeds = group[0].task.training_task(protocol), [job.seed for job in group]
+            ends: Sequence[Curve | Exception]
+            try:
+                ends = compiled_curves(
+                    self.learn, task, steps=protocol.steps, evaluations=protocol.evaluations, seeds=seeds
+                )
+            except Exception as error:
+                ends = [error] * len(group)
+            for job, end in zip(group, ends, strict=True):
+                _record(self.label, job, protocol, end)
+        tell(1.0, f"{len(groups)} of {len(groups)} tasks")
 
 
 # Exact ----------------------------------------------------------------------------------------------------------------

@@ -23,7 +23,7 @@ import numpy as np
 
 from pharos.errors import ParameterError
 from pharos.interaction import GymEnv
-from pharos.policies import PolicyAnswers, PolicyLike
+from pharos.policies import Model, PolicyAnswers, PolicyLike, RecurrentPolicy, deep_policy
 from pharos.training import Curve, Evaluation, Task, evaluate_agent
 
 BLOCK = 4096  # observations that a policy is asked about at once
@@ -113,7 +113,10 @@ class Snapshots:
             ParameterError: it answers something else than actions or probabilities.
         """
         task = self.task
-        if task.sight.frames > 1 or task.mdp.num_states > LARGEST or isinstance(policy, np.ndarray):
+        if isinstance(policy, Model):
+            policy = deep_policy(policy)
+        has_no_table = isinstance(policy, np.ndarray | RecurrentPolicy)
+        if has_no_table or task.sight.frames > 1 or task.mdp.num_states > LARGEST:
             return evaluate_agent(policy, task)
         answers = PolicyAnswers(policy, task.mdp, task.sight)
         if task.sight.observe.observation.irrelevant:

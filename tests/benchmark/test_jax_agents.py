@@ -1,0 +1,169 @@
+"""Agents in JAX on tasks of the benchmark: which snapshot counts, and that its value is exact. Skipped without JAX."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import pharos
+from pharos import benchmark
+from pharos.benchmark import BenchmarkTask, Protocol, Suite
+from pharos.benchmark.jax_agents import compiled_curves
+from pharos.benchmark.suite import digest_of_suite, digest_of_task
+from pharos.errors import AllRunsFailed, ParameterError
+from pharos.training import Task, evaluate_agent
+
+GRID = "simple_grid/4x4-decoy"
+
+
+@pytest.fixture(scope="module")
+def jax():
+    pytest.importorskip("gymnax")
+    return pytest.importorskip("jax")
+
+
+def learner(jax, number):
+    """Q-learning with a linear function, `number` snapshots."""
+    jnp = jax.numpy
+
+    def learn(env, params, steps, key):
+        def step(carry, key):
+            q, seen, state = carry
+            key_action, key_coin, key_step = jax.random.split(key, 3)
+            other = jax.random.randint(key_action, (), 0, env.num_actions)
+            action = jnp.where(jax.random.uniform(key_coin) < 0.5, other, jnp.argmax(seen @ q))
+            after, state, reward, terminated, _, info = env.step(key_step, state, action, params)
+            ahead = jnp.where(terminated, 0.0, jnp.max(info["final_observation"] @ q))
+            q = q.at[:, action].add(0.2 * (reward + 0.9 * ahead - seen @ q[:, action]) * seen)
+            return (q, after, state), None
+
+        def part(carry, keys):
+            carry, _ = jax.lax.scan(step, carry, keys)
+            return carry, {"q": carry[0]}
+
+        key, key_reset = jax.random.split(key)
+        seen, state = env.reset(key_reset, params)
+        keys = jax.random.split(key, steps).reshape(number, steps // number, -1)
+        _, snapshots = jax.lax.scan(part, (jnp.zeros((seen.size, env.num_actions)), seen, state), keys)
+        return lambda parameters, observations: jnp.argmax(observations @ parameters["q"], axis=1), snapshots
+
+    return learn
+
+
+def constants(jax, weights):
+    """Snapshots of policies that play by fixed logits (K, A), whatever they see."""
+
+    def learn(env, params, steps, key):
+        def policy(logits, observations):
+            return jax.nn.softmax(jax.numpy.broadcast_to(logits, (len(observations), env.num_actions)))
+
+        return policy, jax.numpy.asarray(weights)
+
+    return learn
+
+
+@pytest.mark.slow
+def test_an_agent_learns_and_its_curve_is_that_of_its_policies(jax):
+    task = Task.of(GRID, observation="one_hot", random=0.1)
+    learn, seeds = learner(jax, 5), (3, 4)
+    curves = compiled_curves(learn, task, steps=5000, evaluations=5, seeds=seeds)
+    env = pharos.to_gymnax(task.mdp, "one_hot", time_limit=task.env.max_episode_steps)
+    for seed, curve in zip(seeds, curves, strict=True):
+        snapshots = jax.jit(lambda key: learn(env, env.default_params, 5000, key)[1])(jax.random.PRNGKey(seed))
+        tables = np.argmax(np.asarray(env.default_params.observations[:-1] @ snapshots["q"]), axis=2)
+        values = [evaluate_agent(table, task).value for table in tables]
+        assert [row["step"] for row in curve.rows] == [0, 1000, 2000, 3000, 4000, 5000]
+        assert all(row["exact"] for row in curve.rows)
+        assert [row["value"] for row in curve.rows[1:]] == pytest.approx(values, abs=1e-12)
+        assert curve.rows[0]["normalized_regret"] == pytest.approx(1.0)
+        assert curve.rows[-1]["normalized_regret"] < 0.1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("number", "expected"), [(6, [1, 3, 5]), (3, [0, 1, 2]), (2, [-1, 0, 1]), (1, [-1, -1, 0])])
+def test_the_snapshot_that_was_taken_last_counts(jax, number, expected):
+    task = Task.of(GRID)
+    weights = np.random.default_rng(0).normal(size=(number, 4)).astype(np.float32)
+    (curve,) = compiled_curves(constants(jax, weights), task, steps=300, evaluations=3, seeds=[0])
+    tables = [*np.exp(weights.astype(float)), np.ones(4)]
+    for row, place in zip(curve.rows[1:], expected, strict=True):
+        table = np.tile(tables[place] / tables[place].sum(), (task.mdp.num_states, 1))
+        assert row["value"] == pytest.approx(evaluate_agent(table, task).value, abs=1e-5)
+
+
+@pytest.mark.slow
+def test_rewards_have_the_noise_of_the_task(jax):
+    space = pharos.build(GRID, progress=False)
+    plain, noisy = pharos.to_gymnax(space), pharos.to_gymnax(space, reward_noise=2.0)
+    keys = jax.random.split(jax.random.PRNGKey(0), 4000)
+
+    def pay(env, key):
+        _, state = env.reset(key)
+        _, after, reward, *_ = env.step_env(key, state, 1, env.default_params)
+        return after.index, reward
+
+    index, rewards = jax.vmap(lambda key: pay(plain, key))(keys)
+    index_with, rewards_with = jax.vmap(lambda key: pay(noisy, key))(keys)
+    assert (index == index_with).all()
+    noise = np.asarray(rewards_with - rewards)
+    assert abs(noise.mean()) < 4 * 2.0 / np.sqrt(4000)
+    assert noise.std() == pytest.approx(2.0, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"observation": "simple_image", "observation_options": {"frames": 2}}, "have no frames"),
+        ({"reward_delay": 2}, "have no reward_delay"),
+        ({"previous_action": True}, "have no previous_action"),
+    ],
+)
+def test_what_is_in_no_table_is_refused(options, message):
+    with pytest.raises(ParameterError, match=message):
+        compiled_curves(None, Task.of(GRID, **options), steps=3, evaluations=3, seeds=[0])
+
+
+def test_snapshots_without_a_common_axis_are_refused(jax):
+    task = Task.of(GRID)
+    for snapshots in ((np.zeros(2), np.zeros(3)), np.float32(1)):
+        with pytest.raises(ParameterError, match="expected one number of at least 1"):
+            compiled_curves(
+                lambda *_, each=snapshots: (None, jax.tree.map(jax.numpy.asarray, each)),
+                task,
+                steps=3,
+                evaluations=3,
+                seeds=[0],
+            )
+
+
+@pytest.mark.slow
+def test_a_suite_is_run_and_goes_on(jax, tmp_path):
+    protocol = Protocol(steps=300, evaluations=3, seeds=2)
+    suite = _suite(protocol)
+    calls = []
+
+    def learn(env, params, steps, key):
+        calls.append(steps)
+        return learner(jax, 3)(env, params, steps, key)
+
+    found = benchmark.run(learn, suite, out=tmp_path / "mine", seeds=range(2))
+    assert calls == [300] and found.results.record["form"] == "jax" and not found.missing
+    assert found.results.curves["grid"].shape == (2, 3)
+    again = benchmark.run(learn, suite, out=tmp_path / "mine", seeds=range(2))
+    assert calls == [300]
+    np.testing.assert_array_equal(again.results.curves["grid"], found.results.curves["grid"])
+
+    def broken(env, params, steps, key):
+        raise ValueError("no gradient")
+
+    with pytest.raises(AllRunsFailed, match="no gradient"):
+        benchmark.run(broken, suite, out=tmp_path / "broken", seeds=range(2))
+
+
+def _suite(protocol):
+    task = BenchmarkTask("grid", "simple_grid", {"height": 4, "width": 4}, "one_hot")
+    solved = task.training_task(protocol)
+    values = {"value_optimal": solved.reference.optimal, "value_uniform": solved.reference.uniform}
+    made = replace(task, digest=digest_of_task(solved), **values)
+    suite = Suite("one", protocol, (made,), (), "", {})
+    return replace(suite, digest=digest_of_suite(suite))
