@@ -13,7 +13,7 @@ from pharos.benchmark.suite import digest_of_suite, digest_of_task
 from pharos.errors import AllRunsFailed, ParameterError
 from pharos.training import Task, evaluate_agent
 
-GRID = "simple_grid/4x4-decoy"
+GRID = "simple_grid/4x4-plain"
 
 
 @pytest.fixture(scope="module")
