@@ -102,6 +102,12 @@ class GymnaxEnv(environment.Environment):
             chance=jnp.asarray([*mdp.chance.triple, mdp.chance.first_chosen], jnp.float32),
         )
 
+    def joined_ends(self) -> "JoinedEnds":
+        """The same environment with the `step` of gymnax before 1.0, whose fourth part is one `done`."""
+        other = object.__new__(JoinedEnds)
+        other.__dict__.update(self.__dict__)
+        return other
+
     @property
     def default_params(self) -> EnvParams:
         """The tables of the MDP."""
