@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from pharos.benchmark.execution import run
     from pharos.benchmark.results import AgentResults, baselines, read_results
     from pharos.benchmark.scores import AxisScore, BenchmarkScore, Interval, score
+    from pharos.benchmark.sealed import sealed_copies, sealed_instances, season_seed, write_suite
     from pharos.benchmark.suite import BenchmarkTask, Ladder, Protocol, Suite, load_suite
 
 __all__ = [
@@ -36,8 +37,12 @@ __all__ = [
     "read_results",
     "run",
     "score",
+    "sealed_copies",
+    "sealed_instances",
+    "season_seed",
 ]
 _shared = """
+    write_suite
 """
 
 __getattr__ = lazy.attributes(__name__)

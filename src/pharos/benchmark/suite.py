@@ -253,17 +253,18 @@ def digest_of_suite(suite: Suite) -> str:
 def digest_of_task(task: Task) -> str:
     """SHA-256 of a task as it is solved: what it is made of, by name, and its arrays.
 
-    The names: environment, all its parameters, version of its rules, observation with its options, chance, gamma and
-    time limit. The arrays, little-endian: of each state and action the possible next states, -1 for the end, in
-    increasing order, and their probabilities; rewards (S, A), the probability that an episode begins in each state,
-    which states are terminal, and the observation of each state. States are in the order in which they are found from
-    the start, which is the same everywhere. Numbers count by their first 40 bits.
+    The names: environment, all its parameters (of an imported MDP none: it is its arrays), version of its rules,
+    observation with its options, chance, gamma and time limit. The arrays, little-endian: of each state and action the
+    possible next states, -1 for the end, in increasing order, and their probabilities; rewards (S, A), the probability
+    that an episode begins in each state, which states are terminal, and the observation of each state. States are in
+    the order in which they are found from the start, which is the same everywhere. Numbers count by their first 40
+    bits.
     """
     space, mdp = task.space, task.space.mdp(gamma=task.gamma)
     env, observe = task.env, task.sight.observe.observation
     said = {
         "environment": env.name,
-        "parameters": env.parameters,
+        "parameters": {} if env.name == "imported" else env.parameters,  # whose folder may lie anywhere
         "rules_version": env.version,
         "observation": str(task.observation),
         "observation_options": dict(task.observation_options),

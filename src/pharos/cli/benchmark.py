@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 app = Commands(no_args_is_help=True, help="Run agents on a frozen suite of solved tasks, and compare them.")
 
 SuiteName = Annotated[str, typer.Argument(metavar="[SUITE]", help="Name of a suite, or FILE.yaml.")]
+SuiteFile = Annotated[str, typer.Option("--suite", metavar="NAME|FILE")]
+Folder = Annotated[Path, typer.Argument(metavar="DIR")]
 
 
 @app.command("show")
@@ -106,6 +108,28 @@ def run(
         "folder": out,
     }
     return Answer(answer, (f"{results.agent} on {results.suite}", facts), bool(missing))
+
+
+@app.command("seal")
+def seal(folder: Folder, *, season: str, beacon: str, suite: SuiteFile = "v1") -> Answer:
+    """Make the sealed half of a suite, of a round of a public beacon: copies.yaml and instances.yaml.
+
+    Args:
+        folder: For the two suites and the MDPs of the copies.
+        season: Its name, such as v1.s1.
+        beacon: What the round of the season gave, as published; see the rules.
+        suite: The public one.
+    """
+    from pharos.benchmark import load_suite, sealed_copies, sealed_instances, season_seed, write_suite
+
+    public, seed = load_suite(suite), season_seed(season, beacon)
+    copies = sealed_copies(public, seed, folder / "copies")
+    made = {"copies": copies, "instances": sealed_instances(public, seed)}
+    for name, each in made.items():
+        write_suite(each, folder / f"{name}.yaml")
+    answer = {name: {"file": folder / f"{name}.yaml", "digest": each.digest} for name, each in made.items()}
+    facts = [(name, f"{many(len(each.tasks), 'task')}, {each.digest}") for name, each in made.items()]
+    return Answer({"season": season, "seed": seed, **answer}, (str(folder), facts))
 
 
 def _entry(task: "BenchmarkTask") -> dict[str, Any]:
