@@ -10,7 +10,8 @@ DIR/results.safetensors    all curves of what was asked for, when the runs have 
 import os
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from functools import cached_property
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ import numpy as np
 
 from pharos.benchmark.agents import Form, Job, Tell, agent_form
 from pharos.benchmark.results import FILE, AgentResults
+from pharos.benchmark.scores import AxisScore, BenchmarkScore, Interval, score
 from pharos.benchmark.suite import CORE, BenchmarkTask, Suite, load_suite
 from pharos.errors import AllRunsFailed, FolderLocked, ParameterError, PharosError, UnknownName
 from pharos.system import storage
@@ -27,7 +29,7 @@ from pharos.system.workers import usable_workers
 from pharos.training import versions
 
 QUICK = 3  # seeds
-SUITE, AGENT = "suite.json", "agent.json"
+SUITE, AGENT, SCORE = "suite.json", "agent.json", "score.json"
 SHOWN = 200  # characters of what differs
 
 
@@ -39,11 +41,28 @@ class Outcome:
         results: curves of the tasks of which all runs have finished.
         folder: of the runs.
         missing: "task, seed" -> why that run has no result.
+        suite: that was run.
     """
 
     results: AgentResults
     folder: Path
     missing: Mapping[str, str]
+    suite: Suite
+
+    @cached_property
+    def scores(self) -> BenchmarkScore:
+        """All scores. ParameterError: no task of the core has results."""
+        return score(self.results, self.suite)
+
+    @property
+    def score(self) -> Interval:
+        """That of the core."""
+        return self.scores.core
+
+    @property
+    def axes(self) -> Mapping[str, AxisScore]:
+        """Scores and frontiers of the ladders."""
+        return self.scores.axes
 
 
 def run(
@@ -181,9 +200,11 @@ def _collected(folder: Path, form: Form, suite: Suite, record: Mapping[str, Any]
     whole = {task: np.stack(each) for task, each in curves.items() if len(each) == len(seeds)}
     said = {**record, "exact": {task: exact[task] for task in whole}}
     results = AgentResults(str(record["agent"]), suite.name, suite.digest, seeds, whole, said)
-    outcome = Outcome(results, folder, missing)
+    outcome = Outcome(results, folder, missing, suite)
     if not whole:
         reason, _ = Counter(missing.values()).most_common(1)[0]
         raise AllRunsFailed(folder, {reason: reason}, outcome)
     results.write(folder / FILE)
+    if any(task.name in whole for task in suite.core):
+        storage.replace_json(folder / SCORE, {"agent": results.agent, "suite": suite.name, **asdict(outcome.scores)})
     return outcome

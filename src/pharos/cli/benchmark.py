@@ -92,12 +92,15 @@ def run(
     results, missing = outcome.results, outcome.missing
     for reason, count in Counter(missing.values()).most_common():
         complain(f"{count} x {reason}")
-    facts = [
+    facts: list[tuple[str, object]] = [
         ("runs", f"{many(len(results.seeds), 'seed')} of {many(len(results.curves), 'task')}"),
         ("missing", "; ".join(missing) or "none"),
         ("regret", f"{results.mean():.4g} of uniform play, mean of all runs" if results.curves else "none"),
-        ("results", out),
     ]
+    if any(task.name in results.curves for task in loaded.core):
+        facts += [("score of the core", f"{outcome.score}{', preliminary' if outcome.scores.preliminary else ''}")]
+        facts += [(f"frontier of {axis}", f"{each.frontier} {each.unit}") for axis, each in outcome.axes.items()]
+    facts.append(("results", out))
     answer = {
         "agent": results.agent,
         "suite": results.suite,
