@@ -56,6 +56,7 @@ def stage() -> Path:
         pages |= section
     pages |= site_pages.explorer()
     pages["cli.md"] = str(pages["cli.md"]).replace(cli_page.MARK, cli_page.tables())
+    pages["benchmark.md"] = str(pages["benchmark.md"]).replace(site_pages.BOARD, site_pages.baseline_board())
     pages |= {name: site_pages.live(name, str(pages[name])) for name in site_pages.LIVE}
     pages["index.md"] = f"---\nhide: [navigation, toc]\n---\n\n{pages['index.md']}"
     for name, content in pages.items():

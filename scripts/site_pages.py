@@ -12,15 +12,19 @@ import itertools
 import json
 import re
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import pharos
+from pharos import benchmark
+from pharos.benchmark.charts import frontier_text
+from pharos.benchmark.contents import number
 from pharos.cli.list import list_, rules_of
 from pharos.environments import classes, make
 from pharos.interaction.registration import ids_of
 
 DOCS = Path(__file__).parents[1] / "docs"
+BOARD = "<!-- The site has the board of baselines here: scripts/site_pages.py. -->"
 MORE = {  # pages that say more of a class
     **dict.fromkeys(("frozen_lake", "taxi", "cliff_walking", "blackjack"), "toy-text.md"),
     **dict.fromkeys(("sliding_tiles", "pocket_cube", "sokoban"), "puzzles.md"),
@@ -325,6 +329,24 @@ def live(page: str, text: str) -> str:
     file, title, height = LIVE[page]
     frame = f'<iframe src="{file}" title="{title}" loading="lazy" class="live" style="height: {height}"></iframe>'
     return text.replace(MARK, f"{frame}\n\n[Open it alone]({file})")
+
+
+def board(suite: benchmark.Suite, agents: Sequence[benchmark.AgentResults]) -> str:
+    """Table of agents on a suite, the best core first: score of the core, frontiers, digest and seeds."""
+    scores = {each.agent: benchmark.score(each, suite) for each in agents}
+    axes = [ladder.axis for ladder in suite.ladders]
+    heads = ["agent", "core", *(f"{ladder.axis} ({ladder.unit})" for ladder in suite.ladders), "seeds"]
+    lines = ["| " + " | ".join(heads) + " |", "|---" * len(heads) + "|"]
+    for each in sorted(agents, key=lambda each: -scores[each.agent].core.value):
+        own = scores[each.agent]
+        frontiers = [frontier_text(own.axes[axis].frontier) if axis in own.axes else "–" for axis in axes]
+        lines.append("| " + " | ".join([each.agent, number(own.core), *frontiers, str(len(each.seeds))]) + " |")
+    return "\n".join([*lines, "", f"Suite {suite.name}, digest `{suite.digest}`."])
+
+
+def baseline_board() -> str:
+    """The board of the shipped baselines of v1."""
+    return board(benchmark.load_suite("v1"), [benchmark.read_results(name) for name in benchmark.baselines("v1")])
 
 
 def reference() -> dict[str, str]:

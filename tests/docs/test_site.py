@@ -110,6 +110,8 @@ blocks: [{environments: [frozen_lake/4x4], agents: [q_learning]}]
 """
 FEWER = ((r"steps=[\d_]+", "steps=600"), (r"learn\([\d_]+\)", "learn(300)"), (r"range\(64\)", "range(3)"))
 BEFORE = {
+    "benchmark.md": "from pharos import benchmark\ntask = benchmark.load_suite().core[0].name\n"
+    "benchmark.run('random', out='results/mine', seeds=[0], tasks=[task])\n",
     "importing.md": "import numpy as np\nimport pharos\nP, R = np.eye(2)[[[0, 1], [1, 0]]], np.eye(2)\n",
     "leaderboard.md": "import pharos\npharos.train('q_learning', 'frozen_lake/4x4', steps=200, out='runs/lake')\n",
     "regret.md": "import pharos\npharos.train('dqn', 'frozen_lake/4x4', steps=200, random=0.1, out='runs/dqn-0')\n",

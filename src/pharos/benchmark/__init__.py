@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from pharos.benchmark.budget import BudgetSpent
     from pharos.benchmark.comparison import AxisComparison, Comparison, Difference, Power, compare, power
     from pharos.benchmark.execution import run
+    from pharos.benchmark.page import report
     from pharos.benchmark.results import AgentResults, baselines, read_results
     from pharos.benchmark.scores import AxisScore, BenchmarkScore, Interval, score
     from pharos.benchmark.sealed import sealed_copies, sealed_instances, season_seed, write_suite
@@ -35,6 +36,7 @@ __all__ = [
     "load_suite",
     "power",
     "read_results",
+    "report",
     "run",
     "score",
     "sealed_copies",

@@ -9,7 +9,7 @@ import typer
 
 from pharos.cli.answers import Answer, complain, console, progress_bar, termination
 from pharos.cli.command import Commands
-from pharos.cli.options import Count, parse_seeds
+from pharos.cli.options import Count, file_ending, parse_seeds
 from pharos.errors import AllRunsFailed, ParameterError
 from pharos.system.wording import many
 
@@ -133,6 +133,31 @@ def seal(folder: Folder, *, season: str, beacon: str, suite: SuiteFile = "v1") -
     answer = {name: {"file": folder / f"{name}.yaml", "digest": each.digest} for name, each in made.items()}
     facts = [(name, f"{many(len(each.tasks), 'task')}, {each.digest}") for name, each in made.items()]
     return Answer({"season": season, "seed": seed, **answer}, (str(folder), facts))
+
+
+@app.command("report")
+def report(
+    results: Annotated[str, typer.Argument(metavar="RESULTS")],
+    *,
+    out: Annotated[Path, file_ending(".html", ".htm")] = Path("report.html"),
+    beside: str | None = None,
+    latex: bool = False,
+    predictor: str | None = None,
+) -> Answer:
+    """Write a page on an agent's results: frontiers in units, ladders, weaknesses, and residuals against theory.
+
+    Args:
+        results: Folder of a run, file, or name of a shipped baseline.
+        out: FILE.html, which loads nothing.
+        beside: Names of baselines or other results, with commas; dqn,ppo,q_learning when not given, as far as shipped.
+        latex: A table and a paragraph on methods, too, in FILE.tex.
+        predictor: Idealised learner to compare with: dqn, ppo, table, both or none; by the agent's name when not given.
+    """
+    from pharos import benchmark
+
+    others = None if beside is None else [each for each in beside.split(",") if each]
+    files = benchmark.report(results, out, beside=others, latex=latex, predictor=predictor)
+    return Answer({"files": files}, lambda: console().print(*map(str, files), sep="\n", markup=False))
 
 
 def _entry(task: "BenchmarkTask") -> dict[str, Any]:

@@ -21,5 +21,14 @@ def in_one_line(error: BaseException) -> str:
 
 def latex_text(text: str) -> str:
     """Text as LaTeX prints it: its special letters escaped."""
-    special = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
-    return "".join(special.get(letter, "\\" + letter if letter in "&%$#_{}" else letter) for letter in text)
+    special = {
+        "\\": "textbackslash",
+        "~": "textasciitilde",
+        "^": "textasciicircum",
+        "<": "textless",
+        ">": "textgreater",
+    }
+    return "".join(
+        f"\\{special[letter]}{{}}" if letter in special else f"\\{letter}" if letter in "&%$#_{}" else letter
+        for letter in text
+    )

@@ -1,0 +1,305 @@
+"""Charts of the report as SVG inside its page: a few shapes, no library; texts are escaped by the tree that holds them.
+
+Colours and text are classes of the page's style (`STYLE`), so that charts follow light and dark pages. Agent k has the
+colour, the dash and the marker of its place, so that no line is told by its colour alone.
+"""
+
+from collections.abc import Mapping, Sequence
+from xml.etree.ElementTree import Element
+
+import numpy as np
+
+from pharos.benchmark.scores import Interval
+
+WIDTH = 340
+MARKERS = ("M-4 0a4 4 0 1 0 8 0a4 4 0 1 0 -8 0z", "M-4 -4h8v8h-8z", "M0 -5l5 9h-10z", "M0 -5.5l5 5.5l-5 5.5l-5 -5.5z")
+CIVIDIS = ((0, 34, 78), (60, 78, 109), (124, 123, 120), (187, 174, 107), (254, 232, 56))  # Nunez et al. (2018)
+STYLE = """
+:root { color-scheme: light dark; --ink: #23262d; --soft: #5c6370; --ground: #f6f7f9; --paper: #ffffff; --line: #dfe2e8;
+  --c0: #0072b2; --c1: #d55e00; --c2: #00805d; --c3: #b5548c; --c4: #8a6d00; --c5: #5c6370; }
+@media (prefers-color-scheme: dark) {
+  :root { --ink: #d8dbe2; --soft: #a0a7b4; --ground: #121419; --paper: #1b1e24; --line: #3a3f4a;
+    --c0: #6fb4e8; --c1: #ff9248; --c2: #3cc79b; --c3: #e79ac5; --c4: #e6c34a; --c5: #a0a7b4; } }
+* { box-sizing: border-box; }
+body { margin: 0; background: var(--ground); color: var(--ink); font: 15px/1.5 system-ui, sans-serif; }
+header, main { max-width: 1180px; margin: 0 auto; padding: 0 16px; }
+header { padding-top: 24px; }
+h1 { font-size: 26px; margin: 0; overflow-wrap: anywhere; }
+h2 { font-size: 19px; margin: 0 0 6px; }
+p, li { max-width: 90ch; overflow-wrap: anywhere; }
+p { margin: 6px 0 10px; }
+.lead { font-size: 18px; }
+.soft { color: var(--soft); font-size: 14px; }
+.warning { border-left: 4px solid var(--c1); padding-left: 10px; }
+section { background: var(--paper); border: 1px solid var(--line); border-radius: 10px; padding: 16px 18px;
+  margin-bottom: 16px; }
+.panels { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 300px), 1fr)); gap: 14px 22px; }
+figure { margin: 0; max-width: 480px; }
+figcaption { font-weight: 600; }
+figcaption .soft { font-weight: 400; display: block; }
+svg { display: block; width: 100%; height: auto; overflow: visible; }
+svg text { fill: var(--ink); font: 12px system-ui, sans-serif; }
+svg .faint { fill: var(--soft); }
+.grid { stroke: var(--line); fill: none; }
+.edge { stroke: var(--soft); fill: none; }
+.theory { stroke: var(--ink); stroke-width: 1.6; stroke-dasharray: 2 4; stroke-linecap: round; fill: none; }
+.scroll { overflow-x: auto; }
+table { border-collapse: collapse; font-size: 14px; font-variant-numeric: tabular-nums; }
+th, td { padding: 3px 10px 3px 0; border-bottom: 1px solid var(--line); text-align: left; vertical-align: top; }
+td.n, th.n { text-align: right; white-space: nowrap; }
+td.bar svg { width: 150px; }
+.words td, .words th { overflow-wrap: anywhere; }
+summary { cursor: pointer; color: var(--soft); }
+.wide { max-width: 640px; }
+.legend { display: flex; flex-wrap: wrap; gap: 2px 18px; list-style: none; margin: 0 0 10px; padding: 0; }
+.legend li { display: flex; align-items: center; gap: 6px; }
+.legend svg { width: 34px; flex: none; }
+""" + "".join(
+    f".l{k} {{ stroke: var(--c{k}); fill: none; stroke-width: {1.5 if k else 2.6}; }}\n.f{k} {{ fill: var(--c{k}); }}\n"
+    for k in range(6)
+)
+
+Child = Element | str
+
+
+def element(tag: str, *children: Child, **attributes: object) -> Element:
+    """An element of HTML or SVG; `class_` is `class`, and other underscores are hyphens."""
+    node = Element(tag, {name.rstrip("_").replace("_", "-"): _text(value) for name, value in attributes.items()})
+    for child in children:
+        if not isinstance(child, str):
+            node.append(child)
+        elif len(node):
+            node[-1].tail = (node[-1].tail or "") + child
+        else:
+            node.text = (node.text or "") + child
+    return node
+
+
+def _text(value: object) -> str:
+    return f"{value:.2f}".rstrip("0").rstrip(".") if isinstance(value, float) else str(value)
+
+
+def drawing(width: int, height: int, title: str, *shapes: Element) -> Element:
+    """An SVG with a title for readers of screens; hidden from them where that is empty, since words say the same."""
+    name = {"role": "img", "aria_label": title} if title else {"aria_hidden": "true"}
+    return element("svg", *shapes, viewBox=f"0 0 {width} {height}", **name)
+
+
+def line(x1: float, y1: float, x2: float, y2: float, class_: str) -> Element:
+    """A straight line."""
+    return element("path", d=f"M{x1:.1f} {y1:.1f}L{x2:.1f} {y2:.1f}", class_=class_)
+
+
+def curve(points: Sequence[tuple[float, float]], class_: str) -> Element:
+    """A line through points."""
+    return element("path", d="M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in points), class_=class_)
+
+
+def marker(x: float, y: float, agent: int, title: str = "") -> Element:
+    """The marker of an agent, with a title that shows when one points at it."""
+    tip = [element("title", title)] if title else []
+    shape, place = MARKERS[agent % len(MARKERS)], f"translate({x:.1f} {y:.1f})"
+    return element("path", *tip, d=shape, class_=f"f{agent % 6}", transform=place)
+
+
+def label(x: float, y: float, text: str, anchor: str = "start", class_: str = "") -> Element:
+    """A text."""
+    return element("text", text, x=float(x), y=float(y), text_anchor=anchor, class_=class_)
+
+
+def legend(names: Sequence[str], theory: str | None = None) -> Element:
+    """A list of agents with the marks of each; `theory` names the dashed line."""
+    marks = [
+        (name, drawing(34, 12, "", line(1, 6, 33, 6, f"l{k % 6}"), marker(17, 6, k))) for k, name in enumerate(names)
+    ]
+    if theory:
+        marks.append((theory, drawing(34, 12, "", line(2, 6, 33, 6, "theory"))))
+    return element("ul", *(element("li", mark, name) for name, mark in marks), class_="legend")
+
+
+def bars(rows: Sequence[tuple[str, Interval]], title: str) -> Element:
+    """Horizontal bars of scores in [0, 1] with their intervals, one for each agent."""
+    left, wide, step = 122, 160, 24
+    height = step * len(rows) + 18
+    shapes = [line(left + wide * x, 0, left + wide * x, height - 16, "grid") for x in (0, 0.5, 1)]
+    shapes += [label(left + wide * x, height - 3, f"{x:g}", "middle", "faint") for x in (0, 0.5, 1)]
+    for k, (name, score) in enumerate(rows):
+        y = k * step + 4
+        low, high = ends(score)
+        shapes += [
+            label(left - 6, y + 13, shortened(name, 18), "end"),
+            element("rect", x=left, y=y, width=max(0.5, wide * score.value), height=16, class_=f"f{k % 6}"),
+            line(left + wide * low, y + 8, left + wide * high, y + 8, "edge"),
+            label(left + wide * high + 5, y + 13, f"{score.value:.2f}"),
+        ]
+    return drawing(WIDTH, height, title, *shapes)
+
+
+def radar(axes: Sequence[str], scores: Sequence[Mapping[str, float]], title: str) -> Element:
+    """Scores in [0, 1] along rays, one for each axis; an outline for each agent."""
+    size, middle, radius = 360, 180, 120
+    angles = 2 * np.pi * np.arange(len(axes)) / len(axes) - np.pi / 2
+    rays = np.column_stack([np.cos(angles), np.sin(angles)])
+
+    def outline(lengths: Sequence[float]) -> list[tuple[float, float]]:
+        points = middle + radius * rays * np.asarray(lengths)[:, None]
+        return [(float(x), float(y)) for x, y in (*points, points[0])]
+
+    shapes = [curve(outline([share] * len(axes)), "grid") for share in (0.5, 1.0)]
+    shapes += [curve(outline([each.get(axis, 0.0) for axis in axes]), f"l{k % 6}") for k, each in enumerate(scores)]
+    for axis, (x, y) in zip(axes, rays, strict=True):
+        anchor = "middle" if abs(x) < 0.1 else "start" if x > 0 else "end"
+        shapes.append(label(middle + 1.1 * radius * x, middle + 1.12 * radius * y + 4, axis, anchor))
+    return drawing(size, size, title, *shapes)
+
+
+def ladder_panel(
+    levels: Sequence[float],
+    lines: Sequence[Sequence[Interval | None]],
+    theory: Sequence[float | None],
+    frontier: Interval,
+    unit: str,
+    title: str,
+) -> Element:
+    """Normalised regret along the rungs of a ladder: the first line with whiskers, and where its frontier lies.
+
+    Args:
+        levels: of the rungs, which stand equally far apart; between them the frontier is interpolated.
+        lines: for each agent its normalised regret on each rung, None where it did not run.
+        theory: of the idealised learner, None where it was not predicted.
+        frontier: of the first agent, in units of `levels`.
+        unit: label of the horizontal axis.
+    """
+    left, right, top, bottom = 54, WIDTH - 12, 24, 178
+    height = (bottom - top) / 1.05
+
+    def across(level: float) -> float:
+        place = np.interp(level, levels, np.arange(len(levels))) / max(1, len(levels) - 1)
+        return float(left + 10 + (right - left - 20) * place)
+
+    def down(regret: float) -> float:
+        return bottom - height * min(max(regret, 0.0), 1.05)
+
+    shapes = [line(left, down(y), right, down(y), "edge" if y in (0, 1) else "grid") for y in (0, 0.5, 1)]
+    shapes += [
+        label(left - 5, down(y) + 4, text, "end", "faint") for text, y in (("oracle", 0), ("0.5", 0.5), ("random", 1))
+    ]
+    shapes += [label(across(level), bottom + 15, f"{level:.3g}", "middle", "faint") for level in levels]
+    shapes.append(label((left + right) / 2, bottom + 32, unit, "middle"))
+    low, high = map(across, ends(frontier))
+    shapes.append(
+        element("rect", x=low, y=top, width=max(1.0, high - low), height=bottom - top, class_="f0", opacity="0.16")
+    )
+    if not frontier.censored:
+        shapes.append(line(across(frontier.value), top, across(frontier.value), bottom, "l0"))
+    shapes.append(label(left, top - 10, f"frontier {frontier_text(frontier)}"))
+    points = [(across(level), down(y)) for level, y in zip(levels, theory, strict=True) if y is not None]
+    if points:
+        shapes.append(curve(points, "theory"))
+    for k, values in reversed(list(enumerate(lines))):
+        rungs = [(across(level), each, level) for level, each in zip(levels, values, strict=True) if each is not None]
+        if rungs:
+            shapes.append(curve([(x, down(each.value)) for x, each, _ in rungs], f"l{k % 6}"))
+        for x, each, level in rungs:
+            if not k:
+                shapes.append(line(x, down(ends(each)[0]), x, down(ends(each)[1]), "l0"))
+            shapes.append(marker(x, down(each.value), k, f"{level:.4g}: regret {each.value:.2f}"))
+    return drawing(WIDTH, bottom + 38, title, *shapes)
+
+
+def difference_bar(difference: Interval) -> Element:
+    """A difference of scores as a bar from the middle, with its interval."""
+    value, low, high = (65 + 64 * max(-1.0, min(1.0, end)) for end in (difference.value, *ends(difference)))
+    bar = {"x": min(65.0, value), "y": 4, "width": abs(value - 65), "height": 8, "class_": "f0" if value > 65 else "f1"}
+    shapes = line(65, 0, 65, 16, "edge"), element("rect", **bar), line(low, 8, high, 8, "edge")
+    return drawing(130, 16, "", *shapes)
+
+
+def plane(points: Sequence[tuple[str, float, float, float]], below: str, beside: str, title: str) -> Element:
+    """Tasks as dots: (name, x, y, regret in [0, 1]), the darker the less regret, in a scale for all eyes."""
+    wide, left, right, top, bottom = 560, 52, 470, 12, 300
+    xs, ys = (np.array([point[k] for point in points]) for k in (1, 2))
+    (x0, x1), (y0, y1) = _range(xs), _range(ys)
+
+    def at(x: float, y: float) -> tuple[float, float]:
+        return left + (right - left) * (x - x0) / (x1 - x0), bottom - (bottom - top) * (y - y0) / (y1 - y0)
+
+    shapes = []
+    for x in _ticks(x0, x1):
+        across, _ = at(x, y0)
+        shapes += [line(across, top, across, bottom, "grid"), label(across, bottom + 16, f"{x:.2g}", "middle", "faint")]
+    for y in _ticks(y0, y1):
+        _, down = at(x0, y)
+        shapes += [line(left, down, right, down, "grid"), label(left - 6, down + 4, f"{y:.2g}", "end", "faint")]
+    shapes += [label((left + right) / 2, bottom + 36, below, "middle")]
+    shapes += [
+        element("text", beside, text_anchor="middle", transform=f"translate(12 {(top + bottom) / 2}) rotate(-90)")
+    ]
+    for name, x, y, regret in points:
+        (across, down), tip = at(x, y), element("title", f"{name}: regret {regret:.2f}")
+        shapes.append(
+            element(
+                "circle",
+                tip,
+                cx=across,
+                cy=down,
+                r=7,
+                fill=shade(regret),
+                class_="edge",
+                style=f"fill: {shade(regret)}",
+            )
+        )
+    for k in range(40):
+        shapes.append(
+            element("rect", x=490, y=float(bottom - 60 - 4 * k - 4), width=14, height=4.2, fill=shade(k / 39))
+        )
+    shapes += [label(510, bottom - 58 - 160 * y, f"{y:g}", class_="faint") for y in (0, 0.5, 1)]
+    shapes.append(label(490, bottom - 60 - 172, "regret"))
+    return drawing(wide, bottom + 42, title, *shapes)
+
+
+def shade(share: float) -> str:
+    """The colour of a share of 1 in the scale cividis, which people see alike whatever their sight."""
+    place = np.linspace(0, 1, len(CIVIDIS))
+    red, green, blue = (round(float(np.interp(share, place, [color[k] for color in CIVIDIS]))) for k in range(3))
+    return f"#{red:02x}{green:02x}{blue:02x}"
+
+
+def _range(values: np.ndarray) -> tuple[float, float]:
+    """Limits of an axis: of the values, with some room, at least a tenth wide."""
+    room = max(0.05, 0.08 * float(np.ptp(values)))
+    return float(values.min()) - room, float(values.max()) + room
+
+
+def _ticks(low: float, high: float) -> list[float]:
+    """Multiples of a quarter, or of a twentieth, between two numbers."""
+    step = 0.25 if high - low > 0.5 else 0.05
+    return [k * step for k in range(int(np.ceil(low / step)), int(np.floor(high / step)) + 1)]
+
+
+def shortened(text: str, letters: int) -> str:
+    """A text of at most so many letters."""
+    return text if len(text) <= letters else text[: letters - 1] + "…"
+
+
+def ends(interval: Interval) -> tuple[float, float]:
+    """The ends of an interval, for drawing: both at the value where one seed leaves none."""
+    return (interval.value, interval.value) if np.isnan(interval.low) else (interval.low, interval.high)
+
+
+def frontier_text(frontier: Interval, unit: str = "", interval: bool = True) -> str:
+    """A frontier in words: `9.4 bits (8.3 to 10.8)`, `beyond 24 bits (from 19)`, `below 4 bits`."""
+    side = {"above": "beyond ", "below": "below ", "": ""}[frontier.censored]
+    text = f"{side}{frontier.value:.3g}{' ' if unit else ''}{unit}"
+    low, high = ends(frontier)
+    if not interval or low == high:
+        return text
+    if frontier.censored == "above":
+        return text if low == frontier.value else f"{text} ({_level(low)} or more)"
+    if frontier.censored == "below":
+        return text if high == frontier.value else f"{text} ({_level(high)} or less)"
+    return f"{text} ({_level(low)} to {_level(high)})"
+
+
+def _level(level: float) -> str:
+    return f"{level:.3g}" if np.isfinite(level) else "beyond the ladder" if level > 0 else "below the ladder"

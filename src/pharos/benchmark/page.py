@@ -1,0 +1,298 @@
+"""The report of an agent's results: one HTML file that loads and runs nothing, and LaTeX for a paper.
+
+Frontiers and scores stand beside those of baselines; what differs is said in words only where an interval says so. Of
+theory the page has two things: the dashed line on each ladder, and residuals, tasks that an idealised learner solves
+and the agent does not. The page is a tree of elements, so that every text in it is escaped.
+"""
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from xml.etree.ElementTree import Element, tostring
+
+from pharos.benchmark.charts import (
+    STYLE,
+    bars,
+    difference_bar,
+    element,
+    frontier_text,
+    ladder_panel,
+    legend,
+    plane,
+    radar,
+)
+from pharos.benchmark.contents import (
+    PREDICTORS,
+    RESIDUAL,
+    Contents,
+    Source,
+    contents_of,
+    excerpt,
+    number,
+    regret_of,
+    residuals,
+    sentence,
+    signed,
+)
+from pharos.benchmark.latex import latex_of
+from pharos.benchmark.suite import Ladder, Suite
+from pharos.system import storage
+from pharos.system.wording import many
+
+POLICY = "default-src 'none'; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
+
+
+def report(
+    results: Source,
+    out: str | os.PathLike,
+    *,
+    beside: Sequence[Source] | None = None,
+    latex: bool = False,
+    predictor: str | None = None,
+    suite: Suite | str | None = None,
+) -> tuple[Path, ...]:
+    """Write the page on an agent's results, and return the files.
+
+    Args:
+        results: folder of a run, file, shipped baseline by name, or results read.
+        out: the page, one self-contained file of HTML.
+        beside: agents to stand beside it, as `results`; None: those of dqn, ppo and q_learning that are shipped.
+        latex: whether to write a table and a paragraph on methods beside the page, with the ending .tex.
+        predictor: idealised learner that the agent is compared with: "dqn", "ppo", "table", "both" (the larger regret
+            of dqn and ppo) or "none"; None: by the agent's name, and "both" where that says nothing.
+        suite: the one that `results` are of, where that is not shipped.
+    Raises:
+        ParameterError: there are no such results, they are of another suite, or the predictor is none of these.
+    Cost: less than a second.
+    """
+    contents = contents_of(results, beside=beside, predictor=predictor, suite=suite)
+    texts = {Path(out): page(contents)} | ({Path(out).with_suffix(".tex"): latex_of(contents)} if latex else {})
+    for file, text in texts.items():
+        file.parent.mkdir(parents=True, exist_ok=True)
+        storage.replace_file(file, text.encode(errors="replace"))
+    return tuple(texts)
+
+
+def page(contents: Contents) -> str:
+    """The HTML page; every text passes through the tree, which escapes it."""
+    title = f"{contents.agent.name} on the Pharos Benchmark {contents.suite.name}"
+    meta = (
+        {"charset": "utf-8"},
+        {"name": "viewport", "content": "width=device-width, initial-scale=1"},
+        {"http_equiv": "Content-Security-Policy", "content": POLICY},
+    )
+    head = element(
+        "head", *(element("meta", **each) for each in meta), element("title", title), element("style", STYLE)
+    )
+    sections = [section for make in SECTIONS if (section := make(contents)) is not None]
+    body = element("body", element("header", element("h1", title), *_lead(contents)), element("main", *sections))
+    return "<!doctype html>\n" + tostring(element("html", head, body, lang="en"), encoding="unicode", method="html")
+
+
+def _lead(contents: Contents) -> list[Element]:
+    own = contents.agent.score
+    lines = [element("p", sentence(contents), class_="lead")]
+    core = f"Core score {number(own.core)} on {many(contents.num_run(contents.suite.core), 'task')}"
+    core += "".join(f"; {each.name} {each.score.core.value:.2f}" for each in contents.beside)
+    rest = {"Final score": own.final, "interquartile mean": own.iqm, "optimality gap": own.optimality_gap}
+    more = ", ".join(f"{name} {number(interval)}" for name, interval in rest.items())
+    scale = "A score is 1 for the oracle and 0 for random play. Intervals are of 95 %, over seeds."
+    lines.append(element("p", f"{core}. {more}. {scale}"))
+    if own.preliminary:
+        seeds = many(len(contents.agent.results.seeds), "seed")
+        missing = f", and {many(len(own.missing), 'task')} without results" if own.missing else ""
+        text = f"Preliminary: {seeds}{missing}; a result has {contents.suite.protocol.seeds} seeds and all tasks."
+        lines.append(element("p", text, class_="warning"))
+    if own.below_random:
+        lines.append(element("p", f"Worse than random play on {', '.join(own.below_random)}.", class_="warning"))
+    return lines
+
+
+def _axes(contents: Contents) -> Element:
+    cores = [(each.name, each.score.core) for each in contents.agents]
+    figures = [_figure("core", bars(cores, "core: scores of agents"))]
+    axes = list(contents.agent.score.axes)
+    for axis in axes:
+        rows = [(each.name, each.score.axes[axis].score) for each in contents.agents if axis in each.score.axes]
+        figures.append(_figure(axis, bars(rows, f"{axis}: scores of agents")))
+    parts = [element("div", *figures, class_="panels")]
+    if len(axes) > 2:
+        scores = [{axis: own.score.value for axis, own in each.score.axes.items()} for each in contents.agents]
+        figure = _figure("", radar(axes, scores, "scores on all axes"), legend([each.name for each in contents.agents]))
+        parts.append(element("details", element("summary", "The same as a radar"), figure))
+    return _section("Scores on the core and on each axis", "Mean over tasks or rungs; lines are intervals.", *parts)
+
+
+def _ladders(contents: Contents) -> Element | None:
+    ladders = [ladder for ladder in contents.suite.ladders if ladder.axis in contents.agent.score.axes]
+    if not ladders:
+        return None
+    is_predicted = any(contents.predicted(task) is not None for ladder in ladders for task in ladder.tasks)
+    theory = f"theory: {PREDICTORS[contents.predictor]}" if is_predicted else None
+    figures = [_figure(ladder.axis, _ladder(contents, ladder), text=ladder.quantity) for ladder in ladders]
+    return _section(
+        "Ladders",
+        "Normalised regret along one world that gets harder. The shaded band is the interval of the frontier, where "
+        "regret crosses 0.5. Rungs stand equally far apart, whatever their levels.",
+        legend([each.name for each in contents.agents], theory),
+        element("div", *figures, class_="panels"),
+    )
+
+
+def _ladder(contents: Contents, ladder: Ladder) -> Element:
+    frontier = contents.agent.score.axes[ladder.axis].frontier
+    lines = [[regret_of(each, task) for task in ladder.tasks] for each in contents.agents]
+    title = f"{ladder.axis}: regret by {ladder.quantity}; frontier of {contents.agent.name} "
+    title += frontier_text(frontier, ladder.unit)
+    levels = [task.level or 0.0 for task in ladder.tasks]
+    theory = [contents.predicted(task) for task in ladder.tasks]
+    return ladder_panel(levels, lines, theory, frontier, ladder.unit, title)
+
+
+def _core(contents: Contents) -> Element | None:
+    if not contents.comparisons:
+        return None
+    names = {task.name for task in contents.suite.core}
+    differences = [
+        {name: each for name, each in comparison.tasks.items() if name in names} for comparison in contents.comparisons
+    ]
+    distances = [sum(abs(each.interval.value) for each in own.values()) / max(1, len(own)) for own in differences]
+    nearest = min(range(len(distances)), key=distances.__getitem__)
+    other = contents.beside[nearest]
+    rows: list[list[str | Element]] = []
+    for name, each in sorted(differences[nearest].items(), key=lambda item: item[1].interval.value):
+        scores = (f"{agent.score.tasks[name].value:.2f}" for agent in (contents.agent, other))
+        rows.append([name, *scores, signed(each.interval), difference_bar(each.interval), each.verdict])
+    return _section(
+        f"Core tasks beside {other.name}",
+        f"Of the baselines, {other.name} is the nearest: scores are {distances[nearest]:.2f} apart on the average "
+        "task. Sorted by difference, the worst first. The verdict is after Holm's correction over tasks.",
+        _table(["task", "score", other.name, "difference", "", "verdict"], rows, numeric=(1, 2, 3)),
+    )
+
+
+def _plane(contents: Contents) -> Element | None:
+    name = "ppo" if contents.predictor == "ppo" else "dqn"
+    points = [
+        (task.name, task.predicted["table"], task.predicted[name] - task.predicted["table"], own.value)
+        for task in contents.suite.tasks
+        if (own := contents.observed(task)) is not None and {"table", name} <= task.predicted.keys()
+    ]
+    if len(points) < 2:
+        return None
+    below, beside = "regret of a table: exploration", f"{name.upper()} less table: representation"
+    return _section(
+        "What makes a task hard, and where the agent fails",
+        "Each dot is a task, placed by what theory predicts before any run: to the right, even a learner with a table "
+        "needs longer; above, a network loses more than a table. The colour is the agent's regret.",
+        _figure("", plane(points, below, beside, "tasks by predicted difficulty, coloured by regret"), class_="wide"),
+    )
+
+
+def _words(contents: Contents) -> Element | None:
+    if not contents.comparisons or not contents.agent.score.axes:
+        return None
+    worse: list[str] = []
+    better: list[str] = []
+    undecided: list[str] = []
+    for axis, own in contents.agent.score.axes.items():
+        groups: list[list[str]] = [[], [], []]
+        for other, comparison in zip(contents.beside, contents.comparisons, strict=True):
+            if axis in comparison.axes:
+                difference = comparison.axes[axis].frontier
+                group = groups[0 if difference.high < 0 else 1 if difference.low > 0 else 2]
+                group.append(f"{other.name} {frontier_text(other.score.axes[axis].frontier)}")
+        for lines, names in zip((worse, better, undecided), groups, strict=True):
+            if names:
+                lines.append(f"{axis}: {frontier_text(own.frontier, own.unit)}; {', '.join(names)}")
+    parts = []
+    for title, lines in (("Worse", worse), ("Better", better), ("Not shown to differ", undecided)):
+        if lines:
+            parts += [element("h3", title), _list(lines)]
+    if not worse:
+        parts.insert(0, element("p", "No frontier is shown to lie below a baseline's."))
+    return _section(
+        "Strengths and weaknesses in words",
+        "Frontiers differ where the interval of their difference excludes 0; 95 % for each pair.",
+        *parts,
+    )
+
+
+def _residuals(contents: Contents) -> Element:
+    title = "Residuals: worse than theory says"
+    if contents.predictor == "none":
+        return _section(title, "No idealised learner is known for this kind of agent.")
+    rows = residuals(contents)
+    means = PREDICTORS[contents.predictor]
+    text = (
+        f"Tasks where the regret is more than {RESIDUAL:g} above that of {means}, predicted before any run. Theory "
+        "says that an agent of this kind solves them better: look for a bug or a hyperparameter."
+    )
+    if not rows:
+        return _section(title, f"On no task the regret is more than {RESIDUAL:g} above that of {means}.")
+    cells = [
+        [task.name, f"{own.value:.2f}", f"{expected:.2f}", f"{own.value - expected:+.2f}"]
+        for task, own, expected in rows
+    ]
+    return _section(title, text, _table(["task", "observed", "predicted", "residual"], cells, numeric=(1, 2, 3)))
+
+
+def _provenance(contents: Contents) -> Element:
+    own, protocol = contents.agent.results, contents.suite.protocol
+    exact = own.record.get("exact")
+    exact = exact if isinstance(exact, Mapping) else {}
+    count = sum(bool(value) for value in exact.values())
+    facts = {
+        "suite": f"{contents.suite.name}, digest {contents.suite.digest}",
+        "protocol": f"{protocol.steps:,} steps, {many(protocol.evaluations, 'evaluation')}, gamma {protocol.gamma:g}, "
+        f"horizon {protocol.horizon}",
+        "seeds": ", ".join(map(str, own.seeds)),
+        "evaluation": f"exact on {count} of {many(len(exact), 'task')}, else estimated" if exact else "see agent.json",
+        **{f"baseline {each.name}": f"seeds {', '.join(map(str, each.results.seeds))}" for each in contents.beside},
+        **{name: excerpt(value) for name, value in own.record.items() if name != "exact"},
+    }
+    claims = [
+        "Computed, not sampled: V* and the value of uniform play of each task, frozen in the suite; values of the "
+        "agent's policies, by the run, on the machine where it ran.",
+        "Can be verified by others: the values of the final policies.",
+        "Claimed: curves while learning, and so scores and frontiers; the steps used; that one setting was used for "
+        "all tasks. Policies cannot show these; only running the code again does.",
+    ]
+    rows: list[Sequence[str | Element]] = [[name, text] for name, text in facts.items()]
+    table = element("div", _table(["what", "value"], rows), class_="words")
+    return _section("What was verified, and what is claimed", "", _list(claims), table)
+
+
+SECTIONS: tuple[Callable[[Contents], Element | None], ...] = (
+    _axes,
+    _ladders,
+    _words,
+    _core,
+    _plane,
+    _residuals,
+    _provenance,
+)
+
+
+def _section(title: str, text: str, *parts: Element) -> Element:
+    soft = [element("p", text, class_="soft")] if text else []
+    return element("section", element("h2", title), *soft, *parts)
+
+
+def _figure(caption: str, *parts: Element, text: str = "", class_: str = "") -> Element:
+    soft = [element("span", text, class_="soft")] if text else []
+    captions = [element("figcaption", caption, *soft)] if caption else []
+    return element("figure", *captions, *parts, class_=class_)
+
+
+def _list(texts: Sequence[str]) -> Element:
+    return element("ul", *(element("li", text) for text in texts))
+
+
+def _table(heads: Sequence[str], rows: Sequence[Sequence[str | Element]], numeric: Sequence[int] = ()) -> Element:
+    def kind(k: int, cell: str | Element = "") -> str:
+        return "n" if k in numeric else "" if isinstance(cell, str) else "bar"
+
+    head = element("tr", *(element("th", name, class_=kind(k)) for k, name in enumerate(heads)))
+    body = [element("tr", *(element("td", cell, class_=kind(k, cell)) for k, cell in enumerate(row))) for row in rows]
+    return element("div", element("table", element("thead", head), element("tbody", *body)), class_="scroll")

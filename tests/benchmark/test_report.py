@@ -1,0 +1,249 @@
+"""The report: what it says of results whose scores are known, that it loads nothing, and that it escapes texts."""
+
+import math
+import re
+from html.parser import HTMLParser
+from xml.etree.ElementTree import tostring
+
+import numpy as np
+import pytest
+
+from pharos import benchmark
+from pharos.benchmark import AgentResults
+from pharos.benchmark.charts import element, frontier_text, shade
+from pharos.benchmark.contents import contents_of, residuals, sentence
+from pharos.benchmark.latex import latex_of
+from pharos.benchmark.page import page
+from pharos.benchmark.scores import Interval
+from pharos.benchmark.suite import BenchmarkTask, Ladder, Protocol, Suite
+from pharos.errors import ParameterError
+
+VILE = "<script>alert('x')</script> & \"b\".py:learn_50%"
+ELEMENTS_THAT_LOAD = {"script", "link", "img", "iframe", "object", "embed", "image", "use", "audio", "video", "source"}
+
+
+def task(name, axis="core", level=None, **predicted):
+    return BenchmarkTask(name, "deep_sea", axis=axis, level=level, predicted=predicted, digest=name)
+
+
+def rungs(axis, levels):
+    return tuple(task(f"{axis}-{level:g}", axis, float(level), dqn=level / 100, ppo=0.0) for level in levels)
+
+
+SUITE = Suite(
+    "small",
+    Protocol(steps=1000, evaluations=5, seeds=10),
+    (
+        task("easy", dqn=0.1, ppo=0.2, table=0.1),
+        task("hard", dqn=0.1, ppo=0.8, table=0.3),
+        task("odd", table=0.1),
+    ),
+    (
+        Ladder("exploration", "bits", "episodes that random play needs", rungs("exploration", (6, 8, 10, 24))),
+        Ladder("credit", "steps", "steps between a choice and its consequence", rungs("credit", (8, 16, 32))),
+        Ladder("scale", "log10 states", "number of states", rungs("scale", (1, 2, 3))),
+    ),
+    "d1",
+)
+
+
+def results(agent, regrets, seeds=10, spread=0.05, **record):
+    """Results of so much regret on each task, and runs that differ a little."""
+    noise = spread * np.linspace(-1, 1, seeds)[:, None]
+    curves = {name: np.full((seeds, 5), regret) + noise for name, regret in regrets.items()}
+    return AgentResults(agent, SUITE.name, SUITE.digest, tuple(range(seeds)), curves, record)
+
+
+def everywhere(core, exploration, credit, scale):
+    """Regrets on all tasks: (easy, hard, odd), and those of each rung."""
+    columns = (*core, *exploration, *credit, *scale)
+    return {task.name: regret for task, regret in zip(SUITE.tasks, columns, strict=True)}
+
+
+MINE = everywhere((0.1, 0.9, 0.2), (0.1, 0.3, 0.7, 1.0), (0.1, 0.6, 0.9), (0.0, 0.1, 0.2))
+DQN = everywhere((0.2, 0.4, 0.3), (0.1, 0.7, 0.9, 1.0), (0.0, 0.1, 0.2), (0.0, 0.1, 0.2))
+PPO = everywhere((0.6, 0.1, 0.9), (0.8, 0.9, 1.0, 1.0), (0.1, 0.6, 0.9), (0.0, 0.6, 0.9))
+
+
+@pytest.fixture
+def contents():
+    return contents_of(results("mine.py:learn", MINE), beside=[results("dqn", DQN), results("ppo", PPO)], suite=SUITE)
+
+
+class Elements(HTMLParser):
+    def __init__(self, text):
+        super().__init__()
+        self.open, self.tags, self.attributes, self.text = [], [], [], ""
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        self.attributes += attrs
+        if tag != "meta":
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.text += data + "\n" * (data[-1] in ".:")
+
+
+def test_the_sentence_says_frontiers_in_units_beside_those_of_baselines(contents):
+    text = sentence(contents)
+    assert text.startswith("mine.py:learn explores to 9 bits (")  # halfway from 0.3 at 8 bits to 0.7 at 10
+    assert "; DQN 7.33, PPO below 6)" in text  # 6 + 2 * 0.4 / 0.6
+    assert "assigns credit over 14.4 steps (" in text and "DQN beyond 32, PPO 14.4)" in text
+    assert "scales to beyond 3 log10 states (DQN beyond 3, PPO 1.83)" in text
+
+
+def test_weaknesses_are_those_whose_difference_excludes_zero(contents):
+    text = Elements(page(contents)).text
+    worse, better, undecided = re.split("Worse|Better|Not shown to differ", text.split("in words")[1])[1:4]
+    assert "credit: 14.4 steps" in worse and "DQN beyond 32" in worse and "exploration" not in worse
+    assert "exploration: 9 bits" in better and "DQN 7.33" in better and "PPO below 6" in better
+    assert "credit" in undecided and "PPO 14.4" in undecided and "DQN beyond 3" in undecided  # both beyond the ladder
+
+
+def test_an_agent_beside_itself_is_shown_to_differ_nowhere():
+    own = contents_of(results("a", MINE), beside=[results("b", MINE)], suite=SUITE)
+    text = Elements(page(own)).text
+    assert "No frontier is shown to lie below a baseline's." in text
+    assert "Worse" not in text and "Better" not in text
+
+
+def test_core_tasks_stand_beside_the_nearest_baseline_the_worst_first(contents):
+    text = Elements(page(contents)).text.split("Core tasks beside ")[1]
+    assert text.startswith("DQN")  # apart by 0.1, 0.5, 0.1; PPO by 0.5, 0.8, 0.7
+    order = [text.index(name) for name in ("hard", "easy", "odd")]
+    assert order[0] < min(order[1:])
+    assert "-0.50" in text and "+0.10" in text and "scores are 0.23 apart" in text
+
+
+@pytest.mark.parametrize(
+    ("agent", "predictor", "tasks"),
+    [
+        ("mine.py:DQN", None, ["hard", "exploration-24", "exploration-10", "credit-32", "credit-16"]),
+        ("mine.py:learn", None, ["exploration-24", "exploration-10", "credit-32", "credit-16"]),  # both: PPO's 0.8
+        ("sb3_contrib:RecurrentPPO", None, []),
+        ("mine.py:learn", "table", ["hard"]),
+        ("mine.py:DQN", "none", []),
+    ],
+)
+def test_residuals_are_tasks_that_theory_solves_and_the_agent_does_not(agent, predictor, tasks):
+    own = contents_of(results(agent, MINE), beside=[], predictor=predictor, suite=SUITE)
+    names = [task.name for task, _, _ in residuals(own)]
+    assert set(names) == set(tasks) | ({"exploration-8"} if "credit-16" in tasks else set())
+    excess = [own.value - expected for _, own, expected in residuals(own)]
+    assert excess == sorted(excess, reverse=True) and all(each > 0.2 for each in excess)
+
+
+def test_a_prediction_of_two_learners_is_the_larger_regret(contents):
+    assert contents.predictor == "both"
+    assert [contents.predicted(task) for task in SUITE.core] == [0.2, 0.8, None]
+
+
+def test_the_page_loads_nothing_and_runs_nothing(contents, tmp_path):
+    (file,) = benchmark.report(results("a", MINE), tmp_path / "deep" / "a.html", beside=[], suite=SUITE)
+    for text in (page(contents), file.read_text(encoding="utf-8")):
+        elements = Elements(text)
+        assert not elements.open and not ELEMENTS_THAT_LOAD & set(elements.tags)
+        assert not {"src", "href", "srcset", "data"} & {name for name, _ in elements.attributes}
+        assert "url(" not in text and "@import" not in text and "default-src 'none'" in text
+
+
+def test_texts_of_results_are_escaped():
+    own = results(VILE, MINE, hyperparameters={VILE: VILE}, **{VILE: "&amp;"})
+    own = contents_of(own, beside=[results(VILE, DQN)], suite=SUITE)
+    elements = Elements(page(own))
+    assert "script" not in elements.tags and VILE in elements.text and "&amp;" in elements.text
+    assert any(VILE in (value or "") for name, value in elements.attributes if name == "aria-label")
+    latex = latex_of(own)
+    assert "<" not in latex and r"\textless{}script\textgreater{}" in latex and r"learn\_50\%" in latex
+    assert not re.search(r"(?<!\\)[%#]", latex)
+
+
+def test_every_picture_has_a_name_or_is_hidden(contents):
+    tags = re.findall(r"<svg [^>]*>", page(contents))
+    assert len(tags) > 10
+    for tag in tags:
+        assert re.search(r'aria-label="[^"]+"', tag) or 'aria-hidden="true"' in tag, tag
+
+
+def test_colours_of_agents_have_a_dark_and_a_light_form(contents):
+    text = page(contents)
+    assert "prefers-color-scheme: dark" in text
+    for k in range(6):
+        assert text.count(f"--c{k}: #") == 2
+
+
+def test_results_of_few_seeds_and_tasks_are_preliminary():
+    own = results("a", {name: MINE[name] for name in ("easy", "hard")}, seeds=3)
+    own = contents_of(own, beside=[results("dqn", DQN)], suite=SUITE)
+    text = Elements(page(own)).text
+    assert "Preliminary: 3 seeds, and 11 tasks without results; a result has 10 seeds and all tasks." in text
+    assert "the ladders were not run" in text and "Ladders" not in text
+    assert "Preliminary" not in page(contents_of(results("a", MINE), beside=[], suite=SUITE))
+
+
+def test_one_seed_has_no_intervals_and_a_page():
+    own = contents_of(results("a", MINE, 1, 0.0), beside=[results("dqn", DQN, 1, 0.0)], suite=SUITE)
+    text = page(own)
+    assert "nan" not in text.lower().replace("exploration", "") and "inf" not in latex_of(own)
+    assert "explores to 9 bits (DQN 7.33)" in sentence(own)
+
+
+def test_runs_worse_than_random_play_are_named():
+    own = results("a", MINE | {"odd": 1.4})
+    assert "Worse than random play on odd." in page(contents_of(own, beside=[], suite=SUITE))
+
+
+def test_the_table_in_latex_has_a_column_for_each_agent(tmp_path):
+    own = results("mine", MINE, versions={"pharos": "1"})
+    files = benchmark.report(own, tmp_path / "a.html", beside=[results("dqn", DQN)], latex=True, suite=SUITE)
+    assert [file.name for file in files] == ["a.html", "a.tex"]
+    text = files[1].read_text()
+    table, methods = text.split("\n\n")
+    rows = [line for line in table.splitlines() if line.endswith(r"\\")]
+    assert len(rows) == 5 and all(row.count("&") == 2 for row in rows)
+    assert rows[0] == r" & mine & DQN \\" and rows[1].startswith("core (score) & 0.60 (0.59 to 0.61) & 0.70")
+    assert rows[3].endswith(r"& beyond 32 \\")
+    assert r"\texttt{d1}" in methods and "13 of 13 tasks,\n1,000 steps each, with seeds 0, 1, 2" in methods
+    assert "beside DQN on" in methods and r'Versions: \{"pharos": "1"\}.' in methods
+
+
+def test_the_same_results_give_the_same_bytes(tmp_path):
+    own = results("mine", MINE)
+    one, other = (benchmark.report(own, tmp_path / name, beside=[], suite=SUITE)[0] for name in ("a", "b"))
+    assert one.read_bytes() == other.read_bytes()
+
+
+def test_a_predictor_that_there_is_not_is_refused():
+    with pytest.raises(ParameterError, match="predictor sac; expected one of dqn, ppo, table, both, none"):
+        contents_of(results("a", MINE), beside=[], predictor="sac", suite=SUITE)
+
+
+@pytest.mark.parametrize(
+    ("frontier", "text"),
+    [
+        (Interval(9.43, 8.31, 10.77), "9.43 bits (8.31 to 10.8)"),
+        (Interval(9.43), "9.43 bits"),
+        (Interval(9.43, -math.inf, math.inf), "9.43 bits (below the ladder to beyond the ladder)"),
+        (Interval(24.0, 24.0, math.inf, "above"), "beyond 24 bits"),
+        (Interval(24.0, 19.0, math.inf, "above"), "beyond 24 bits (19 or more)"),
+        (Interval(6.0, -math.inf, 6.0, "below"), "below 6 bits"),
+        (Interval(6.0, -math.inf, 7.0, "below"), "below 6 bits (7 or less)"),
+    ],
+)
+def test_frontiers_in_words(frontier, text):
+    assert frontier_text(frontier, "bits") == text
+
+
+def test_elements_keep_the_order_of_texts_and_children():
+    node = element("p", "a ", element("b", "<"), " c", " d", class_="x", stroke_width=1.50)
+    assert tostring(node, encoding="unicode", method="html") == '<p class="x" stroke-width="1.5">a <b>&lt;</b> c d</p>'
+
+
+def test_shades_go_from_dark_to_light():
+    lightness = [sum(int(shade(x)[k : k + 2], 16) for k in (1, 3, 5)) for x in np.linspace(0, 1, 11)]
+    assert lightness == sorted(lightness) and lightness[0] < 120 < 500 < lightness[-1]
