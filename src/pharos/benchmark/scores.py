@@ -6,7 +6,7 @@ clipped to [0, 1] as a whole: evaluations are not clipped one by one, and what l
 
 Intervals are Student's t with the standard error over seeds within each task and the degrees of freedom of Welch and
 Satterthwaite. The percentile bootstrap of seeds within tasks is too narrow with few seeds: its spread lacks the factor
-sqrt(n / (n - 1)) and it has normal quantiles: it covers 89 to 94 % with 10 seeds, t 93 to 98 %, in
+sqrt(n / (n - 1)) and it has normal quantiles: it covers 89 to 94 % with 10 seeds, t 93 to 97 %, in
 docs/evidence/benchmark.md. No random numbers are drawn: equal results give equal intervals, to the last digit.
 
 Sources: Agarwal et al. (2021), Deep reinforcement learning at the edge of the statistical precipice, for the
