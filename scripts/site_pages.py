@@ -346,6 +346,8 @@ def board(suite: benchmark.Suite, agents: Sequence[benchmark.AgentResults]) -> s
 
 def baseline_board() -> str:
     """The board of the shipped baselines of v1."""
+    if not benchmark.baselines("v1"):
+        return "No baselines are shipped yet."
     return board(benchmark.load_suite("v1"), [benchmark.read_results(name) for name in benchmark.baselines("v1")])
 
 

@@ -209,7 +209,8 @@ def test_the_table_in_latex_has_a_column_for_each_agent(tmp_path):
     assert rows[0] == r" & mine & DQN \\" and rows[1].startswith("core (score) & 0.60 (0.59 to 0.61) & 0.70")
     assert rows[3].endswith(r"& beyond 32 \\")
     assert r"\texttt{d1}" in methods and "13 of 13 tasks,\n1,000 steps each, with seeds 0, 1, 2" in methods
-    assert "beside DQN on" in methods and r'Versions: \{"pharos": "1"\}.' in methods
+    assert "We ran mine beside DQN on the" in methods and "Versions: pharos 1." in methods
+    assert "Source" not in methods
 
 
 def test_the_same_results_give_the_same_bytes(tmp_path):

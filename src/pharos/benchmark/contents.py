@@ -3,7 +3,7 @@
 import json
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from pharos.benchmark.charts import frontier_text
@@ -22,7 +22,7 @@ PHRASES = {
     "exploration": "explores to",
     "estimation": "stands noise of",
     "credit": "assigns credit over",
-    "representation": "copes with representations to",
+    "representation": "copes with representations that cost",
     "memory": "remembers for",
     "scale": "scales to",
 }
@@ -161,7 +161,9 @@ def residuals(contents: Contents) -> list[tuple[BenchmarkTask, Interval, float]]
 
 
 def excerpt(value: object) -> str:
-    """A value of the record as text, at most 400 letters."""
+    """A value of the record as text, at most 400 letters: `numpy 2.4, pharos 0.1`."""
+    if isinstance(value, Mapping):
+        value = ", ".join(f"{name} {each}" for name, each in sorted(value.items()))
     text = value if isinstance(value, str) else json.dumps(storage.plain(value), sort_keys=True)
     return text if len(text) <= LONGEST else text[:LONGEST] + "…"
 

@@ -21,11 +21,11 @@ def latex_of(contents: Contents) -> str:
 def methods(contents: Contents) -> str:
     """The paragraph on methods, in LaTeX: suite, protocol, seeds, statistics and digests."""
     suite, own, protocol = contents.suite, contents.agent.results, contents.suite.protocol
-    record = {name: value for name, value in own.record.items() if name in ("source", "versions", "division")}
-    others = listed([latex_text(each.name) for each in contents.beside]) if contents.beside else "no baseline"
+    record = {name: own.record.get(name) for name in ("source", "hyperparameters", "versions")}
+    others = f" beside {listed([latex_text(each.name) for each in contents.beside])}" if contents.beside else ""
     num_tasks = f"{contents.num_run(suite.tasks)} of {many(len(suite.tasks), 'task')}"
     lines = (
-        rf"We ran {latex_text(contents.agent.name)} beside {others} on the Pharos Benchmark {latex_text(suite.name)}",
+        rf"We ran {latex_text(contents.agent.name)}{others} on the Pharos Benchmark {latex_text(suite.name)}",
         rf"(SHA-256 of tasks and protocol: \texttt{{{latex_text(suite.digest)}}}): {num_tasks},",
         f"{protocol.steps:,} steps each, with seeds {', '.join(map(str, own.seeds))}.",
         f"The policy was evaluated after each of {protocol.evaluations} equal parts; its normalised regret is",
@@ -34,5 +34,7 @@ def methods(contents: Contents) -> str:
         "a ladder at which mean regret, made increasing by isotonic regression, crosses 0.5.",
         r"Intervals are of 95\,\%, Student's $t$ over seeds within tasks.",
     )
-    more = (f"{latex_text(name.capitalize())}: {latex_text(excerpt(value))}." for name, value in record.items())
+    more = (
+        f"{latex_text(name.capitalize())}: {latex_text(excerpt(value))}." for name, value in record.items() if value
+    )
     return "\n".join((*lines, *more))

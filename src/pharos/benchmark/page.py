@@ -249,7 +249,8 @@ def _provenance(contents: Contents) -> Element:
         "seeds": ", ".join(map(str, own.seeds)),
         "evaluation": f"exact on {count} of {many(len(exact), 'task')}, else estimated" if exact else "see agent.json",
         **{f"baseline {each.name}": f"seeds {', '.join(map(str, each.results.seeds))}" for each in contents.beside},
-        **{name: excerpt(value) for name, value in own.record.items() if name != "exact"},
+        "division": str(own.record.get("division") or "one setting for all tasks"),
+        **{name: excerpt(value) for name, value in own.record.items() if value and name not in ("exact", "division")},
     }
     claims = [
         "Computed, not sampled: V* and the value of uniform play of each task, frozen in the suite; values of the "
