@@ -8,32 +8,42 @@ from typing import TYPE_CHECKING
 from pharos.system import lazy
 
 if TYPE_CHECKING:
+    from pharos.benchmark.board import benchmark_board
     from pharos.benchmark.budget import BudgetSpent
+    from pharos.benchmark.commitment import Commitment, make_commitment
     from pharos.benchmark.comparison import AxisComparison, Comparison, Difference, Power, compare, power
     from pharos.benchmark.execution import run
     from pharos.benchmark.page import report
+    from pharos.benchmark.repetition import Audit, make_audit
     from pharos.benchmark.results import AgentResults, baselines, read_results
     from pharos.benchmark.scores import AxisScore, BenchmarkScore, Interval, score
     from pharos.benchmark.sealed import sealed_copies, sealed_instances, season_seed, write_suite
+    from pharos.benchmark.submission import Submission, submit, verify
     from pharos.benchmark.suite import BenchmarkTask, Ladder, Protocol, Suite, load_suite
 
 __all__ = [
     "AgentResults",
+    "Audit",
     "AxisComparison",
     "AxisScore",
     "BenchmarkScore",
     "BenchmarkTask",
     "BudgetSpent",
+    "Commitment",
     "Comparison",
     "Difference",
     "Interval",
     "Ladder",
     "Power",
     "Protocol",
+    "Submission",
     "Suite",
     "baselines",
+    "benchmark_board",
     "compare",
     "load_suite",
+    "make_audit",
+    "make_commitment",
     "power",
     "read_results",
     "report",
@@ -42,6 +52,8 @@ __all__ = [
     "sealed_copies",
     "sealed_instances",
     "season_seed",
+    "submit",
+    "verify",
 ]
 _shared = """
     write_suite

@@ -46,6 +46,7 @@ from pharos.training import (
     train_configs,
     train_parts,
     write_curve,
+    write_policy,
     write_record,
 )
 
@@ -336,6 +337,8 @@ def _record(label: str, job: Job, protocol: Protocol, end: Curve | Exception) ->
         said = f"{label} on {job.task.name}, seed {job.seed}: {type(end).__name__}: {in_one_line(end)}"
         write_record(job.folder, {**record, "status": "failed", "error": said})
         return said
+    if end.table is not None:
+        write_policy(job.folder, end.table)
     write_curve(job.folder, end.rows)
     write_record(job.folder, {**record, "status": "finished", "result": end.result()})
     return None

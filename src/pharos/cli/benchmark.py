@@ -1,7 +1,8 @@
 """pharos benchmark: agents on frozen tasks whose every state is known, and scores with units."""
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -21,6 +22,7 @@ app = Commands(no_args_is_help=True, help="Run agents on a frozen suite of solve
 SuiteName = Annotated[str, typer.Argument(metavar="[SUITE]", help="Name of a suite, or FILE.yaml.")]
 SuiteFile = Annotated[str, typer.Option("--suite", metavar="NAME|FILE")]
 Folder = Annotated[Path, typer.Argument(metavar="DIR")]
+Submitted = Annotated[Path, typer.Argument(metavar="FILE")]
 
 
 @app.command("show")
@@ -158,6 +160,164 @@ def report(
     others = None if beside is None else [each for each in beside.split(",") if each]
     files = benchmark.report(results, out, beside=others, latex=latex, predictor=predictor)
     return Answer({"files": files}, lambda: console().print(*map(str, files), sep="\n", markup=False))
+
+
+@app.command("commit")
+def commit(
+    agent: str,
+    *,
+    out: Path = Path("commitment.json"),
+    suite: SuiteFile = "v1",
+    hyperparameters: Mapping[str, Any] | None = None,
+) -> Answer:
+    """Write what binds you to an agent; publish its SHA-256 before the round of the beacon.
+
+    Args:
+        agent: As `benchmark run` takes it.
+        out: FILE.json.
+        suite: The public one.
+        hyperparameters: A hyperparameter, of all tasks.
+    """
+    from pharos.benchmark import load_suite, make_commitment
+
+    made = make_commitment(agent, load_suite(suite), hyperparameters, date=date.today().isoformat())
+    made.write(out)
+    return Answer({"file": out, "sha256": made.digest, "commitment": made}, (str(out), [("publish", made.digest)]))
+
+
+@app.command("submit")
+def submit(
+    results: Annotated[Path, typer.Argument(metavar="DIR")],
+    *,
+    out: Path | None = None,
+    suite: SuiteFile = "v1",
+    author: str = "",
+    note: str = "",
+    commitment: Path | None = None,
+) -> Answer:
+    """Pack curves, final policies and the commitment of a run into one file that anybody can verify.
+
+    Args:
+        results: Folder of `benchmark run`.
+        out: FILE.safetensors; AGENT.safetensors when not given.
+        suite: That it is of.
+        author: Who submits it.
+        note: Shown beside it.
+        commitment: File of `benchmark commit`.
+    """
+    from pharos import benchmark
+
+    file = out or Path(f"{results.name}.safetensors")
+    bound = None if commitment is None else benchmark.Commitment.read(commitment)
+    loaded = benchmark.load_suite(suite)
+    with progress_bar("policies", 1) as tell:
+        made = benchmark.submit(results, file, loaded, author=author, note=note, commitment=bound, progress=_told(tell))
+    runs = sum(map(len, made.results.curves.values()))
+    facts = [("runs", f"{runs:,}"), ("policies", f"{len(made.policies):,}"), ("committed", "yes" if bound else "no")]
+    return Answer({"file": file, "runs": runs, "policies": len(made.policies)}, (str(file), facts))
+
+
+@app.command("verify")
+def verify(file: Submitted, *, suite: SuiteFile = "v1") -> Answer:
+    """Solve the tasks of a submission and evaluate its final policies again; exit code 1 where one is not as claimed.
+
+    Args:
+        file: That `benchmark submit` wrote.
+        suite: That it is of.
+    """
+    from pharos import benchmark
+
+    loaded = benchmark.load_suite(suite)
+    with progress_bar("verifying", 1) as tell:
+        verdict = benchmark.verify(file, loaded, progress=_told(tell))
+    wrong = {each.name: {"claimed": each.claimed, "computed": each.found} for each in verdict.wrong}
+    answer = {"holds": verdict.holds, "sha256": verdict.sha256, "verified": len(verdict.checks) - len(wrong)}
+    answer |= {"wrong": wrong, "refused": verdict.refused, "missing": verdict.missing}
+    facts = [
+        (
+            "policies",
+            f"{len(verdict.checks) - len(wrong):,} as claimed, {len(wrong):,} not, {len(verdict.missing):,} missing",
+        ),
+        *((name, f"regret {each['computed']:.6g}, claimed {each['claimed']:.6g}") for name, each in wrong.items()),
+        *verdict.refused.items(),
+        ("learning", "claimed: only an audit tells how policies were learnt"),
+    ]
+    return Answer(answer, (f"{file}: {'holds' if verdict.holds else 'does not hold'}", facts), not verdict.holds)
+
+
+@app.command("audit")
+def audit(
+    file: Submitted,
+    *,
+    source: str,
+    out: Path | None = None,
+    suite: SuiteFile = "v1",
+    published: str = "",
+    round: Annotated[str, typer.Option("--round", metavar="YYYY-MM-DD")] = "",
+    elsewhere: bool = False,
+    workers: Count | None = None,
+) -> Answer:
+    """Train three runs of a submission again, drawn by its own digest; exit code 1 where one does not repeat.
+
+    Args:
+        file: That `benchmark submit` wrote.
+        source: The agent, as `benchmark run` takes it; its code is executed, so use a container without network.
+        out: FILE.audit.json when not given.
+        suite: That it is of.
+        published: When you saw its commitment published, YYYY-MM-DD.
+        round: When the round of the beacon was.
+        elsewhere: It was trained on another kind of processor: networks need not repeat to the last bit.
+        workers: Processes.
+    """
+    from pharos import benchmark
+
+    loaded, target = benchmark.load_suite(suite), out or file.with_name(f"{file.name}.audit.json")
+    with progress_bar("runs", 1) as tell:
+        made = benchmark.make_audit(
+            *(file, source, loaded),
+            date=date.today().isoformat(),
+            published=published,
+            round=round,
+            elsewhere=elsewhere,
+            workers=workers,
+            progress=_told(tell),
+        )
+    made.write(target)
+    facts = [("source", "is the one named" if made.is_source else "is another one, and was not run")]
+    for each in made.repeats:
+        said = "equal" if each.equal else f"{each.again} for {each.claimed:.6g}, from {each.low:.4g} to {each.high:.4g}"
+        facts.append((f"{each.task}, seed {each.seed}", each.error or said))
+    answer = {"file": target, "holds": made.holds, "audit": made}
+    return Answer(answer, (f"{file}: {'repeats' if made.holds else 'does not repeat'}", facts), not made.holds)
+
+
+@app.command("board")
+def board(
+    files: Annotated[list[Path], typer.Argument(metavar="FILE...")],
+    *,
+    out: Path = Path("board.html"),
+    suite: Annotated[list[str] | None, typer.Option(metavar="NAME|FILE")] = None,
+    title: str = "Benchmark",
+) -> Answer:
+    """Verify submissions, and write a page with two lists: audited (FILE.audit.json lies beside), and claimed.
+
+    Args:
+        files: Submissions.
+        out: FILE.html.
+        suite: That they may be of; several times for more; v1 when not given.
+        title: Of the page.
+    """
+    from pharos import benchmark
+
+    suites = [benchmark.load_suite(each) for each in suite or ["v1"]]
+    with progress_bar("verifying", 1) as tell:
+        made = benchmark.benchmark_board(files, out, suites, title=title, progress=_told(tell))
+    facts = [("verified", f"{len(made.verified):,}"), ("refused", f"{len(made.refused):,}"), *made.refused.items()]
+    return Answer({"file": out, "verified": len(made.verified), "refused": made.refused}, (str(out), facts))
+
+
+def _told(show: Callable[[int, str], None] | None) -> Callable[[int, int, str], None] | None:
+    return None if show is None else lambda done, total, text: show(done, f"{done} of {total}: {text}")
 
 
 def _entry(task: "BenchmarkTask") -> dict[str, Any]:

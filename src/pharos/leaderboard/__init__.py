@@ -1,8 +1,8 @@
 """Entries of a leaderboard: what a run has learnt and what it claims, in one file that anybody can verify."""
 
-from pharos.leaderboard.board import board, reason
+from pharos.leaderboard.board import Board, Cell, Ranking, board, reason, write_page
 from pharos.leaderboard.entry import Claim, Entry, check_values, in_file, read, read_sealed, write_sealed
-from pharos.leaderboard.submission import submit
+from pharos.leaderboard.submission import stored_table, submit
 from pharos.leaderboard.verification import Check, Verdict, verify
 
 __all__ = [
@@ -13,5 +13,5 @@ __all__ = [
     "verify",
 ]
 _shared = """
-    Check Claim Entry check_values in_file read_sealed reason write_sealed
+    Board Cell Check Claim Entry Ranking check_values in_file read_sealed reason stored_table write_page write_sealed
 """

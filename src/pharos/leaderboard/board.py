@@ -8,7 +8,7 @@ import base64
 import hashlib
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -118,7 +118,7 @@ def board(
     files = sorted(path for path in place.rglob(f"*{SUFFIX}") if path.is_file())
     if not files:
         raise ParameterError(f"{place}: expected a folder with entries, *{SUFFIX}; `pharos submit RUN` makes one")
-    template = templates("pharos.leaderboard", "the page of a leaderboard").get_template("board.html.j2")
+    _template()  # or what is missing for it is told before anything is verified
     made, values = Board(Path(out)), dict[str, TaskValues]()
     for k, path in enumerate(files):
         name = path.relative_to(place).as_posix()
@@ -142,20 +142,38 @@ def board(
             made.verified.append(verdict)
         else:
             made.refused[name] = why_not(verdict)
+    write_page(made.file, title, _rankings(made.verified), COLUMNS, made.refused, len(made.verified))
+    return made
+
+
+def write_page(
+    file: str | os.PathLike,
+    title: str,
+    rankings: Sequence[Ranking],
+    columns: Sequence[tuple[str, str]],
+    refused: Mapping[str, str],
+    verified: int,
+    introduction: str = "",
+) -> None:
+    """Write the page of a board; the introduction goes in the place of the usual one."""
     script = _script()
-    text = template.render(
+    text = _template().render(
         title=title,
-        rankings=_rankings(made.verified),
-        columns=COLUMNS,
-        refused=made.refused,
-        verified=len(made.verified),
+        rankings=rankings,
+        columns=columns,
+        refused=refused,
+        verified=verified,
+        introduction=introduction,
         version=_version(),
         script=script,
         script_hash=base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
     )
-    made.file.parent.mkdir(parents=True, exist_ok=True)
-    storage.replace_file(made.file, text.encode(errors="replace"))  # names of files may be no text
-    return made
+    Path(file).parent.mkdir(parents=True, exist_ok=True)
+    storage.replace_file(file, text.encode(errors="replace"))  # names of files may be no text
+
+
+def _template() -> Any:
+    return templates("pharos.leaderboard", "the page of a leaderboard").get_template("board.html.j2")
 
 
 def reason(error: Exception) -> str:

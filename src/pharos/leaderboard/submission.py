@@ -75,7 +75,7 @@ def submit(
         rules_version=_rules_version(run, record, config),
         claim=claim,
         training={key: result.get(key) for key in TRAINING} | {"seconds": record.get("seconds")},
-        arrays=_table(run) if config.is_tabular else _network(run),
+        arrays={POLICY: stored_table(run)} if config.is_tabular else _network(run),
     )
     target = Path(f"{config.id}{SUFFIX}" if file is None else file)
     if target.suffix.lower() != SUFFIX:
@@ -104,14 +104,18 @@ def _rules_version(run: Path, record: dict[str, Any], config: RunConfig) -> int:
     return rules.version
 
 
-def _table(run: Path) -> dict[str, np.ndarray]:
-    """The greedy policy, in as few bytes as its actions take."""
+def stored_table(run: Path) -> np.ndarray:
+    """The policy of a run that kept a table, actions in as few bytes as they take.
+
+    Raises:
+        ResultCorrupted: policy.npy cannot be read.
+    """
     try:
         table = np.load(run / "policy.npy", allow_pickle=False)
     except Exception as error:  # the header is read as Python
         raise ResultCorrupted(f"{run / 'policy.npy'}: cannot be read: {error}") from None
     whole = table.astype(np.int64)
-    return {POLICY: whole.astype(np.min_scalar_type(int(whole.max(initial=0)))) if (whole == table).all() else table}
+    return whole.astype(np.min_scalar_type(int(whole.max(initial=0)))) if (whole == table).all() else table
 
 
 def _network(run: Path) -> dict[str, np.ndarray]:

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
         read_table,
         versions,
         write_curve,
+        write_policy,
         write_record,
         write_table,
     )
@@ -57,7 +58,7 @@ __all__ = [
 _shared = """
     CELL Curve ENGINES FailedRun Horizon Progress SPACES TaskCache TaskValues TuningResult bootstrap_interval
     check_agent clear_run digest_of_curve read_curve read_curve_table read_record read_rows read_table run_id
-    train_parts versions write_curve write_record write_table
+    train_parts versions write_curve write_policy write_record write_table
 """
 
 __getattr__ = lazy.attributes(__name__)

@@ -22,10 +22,15 @@ RESAMPLED = 1 << 22  # numbers that one batch of resamples may hold
 
 @dataclass
 class Curve:
-    """The rows so far, and the regret of the episodes between evaluations."""
+    """The rows so far, and the regret of the episodes between evaluations.
+
+    Attributes:
+        table: the policy of the last row, where it is a table.
+    """
 
     task: Task
     rows: list[dict[str, Any]] = field(default_factory=list)
+    table: np.ndarray | None = None
 
     def add(
         self, step: int, episodes: int, returns: float, agent: Any, evaluation: Evaluation | None = None
@@ -56,6 +61,7 @@ class Curve:
             "returns": returns,
         }
         self.rows.append(row)
+        self.table = agent if isinstance(agent, np.ndarray) else None
         return row
 
     def result(self) -> dict[str, Any]:

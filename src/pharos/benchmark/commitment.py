@@ -1,0 +1,94 @@
+"""Commitment: what will be submitted, said before the tasks are drawn.
+
+A commitment names SHA-256 digests of an agent's source and of its hyperparameters. Whoever publishes it before a round
+of the beacon cannot have chosen them by the tasks of that round. It needs no salt: a salt hides what could be guessed,
+and here nothing has to stay hidden, since source and hyperparameters are published after the round; what binds is that
+nobody finds another source with the same digest. Its date is only said by its author: what counts is where it was
+published, and when.
+"""
+
+import hashlib
+import json
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from pharos.benchmark.agents import agent_form
+from pharos.benchmark.suite import Suite
+from pharos.errors import FileFormatError, ParameterError, ResultCorrupted
+from pharos.system import records, storage
+
+FORMAT = 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class Commitment:
+    """What an author binds themself to.
+
+    Attributes:
+        agent: its label, such as "my_file.py:learn" or "dqn".
+        source: SHA-256 of the file or module that the agent names; empty for agents of pharos.
+        hyperparameters: SHA-256 of all of them, as JSON with sorted keys.
+        suite: SHA-256 of the public suite.
+        date: on which it was made, by its author's clock: YYYY-MM-DD.
+    """
+
+    agent: str
+    source: str
+    hyperparameters: str
+    suite: str
+    date: str
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of all that it says: the line to publish."""
+        return digest_of(asdict(self))
+
+    def write(self, file: str | os.PathLike) -> None:
+        """Replace a file by it, in one step."""
+        storage.replace_json(file, {"format": FORMAT, **asdict(self), "sha256": self.digest})
+
+    @staticmethod
+    def read(file: str | os.PathLike) -> "Commitment":
+        """Read what `write` wrote.
+
+        Raises:
+            ParameterError: there is no such file. FileFormatError: it is no commitment.
+            ResultCorrupted: it was changed.
+        """
+        try:
+            entry = storage.read_json(Path(file), FileFormatError, "ask for it again")
+        except FileNotFoundError:
+            raise ParameterError(f"{file}: no such file; `pharos benchmark commit` writes it") from None
+        if not isinstance(entry, dict) or entry.get("format") != FORMAT:
+            raise FileFormatError(f"{file}: is no commitment; expected a file of `pharos benchmark commit`")
+        said = {name: value for name, value in entry.items() if name not in ("format", "sha256")}
+        commitment = records.read(Commitment, said, f"{file}: the commitment")
+        if commitment.digest != entry.get("sha256"):
+            raise ResultCorrupted(f"{file}: what it says was changed after it was written; ask for it again")
+        return commitment
+
+
+def make_commitment(
+    agent: str | Callable[..., Any], suite: Suite, hyperparameters: Mapping[str, Any] | None = None, *, date: str
+) -> Commitment:
+    """The commitment to an agent and its hyperparameters.
+
+    Args:
+        agent, hyperparameters: as `benchmark.run` takes them; its code is imported.
+        suite: the public one.
+    Raises:
+        UnknownName, ParameterError: there is no such agent, file or hyperparameter.
+    """
+    form = agent_form(agent, suite, hyperparameters)
+    settings = digest_of(storage.plain(form.hyperparameters))
+    return Commitment(agent=form.label, source=form.checksum, hyperparameters=settings, suite=suite.digest, date=date)
+
+
+def digest_of(value: object) -> str:
+    """SHA-256 of a value as JSON with sorted keys and without blanks."""
+    return hashlib.sha256(
+        json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
+    ).hexdigest()
