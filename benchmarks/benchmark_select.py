@@ -176,7 +176,7 @@ def noise_over_gap(task, learnt):
     """Standard deviation of the noise in rewards / the smallest loss of an action that loses something."""
     q = learnt.optimal.q
     gaps = q.max(axis=1, keepdims=True) - q
-    return task.chance.get("reward_noise", 0.0) / gaps[gaps > 1e-6].min()
+    return task.chance.get("reward_noise", 0.0) / gaps[gaps > TIE].min(initial=np.inf)
 
 
 def log10_states(task, learnt):
