@@ -16,7 +16,8 @@ def test_the_answer_has_every_task():
     assert said["minutes"]["dqn"] == pytest.approx(commands._minutes(suite)["dqn"])
 
 
-def test_the_table_has_every_task_with_its_level():
+def test_the_table_has_every_task_with_its_level(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "160")
     shown = run("benchmark", "show", "v1").stdout
     assert all(task.name in shown for task in load_suite().tasks)
     assert "6 bits" in shown and load_suite().digest in shown.replace("\n", "")
