@@ -7,8 +7,6 @@ nobody finds another source with the same digest. Its date is only said by its a
 published, and when.
 """
 
-import hashlib
-import json
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
@@ -16,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from pharos.benchmark.agents import agent_form
-from pharos.benchmark.suite import Suite
+from pharos.benchmark.suite import Suite, sha256_of_json
 from pharos.errors import FileFormatError, ParameterError, ResultCorrupted
 from pharos.system import records, storage
 
@@ -44,7 +42,7 @@ class Commitment:
     @property
     def digest(self) -> str:
         """SHA-256 of all that it says: the line to publish."""
-        return digest_of(asdict(self))
+        return sha256_of_json(asdict(self))
 
     def write(self, file: str | os.PathLike) -> None:
         """Replace a file by it, in one step."""
@@ -83,12 +81,5 @@ def make_commitment(
         UnknownName, ParameterError: there is no such agent, file or hyperparameter.
     """
     form = agent_form(agent, suite, hyperparameters)
-    settings = digest_of(storage.plain(form.hyperparameters))
+    settings = sha256_of_json(storage.plain(form.hyperparameters))
     return Commitment(agent=form.label, source=form.checksum, hyperparameters=settings, suite=suite.digest, date=date)
-
-
-def digest_of(value: object) -> str:
-    """SHA-256 of a value as JSON with sorted keys and without blanks."""
-    return hashlib.sha256(
-        json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
-    ).hexdigest()

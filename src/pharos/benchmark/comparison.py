@@ -11,6 +11,7 @@ Interval estimation for the difference between independent proportions, for diff
 """
 
 import math
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -120,8 +121,8 @@ def compare(
         ParameterError: the suites' digests differ, or no task is common to both.
     Cost: milliseconds.
     """
-    ours, theirs = _results(ours), _results(theirs)
-    suite = _suite(ours, suite)
+    ours, theirs = results_of(ours), results_of(theirs)
+    suite = suite_of_results(ours, suite)
     for each in (ours, theirs):
         check_suite(each, suite)
     x, y = run_scores(ours), run_scores(theirs)
@@ -167,8 +168,8 @@ def power(
     Raises:
         ParameterError: fewer than two seeds, a difference that is not positive, or another suite.
     """
-    results = _results(results)
-    suite = _suite(results, suite)
+    results = results_of(results)
+    suite = suite_of_results(results, suite)
     check_suite(results, suite)
     if len(results.seeds) < 2:
         raise ParameterError(f"results of {results.agent} have one seed; expected two or more, to see how seeds vary")
@@ -267,9 +268,11 @@ def _seeds_for(variances: np.ndarray, difference: float) -> int | None:
     return low
 
 
-def _results(results: AgentResults | Path | str) -> AgentResults:
+def results_of(results: AgentResults | str | os.PathLike) -> AgentResults:
+    """Results as they are, or read."""
     return results if isinstance(results, AgentResults) else AgentResults.read(results)
 
 
-def _suite(results: AgentResults, suite: Suite | str | None) -> Suite:
+def suite_of_results(results: AgentResults, suite: Suite | str | None) -> Suite:
+    """The suite that is given, or the one that results name."""
     return suite if isinstance(suite, Suite) else load_suite(suite or results.suite)

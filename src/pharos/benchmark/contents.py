@@ -7,10 +7,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from pharos.benchmark.charts import frontier_text
-from pharos.benchmark.comparison import Comparison, compare
+from pharos.benchmark.comparison import Comparison, compare, results_of, suite_of_results
 from pharos.benchmark.results import AgentResults, baselines
 from pharos.benchmark.scores import BenchmarkScore, Interval, score
-from pharos.benchmark.suite import BenchmarkTask, Suite, load_suite
+from pharos.benchmark.suite import BenchmarkTask, Suite
 from pharos.errors import ParameterError
 from pharos.plots import agent_name
 from pharos.system import storage
@@ -92,13 +92,13 @@ def contents_of(
     suite: Suite | str | None = None,
 ) -> Contents:
     """Contents of a report; arguments and errors as for `report`."""
-    own = _read(results)
-    suite = suite if isinstance(suite, Suite) else load_suite(suite or own.suite)
+    own = results_of(results)
+    suite = suite_of_results(own, suite)
     if beside is None:
         beside = [name for name in BESIDE if name in baselines(suite.name) and name != own.agent]
     if predictor not in (None, "none", *PREDICTORS):
         raise ParameterError(f"predictor {predictor}; expected one of {', '.join(PREDICTORS)}, none")
-    others = [_read(each) for each in beside]
+    others = [results_of(each) for each in beside]
     names = f"{own.agent} {own.record.get('source')}".lower()
     return Contents(
         suite,
@@ -112,10 +112,6 @@ def contents_of(
 def _name(label: str) -> str:
     """An agent beside: as pharos spells its own, and whole where it is of a file or a module."""
     return label if ":" in label else agent_name(label)
-
-
-def _read(results: Source) -> AgentResults:
-    return results if isinstance(results, AgentResults) else AgentResults.read(results)
 
 
 def regret_of(agent: Agent, task: BenchmarkTask) -> Interval | None:

@@ -102,13 +102,18 @@ def baselines(suite: str = "v1") -> tuple[str, ...]:
 
 
 def _results(record: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> AgentResults:
-    check_values(record)
     kinds = {"agent": str, "suite": str, "suite_digest": str, "seeds": list, "record": dict}
+    agent, suite, digest, seeds, more = entries_of(record, kinds, WHAT)
+    return AgentResults(agent, suite, digest, tuple(seeds), arrays, more)
+
+
+def entries_of(record: Mapping[str, Any], kinds: Mapping[str, type], what: str) -> tuple[Any, ...]:
+    """Entries of the record of a file, in the order of `kinds`; FileFormatError: one is missing or of another type."""
+    check_values(record)
     wrong = [name for name, kind in kinds.items() if not isinstance(record.get(name), kind)]
     if wrong or not all(type(seed) is int for seed in record["seeds"]):
-        raise FileFormatError(f"is no {WHAT}: its {', '.join(wrong) or 'seeds'} are missing or of another type")
-    agent, suite, digest, seeds, more = (record[name] for name in kinds)
-    return AgentResults(agent, suite, digest, tuple(seeds), arrays, more)
+        raise FileFormatError(f"is no {what}: its {', '.join(wrong) or 'seeds'} are missing or of another type")
+    return tuple(record[name] for name in kinds)
 
 
 read_results = AgentResults.read

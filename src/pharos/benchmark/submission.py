@@ -20,11 +20,11 @@ import numpy as np
 
 from pharos.benchmark.agents import sha256
 from pharos.benchmark.budget import Snapshots
-from pharos.benchmark.commitment import Commitment, digest_of
-from pharos.benchmark.results import AgentResults
-from pharos.benchmark.suite import BenchmarkTask, Suite
+from pharos.benchmark.commitment import Commitment
+from pharos.benchmark.results import AgentResults, entries_of
+from pharos.benchmark.suite import BenchmarkTask, Suite, sha256_of_json
 from pharos.errors import FileFormatError, ParameterError, PharosError
-from pharos.leaderboard import Check, check_values, in_file, read_sealed, stored_table, write_sealed
+from pharos.leaderboard import Check, in_file, read_sealed, stored_table, write_sealed
 from pharos.system import records
 from pharos.training import Task, evaluate_agent, load_agent
 
@@ -85,7 +85,7 @@ class Submission:
     def fits(self) -> bool:
         """Whether source and hyperparameters are those of its commitment."""
         source = sha256_of_source(self.results)
-        settings = digest_of(self.results.record.get("hyperparameters"))
+        settings = sha256_of_json(self.results.record.get("hyperparameters"))
         committed = self.commitment
         return committed is not None and (committed.source, committed.hyperparameters) == (source, settings)
 
@@ -97,12 +97,8 @@ def sha256_of_source(results: AgentResults) -> str:
 
 
 def _submission(record: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Submission:
-    check_values(record)
     kinds = {"name": str, "author": str, "note": str, "suite": str, "suite_digest": str, "seeds": list, "record": dict}
-    wrong = [name for name, kind in kinds.items() if not isinstance(record.get(name), kind)]
-    if wrong or not all(type(seed) is int for seed in record["seeds"]):
-        raise FileFormatError(f"is no {WHAT}: its {', '.join(wrong) or 'seeds'} are missing or of another type")
-    name, author, note, suite, digest, seeds, said = (record[key] for key in kinds)
+    name, author, note, suite, digest, seeds, said = entries_of(record, kinds, WHAT)
     curves, policies = {}, {}
     for key, array in arrays.items():
         kind, *words = key.split("/")
@@ -244,10 +240,9 @@ def verify(
         if progress is not None:
             progress(place, len(results.curves), name)
         entry = suite.task(name)
-        entry.check(suite.protocol)
+        task = entry.check(suite.protocol)
         if curve.min() < -tolerance:
             refused[name] = f"its normalised regret is {curve.min():.6g}, better than the optimal policy"
-        task = entry.training_task(suite.protocol)
         for seed, claimed in zip(results.seeds, curve[:, -1], strict=True):
             run, policy = f"{name}/{seed}", submission.policies.get((name, seed))
             if policy is None:

@@ -99,8 +99,11 @@ class BenchmarkTask:
             horizon=protocol.horizon,
         )
 
-    def check(self, protocol: Protocol) -> None:
-        """ParameterError where the task is another one on this installation. Cost: its states are built and solved."""
+    def check(self, protocol: Protocol) -> Task:
+        """What an agent learns; ParameterError where that is another task on this installation.
+
+        Cost: its states are built and solved.
+        """
         task = self.training_task(protocol)
         if (digest := digest_of_task(task)) != self.digest:
             raise ParameterError(
@@ -116,6 +119,7 @@ class BenchmarkTask:
                     f"task {self.name}: the value of {name} play is {value!r} on this installation; expected "
                     f"{expected!r}; install the version of pharos that the suite is of"
                 )
+        return task
 
 
 @dataclass(frozen=True)
@@ -247,7 +251,7 @@ def _tasks(entries: object, axis: str, whose: str) -> tuple[BenchmarkTask, ...]:
 def digest_of_suite(suite: Suite) -> str:
     """SHA-256 of the protocol, and of name, axis, level and digest of each task, as canonical JSON."""
     tasks = [[task.name, task.axis, task.level, task.digest] for task in suite.tasks]
-    return hashlib.sha256(_canonical({"protocol": vars(suite.protocol), "tasks": tasks})).hexdigest()
+    return sha256_of_json({"protocol": vars(suite.protocol), "tasks": tasks})
 
 
 def digest_of_task(task: Task) -> str:
@@ -290,10 +294,7 @@ def _arrays(mdp: TabularMDP) -> Iterable[np.ndarray]:
     yield keys % (num_states + 1) - 1
     yield np.bincount(inverse, probabilities, len(keys))
     start = np.zeros(num_states)
-    if isinstance(mdp.initial, np.ndarray):
-        start[:] = mdp.initial
-    else:
-        start[mdp.initial] = 1.0
+    start[mdp.start_states] = mdp.start_probabilities
     yield from (np.asarray(mdp.rewards, np.float64), start, np.asarray(mdp.terminal, bool))
 
 
@@ -301,6 +302,11 @@ def rounded(values: np.ndarray) -> np.ndarray:
     """Numbers with mantissas of BITS bits; zero has no sign."""
     mantissa, exponent = np.frexp(np.asarray(values, np.float64))
     return np.ldexp(np.round(np.ldexp(mantissa, BITS)), exponent - BITS) + 0.0
+
+
+def sha256_of_json(value: object) -> str:
+    """SHA-256, hexadecimal, of a value as JSON with sorted keys and without blanks."""
+    return hashlib.sha256(_canonical(value)).hexdigest()
 
 
 def _canonical(value: object) -> bytes:
