@@ -164,15 +164,12 @@ def excerpt(value: object) -> str:
     return text if len(text) <= LONGEST else text[:LONGEST] + "…"
 
 
-def number(interval: Interval) -> str:
+def number(interval: Interval, form: str = ".2f") -> str:
     """A score with its interval, which one seed does not have: `0.70 (0.68 to 0.72)`."""
-    return f"{interval.value:.2f}" + (
-        "" if math.isnan(interval.low) else f" ({interval.low:.2f} to {interval.high:.2f})"
-    )
+    ends = "" if math.isnan(interval.low) else f" ({interval.low:{form}} to {interval.high:{form}})"
+    return f"{interval.value:{form}}{ends}"
 
 
 def signed(interval: Interval) -> str:
     """A difference of scores with its interval: `+0.12 (+0.03 to +0.21)`."""
-    return f"{interval.value:+.2f}" + (
-        "" if math.isnan(interval.low) else f" ({interval.low:+.2f} to {interval.high:+.2f})"
-    )
+    return number(interval, "+.2f")

@@ -22,7 +22,8 @@ from pharos.agents import BATCHED
 from pharos.benchmark.agents import agent_form, sha256
 from pharos.benchmark.execution import run
 from pharos.benchmark.results import AgentResults
-from pharos.benchmark.submission import Submission, Tell, check_suite, sha256_of_source
+from pharos.benchmark.scores import check_suite
+from pharos.benchmark.submission import Submission, Tell, sha256_of_source
 from pharos.benchmark.suite import Suite
 from pharos.errors import FileFormatError, ParameterError, PharosError, ResultCorrupted
 from pharos.system import records, storage

@@ -152,16 +152,24 @@ def axis_score(ladder: "Ladder", runs: Mapping[str, np.ndarray]) -> AxisScore | 
     return AxisScore(ladder.axis, ladder.unit, mean_interval(own, (0.0, 1.0)), frontier(levels, [1.0 - x for x in own]))
 
 
-def check_suite(results: "AgentResults", suite: "Suite") -> None:
+def check_suite(results: "AgentResults", suite: "Suite", whose: str = "") -> None:
     """Refuse results of another suite, by name.
 
+    Args:
+        whose: the file that they are of, for messages.
     Raises:
-        ParameterError: the digest is another one.
+        ParameterError: the digest is another one, or there are curves of tasks that are not in the suite.
     """
     if results.digest != suite.digest:
         raise ParameterError(
-            f"results of {results.agent} are of suite {results.suite} with digest {results.digest[:12]}; expected "
-            f"{suite.name} with {suite.digest[:12]}: run the agent on that suite"
+            f"{f'{whose}: ' * bool(whose)}results of {results.agent} are of suite {results.suite} with digest "
+            f"{results.digest[:12]}; expected {suite.name} with {suite.digest[:12]}: run the agent on that suite, or "
+            f"name its suite (--suite)"
+        )
+    if unknown := sorted({*results.curves} - {task.name for task in suite.tasks}):
+        raise ParameterError(
+            f"{whose or f'results of {results.agent}'}: curves of {unknown[0]!r}, which is no task of suite "
+            f"{suite.name}"
         )
 
 

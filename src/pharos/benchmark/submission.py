@@ -22,6 +22,7 @@ from pharos.benchmark.agents import sha256
 from pharos.benchmark.budget import Snapshots
 from pharos.benchmark.commitment import Commitment
 from pharos.benchmark.results import AgentResults, entries_of
+from pharos.benchmark.scores import check_suite
 from pharos.benchmark.suite import BenchmarkTask, Suite, sha256_of_json
 from pharos.errors import FileFormatError, ParameterError, PharosError
 from pharos.leaderboard import Check, in_file, read_sealed, stored_table, write_sealed
@@ -270,13 +271,3 @@ def _regret(policy: np.ndarray, task: Task, entry: BenchmarkTask) -> float:
         raise FileFormatError(f"its policy names an action beyond 0 to {actions - 1}")
     value = evaluate_agent(policy.astype(np.int64 if is_choice else np.float64), task, max_states=states).value
     return (entry.value_optimal - value) / (entry.value_optimal - entry.value_uniform)
-
-
-def check_suite(results: AgentResults, suite: Suite, whose: str) -> None:
-    if results.digest != suite.digest:
-        raise ParameterError(
-            f"{whose}: is of suite {results.suite} with digest {results.digest[:16]}...; expected {suite.name}, "
-            f"{suite.digest[:16]}...: name its suite (--suite)"
-        )
-    if unknown := sorted({*results.curves} - {task.name for task in suite.tasks}):
-        raise ParameterError(f"{whose}: has curves of {unknown[0]!r}, which is no task of suite {suite.name}")
