@@ -11,7 +11,7 @@ import importlib
 import inspect
 import math
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -67,9 +67,11 @@ def algorithm(agent: str | type) -> type:
         ) from error
 
 
-def check_hyperparameters(agent: str | type, hyperparameters: Mapping[str, Any]) -> None:
+def check_hyperparameters(agent: str | type, hyperparameters: Mapping[str, Any], also: Iterable[str] = ()) -> None:
     """Refuse hyperparameters that the algorithm lacks, and values that it would accept silently or fail with late.
 
+    Args:
+        also: names that the engine adds to those of the algorithm.
     Raises:
         UnknownName: with the nearest name that it has. ParameterError: a number out of its range, or something else for
             one.
@@ -77,7 +79,7 @@ def check_hyperparameters(agent: str | type, hyperparameters: Mapping[str, Any])
     name = _title(agent)
     parameters = inspect.signature(algorithm(agent)).parameters
     if all(each.kind is not inspect.Parameter.VAR_KEYWORD for each in parameters.values()):
-        names = sorted({*parameters, "n_envs", "n_timesteps", "net_arch"} - OURS)
+        names = sorted({*parameters, "n_envs", "n_timesteps", "net_arch", *also} - OURS)
         for hyperparameter in hyperparameters:
             if hyperparameter not in names:
                 raise UnknownName(f"hyperparameter of {name}", hyperparameter, names)

@@ -134,9 +134,7 @@ def agent_form(agent: str | Callable[..., Any], suite: Suite, hyperparameters: M
     if lacking is not None:
         raise ParameterError(f"the batched engine: {lacking}")
     if agent not in AGENTS or not AGENTS[agent].is_tabular:
-        check_hyperparameters(
-            agent, {each: chosen[each] for each in chosen if each != "double" or agent not in BATCHED}
-        )
+        check_hyperparameters(agent, chosen, batched.OURS if agent in BATCHED else ())
     return Trained(agent, "engine" if agent in AGENTS else "class", chosen)
 
 

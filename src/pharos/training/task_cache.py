@@ -140,9 +140,9 @@ class TaskCache:
                 table()  # what is wrong is said before others are concerned
             make = table if config.is_tabular else algorithm
             return Member(place, config, folder, task, chosen, make, key, is_alone)
-        from pharos.agents.batched import BatchRun, ObservationSource, group_key, supports
+        from pharos.agents.batched import OURS, BatchRun, ObservationSource, group_key, supports
 
-        check_hyperparameters(config.agent, {name: chosen[name] for name in chosen if name != "double"})  # ours alone
+        check_hyperparameters(config.agent, chosen, OURS)
         lacking = supports(config.agent, chosen)
         if lacking is not None:
             raise ParameterError(f"the batched engine: {lacking}; the engine sb3 has it")

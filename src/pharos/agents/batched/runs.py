@@ -62,6 +62,8 @@ OF_A_BATCH: dict[str, dict[str, Any]] = {
         "net_arch": [128],
     },
 }
+OURS = ("double",)
+"""Hyperparameters that Stable-Baselines3 does not have."""
 # Names that change nothing here, or that may have this one value only.
 WITHOUT_EFFECT = ("n_timesteps", "verbose", "stats_window_size")
 ONLY: dict[str, Any] = {
