@@ -248,3 +248,12 @@ def test_elements_keep_the_order_of_texts_and_children():
 def test_shades_go_from_dark_to_light():
     lightness = [sum(int(shade(x)[k : k + 2], 16) for k in (1, 3, 5)) for x in np.linspace(0, 1, 11)]
     assert lightness == sorted(lightness) and lightness[0] < 120 < 500 < lightness[-1]
+
+
+def test_an_agent_keeps_its_colour_where_another_one_has_not_run():
+    whole = everywhere((0.1, 0.2, 0.3), (0.0, 0.2, 0.8, 1.0), (0.1, 0.2, 0.3), (0.1, 0.2, 0.3))
+    core_alone = {name: whole[name] for name in ("easy", "hard", "odd")}
+    own, first, second = results("mine", whole), results("core_alone", core_alone), results("other", whole)
+    text = page(contents_of(own, beside=[first, second], suite=SUITE))
+    chart = text.split('aria-label="exploration: scores of agents"')[1].split("</svg>")[0]
+    assert re.findall(r'class="(f\d)"', chart) == ["f0", "f2"]

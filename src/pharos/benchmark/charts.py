@@ -117,14 +117,14 @@ def legend(names: Sequence[str], theory: str | None = None) -> Element:
     return element("ul", *(element("li", mark, name) for name, mark in marks), class_="legend")
 
 
-def bars(rows: Sequence[tuple[str, Interval]], title: str) -> Element:
-    """Horizontal bars of scores in [0, 1] with their intervals, one for each agent."""
+def bars(rows: Mapping[int, tuple[str, Interval]], title: str) -> Element:
+    """Horizontal bars of scores in [0, 1] with their intervals: place of an agent -> its name and score."""
     left, wide, step = 122, 160, 24
     height = step * len(rows) + 18
     shapes = [line(left + wide * x, 0, left + wide * x, height - 16, "grid") for x in (0, 0.5, 1)]
     shapes += [label(left + wide * x, height - 3, f"{x:g}", "middle", "faint") for x in (0, 0.5, 1)]
-    for k, (name, score) in enumerate(rows):
-        y = k * step + 4
+    for row, (k, (name, score)) in enumerate(rows.items()):
+        y = row * step + 4
         low, high = ends(score)
         shapes += [
             label(left - 6, y + 13, shortened(name, 18), "end"),

@@ -109,11 +109,12 @@ def _lead(contents: Contents) -> list[Element]:
 
 
 def _axes(contents: Contents) -> Element:
-    cores = [(each.name, each.score.core) for each in contents.agents]
+    agents = dict(enumerate(contents.agents))
+    cores = {k: (each.name, each.score.core) for k, each in agents.items()}
     figures = [_figure("core", bars(cores, "core: scores of agents"))]
     axes = list(contents.agent.score.axes)
     for axis in axes:
-        rows = [(each.name, each.score.axes[axis].score) for each in contents.agents if axis in each.score.axes]
+        rows = {k: (each.name, each.score.axes[axis].score) for k, each in agents.items() if axis in each.score.axes}
         figures.append(_figure(axis, bars(rows, f"{axis}: scores of agents")))
     parts = [element("div", *figures, class_="panels")]
     if len(axes) > 2:
