@@ -49,6 +49,7 @@ th, td { padding: 3px 10px 3px 0; border-bottom: 1px solid var(--line); text-ali
 td.n, th.n { text-align: right; white-space: nowrap; }
 td.bar svg { width: 150px; }
 .words td, .words th { overflow-wrap: anywhere; }
+.words td:first-child { overflow-wrap: normal; }
 summary { cursor: pointer; color: var(--soft); }
 .wide { max-width: 640px; }
 .legend { display: flex; flex-wrap: wrap; gap: 2px 18px; list-style: none; margin: 0 0 10px; padding: 0; }
