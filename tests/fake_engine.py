@@ -10,6 +10,8 @@ import numpy as np
 
 MOST = 1000
 BROKEN = 0.666
+OURS = ()
+"""Hyperparameters that only this engine has: none."""
 made: list[int] = []
 """How many runs each batch had."""
 
