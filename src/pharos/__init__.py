@@ -16,7 +16,7 @@ import warnings as _warnings
 from typing import Any
 
 from pharos.interaction import registration as _registration  # noqa: F401  (Gymnasium's registry)
-from pharos.system.installation import conflict as _conflict
+from pharos.system.lazy import conflict as _conflict
 
 if _conflict() is not None:
     _warnings.warn(str(_conflict()), stacklevel=2)

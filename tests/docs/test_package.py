@@ -17,7 +17,7 @@ import yaml
 
 import pharos
 from pharos import errors
-from pharos.system import installation
+from pharos.system import lazy
 
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -116,12 +116,12 @@ def test_the_source_distribution_leaves_nothing_out():
 
 
 def test_the_other_project_in_the_same_folder_is_told(tmp_path, monkeypatch):
-    assert installation.conflict() is None
+    assert lazy.conflict() is None
     (tmp_path / "__version__.py").write_text('__version__ = "0.2.0"\n')
-    wrong = installation.conflict(tmp_path)
+    wrong = lazy.conflict(tmp_path)
     assert "pip uninstall pharos pharos-rl; pip install pharos-rl" in wrong and "\n" not in wrong
 
-    monkeypatch.setattr(installation, "conflict", lambda folder=None: wrong)  # this one came last
+    monkeypatch.setattr(lazy, "conflict", lambda folder=None: wrong)  # this one came last
     spec = importlib.util.spec_from_file_location("came_last", pharos.__file__)
     with pytest.warns(UserWarning, match="another project"):
         spec.loader.exec_module(importlib.util.module_from_spec(spec))
@@ -133,9 +133,9 @@ import importlib, sys, types
 from pathlib import Path
 sys.modules["pharos"] = other = types.ModuleType("pharos")
 other.__path__ = [FOLDER]
-from pharos.system import installation
+from pharos.system import lazy
 from pharos.cli import main
-importlib.import_module("pharos.cli.app").conflict = lambda: installation.conflict(Path(OTHER))
+importlib.import_module("pharos.cli.app").conflict = lambda: lazy.conflict(Path(OTHER))
 main()
 """.replace("FOLDER", repr(str(Path(pharos.__file__).parent))).replace("OTHER", repr(str(tmp_path)))
     (tmp_path / "__version__.py").touch()

@@ -13,7 +13,7 @@ from pharos import TabularMDP, hardness
 from pharos.errors import FileFormatError
 from pharos.hardness.distances import lean_sweep
 from pharos.hardness.distances.transition_graph import Graph
-from pharos.system import large_arrays
+from pharos.system import memory
 
 pytestmark = pytest.mark.long
 
@@ -49,7 +49,7 @@ def test_sweeps_give_the_distances_of_searches(mdp, restart, dtype, is_mapped):
     expected = np.where(np.isinf(d), graph.far, d).astype(dtype)
     found = np.empty(graph.num_nodes, dtype)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(large_arrays, "RANGE", 5)
+        patch.setattr(memory, "RANGE", 5)
         for node in range(graph.num_nodes):
             forward = graph.search_forward(node, found)
             assert (found == expected[node]).all()

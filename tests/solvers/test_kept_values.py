@@ -23,11 +23,10 @@ from pharos.mdp import BEST, TabularMDP
 from pharos.solvers import uniform_value, value_iteration
 from pharos.solvers.fixed_point import Backup, largest_of
 from pharos.solvers.values import blocked_fixed_point
-from pharos.system import kept_arrays
+from pharos.system import memory
 from strategies import small_mdps
 
 values = importlib.import_module("pharos.solvers.values")
-memory_map = importlib.import_module("pharos.system.large_arrays")
 
 
 def ring(size: int = 400, gamma: float = 0.99) -> TabularMDP:
@@ -42,13 +41,13 @@ def ring(size: int = 400, gamma: float = 0.99) -> TabularMDP:
 @pytest.fixture
 def no_memory(monkeypatch):
     """Whatever is large is in a mapped file, and nothing is small."""
-    monkeypatch.setattr(memory_map, "SMALL", 0)
-    monkeypatch.setattr(memory_map.machine, "available_memory", lambda: 0)
+    monkeypatch.setattr(memory, "SMALL", 0)
+    monkeypatch.setattr(memory, "available_memory", lambda: 0)
 
 
 def test_large_zeros_are_a_file_without_a_name_where_memory_has_no_room(tmp_path, monkeypatch, no_memory):
     monkeypatch.setenv("PHAROS_CACHE_DIR", str(tmp_path / "cache"))
-    array = memory_map.large_zeros((3, 5), np.float64)
+    array = memory.large_zeros((3, 5), np.float64)
     assert array.shape == (3, 5) and not array.any() and not array.flags.owndata
     array[:] = np.arange(15).reshape(3, 5)
     assert array.sum() == 105 and list((tmp_path / "cache").iterdir()) == []
@@ -68,10 +67,10 @@ class RecordingFile(io.BytesIO):
 
 def test_zeros_are_written_in_blocks_where_the_system_cannot_take_their_room(monkeypatch):
     monkeypatch.delattr(os, "posix_fallocate", raising=False)
-    monkeypatch.setattr(memory_map, "_BLOCK", 64)
+    monkeypatch.setattr(memory, "_BLOCK", 64)
     file = RecordingFile()
     file.write(b"header")
-    memory_map.append_zeros(file, 150)
+    memory.append_zeros(file, 150)
     assert file.getvalue() == b"header" + bytes(150) and file.sizes == [6, 64, 64, 22]
 
 
@@ -81,15 +80,15 @@ def test_values_in_files_are_those_in_memory_to_the_last_bit(tmp_path, monkeypat
     kept = value_iteration(mdp, values=tmp_path / "values.npy")
     assert (kept.x == expected.x).all() and kept.sweeps == expected.sweeps and kept.error_bound == expected.error_bound
     assert (np.load(tmp_path / "values.npy", mmap_mode="r") == expected.x).all()
-    monkeypatch.setattr(memory_map, "SMALL", 0)
-    monkeypatch.setattr(memory_map.machine, "available_memory", lambda: 0)
+    monkeypatch.setattr(memory, "SMALL", 0)
+    monkeypatch.setattr(memory, "available_memory", lambda: 0)
     assert (value_iteration(mdp).x == expected.x).all()
 
 
 def test_large_values_are_swept_in_memory_and_end_in_their_file(tmp_path, monkeypatch):
     mdp, path = ring(), tmp_path / "values.npy"
     whole = value_iteration(mdp)
-    monkeypatch.setattr(memory_map, "SMALL", 0)
+    monkeypatch.setattr(memory, "SMALL", 0)
 
     def look(sweeps, _):
         assert not np.load(path).any()  # what is swept is elsewhere
@@ -113,10 +112,10 @@ def test_transitions_that_memory_has_no_room_for_are_read_by_pieces(tmp_path, mo
     mdp = space.mdp(gamma=0.99)
     expected = [value_iteration(mdp, blocks=blocks) for blocks in (1, 3)]
     reads = []
-    monkeypatch.setattr(memory_map, "PIECE", 7)
-    monkeypatch.setattr(memory_map.machine, "available_memory", lambda: 100 * mdp.num_actions * 4)
-    whole = memory_map._UncachedFile.read
-    monkeypatch.setattr(memory_map._UncachedFile, "read", lambda *words: reads.append(words[1:3]) or whole(*words))
+    monkeypatch.setattr(memory, "PIECE", 7)
+    monkeypatch.setattr(memory, "available_memory", lambda: 100 * mdp.num_actions * 4)
+    whole = memory._UncachedFile.read
+    monkeypatch.setattr(memory._UncachedFile, "read", lambda *words: reads.append(words[1:3]) or whole(*words))
     for blocks, each in zip((1, 3), expected, strict=True):
         found = value_iteration(mdp, blocks=blocks)
         assert (found.x == each.x).all() and (found.sweeps, found.error_bound) == (each.sweeps, each.error_bound)
@@ -128,29 +127,29 @@ def test_pieces_make_up_all_rows_once(tmp_path, monkeypatch, size):
     rows = np.arange(30_000, dtype=np.int32).reshape(-1, 3)
     rows.tofile(tmp_path / "rows.bin")
     mapped = np.memmap(tmp_path / "rows.bin", np.int32, "r", shape=rows.shape)[50:]
-    monkeypatch.setattr(memory_map, "PIECE", size)
-    monkeypatch.setattr(memory_map.machine, "available_memory", lambda: 1)
+    monkeypatch.setattr(memory, "PIECE", size)
+    monkeypatch.setattr(memory, "available_memory", lambda: 1)
     advice = []
-    monkeypatch.setattr(memory_map, "_advise", lambda *words: advice.append(words[-1]))
+    monkeypatch.setattr(memory, "_advise", lambda *words: advice.append(words[-1]))
     for kept in (0, 123, 9000, 9950):
         stops = [9950]
-        for array, start, stop in memory_map.pieces_from_the_end(mapped, 100, 9950, kept):
+        for array, start, stop in memory.pieces_from_the_end(mapped, 100, 9950, kept):
             assert stop == stops[-1] and array.shape == mapped.shape and array.dtype == mapped.dtype
             assert (array[start:stop] == rows[50 + start : 50 + stop]).all() and not array.flags.writeable
             stops.append(start)
         assert stops[-1] == 100
-    assert memory_map._COLD not in advice  # rows that have room are wanted in the next sweep
+    assert memory._COLD not in advice  # rows that have room are wanted in the next sweep
     (tmp_path / "rows.bin").unlink()
-    assert [place[1:] for place in memory_map.pieces_from_the_end(mapped, 100, 9950, 123)] == [(100, 9950)]
-    assert sys.platform != "linux" or memory_map._COLD in advice
+    assert [place[1:] for place in memory.pieces_from_the_end(mapped, 100, 9950, 123)] == [(100, 9950)]
+    assert sys.platform != "linux" or memory._COLD in advice
 
 
 @pytest.mark.long
 def test_gaps_with_values_in_files_are_those_in_memory_to_the_last_bit(tmp_path, monkeypatch):
     mdp = ring()
     expected = hardness.gaps(mdp)
-    monkeypatch.setattr(memory_map, "SMALL", 0)
-    monkeypatch.setattr(memory_map.machine, "available_memory", lambda: 0)
+    monkeypatch.setattr(memory, "SMALL", 0)
+    monkeypatch.setattr(memory, "available_memory", lambda: 0)
     assert hardness.gaps(mdp).to_dict() == expected.to_dict()
     names = ["sum_of_reciprocal_gaps", "minimal_gap"]
     kept = hardness.report(mdp, names, folder=tmp_path)
@@ -231,7 +230,7 @@ def test_a_file_of_values_is_for_one_solve_of_one_mdp_at_a_time(tmp_path, monkey
         def refuse(*_):
             raise OSError(answer, os.strerror(answer))
 
-        monkeypatch.setattr(kept_arrays.fcntl, "flock", refuse)
+        monkeypatch.setattr(memory.fcntl, "flock", refuse)
     path = tmp_path / "values.npy"
     solution = value_iteration(ring(), values=path)
     with pytest.raises(FolderLocked, match=r"in use|is using values there"):
@@ -359,10 +358,10 @@ def test_a_number_of_blocks_that_cannot_be_is_one_line():
 
 
 def test_rows_that_fill_memory_are_all_swept_and_stay_what_they_are(tmp_path, monkeypatch, no_memory):
-    monkeypatch.setattr(memory_map, "RANGE", 1000)
+    monkeypatch.setattr(memory, "RANGE", 1000)
     rows = np.arange(30_000, dtype=np.int32).reshape(-1, 3)
     rows.tofile(tmp_path / "rows.bin")
     mapped = np.memmap(tmp_path / "rows.bin", np.int32, "r", shape=rows.shape)
-    ranges = list(memory_map.ranges_from_the_end(mapped, 100, len(rows)))
+    ranges = list(memory.ranges_from_the_end(mapped, 100, len(rows)))
     assert ranges[0] == (9000, 10_000) and ranges[-1] == (100, 1000)
     assert all(start == stop for (start, _), (_, stop) in itertools.pairwise(ranges)) and (mapped == rows).all()

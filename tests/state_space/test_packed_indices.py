@@ -28,7 +28,7 @@ from pharos.solvers import evaluate_policy, ranked, uniform_value, value_iterati
 from pharos.state_space import files as writing
 from pharos.state_space import manifest as manifests
 from pharos.state_space import search
-from pharos.system import large_arrays, packed_indices
+from pharos.system import memory, packed_indices
 from pharos.system.packed_indices import INT40, PACKED, PackedIndices, blocks_of, holds_end
 from rank_threads import threads
 from strategies import deterministic_mdps, outcome_mdps
@@ -422,8 +422,8 @@ def test_steps_through_a_space_are_the_same(world, spaces):
 @pytest.mark.long
 def test_mapped_files_are_read_ahead(spaces, monkeypatch):
     asked = []
-    monkeypatch.setattr(large_arrays, "RANGE", 1000)
-    monkeypatch.setattr(large_arrays, "_advise", lambda array, *place: asked.append((array.dtype, *place[:2])))
+    monkeypatch.setattr(memory, "RANGE", 1000)
+    monkeypatch.setattr(memory, "_advise", lambda array, *place: asked.append((array.dtype, *place[:2])))
     successors = pharos.load(spaces("breakout")[1].folder).successors
-    ranges = [*large_arrays.ranges_from_the_end(successors, 0, 5439)]
+    ranges = [*memory.ranges_from_the_end(successors, 0, 5439)]
     assert ranges[0] == (4439, 5439) and asked[0] == (PACKED, 3439, 4439)

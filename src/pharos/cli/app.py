@@ -37,7 +37,7 @@ from pharos.cli.answers import INTERRUPTED, complain
 from pharos.cli.command import Commands
 from pharos.errors import DivergenceError, ParameterError, PharosError
 from pharos.system import compiling
-from pharos.system.installation import conflict
+from pharos.system.lazy import conflict
 
 EXIT_FAILED, EXIT_USAGE, EXIT_INTERRUPTED = 1, 2, 130
 # Options that went, by the command that had them, and what it says of them

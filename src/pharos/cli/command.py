@@ -27,7 +27,7 @@ from typer.models import ArgumentInfo, OptionInfo, ParameterInfo
 from pharos.cli.answers import Answer
 from pharos.cli.options import parse_parameters
 from pharos.environments import declared_parameters
-from pharos.system.options import first_sentence, meanings
+from pharos.system.records import first_sentence, meanings
 
 JSON = OptionInfo(default=False, param_decls=("--json",), help="One JSON object on standard output, nothing else.")
 Words = list[str] | None

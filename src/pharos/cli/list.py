@@ -12,7 +12,7 @@ from pharos.cli.answers import Answer, console
 from pharos.cli.options import complete_target
 from pharos.environments import class_called, classes, declared_parameters, imported, named_instances
 from pharos.errors import UnknownName
-from pharos.system.options import meanings
+from pharos.system.records import meanings
 
 if TYPE_CHECKING:
     from pharos.environments import Environment

@@ -17,7 +17,7 @@ from pharos.interaction.frame_stack import FrameStack
 from pharos.interaction.reward_channel import RewardChannel
 from pharos.interaction.simulator import Interaction, SimulatedEnv, Simulator, Stream
 from pharos.observations import NO_ACTION, Index
-from pharos.system.options import split
+from pharos.system.records import split
 
 if TYPE_CHECKING:
     from pharos.drawing import Window

@@ -14,7 +14,7 @@ from pharos.kernels.stepping import Setting
 from pharos.mdp import Chance, ChanceSetting
 from pharos.observations import NO_ACTION, ObservationInContext, observe
 from pharos.rules import rules_of
-from pharos.system.options import flat, option_names
+from pharos.system.records import flat, option_names
 
 if TYPE_CHECKING:
     from pharos.state_space import StateSpace

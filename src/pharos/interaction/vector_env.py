@@ -23,7 +23,7 @@ from pharos.interaction.simulator import Interaction, SimulatedEnv, Simulator, s
 from pharos.interaction.walks import RulesWalk, TableWalk
 from pharos.kernels.stepping import DISABLED, SAME_STEP, Batch, first_outside
 from pharos.observations import NO_ACTION
-from pharos.system.options import split
+from pharos.system.records import split
 
 _MODES = (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP, AutoresetMode.DISABLED)
 

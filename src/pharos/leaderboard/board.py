@@ -30,8 +30,7 @@ from pharos.leaderboard.verification import (
 )
 from pharos.observations import title as observation_title
 from pharos.system import storage
-from pharos.system.templates import templates
-from pharos.system.wording import in_words
+from pharos.system.wording import in_words, templates
 from pharos.training import TaskValues
 
 LONGEST_REASON = 400

@@ -27,7 +27,7 @@ from pharos.kernels import bellman, graph, occupancy, outcomes, paths
 from pharos.mdp.chance import Chance
 from pharos.mdp.rewards import Rewards
 from pharos.mdp.selection import Extreme, PolicyTable, Selection
-from pharos.system.large_arrays import pieces_from_the_end, rows_with_room
+from pharos.system.memory import pieces_from_the_end, rows_with_room
 from pharos.system.packed_indices import Indices, room_for_indices
 
 if TYPE_CHECKING:

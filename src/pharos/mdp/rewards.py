@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from pharos.errors import ParameterError
-from pharos.system.large_arrays import large_zeros
+from pharos.system.memory import large_zeros
 
 _BLOCK = 1 << 16
 # Entries of a palette that each reward is compared with, before it is searched for.

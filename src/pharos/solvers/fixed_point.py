@@ -40,8 +40,7 @@ from pharos.errors import DivergenceError, PrecisionError
 from pharos.mdp import BellmanEquation, Part, PolicyTable, Selection, TabularMDP
 from pharos.solvers.convergence import SETTLED, SETTLING, Convergence, imprecise, operations, shrinking, sweeps_left
 from pharos.solvers.policy_iteration import PolicyIteration
-from pharos.system.large_arrays import SHARE_OF_VALUES, large_zeros
-from pharos.system.memory import available_memory
+from pharos.system.memory import SHARE_OF_VALUES, available_memory, large_zeros
 
 _UNIT = 2.0**-53
 # Half a unit in the last place of 32 bits, for numbers from 1 to 2, and for the smallest ones.

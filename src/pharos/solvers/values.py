@@ -40,9 +40,9 @@ from pharos.solvers.fixed_point import (
 from pharos.solvers.policy_iteration import chain, chain_values
 from pharos.solvers.ranked import DistributedOptions, shared_solution
 from pharos.solvers.solution import Solution
-from pharos.system import large_arrays
+from pharos.system import memory
 from pharos.system.compiling import Stopwatch
-from pharos.system.kept_arrays import kept_array
+from pharos.system.memory import kept_array
 from pharos.system.workers import usable_workers
 
 # Rows of values in a file that are read in one go.
@@ -208,11 +208,7 @@ def _in_memory(
     Large values that memory has room for are swept there, as pages of a file that change are written again and again,
     and copied to their file every ten minutes, where that costs little, and in the end, whatever ends it.
     """
-    if (
-        mapped is None
-        or mapped.nbytes <= large_arrays.SMALL
-        or not large_arrays.fits(mapped.nbytes, large_arrays.SHARE_OF_VALUES)
-    ):
+    if mapped is None or mapped.nbytes <= memory.SMALL or not memory.fits(mapped.nbytes, memory.SHARE_OF_VALUES):
         yield mapped, progress
         return
     x, due = np.array(mapped), time.monotonic() + _SECONDS

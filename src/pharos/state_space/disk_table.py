@@ -13,7 +13,7 @@ import numpy as np
 from pharos.kernels import disk_table as kernels
 from pharos.kernels.hash_table import slots_of
 from pharos.state_space.files import cannot_write
-from pharos.system.large_arrays import mapped_file
+from pharos.system.memory import mapped_file
 
 LOAD = 0.7  # the table grows beyond this share of used slots
 LEAST = 1 << 16  # slots of the smallest table

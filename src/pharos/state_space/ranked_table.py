@@ -38,7 +38,7 @@ from pharos.state_space.plan import Plan
 from pharos.state_space.progress import Progress
 from pharos.state_space.search import Options, Search
 from pharos.state_space.table import Block, MemoryTable
-from pharos.system.large_arrays import huge_pages
+from pharos.system.memory import huge_pages
 
 ROWS = 1 << 16  # of a rank in a superstep, at most
 SUCCESSORS = 1 << 20  # of a rank's rows, at most

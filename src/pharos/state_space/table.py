@@ -8,7 +8,7 @@ import numpy as np
 
 from pharos.kernels.hash_table import fill, fill_more, fill_range, insert_missing
 from pharos.system import memory as machine
-from pharos.system.large_arrays import huge_pages, reserved_states, reserved_table
+from pharos.system.memory import huge_pages, reserved_states, reserved_table
 from pharos.system.packed_indices import INT32_STATES
 
 LOAD = 0.5  # the table in memory grows beyond this share of used slots

@@ -1,6 +1,9 @@
-"""Packages that load a file when something in it is first used (PEP 562).
+"""How packages load: a file when something in it is first used (PEP 562), and not from the folder of another project.
 
 `import pharos` and a script's first lines need few of the names that a package publishes; the others cost nothing then.
+
+The distribution `pharos-rl` is this project. The distribution `pharos` is Graviti's SDK for pictures, whose files lie
+in the same folder where both are installed; whichever came last has replaced the other's `__init__.py`.
 """
 
 import ast
@@ -36,3 +39,26 @@ def attributes(package: str) -> Callable[[str], Any]:
         return value
 
     return attribute
+
+
+# Installation ---------------------------------------------------------------------------------------------------------
+
+
+FOREIGN_FILE = "__version__.py"
+"""A file of Graviti's package; this one has none of that name."""
+
+
+def conflict(folder: Path | None = None) -> str | None:
+    """What is wrong where the other project lies in the same folder, and how to mend it; None where it does not.
+
+    Args:
+        folder: of the package; None: that of pharos.
+    """
+    folder = folder or Path(__file__).parents[1]
+    if not (folder / FOREIGN_FILE).exists():
+        return None
+    return (
+        f"the distribution 'pharos' (Graviti's SDK, another project) is installed in the folder of pharos-rl, "
+        f"{folder}, and each overwrites files of the other; "
+        f"to mend it: pip uninstall pharos pharos-rl; pip install pharos-rl"
+    )

@@ -1,14 +1,120 @@
-"""Dataclasses that are read from JSON of unknown origin: names and types of entries are those of the fields."""
+"""Frozen dataclasses made of keywords or read from JSON.
 
+Options that travel together are declared once, and documented under *Attributes* of the class; Python's keywords, the
+command line and YAML files are read into them. Records are JSON of unknown origin: names and types of entries are those
+of the fields.
+"""
+
+import functools
+import inspect
+import operator
+import re
 import types
-from collections.abc import Collection, Mapping
-from dataclasses import fields, is_dataclass
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import MISSING, fields, is_dataclass, replace
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 from pharos.errors import FileFormatError
 
 T = TypeVar("T")
-SHOWN = 60
+F = TypeVar("F", bound=Callable[..., Any])
+SHOWN = 60  # letters of a wrong entry, in errors
+
+
+def meanings(documented: object) -> dict[str, str]:
+    """Name -> text, of entries such as `height, width: of the grid` in the section Attributes or Args of a docstring;
+    also of the classes that a class extends.
+    """
+    texts: dict[str, str] = {}
+    for each in reversed(getattr(documented, "__mro__", [documented])):
+        sections = re.findall(
+            r"^(?:Attributes|Args):\n((?:(?: .*)?(?:\n|$))+)", inspect.getdoc(each) or "", re.MULTILINE
+        )
+        names: list[str] = []
+        for line in "\n".join(sections).splitlines():
+            entry = re.match(r"    (\w+(?:, \w+)*): (.*)", line)
+            if entry:
+                names = entry[1].split(", ")
+                texts |= dict.fromkeys(names, entry[2])
+            elif not line.startswith("     "):
+                names = []
+            for name in () if entry else names:
+                texts[name] += " " + line.strip()
+    return texts
+
+
+def first_sentence(text: str) -> str:
+    """The first sentence of a text, with a capital letter, but for names such as `dqn, ppo`."""
+    sentence = re.split(r"(?<=\.) (?=[A-Z])", text)[0]
+    return sentence[:1].upper() + sentence[1:] if re.match(r"[a-z]+[ ;:]", sentence) else sentence
+
+
+@functools.cache
+def parts(cls: Any) -> dict[str, type]:
+    """Field -> its class, of the fields that are dataclasses themselves."""
+    hints = get_type_hints(cls)
+    return {each.name: hints[each.name] for each in fields(cls) if is_dataclass(hints[each.name])}
+
+
+def option_names(cls: type) -> set[str]:
+    """Names of the fields of a dataclass, and of those of its parts."""
+    return {each.name for owner in (cls, *parts(cls).values()) for each in fields(owner)}
+
+
+def joined(cls: type, options: Mapping[str, Any]) -> dict[str, Any]:
+    """Options of a dataclass, with fields of its parts given by their own names: `sticky=0.1` as `chance=...`."""
+    own = dict(options)
+    for name, part in parts(cls).items():
+        inside = {each.name: own.pop(each.name) for each in fields(part) if each.name in own}
+        if inside:
+            own[name] = replace(own.get(name, part()), **inside)
+    return own
+
+
+def flat(cls: type[T]) -> type[T]:
+    """Class decorator: a dataclass that takes the fields of its parts as keywords, too, and has them as attributes."""
+    init = cls.__init__
+
+    @functools.wraps(init)
+    def flat_init(self: T, *args: object, **options: object) -> None:
+        init(self, *args, **joined(cls, options))
+
+    cls.__init__ = flat_init  # type: ignore[method-assign, assignment]
+    for name, part in parts(cls).items():  # type: ignore[arg-type]
+        for each in fields(part):  # type: ignore[arg-type]
+            setattr(cls, each.name, property(operator.attrgetter(f"{name}.{each.name}")))
+    return cls
+
+
+def takes(cls: Any, **defaults: object) -> Callable[[F], F]:
+    """Decorator: the signature of a function shows the options of a dataclass and its parts before `**options`."""
+    own = [each for each in fields(cls) if each.name not in parts(cls)]
+    leaves = [*own, *(each for part in parts(cls).values() for each in fields(part))]  # type: ignore[arg-type]
+
+    def shown(function: F) -> F:
+        signature = inspect.signature(function)
+        *before, rest = signature.parameters.values()
+        names = {each.name for each in before}
+        values = {each.name: None if each.default is MISSING else each.default for each in leaves} | defaults
+        made = [
+            inspect.Parameter(each.name, rest.KEYWORD_ONLY, default=values[each.name], annotation=each.type)
+            for each in leaves
+            if each.name not in names
+        ]
+        function.__signature__ = signature.replace(parameters=[*before, *made, rest])  # type: ignore[attr-defined]
+        return function
+
+    return shown
+
+
+def split(cls: type[T], options: Mapping[str, Any]) -> tuple[T, dict[str, Any]]:
+    """An object of the options that are fields of a dataclass or of its parts; and the other options."""
+    names = option_names(cls)
+    own = {name: value for name, value in options.items() if name in names}
+    return cls(**joined(cls, own)), {name: value for name, value in options.items() if name not in names}
+
+
+# Records --------------------------------------------------------------------------------------------------------------
 
 
 def read(cls: type[T], entry: object, whose: str, optional: Collection[str] = ()) -> T:

@@ -1,6 +1,12 @@
-"""How messages and tables say numbers, names and errors."""
+"""How messages and tables say numbers, names and errors; and the templates of pages."""
 
-from pharos.errors import PharosError
+from functools import cache
+from typing import TYPE_CHECKING
+
+from pharos.errors import MissingExtra, PharosError
+
+if TYPE_CHECKING:
+    import jinja2
 
 
 def many(count: int, one: str, several: str | None = None) -> str:
@@ -31,4 +37,31 @@ def latex_text(text: str) -> str:
     return "".join(
         f"\\{special[letter]}{{}}" if letter in special else f"\\{letter}" if letter in "&%$#_{}" else letter
         for letter in text
+    )
+
+
+# Templates ------------------------------------------------------------------------------------------------------------
+
+
+@cache
+def templates(package: str, page: str) -> "jinja2.Environment":
+    """The templates of Jinja2 in the folder `templates` of a package: what is filled in is escaped.
+
+    A name that is not there is an error.
+
+    Args:
+        page: that is made of them, for the error.
+    Raises:
+        MissingExtra: Jinja2 is not installed.
+    """
+    try:
+        import jinja2
+    except ImportError as error:
+        raise MissingExtra(page, "jinja2", "study") from error
+    return jinja2.Environment(
+        loader=jinja2.PackageLoader(package),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        keep_trailing_newline=True,
     )

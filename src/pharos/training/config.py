@@ -13,8 +13,7 @@ from pharos.agents import BATCHED, agent_kind, agent_source, is_known
 from pharos.environments import Environment, as_tuples, class_called, class_of, make, source_of
 from pharos.errors import FileFormatError, ParameterError, UnknownName, UntrustedCode
 from pharos.observations import OwnObservation, observation_of, registered
-from pharos.system.options import flat
-from pharos.system.records import read
+from pharos.system.records import flat, read
 from pharos.system.sources import Source, is_reference, resolve
 from pharos.training.options import ENGINES, TrainingOptions
 

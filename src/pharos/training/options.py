@@ -7,7 +7,7 @@ from typing import Any
 from pharos.environments import Environment, parameter
 from pharos.errors import ParameterError
 from pharos.mdp import ChanceSetting
-from pharos.system.options import flat
+from pharos.system.records import flat
 
 ENGINES = ("sb3", "batched")
 """What trains networks: Stable-Baselines3, one run in a process; or many runs as one program."""

@@ -19,7 +19,7 @@ from pharos.agents import hyperparameters as hyperparameters_of
 from pharos.environments import Environment
 from pharos.errors import AllRunsFailed, ParameterError
 from pharos.observations import own_observation
-from pharos.system.options import split, takes
+from pharos.system.records import split, takes
 from pharos.training.batch import Progress, ProgressCallback, TrainingJobs, train_configs
 from pharos.training.config import RunConfig
 from pharos.training.options import TrainingOptions

@@ -14,7 +14,7 @@ from pharos.mdp import ChanceSetting, TabularMDP
 from pharos.policies import ReachableRows, Sight, reachable_rows
 from pharos.solvers import ReferenceValues, Solution, uniform_value, value_iteration, worst_value
 from pharos.state_space import StateSpace, build
-from pharos.system.options import flat
+from pharos.system.records import flat
 from pharos.training.options import Horizon
 
 TAIL = 1e-9  # part of a discounted return that is not looked at

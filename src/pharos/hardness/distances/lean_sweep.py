@@ -26,9 +26,7 @@ from pharos.hardness.distances.transition_graph import Graph
 from pharos.hardness.interval import BudgetClock, Interval
 from pharos.kernels import graph
 from pharos.system import storage
-from pharos.system.kept_arrays import kept_array
-from pharos.system.large_arrays import large_zeros, ranges_from_the_end
-from pharos.system.memory import available_memory
+from pharos.system.memory import available_memory, kept_array, large_zeros, ranges_from_the_end
 
 _FILE, _RECORD = "bounds.npy", "bounds.json"
 _FORMAT = 1

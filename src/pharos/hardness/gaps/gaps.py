@@ -20,7 +20,7 @@ from pharos.hardness.interval import Certified
 from pharos.kernels import gaps as kernels
 from pharos.mdp import BEST, BellmanEquation, TabularMDP, require_mdp
 from pharos.solvers import Solution, value_iteration
-from pharos.system.large_arrays import large_zeros
+from pharos.system.memory import large_zeros
 
 # Of Colosseum.
 REGULARIZER = 0.1

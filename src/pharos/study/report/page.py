@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pharos.system.templates import templates
-from pharos.system.wording import in_words
+from pharos.system.wording import in_words, templates
 
 if TYPE_CHECKING:
     import pandas as pd
