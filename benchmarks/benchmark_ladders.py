@@ -1,6 +1,7 @@
 """Which ladders the suite v1 may have: every axis' quantity on every rung, from measures alone, before any run.
 
-python benchmarks/benchmark_ladders.py               print the table, and which ladders are admitted
+python benchmarks/benchmark_ladders.py                     print the table, and which ladders are admitted
+python benchmarks/benchmark_ladders.py --suite FILE.yaml   the same of benchmark_ladders_left_out.yaml
 
 Quantities are those of benchmark_select.py: exploration in bits, noise in gaps, credit in steps, representation as
 predicted regret of a network less that of a table, memory in steps, states as a logarithm. A quantity is placed among
@@ -14,6 +15,7 @@ least twice as much as on any other.
 """
 
 import argparse
+from pathlib import Path
 
 import numpy as np
 
@@ -21,6 +23,7 @@ from benchmark_select import LEVELS
 from pharos.benchmark import load_suite
 
 TIMES = 2.0
+LEFT_OUT = Path(__file__).with_name("benchmark_ladders_left_out.yaml")
 AXES = {
     "exploration": "exploration_bits",
     "estimation": "noise_over_gap",
@@ -35,7 +38,8 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--suite", default="v1")
     suite = load_suite(parser.parse_args().suite)
-    rungs = {ladder.axis: [task.level for task in ladder.tasks] for ladder in suite.ladders}
+    places = [*load_suite("v1").ladders, *load_suite(LEFT_OUT).ladders]
+    rungs = {ladder.axis: [task.level for task in ladder.tasks] for ladder in places}
     verdicts = []
     print(f"| task | {' | '.join(AXES)} |\n|---|{'---|' * len(AXES)}", flush=True)
     for ladder in suite.ladders:

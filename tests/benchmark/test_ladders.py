@@ -72,7 +72,7 @@ def test_a_ladder_is_admitted_if_it_rises_and_nothing_else_moves_half_as_far(scr
     still = {axis: 0.0 for axis in scripts[1].AXES}
     rows = [{**still, "credit": task.level} for task in ladder.tasks]
     assert scripts[1].verdict(ladder, rows, rungs).endswith("| yes |")
-    states = np.interp(np.linspace(0, 3.1, len(rows)), range(len(rungs["scale"])), rungs["scale"])
-    moved = [{**row, "scale": value} for row, value in zip(rows, states, strict=True)]
+    noise = np.interp(np.linspace(0, 3.1, len(rows)), range(len(rungs["estimation"])), rungs["estimation"])
+    moved = [{**row, "estimation": value} for row, value in zip(rows, noise, strict=True)]
     assert scripts[1].verdict(ladder, moved, rungs).endswith("| no |")
     assert scripts[1].verdict(ladder, rows[::-1], rungs).endswith("| no |")
