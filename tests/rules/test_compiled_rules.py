@@ -18,7 +18,9 @@ from pharos.hardness import diameter
 from pharos.interaction.gym_env import GymEnv
 from pharos.interaction.vector_env import make_vec
 from pharos.rules import reason_of
-from pharos.rules.compiler import exploration_kernels, interaction_kernels, numeric_attributes
+from pharos.rules.compiled import exploration_kernels, interaction_kernels
+from pharos.rules.compiler import numeric_attributes
+from pharos.rules.exploration import no_ages
 from pharos.system.compiling import private_folder
 
 
@@ -167,7 +169,9 @@ def test_kernels_do_not_depend_on_rules_that_they_do_not_call():
         cls = cls or corridor_class(**rules)
         names = numeric_attributes(cls())[0]
         explored, played = exploration_kernels(cls, names, 1, 2), interaction_kernels(cls, names, 2)
-        return {name: kernel._cache.path for each in (explored, played) for name, kernel in each._asdict().items()}
+        kernels = {**explored._asdict(), **played._asdict()}
+        assert kernels.pop("ages_of") is no_ages
+        return {name: kernel._cache.path for name, kernel in kernels.items()}
 
     def reward(self, state, action, next_state):
         return 2.0 * (next_state[0] == self.length - 1)

@@ -5,7 +5,7 @@ rules/interaction.py), of Q-learning (learning.py, sampled_learning.py), of the 
 table walk of vector environments.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numba import float64, njit, uint64
@@ -31,14 +31,14 @@ class Setting(NamedTuple):
             probabilities.
     """
 
-    ranges: Any
-    scale: Any
+    ranges: np.ndarray
+    scale: np.ndarray
     chance: tuple[float, ...]
     limit: int
     mode: int
     first_previous: int
-    starts: Any
-    cumulative: Any
+    starts: np.ndarray
+    cumulative: np.ndarray
 
 
 class Batch(NamedTuple):
@@ -56,19 +56,19 @@ class Batch(NamedTuple):
             chance.
     """
 
-    rng: Any
-    actions: Any
-    states: Any
-    previous: Any
-    elapsed: Any
-    ended: Any
-    rewards: Any
-    terminated: Any
-    truncated: Any
-    executed: Any
-    final: Any
-    vector: Any
-    probabilities: Any
+    rng: np.ndarray
+    actions: np.ndarray
+    states: np.ndarray
+    previous: np.ndarray
+    elapsed: np.ndarray
+    ended: np.ndarray
+    rewards: np.ndarray
+    terminated: np.ndarray
+    truncated: np.ndarray
+    executed: np.ndarray
+    final: np.ndarray
+    vector: np.ndarray
+    probabilities: np.ndarray
 
 
 @njit(forceinline=True)

@@ -5,20 +5,50 @@ it cannot.
 """
 
 from collections.abc import Callable
-from typing import Any
+from functools import cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pharos.environments import Environment
 from pharos.errors import RuleError
-from pharos.rules.compiler import exploration_kernels, interaction_kernels, numeric_attributes, type_text
+from pharos.rules.compiler import Function, compiler_of, numeric_attributes, type_text
 from pharos.rules.layout import Layout
-from pharos.system.packed_indices import PackedIndices
+from pharos.system.packed_indices import Indices, PackedIndices
 
+if TYPE_CHECKING:
+    from pharos.rules.exploration import ExplorationKernels
+    from pharos.rules.interaction import InteractionKernels
+
+Rows = np.ndarray | tuple[np.ndarray, np.ndarray]  # terminal, or (terminal, probabilities)
 COUNTED = np.empty(0, np.int64)
 """No ranks of outcomes: those of a state and action are all its possible ones, in their order."""
 
 _SUSPECTS = 16  # states of which a kernel cannot say in which one a rule failed
+
+
+# Makers of kernels are imported where they are called: a script that steps does not load those that search.
+@cache
+def exploration_kernels(
+    cls: type[Environment], names: tuple[str, ...], num_words: int, num_actions: int, outcomes: int = 1
+) -> "ExplorationKernels":
+    """The kernels of `exploration.py` for the rules of a class that mention the attributes `names`."""
+    from pharos.rules.exploration import exploration
+
+    compiler, rules, parameters = compiler_of(cls, names, outcomes, num_words, num_actions)
+    return exploration(compiler, rules, parameters, num_words, num_actions, outcomes, cls.pays_by_outcome())
+
+
+@cache
+def interaction_kernels(
+    cls: type[Environment], names: tuple[str, ...], num_actions: int, outcomes: int = 1, motion: bool = False
+) -> "InteractionKernels":
+    """The kernels of `interaction.py`; with motion they draw the planes of `draw_motion` behind those of `draw`."""
+    from pharos.rules.interaction import interaction
+
+    layers = len(cls.layers) if motion else 0
+    compiler, rules, parameters = compiler_of(cls, names, outcomes, 0, num_actions, *((layers,) if motion else ()))
+    return interaction(compiler, rules, parameters, num_actions, outcomes, layers)
 
 
 class _Compiled:
@@ -28,8 +58,7 @@ class _Compiled:
         names, self.parameters = numeric_attributes(env)
         self.env, self.layout = env, layout
         self.outcomes = int(env.outcomes)
-        cls = _class_of(env)
-        self.kernels: Any = exploration_kernels(cls, names, layout.num_words, env.num_actions, self.outcomes)
+        self.kernels = exploration_kernels(_class_of(env), names, layout.num_words, env.num_actions, self.outcomes)
 
 
 class CompiledExploration(_Compiled):
@@ -78,7 +107,7 @@ class CompiledExploration(_Compiled):
             first, stop = int(progress[FIRST]), int(progress[COUNT]) if stop is None else stop
             blame(self.env, self.layout, states[first : min(first + _SUSPECTS, stop)], failure)
 
-    def _rows(self, terminal, probabilities) -> Any:
+    def _rows(self, terminal, probabilities) -> Rows:
         """What the kernels write of each row beside its successors."""
         return terminal if self._is_plain else (terminal, probabilities)
 
@@ -165,7 +194,7 @@ class CompiledAges(_Compiled):
         return out
 
 
-def _read_only(array: Any) -> Any:
+def _read_only(array: Indices) -> Indices:
     """A view that is not to be written to, as arrays of a StateSpace are: the kernel is compiled for these alone."""
     if isinstance(array, PackedIndices):  # which kernels never write to
         return array
@@ -196,7 +225,7 @@ class CompiledStepping:
     def __reduce__(self):
         return CompiledStepping, (self.env,)
 
-    def step_and_draw_one(self, *arguments: object) -> Any:
+    def step_and_draw_one(self, *arguments: object) -> Function | None:
         """The kernel that steps and draws, made ready for these arguments; None where `draw` does not compile."""
         try:
             self._step_and_draw_one(self.parameters, *arguments)
@@ -236,5 +265,6 @@ def signature_of(env: Environment) -> tuple:
     return (type(env), env.num_actions, env.outcomes, tuple(map(type_text, parameters)))
 
 
-def _class_of(env: Environment) -> Any:
+def _class_of(env: Environment) -> type:
+    """Its class, which type checkers take for a key of `cache` where they do not know its `__hash__`."""
     return type(env)

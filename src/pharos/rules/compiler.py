@@ -19,10 +19,10 @@ import re
 import sys
 import types as python_types
 from collections import namedtuple
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numba
 import numpy as np
@@ -36,23 +36,23 @@ from pharos.rules.fingerprint import closure_of, function_text, mentioned_names,
 from pharos.system import paths, storage
 from pharos.system.compiling import private_folder
 
-if TYPE_CHECKING:
-    from pharos.rules.branching import BranchingKernels
-    from pharos.rules.exploration import ExplorationKernels
-    from pharos.rules.interaction import InteractionKernels
-
-# Makers of kernels are imported where they are called: a script that steps does not load those that search.
+Function = Callable[..., Any]
+"""A function that Numba compiles, or has compiled."""
+CompiledRules = dict[str, Function]
+"""Rules by their names."""
+Constructor = Callable[..., tuple[object, ...]]
+"""The class of what the rules see as `self`, a named tuple."""
 RULES = ("transition", "is_terminal", "reward", "draw")
 _COLOURS = re.compile("\x1b\\[[0-9;]*m")  # Numba writes them where colorama is installed
 _HERE = Path(__file__).parent
 _KERNELS = _HERE.parent / "kernels"
 _MACHINERY = (
-    *(_HERE / name for name in ("compiler.py", "exploration.py", "branching.py", "interaction.py", "packed_view.py")),
+    *(_HERE / name for name in ("compiler.py", "exploration.py", "interaction.py", "packed_view.py")),
     *(_KERNELS / name for name in ("hash_table.py", "stepping.py")),
 )
 
 
-def rules_of_class(cls: Any) -> tuple[str, ...]:
+def rules_of_class(cls: type[Environment]) -> tuple[str, ...]:
     """The names of the rules that a class has: those of every class, and those others that it defines."""
     own = {
         "probability": cls.takes_outcomes(),
@@ -62,7 +62,7 @@ def rules_of_class(cls: Any) -> tuple[str, ...]:
     return RULES + tuple(rule for rule, is_defined in own.items() if is_defined)
 
 
-def numeric_attributes(env: Environment) -> tuple[tuple[str, ...], tuple[Any, ...]]:
+def numeric_attributes(env: Environment) -> tuple[tuple[str, ...], tuple[object, ...]]:
     """Names and values of what compiled rules see as `self`: the numbers, tuples of numbers and arrays that they
     mention.
 
@@ -83,7 +83,7 @@ def _is_numeric(value: object) -> bool:
     return isinstance(value, bool | int | float | np.number)
 
 
-def _plain(value: object) -> Any:
+def _plain(value: object) -> object:
     if isinstance(value, np.ndarray):
         return np.ascontiguousarray(value)
     if isinstance(value, np.number):
@@ -91,38 +91,9 @@ def _plain(value: object) -> Any:
     return value
 
 
-@cache
-def exploration_kernels(
-    cls: Any, names: tuple[str, ...], num_words: int, num_actions: int, outcomes: int = 1
-) -> "ExplorationKernels | BranchingKernels":
-    """The kernels of `exploration.py` for the rules of a class that mention the attributes `names`; those of
-    `branching.py` where there is chance or an age.
-    """
-    compiler, rules, parameters = _compiler_of(cls, names, outcomes, num_words, num_actions)
-    if outcomes == 1 and "age" not in rules:
-        from pharos.rules.exploration import exploration
-
-        return exploration(compiler, rules, parameters, num_words, num_actions)
-    from pharos.rules.branching import branching
-
-    return branching(compiler, rules, parameters, num_words, num_actions, outcomes, cls.pays_by_outcome())
-
-
-@cache
-def interaction_kernels(
-    cls: Any, names: tuple[str, ...], num_actions: int, outcomes: int = 1, motion: bool = False
-) -> "InteractionKernels":
-    """The kernels of `interaction.py`; with motion they draw the planes of `draw_motion` behind those of `draw`."""
-    from pharos.rules.interaction import interaction
-
-    layers = len(cls.layers) if motion else 0
-    compiler, rules, parameters = _compiler_of(cls, names, outcomes, 0, num_actions, *((layers,) if motion else ()))
-    return interaction(compiler, rules, parameters, num_actions, outcomes, layers)
-
-
-def _compiler_of(
+def compiler_of(
     cls: type[Environment], names: tuple[str, ...], outcomes: int, *numbers: int
-) -> tuple["Compiler", dict, type]:
+) -> tuple["Compiler", CompiledRules, Constructor]:
     """What a maker needs: the compiler, the compiled rules by their names, and the class of `self`.
 
     With one outcome, `transition` and `reward` take none, whatever the class; with more of them, both do.
@@ -133,16 +104,10 @@ def _compiler_of(
     key = (names, numbers, *((outcomes,) if outcomes > 1 else ()))
     compiler = Compiler(texts, key)
     if outcomes == 1 and cls.takes_outcomes():
-        from pharos.rules.branching import one_outcome
-
         rules["transition"] = one_outcome(compiler.calling("transition"), rules["transition"])
     if outcomes == 1 and cls.pays_by_outcome():
-        from pharos.rules.branching import reward_of_one_outcome
-
         rules["reward"] = reward_of_one_outcome(compiler.calling("reward"), rules["reward"])
     if outcomes > 1 and not cls.pays_by_outcome():
-        from pharos.rules.branching import reward_of_any_outcome
-
         rules["reward"] = reward_of_any_outcome(compiler.calling("reward"), rules["reward"])
     return compiler, rules, namedtuple("Parameters", names)
 
@@ -168,7 +133,7 @@ class Compiler:
             these. key: what else they depend on.
     """
 
-    def __init__(self, texts: dict[str, tuple[str, Any]], key: tuple):
+    def __init__(self, texts: dict[str, tuple[str, str]], key: tuple):
         self.texts, self.key = texts, key
         everything = (_machinery(), [text for _, text in texts.values()], *key, numba.__version__)
         label = next(iter(texts.values()))[0]
@@ -178,35 +143,65 @@ class Compiler:
         """The compiler of functions that call these rules alone: when another one is edited, they stay compiled."""
         return Compiler({rule: self.texts[rule] for rule in rules}, self.key)
 
-    def inlined(self, function: Callable) -> Any:
+    def inlined(self, function: Function) -> Function:
         """A function that becomes part of its callers."""
         return numba.njit(forceinline=True)(self._named(function))
 
-    def function(self, function: Callable) -> Any:
+    def function(self, function: Function) -> Function:
         """A function that kernels call."""
         return numba.njit(nogil=True)(self._named(function))
 
-    def kernel(self, function: Callable) -> Any:
+    def kernel(self, function: Function) -> Function:
         """A function that Python calls; the compiled form is kept on disk."""
         kernel: Any = numba.njit(nogil=True)(self._named(function))
         kernel._cache = cache_of_kernel(f"{self.name}.{function.__name__}")
         return kernel
 
-    def _named(self, function: Any) -> Any:
+    def _named(self, function: Function) -> Function:
         function.__qualname__ = f"{self.name}.{function.__name__}"
         return function
+
+
+def one_outcome(compiler: Compiler, transition: Function) -> Function:
+    """The rule of a class that takes outcomes, where there is but outcome 0, as that of a class that does not."""
+
+    @compiler.inlined
+    def transition_of_one(self, state, action, out):
+        transition(self, state, action, 0, out)
+
+    return transition_of_one
+
+
+def reward_of_one_outcome(compiler: Compiler, reward: Function) -> Function:
+    """The reward of a class that pays by outcome, where there is but outcome 0."""
+
+    @compiler.inlined
+    def reward_of_one(self, state, action, next_state):
+        return reward(self, state, action, next_state, 0)
+
+    return reward_of_one
+
+
+def reward_of_any_outcome(compiler: Compiler, reward: Function) -> Function:
+    """The reward of a class that does not pay by outcome, as that of one that does."""
+
+    @compiler.inlined
+    def reward_of_any(self, state, action, next_state, outcome):
+        return reward(self, state, action, next_state)
+
+    return reward_of_any
 
 
 class _RuleCompiler:
     """Compiles a rule and, recursively, the plain functions that it mentions by a global name."""
 
     def __init__(self):
-        self._done: dict[Any, Any] = {}
+        self._done: dict[object, Function] = {}
 
-    def compiled(self, function: object) -> Any:
-        function = plain_function(function)
+    def compiled(self, rule: Function) -> Function:
+        function = plain_function(rule)
         if not isinstance(function, python_types.FunctionType):
-            return function  # Numba will say what it thinks of it
+            return rule  # Numba will say what it thinks of it
         if function in self._done:
             return self._done[function]
         self._done[function] = function  # a function that calls itself keeps its interpreted self, which Numba refuses
@@ -225,7 +220,7 @@ class _RuleCompiler:
         self._done[function] = numba.njit(forceinline=True)(clone)
         return self._done[function]
 
-    def _compiled_among(self, values: dict[str, Any]) -> dict[str, Any]:
+    def _compiled_among(self, values: Mapping[str, object]) -> CompiledRules:
         functions = {name: plain_function(value) for name, value in values.items()}
         return {n: self.compiled(f) for n, f in functions.items() if isinstance(f, python_types.FunctionType)}
 
@@ -254,7 +249,7 @@ def reason_of(error: BaseException) -> str:
     what = lines[start] if lines else ""
     if what.endswith("for signature:"):  # the useful words stand below
         what += "".join(f" {line.removeprefix('>>>').strip()}" for line in lines[start + 1 : start + 2])
-    ours = tuple(os.path.join("rules", file) for file in ("exploration.py", "branching.py", "interaction.py"))
+    ours = tuple(os.path.join("rules", file) for file in ("exploration.py", "interaction.py"))
     where = [line for line in lines if line.startswith("File ") and not any(file in line for file in ours)]
     return what + (f" ({where[-1].rstrip(':')})" if where else "")
 
@@ -263,6 +258,23 @@ def reason_of(error: BaseException) -> str:
 
 
 DIGEST_BYTES = 32
+
+
+class Codegen(Protocol):
+    """What Numba knows of the processor."""
+
+    def magic_tuple(self) -> object:
+        """What compiled code depends on."""
+
+
+class TargetContext(Protocol):
+    """What Numba knows of the process that loads a kernel."""
+
+    def refresh(self) -> None:
+        """Take over what was registered since."""
+
+    def codegen(self) -> Codegen:
+        """The processor."""
 
 
 class KernelCache(NullCache):
@@ -279,7 +291,7 @@ class KernelCache(NullCache):
     def cache_path(self) -> str:
         return str(self.path.parent)
 
-    def load_overload(self, sig: Any, target_context: Any) -> Any:
+    def load_overload(self, sig: object, target_context: TargetContext) -> CompileResult | None:
         """The compiled kernel; None where there is none, or a damaged one, which is deleted."""
         target_context.refresh()
         file = self._file(sig, target_context.codegen())
@@ -296,7 +308,7 @@ class KernelCache(NullCache):
                 file.unlink()
             return None
 
-    def save_overload(self, sig: Any, cres: Any) -> None:
+    def save_overload(self, sig: object, cres: Any) -> None:
         """Keep a compiled kernel, where there is room: the next process compiles again where there is none."""
         if cres.lifted or cres.library.has_dynamic_globals:  # it refers to addresses of this process
             return
@@ -305,12 +317,12 @@ class KernelCache(NullCache):
         with contextlib.suppress(OSError):
             storage.replace_file(file, hashlib.sha256(data).digest() + data, durable=False)
 
-    def _file(self, sig: Any, codegen: Any) -> Path:
+    def _file(self, sig: object, codegen: Codegen) -> Path:
         key = repr((sig, codegen.magic_tuple(), numba.__version__, sys.version_info[:2]))
         return self.path.with_name(f"{self.path.name}.{hashlib.sha256(key.encode()).hexdigest()[:16]}.nbc")
 
 
-def cache_of_kernel(name: str) -> Any:
+def cache_of_kernel(name: str) -> NullCache:
     """The cache of the kernel with this name; one that keeps nothing where no folder is private."""
     folder = private_folder(paths.cache_directory())
     return NullCache() if folder is None else KernelCache(folder / name)

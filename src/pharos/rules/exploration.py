@@ -1,20 +1,25 @@
 """Makers of the kernels that enumerate states: they call the rules of one class, on packed states.
 
 Each maker is an ordinary function that returns compiled ones (see `compiler.Compiler`). What the inner functions take
-from it are constants for Numba: the rules; `Parameters`, what the rules see as `self`; W words a state; A actions.
+from it are constants for Numba: the rules; `Parameters`, what the rules see as `self`; W words a state; A actions of at
+most K outcomes, 1 without chance.
 `layout` is a tuple of one table (D, 4): where component i of a state sits (layout.py).
 
-Classes with chance or an age have kernels of branching.py, which takes the search from here: A is the number of
-branches of a state then, and `terminal` whatever their `expand` writes beside the successors.
+A state has A K branches, branch a K + k for outcome k of action a. With chance or an age the expansion is another one
+(`expand_branches_function`), and the search the same with A K in place of A: an impossible branch is taken to lead to
+the state itself with probability 0, as the branches of a terminal state do but for its first outcomes; `terminal` is
+then whatever the expansion writes beside the successors.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numba import int64
 
 from pharos.kernels.hash_table import COUNT, DEPTH, FAULT, FIRST, LEVEL_END, entry_at, mixed, prefetch, slot_of
+from pharos.rules.compiler import CompiledRules, Compiler, Constructor, Function
 from pharos.rules.packed_view import fault, get_word, packed_view, read_only_view, set_word
+from pharos.system.outcome_rows import SUM_TOLERANCE
 
 BATCH = 16  # states expanded before their successors are looked up: enough look-ups to hide the memory's latency
 
@@ -22,33 +27,49 @@ BATCH = 16  # states expanded before their successors are looked up: enough look
 class ExplorationKernels(NamedTuple):
     """The compiled kernels; see the makers below."""
 
-    explore: Any
-    expand_and_find: Any
-    rewards_of: Any
+    explore: Function
+    expand_and_find: Function
+    rewards_of: Function
+    ages_of: Function
 
 
 class Words(NamedTuple):
     """Functions on states of W words."""
 
-    load: Any
-    hash_of: Any
-    same: Any
+    load: Function
+    hash_of: Function
+    same: Function
 
 
-def exploration(compiler: Any, rules: object, Parameters: object, W: int, A: int) -> ExplorationKernels:
-    """The kernels of a class of environments whose states take W words and which has A actions."""
-    search = compiler.calling("transition", "is_terminal")
+def exploration(
+    compiler: Compiler, rules: CompiledRules, Parameters: Constructor, W: int, A: int, K: int = 1, pays: bool = False
+) -> ExplorationKernels:
+    """The kernels of a class of environments whose states take W words, with A actions of at most K outcomes.
+
+    pays: whether its reward depends on the outcome.
+    """
+    search = compiler.calling(*(rule for rule in rules if rule not in ("reward", "draw", "draw_motion")))
     words = words_functions(search, W)
-    expand = expand_function(search, rules, Parameters, words, W, A)
-    prefetch_states = prefetch_function(search, A)
+    prefetch_states = prefetch_function(search, A * K)
+    if K > 1 or "age" in rules:
+        expand = expand_branches_function(search, rules, Parameters, words, W, A, K)
+    else:
+        expand = expand_function(search, rules, Parameters, words, W, A)
+    if K > 1:
+        paying = compiler.calling("reward", *(("probability",) * pays))
+        rewards_of = expected_rewards_kernel(paying, rules, Parameters, words, W, A, K if pays else 1)
+    else:
+        rewards_of = rewards_of_kernel(compiler.calling("reward"), rules, Parameters, words, W, A)
+    ages = ages_of_kernel(compiler.calling("age"), rules, Parameters, words, W) if "age" in rules else no_ages
     return ExplorationKernels(
-        explore=explore_kernel(search, expand, prefetch_states, words, W, A),
-        expand_and_find=expand_and_find_kernel(search, expand, prefetch_states, words, A),
-        rewards_of=rewards_of_kernel(compiler.calling("reward"), rules, Parameters, words, W, A),
+        explore=explore_kernel(search, expand, prefetch_states, words, W, A * K),
+        expand_and_find=expand_and_find_kernel(search, expand, prefetch_states, words, A * K),
+        rewards_of=rewards_of,
+        ages_of=ages,
     )
 
 
-def words_functions(compiler: Any, W: int) -> Words:
+def words_functions(compiler: Compiler, W: int) -> Words:
     """Reading, hashing and comparing states of W words."""
 
     @compiler.inlined
@@ -73,7 +94,9 @@ def words_functions(compiler: Any, W: int) -> Words:
     return Words(load, hash_of, same)
 
 
-def expand_function(compiler: Any, rules: Any, Parameters: Any, words: Words, W: int, A: int) -> Any:
+def expand_function(
+    compiler: Compiler, rules: CompiledRules, Parameters: Constructor, words: Words, W: int, A: int
+) -> Function:
     """Successors of a few states, and where in the table to look for them."""
     transition, is_terminal = rules["transition"], rules["is_terminal"]
     load, hash_of, _ = words
@@ -111,7 +134,7 @@ def expand_function(compiler: Any, rules: Any, Parameters: Any, words: Words, W:
     return expand
 
 
-def prefetch_function(compiler: Any, A: int) -> Any:
+def prefetch_function(compiler: Compiler, A: int) -> Function:
     """Fetching the states that look-ups will meet."""
 
     @compiler.inlined
@@ -126,7 +149,9 @@ def prefetch_function(compiler: Any, A: int) -> Any:
     return prefetch_states
 
 
-def explore_kernel(compiler: Any, expand: Any, prefetch_states: Any, words: Words, W: int, A: int) -> Any:
+def explore_kernel(
+    compiler: Compiler, expand: Function, prefetch_states: Function, words: Words, W: int, A: int
+) -> Function:
     """The search by one thread."""
     same = words.same
 
@@ -191,7 +216,9 @@ def explore_kernel(compiler: Any, expand: Any, prefetch_states: Any, words: Word
     return explore
 
 
-def expand_and_find_kernel(compiler: Any, expand: Any, prefetch_states: Any, words: Words, A: int) -> Any:
+def expand_and_find_kernel(
+    compiler: Compiler, expand: Function, prefetch_states: Function, words: Words, A: int
+) -> Function:
     """The part of a wide frontier that threads share."""
     same = words.same
 
@@ -235,7 +262,9 @@ def expand_and_find_kernel(compiler: Any, expand: Any, prefetch_states: Any, wor
     return expand_and_find
 
 
-def rewards_of_kernel(compiler: Any, rules: Any, Parameters: Any, words: Words, W: int, A: int) -> Any:
+def rewards_of_kernel(
+    compiler: Compiler, rules: CompiledRules, Parameters: Constructor, words: Words, W: int, A: int
+) -> Function:
     """Rewards of stored transitions."""
     reward = rules["reward"]
     load = words.load
@@ -263,3 +292,163 @@ def rewards_of_kernel(compiler: Any, rules: Any, Parameters: Any, words: Words, 
         return finite
 
     return rewards_of
+
+
+# Chance and ages ------------------------------------------------------------------------------------------------------
+
+
+def _rules_of_branches(compiler: Compiler, rules: CompiledRules, K: int) -> tuple[Function, Function, Function]:
+    """(transition, probability, age) as `expand` calls them, whatever the class defines."""
+    transition = rules["transition"]
+
+    @compiler.inlined
+    def transition_of_all(self, state, action, outcome, out):
+        transition(self, state, action, out)
+
+    @compiler.inlined
+    def certain(self, state, action, outcome):
+        return 1.0
+
+    @compiler.inlined
+    def no_age(self, state):
+        return 0
+
+    if K == 1:  # rules["transition"] takes no outcome then
+        return transition_of_all, certain, rules.get("age", no_age)
+    return transition, rules["probability"], rules.get("age", no_age)
+
+
+def expand_branches_function(
+    compiler: Compiler, rules: CompiledRules, Parameters: Constructor, words: Words, W: int, A: int, K: int
+) -> Function:
+    """Successors of a few states by all branches, how likely they are, and where in the table to look for them."""
+    load, hash_of, _ = words
+    transition, probability, age = _rules_of_branches(compiler, rules, K)
+    is_terminal = rules["is_terminal"]
+    WORDS = (0,) * W
+    AGED, CHANCE = "age" in rules, K > 1
+    TOLERANCE = SUM_TOLERANCE
+
+    @compiler.function
+    def expand(parameters, layout, states, first, n, keys, slots, rows, row, table, progress):
+        """Successors of states [first, first + n): packed words to keys, slots from which to search to slots, -1 where
+        a branch leads to the state itself: it is terminal, or the branch is impossible.
+
+        keys (n * A * K, W), slots (n * A * K,). rows is (terminal, probabilities): terminal[row + i] gets whether state
+        first + i is terminal, and probabilities[row + i] (A * K,) how likely the branches are.
+        """
+        terminal, probabilities = rows
+        self = Parameters(*parameters)
+        state = read_only_view(WORDS, *layout)
+        out = packed_view(WORDS, *layout)
+        capacity = table.shape[0]
+        progress[FIRST] = first  # where to look, should a rule fail
+        broken = False
+        j = 0
+        for i in range(n):
+            load(state, states, first + i)
+            ended = is_terminal(self, state)
+            terminal[row + i] = ended
+            now = np.int64(0) if ended else np.int64(age(self, state))
+            for a in range(A):
+                total = 0.0
+                for k in range(K):
+                    slots[j] = -1
+                    likely = 1.0 if k == 0 else 0.0
+                    if not ended:
+                        likely = float(probability(self, state, a, k))
+                        total += likely
+                        if not (likely >= 0.0 and likely <= 1.0 + TOLERANCE):
+                            broken = True
+                        if likely > 0.0:
+                            load(out, states, first + i)
+                            transition(self, state, a, k, out)
+                            if AGED and np.int64(age(self, out)) <= now:
+                                broken = True
+                            for w in range(W):
+                                keys[j, w] = get_word(out, w)
+                            slots[j] = slot_of(hash_of(keys, j), capacity)
+                            prefetch(table, slots[j])
+                    if CHANCE:
+                        probabilities[row + i, a * K + k] = likely if likely > 0.0 else 0.0
+                    j += 1
+                if CHANCE and not ended and not abs(total - 1.0) <= TOLERANCE:
+                    broken = True
+        progress[FAULT] = max(fault(state), fault(out))
+        if broken and progress[FAULT] == 0:
+            progress[FAULT] = len(state) + 2  # no component, but a probability or an age
+
+    return expand
+
+
+def expected_rewards_kernel(
+    compiler: Compiler, rules: CompiledRules, Parameters: Constructor, words: Words, W: int, A: int, K: int
+) -> Function:
+    """Rewards of stored transitions: what executing an action pays on average.
+
+    K: 1 where rewards do not depend on the outcome, which is not looked for then.
+    """
+    reward, probability = rules["reward"], rules["probability"]
+    load = words.load
+    WORDS = (0,) * W
+
+    @compiler.kernel
+    def rewards_of(parameters, layout, states, which, successors, probabilities, ranks, terminal, start, out):
+        """out[i, a] = expected reward of action a in state start + i; 0 in terminal states; out (n, A), zeros.
+
+        which (N,), ascending: i A + a of each outcome; successors, probabilities (N,): where it leads, how likely it
+        is. ranks (N,): which one of the possible outcomes, -1 for none; without entries: they are counted. Rewards that
+        are all the same are their own expectation, to the last bit.
+        """
+        self = Parameters(*parameters)
+        state = read_only_view(WORDS, *layout)
+        following = read_only_view(WORDS, *layout)
+        before, first, same = int64(-1), 0.0, True
+        passed, outcome = int64(-1), int64(-1)  # possible outcomes of this action passed by, and the last of them
+        for j in range(len(which)):
+            i, a = which[j] // A, which[j] % A
+            if terminal[start + i]:
+                continue
+            if which[j] != before:
+                load(state, states, start + i)
+                passed, outcome = int64(-1), int64(-1)
+            load(following, states, int64(successors[j]))
+            if K > 1:
+                rank = ranks[j] if len(ranks) > 0 else passed + 1
+                while passed < rank and outcome < K - 1:
+                    outcome += 1
+                    if probability(self, state, a, outcome) > 0.0:
+                        passed += 1
+            value = float(reward(self, state, a, following, outcome))
+            if which[j] != before:
+                before, first, same = which[j], value, True
+                out[i, a] = 0.0
+            same = same and value == first
+            out[i, a] += probabilities[j] * value
+            if j + 1 == len(which) or which[j + 1] != before:
+                out[i, a] = first if same else out[i, a]
+
+    return rewards_of
+
+
+def no_ages(*arguments: object) -> None:
+    """Raise: the class defines no age."""
+    raise NotImplementedError("a class without age() has no ages")
+
+
+def ages_of_kernel(compiler: Compiler, rules: CompiledRules, Parameters: Constructor, words: Words, W: int) -> Function:
+    """Ages of states."""
+    age = rules["age"]
+    load = words.load
+    WORDS = (0,) * W
+
+    @compiler.kernel
+    def ages_of(parameters, layout, states, start, stop, out):
+        """out[i] = age of state start + i."""
+        self = Parameters(*parameters)
+        state = read_only_view(WORDS, *layout)
+        for s in range(start, stop):
+            load(state, states, s)
+            out[s - start] = int64(age(self, state))
+
+    return ages_of

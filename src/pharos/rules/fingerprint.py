@@ -10,7 +10,6 @@ import hashlib
 import sys
 import types
 from collections.abc import Iterable
-from typing import Any
 
 import numpy as np
 
@@ -30,7 +29,7 @@ _STABLE = (
 
 def fingerprint_of_rules(env: object, rules: Iterable[str]) -> str:
     """SHA-256 of these rules of `env` and of the attributes of the instance that they mention."""
-    numbers: dict[Any, int] = {}
+    numbers: dict[object, int] = {}
     functions = [getattr(type(env), rule) for rule in rules]
     parts = [function_text(function, numbers) for function in functions]
     for name in sorted(mentioned_names(functions, type(env))):
@@ -46,12 +45,12 @@ def mutable_attributes(env: object, rules: Iterable[str]) -> list[str]:
     return sorted(n for n in names if isinstance(getattr(env, n, None), list | dict | set | bytearray))
 
 
-def mentioned_names(functions: Iterable[Any], owner: type | None = None) -> set[str]:
+def mentioned_names(functions: Iterable[object], owner: type | None = None) -> set[str]:
     """Names of attributes and globals in these functions, in those that they call by a global name, and in methods of
     `owner`.
     """
     names: set[str] = set()
-    closure: set[Any] = set()
+    closure: set[object] = set()
     pending = [plain_function(function) for function in functions]
     while pending:
         function = pending.pop()
@@ -66,7 +65,7 @@ def mentioned_names(functions: Iterable[Any], owner: type | None = None) -> set[
     return names
 
 
-def plain_function(value: object) -> Any:
+def plain_function(value: object) -> object:
     """The Python function behind one that Numba has compiled; anything else as it is."""
     return getattr(value, "py_func", value)
 
@@ -80,7 +79,7 @@ def names_in(code: types.CodeType) -> set[str]:
     return names
 
 
-def closure_of(function: types.FunctionType) -> dict[str, Any]:
+def closure_of(function: types.FunctionType) -> dict[str, object]:
     """Name -> value of the variables that a function takes from an enclosing one."""
     variables = {}
     for name, cell in zip(function.__code__.co_freevars, function.__closure__ or (), strict=True):
@@ -91,7 +90,7 @@ def closure_of(function: types.FunctionType) -> dict[str, Any]:
     return variables
 
 
-def function_text(function: object, numbers: dict[Any, int]) -> str:
+def function_text(function: object, numbers: dict[object, int]) -> str:
     """A text for a function and for everything that it reaches by name."""
     function = plain_function(function)
     if not isinstance(function, types.FunctionType):
@@ -107,7 +106,7 @@ def function_text(function: object, numbers: dict[Any, int]) -> str:
     return "\n".join(parts)
 
 
-def value_text(value: object, names: set[str], numbers: dict[Any, int]) -> str:
+def value_text(value: object, names: set[str], numbers: dict[object, int]) -> str:
     """A text for a value; of a module, for those of its attributes that are among `names`."""
     value = plain_function(value)
     home = getattr(value, "__module__", None) or ""
@@ -147,7 +146,7 @@ def value_text(value: object, names: set[str], numbers: dict[Any, int]) -> str:
     return repr(value)
 
 
-def _first_time(value: object, numbers: dict[Any, int]) -> bool:
+def _first_time(value: object, numbers: dict[object, int]) -> bool:
     first = value not in numbers
     numbers.setdefault(value, len(numbers))
     return first

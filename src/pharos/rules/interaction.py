@@ -8,28 +8,33 @@ One environment takes a branch a K + k, outcome k of action a, which `outcome_on
 themselves. Without chance K is 1, so a branch is an action. Branch -1 - a is action a without effect.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numba import int64
 
 from pharos.kernels.stepping import SAME_STEP, drawn_start, executed_action, has_no_effect, uniform_number
+from pharos.rules.compiler import CompiledRules, Compiler, Constructor, Function
+
+Advances = tuple[Function, Function]  # `advance` and `stay`, of `advance_functions`
 
 
 class InteractionKernels(NamedTuple):
     """The compiled kernels; see the makers below."""
 
-    step_one: Any
-    outcome_one: Any
-    step_and_draw_one: Any
-    step_many: Any
-    is_terminal_one: Any
-    draw_simple: Any
-    draw_complex: Any
-    draw_planes: Any
+    step_one: Function
+    outcome_one: Function
+    step_and_draw_one: Function
+    step_many: Function
+    is_terminal_one: Function
+    draw_simple: Function
+    draw_complex: Function
+    draw_planes: Function
 
 
-def interaction(compiler: Any, rules: Any, Parameters: Any, A: int, K: int = 1, L: int = 0) -> InteractionKernels:
+def interaction(
+    compiler: Compiler, rules: CompiledRules, Parameters: Constructor, A: int, K: int = 1, L: int = 0
+) -> InteractionKernels:
     """The kernels of a class of environments with A actions of at most K outcomes.
 
     L: how many layers `draw` has, where the planes of `draw_motion` are to follow; else 0.
@@ -56,7 +61,7 @@ def interaction(compiler: Any, rules: Any, Parameters: Any, A: int, K: int = 1, 
     )
 
 
-def advance_functions(compiler: Any, rules: Any, K: int) -> tuple[Any, Any]:
+def advance_functions(compiler: Compiler, rules: CompiledRules, K: int) -> Advances:
     """One step by the rules, checked; and one by an action without effect."""
     transition, is_terminal, reward = rules["transition"], rules["is_terminal"], rules["reward"]
 
@@ -101,9 +106,10 @@ def advance_functions(compiler: Any, rules: Any, K: int) -> tuple[Any, Any]:
     return advance, stay
 
 
-def drawn_outcome_function(compiler: Any, rules: Any, K: int) -> Any:
+def drawn_outcome_function(compiler: Compiler, rules: CompiledRules, K: int) -> Function:
     """Which outcome a number from 0 to 1 stands for."""
-    probability = rules.get("probability")
+    if K > 1:
+        probability = rules["probability"]
 
     @compiler.inlined
     def only_outcome(self, state, action, u):
@@ -123,7 +129,7 @@ def drawn_outcome_function(compiler: Any, rules: Any, K: int) -> Any:
     return only_outcome if K == 1 else drawn_outcome
 
 
-def outcome_one_kernel(compiler: Any, Parameters: Any, drawn_outcome: Any) -> Any:
+def outcome_one_kernel(compiler: Compiler, Parameters: Constructor, drawn_outcome: Function) -> Function:
     """The outcome of one step of one environment."""
 
     @compiler.kernel
@@ -134,7 +140,7 @@ def outcome_one_kernel(compiler: Any, Parameters: Any, drawn_outcome: Any) -> An
     return outcome_one
 
 
-def step_one_kernel(compiler: Any, Parameters: Any, advances: tuple[Any, Any]) -> Any:
+def step_one_kernel(compiler: Compiler, Parameters: Constructor, advances: Advances) -> Function:
     """One step of one environment."""
     advance, stay = advances
 
@@ -156,7 +162,7 @@ def step_one_kernel(compiler: Any, Parameters: Any, advances: tuple[Any, Any]) -
     return step_one
 
 
-def draw_all_function(compiler: Any, rules: Any, L: int) -> Any:
+def draw_all_function(compiler: Compiler, rules: CompiledRules, L: int) -> Function:
     """Where things are, and behind these planes their motion."""
     draw, draw_motion = rules["draw"], rules["draw_motion"]
 
@@ -169,7 +175,7 @@ def draw_all_function(compiler: Any, rules: Any, L: int) -> Any:
     return draw_all
 
 
-def draw_flat_function(compiler: Any, rules: Any) -> Any:
+def draw_flat_function(compiler: Compiler, rules: CompiledRules) -> Function:
     """A simple image, a pixel for each cell."""
     draw = rules["draw"]
 
@@ -191,7 +197,9 @@ def draw_flat_function(compiler: Any, rules: Any) -> Any:
     return draw_flat
 
 
-def step_and_draw_one_kernel(compiler: Any, Parameters: Any, advances: tuple[Any, Any], draw_flat: Any) -> Any:
+def step_and_draw_one_kernel(
+    compiler: Compiler, Parameters: Constructor, advances: Advances, draw_flat: Function
+) -> Function:
     """One step of one environment, and its image."""
     advance, stay = advances
 
@@ -214,8 +222,8 @@ def step_and_draw_one_kernel(compiler: Any, Parameters: Any, advances: tuple[Any
 
 
 def step_many_kernel(
-    compiler: Any, Parameters: Any, advances: tuple[Any, Any], drawn_outcome: Any, A: int, K: int
-) -> Any:
+    compiler: Compiler, Parameters: Constructor, advances: Advances, drawn_outcome: Function, A: int, K: int
+) -> Function:
     """One step of many environments."""
     advance, stay = advances
 
@@ -278,7 +286,7 @@ def step_many_kernel(
     return step_many
 
 
-def is_terminal_one_kernel(compiler: Any, rules: Any, Parameters: Any) -> Any:
+def is_terminal_one_kernel(compiler: Compiler, rules: CompiledRules, Parameters: Constructor) -> Function:
     """Whether one state is terminal."""
     is_terminal = rules["is_terminal"]
 
@@ -290,7 +298,9 @@ def is_terminal_one_kernel(compiler: Any, rules: Any, Parameters: Any) -> Any:
     return is_terminal_one
 
 
-def draw_simple_kernel(compiler: Any, rules: Any, Parameters: Any, draw_flat: Any) -> Any:
+def draw_simple_kernel(
+    compiler: Compiler, rules: CompiledRules, Parameters: Constructor, draw_flat: Function
+) -> Function:
     """Simple images of many states."""
     draw = rules["draw"]
 
@@ -323,7 +333,7 @@ def draw_simple_kernel(compiler: Any, rules: Any, Parameters: Any, draw_flat: An
     return draw_simple
 
 
-def draw_complex_kernel(compiler: Any, rules: Any, Parameters: Any) -> Any:
+def draw_complex_kernel(compiler: Compiler, rules: CompiledRules, Parameters: Constructor) -> Function:
     """Complex images of many states."""
     draw = rules["draw"]
 
@@ -363,7 +373,7 @@ def draw_complex_kernel(compiler: Any, rules: Any, Parameters: Any) -> Any:
     return draw_complex
 
 
-def draw_planes_kernel(compiler: Any, rules: Any, Parameters: Any) -> Any:
+def draw_planes_kernel(compiler: Compiler, rules: CompiledRules, Parameters: Constructor) -> Function:
     """What `draw` writes, for many states."""
     draw = rules["draw"]
 

@@ -14,11 +14,12 @@ import contextlib
 import warnings
 from collections.abc import Callable
 from functools import cached_property
-from typing import Any, Protocol, TypeVar
+from typing import Protocol, TypeVar
 
 import numpy as np
 
 from pharos.environments import Environment
+from pharos.kernels.stepping import Batch, Setting
 from pharos.rules.compiled import (
     COUNTED,
     CompiledAges,
@@ -35,6 +36,7 @@ from pharos.system import compiling
 from pharos.system.packed_indices import Indices
 
 Engine = TypeVar("Engine")
+Reasons = dict[tuple[object, ...] | None, str]  # signature of the instances -> why Numba does not compile them
 
 
 class Exploration(Protocol):
@@ -106,7 +108,7 @@ class Rewards(Protocol):
     def expected_block(
         self,
         states: np.ndarray,
-        outcomes: tuple[Any, ...],
+        outcomes: tuple[np.ndarray, Indices, np.ndarray],
         terminal: np.ndarray,
         start: int,
         stop: int,
@@ -137,23 +139,37 @@ class Stepping(Protocol):
     """
 
     is_compiled: bool
-    parameters: Any
+    parameters: tuple[object, ...]
 
-    def outcome_one(self, *arguments: Any) -> Any:
+    def outcome_one(
+        self, parameters: tuple[object, ...], state: np.ndarray, action: int, u: float, /
+    ) -> tuple[int, float]:
         """(outcome, its probability) of an action, by a number in [0, 1)."""
 
-    def step_one(self, *arguments: Any) -> Any:
+    def step_one(
+        self,
+        parameters: tuple[object, ...],
+        ranges: np.ndarray,
+        scale: np.ndarray,
+        state: np.ndarray,
+        branch: int,
+        following: np.ndarray,
+        vector: np.ndarray,
+        /,
+    ) -> tuple[float, int]:
         """(reward, code) of one step, by an action, or by the branch a K + k for outcome k of K of action a;
         -1 - a: by action a without effect.
         """
 
-    def step_many(self, *arguments: Any) -> Any:
+    def step_many(
+        self, parameters: tuple[object, ...], setting: Setting, batch: Batch, first: int, last: int, /
+    ) -> int:
         """One step of many environments; -1, or which component of which left its range."""
 
-    def is_terminal_one(self, *arguments: Any) -> Any:
+    def is_terminal_one(self, parameters: tuple[object, ...], state: np.ndarray, /) -> bool:
         """Whether a state is terminal."""
 
-    def step_and_draw_one(self, *arguments: Any) -> Any:
+    def step_and_draw_one(self, *arguments: object) -> Callable[..., tuple[float, int]] | None:
         """The function that steps and draws, of these arguments after the parameters; None where there is none."""
 
 
@@ -254,9 +270,9 @@ def rules_of(env: Environment, *, workers: int = 1) -> Rules:
     return Rules(env, workers)
 
 
-# (engine, class) -> signature -> why Numba does not compile it
-_reasons: dict[tuple[Any, type], dict[Any, str]] = {}
-_warned: set[tuple[type, Any]] = set()
+# of (engine, class)
+_reasons: dict[tuple[object, type], Reasons] = {}
+_warned: set[tuple[type, object]] = set()
 
 
 def compiled_or_none(engine: Callable[..., Engine], env: Environment, *arguments: object) -> Engine | None:
@@ -278,7 +294,7 @@ def _reason(engine: Callable[..., Engine], env: Environment, *arguments: object)
     """The engine and "", or None and why there is none; what failed to compile once is not tried again."""
     failed = _reasons.setdefault((engine, type(env)), {})
     try:
-        key: Any = (signature_of(env), *(each for each in arguments if isinstance(each, str))) if failed else None
+        key = (signature_of(env), *(each for each in arguments if isinstance(each, str))) if failed else None
         if key not in failed:
             return engine(env, *arguments), ""
     except Exception as error:  # Numba raises its own errors, and others from inside of it
@@ -286,7 +302,7 @@ def _reason(engine: Callable[..., Engine], env: Environment, *arguments: object)
     return None, failed[key]
 
 
-def _note(failed: dict[Any, str], env: Environment, arguments: tuple, reason: str) -> str:
+def _note(failed: Reasons, env: Environment, arguments: tuple, reason: str) -> str:
     with contextlib.suppress(Exception):  # of a parameter that cannot be asked for: it is asked for again
         failed[signature_of(env), *(each for each in arguments if isinstance(each, str))] = reason
     return reason

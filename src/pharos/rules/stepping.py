@@ -2,8 +2,6 @@
 plain Python.
 """
 
-from typing import Any
-
 import numpy as np
 
 from pharos.environments import Environment
@@ -17,12 +15,12 @@ class InterpretedStepping:
     """See `rules.Stepping`: 30 to 100 times slower than the compiled one, and its witness in tests."""
 
     is_compiled = False
-    parameters: Any = None
+    parameters: tuple[object, ...] = ()
 
     def __init__(self, env: Environment):
         self.env = env
 
-    def step_and_draw_one(self, *arguments: Any) -> Any:
+    def step_and_draw_one(self, *arguments: object) -> None:
         """None: steps and drawings are two calls."""
         return None
 
