@@ -52,6 +52,7 @@ def verdicts(cells, **options):
 
 
 OBSERVATION = "the harder observation of DQN"
+LEARNER = "the learner with more regret"
 
 
 @pytest.mark.slow
@@ -232,7 +233,7 @@ def test_what_is_not_there_is_no_data():
     assert found[OBSERVATION, "freeway"].verdict == found[OBSERVATION, "simple_grid"].verdict == "no data"
     assert found["models by class explain more than one", "all"].verdict == "no data"
     assert found["DQN and PPO find the same hard", "all"].verdict == "no data"
-    assert len(found) == 9
+    assert len(found) == 13
 
 
 def test_the_power_of_an_f_test_is_the_published_one():
@@ -250,9 +251,64 @@ def test_the_power_of_a_difference_is_that_of_the_normal_approximation():
 
 def test_each_finding_says_with_what_power_it_could_have_been_found():
     found = study.findings(made(), study.models(made()), resamples=50)
-    assert found["power"].between(0.04, 1.0).all()
+    tested = found[found["finding"] != LEARNER]
+    assert tested["power"].between(0.04, 1.0).all()
     few = made(instances=2)
     fewer = study.findings(few, study.models(few), resamples=50)
     both = found.merge(fewer, on=["finding", "of"], suffixes=("", "_few"))
     known = both[both["power_few"].notna() & both["finding"].str.startswith(("models by class", "one model"))]
     assert len(known) and (known["power_few"] < known["power"]).all()
+
+
+@pytest.mark.parametrize(("shift", "ours", "grids"), ((2, "table", "disagrees"), (-2, "DQN", "agrees")))
+def test_a_table_is_compared_with_dqn_on_vectors(shift, ours, grids):
+    cells = made()
+    table = cells[(cells["agent"] == "dqn") & (cells["observation"] == "vector")].assign(
+        agent="q_learning", observation="index"
+    )
+    table["normalized_regret"] += shift
+    found = verdicts(pd.concat([cells, table]))
+    row = found[LEARNER, "simple_grid"]
+    assert (row.ours, row.verdict, found[LEARNER, "freeway"].verdict) == (
+        ours, grids, "agrees" if grids == "disagrees" else "disagrees"
+    )  # fmt: skip
+    assert row.lower == pytest.approx(shift) == row.upper
+
+
+def test_classes_that_lack_an_observation_are_no_data():
+    cells = made()
+    cells = cells[(cells["environment"] != "freeway") | (cells["observation"] == "vector")]
+    assert verdicts(cells)["models by class explain more than one", "all"].verdict == "no data"
+
+
+@pytest.mark.parametrize("number", (6, 10, 18, 44))
+def test_the_interval_of_a_difference_holds_what_the_signed_rank_test_does_not_exclude(number):
+    differences = np.random.default_rng(number).normal(0.3, 1, number)
+    effect, lower, upper = _findings._shift(differences)
+    assert lower < effect < upper
+    for inside, outside in ((lower + 1e-6, lower - 1e-6), (upper - 1e-6, upper + 1e-6)):
+        assert stats.wilcoxon(differences - inside, method="exact").pvalue > 0.05
+        assert stats.wilcoxon(differences - outside, method="exact").pvalue <= 0.05
+
+
+def test_five_differences_have_no_interval():
+    assert _findings._shift(np.arange(1.0, 6.0)) == (3.0, -math.inf, math.inf)
+
+
+@pytest.mark.slow
+def test_the_interval_of_a_share_covers_as_often_as_it_says():
+    random, added, free, share = np.random.default_rng(0), 4, 40, 0.3
+    held = []
+    for statistic in random.noncentral_f(added, free, share / (1 - share) * (added + free + 1), 500):
+        effect, lower, upper = _findings._share(statistic, added, free)
+        held.append(lower <= share <= upper)
+        assert 0 <= lower <= upper <= 1 and effect == pytest.approx(added * statistic / (added * statistic + free))
+        assert (lower > 0) == (stats.f.sf(statistic, added, free) < 0.025)
+    assert 0.925 < np.mean(held) < 0.975
+
+
+def test_every_verdict_of_an_interval_is_told_by_its_ends():
+    for row in verdicts(made(image_harder=1)).values():
+        if row.verdict in ("agrees", "disagrees") and row.finding == OBSERVATION:
+            assert row.lower > 0 or row.upper < 0
+        assert math.isnan(row.effect) == (row.verdict == "no data")

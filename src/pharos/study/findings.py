@@ -1,13 +1,14 @@
 """The paper's findings in words, each tested on the data of a study."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.linalg import helmert
 
+from pharos.agents import TABULAR_OBSERVATION
 from pharos.study.analysis import IMAGE, VECTOR, Models, agreement, paper_agreement
 from pharos.study.regression import Fit, r_squared
 from pharos.system.wording import in_words
@@ -17,29 +18,35 @@ if TYPE_CHECKING:
     import pandas as pd
 
 LEVEL = 0.05  # of every test; each stands alone, without a correction for their number
-COLUMNS = ["finding", "of", "paper", "ours", "evidence", "p", "power", "verdict"]
-# By the paper's section 4.2
-_HARDER = {"simple_grid": IMAGE, "frozen_lake": IMAGE, "breakout": VECTOR, "freeway": VECTOR}
+COLUMNS = ["finding", "of", "paper", "ours", "evidence", "effect", "lower", "upper", "p", "power", "verdict"]
+# By the paper's sections 4.2 and 4.1
+_HARDER = {"simple_grid": "image", "frozen_lake": "image", "breakout": "vector", "freeway": "vector"}
+_OBSERVATIONS = {"image": ("dqn", IMAGE), "vector": ("dqn", VECTOR)}
+_SLOWER = {"simple_grid": "DQN", "frozen_lake": "DQN", "breakout": "table", "freeway": "table"}
+_LEARNERS = {"table": ("q_learning", TABULAR_OBSERVATION), "DQN": ("dqn", VECTOR)}
 _PRINTED_AGREEMENT = 0.81
 # R2 that the paper prints: of one model, of those by representation and by class together, with vectors and with images
 _PRINTED_R2 = {"single": 0.09, "representation": 0.48, "class": 0.65, "vector": 0.6, "image": 0.3}
 # In units of random play's regret: the paper prints no sizes of this, and less would be of no consequence
 SMALLEST_DIFFERENCE = 0.05
 NORMAL = 1.959964  # the 97.5th percentile of the normal distribution
+Effect = tuple[float, float, float]  # with the ends of its 95 % interval
 
 
 def findings(cells: "pd.DataFrame", models: Models, *, resamples: int = 1000) -> "pd.DataFrame":
-    """Return the findings of the paper's sections 4.2 and 4.3 and appendix C beside what the data say.
+    """Return the findings of the paper's sections 4.1 to 4.3 and appendix C beside what the data say.
 
     A task is an instance under one kind of chance; every test counts it once, whatever the number of its observations.
 
     - Which observation costs DQN more regret, for each class: the normalised regret of both on the same tasks,
-      Wilcoxon's signed-rank test, two-sided.
+      Wilcoxon's signed-rank test, two-sided; likewise, whether a table or DQN with vectors has more regret. The effect
+      is the difference by Hodges and Lehmann, image less vector and table less DQN, its interval that of the test.
     - One linear model of all explains next to nothing: the F test of class and measures on the means of the tasks over
       observations. Where it is significant, the verdict adds "mostly by class" if class and representation alone
       explain more than half of R2, and the evidence tests what the measures add.
     - Models by representation explain more: the F test of class and measures on the differences within tasks. Models
       by class explain more: the F test of their slopes on the means of the tasks. The single model is nested in both.
+      The effect of an F test is the share of what the smaller model leaves that the larger one explains.
     - Hardness explains regret better with vectors than with images: the difference of R2, tasks resampled, 95 %
       percentile interval.
     - DQN and PPO agree: Pearson's r of their mean returns over cells, with Fisher's interval.
@@ -48,9 +55,9 @@ def findings(cells: "pd.DataFrame", models: Models, *, resamples: int = 1000) ->
         cells: as from `cells`.
         models: of DQN's cumulative regret.
     Returns:
-        One row a finding: what the paper says, ours, the statistic in words, p-value (NaN where an interval decides),
-        the power, and the verdict: "agrees" or "disagrees" where the test is significant at 0.05, "undecided" where it
-        is not, "no data".
+        One row a finding: what the paper says, ours, the statistic in words, the effect and the ends of its 95 %
+        interval, p-value (NaN where an interval decides), the power, and the verdict: "agrees" or "disagrees" where
+        the test is significant at 0.05, "undecided" where it is not, "no data".
         The power is the probability that these tasks find the effect, at 0.05, where it is as large as the paper
         prints: its R2 for the F tests, its r, its difference of R2; of observations, whose sizes it does not print, a
         difference of SMALLEST_DIFFERENCE. "undecided" with little power says nothing against the paper.
@@ -58,15 +65,30 @@ def findings(cells: "pd.DataFrame", models: Models, *, resamples: int = 1000) ->
     """
     import pandas as pd
 
-    rows = [_representation(cells, environment, harder) for environment, harder in _HARDER.items()]
+    rows = [
+        _compared(cells, "the harder observation of DQN", environment, harder, _OBSERVATIONS)
+        for environment, harder in _HARDER.items()
+    ]
+    rows += [
+        _compared(cells, "the learner with more regret", environment, slower, _LEARNERS)
+        for environment, slower in _SLOWER.items()
+    ]
     rows += [_single(models), *_nested(models), _vectors_explained_better(models, resamples), _agreement(cells)]
     return pd.DataFrame(rows, columns=COLUMNS)
 
 
 def _row(
-    finding: str, of: str, paper: str, ours: str, evidence: str, p: float, verdict: str, power: float = math.nan
+    finding: str,
+    of: str,
+    paper: str,
+    ours: str,
+    evidence: str,
+    p: float,
+    verdict: str,
+    power: float = math.nan,
+    effect: Effect = (math.nan, math.nan, math.nan),
 ) -> dict[str, Any]:
-    return dict(zip(COLUMNS, (finding, of, paper, ours, evidence, p, power, verdict), strict=True))
+    return dict(zip(COLUMNS, (finding, of, paper, ours, evidence, *effect, p, power, verdict), strict=True))
 
 
 def _power_of_mean(effect: float, deviation: float, number: int) -> float:
@@ -98,23 +120,43 @@ def _nothing(finding: str, of: str, paper: str, why: str) -> dict[str, Any]:
     return _row(finding, of, paper, "", why, math.nan, "no data")
 
 
-def _representation(cells: "pd.DataFrame", environment: str, harder: str) -> dict[str, Any]:
+def _compared(
+    cells: "pd.DataFrame", finding: str, environment: str, paper: str, sides: Mapping[str, tuple[str, str]]
+) -> dict[str, Any]:
+    """Which of two pairs of agent and observation has more regret on the tasks of a class, both named in `sides`."""
     from scipy import stats
 
-    finding, paper = "the harder observation of DQN", "image" if harder == IMAGE else "vector"
-    part = cells[(cells["agent"] == "dqn") & (cells["environment"] == environment)]
-    wide = part.pivot_table(index=["instance", "chance"], columns="observation", values="normalized_regret")
-    if not {IMAGE, VECTOR} <= set(wide.columns) or len(both := wide[[IMAGE, VECTOR]].dropna()) == 0:
-        return _nothing(finding, environment, paper, "no task with both observations")
-    difference = both[IMAGE].to_numpy(float) - both[VECTOR].to_numpy(float)
+    part = cells[cells["environment"] == environment]
+    wide = part.pivot_table(index=["instance", "chance"], columns=["agent", "observation"], values="normalized_regret")
+    (first, one), (second, other) = sides.items()
+    if not {one, other} <= set(wide.columns) or len(both := wide[[one, other]].dropna()) == 0:
+        return _nothing(finding, environment, paper, "no task with both")
+    difference = both[one].to_numpy(float) - both[other].to_numpy(float)
     p = float(stats.wilcoxon(difference).pvalue) if (difference != 0).any() else 1.0
-    ours = "image" if np.median(difference) > 0 else "vector"
+    ours = first if np.median(difference) > 0 else second
     evidence = (
-        f"image {both[IMAGE].mean():.3f}, vector {both[VECTOR].mean():.3f} of random play's regret; image harder in "
+        f"{first} {both[one].mean():.3f}, {second} {both[other].mean():.3f} of random play's regret; {first} harder in "
         f"{int((difference > 0).sum())} of {len(difference)} tasks"
     )
     power = _power_of_mean(SMALLEST_DIFFERENCE, float(difference.std(ddof=1)), len(difference)) if p < 1 else math.nan
-    return _row(finding, environment, paper, ours, evidence, p, _verdict(ours == paper, p), power)
+    verdict, effect = _verdict(ours == paper, p), _shift(difference)
+    return _row(finding, environment, paper, ours, evidence, p, verdict, power, effect)
+
+
+def _shift(differences: np.ndarray) -> Effect:
+    """The estimate by Hodges and Lehmann of paired differences; its interval holds what the signed-rank test does not
+    exclude, everything where there are fewer than six.
+
+    Source: Hollander, Wolfe and Chicken (2014), Nonparametric statistical methods, sections 3.2 and 3.3.
+    """
+    first, second = np.triu_indices(len(differences))
+    averages = np.sort((differences[first] + differences[second]) / 2)
+    chances = np.ones(1)  # of each sum of the ranks that are positive, by chance alone
+    for rank in range(1, len(differences) + 1):
+        chances = (np.pad(chances, (0, rank)) + np.pad(chances, (rank, 0))) / 2
+    excluded = int((np.cumsum(chances) <= LEVEL / 2).sum())
+    ends = (averages[excluded - 1], averages[-excluded]) if excluded else (-math.inf, math.inf)
+    return float(np.median(averages)), float(ends[0]), float(ends[1])
 
 
 def _verdict(agrees: bool, p: float) -> str:
@@ -178,6 +220,32 @@ def _f_test(small: float, large: float, added: int, free: int) -> tuple[float, f
     return statistic, float(stats.f.sf(statistic, added, free))
 
 
+def _share(statistic: float, added: int, free: int) -> Effect:
+    """The share of what a smaller model leaves that a larger one explains, of the F test between them; the interval
+    is that of the noncentrality.
+
+    Source: Steiger (2004), Beyond the F test, with f2 (u + v + 1) as the noncentrality.
+    """
+    from scipy import optimize, stats
+
+    if not math.isfinite(statistic):
+        return 1.0, 1.0, 1.0
+
+    def end(probability: float) -> float:
+        def excess(shift: float) -> float:
+            return float(stats.ncf.cdf(statistic, added, free, shift)) - probability
+
+        if stats.f.cdf(statistic, added, free) <= probability:
+            return 0.0
+        highest = 1.0
+        while excess(highest) > 0:
+            highest *= 2
+        shift = float(optimize.brentq(excess, 0.0, highest))
+        return shift / (shift + added + free + 1)
+
+    return added * statistic / (added * statistic + free), end(1 - LEVEL / 2), end(LEVEL / 2)
+
+
 def _single(models: Models) -> dict[str, Any]:
     finding, paper = "one model explains next to nothing", "R² 0.09, nothing significant"
     fit = models.get("single", "all")
@@ -203,7 +271,8 @@ def _single(models: Models) -> dict[str, Any]:
             evidence += f"; class and representation alone {by_class:.2f}, measures add {fit.r_squared - by_class:.2f} "
             evidence += f"(F({measures}, {number - parameters}) = {added:.1f}, p = {p_added:.1g})"
     power = _power_of_f(parameters - 1, number - parameters, _PRINTED_R2["single"])
-    return _row(finding, "all", paper, f"R² {fit.r_squared:.2f}", evidence, p, verdict, power)
+    effect = _share(statistic, parameters - 1, number - parameters)
+    return _row(finding, "all", paper, f"R² {fit.r_squared:.2f}", evidence, p, verdict, power, effect)
 
 
 def _nested(models: Models) -> list[dict[str, Any]]:
@@ -235,7 +304,10 @@ def _more_slopes(finding: str, paper: str, model: str, single: Fit, parts: Seque
         of = "of task means"
         small, large = _rest(tasks.design, tasks.means), 0.0
         added, free = -parameters, number
-        for part in map(_tasks, parts):
+        of_parts = [_tasks(part) for part in parts]
+        if sum(len(part.names) for part in of_parts) != number:
+            return _nothing(finding, "all", paper, "some tasks lack an observation that others have")
+        for part in of_parts:
             large += _rest(part.design, part.means)
             added, free = added + part.design.shape[1], free - part.design.shape[1]
     if added < 1 or free < 1 or large <= 0:
@@ -245,7 +317,8 @@ def _more_slopes(finding: str, paper: str, model: str, single: Fit, parts: Seque
     total = float(((single.actual - single.actual.mean()) ** 2).sum())
     ours = f"R² {1 - rest / total:.2f} together, {single.r_squared:.2f} for one model"
     power = _power_of_f(added, free, _PRINTED_R2[model], _PRINTED_R2["single"])
-    return _row(finding, "all", paper, ours, f"F({added}, {free}) = {statistic:.1f} {of}", p, _verdict(True, p), power)
+    evidence, verdict = f"F({added}, {free}) = {statistic:.1f} {of}", _verdict(True, p)
+    return _row(finding, "all", paper, ours, evidence, p, verdict, power, _share(statistic, added, free))
 
 
 def _vectors_explained_better(models: Models, resamples: int) -> dict[str, Any]:
@@ -271,7 +344,8 @@ def _vectors_explained_better(models: Models, resamples: int) -> dict[str, Any]:
     error = (upper - lower) / (2 * NORMAL)
     printed = _PRINTED_R2["vector"] - _PRINTED_R2["image"]
     power = _power_of_error(printed, error)
-    return _row(finding, "all", paper, ours, evidence, math.nan, verdict, power)
+    effect = (float(difference(np.arange(len(tasks)), 0)), lower, upper)
+    return _row(finding, "all", paper, ours, evidence, math.nan, verdict, power, effect)
 
 
 def _power_of_error(effect: float, error: float) -> float:
@@ -306,4 +380,4 @@ def _agreement(cells: "pd.DataFrame") -> dict[str, Any]:
         if (other := agreement(cells, regret)) is not None:
             evidence += f"; of {in_words(regret)} r = {other[0]:.2f}"
     power = _power_of_error(math.atanh(_PRINTED_AGREEMENT), 1 / math.sqrt(number - 3))
-    return _row(finding, "all", paper, f"r = {r:.2f}", evidence, math.nan, verdict, power)
+    return _row(finding, "all", paper, f"r = {r:.2f}", evidence, math.nan, verdict, power, (r, lower, upper))

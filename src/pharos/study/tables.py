@@ -76,9 +76,7 @@ def finished_runs(study: Specification, place: Path) -> FinishedRuns:
             if record is None or record["status"] != _worker.FINISHED:
                 continue
             curve = read_curve(place, run.id)
-            row = {"id": run.id, **described(run), "seconds": float(record["seconds"]), "began": _began(record)}
-            row |= _result_of(record, place / "runs" / run.id) | {"return": _last_return(curve)}
-            row["exact"], row["half_width"] = _exactness(curve, row)
+            row = {"id": run.id} | row_of(run, record, curve, place / "runs" / run.id)
         except FileFormatError as error:
             damaged[run.id] = str(error)
             continue
@@ -111,6 +109,14 @@ def table(source: Source, folder: str | os.PathLike | None = None) -> "pd.DataFr
 def curves(source: Source, folder: str | os.PathLike | None = None) -> "pd.DataFrame":
     """One row an evaluation of a finished run: the columns of curve.parquet, and those that describe the run."""
     return _warned(finished_runs(*opened(source, folder))).points
+
+
+def row_of(run: Run, record: Mapping[str, Any], curve: "pd.DataFrame", folder: Path) -> dict[str, Any]:
+    """The columns of `table` for one finished run, without its id; `folder` is named in errors."""
+    row = {**described(run), "seconds": float(record["seconds"]), "began": _began(record)}
+    row |= _result_of(record, folder) | {"return": _last_return(curve)}
+    row["exact"], row["half_width"] = _exactness(curve, row)
+    return row
 
 
 def _warned(runs: FinishedRuns) -> FinishedRuns:
