@@ -1,8 +1,8 @@
-# Two targets do it all on a fresh machine: `make quickstart` and `make test`; `make docs` builds the site.
+# Two targets do it all on a fresh machine: `make quickstart` and `make test`; `make docs` builds the site, `make article` a PDF.
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 
-.PHONY: quickstart test test-fast test-long lint docs clean
+.PHONY: quickstart test test-fast test-long lint docs article clean
 
 .venv/.ok: pyproject.toml setup.py constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
@@ -33,6 +33,9 @@ lint: .venv/.ok
 
 docs: .venv/.docs
 	$(BIN)/python scripts/build_site.py
+
+article:
+	$(PYTHON) scripts/article_latex.py
 
 clean:
 	rm -rf .venv build dist site *.egg-info .pytest_cache .mypy_cache .ruff_cache

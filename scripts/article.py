@@ -32,19 +32,27 @@ SMALL = ("simple_grid", "frozen_lake")
 NAMES = {"simple_grid": "grids", "frozen_lake": "lakes", "freeway": "Freeway", "breakout": "Breakout", "all": "all"}
 PRIMARY = {"dqn": "kernel_regret", "ppo": "clipped_regret_evaluated"}
 ROWS = (  # of the table of findings: in words, the finding and its class as in `study.findings`
-    ("images cost DQN more than vectors: grids", "the harder observation of DQN", "simple_grid"),
-    ("images cost DQN more than vectors: lakes", "the harder observation of DQN", "frozen_lake"),
-    ("images cost DQN less than vectors: Freeway", "the harder observation of DQN", "freeway"),
-    ("images cost DQN less than vectors: Breakout", "the harder observation of DQN", "breakout"),
-    ("a table has less regret than DQN: grids", "the learner with more regret", "simple_grid"),
-    ("a table has less regret than DQN: lakes", "the learner with more regret", "frozen_lake"),
-    ("a table has more regret than DQN: Freeway", "the learner with more regret", "freeway"),
-    ("a table has more regret than DQN: Breakout", "the learner with more regret", "breakout"),
-    ("one linear model for all explains next to nothing", "one model explains next to nothing", "all"),
-    ("a model for each representation explains more", "models by representation explain more than one", "all"),
-    ("a model for each class explains more", "models by class explain more than one", "all"),
-    ("measures explain vectors better than images", "hardness explains vectors better than images", "all"),
-    ("DQN and PPO find the same tasks hard", "DQN and PPO find the same hard", "all"),
+    ("images harder for DQN: grids", "the harder observation of DQN", "simple_grid"),
+    ("images harder for DQN: lakes", "the harder observation of DQN", "frozen_lake"),
+    ("vectors harder for DQN: Freeway", "the harder observation of DQN", "freeway"),
+    ("vectors harder for DQN: Breakout", "the harder observation of DQN", "breakout"),
+    ("DQN worse than a table: grids", "the learner with more regret", "simple_grid"),
+    ("DQN worse than a table: lakes", "the learner with more regret", "frozen_lake"),
+    ("a table worse than DQN: Freeway", "the learner with more regret", "freeway"),
+    ("a table worse than DQN: Breakout", "the learner with more regret", "breakout"),
+    ("one model explains next to nothing (R² 0.09)", "one model explains next to nothing", "all"),
+    (
+        "one by representation explains more (0.48)",
+        "models by representation explain more than one",
+        "all",
+    ),
+    ("one by class explains more (0.65)", "models by class explain more than one", "all"),
+    (
+        "vectors are explained better than images (0.6, 0.3)",
+        "hardness explains vectors better than images",
+        "all",
+    ),
+    ("DQN and PPO find the same hard (r = 0.81)", "DQN and PPO find the same hard", "all"),
 )
 
 
@@ -114,7 +122,7 @@ def number(value, digits=2):
 
 
 def interval(middle, lower, upper, digits=2):
-    return f"{number(middle, digits)} ({number(lower, digits)} to {number(upper, digits)})"
+    return f"{number(middle, digits)} ({number(lower, digits)}, {number(upper, digits)})"
 
 
 def markdown(head, rows):
@@ -133,9 +141,21 @@ def findings_table():
                 continue
             digits = 3 if one["of"] != "all" else 2
             row += [one["runs"], interval(one["effect"], one["lower"], one["upper"], digits)]
-            row += [one["verdict"].replace(", mostly by class", "")]
+            row += [one["verdict"].removesuffix(", mostly by class")]
         rows.append(row)
-    return markdown(["finding of the paper", *["runs", "effect (95 %)", "here"] * 2], rows)
+    head = [("`classes`, runs", "effect (95 %)", "verdict"), ("`paper`, runs", "effect (95 %)", "verdict")]
+    return markdown(["finding of the paper", *head[0], *head[1]], rows)
+
+
+def models_table():
+    """R2 of the one model for all classes, and of what it consists of."""
+    table = study.cells(runs("classes"), pd.read_csv(STUDIES / "classes" / "hardness.csv"))
+    predictors, rows = study.specification("classes").hardness.predictors, []
+    for regret in ("cumulative_regret", "normalized_regret"):
+        models = study.models(table, regret=regret, measures=predictors)
+        values = (models.get("single", "all").r_squared, models.class_alone, models.leave_one_class_out)
+        rows.append([regret.split("_")[0].replace("z", "s"), *map(number, values)])
+    return markdown(["regret", "with measures", "without", "classes left out"], rows)
 
 
 def encodings_table():
@@ -210,7 +230,9 @@ def sealed_table():
     ):
         row = judged()[agent, predictor]
         said = [interval(*(row[name + end] for end in ("", "_lower", "_upper"))) for name in ("r_squared", "rho")]
-        share = number(row["agreement"]) if row["pairs"] and row["agreement"] == row["agreement"] else "0.50"
+        share = "0.50"  # of what is the same for all observations of an MDP
+        if row["agreement_lower"] == row["agreement_lower"]:
+            share = interval(*(row["agreement" + end] for end in ("", "_lower", "_upper")))
         rows.append([agent.upper(), words, *said, share])
     return markdown(["agent", "predictor", "R², class left out", "rank correlation", "pairs in order"], rows)
 
@@ -226,29 +248,41 @@ def misses(agent, predictor):
 
 
 def facts():
-    """What the text says in numbers, by name."""
+    """Phrases of the text that hold numbers, each as the text has it."""
+    measures = pd.read_csv(STUDIES / "classes" / "hardness.csv")
     cells, predictions, done = sealed()
-    said = {"sealed runs": len(done)}
     dates = done.merge(predictions, on=CELL)
-    said["older than its prediction"] = int((dates["written"] < dates["date"]).sum())
+    if len(dates) != len(done) or (dates["written"] < dates["date"]).any():
+        raise ValueError("a run was finished before its prediction was written")
+    said = [f"{len(done)} runs", f"{len(cells)} cells, {len(cells) // 2} an agent"]
+    within, pairs, images = {}, {}, {}
     for agent, part in cells.groupby("agent"):
-        regret, mdp = part["greedy"], part["instance"] + part["chance"]
-        total = ((regret - regret.mean()) ** 2).sum()
-        by_class = ((regret.groupby(part["environment"]).transform("mean") - regret.mean()) ** 2).sum()
-        within = ((regret - regret.groupby(mdp).transform("mean")) ** 2).sum()
-        said[f"{agent}: variance between classes"] = round(by_class / total, 2)
-        said[f"{agent}: variance between observations of one MDP"] = round(within / total, 2)
-        ranges = regret.groupby(mdp).agg(["min", "max"])
-        said[f"{agent}: MDPs whose observations differ by more than 0.2"] = int(
-            (ranges["max"] - ranges["min"] > 0.2).sum()
-        )
-        groups = mdp.value_counts()
-        said[f"{agent}: pairs of observations"] = int((groups * (groups - 1) // 2).sum())
-        said[f"{agent}: pairs that differ by more than 0.05"] = int(judged()[agent, PRIMARY[agent]]["pairs"])
-        row = judged()[agent, PRIMARY[agent]]
-        said[f"{agent}: image against vector"] = (
-            f"{row['image_agreement'] * row['image_pairs']:g} of {row['image_pairs']}"
-        )
+        regret, mdps = part["greedy"], part.groupby("instance")["greedy"]
+        within[agent] = ((regret - mdps.transform("mean")) ** 2).sum() / ((regret - regret.mean()) ** 2).sum()
+        row, sizes = judged()[agent, PRIMARY[agent]], mdps.size()
+        pairs[agent] = f"{row['pairs']} of {(sizes * (sizes - 1) // 2).sum()}"
+        images[agent] = f"{row['image_agreement'] * row['image_pairs']:g} of {row['image_pairs']}"
+    said += [
+        f"{within['dqn']:.2f} of the variance of DQN's regret and {within['ppo']:.2f} of PPO's",
+        f"{pairs['dqn']} pairs for DQN and {pairs['ppo']} for PPO",
+        f"{images['dqn']} for DQN and {images['ppo']} for PPO",
+    ]
+    spread = cells[cells["agent"] == "dqn"].groupby("instance")["greedy"].agg(np.ptp)
+    said.append(f"by more than 0.2 on {(spread > 0.2).sum()} of {len(spread)} MDPs")
+    hanoi = cells.merge(predictions, on=CELL).query("agent == 'dqn' and instance == 'games.py:Hanoi(discs=3)'")
+    hanoi = hanoi.assign(kind=hanoi["observation"].map(kind)).set_index("kind")
+    for column, verb in (("greedy", "was"), ("kernel_regret", "had been predicted as")):
+        image, vector = (hanoi[column][name] for name in ("simple_image", "vector"))
+        said.append(f"{verb} {image:.2f} by its image and {vector:.2f} by its vector")
+    said.append(f"{measures['num_states'].min():,} to {measures['num_states'].max():,} states")
+    done = runs("classes")
+    said.append(f"{(~done['exact']).sum()} of {len(done)} runs")
+    power = [found("classes")[finding, "frozen_lake"]["power"] for _, finding, of in ROWS if of == "frozen_lake"]
+    said.append(f"a power of {power[0]:.2f} and {power[1]:.2f}")
+    for name in ("classes", "paper"):
+        small = study.cells(runs(name)[runs(name)["environment"].isin(SMALL)])
+        r = [study.agreement(small, column)[0] for column in ("return", "normalized_regret")]
+        said.append(f"r is {r[0]:.2f} of returns and {r[1]:.2f} of normalised regret")
     return said
 
 
@@ -256,8 +290,7 @@ def facts():
 
 
 def draw():
-    from pharos.plots import save
-    from pharos.plots.style import styled
+    from pharos.plots.style import file_of, styled
 
     for name, figure in (
         ("article-regret", regret_figure),
@@ -265,9 +298,12 @@ def draw():
         ("article-sealed", sealed_figure),
         ("article-misses", misses_figure),
     ):
-        print(save(styled(figure)(), IMAGES / f"{name}.png"))
+        file = IMAGES / f"{name}.png"
+        file.write_bytes(styled(lambda figure=figure: file_of(figure(), "png", PRINT_DPI))())
+        print(file)
 
 
+PRINT_DPI = 240
 LOOKS = {
     "vector": ("#0072B2", "o"),
     "simple_image": ("#D55E00", "s"),
@@ -279,8 +315,9 @@ LABELS = {"simple_image": "image", "one_hot": "one-hot"}
 
 def regret_figure():
     """Regret of the policy of the moment over training, means over instances and seeds."""
-    from pharos.plots.style import legend_below
     from matplotlib.figure import Figure
+
+    from pharos.plots.style import legend_below
 
     points = pd.concat([packed(name)[1] for name in ("small/runs.parquet", "classes/large.parquet")])
     drawn = Figure(figsize=(3.4, 3.5), layout="constrained")
@@ -322,7 +359,7 @@ def observations_figure():
     for name, some in cells.groupby(cells["observation"].map(kind)):
         color, mark = LOOKS[name]
         axis.scatter(
-            some["instance"].map(places), some["greedy"], 13, color, mark, label=LABELS.get(name, name), zorder=2
+            some["instance"].map(places), some["greedy"], 13, color, marker=mark, label=LABELS.get(name, name), zorder=2
         )
     axis.set(xlabel=f"{len(order)} MDPs, by mean regret", ylabel="regret of DQN", xticks=[], ylim=(0, 1.7))
     axis.legend(loc="upper left", handletextpad=0.2)
@@ -341,7 +378,9 @@ def sealed_figure():
         axis.plot([0, 1.7], [0, 1.7], color="#999999", linewidth=0.9, zorder=0)
         for name, some in both.groupby(both["observation"].map(kind)):
             color, mark = LOOKS[name]
-            axis.scatter(some[predictor], some["greedy"], 10, color, mark, label=LABELS.get(name, name), linewidth=0)
+            axis.scatter(
+                some[predictor], some["greedy"], 10, color, marker=mark, label=LABELS.get(name, name), linewidth=0
+            )
         axis.set(xlim=(0, 1.7), ylim=(0, 1.7), xlabel="predicted regret", title=agent.upper(), aspect="equal")
         axis.set(xticks=[0, 0.5, 1, 1.5], yticks=[0, 0.5, 1, 1.5])
     axes[0].set_ylabel("observed regret")
@@ -359,16 +398,16 @@ def misses_figure():
     for place, name in enumerate(before.index):
         axis.plot([before[name], after[name]], [place, place], color="#999999", linewidth=0.9, zorder=1)
     places = np.arange(len(before))
-    axis.scatter(before, places, 18, "#D55E00", "s", label="expectations (named before)", zorder=2)
-    axis.scatter(after[before.index], places, 18, "#0072B2", "o", label="samples (proposed after)", zorder=2)
+    axis.scatter(before, places, 18, "#D55E00", marker="s", label="expectations (named before)", zorder=2)
+    axis.scatter(after[before.index], places, 18, "#0072B2", marker="o", label="samples (proposed after)", zorder=2)
     axis.axvline(0, color="#23262d", linewidth=0.9)
     axis.set(yticks=places, yticklabels=[name.replace("_", " ") for name in before.index])
     axis.set(xlabel="observed less predicted regret of DQN")
-    axis.legend(loc="lower right", handletextpad=0.2, fontsize=7)
+    drawn.legend(loc="outside lower center", handletextpad=0.2)
     return drawn
 
 
-TABLES = {"findings": findings_table, "encodings": encodings_table, "sealed": sealed_table}
+TABLES = {"findings": findings_table, "models": models_table, "encodings": encodings_table, "sealed": sealed_table}
 
 
 def main():
@@ -379,11 +418,7 @@ def main():
         return
     for name, table in TABLES.items():
         print(f"{name}\n\n{table()}\n")
-    for name, value in facts().items():
-        print(f"{name}: {value}")
-    for predictor in ("kernel_regret", "sampled_regret"):
-        print(predictor, misses("dqn", predictor).round(2).to_dict())
-    print("clipped_regret_evaluated", misses("ppo", "clipped_regret_evaluated").round(2).to_dict())
+    print("phrases\n", *facts(), sep="\n")
 
 
 if __name__ == "__main__":
