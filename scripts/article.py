@@ -282,7 +282,7 @@ def facts():
     for name in ("classes", "paper"):
         small = study.cells(runs(name)[runs(name)["environment"].isin(SMALL)])
         r = [study.agreement(small, column)[0] for column in ("return", "normalized_regret")]
-        said.append(f"r is {r[0]:.2f} of returns and {r[1]:.2f} of normalised regret")
+        said.append(f"{r[0]:.2f} for returns and {r[1]:.2f} for normalised regret in `{name}`")
     return said
 
 
