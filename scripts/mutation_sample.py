@@ -61,13 +61,11 @@ TESTED_BY = {  # path in src/pharos: weight of its faults (kernels compile again
     "hardness/gaps/gap_blocks.py": (0.6, "test_gaps"),
     "hardness/gaps/ties.py": (1.0, "test_gaps"),
     "hardness/planning/steps.py": (0.6, "test_effective_horizon"),
-    "kernels/bellman.py": (0.3, "test_solvers test_dynamics"),
+    "kernels/bellman.py": (0.3, "test_solvers test_dynamics test_chain_measures"),
     "kernels/gaps.py": (0.5, "test_gaps"),
     "kernels/graph.py": (0.2, "test_diameter test_dynamics"),
     "kernels/many_searches.py": (0.2, "test_diameter"),
-    "kernels/clocks.py": (0.2, "test_diameter"),
     "kernels/hitting.py": (0.3, "test_stochastic_diameter"),
-    "kernels/paths.py": (0.5, "test_dynamics test_chain_measures"),
 }
 
 COMPARISONS = "Eq_NotEq NotEq_Eq Lt_LtE Lt_GtE LtE_Lt LtE_Gt Gt_GtE Gt_LtE GtE_Gt GtE_Lt Is_IsNot IsNot_Is"

@@ -10,7 +10,7 @@ from pharos.agents.batched.arithmetic import TensorArithmetic
 from pharos.agents.batched.runs import lane_width, lane_widths
 from pharos.environments import make
 from pharos.errors import ParameterError
-from pharos.kernels.philox import philox
+from pharos.kernels.batched import philox
 from pharos.mdp import ChanceSetting, lazy_actions, random_actions
 from pharos.policies import is_walk, walk_values
 from pharos.training import Task, evaluate_agent

@@ -9,7 +9,7 @@ from pharos.agents import make_model
 from pharos.agents.batched import BatchRun, ObservationSource, make_batch
 from pharos.environments import make
 from pharos.interaction import make_sb3_vec
-from pharos.kernels import batched_rollouts as rollouts
+from pharos.kernels import batched as rollouts
 from pharos.policies import DeepPolicy
 from pharos.training.task import Task
 

@@ -15,9 +15,7 @@ from pharos.agents import make_model
 from pharos.agents.batched import BatchRun, ObservationSource, group_key, make_batch, observed
 from pharos.errors import ParameterError
 from pharos.interaction import make_sb3_vec
-from pharos.kernels import batched_learning as learning
-from pharos.kernels import batched_worlds as worlds
-from pharos.kernels import philox
+from pharos.kernels import batched
 from pharos.policies import walk_values
 from pharos.training import ChanceSetting, Task, evaluate_agent, load_agent, train_many
 
@@ -95,7 +93,7 @@ def test_dqn_learns_from_the_frames_that_stable_baselines3_keeps(sight, n_steps,
     lane, env, flags = recorded("dqn", task, hyperparameters, total)
     monkeypatch.setattr(lane, "learn_minibatch", lambda: None)
     lane.advance(total)
-    assert flags == {0, worlds.DONE, worlds.DONE | worlds.TIMEOUT}
+    assert flags == {0, batched.DONE, batched.DONE | batched.TIMEOUT}
     model = make_model(DQN, env, hyperparameters, seed=0)
     monkeypatch.setattr(model, "train", lambda **_: None)
     model.learn(total)
@@ -110,9 +108,9 @@ def test_dqn_learns_from_the_frames_that_stable_baselines3_keeps(sight, n_steps,
     rewards, factors = (np.zeros((lane.width, size), np.float32) for _ in range(2))
     batch = (states, nexts, actions, rewards, factors)
     gammas = lane.own["gamma"]
-    learning.sample_histories(lane.keys, 7, 0, place, memory.size, gammas, n_steps, memory.memory, batch)
+    batched.sample_histories(lane.keys, 7, 0, place, memory.size, gammas, n_steps, memory.memory, batch)
     words = np.zeros((lane.width, size, 4), np.uint32)
-    philox.words(lane.keys, worlds.SAMPLE, 7, words)
+    batched.words(lane.keys, batched.SAMPLE, 7, words)
     drawn = (((words[RUN, :, k].astype(np.uint64) * n) >> 32) for k, n in ((0, memory.size), (1, lane.copies)))
     rows, copies = (each.astype(np.int64) for each in drawn)
     assert set(rows.tolist()) == set(range(memory.size)), "all of the memory is among them"
@@ -141,7 +139,7 @@ def test_ppo_gathers_the_frames_and_values_that_stable_baselines3_gathers(sight,
 
     monkeypatch.setattr(lane, "update", keep)
     lane.advance(total)
-    assert flags == {0, worlds.DONE, worlds.DONE | worlds.TIMEOUT}
+    assert flags == {0, batched.DONE, batched.DONE | batched.TIMEOUT}
     model = make_model(PPO, env, PPO_OPTIONS, seed=0)
     model.policy.load_state_dict({name: torch.from_numpy(array) for name, array in lane.stored(RUN).items()})
     buffer = model.rollout_buffer

@@ -13,9 +13,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from pharos.agents import make_model
 from pharos.agents.batched import BatchRun, make_batch
-from pharos.kernels import batched_learning as learning
-from pharos.kernels import batched_worlds as worlds
-from pharos.kernels import philox
+from pharos.kernels import batched
 from pharos.mdp import TabularMDP
 
 STATES, ACTIONS, RUN = 9, 3, 1
@@ -59,11 +57,11 @@ class Recorded(VecEnv):
         step = self.steps[self.at]
         self.at += 1
         infos = [{} for _ in self.starts]
-        done = step["flags"] & worlds.DONE > 0
+        done = step["flags"] & batched.DONE > 0
         for e in np.flatnonzero(done):
             infos[e] = {
                 "terminal_observation": OneHots().at(step["next_state"][e]),
-                "TimeLimit.truncated": bool(step["flags"][e] & worlds.TIMEOUT),
+                "TimeLimit.truncated": bool(step["flags"][e] & batched.TIMEOUT),
             }
         return OneHots().at(step["state"]), step["reward"].copy(), done, infos
 
@@ -103,7 +101,7 @@ def recorded(lane, steps):
     lane.step = record
     lane.advance(steps)
     flags = np.concatenate([each["flags"] for each in found])
-    assert {0, worlds.DONE, worlds.DONE | worlds.TIMEOUT} == set(flags.tolist())
+    assert {0, batched.DONE, batched.DONE | batched.TIMEOUT} == set(flags.tolist())
     return Recorded(starts, found)
 
 
@@ -160,8 +158,8 @@ def assert_same_memory(lane, model):
     assert (buffer.next_observations.argmax(axis=2) == following)[seen].all()
     assert (buffer.actions[..., 0] == action)[seen].all()
     assert (buffer.rewards == reward)[seen].all()
-    assert (buffer.dones == (flags & worlds.DONE > 0))[seen].all()
-    assert (buffer.timeouts == (flags & worlds.TIMEOUT > 0))[seen].all()
+    assert (buffer.dones == (flags & batched.DONE > 0))[seen].all()
+    assert (buffer.timeouts == (flags & batched.TIMEOUT > 0))[seen].all()
 
 
 def assert_same_minibatch(lane, model, monkeypatch):
@@ -170,9 +168,9 @@ def assert_same_minibatch(lane, model, monkeypatch):
     states, nexts, actions = (np.zeros((lane.width, size), np.int64) for _ in range(3))
     rewards, factors = (np.zeros((lane.width, size), np.float32) for _ in range(2))
     batch, place, steps = (states, nexts, actions, rewards, factors), lane.calls % memory.size, lane.shared["n_steps"]
-    learning.sample(lane.keys, 7, 0, place, filled, lane.own["gamma"], int(steps), memory.memory, batch)
+    batched.sample(lane.keys, 7, 0, place, filled, lane.own["gamma"], int(steps), memory.memory, batch)
     words = np.zeros((lane.width, size, 4), np.uint32)
-    philox.words(lane.keys, worlds.SAMPLE, 7, words)
+    batched.words(lane.keys, batched.SAMPLE, 7, words)
     rows, copies = ((words[RUN, :, k].astype(np.uint64) * n) >> 32 for k, n in ((0, filled), (1, lane.copies)))
     assert {place, (place - 1) % filled} & set(rows.tolist()), "the ends of the memory are among them"
     monkeypatch.setattr(np.random, "randint", lambda *_, **__: copies.astype(np.int64))

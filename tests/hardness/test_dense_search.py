@@ -10,7 +10,7 @@ import pharos
 from naive.hardness import distances
 from pharos import TabularMDP, hardness
 from pharos.hardness.distances.transition_graph import Graph
-from pharos.kernels import dense_search
+from pharos.kernels import many_searches
 from solution_lengths import solution_lengths
 
 
@@ -32,10 +32,10 @@ def graphs(draw):
 def test_the_largest_distance_to_each_source_is_found(drawn):
     graph, distance = drawn
     sources = np.arange(graph.num_nodes, dtype=graph.dtype)
-    bits = [np.zeros((graph.num_nodes, dense_search.WORDS), np.uint64) for _ in range(3)]
+    bits = [np.zeros((graph.num_nodes, many_searches.WORDS), np.uint64) for _ in range(3)]
     flags = [np.zeros(graph.num_nodes, np.bool_) for _ in range(2)]
     largest = np.empty(len(sources), np.int64)
-    dense_search.dense_search_backward(graph.next_states, graph.ends, graph.start, sources, *bits, *flags, largest)
+    many_searches.dense_search_backward(graph.next_states, graph.ends, graph.start, sources, *bits, *flags, largest)
     np.testing.assert_array_equal(largest, np.where(np.isfinite(distance), distance, 0).max(axis=0))
 
 
@@ -50,7 +50,7 @@ def test_bounds_that_follow_along_edges_hold_and_are_the_least_of_all_paths(draw
     in_upper, out_upper = (np.where(known, exact, unknown).astype(graph.dtype) for exact in (for_in, for_out))
     expected_in = np.min(np.where(known, for_in, np.inf)[:, None] + distance, axis=0)
     expected_out = np.min(distance + np.where(known, for_out, np.inf)[None, :], axis=1)
-    while dense_search.lower_along_edges(graph.next_states, graph.ends, graph.start, in_upper, out_upper):
+    while many_searches.lower_along_edges(graph.next_states, graph.ends, graph.start, in_upper, out_upper):
         pass
     for found, expected in ((in_upper, expected_in), (out_upper, expected_out)):
         np.testing.assert_array_equal(found, np.where(np.isfinite(expected), expected, unknown).astype(graph.dtype))
@@ -63,13 +63,13 @@ def test_nodes_that_are_spread_out_are_no_successors_of_those_before(drawn, limi
     graph, distance = drawn
     order = np.arange(graph.num_nodes, dtype=graph.dtype)[::-1].copy()
     blocked = np.zeros(graph.num_nodes, np.bool_)
-    chosen = dense_search.spread_out(graph.next_states, graph.ends, order, blocked, limit)
+    chosen = many_searches.spread_out(graph.next_states, graph.ends, order, blocked, limit)
     ended = np.append(graph.ends, [True] * graph.has_end)
     for i, v in enumerate(chosen):
         assert not any(distance[u, v] == 1 and not ended[u] and v < len(graph.ends) for u in chosen[:i])
     assert len(chosen) == limit or len(chosen) > 0
     num_successors = [len({t for t in row if t != s}) for s, row in enumerate(graph.next_states.tolist())]
-    counted = dense_search.num_successors(graph.next_states, graph.ends, graph.num_nodes)
+    counted = many_searches.num_successors(graph.next_states, graph.ends, graph.num_nodes)
     assert counted[: len(graph.ends)][~graph.ends].tolist() == np.array(num_successors)[~graph.ends].tolist()
 
 

@@ -15,7 +15,7 @@ from pharos.errors import ParameterError
 from pharos.hardness.distances import hidden_clock, sum_sweep
 from pharos.hardness.distances.transition_graph import Graph
 from pharos.hardness.interval import BudgetClock
-from pharos.kernels import clocks
+from pharos.kernels import graph as kernels
 from pharos.system import compiling
 
 
@@ -202,7 +202,7 @@ def test_a_clock_with_layers_of_many_words_is_followed():
 
 def test_following_a_clock_may_read_each_entry_of_the_table_200_times(monkeypatch):
     limits = []
-    monkeypatch.setattr(clocks, "last_gap", lambda *arguments: limits.append(arguments[-1]) or (-3, 0))
+    monkeypatch.setattr(kernels, "last_gap", lambda *arguments: limits.append(arguments[-1]) or (-3, 0))
     mdp = clocked(30, 9, np.zeros((30, 9), bool))
     hardness.diameter(mdp)
     assert limits == [200 * mdp.next_states.size + 10**8]

@@ -9,7 +9,7 @@ import pharos
 from naive.hardness import distances
 from pharos import TabularMDP, hardness
 from pharos.hardness.distances.sum_sweep import orbits
-from pharos.kernels import symmetry
+from pharos.kernels import graph
 from without_end import without_end
 
 pytestmark = pytest.mark.long  # with each class compiled
@@ -47,7 +47,7 @@ def test_a_map_is_found_exactly_where_there_is_one_and_keeps_every_step(table, s
     image, preimage = np.zeros(size, np.int64), np.zeros(size, np.int64)
     ends = (table == -1).all(axis=1)
     queue = np.empty(size, np.int64)
-    found, steps = symmetry.symmetry(table, ends, -1, s, t, image, preimage, queue)
+    found, steps = graph.symmetry(table, ends, -1, s, t, image, preimage, queue)
     naive, waiting = {s: t}, [s]  # follow the same words of actions from both
     agree = True
     while waiting:
@@ -63,7 +63,7 @@ def test_a_map_is_found_exactly_where_there_is_one_and_keeps_every_step(table, s
         images = image - 1
         assert images.tolist() == [naive[u] for u in range(size)]
         np.testing.assert_array_equal(np.where(table < 0, -1, images[table]), table[images])
-    symmetry.forget(image, preimage, queue, steps)
+    graph.forget(image, preimage, queue, steps)
     assert (image == 0).all() and (preimage == 0).all()
 
 

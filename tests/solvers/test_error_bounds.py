@@ -352,7 +352,7 @@ def test_large_mdps_with_chance_near_gamma_1_are_solved_by_sparse_systems(neighb
 def test_elimination_is_counted_entry_by_entry():
     from scipy import sparse
 
-    from pharos.kernels import krylov
+    from pharos.kernels import linear_algebra
 
     rng = np.random.default_rng(0)
     for size in (1, 2, 7, 30):
@@ -364,9 +364,9 @@ def test_elimination_is_counted_entry_by_entry():
             below = pivot + 1 + np.flatnonzero(filled[pivot + 1 :, pivot])
             filled[np.ix_(below, below)] = True
         counts = np.tril(filled, -1).sum(axis=0)
-        assert krylov.entries_of_factor(matrix.indptr, matrix.indices, 10**6).tolist() == counts.tolist()
+        assert linear_algebra.entries_of_factor(matrix.indptr, matrix.indices, 10**6).tolist() == counts.tolist()
         if counts.sum() > 5:
-            assert krylov.entries_of_factor(matrix.indptr, matrix.indices, 5).sum() > 5
+            assert linear_algebra.entries_of_factor(matrix.indptr, matrix.indices, 5).sum() > 5
 
 
 @pytest.mark.parametrize("gamma", [0.9999, 0.999999, 0.99999999])

@@ -9,11 +9,9 @@ from pharos.system import compiling
 
 compiling.prepare(Path(__file__).parent)
 
-from pharos.kernels import packed_indices  # noqa: E402  (it loads Numba, which reads where to keep compiled code)
+from pharos.kernels import outcomes  # noqa: E402  (it loads Numba, which reads where to keep compiled code)
 
 _shared = """
-    batched_learning batched_rollouts batched_worlds bellman clocks components dense_search disk_table gaps graph
-    hash_table hitting horizon krylov landmarks learning many_searches observation_kernels occupancy outcomes
-    packed_indices packing palettes partition paths philox refinement sampled_learning stepping symmetry tails
-    tangent travel vicinity
+    batched bellman gaps graph hash_table hitting horizon learning linear_algebra many_searches observation_kernels
+    occupancy outcomes partition stepping
 """

@@ -1,19 +1,120 @@
-"""Bellman backups in place, over flat arrays. mdp/dynamics.py says what they mean, solvers/ proves their bounds.
+"""Bellman backups in place, over flat arrays, and the orders of states in which they converge soonest.
 
-Common arguments: transitions: see kernels/outcomes.py; table, palette: see mdp/rewards.py; v (S + 1,) float64,
-under sticky actions (S + 1, A) by the previously executed action, with row S 0, so that index -1 reads 0; weights:
-(chosen, previous, uniform); choice: 1.0 maximises, -1.0 minimises, (S,) integers are the actions of a policy; actions:
-a tuple of A zeros, whose length the compiler knows, so that the loops over actions are unrolled (a third faster). Each
-sweep goes from the last state to the first, of an order (S,) or, where that is None, of their numbers, and returns the
+mdp/dynamics.py says what they mean, solvers/ proves their bounds.
+
+Common arguments: transitions: see kernels/outcomes.py; table, palette: see mdp/rewards.py; v (S + 1,) float64, under
+sticky actions (S + 1, A) by the previously executed action, with row S 0, so that index -1 reads 0; weights: (chosen,
+previous, uniform); choice: 1.0 maximises, -1.0 minimises, (S,) integers are the actions of a policy; actions: a tuple
+of A zeros, whose length the compiler knows, so that the loops over actions are unrolled (a third faster). Each sweep
+goes from the last state to the first, of an order (S,) or, where that is None, of their numbers, and returns the
 largest change of an entry.
+
+Topological orders, in which each state comes before those that it may lead to: (S,) states, or None for that of their
+numbers. Source: Kahn (1962). live (S,) bool: states whose transitions count; what leads to -1 leads nowhere. Strongly
+connected components: sets of states each of which can come to each other, in topological order. Source: Tarjan (1972);
+with one number for each state: Pearce (2016), "A space-efficient algorithm for finding strongly connected components".
 """
 
 import numpy as np
 from numba import njit, types, uint64
 
 from pharos.kernels.interpreted import interpreted_first, overload
-from pharos.kernels.outcomes import expectation, fetch_values, size_of
-from pharos.kernels.paths import state_at
+from pharos.kernels.outcomes import expectation, fetch_values, outcome, outcomes_of, size_of
+
+# Orders ---------------------------------------------------------------------------------------------------------------
+
+
+def state_at(order, i):
+    """The state at place i."""
+
+
+@overload(state_at)
+def _state_at(order, i):
+    if isinstance(order, types.NoneType):
+        return lambda order, i: i
+    return lambda order, i: order[i]
+
+
+@interpreted_first()
+@njit(cache=True, nogil=True)
+def is_increasing(transitions, live, age):
+    """(s, a, t) of the first transition of a live state s to a state t whose age (S,) is not larger, or (-1, -1, -1).
+
+    age None: the number of the state.
+    """
+    num_states, num_actions = size_of(transitions)
+    for s in range(num_states):
+        if live[s]:
+            for a in range(num_actions):
+                for k in outcomes_of(transitions, s, a):
+                    t, _ = outcome(transitions, s, a, k)
+                    if t >= 0 and state_at(age, t) <= state_at(age, s):
+                        return s, a, np.int64(t)
+    return -1, -1, -1
+
+
+@interpreted_first()
+@njit(cache=True, nogil=True)
+def topological_order(transitions, live):
+    """The order; where there is a cycle, it lacks the states of the cycle and all that they lead to.
+
+    Cost: two passes over the transitions; 16 bytes a state.
+    """
+    num_states, num_actions = size_of(transitions)
+    waiting = np.zeros(num_states, np.int64)  # edges from states that are not done yet
+    for s in range(num_states):
+        if live[s]:
+            for a in range(num_actions):
+                for k in outcomes_of(transitions, s, a):
+                    t, _ = outcome(transitions, s, a, k)
+                    if t >= 0:
+                        waiting[t] += 1
+    order = np.empty(num_states, np.int64)
+    tail = 0
+    for s in range(num_states):
+        if waiting[s] == 0:
+            order[tail] = s
+            tail += 1
+    head = 0
+    while head < tail:
+        s = order[head]
+        head += 1
+        if not live[s]:
+            continue
+        for a in range(num_actions):
+            for k in outcomes_of(transitions, s, a):
+                t, _ = outcome(transitions, s, a, k)
+                if t >= 0:
+                    waiting[t] -= 1
+                    if waiting[t] == 0:
+                        order[tail] = t
+                        tail += 1
+    return order[:tail]
+
+
+@interpreted_first()
+@njit(cache=True, nogil=True)
+def longest_path(transitions, live, order):
+    """Edges of the longest path of states in such an order. Cost: one pass over the transitions; 4 bytes a state."""
+    num_states, num_actions = size_of(transitions)
+    length = np.zeros(num_states, np.int32)
+    longest = 0
+    for i in range(num_states - 1, -1, -1):
+        s = state_at(order, i)
+        if live[s]:
+            edges = 0
+            for a in range(num_actions):
+                for k in outcomes_of(transitions, s, a):
+                    t, _ = outcome(transitions, s, a, k)
+                    if t >= 0:
+                        edges = max(edges, length[t] + 1)
+            length[s] = edges
+            longest = max(longest, edges)
+    return longest
+
+
+# Backups --------------------------------------------------------------------------------------------------------------
+
 
 UNROLLED = 128  # actions
 # States between the one whose values are fetched and the one that is backed up: memory has that long to answer.
@@ -260,3 +361,151 @@ def chain_values(successor, reward, gamma, v, order):
             v[t] = reward[t] + (gamma * v[successor[t]] if successor[t] >= 0 else 0.0)
             mark[t] = -1
     return -1
+
+
+# Components -----------------------------------------------------------------------------------------------------------
+
+
+@njit(cache=True, nogil=True)
+def number_components(transitions, live, component, path, waiting):
+    """component[s] = the number of the component of s, in topological order. Returns how many there are.
+
+    A component has a smaller number than those that it leads to. component, path, waiting (S,) integers; the last two
+    are scratch.
+    Cost: one look at each transition, in the order of a depth-first search; 9 bytes a state on top.
+    """
+    num_states, num_actions = size_of(transitions)
+    action = np.empty(num_states, np.int32)  # of the states on the path, where to go on looking
+    branch = np.empty(num_states, np.int32)
+    is_root = np.empty(num_states, np.bool_)  # whether a state of the path is the first one seen of its component
+    component[:] = 0
+    number, last = 1, num_states  # numbers of states on the way go up from 1, those of finished components down from S
+    tail = 0
+    for start in range(num_states):
+        depth = -1
+        following = start
+        while component[start] == 0 or depth >= 0:
+            if component[following] == 0:
+                depth += 1
+                path[depth], action[depth], branch[depth], is_root[depth] = following, 0, 0, True
+                component[following] = number
+                number += 1
+            s = np.int64(path[depth])
+            following = s
+            if live[s]:
+                a, k = np.int64(action[depth]), np.int64(branch[depth])
+                while a < num_actions and following == s:
+                    while k < len(outcomes_of(transitions, s, a)):
+                        t, _ = outcome(transitions, s, a, k)
+                        if t >= 0 and component[t] == 0:
+                            following = np.int64(t)  # and look at this transition again, when it is finished
+                            break
+                        if t >= 0 and component[t] < component[s]:
+                            component[s] = component[t]
+                            is_root[depth] = False
+                        k += 1
+                    else:
+                        a, k = a + 1, np.int64(0)
+                action[depth], branch[depth] = a, k
+            if following != s:
+                continue
+            if is_root[depth]:
+                number -= 1
+                while tail > 0 and component[waiting[tail - 1]] >= component[s]:
+                    tail -= 1
+                    component[waiting[tail]] = last
+                    number -= 1
+                component[s] = last
+                last -= 1
+            else:
+                waiting[tail] = s
+                tail += 1
+            depth -= 1
+    for s in range(num_states):
+        component[s] -= last + 1
+    return num_states - last
+
+
+@njit(cache=True, nogil=True)
+def component_order(transitions, live, component, first, is_cyclic, order):
+    """order (S,) = the states by component, ascending in each; those of component c from first[c] to first[c + 1].
+
+    is_cyclic[c] = whether a state of c can be visited again. first (C + 1,) of zeros.
+    """
+    num_states, num_actions = size_of(transitions)
+    count = len(is_cyclic)
+    for s in range(num_states):
+        first[component[s]] += 1
+    total = 0
+    for c in range(count + 1):
+        size = first[c]
+        is_cyclic[min(c, count - 1)] |= size > 1
+        first[c] = total
+        total += size
+    for s in range(num_states):
+        c = component[s]
+        order[first[c]] = s
+        first[c] += 1
+        if live[s] and not is_cyclic[c]:
+            for a in range(num_actions):
+                for k in outcomes_of(transitions, s, a):
+                    t, _ = outcome(transitions, s, a, k)
+                    is_cyclic[c] |= t == s
+    for c in range(count, 0, -1):
+        first[c] = first[c - 1]
+    first[0] = 0
+
+
+@njit(cache=True, nogil=True)
+def joined(first, is_cyclic, least):
+    """(starts (G + 1,) in the order, whether each group has a cycle): neighbouring components put together.
+
+    Those without a cycle as many as there are; those with one, and whatever comes next, until they have `least` states.
+    """
+    starts = np.empty(len(first), np.int64)
+    has_cycle = np.empty(len(is_cyclic), np.bool_)
+    groups = 0
+    for c in range(len(is_cyclic)):
+        if groups > 0:
+            size = first[c] - starts[groups - 1]
+            if (size < least) if has_cycle[groups - 1] else not is_cyclic[c]:
+                continue
+        starts[groups], has_cycle[groups] = first[c], is_cyclic[c]
+        groups += 1
+    starts[groups] = first[-1]
+    return starts[: groups + 1], has_cycle[:groups]
+
+
+@njit(cache=True, nogil=True)
+def settle(
+    transitions,
+    table,
+    palette,
+    gamma,
+    uniform,
+    choice,
+    v,
+    actions,
+    order,
+    starts,
+    has_cycle,
+    target,
+    settled,
+    most,
+    before,
+):
+    """Sweep group by group, from the last to the first, each until it changes by at most `target`, or by its rounding.
+
+    starts, has_cycle: as `joined` makes them; settled: a change that is no more than rounding, relative to the values.
+    most: backups, after which each group that is left is swept once. before: the largest absolute value so
+    far. See kernels/bellman.py for the rest.
+    """
+    for group in range(len(has_cycle) - 1, -1, -1):
+        change, largest = np.inf, before
+        while change > max(target, settled * largest):
+            start, stop = starts[group], starts[group + 1]
+            change = optimal_sweep(transitions, table, palette, gamma, uniform, choice, v, actions, order, start, stop)
+            largest += change  # at least as large as the values
+            most -= stop - start
+            if most < 0 or not has_cycle[group]:
+                break

@@ -1,4 +1,12 @@
-"""Observations that need no rules: loops over the components of a block of states."""
+"""Observations that need no rules, by the components of a block of states, and tangent kernels of observations.
+
+Neural tangent kernels of one block of pairs (x, y) of observations, I times J of them: q: covariance of the
+pre-activations of a layer; theta: its tangent kernel; variance_x (I,), variance_y (J,): q of x with itself. Of a ReLU,
+E[f(u) f(v)] and E[f'(u) f'(v)] are arc-cosine kernels (Cho and Saul, 2009); of a hyperbolic tangent they are power
+series in the correlation, made of Hermite coefficients (Daniely, Frostig and Singer, 2016).
+"""
+
+import math
 
 import numpy as np
 from numba import njit
@@ -52,3 +60,115 @@ def scramble(states, low, lengths, keys, out):
                     drawn = _mixed(word)
                 out[n, place] ^= np.int8(drawn & one)
                 drawn >>= one
+
+
+# Tangent kernels ------------------------------------------------------------------------------------------------------
+
+
+RELU, TANH = 0, 1
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _relu(q, scale):
+    """(E[f(u) f(v)], E[f'(u) f'(v)]) of a centred Gaussian pair of covariance q; scale: product of the deviations."""
+    if scale <= 0.0:
+        return 0.0, 0.0
+    cosine = min(max(q / scale, -1.0), 1.0)
+    angle = math.pi - math.acos(cosine)
+    return scale * (math.sqrt(1.0 - cosine * cosine) + angle * cosine) / (2 * math.pi), angle / (2 * math.pi)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _series(q, scale, a, b):
+    """The same of an odd function with Hermite coefficients a, b (M,) of degree 1, 3, 5, ... at both deviations."""
+    correlation = min(max(q / scale, -1.0), 1.0) if scale > 0.0 else 0.0
+    power, value, slope = 1.0, 0.0, 0.0
+    for m in range(len(a)):
+        product = a[m] * b[m] * power
+        slope += (2 * m + 1) * product
+        value += product * correlation
+        power *= correlation * correlation
+    return value, slope / scale if scale > 0.0 else a[0] * b[0]
+
+
+@njit(cache=True, nogil=True)
+def dense(q, theta, variances_x, variances_y, kinds, coefficients_x, coefficients_y, widths, weights, biases, out):
+    """out (I, J) float32 = the tangent kernel of the output of dense layers, the last of them linear.
+
+    q, theta (I, J): of the first hidden layer. variances_x (L, I), variances_y (L, J): of all hidden layers.
+    kinds (L,): RELU or TANH; coefficients_x (L, I, M), coefficients_y: of TANH. widths (L,): units. weights, biases
+    (L,): variances of an entry of the following layer.
+    """
+    layers = len(widths)
+    for i in range(out.shape[0]):
+        for j in range(out.shape[1]):
+            covariance, tangent = q[i, j], theta[i, j]
+            for layer in range(layers):
+                scale = math.sqrt(variances_x[layer, i] * variances_y[layer, j])
+                if kinds[layer] == 0:
+                    value, slope = _relu(covariance, scale)
+                else:
+                    value, slope = _series(covariance, scale, coefficients_x[layer, i], coefficients_y[layer, j])
+                inner = widths[layer] * value
+                tangent = inner + 1.0 + weights[layer] * widths[layer] * slope * tangent
+                covariance = weights[layer] * inner + biases[layer]
+            out[i, j] = tangent
+
+
+@njit(cache=True, nogil=True)
+def patches(gram, codes_x, codes_y, variance_x, variance_y, weight, bias, value, slope):
+    """One position of a first convolution with ReLUs: value (I, J) = E[f f], slope (I, J) = E[f' f'] (gram + 1).
+
+    gram (U, V): inner products of the different patches; codes_x (I,), codes_y (J,): which of them x and y have there.
+    variance_x (U,), variance_y (V,): of the different patches. weight, bias: variances of an entry.
+    """
+    values, slopes = np.empty(gram.shape, np.float32), np.empty(gram.shape, np.float32)
+    for u in range(gram.shape[0]):
+        for v in range(gram.shape[1]):
+            scale = math.sqrt(variance_x[u] * variance_y[v])
+            mean, derivative = _relu(weight * gram[u, v] + bias, scale)
+            values[u, v] = mean
+            slopes[u, v] = derivative * (gram[u, v] + 1.0)
+    for i in range(len(codes_x)):
+        for j in range(len(codes_y)):
+            value[i, j] = values[codes_x[i], codes_y[j]]
+            slope[i, j] = slopes[codes_x[i], codes_y[j]]
+
+
+@njit(cache=True, nogil=True)
+def gathered(value, slope, taps, filters, weight, bias, q, theta):
+    """q, theta (I, J) of a unit that sees some positions of a convolution of `filters` filters: value, slope (P, I, J).
+
+    taps: indices of the positions; -1: padding. weight, bias: variances of an entry of this unit.
+    """
+    q[:] = 0.0
+    theta[:] = 0.0
+    for p in taps:
+        if p >= 0:
+            for i in range(q.shape[0]):
+                for j in range(q.shape[1]):
+                    q[i, j] += value[p, i, j]
+                    theta[i, j] += slope[p, i, j]
+    for i in range(q.shape[0]):
+        for j in range(q.shape[1]):
+            inner = filters * q[i, j]
+            theta[i, j] = inner + 1.0 + weight * filters * theta[i, j]
+            q[i, j] = weight * inner + bias
+
+
+@njit(cache=True, nogil=True)
+def rectified(q, theta, variance_x, variance_y, value, slope):
+    """value (I, J) = E[f f], slope (I, J) = E[f' f'] theta of ReLUs at covariance q (I, J)."""
+    for i in range(q.shape[0]):
+        for j in range(q.shape[1]):
+            mean, derivative = _relu(q[i, j], math.sqrt(variance_x[i] * variance_y[j]))
+            value[i, j] = mean
+            slope[i, j] = derivative * theta[i, j]
+
+
+@njit(cache=True, nogil=True)
+def mirrored(square):
+    """Copy the upper triangle of square (N, N) to the lower one."""
+    for i in range(square.shape[0]):
+        for j in range(i):
+            square[i, j] = square[j, i]

@@ -1,4 +1,8 @@
-"""What executing an action may lead to, for loops that do not ask how it is stored.
+"""Outcomes of executing an action, for loops that do not ask how they are stored.
+
+`PackedIndices` are read like arrays of int64, entry by entry. So a loop over `next_states[s, a]` is written once, and
+Numba compiles it for each width of the indices; what it makes of int32 and int64 stays what it is. They cannot be
+written to here, nor returned.
 
 Kernels take `transitions`, one of three things:
 
@@ -13,16 +17,97 @@ Kernels take `transitions`, one of three things:
 
 `outcomes_of` and `outcome` give them one by one, `expectation` adds up values. Loops over tables cost nothing more:
 their indices are unsigned, as signed ones would be asked at each read whether they count from the end.
+
+State spaces store the possible outcomes, row after row, and their probabilities as codes of a palette. Row s A + a is
+that of action a in state s. Probabilities are seen as their bits, uint64: 0 is an impossible outcome. The palette
+(capacity, K) uint64 has the distinct rows of probabilities, the possible ones in their order, then zeros, numbered in
+the order in which they are met; a table of slots finds them by their hash. K is the most outcomes of a row.
 """
 
-import numpy as np
-from numba import njit, types, uint64
+import operator
 
-from pharos.kernels.hash_table import prefetch
+import numba.extending
+import numpy as np
+from numba import from_dtype, int64, njit, types, uint64
+from numba.core import cgutils
+from numba.extending import (
+    NativeValue,
+    make_attribute_wrapper,
+    models,
+    overload_attribute,
+    register_model,
+    unbox,
+)
+
+from pharos.kernels.hash_table import mixed, prefetch, slot_of
 from pharos.kernels.interpreted import interpreted_first, overload
-from pharos.kernels.packed_indices import PackedIndicesType
+from pharos.system.packed_indices import PACKED, PackedIndices
+
+# Indices of 40 bits ---------------------------------------------------------------------------------------------------
+
+
+class PackedIndicesType(types.Type):
+    """Numba's type of them, by the number of dimensions."""
+
+    def __init__(self, ndim):
+        self.entries = types.Array(from_dtype(PACKED), ndim, "C", readonly=True)
+        super().__init__(name=f"pharos.PackedIndices({ndim})")
+
+
+@register_model(PackedIndicesType)
+class _PackedIndicesModel(models.StructModel):
+    def __init__(self, manager, indices_type):
+        super().__init__(manager, indices_type, [("entries", indices_type.entries)])
+
+
+make_attribute_wrapper(PackedIndicesType, "entries", "entries")
+
+
+@unbox(PackedIndicesType)
+def _unboxed(indices_type, indices, c):
+    array = c.pyapi.object_getattr_string(indices, "packed")
+    entries = c.unbox(indices_type.entries, array)
+    c.pyapi.decref(array)  # the object keeps it
+    result = cgutils.create_struct_proxy(indices_type)(c.context, c.builder)
+    result.entries = entries.value
+    return NativeValue(result._getvalue(), is_error=entries.is_error, cleanup=entries.cleanup)
+
+
+@numba.extending.overload(operator.getitem, jit_options={"forceinline": True})
+def _getitem(indices, where):
+    if not isinstance(indices, PackedIndicesType):
+        return None
+
+    def entry(indices, where):
+        parts = indices.entries[where]
+        return np.int64(parts.high) << 32 | np.int64(parts.low)
+
+    return entry
+
+
+@overload_attribute(PackedIndicesType, "shape")
+def _shape(indices):
+    return lambda indices: indices.entries.shape
+
+
+@numba.extending.overload(len)
+def _length(indices):
+    if isinstance(indices, PackedIndicesType):
+        return lambda indices: len(indices.entries)
+    return None
+
+
+def _type_of(indices):
+    return PackedIndicesType(indices.ndim)
+
+
+PackedIndices._numba_type_ = property(_type_of)  # type: ignore[attr-defined]
+
 
 # The largest K that the compiler is told.
+# Transitions ----------------------------------------------------------------------------------------------------------
+
+
 UNROLLED = 4
 
 
@@ -302,3 +387,111 @@ def have_one_outcome(transitions):
                     return False
                 break
     return True
+
+
+# Palettes -------------------------------------------------------------------------------------------------------------
+
+
+_SEED = uint64(0x9E3779B97F4A7C15)
+
+
+@njit(cache=True, nogil=True)
+def possible(successors, bits, num_actions, out, likely, counts):
+    """Take the possible outcomes of some states: N successors to out, their bits to likely, how many each row has to
+    counts.
+
+    successors (rows, A K), bits (rows, A K); out, likely (at least N,), counts (rows * A,). Returns N.
+    """
+    rows, branches = successors.shape
+    most = branches // num_actions
+    n = 0
+    for i in range(rows):
+        for a in range(num_actions):
+            before = n
+            for b in range(a * most, (a + 1) * most):
+                if bits[i, b] != 0:
+                    out[n], likely[n] = successors[i, b], bits[i, b]
+                    n += 1
+            counts[i * num_actions + a] = n - before
+    return n
+
+
+@njit(cache=True, nogil=True)
+def encode(likely, counts, first_row, first, palette, size, table, codes):
+    """codes[r] = the number of row r's probabilities in the palette, for the rows from `first_row` on; new ones are
+    entered.
+
+    likely (N,): the row's are those from `first` on. Returns (row, first, size) of the first row that finds the palette
+    full; row is len(counts) where there is none.
+    """
+    capacity, most = palette.shape
+    slots = table.shape[0]
+    code = int64(-1)
+    row = first_row
+    while row < len(counts):
+        n = counts[row]
+        if code < 0 or not _is(palette, code, likely, first, n):
+            h = _SEED
+            for k in range(n):
+                h = mixed(h ^ likely[first + k])
+            slot = slot_of(h, slots)
+            while True:
+                code = int64(table[slot])
+                if code < 0 or _is(palette, code, likely, first, n):
+                    break
+                slot = slot + 1 if slot + 1 < slots else 0
+            if code < 0:
+                if size == capacity:
+                    return row, first, size
+                code = size
+                for k in range(n):
+                    palette[code, k] = likely[first + k]
+                for k in range(n, most):
+                    palette[code, k] = 0
+                table[slot] = code
+                size += 1
+        codes[row] = code
+        first += n
+        row += 1
+    return row, first, size
+
+
+@njit(cache=True, nogil=True)
+def enter(palette, size, table):
+    """Put the first `size` vectors of a palette, all different, into an empty table (every slot -1)."""
+    slots = table.shape[0]
+    for code in range(size):
+        h = _SEED
+        for k in range(palette.shape[1]):
+            if palette[code, k] != 0:
+                h = mixed(h ^ palette[code, k])
+        slot = slot_of(h, slots)
+        while table[slot] >= 0:
+            slot = slot + 1 if slot + 1 < slots else 0
+        table[slot] = code
+
+
+@njit(forceinline=True)
+def _is(palette, code, likely, first, n):
+    """Whether the vector of this number is that of a row of n outcomes."""
+    if n < palette.shape[1] and palette[code, n] != 0:
+        return False
+    for k in range(n):
+        if palette[code, k] != likely[first + k]:
+            return False
+    return True
+
+
+@njit(cache=True, nogil=True)
+def padded(values, counts, fill_with_first, out):
+    """out[r] (K,) = the values of row r, then the first of them, or zeros.
+
+    values (N,), counts (rows,), out (rows, K).
+    """
+    first = 0
+    for row in range(len(counts)):
+        n = counts[row]
+        rest = values[first] if fill_with_first else values[first] * 0
+        for k in range(out.shape[1]):
+            out[row, k] = values[first + k] if k < n else rest
+        first += n

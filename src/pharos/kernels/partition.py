@@ -2,6 +2,13 @@
 
 Exact: hashes only say where to look, and rows are compared entry by entry. `slots` is a hash table of at least twice as
 many entries as rows, -1 where empty, that is empty again after each call.
+
+Under transition probabilities classes split by the probabilities of reaching classes, into the coarsest stable
+partition. Rows are those of a sparse matrix, row s A + a of state s and action a; columns from S on are no state. Two
+rows are alike if they reach every class with the same probability, rounded to 2^-40, so that the order of additions
+does not matter. Members of a class lie side by side in `elements`. Of the groups into which it falls the largest keeps
+its number, and only states that lead to a class with a new number are asked again: a state is renumbered at most
+log2(S) times. Source: Hopcroft (1971); Valmari and Franceschinis (2010), "Simple O(m log n) time Markov chain lumping".
 """
 
 import numpy as np
@@ -129,4 +136,235 @@ def split(next_states, classes, sizes, count, candidates, n, slots, used, new, c
             sizes[new[i]] += 1
             classes[s] = new[i]
             changed[s] = True
+    return count
+
+
+# Transition probabilities ---------------------------------------------------------------------------------------------
+
+
+# Probabilities are compared in these units.
+UNITS = 2.0**40
+
+
+@njit(cache=True, nogil=True)
+def predecessors(first, column, num_actions, edges, states):
+    """states[edges[t]:edges[t + 1]] = the states that some action may lead to t; edges (S + 1,), states (outcomes,)."""
+    size = len(edges) - 1
+    edges[:] = 0
+    for k in range(len(column)):
+        if column[k] < size:
+            edges[column[k] + 1] += 1
+    for t in range(size):
+        edges[t + 1] += edges[t]
+    for s in range(size):
+        for k in range(first[s * num_actions], first[(s + 1) * num_actions]):
+            t = column[k]
+            if t < size:
+                states[edges[t]] = s
+                edges[t] += 1
+    for t in range(size, 0, -1):
+        edges[t] = edges[t - 1]
+    edges[0] = 0
+
+
+@njit(cache=True, nogil=True)
+def _reached(matrix, row, classes, mass, keys):
+    """mass[c] = the probability of reaching class c, for the c in keys[:result]; mass is 0 before."""
+    first, column, weight = matrix
+    n = 0
+    for k in range(first[row], first[row + 1]):
+        if column[k] < len(classes):
+            c = classes[column[k]]
+            if mass[c] == 0.0:
+                keys[n] = c
+                n += 1
+            mass[c] += weight[k]
+    return n
+
+
+@njit(cache=True, nogil=True)
+def _hash(matrix, num_actions, s, classes, mass, keys):
+    """The same for states whose rows are alike, in whatever order they name classes."""
+    result = uint64(num_actions)
+    for row in range(s * num_actions, (s + 1) * num_actions):
+        total = uint64(0)
+        for i in range(_reached(matrix, row, classes, mass, keys)):
+            whole = np.int64(np.rint(mass[keys[i]] * UNITS))
+            if whole > 0:
+                total += mixed(mixed(uint64(keys[i])) ^ uint64(whole))
+            mass[keys[i]] = 0.0
+        result = mixed(result ^ total)
+    return result
+
+
+@njit(cache=True, nogil=True)
+def _alike(matrix, num_actions, s, other, classes, mass, keys, mass_of_other, keys_of_other):
+    """Whether all rows of two states are alike."""
+    for a in range(num_actions):
+        n = _reached(matrix, s * num_actions + a, classes, mass, keys)
+        m = _reached(matrix, other * num_actions + a, classes, mass_of_other, keys_of_other)
+        same = True
+        for i in range(n):
+            same = same and np.rint(mass[keys[i]] * UNITS) == np.rint(mass_of_other[keys[i]] * UNITS)
+        for i in range(m):
+            c = keys_of_other[i]
+            same = same and np.rint(mass[c] * UNITS) == np.rint(mass_of_other[c] * UNITS)
+        mass[keys[:n]] = 0.0
+        mass_of_other[keys_of_other[:m]] = 0.0
+        if not same:
+            return False
+    return True
+
+
+@njit(cache=True, nogil=True)
+def refine(matrix, num_actions, into, classes, layout, slots):
+    """Split classes (S,), numbered from 0 without gaps, until nothing splits; returns the rounds, the last in vain.
+
+    into: `predecessors`. layout: elements, place, begin, sizes, (S,) each, and slots, a power of 2 of at least 2 S that
+    are all -1: scratch.
+    """
+    size, kind = len(classes), classes.dtype
+    count = _laid_out(classes, layout)
+    candidates, touched, asked_of = np.arange(size).astype(kind), np.empty(size, kind), np.zeros(size, kind)
+    renumbered, number = np.empty(size, kind), np.empty(size, kind)
+    rows = (np.zeros(size), np.empty(size, kind), np.zeros(size), np.empty(size, kind))
+    groups = (np.empty(size, kind), np.empty(size, kind), np.empty(size, np.uint64), slots, np.empty(size, kind))
+    group_sizes = np.empty(size, kind)
+    is_asked = np.zeros(size, np.bool_)
+    n, rounds = size, 0
+    while True:
+        rounds += 1
+        num_touched = _to_the_front(candidates, n, classes, layout, asked_of, touched)
+        changed = 0
+        for i in range(num_touched):
+            c = touched[i]
+            k, asked_of[c] = asked_of[c], 0
+            if layout[3][c] > 1:
+                num_groups = _grouped(matrix, num_actions, c, k, classes, layout, groups, group_sizes, rows)
+                if num_groups > 1:
+                    count, changed = _split(
+                        c, k, num_groups, count, layout, groups, group_sizes, renumbered, number, changed
+                    )
+        if changed == 0:
+            return rounds
+        n = 0
+        edges, states = into
+        for i in range(changed):  # all signatures of a round are in terms of the classes before it
+            s = renumbered[i]
+            classes[s] = number[i]
+            for k in range(edges[s], edges[s + 1]):
+                if not is_asked[states[k]]:
+                    is_asked[states[k]] = True
+                    candidates[n] = states[k]
+                    n += 1
+        for i in range(n):
+            is_asked[candidates[i]] = False
+
+
+@njit(cache=True, nogil=True)
+def _to_the_front(candidates, n, classes, layout, asked_of, touched):
+    """Members that are asked come first in their class, asked_of[c] of them; returns how many classes are touched."""
+    elements, place, begin, _ = layout
+    num_touched = 0
+    for i in range(n):
+        s = candidates[i]
+        c = classes[s]
+        if asked_of[c] == 0:
+            touched[num_touched] = c
+            num_touched += 1
+        front, here = begin[c] + asked_of[c], place[s]
+        t = elements[front]
+        elements[front], elements[here] = s, t
+        place[s], place[t] = front, here
+        asked_of[c] += 1
+    return num_touched
+
+
+@njit(cache=True, nogil=True)
+def _grouped(matrix, num_actions, c, k, classes, layout, groups, group_sizes, rows):
+    """group[j] of the first k members of class c: members whose rows are alike; returns how many groups.
+
+    The others lead where they led before: one of them stands for all, and opens group 0.
+    """
+    elements, _, begin, sizes = layout
+    group, member, hashes, slots, used = groups
+    mask = len(slots) - 1
+    num_groups = 0
+    for j in range(-1 if k < sizes[c] else 0, k):
+        s = elements[begin[c] + (k if j < 0 else j)]
+        h = _hash(matrix, num_actions, s, classes, rows[0], rows[1])
+        slot = np.int64(h) & mask
+        while True:
+            g = slots[slot]
+            if g < 0:
+                g = num_groups
+                slots[slot] = g
+                used[g], hashes[g], member[g], group_sizes[g] = slot, h, s, 0
+                num_groups += 1
+                break
+            if hashes[g] == h and _alike(matrix, num_actions, s, member[g], classes, *rows):
+                break
+            slot = (slot + 1) & mask
+        if j >= 0:
+            group[j] = g
+        group_sizes[g] += 1 if j >= 0 else sizes[c] - k
+    for g in range(num_groups):
+        slots[used[g]] = -1
+    return num_groups
+
+
+@njit(cache=True, nogil=True)
+def _split(c, k, num_groups, count, layout, groups, group_sizes, renumbered, number, changed):
+    """Lay the groups of class c side by side and number them anew, but for the largest; returns (classes, renumbered
+    states).
+
+    Group 0 comes last, beside the members that were not asked.
+    """
+    elements, place, begin, sizes = layout
+    group, ends, _, _, states = groups
+    largest, at = 0, begin[c]
+    for g in range(num_groups - 1, -1, -1):
+        ends[g] = at
+        at += group_sizes[g]
+        if group_sizes[g] > group_sizes[largest]:
+            largest = g
+    states[:k] = elements[begin[c] : begin[c] + k]
+    for j in range(k):
+        s = states[j]
+        elements[ends[group[j]]], place[s] = s, ends[group[j]]
+        ends[group[j]] += 1
+    at = begin[c]
+    for g in range(num_groups - 1, -1, -1):
+        new = c
+        if g != largest:
+            new = count
+            count += 1
+            for j in range(at, at + group_sizes[g]):
+                renumbered[changed], number[changed] = elements[j], new
+                changed += 1
+        begin[new], sizes[new] = at, group_sizes[g]
+        at += group_sizes[g]
+    return count, changed
+
+
+@njit(cache=True, nogil=True)
+def _laid_out(classes, layout):
+    """Members of each class side by side: elements[begin[c]:begin[c] + sizes[c]], s at place[s]; returns how many
+    classes."""
+    elements, place, begin, sizes = layout
+    count = 0
+    sizes[:] = 0
+    for s in range(len(classes)):
+        sizes[classes[s]] += 1
+        count = max(count, classes[s] + 1)
+    at = 0
+    for c in range(count):
+        begin[c] = at
+        at += sizes[c]
+    for s in range(len(classes)):
+        place[s] = begin[classes[s]]
+        elements[place[s]] = s
+        begin[classes[s]] += 1
+    for c in range(count):
+        begin[c] -= sizes[c]
     return count

@@ -105,15 +105,15 @@ def _refined(table: Indices, classes: np.ndarray) -> tuple[np.ndarray, int]:
 
 def _refined_general(mdp: TabularMDP, classes: np.ndarray) -> tuple[np.ndarray, int]:
     """The same for transition probabilities."""
-    from pharos.kernels import partition, refinement
+    from pharos.kernels import partition
 
     states, matrix = mdp.num_states, mdp.dynamics.matrix()
     small = np.int32 if max(states, matrix.nnz) < 2**31 else np.int64
     rows = (matrix.indptr.astype(np.int64, copy=False), matrix.indices.astype(small, copy=False), matrix.data)
     into = np.empty(states + 1, np.int64), np.empty(matrix.nnz, small)
-    refinement.predecessors(rows[0], rows[1], mdp.num_actions, *into)
+    partition.predecessors(rows[0], rows[1], mdp.num_actions, *into)
     now, layout = classes.astype(small), tuple(np.empty(states, small) for _ in range(4))
-    rounds = refinement.refine(rows, mdp.num_actions, into, now, layout, partition.slots_for(states))
+    rounds = partition.refine(rows, mdp.num_actions, into, now, layout, partition.slots_for(states))
     return _numbered(now[:, None], np.zeros(states, np.int64)), int(rounds)
 
 

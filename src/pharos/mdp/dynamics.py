@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from pharos.errors import ParameterError
-from pharos.kernels import bellman, graph, occupancy, outcomes, paths
+from pharos.kernels import bellman, graph, occupancy, outcomes
 from pharos.mdp.chance import Chance
 from pharos.mdp.rewards import Rewards
 from pharos.mdp.selection import Extreme, PolicyTable, Selection
@@ -321,16 +321,16 @@ class Dynamics(ABC):
             least: small components with cycles are put together until a group has as many states.
         Cost: one look at each transition, and 33 bytes a state.
         """
-        from pharos.kernels import components  # which few need
+        from pharos.kernels import bellman  # which few need
 
         dtype = np.int32 if self.num_states < 2**31 else np.int64
         number, path, waiting = (np.empty(self.num_states, dtype) for _ in range(3))
-        count = components.number_components(self.for_kernels, live, number, path, waiting)
+        count = bellman.number_components(self.for_kernels, live, number, path, waiting)
         first, is_cyclic = np.zeros(count + 1, np.int64), np.zeros(count, np.bool_)
         order = np.empty(self.num_states, np.int64)
-        components.component_order(self.for_kernels, live, number, first, is_cyclic, order)
+        bellman.component_order(self.for_kernels, live, number, first, is_cyclic, order)
         largest = int(np.diff(first).max(initial=0, where=is_cyclic))
-        starts, has_cycle = components.joined(first, is_cyclic, least)
+        starts, has_cycle = bellman.joined(first, is_cyclic, least)
         return Components(order, starts, has_cycle, count, largest)
 
     def settle_components(
@@ -344,12 +344,12 @@ class Dynamics(ABC):
         """
         choice, before = _choice(equation.select), float(max(x.max(), -x.min()))
         if choice is not None and not equation.chance.is_sticky:
-            from pharos.kernels import components
+            from pharos.kernels import bellman
 
             tables = (self.for_sweeps, equation.rewards.table, equation.rewards.palette, equation.gamma)
             actions, chance = bellman.actions_of(self.num_actions), equation.chance.uniform
             groups = (parts.order, parts.starts, parts.has_cycle)
-            components.settle(*tables, chance, choice, x[:, 0], actions, *groups, target, settled, most, before)
+            bellman.settle(*tables, chance, choice, x[:, 0], actions, *groups, target, settled, most, before)
             return
         for group in range(len(parts.has_cycle) - 1, -1, -1):
             start, stop = int(parts.starts[group]), int(parts.starts[group + 1])
@@ -364,15 +364,15 @@ class Dynamics(ABC):
     def order(self, live: np.ndarray) -> Order | None:
         """An order of states in which each live one (S,) bool stands before those it leads to; None: there is none."""
         states = None
-        if paths.is_increasing(self.for_kernels, live, None)[0] >= 0:
-            states = paths.topological_order(self.for_kernels, live)
+        if bellman.is_increasing(self.for_kernels, live, None)[0] >= 0:
+            states = bellman.topological_order(self.for_kernels, live)
             if len(states) < self.num_states:
                 return None
-        return Order(states, int(paths.longest_path(self.for_kernels, live, states)))
+        return Order(states, int(bellman.longest_path(self.for_kernels, live, states)))
 
     def check_age(self, live: np.ndarray, age: np.ndarray) -> None:
         """ParameterError unless each transition of a live state (S,) bool leads to one of larger age (S,)."""
-        s, a, t = paths.is_increasing(self.for_kernels, live, age)
+        s, a, t = bellman.is_increasing(self.for_kernels, live, age)
         if s >= 0:
             raise ParameterError(
                 f"age: state {s}, of age {age[s]}, leads by action {a} to state {t}, of age {age[t]}; expected more"

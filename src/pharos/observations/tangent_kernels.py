@@ -153,7 +153,7 @@ def tangent_kernel(network: Network, x: np.ndarray, y: np.ndarray | None = None)
 
     in_blocks(run, len(blocks), 1)
     if y is None:
-        from pharos.kernels.tangent import mirrored
+        from pharos.kernels.observation_kernels import mirrored
 
         mirrored(out)
     return out
@@ -233,7 +233,7 @@ class _Convolved:
         return result
 
     def __call__(self, rows: slice, columns: slice) -> tuple[np.ndarray, np.ndarray]:
-        from pharos.kernels import tangent
+        from pharos.kernels import observation_kernels
 
         shape = (len(self.x[0].codes[rows]), len(self.y[0].codes[columns]))
         value, slope = (np.empty((self.positions, *shape), np.float32) for _ in range(2))
@@ -241,17 +241,17 @@ class _Convolved:
         for p in range(self.positions):
             (of_x, codes_x, squares_x), (of_y, codes_y, squares_y) = self.x[p].met(rows), self.y[p].met(columns)
             variances = weight * squares_x + bias, weight * squares_y + bias
-            tangent.patches(of_x @ of_y.T, codes_x, codes_y, *variances, weight, bias, value[p], slope[p])
+            observation_kernels.patches(of_x @ of_y.T, codes_x, codes_y, *variances, weight, bias, value[p], slope[p])
         q, theta = np.empty(shape), np.empty(shape)
         for number, taps in enumerate(self.taps):
             filters, constants = float(self.layers[number].filters), self.constants[number + 1]
             is_last = number == len(self.taps) - 1
             after = None if is_last else [np.empty((len(taps), *shape), np.float32) for _ in range(2)]
             for p, window in enumerate(taps):
-                tangent.gathered(value, slope, window, filters, *constants, q, theta)
+                observation_kernels.gathered(value, slope, window, filters, *constants, q, theta)
                 if after is not None:
                     of_x, of_y = self.variances_x[number + 1][p, rows], self.variances_y[number + 1][p, columns]
-                    tangent.rectified(q, theta, of_x, of_y, after[0][p], after[1][p])
+                    observation_kernels.rectified(q, theta, of_x, of_y, after[0][p], after[1][p])
             if after is not None:
                 value, slope = after
         return q, theta
@@ -326,7 +326,7 @@ class _Head:
         return np.stack(variances[:-1]), np.stack(coefficients)
 
     def __call__(self, q: np.ndarray, theta: np.ndarray, rows: slice, columns: slice, out: np.ndarray) -> None:
-        from pharos.kernels.tangent import dense
+        from pharos.kernels.observation_kernels import dense
 
         (of_x, series_x), (of_y, series_y) = self.x, self.y
         sides = of_x[:, rows], of_y[:, columns]

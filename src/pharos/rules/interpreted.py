@@ -16,8 +16,7 @@ import numpy as np
 
 from pharos.environments import Environment
 from pharos.errors import RuleError
-from pharos.kernels.hash_table import COUNT, FIRST, find, insert_missing, slots_of
-from pharos.kernels.packing import pack_rows, unpack_rows
+from pharos.kernels.hash_table import COUNT, FIRST, find, insert_missing, pack_rows, slots_of, unpack_rows
 from pharos.rules.layout import Layout, unpack
 from pharos.system.outcome_rows import SUM_TOLERANCE
 

@@ -2,7 +2,7 @@
 
 Component i with `size[i]` values takes ceil(log2(size[i])) bits and holds value - low[i]. Components follow one another
 in the order of declaration; one that would straddle two words starts the next word. The rule is part of the file
-format. `kernels.packing` has compiled twins of `pack` and `unpack` for a few states at a time; this file loads no
+format. `kernels.hash_table` has compiled twins of `pack` and `unpack` for a few states at a time; this file loads no
 Numba.
 """
 

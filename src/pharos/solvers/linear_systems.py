@@ -84,34 +84,34 @@ def bicgstab(
         steps: of two applications each, at most.
     SciPy's adds up by BLAS, whose sums depend on the number of threads, and which waits for them on a busy machine.
     """
-    from pharos.kernels import krylov
+    from pharos.kernels import linear_algebra
 
     size = len(right)
     constant = float(times(np.ones(size)).mean())
     x, towards, onwards = np.zeros(size), np.empty(size), np.empty(size)
     residual, direction, moved = right.copy(), right.copy(), np.empty(size)
     total = float(right.sum())
-    rho = norm = whole = krylov.products(right, right)[1]
+    rho = norm = whole = linear_algebra.products(right, right)[1]
     enough, step = shrinkage * shrinkage * norm, 0
     best = norm
     with np.errstate(all="ignore"):  # a breakdown is NaN, and does not converge
         while norm > enough and step < steps:
             step += 1
             # Preconditioned: where episodes do not end, constant vectors shrink to 1 - gamma, which slows all methods.
-            krylov.shift(direction, np.float64(total) / size / constant, towards)
+            linear_algebra.shift(direction, np.float64(total) / size / constant, towards)
             moved[:] = times(towards)
-            alpha = np.float64(rho) / krylov.products(right, moved)[0]
-            total = krylov.advance(residual, -alpha, moved)
-            krylov.shift(residual, np.float64(total) / size / constant, onwards)
+            alpha = np.float64(rho) / linear_algebra.products(right, moved)[0]
+            total = linear_algebra.advance(residual, -alpha, moved)
+            linear_algebra.shift(residual, np.float64(total) / size / constant, onwards)
             stabilised = times(onwards)
-            across, own = krylov.products(residual, stabilised)
+            across, own = linear_algebra.products(residual, stabilised)
             omega = np.float64(across) / own
-            krylov.advance(x, alpha, towards)
-            krylov.advance(x, omega, onwards)
-            krylov.advance(residual, -omega, stabilised)
+            linear_algebra.advance(x, alpha, towards)
+            linear_algebra.advance(x, omega, onwards)
+            linear_algebra.advance(residual, -omega, stabilised)
             before = rho
-            rho, norm = krylov.products(right, residual)
-            total = krylov.turn(direction, (rho / np.float64(before)) * (alpha / omega), omega, moved, residual)
+            rho, norm = linear_algebra.products(right, residual)
+            total = linear_algebra.turn(direction, (rho / np.float64(before)) * (alpha / omega), omega, moved, residual)
             if not norm < 1e8 * best:
                 break
             best = min(best, norm)
@@ -121,8 +121,8 @@ def bicgstab(
 
 def fills_little(matrix: "csr_matrix") -> bool:
     """Whether elimination in the order of the rows, with pivots on the diagonal, keeps within the limits above."""
-    from pharos.kernels import krylov
+    from pharos.kernels import linear_algebra
 
     both = (abs(matrix) + abs(matrix).T).tocsr()
-    entries = krylov.entries_of_factor(both.indptr, both.indices, MOST_ENTRIES).astype(float)
+    entries = linear_algebra.entries_of_factor(both.indptr, both.indices, MOST_ENTRIES).astype(float)
     return bool(entries.sum() <= MOST_ENTRIES and entries @ entries <= MOST_MULTIPLICATIONS)

@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 
-from pharos.kernels import bellman, krylov
+from pharos.kernels import bellman, linear_algebra
 from pharos.mdp import (
     BellmanEquation,
     PolicyTable,
@@ -183,7 +183,7 @@ class PolicyIteration:
         def times(y: np.ndarray) -> np.ndarray:
             image[:] = y
             mdp.dynamics.sweep(silent, swept)
-            krylov.take_from(y, image)
+            linear_algebra.take_from(y, image)
             return image
 
         step, _, applications = bicgstab(times, right, FORCING, STEPS)

@@ -1,6 +1,6 @@
 """The table of states on disk, for state spaces whose table does not fit in memory.
 
-kernels/disk_table.py has its layout.
+kernels/hash_table.py has its layout.
 """
 
 import contextlib
@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pharos.kernels import disk_table as kernels
+from pharos.kernels import hash_table as kernels
 from pharos.kernels.hash_table import slots_of
 from pharos.state_space.files import cannot_write
 from pharos.system.memory import mapped_file

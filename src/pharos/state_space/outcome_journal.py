@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from pharos.kernels import palettes
+from pharos.kernels import outcomes as kernels
 from pharos.state_space.checks import states_to_check
 from pharos.state_space.files import GrowingFile
 from pharos.state_space.journal import Journal, Position
@@ -75,7 +75,7 @@ class OutcomeJournal(Journal):
             self._vectors = len(vectors)
             self.palette = np.zeros((max(len(self.palette), self._vectors), self._most), np.uint64)
             self.palette[: self._vectors] = vectors
-            palettes.enter(self.palette, self._vectors, self._table)
+            kernels.enter(self.palette, self._vectors, self._table)
         if position.first:
             outcomes = self._parts(position.first).of_states(states_to_check(position.first))
             bits = np.memmap(self.path / TERMINAL, "|u1", "r")
@@ -103,7 +103,7 @@ class OutcomeJournal(Journal):
         bits = np.ascontiguousarray(block.probabilities).view(np.uint64)
         counts = np.empty(len(bits) * self._num_actions, np.int64)
         following, likely = np.empty(bits.size, self.index_dtype), np.empty(bits.size, np.uint64)
-        size = palettes.possible(block.successors, bits, self._num_actions, following, likely, counts)
+        size = kernels.possible(block.successors, bits, self._num_actions, following, likely, counts)
         num_vectors = self._vectors
         codes = self._encoded(likely[:size], counts)
         if codes is None and self.palette is not None:
@@ -128,7 +128,7 @@ class OutcomeJournal(Journal):
         row = first = 0
         while self.palette is not None:
             arrays = self.palette, self._vectors, self._table, codes
-            row, first, self._vectors = palettes.encode(likely, counts, row, first, *arrays)
+            row, first, self._vectors = kernels.encode(likely, counts, row, first, *arrays)
             if row == len(counts):
                 return codes
             if len(self.palette) >= MOST_CODES:

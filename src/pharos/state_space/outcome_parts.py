@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pharos.kernels import palettes
+from pharos.kernels import outcomes as kernels
 from pharos.state_space.files import GrowingFile, cannot_write
 from pharos.state_space.manifest import CODES, INDEX_TYPES, OFFSETS, PALETTE, PARTS, PROBABILITIES
 from pharos.system.outcome_rows import OutcomesOfState
@@ -171,7 +171,7 @@ class OutcomeParts:
 
 def _padded(values: np.ndarray, counts: np.ndarray, most: int, *, fill_with_first: bool) -> np.ndarray:
     out = np.empty((len(counts), most), values.dtype)
-    palettes.padded(values, counts, fill_with_first, out)
+    kernels.padded(values, counts, fill_with_first, out)
     return out
 
 

@@ -203,9 +203,9 @@ class SpilledTable:
         first, count = int(progress[0]), int(progress[1])
         self._table.grow(count + len(keys))
         looked_up = self._table.look_up(keys, indices, first, self._order, self._slots)
-        from pharos.kernels import disk_table
+        from pharos.kernels import hash_table
 
-        disk_table.number(keys, indices, successors, self.states, self.appended, progress)
+        hash_table.number(keys, indices, successors, self.states, self.appended, progress)
         self._table.settle(looked_up, indices, self._order, self._slots)
 
 

@@ -2,7 +2,7 @@
 
 A number n from -2^39 to 2^39 - 1 is n mod 2^40, little-endian (two's complement), so that -1, the end of an episode, is
 five bytes of 255. NumPy has no such type: `PackedIndices` is an array of them to those who read rows, and
-kernels/packed_indices.py the same to compiled loops. docs/decisions/0017-indices-of-40-bits.md has the measurements.
+kernels/outcomes.py the same to compiled loops. docs/decisions/0017-indices-of-40-bits.md has the measurements.
 """
 
 from collections.abc import Iterator

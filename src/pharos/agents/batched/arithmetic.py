@@ -1,7 +1,7 @@
 """Losses, their gradients and Adam, in two ways: compiled loops on the processor, tensor operations elsewhere.
 
-Both take and give tensors; the loops see them as arrays. What they compute is in kernels/batched_learning.py and
-kernels/batched_rollouts.py. Tensor operations wait for nothing, so that a GPU can record them.
+Both take and give tensors; the loops see them as arrays. What they compute is in kernels/batched.py. Tensor operations
+wait for nothing, so that a GPU can record them.
 """
 
 from typing import Any
@@ -11,10 +11,7 @@ import torch
 from torch import Tensor
 
 from pharos.agents.batched.device_buffers import PinnedBuffer, is_gpu
-from pharos.kernels import batched_learning, batched_rollouts
-
-learning: Any = batched_learning  # compiled functions, whose types are hidden
-rollouts: Any = batched_rollouts
+from pharos.kernels import batched as kernels
 
 
 class CompiledArithmetic:
@@ -28,8 +25,9 @@ class CompiledArithmetic:
         self, q: Tensor, q_next: Tensor, q_choice: Tensor, minibatch: Any, dq: Tensor, loss: PinnedBuffer
     ) -> None:
         """The loss of DQN (W,) and its gradient; minibatch: (actions, rewards, discounts) (W, B)."""
-        arrays = tuple(part.numpy() for part in minibatch)
-        learning.huber(q.numpy(), q_next.numpy(), q_choice.numpy(), *arrays, dq.numpy(), loss.array)
+        q_arrays = q.numpy(), q_next.numpy(), q_choice.numpy()
+        actions, rewards, discounts = (part.numpy() for part in minibatch)
+        kernels.huber(*q_arrays, actions, rewards, discounts, dq.numpy(), loss.array)
 
     def clipped_loss(
         self, scores: Tensor, values: Tensor, minibatch: Any, weights: Any, gradients: Any, loss: PinnedBuffer,
@@ -45,7 +43,7 @@ class CompiledArithmetic:
         arrays = tuple(part.numpy() for part in minibatch)
         own = tuple(part.numpy() for part in weights)
         written = (*(gradient.numpy() for gradient in gradients), loss.array, divergence.array)
-        rollouts.clipped_loss(scores.numpy(), values.numpy(), arrays, *own, *written)
+        kernels.clipped_loss(scores.numpy(), values.numpy(), arrays, *own, *written)
 
     def plan(self, counts: np.ndarray, is_active: np.ndarray, rates: Any, max_norms: Any, eps: float) -> None:
         """Say what the next `adam` does: a step for the active runs (W,), which `counts` (W,) goes up for.
@@ -57,7 +55,7 @@ class CompiledArithmetic:
 
     def adam(self, state: Any) -> None:
         """The step that was planned; state: (parameters, gradients, means, squares), (W, P) each."""
-        learning.adam(*(tensor.numpy() for tensor in state), *self._steps)
+        kernels.adam(*(tensor.numpy() for tensor in state), *self._steps)
 
 
 class TensorArithmetic(CompiledArithmetic):

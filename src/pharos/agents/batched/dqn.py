@@ -10,7 +10,7 @@ from pharos.agents.batched.lane import Lane
 from pharos.agents.batched.networks import QNetworks
 from pharos.agents.batched.replay import Replay
 from pharos.agents.batched.runs import remembers_targets
-from pharos.kernels import batched_worlds as kernels
+from pharos.kernels import batched as kernels
 
 
 class DQNLane(Lane):

@@ -15,8 +15,7 @@ from pharos.agents.batched.layers import MASK, Shape, Values, room
 from pharos.agents.batched.networks import names_of, spread
 from pharos.agents.batched.observed import DeviceObservationTable, ObservationTable
 from pharos.agents.batched.runs import BatchRun, resolved
-from pharos.kernels import batched_worlds as kernels
-from pharos.kernels import philox
+from pharos.kernels import batched as kernels
 
 ASKED = (16, 64, 256)  # rows of the blocks in which a policy is asked
 
@@ -185,7 +184,7 @@ class Lane:
     def _draws(keys: np.ndarray, number: int) -> np.ndarray:
         """(N, number) uniform in (0, 1) for keys (N,), for the first parameters."""
         words = np.empty((len(keys), -(-number // 4), 4), np.uint32)
-        philox.words(keys, kernels.WEIGHTS, 0, words)
+        kernels.words(keys, kernels.WEIGHTS, 0, words)
         return (words.reshape(len(keys), -1)[:, :number] + 0.5) * 2.0**-32
 
     # What is kept ---------------------------------------------------------------------------------------------------

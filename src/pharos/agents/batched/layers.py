@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pharos.kernels import batched_learning
+from pharos.kernels.batched import linear_row
 
 ALIGNED = 16  # floats: each parameter of each run begins at a multiple of 64 bytes
 RELU, TANH, NONE = "relu", "tanh", "none"
@@ -21,7 +21,6 @@ ROWS = "all parameters"
 MASK = "which pixels there are"
 KERNEL = 3  # of the small convolution
 
-linear_row: Any = batched_learning.linear_row
 Values = dict[str, Tensor]
 
 
@@ -166,7 +165,8 @@ class Linear(Layer):
         if x.shape[1] == 1 and x.device.type == "cpu" and self.activation != TANH:
             # to act once is to read all weights; those of inputs that a ReLU made 0 need not be
             rows = values[ROWS].numpy()
-            linear_row(rows, *self._offsets, x[:, 0].numpy(), self.activation == RELU, y[:, 0].numpy())
+            weight, bias = self._offsets
+            linear_row(rows, weight, bias, x[:, 0].numpy(), self.activation == RELU, y[:, 0].numpy())
             return y
         torch.baddbmm(values[f"{self.name}.bias"], x, values[f"{self.name}.weight"], out=y)
         self._activate(y)

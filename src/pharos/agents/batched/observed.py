@@ -9,9 +9,8 @@ import torch
 from pharos.agents.batched.device_buffers import PinnedBuffer, is_gpu
 from pharos.agents.batched.layers import KERNEL, whole
 from pharos.agents.batched.runs import BLOCK, BatchRun, ObservationSource, as_networks_see, is_small
-from pharos.kernels import batched_worlds
+from pharos.kernels import batched as kernels
 
-kernels: Any = batched_worlds  # compiled functions, whose types are hidden
 LARGEST_TABLE = 1 << 28  # bytes of observations as networks take them, on the processor
 SHARE_OF_DEVICE = 0.5  # of a GPU's free memory that a table may take
 

@@ -8,8 +8,7 @@ import torch
 from pharos.agents.batched.device_buffers import CudaGraph, PinnedBuffer, wait
 from pharos.agents.batched.lane import Lane
 from pharos.agents.batched.networks import ActorCritics
-from pharos.kernels import batched_rollouts as rollouts
-from pharos.kernels import batched_worlds as kernels
+from pharos.kernels import batched as kernels
 
 WEIGHTS = ("clip_range", "ent_coef", "vf_coef")
 
@@ -86,7 +85,7 @@ class PPOLane(Lane):
         """See `Lane`."""
         self.add_values_of_cut_episodes()
         last = self.values_of(self.worlds.seen)
-        rollouts.advantages(
+        kernels.advantages(
             self.rewards, self.kept_values, self.begins, last, self.begin > 0, self.own["gamma"],
             self.own["gae_lambda"], self.advantages,
         )  # fmt: skip
@@ -96,11 +95,11 @@ class PPOLane(Lane):
         number, size = self._order.shape[1], int(self.shared["batch_size"])
         is_active = ~self.is_idle
         for epoch in range(int(self.shared["n_epochs"])):
-            rollouts.shuffle(self.keys, self.calls, epoch, self._order)
+            kernels.shuffle(self.keys, self.calls, epoch, self._order)
             for first in range(0, number, size):
                 shape = (self.width, min(size, number - first))
                 minibatch = tuple(np.empty((*shape, *part.shape[2:]), part.dtype) for part in sources)
-                rollouts.gather(self._order, first, sources, minibatch)
+                kernels.gather(self._order, first, sources, minibatch)
                 is_active &= self.learn_minibatch(minibatch, is_active)
                 if not is_active.any():
                     return
@@ -142,7 +141,7 @@ class PPOLane(Lane):
         for mirror, part in zip(lesson.minibatch, minibatch, strict=True):
             mirror.array[:] = part
         if self.shared["normalize_advantage"] and size > 1:
-            rollouts.normalize(lesson.minibatch[3].array)
+            kernels.normalize(lesson.minibatch[3].array)
         lesson.assess()
         if self.shared["target_kl"] is not None:
             wait(self.device)

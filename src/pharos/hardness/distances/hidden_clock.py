@@ -14,15 +14,13 @@ cycles 1 and would spread every search over all layers; in H they do not exist.
 Source: ours.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from pharos.hardness.distances.transition_graph import WIDE, Graph, Layers
-from pharos.kernels import clocks
+from pharos.kernels import graph as kernels
 
-# Untyped, as starred arguments of compiled functions are not checked.
-kernels: Any = clocks
 # Cycles shorter than this leave layers so wide that searches by levels read as little.
 _SHORTEST = 64
 # Times that searches may go round.
@@ -51,7 +49,7 @@ class HiddenClock(NamedTuple):
         if graph.start < 0 or graph.has_end:
             return None
         # Without a cycle nothing goes round: as many layers as there are distances.
-        cycle = int(clocks.period(graph.next_states, graph.ends, -1, away, False)) or int(away.max()) + 1
+        cycle = int(kernels.period(graph.next_states, graph.ends, -1, away, False)) or int(away.max()) + 1
         if cycle < _SHORTEST or int(away.max()) + int(home.max()) > _ROUNDS * cycle:
             return None
         layer = away % cycle

@@ -24,7 +24,7 @@ from pharos.errors import FileFormatError, ParameterError
 from pharos.hardness.distances.sum_sweep import SumSweep
 from pharos.hardness.distances.transition_graph import Graph
 from pharos.hardness.interval import BudgetClock, Interval
-from pharos.kernels import graph
+from pharos.kernels import graph as kernels
 from pharos.system import storage
 from pharos.system.memory import available_memory, kept_array, large_zeros, ranges_from_the_end
 
@@ -96,8 +96,6 @@ def digest_of(graph: Graph) -> str:
     return digest.hexdigest()
 
 
-# Untyped, as starred arguments of compiled functions are not checked.
-kernels: Any = graph
 Result = TypeVar("Result")
 
 

@@ -14,15 +14,11 @@ import numpy as np
 from pharos.hardness.distances.hidden_clock import HiddenClock
 from pharos.hardness.distances.transition_graph import WIDE, Graph, Layers
 from pharos.hardness.interval import Budget, BudgetClock, Interval
-from pharos.kernels import clocks, dense_search, graph, many_searches, symmetry
+from pharos.kernels import graph as kernels
+from pharos.kernels import many_searches
 from pharos.system.packed_indices import Indices
 from pharos.system.wording import many
 
-# Untyped, as starred arguments of compiled functions are not checked.
-kernels: Any = graph
-clock: Any = clocks
-dense: Any = dense_search
-searches: Any = many_searches
 # Widths of searches from many nodes, in words of 64 sources: eight words are a cache line.
 _WORDS = (1, 8)
 # Levels up to which every node is asked on every level. Breakout has six times as many, puzzles half of them.
@@ -144,7 +140,7 @@ class SumSweep:
         still_open, (num_out, num_in, far_out, far_in, middle) = self._open()
         while still_open and not self.spending.is_over:
             if len(worth) == 3 and self.spending.searches >= 12 and still_open >= 16:
-                if self.best <= _FEW_LEVELS and self._fits(dense.WORDS):
+                if self.best <= _FEW_LEVELS and self._fits(many_searches.WORDS):
                     worth["dense"] = math.inf
                 else:
                     worth |= {f"many {words}": math.inf for words in _WORDS if self._fits(words)}
@@ -182,16 +178,14 @@ class SumSweep:
         sources = nodes.astype(graph.dtype)
         words = -(-len(sources) // 64)
         largest = np.empty(len(sources), np.int64)
-        bits = [np.zeros((graph.num_nodes, words), np.uint64) for _ in range(3)]
-        scratch = (graph.queue, np.empty_like(graph.queue))
+        origins, front, coming = (np.zeros((graph.num_nodes, words), np.uint64) for _ in range(3))
+        scratch = (origins, front, coming, graph.queue, np.empty_like(graph.queue))
         if outward:
-            _, reads = searches.search_forward_from_many(
-                graph.next_states, graph.ends, graph.start, sources, *bits, *scratch, largest
+            _, reads = many_searches.search_forward_from_many(
+                graph.next_states, graph.ends, graph.start, sources, *scratch, largest
             )
         else:
-            _, reads = searches.search_backward_from_many(
-                *graph.backward, graph.start, sources, *bits, *scratch, largest
-            )
+            _, reads = many_searches.search_backward_from_many(*graph.backward, graph.start, sources, *scratch, largest)
         upper[nodes] = lower[nodes] = largest
         self.best = max(self.best, int(largest.max()))
         self.spending.searches += len(sources)
@@ -209,22 +203,23 @@ class SumSweep:
         graph = self.graph
         table, ends, start = graph.next_states, graph.ends, graph.start
         nodes = np.flatnonzero(np.greater(self.in_upper, self.best)).astype(graph.dtype)
-        degrees = dense.num_successors(table, ends, graph.num_nodes)[nodes]
+        degrees = many_searches.num_successors(table, ends, graph.num_nodes)[nodes]
         order = nodes[np.lexsort((-self.in_upper[nodes].astype(np.int64), -degrees.astype(np.int64)))]
-        limit = int(min(64 * dense.WORDS, max(1, self.spending.budget.searches - self.spending.searches)))
+        limit = int(min(64 * many_searches.WORDS, max(1, self.spending.budget.searches - self.spending.searches)))
         blocked, active, arriving = (np.zeros(graph.num_nodes, np.bool_) for _ in range(3))
-        sources = np.sort(dense.spread_out(table, ends, order, blocked, limit))
-        bits = [np.zeros((graph.num_nodes, dense.WORDS), np.uint64) for _ in range(3)]
+        sources = np.sort(many_searches.spread_out(table, ends, order, blocked, limit))
+        origins, front, coming = (np.zeros((graph.num_nodes, many_searches.WORDS), np.uint64) for _ in range(3))
         largest = np.empty(len(sources), np.int64)
-        reads = dense.dense_search_backward(table, ends, start, sources, *bits, active, arriving, largest)
+        scratch = (origins, front, coming, active, arriving)
+        reads = many_searches.dense_search_backward(table, ends, start, sources, *scratch, largest)
         self.in_upper[sources] = self.in_lower[sources] = largest
         self.best = max(self.best, int(largest.max()))
         passes = 1
-        while dense.lower_along_edges(table, ends, start, self.in_upper, self.out_upper):
+        while many_searches.lower_along_edges(table, ends, start, self.in_upper, self.out_upper):
             passes += 1
         self.spending.searches += len(sources)
         self.method = "directed ExactSumSweep, then searches from many states at once"
-        return int(reads) * (1 + dense.WORDS) // 8 + passes * table.size
+        return int(reads) * (1 + many_searches.WORDS) // 8 + passes * table.size
 
     # Symmetries -------------------------------------------------------------------------------------------------------
 
@@ -281,7 +276,7 @@ class SumSweep:
         graph = self.graph
         if graph.num_nodes < 64:
             return ""
-        cycle = int(clock.period(graph.next_states, graph.ends, graph.start, self.away, graph.has_end))
+        cycle = int(kernels.period(graph.next_states, graph.ends, graph.start, self.away, graph.has_end))
         if cycle < 8:
             return ""
         layer = self.away % cycle
@@ -290,9 +285,9 @@ class SumSweep:
         if widest > WIDE:
             return f"all cycles have multiples of {cycle} steps, but a layer of {widest} states is too wide to follow"
         layers = Layers.of(layer, widths, graph.dtype)
-        scratch = [np.empty((widest, -(-widest // 64)), np.uint64) for _ in range(2)]
+        now, later = (np.empty((widest, -(-widest // 64)), np.uint64) for _ in range(2))
         max_reads = 200 * graph.num_nodes * graph.next_states.shape[1] + 10**8
-        gap, _ = clock.last_gap(graph.next_states, graph.ends, graph.start, *layers, *scratch, max_reads)
+        gap, _ = kernels.last_gap(graph.next_states, graph.ends, graph.start, *layers, now, later, max_reads)
         if gap == -2:
             return f"all cycles have multiples of {cycle} steps, but some state needs more to reach its whole layer"
         if gap == -3:
@@ -309,15 +304,15 @@ def _infinite_diameter(graph: Graph, spending: BudgetClock, conventions: dict[st
     size = graph.num_nodes
     end = spending.seconds + COUNTING if spending.budget == Budget() else math.inf
     words = 8 if 24 * 8 * size <= _BATCH_MEMORY else 1
-    bits = [np.zeros((size, words), np.uint64) for _ in range(3)]
-    scratch = (graph.queue, np.empty_like(graph.queue))
+    origins, front, coming = (np.zeros((size, words), np.uint64) for _ in range(3))
+    scratch = (origins, front, coming, graph.queue, np.empty_like(graph.queue))
     reached = finite = done = 0
     while done < size and not spending.is_over and spending.seconds < end:
         sources = np.arange(done, min(done + 64 * words, size), dtype=graph.dtype)
-        bits[0][:] = 0
+        origins[:] = 0
         largest = np.empty(len(sources), np.int64)
-        pairs, _ = searches.search_forward_from_many(
-            graph.next_states, graph.ends, graph.start, sources, *bits, *scratch, largest
+        pairs, _ = many_searches.search_forward_from_many(
+            graph.next_states, graph.ends, graph.start, sources, *scratch, largest
         )
         reached += int(pairs)
         finite = max(finite, int(largest.max()))
@@ -349,8 +344,6 @@ def _infinite_diameter(graph: Graph, spending: BudgetClock, conventions: dict[st
 # Orbits ---------------------------------------------------------------------------------------------------------------
 
 
-# Untyped, as starred arguments of compiled functions are not checked.
-symmetries: Any = symmetry
 # States to which a symmetry is sought, and maps that join nothing before the search for others ends.
 _CANDIDATES, _IN_VAIN = 200, 3
 
@@ -383,14 +376,14 @@ def orbits(
     for t in others[others != pivot]:
         if count == 1 or in_vain == _IN_VAIN or steps_left < 0 or is_over():
             break
-        is_symmetry, steps = symmetries.symmetry(next_states, ends, start, pivot, t, image, preimage, queue)
+        is_symmetry, steps = kernels.symmetry(next_states, ends, start, pivot, t, image, preimage, queue)
         if is_symmetry:
             orbit = np.arange(size, dtype=dtype) if orbit is None else orbit
-            before, count = count, int(symmetries.join(orbit, image))
+            before, count = count, int(kernels.join(orbit, image))
             in_vain = in_vain + 1 if count == before else 0
         else:
             steps_left -= steps
-        symmetries.forget(image, preimage, queue, steps)
+        kernels.forget(image, preimage, queue, steps)
     while orbit is not None and (orbit != orbit[orbit]).any():
         orbit = orbit[orbit]
     return orbit

@@ -7,12 +7,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pharos.kernels import graph
+from pharos.kernels import graph as kernels
 from pharos.mdp import TabularMDP
 from pharos.system.packed_indices import Indices
-
-# Untyped, as starred arguments of compiled functions are not checked.
-kernels: Any = graph
 
 
 class Graph:

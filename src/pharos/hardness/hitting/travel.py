@@ -39,7 +39,7 @@ from functools import cached_property
 
 import numpy as np
 
-from pharos.kernels import travel, vicinity
+from pharos.kernels import hitting
 from pharos.mdp import TabularMDP, outcomes_of
 from pharos.system.workers import usable_workers
 
@@ -99,7 +99,7 @@ class HubBounds:
         ends = np.cumsum(np.where(used, counts, 0))
         square = np.where(used, ends - counts, -1)
         steps = np.empty(int(ends[-1]) if len(ends) else 0, np.uint8)
-        into = travel.outcomes_into(node, size)
+        into = hitting.outcomes_into(node, size)
         dtype = np.int32 if len(node) < 2**31 else np.int64
         edges = np.linspace(0, size, self._threads + 1).astype(np.int64)
         room = [
@@ -113,12 +113,12 @@ class HubBounds:
 
             list(pool.map(part, range(self._threads)))
 
-        all_nodes(travel.steps_back)
+        all_nodes(hitting.steps_back)
         length = np.empty(len(node), np.int64)
-        self._rho = travel.keep_near(*self._fixed, square, steps, LIMIT, length)
+        self._rho = hitting.keep_near(*self._fixed, square, steps, LIMIT, length)
         start = np.cumsum(length) - length
         way = np.empty(int(length.sum()), dtype)
-        all_nodes(travel.ways_back, start, way)
+        all_nodes(hitting.ways_back, start, way)
         self._ways = (square, steps, start, way)
 
     def _solve(self, own: float, times: np.ndarray) -> np.ndarray:
@@ -130,7 +130,7 @@ class HubBounds:
             for passes in range(PASSES):
                 arrays = (own, times, value, new, passes < 2)  # twice, as two arrays take turns
                 parts = [
-                    pool.submit(travel.attempt, low, high, *self._fixed, *self._ways, *arrays)
+                    pool.submit(hitting.attempt, low, high, *self._fixed, *self._ways, *arrays)
                     for low, high in itertools.pairwise(edges)
                 ]
                 short = max(part.result() for part in parts)
@@ -143,7 +143,7 @@ class HubBounds:
         """(N,) V: upper bounds of the expected steps from the hub to each node, given those from each node to the
         hub."""
         first, _, node, _ = self._outcomes
-        return travel.times_from(hub, first, node, self._solve(1.0, times), self.leak) * ROUNDING
+        return hitting.times_from(hub, first, node, self._solve(1.0, times), self.leak) * ROUNDING
 
     def shortened(
         self, times: np.ndarray, bound: np.ndarray, targets: np.ndarray, size: int, is_over: Callable[[], bool]
@@ -164,7 +164,7 @@ class HubBounds:
                 np.zeros(num_nodes, np.int32),
                 np.empty(size, np.int64),
                 np.empty((4 * size, 2), np.int64),
-                np.empty(vicinity.TURNS, np.int64),
+                np.empty(hitting.TURNS, np.int64),
                 *np.empty((2, size, num_previous + 1)),
             )
             for _ in range(self._threads)
@@ -180,7 +180,7 @@ class HubBounds:
                     break
                 edges = np.linspace(0, len(part), self._threads + 1).astype(np.int64)
                 tasks = [
-                    pool.submit(vicinity.shorten, part, low, high, *fixed, own)
+                    pool.submit(hitting.shorten, part, low, high, *fixed, own)
                     for own, low, high in zip(room, edges[:-1], edges[1:], strict=True)
                 ]
                 for task in tasks:
@@ -192,13 +192,13 @@ class HubBounds:
     def _into(self) -> tuple[np.ndarray, np.ndarray]:
         """Which outcomes lead to each node; made anew for shortening, as many MDPs need none, and it is large."""
         first, _, node, _ = self._outcomes
-        return travel.outcomes_into(node, len(first) - 1)
+        return hitting.outcomes_into(node, len(first) - 1)
 
     def _steps_from(self, hub: int) -> np.ndarray:
         """(N,) int32, see `vicinity.steps_from`; the last ones are kept, as rounds of shortening have one hub."""
         if hub != self._steps[0]:
             first, _, node, _ = self._outcomes
-            self._steps = hub, vicinity.steps_from(hub, first, node)
+            self._steps = hub, hitting.steps_from(hub, first, node)
         return self._steps[1]
 
 

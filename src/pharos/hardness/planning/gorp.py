@@ -333,10 +333,10 @@ def knapsack(lower: np.ndarray, upper: np.ndarray, f: np.ndarray) -> np.ndarray:
 
 
 def _bernstein(m: int, mean: np.ndarray, best: np.ndarray, worst: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    from pharos.kernels import tails
+    from pharos.kernels import horizon as kernels
 
     lower, upper = np.empty_like(mean), np.maximum(0, (best - mean) * (mean - worst))
-    tails.bernstein(mean, best - worst, float(m), lower, upper)
+    kernels.bernstein(mean, best - worst, float(m), lower, upper)
     return lower, upper
 
 

@@ -102,13 +102,13 @@ class Exact(KernelOperator):
         self.matrix = np.ascontiguousarray(kernel(states, states), np.float32)
 
     def __call__(self, z: np.ndarray) -> np.ndarray:
-        from pharos.kernels import landmarks
+        from pharos.kernels import linear_algebra
 
         if z.shape[1] > FEW:
             return self.matrix @ z
         rows = np.ascontiguousarray(z.T, np.float64)
         out = np.empty_like(rows)
-        landmarks.product(self.matrix, rows, out)
+        linear_algebra.product(self.matrix, rows, out)
         return out.T
 
     def parts(self, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -160,7 +160,7 @@ class Landmarks(KernelOperator):
 
     def summed(self, weights: np.ndarray, error: np.ndarray, rate: float, series: np.ndarray) -> np.ndarray:
         """As for others, with one pass over the features a term in place of two."""
-        from pharos.kernels import landmarks
+        from pharos.kernels import linear_algebra
 
         if len(series) < 3:
             return super().summed(weights, error, rate, series)
@@ -168,10 +168,10 @@ class Landmarks(KernelOperator):
         past, now = error.copy(), error - np.float32(2 * rate) * self(weights * error)
         total = np.float32(series[0]) * past + np.float32(series[1]) * now
         projected = np.empty((error.shape[1], self.features.shape[1]))
-        landmarks.project(self.features, weights * now, projected)
+        linear_algebra.project(self.features, weights * now, projected)
         for coefficient in series[2:]:
             across = projected.astype(np.float32)
-            landmarks.step(self.features, self.diagonal, weights, np.float32(rate), across, now, past, projected)
+            linear_algebra.step(self.features, self.diagonal, weights, np.float32(rate), across, now, past, projected)
             past, now = now, past
             total += np.float32(coefficient) * now
         return total

@@ -1,0 +1,512 @@
+"""W runs at once: their random numbers, episodes on the tables of their MDPs, and minibatches of DQN and PPO.
+
+Random numbers are counted: Philox4x32-10 (Salmon, Moraes, Dror and Shaw, SC 2011), four words of 32 bits a call. The
+same counter and key give the same words, whoever asks, in whatever order. A key names a run; a counter names a draw:
+(draw, copy, step, stream).
+
+Each run has E copies of its environment. Every draw is named by its counter: the run is the key, and a step of a copy
+has one block of four words: a random action; what is executed; which outcome; where the next episode starts. Where
+actions may have no effect or pay is noisy there is another block: whether there is an effect; two for the noise.
+Whether a run explores in a step is a block of its own, as one draw holds for all copies of a run.
+
+DQN: minibatches of a replay memory, losses with their gradients, Adam with clipping. Sources: Mnih et al. (2015); van
+Hasselt et al. (2016), double; Kingma and Ba (2015).
+
+PPO: advantages, minibatches, the clipped loss with its gradients. Sources: Schulman et al. (2016), generalised
+advantages; Schulman et al. (2017). Each function does for every run what Stable-Baselines3 does for one; docs/agents.md
+says where the arithmetic differs.
+"""
+
+import numpy as np
+from numba import float32, njit, uint32, uint64
+from numba.extending import overload
+
+from pharos.kernels.bellman import reward_at
+from pharos.kernels.outcomes import drawn_outcome, outcome, size_of
+from pharos.kernels.stepping import executed_by_number, normal_by_numbers, paid_late, start_by_number
+
+# Random numbers -------------------------------------------------------------------------------------------------------
+
+
+MULTIPLIER_0, MULTIPLIER_1 = 0xD2511F53, 0xCD9E8D57
+WEYL_0, WEYL_1 = 0x9E3779B9, 0xBB67AE85
+ROUNDS = 10
+MASK = 0xFFFFFFFF
+UNIT = 2.0**-32
+
+
+@njit(forceinline=True)
+def philox(c0, c1, c2, c3, key):
+    """Four words (uint64 below 2^32) of the counter (c0, c1, c2, c3) and a key of 64 bits, its low word first."""
+    c0, c1, c2, c3 = uint64(c0), uint64(c1), uint64(c2), uint64(c3)
+    k0, k1 = uint64(key) & uint64(MASK), uint64(key) >> uint64(32)
+    for _ in range(ROUNDS):
+        low, high = uint64(MULTIPLIER_0) * c0, uint64(MULTIPLIER_1) * c2
+        c0, c1, c2, c3 = (
+            (high >> uint64(32)) ^ c1 ^ k0,
+            high & uint64(MASK),
+            (low >> uint64(32)) ^ c3 ^ k1,
+            low & uint64(MASK),
+        )
+        k0, k1 = (k0 + uint64(WEYL_0)) & uint64(MASK), (k1 + uint64(WEYL_1)) & uint64(MASK)
+    return c0, c1, c2, c3
+
+
+@njit(forceinline=True)
+def unit(word):
+    """A word as a number in (0, 1): the middle of its interval of length 2^-32."""
+    return (np.float64(word) + 0.5) * UNIT
+
+
+@njit(forceinline=True)
+def below(word, n):
+    """A word as an integer in [0, n), n < 2^32."""
+    return np.int64((uint64(word) * uint64(n)) >> uint64(32))
+
+
+@njit(cache=True, nogil=True)
+def words(keys, stream, step, out):
+    """out[i, j] = the four words of draw j of copy 0 at a step, in a stream, for key i; keys (N,), out (N, M, 4)."""
+    for i in range(out.shape[0]):
+        for j in range(out.shape[1]):
+            w = philox(j, 0, step, stream, keys[i])
+            for k in range(4):
+                out[i, j, k] = uint32(w[k])
+
+
+STEP, EXPLORE, SAMPLE, SHUFFLE, WEIGHTS, ACT = range(6)  # streams of random numbers
+DONE, TIMEOUT = 1, 2  # bits of a transition's flags
+
+
+@njit(cache=True, nogil=True)
+def exploring(keys, step, epsilon, is_warming, out):
+    """out[i] = whether run i acts at random in a step: while it warms up, and with probability epsilon[i]."""
+    for i in range(len(keys)):
+        out[i] = is_warming[i] or unit(philox(0, 0, step, EXPLORE, keys[i])[0]) < epsilon[i]
+
+
+@njit(cache=True, nogil=True)
+def anneal(first, last, share, passed, out):
+    """out (W,) = what goes from first to last, (W,), over a share (W,) of the training, of which `passed` is over."""
+    for i in range(len(out)):
+        if passed > share[i]:
+            out[i] = last[i]
+        else:
+            out[i] = first[i] + passed * (last[i] - first[i]) / share[i] if share[i] > 0.0 else first[i]
+
+
+@njit(cache=True, nogil=True)
+def look_up(table, begins, states, out):
+    """out (W, pitch): the rows of a table (R, size), one after another, of the states (W, B) of each run.
+
+    begins (W,): the row of each run's first state.
+    """
+    size = table.shape[1]
+    for i in range(states.shape[0]):
+        for b in range(states.shape[1]):
+            row, target = table[begins[i] + states[i, b]], out[i, b * size : (b + 1) * size]
+            for j in range(size):
+                target[j] = row[j]
+
+
+@njit(cache=True, nogil=True)
+def look_up_frames(table, begins, histories, piece, out):
+    """out (W, pitch): `piece` entries of each frame in turn, the oldest first, of the histories (W, B, k) of each run.
+
+    table (R, length): a row for each frame, of which `piece` is a part; begins (W,): the row of each run's first state.
+    """
+    length, frames, piece = uint64(table.shape[1]), uint64(histories.shape[2]), uint64(piece)
+    for i in range(histories.shape[0]):
+        target = out[i]
+        for b in range(histories.shape[1]):
+            for f in range(frames):
+                row = table[begins[i] + histories[i, b, f]]
+                at, first = uint64(b) * length * frames + f * piece, uint64(0)
+                while first < length:
+                    for j in range(piece):
+                        target[at + j] = row[first + j]
+                    first += piece
+                    at += frames * piece
+
+
+@njit(cache=True, nogil=True)
+def write_drawn(raw, places, members, out):
+    """out (W, pitch): the entries `places` (size,) of observations, B of each of the runs `members`, one run after
+    another in raw (len(members) B, M).
+    """
+    size, number = len(places), len(raw) // len(members)
+    for k in range(len(members)):
+        for b in range(number):
+            row, target = raw[k * number + b], out[members[k], b * size : (b + 1) * size]
+            for j in range(size):
+                target[j] = row[places[j]]
+
+
+@njit(cache=True, nogil=True)
+def choose(keys, step, explores, q, actions):
+    """actions (W, E): random ones where a run explores, else the first of the best of q (W, E, A)."""
+    for i in range(actions.shape[0]):
+        for e in range(actions.shape[1]):
+            if explores[i]:
+                actions[i, e] = below(philox(0, e, step, STEP, keys[i])[0], q.shape[2])
+            else:
+                best = 0
+                for a in range(1, q.shape[2]):
+                    if q[i, e, a] > q[i, e, best]:
+                        best = a
+                actions[i, e] = best
+
+
+def paid(rewards, s, a, k):
+    """The reward of outcome k of (s, a): of the outcome itself, or expected where only that is known."""
+
+
+@overload(paid)
+def _paid(rewards, s, a, k):
+    if len(rewards) == 2:  # (table, palette) of expected rewards
+        return lambda rewards, s, a, k: reward_at(rewards[0], rewards[1], s, a)
+    return lambda rewards, s, a, k: outcome(rewards, s, a, k)[0]
+
+
+@njit(cache=True, nogil=True)
+def start(keys, members, starts, cumulative, state):
+    """state (W, E) of the first episodes of the runs `members`."""
+    for i in members:
+        for e in range(state.shape[1]):
+            state[i, e] = starts[start_by_number(cumulative, unit(philox(1, e, 0, STEP, keys[i])[3]))]
+
+
+@njit(cache=True, nogil=True)
+def advance(
+    transitions, rewards, staying, terminal, starts, cumulative, members, setting, knobs, actions, episodes, pending,
+    transition, counts,
+):  # fmt: skip
+    """One step of every copy of the runs `members`, which share an MDP; what has ended starts anew.
+
+    transitions: see kernels/outcomes.py; rewards: see `paid`; staying (S, A): what an action without effect pays,
+    (0, 0) where all have one; terminal (S,); starts, cumulative: start states and their cumulated probabilities.
+    setting: (keys (W,) uint64, step, chances (W, 4), limits (W,), gammas (W,)), as in `stepping.Setting`.
+    knobs (W, 3): the probability that an action has no effect, the deviation of the noise of pay, its delay in steps.
+    pending (W, E, D): what was earned and is due; see `paid_late`.
+    episodes: (state, previous, elapsed (W, E) int64, return, discount (W, E) float64) of the running episodes, and
+    (number, sum of returns (W,)) of the finished ones, which this step adds to where `counts` is true.
+    transition: (next state (W, E) int64, reward (W, E) float64, flags (W, E) uint8) of this step, written here; the
+    reward is what is paid, returns are of what is earned. A transition that ends an episode without a next state has
+    the state itself there.
+    """
+    keys, step, chances, limits, gammas = setting
+    state, previous, elapsed, running, discount, finished, returns = episodes
+    following, reward, flags = transition
+    num_actions = size_of(transitions)[1]
+    for i in members:
+        chance = (chances[i, 0], chances[i, 1], chances[i, 2], chances[i, 3])
+        for e in range(state.shape[1]):
+            w = philox(0, e, step, STEP, keys[i])
+            s, action = state[i, e], actions[i, e]
+            if chance[0] < 1.0 or chance[3] < 1.0:
+                action = executed_by_number(action, previous[i, e], chance, num_actions, unit(w[1]))
+            lazy, noise, delay = knobs[i, 0], knobs[i, 1], np.int64(knobs[i, 2])
+            more = philox(2, e, step, STEP, keys[i]) if lazy > 0.0 or noise > 0.0 else w
+            if lazy > 0.0 and unit(more[0]) < lazy:
+                t, earned = s, np.float64(staying[s, action])
+            else:
+                k = drawn_outcome(transitions, s, action, unit(w[2]))[0]
+                t = np.int64(outcome(transitions, s, action, k)[0])
+                earned = np.float64(paid(rewards, s, action, k))
+            ended = t < 0 or terminal[t]
+            elapsed[i, e] += 1
+            timeout = not ended and elapsed[i, e] >= limits[i]
+            following[i, e] = s if t < 0 else t
+            flags[i, e] = (DONE if ended or timeout else 0) | (TIMEOUT if timeout else 0)
+            reward[i, e] = earned
+            if delay > 0:
+                reward[i, e] = paid_late(pending[i, e, :delay], elapsed[i, e] - 1, earned, ended or timeout)
+            if noise > 0.0:
+                reward[i, e] += noise * normal_by_numbers(unit(more[1]), unit(more[2]))
+            running[i, e] += discount[i, e] * earned
+            discount[i, e] *= gammas[i]
+            state[i, e], previous[i, e] = following[i, e], action
+            if ended or timeout:
+                if counts:
+                    finished[i] += 1
+                    returns[i] += running[i, e]
+                running[i, e], discount[i, e] = 0.0, 1.0
+                state[i, e] = starts[start_by_number(cumulative, unit(w[3]))]
+                previous[i, e], elapsed[i, e] = -1, 0
+
+
+@njit(cache=True, nogil=True)
+def act(keys, step, scores, actions, log_probabilities):
+    """Draw actions (W, E) from the softmax of scores (W, E, A), and the logarithms of their probabilities, float32."""
+    num_actions = scores.shape[2]
+    for i in range(actions.shape[0]):
+        for e in range(actions.shape[1]):
+            best = scores[i, e].max()
+            total = 0.0
+            for a in range(num_actions):
+                total += np.exp(np.float64(scores[i, e, a] - best))
+            u = unit(philox(0, e, step, STEP, keys[i])[0]) * total
+            passed, chosen = 0.0, num_actions - 1
+            for a in range(num_actions):
+                passed += np.exp(np.float64(scores[i, e, a] - best))
+                if u < passed:
+                    chosen = a
+                    break
+            actions[i, e] = chosen
+            log_probabilities[i, e] = np.float64(scores[i, e, chosen] - best) - np.log(total)
+
+
+@njit(cache=True, nogil=True)
+def sample(keys, step, draw, place, filled, gammas, num_steps, memory, batch):
+    """Draw a minibatch of each run from its replay memory, uniformly, with returns of `num_steps` steps.
+
+    place: the row that is written next; filled: the number of rows that are; gammas (W,).
+    memory: (state, next state (W, R, E), action (W, R, E), reward (W, R, E) float32, flags (W, R, E)).
+    batch: (state, next state (W, B), action (W, B), reward (W, B) float32, discount (W, B) float32), written here:
+    discount is what the value of the next state is multiplied by: gamma^n, 0 where the episode ended there. A return
+    stops at the end of an episode, at a time limit, and at the newest transition.
+    """
+    state, following, action, reward, flags = memory
+    states, nexts, actions, rewards, discounts = batch
+    size, copies = state.shape[1], state.shape[2]
+    last = (place - 1) % size
+    for i in range(states.shape[0]):
+        for b in range(states.shape[1]):
+            w = philox(b, draw, step, SAMPLE, keys[i])
+            row, e = below(w[0], filled), below(w[1], copies)
+            at, rewards[i, b], discounts[i, b] = _steps_from(i, row, e, last, gammas[i], num_steps, reward, flags)
+            states[i, b], actions[i, b], nexts[i, b] = state[i, row, e], action[i, row, e], following[i, at, e]
+
+
+@njit(cache=True, nogil=True)
+def sample_histories(keys, step, draw, place, filled, gammas, num_steps, memory, batch):
+    """`sample` of the `filled` newest rows, with states and next states (W, B, k): the last k of the episode.
+
+    They are read from the rows before; the first state of an episode stands for those before it. Rows that were never
+    written have the flag DONE.
+    """
+    state, following, action, reward, flags = memory
+    states, nexts, actions, rewards, discounts = batch
+    size, copies, frames = state.shape[1], state.shape[2], states.shape[2]
+    first, last = (place - filled) % size, (place - 1) % size
+    for i in range(states.shape[0]):
+        for b in range(states.shape[1]):
+            w = philox(b, draw, step, SAMPLE, keys[i])
+            row, e = (first + below(w[0], filled)) % size, below(w[1], copies)
+            at, rewards[i, b], discounts[i, b] = _steps_from(i, row, e, last, gammas[i], num_steps, reward, flags)
+            actions[i, b] = action[i, row, e]
+            _last_states(i, row, e, state, flags, states[i, b])
+            _last_states(i, at, e, state, flags, nexts[i, b])
+            for f in range(1, frames):
+                nexts[i, b, f - 1] = nexts[i, b, f]
+            nexts[i, b, frames - 1] = following[i, at, e]
+
+
+@njit(cache=True, nogil=True)
+def _steps_from(i, row, e, last, gamma, num_steps, reward, flags):
+    """(the row where they end, return, discount of what follows) of at most `num_steps` steps from a row."""
+    size = reward.shape[1]
+    total, factor, at = 0.0, 1.0, row
+    for n in range(num_steps):
+        at = (row + n) % size
+        total += factor * reward[i, at, e]
+        factor *= gamma
+        if flags[i, at, e] & DONE or at == last:
+            break
+    ended = flags[i, at, e] & DONE and not flags[i, at, e] & TIMEOUT
+    return at, float32(total), float32(0.0) if ended else float32(factor)
+
+
+@njit(cache=True, nogil=True)
+def _last_states(i, row, e, state, flags, out):
+    """out (k,) = the state of a row and those of the k - 1 before it, the oldest first."""
+    size = state.shape[1]
+    for f in range(len(out) - 1, -1, -1):
+        out[f] = state[i, row, e]
+        before = row - 1 if row > 0 else size - 1
+        if not flags[i, before, e] & DONE:
+            row = before
+
+
+@njit(cache=True, nogil=True)
+def huber(q, q_next, q_choice, actions, rewards, discounts, dq, loss):
+    """The smooth L1 loss of DQN, (W,), and its gradient dq (W, B, A).
+
+    q: (W, B, A) of the states; q_next: of the next states, by the target network; q_choice: what the next action is
+    the best of: q_next itself, or by the online network (double).
+    """
+    num_rows, num_actions = q.shape[1], q.shape[2]
+    share = float32(1.0) / float32(num_rows)
+    for i in range(q.shape[0]):
+        total = 0.0
+        for b in range(num_rows):
+            best = 0
+            for a in range(num_actions):
+                dq[i, b, a] = 0.0
+                if q_choice[i, b, a] > q_choice[i, b, best]:
+                    best = a
+            target = rewards[i, b] + discounts[i, b] * q_next[i, b, best]
+            difference = q[i, b, actions[i, b]] - target
+            size = abs(difference)
+            total += 0.5 * size * size if size < 1.0 else size - 0.5
+            dq[i, b, actions[i, b]] = share * min(max(difference, float32(-1.0)), float32(1.0))
+        loss[i] = total / num_rows
+
+
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
+def _squares(x):
+    total = float32(0.0)
+    for j in range(len(x)):
+        total += x[j] * x[j]
+    return total
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _adam(parameters, gradient, mean, square, scale, step, eps):
+    first, second, keep = float32(0.1), float32(0.001), float32(0.999)
+    for j in range(len(parameters)):
+        g = scale * gradient[j]
+        m = mean[j] + first * (g - mean[j])
+        v = keep * square[j] + second * g * g
+        mean[j], square[j] = m, v
+        parameters[j] -= step * m / (np.sqrt(v) + eps)
+
+
+@njit(cache=True, nogil=True)
+def adam(parameters, gradients, means, squares, counts, is_active, rates, max_norms, eps):
+    """A step of Adam (betas 0.9 and 0.999) for the runs that are active, by gradients clipped to a norm.
+
+    parameters, gradients, means, squares: (W, P) float32; counts (W,): steps so far; rates, max_norms (W,).
+    """
+    for i in range(len(parameters)):
+        if is_active[i]:
+            counts[i] += 1
+            norm = np.sqrt(np.float64(_squares(gradients[i])))
+            scale = float32(min(1.0, max_norms[i] / (norm + 1e-6)))
+            root = np.sqrt(1.0 - 0.999 ** counts[i])  # what divides the root of the squares multiplies the rest
+            step = float32(rates[i] / (1.0 - 0.9 ** counts[i]) * root)
+            _adam(parameters[i], gradients[i], means[i], squares[i], scale, step, float32(eps * root))
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"})
+def linear_row(parameters, weight, bias, x, is_relu, y):
+    """y (W, out) = x (W, in) w + b, at least 0 where `is_relu`; the weights of inputs that are 0 are not read.
+
+    parameters (W, P) float32: w begins at `weight`, in rows of `out`, and b at `bias`.
+    """
+    outputs = y.shape[1]
+    total = np.empty(outputs, np.float32)
+    for i in range(len(parameters)):
+        row = parameters[i]
+        for j in range(outputs):
+            total[j] = row[uint64(bias + j)]
+        for k in range(x.shape[1]):
+            factor = x[i, k]
+            if factor != 0.0:
+                first = uint64(weight + k * outputs)
+                for j in range(outputs):
+                    total[j] += factor * row[first + uint64(j)]
+        for j in range(outputs):
+            y[i, j] = max(total[j], float32(0.0)) if is_relu else total[j]
+
+
+@njit(cache=True, nogil=True)
+def advantages(rewards, values, begins, last_values, ends, gammas, lambdas, out):
+    """out (W, T, E) = generalised advantages of rollouts of T steps.
+
+    rewards, values, begins (W, T, E) float32: begins is 1 where a step is the first of an episode; last_values (W, E)
+    of the states after the rollout, ends (W, E) whether the last step ended an episode; gammas, lambdas (W,).
+    """
+    num_steps, copies = rewards.shape[1], rewards.shape[2]
+    for i in range(rewards.shape[0]):
+        gamma, both = float32(gammas[i]), float32(gammas[i] * lambdas[i])
+        for e in range(copies):
+            advantage = float32(0.0)
+            goes_on, following = float32(0.0 if ends[i, e] else 1.0), last_values[i, e]
+            for t in range(num_steps - 1, -1, -1):
+                delta = rewards[i, t, e] + gamma * following * goes_on - values[i, t, e]
+                advantage = delta + both * goes_on * advantage
+                out[i, t, e] = advantage
+                goes_on, following = float32(1.0) - begins[i, t, e], values[i, t, e]
+
+
+@njit(cache=True, nogil=True)
+def shuffle(keys, step, draw, order):
+    """order (W, M) = a permutation of 0 .. M-1 for each run (Fisher and Yates)."""
+    number = order.shape[1]
+    for i in range(order.shape[0]):
+        for j in range(number):
+            order[i, j] = j
+        for j in range(number - 1, 0, -1):
+            other = below(philox(j, draw, step, SHUFFLE, keys[i])[0], j + 1)
+            order[i, j], order[i, other] = order[i, other], order[i, j]
+
+
+@njit(cache=True, nogil=True)
+def gather(order, first, sources, targets):
+    """targets (W, B) of five arrays = the entries order[:, first : first + B] of sources (W, M).
+
+    The arrays: states, or histories with one more axis, actions, logarithms of probabilities, advantages, returns.
+    """
+    for i in range(targets[0].shape[0]):
+        for b in range(targets[0].shape[1]):
+            at = order[i, first + b]
+            targets[0][i, b] = sources[0][i, at]
+            targets[1][i, b] = sources[1][i, at]
+            targets[2][i, b] = sources[2][i, at]
+            targets[3][i, b] = sources[3][i, at]
+            targets[4][i, b] = sources[4][i, at]
+
+
+@njit(cache=True, nogil=True)
+def normalize(advantages):
+    """Each run's (W, B) less its mean, by its standard deviation + 1e-8; B >= 2."""
+    number = advantages.shape[1]
+    for i in range(advantages.shape[0]):
+        mean, squares = 0.0, 0.0
+        for b in range(number):
+            mean += advantages[i, b]
+        mean /= number
+        for b in range(number):
+            squares += (advantages[i, b] - mean) ** 2
+        scale = np.sqrt(squares / (number - 1)) + 1e-8
+        for b in range(number):
+            advantages[i, b] = (advantages[i, b] - mean) / scale
+
+
+@njit(cache=True, nogil=True)
+def clipped_loss(scores, values, minibatch, clip_ranges, entropy_weights, value_weights, dscores, dvalues, loss, kl):
+    """The loss of PPO (W,), its gradients, and the approximate divergence from the old policy (W,).
+
+    scores (W, B, A), values (W, B, 1) float32; dscores and dvalues alike.
+    minibatch: (actions, old logarithms of probabilities, advantages, returns), (W, B) each.
+    """
+    actions, old, advantage, returns = minibatch
+    number, num_actions = scores.shape[1], scores.shape[2]
+    log_p = np.empty(num_actions)
+    for i in range(scores.shape[0]):
+        total, divergence = 0.0, 0.0
+        low, high = 1.0 - clip_ranges[i], 1.0 + clip_ranges[i]
+        for b in range(number):
+            best, mass = scores[i, b].max(), 0.0
+            for a in range(num_actions):
+                log_p[a] = scores[i, b, a] - best
+                mass += np.exp(log_p[a])
+            mass, entropy = np.log(mass), 0.0
+            for a in range(num_actions):
+                log_p[a] -= mass
+                entropy -= np.exp(log_p[a]) * log_p[a]
+            gained = log_p[actions[i, b]] - old[i, b]
+            ratio = np.exp(gained)
+            divergence += (ratio - 1.0) - gained
+            free = advantage[i, b] * ratio
+            bound = advantage[i, b] * min(max(ratio, low), high)
+            error = values[i, b, 0] - returns[i, b]
+            total += -min(free, bound) - entropy_weights[i] * entropy + value_weights[i] * error * error
+            of_log_p = -free / number if free <= bound else 0.0
+            dvalues[i, b, 0] = value_weights[i] * 2.0 * error / number
+            for a in range(num_actions):
+                p = np.exp(log_p[a])
+                of_entropy = entropy_weights[i] * p * (log_p[a] + entropy) / number
+                dscores[i, b, a] = of_log_p * ((1.0 if a == actions[i, b] else 0.0) - p) + of_entropy
+        loss[i], kl[i] = total / number, divergence / number
