@@ -13,7 +13,7 @@ import time
 import numpy as np
 
 import pharos
-from pharos.hardness.distances.transition_graph import Graph
+from pharos.hardness.sum_sweep import Graph
 from pharos.mdp import ExpandedMDP
 
 SMALL = {

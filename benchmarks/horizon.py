@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pharos
 from pharos import hardness, importers
-from pharos.hardness.planning.effective_horizon import TIE, LargeHorizon, SmallHorizon, parts_of
+from pharos.hardness.effective_horizon import TIE, LargeHorizon, SmallHorizon, parts_of
 from pharos.mdp import sticky_actions
 
 CORRIDOR = Path(__file__).parents[1] / "tests" / "data" / "bridge" / "key-corridor-s3r1.npz"

@@ -17,8 +17,8 @@ from pathlib import Path
 import numpy as np
 
 import pharos
-from pharos.hardness.distances.lean_sweep import LeanGraph
-from pharos.hardness.distances.transition_graph import Graph
+from pharos.hardness.diameter import LeanGraph
+from pharos.hardness.sum_sweep import Graph
 from pharos.mdp import BEST, BellmanEquation, Table, sticky_actions
 from pharos.state_space import search
 from pharos.system.packed_indices import PackedIndices

@@ -93,7 +93,7 @@ def test_importing_pharos_loads_nothing_heavy(command):
 
 
 def test_measures_and_training_load_sparse_matrices_where_they_use_them():
-    code = "import sys, pharos.training, pharos.hardness.built_in; print('scipy.sparse' in sys.modules)"
+    code = "import sys, pharos.training, pharos.hardness.registry; print('scipy.sparse' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"
 

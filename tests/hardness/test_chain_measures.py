@@ -16,7 +16,7 @@ from pharos.errors import ParameterError, UndefinedMeasure
 from pharos.mdp import TabularMDP, random_actions, sticky_actions
 from strategies import small_mdps
 
-_occupancy = importlib.import_module("pharos.hardness.visitation.occupancy")
+_occupancy = importlib.import_module("pharos.hardness.visitation")
 
 
 def chain_of(mdp, restart=True):

@@ -21,7 +21,7 @@ from naive.colosseum import (
     within_ulps,
 )
 from pharos import TabularMDP, hardness
-from pharos.hardness.distances.diameter import colosseum_diameter
+from pharos.hardness.diameter import colosseum_diameter
 
 pytestmark = pytest.mark.long  # with each class compiled
 

@@ -11,7 +11,7 @@ from scipy import sparse
 from naive.colosseum import STOPS, episodic_diameter, within_ulps
 from pharos import TabularMDP
 from pharos.errors import ParameterError
-from pharos.hardness.distances.diameter import colosseum_diameter
+from pharos.hardness.diameter import colosseum_diameter
 
 
 def deep_sea(size):

@@ -14,7 +14,7 @@ from naive.colosseum import STOPS, diameter, episodic_diameter, farthest, law, w
 from pharos import TabularMDP, hardness
 from pharos.drawing import text_drawing
 from pharos.errors import ParameterError
-from pharos.hardness.distances.diameter import colosseum_diameter
+from pharos.hardness.diameter import colosseum_diameter
 
 pytestmark = pytest.mark.long  # with each class compiled and walked through in full
 

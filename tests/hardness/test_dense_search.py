@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 import pharos
 from naive.hardness import distances
 from pharos import TabularMDP, hardness
-from pharos.hardness.distances.transition_graph import Graph
+from pharos.hardness.sum_sweep import Graph
 from pharos.kernels import many_searches
 from solution_lengths import solution_lengths
 

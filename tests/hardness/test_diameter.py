@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from naive.hardness import distances
 from pharos import TabularMDP, hardness, random_actions
 from pharos.errors import ParameterError
-from pharos.hardness.distances import hidden_clock, sum_sweep
-from pharos.hardness.distances.transition_graph import Graph
+from pharos.hardness import sum_sweep
 from pharos.hardness.interval import BudgetClock
+from pharos.hardness.sum_sweep import Graph
 from pharos.kernels import graph as kernels
 from pharos.system import compiling
 
@@ -220,11 +220,11 @@ def test_a_clock_that_restarts_hide_gives_the_largest_distance_to_every_target(s
     mdp = clocked(period, rows, blocked, ending)
     d = distances(mdp)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(hidden_clock, "_SHORTEST", 2)
-        patch.setattr(hidden_clock, "_ROUNDS", 100)
+        patch.setattr(sum_sweep, "_SHORTEST", 2)
+        patch.setattr(sum_sweep, "_ROUNDS", 100)
         patch.setattr(sum_sweep, "_WORDS", (1, words))
         graph = Graph.of(mdp, restart=True)
-        clock = hidden_clock.HiddenClock.of(graph, d[:, mdp.initial].astype(int), d[mdp.initial].astype(int))
+        clock = sum_sweep.HiddenClock.of(graph, d[:, mdp.initial].astype(int), d[mdp.initial].astype(int))
         found = hardness.diameter(mdp)
     assert (found.lower, found.upper) == (d.max(), d.max())
     if clock is not None:

@@ -14,8 +14,8 @@ import pharos
 from naive.horizon import analysis
 from pharos import hardness
 from pharos.errors import ParameterError, PrecisionError, UndefinedMeasure
-from pharos.hardness.planning.effective_horizon import LargeHorizon, SmallHorizon, parts_of
-from pharos.hardness.planning.steps import TIE
+from pharos.hardness.effective_horizon import LargeHorizon, SmallHorizon, parts_of
+from pharos.hardness.steps import TIE
 from pharos.mdp import TabularMDP, random_actions, sticky_actions
 from strategies import FEW, deterministic_mdps, general_mdps, outcome_mdps
 
@@ -128,7 +128,7 @@ def test_the_compiled_analysis_of_key_corridor_is_the_published_one():
 def test_larger_games_are_analysed_by_the_compiled_one(monkeypatch):
     mdp = pharos.build(pharos.make("frozen_lake/8x8")).mdp(gamma=1.0)
     expected = hardness.effective_horizon(mdp, horizon=30)
-    monkeypatch.setattr(importlib.import_module("pharos.hardness.planning.effective_horizon"), "COMPILED", 0)
+    monkeypatch.setattr(importlib.import_module("pharos.hardness.effective_horizon"), "COMPILED", 0)
     assert hardness.effective_horizon(mdp, horizon=30) == expected
 
 

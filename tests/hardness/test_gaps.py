@@ -13,8 +13,7 @@ import pharos
 from naive.gaps import naive_gaps
 from pharos import hardness
 from pharos.errors import ParameterError, PrecisionError
-from pharos.hardness.gaps.gaps import resolved_gaps
-from pharos.hardness.gaps.ties import same_outcomes
+from pharos.hardness.gaps import resolved_gaps, same_outcomes
 from pharos.mdp import TabularMDP, random_actions, sticky_actions
 from strategies import deterministic_mdps, small_mdps
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from naive.gorp import failure_probability, returns_of_paths
 from pharos import hardness, importers
 from pharos.errors import ParameterError, UndefinedMeasure
-from pharos.hardness.planning.gorp import METHODS, Search, knapsack
+from pharos.hardness.gorp import METHODS, Search, knapsack
 from pharos.mdp import TabularMDP, sticky_actions
 from strategies import deterministic_mdps, small_mdps
 

@@ -1,5 +1,6 @@
 """Measures of what a network makes of an MDP's states: against tables, closed forms, and learners written plainly."""
 
+import importlib
 import json
 
 import numpy as np
@@ -273,7 +274,7 @@ def test_landmarks_are_exact_where_there_are_enough_of_them_and_say_so_where_not
 
 def test_gradient_steps_in_a_series_are_those_made_one_by_one():
     """Of all three operators, with 300 observations and rows of more than one block."""
-    from pharos.hardness.representation.kernel_operator import Exact, Identity, Landmarks
+    from pharos.hardness.representation import Exact, Identity, Landmarks
 
     rng = np.random.default_rng(2)
     kernel, states = kernel_of(300), np.arange(300)
@@ -299,7 +300,7 @@ def test_gradient_steps_in_a_series_are_those_made_one_by_one():
 
 def test_adams_kernel_has_the_square_roots_of_eigenvalues():
     """Under the weights; by landmarks that are all observations as exactly."""
-    from pharos.hardness.representation.kernel_operator import Exact, Landmarks
+    from pharos.hardness.representation import Exact, Landmarks
 
     kernel, states, weights = kernel_of(9), np.arange(9), np.random.default_rng(1).dirichlet(np.ones(9))
 
@@ -364,7 +365,7 @@ def test_learning_time_of_one_eigenvalue_is_a_logarithm():
 
 def test_sample_complexity_is_that_of_regression_by_simulation():
     """Kernel regression of a fixed function on random samples: the predicted number leaves about a tenth."""
-    from pharos.hardness.representation import kernel_spectrum
+    spectra = importlib.import_module("pharos.hardness.kernel_regret")
 
     rng = np.random.default_rng(0)
     features = rng.normal(size=(400, 60)) * np.arange(1, 61) ** -1.0
@@ -372,12 +373,12 @@ def test_sample_complexity_is_that_of_regression_by_simulation():
     y = y - y.mean()
     centred = kernel - kernel.mean(0) - kernel.mean(1)[:, None] + kernel.mean()
     weights = np.full(400, 1 / 400)
-    eigenvalues, energy = kernel_spectrum._spectrum(centred, y[:, None], weights)
-    n = round(kernel_spectrum._samples(eigenvalues, energy))
+    eigenvalues, energy = spectra._spectrum(centred, y[:, None], weights)
+    n = round(spectra._samples(eigenvalues, energy))
     left = []
     for _ in range(200):
         rows = rng.integers(0, 400, n)
-        ridge = kernel_spectrum.RIDGE * np.trace(centred) / 400 * np.eye(n)
+        ridge = spectra.RIDGE * np.trace(centred) / 400 * np.eye(n)
         fit = centred[:, rows] @ np.linalg.lstsq(centred[np.ix_(rows, rows)] + ridge, y[rows], rcond=None)[0]
         left.append(((fit - y) ** 2).mean() / (y**2).mean())
     assert 0.07 < np.mean(left) < 0.14
@@ -447,7 +448,7 @@ def test_a_kernel_that_does_not_fit_is_told_before_anything_is_learnt(grid, monk
     def learnt(*_):
         raise AssertionError("learnt first")
 
-    monkeypatch.setattr("pharos.hardness.representation.mean_field.Learner.curve", learnt)
+    monkeypatch.setattr("pharos.hardness.representation.Learner.curve", learnt)
     with pytest.raises(ParameterError, match="landmarks is 1; expected at least 2"):
         representation(grid, "vector", "mlp16", landmarks=1)
     with pytest.raises(ParameterError, match="landmarks is 1; expected at least 2"):

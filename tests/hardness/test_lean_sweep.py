@@ -1,6 +1,7 @@
 """Diameters by sweeps over the table, in two bytes a state: against all pairs, and where two bytes are too few."""
 
 import contextlib
+import importlib
 
 import numpy as np
 import pytest
@@ -11,16 +12,16 @@ from test_diameter import deterministic_mdps
 from naive.hardness import distances
 from pharos import TabularMDP, hardness
 from pharos.errors import FileFormatError
-from pharos.hardness.distances import lean_sweep
-from pharos.hardness.distances.transition_graph import Graph
+from pharos.hardness.sum_sweep import Graph
 from pharos.system import memory
 
+sweeps = importlib.import_module("pharos.hardness.diameter")
 pytestmark = pytest.mark.long
 
 
 @pytest.fixture
 def no_memory(monkeypatch):
-    monkeypatch.setattr(lean_sweep, "available_memory", lambda: 0)
+    monkeypatch.setattr(sweeps, "available_memory", lambda: 0)
 
 
 @settings(max_examples=150, deadline=None)
@@ -28,7 +29,7 @@ def no_memory(monkeypatch):
 def test_the_diameter_is_the_largest_distance_between_any_two_states(mdp, restart):
     d = distances(mdp, restart=restart)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(lean_sweep, "available_memory", lambda: 0)
+        patch.setattr(sweeps, "available_memory", lambda: 0)
         found = hardness.diameter(mdp, restart=restart)
         eccentricity = hardness.start_eccentricity(mdp, restart=restart)
     assert "sweeps over the table" in found.method
@@ -42,7 +43,7 @@ def test_the_diameter_is_the_largest_distance_between_any_two_states(mdp, restar
 @given(deterministic_mdps(), st.booleans(), st.sampled_from([np.int16, np.int32]), st.booleans())
 def test_sweeps_give_the_distances_of_searches(mdp, restart, dtype, is_mapped):
     plain = Graph.of(mdp, restart)
-    graph = lean_sweep.LeanGraph(plain, dtype)
+    graph = sweeps.LeanGraph(plain, dtype)
     if is_mapped:
         graph.next_states = graph.next_states.view(np.memmap)
     d = distances(mdp, restart=restart)
@@ -64,13 +65,13 @@ def test_distances_that_two_bytes_cannot_hold_take_four(size, no_memory, monkeyp
     state = np.arange(size)
     table = np.stack([(state + 1) % size, np.zeros_like(state)], axis=1)  # one step on, or back to the start
     mdp = TabularMDP.from_arrays(table, np.zeros(table.shape))
-    widths, lean = [], lean_sweep.LeanGraph
+    widths, lean = [], sweeps.LeanGraph
 
     def made(graph, dtype):
         widths.append(dtype)
         return lean(graph, dtype)
 
-    monkeypatch.setattr(lean_sweep, "LeanGraph", made)
+    monkeypatch.setattr(sweeps, "LeanGraph", made)
     found = hardness.diameter(mdp)
     assert found.exact and found.upper == size - 1
     assert (widths == [np.int16]) == (size < 2**15 - 1)
@@ -91,7 +92,7 @@ def test_an_interval_is_proven_within_the_budget(no_memory):
 def test_a_diameter_goes_on_from_kept_bounds_wherever_it_was_stopped(tmp_path_factory, mdp, restart, searches, seed):
     d = distances(mdp, restart=restart)
     folder = tmp_path_factory.mktemp("bounds")
-    rng, raised = np.random.default_rng(seed), lean_sweep.SumSweep._search_out
+    rng, raised = np.random.default_rng(seed), sweeps.SumSweep._search_out
 
     def stopped(self, v):  # in the middle of an update, of which any entries may be there
         before = self.in_lower.copy()
@@ -101,14 +102,14 @@ def test_a_diameter_goes_on_from_kept_bounds_wherever_it_was_stopped(tmp_path_fa
         raise KeyboardInterrupt
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(lean_sweep, "available_memory", lambda: 0)
+        patch.setattr(sweeps, "available_memory", lambda: 0)
         if rng.random() < 0.5:
-            patch.setattr(lean_sweep.SumSweep, "_search_out", stopped)
+            patch.setattr(sweeps.SumSweep, "_search_out", stopped)
         with contextlib.suppress(KeyboardInterrupt):
             part = hardness.diameter(mdp, restart=restart, budget=hardness.Budget(searches=searches), bounds=folder)
             assert part.lower <= d.max() <= part.upper
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(lean_sweep, "available_memory", lambda: 0)
+        patch.setattr(sweeps, "available_memory", lambda: 0)
         whole = hardness.diameter(mdp, restart=restart, bounds=folder)
     assert whole.exact and whole.upper == d.max() and [*folder.iterdir()] == []
 

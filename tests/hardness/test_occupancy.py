@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 import pharos
 from naive.mdp import augmented
 from pharos.errors import ParameterError, UndefinedMeasure
-from pharos.hardness.visitation.occupancy import occupancy
+from pharos.hardness.visitation import occupancy
 from pharos.mdp import random_actions, sticky_actions
 from strategies import small_mdps
 

@@ -9,8 +9,7 @@ from test_kernel_measures import chain, kernel_of, random_mdp
 import pharos
 from pharos import hardness
 from pharos.errors import ParameterError, UndefinedMeasure
-from pharos.hardness import Representation, Rollouts, Schedule, kernel_policy_regret, kernel_regret
-from pharos.hardness.representation import mean_field
+from pharos.hardness import Representation, Rollouts, Schedule, kernel_policy_regret, kernel_regret, representation
 from pharos.mdp import TabularMDP, lazy_actions
 from pharos.observations import Network, tangent_kernel
 
@@ -129,7 +128,7 @@ def test_clipping_is_what_its_definition_says(sticky, clip_range):
         without = kernel_policy_regret(mdp, seen, schedule=SHORT, rollouts=ROLLOUTS)
         assert np.abs(found.curve.played - without.curve.played).max() > 0.01
         assert found.to_dict()["evaluated"] == pytest.approx(
-            np.minimum(played, mean_field.WORST_GREEDY).mean(), abs=1e-3
+            np.minimum(played, representation.WORST_GREEDY).mean(), abs=1e-3
         )
         assert found.conventions["rollouts"]["clip_range"] == clip_range
 
@@ -248,9 +247,9 @@ def test_wide_networks_trained_by_exact_gradients_have_the_curve():
 
 
 def test_a_learner_walks_once_for_a_policy_that_has_settled(monkeypatch):
-    asked, visits_of = [], mean_field.visits_of
+    asked, visits_of = [], representation.visits_of
     monkeypatch.setattr(
-        mean_field, "visits_of", lambda mdp, policy, *of: asked.append(policy) or visits_of(mdp, policy, *of)
+        representation, "visits_of", lambda mdp, policy, *of: asked.append(policy) or visits_of(mdp, policy, *of)
     )
     long = Schedule(steps=20_000, learning_starts=0, exploration_fraction=0.1)
     found = kernel_regret(chain(4), Representation.of_matrix(np.eye(4)), schedule=long).curve

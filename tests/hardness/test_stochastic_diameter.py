@@ -13,10 +13,9 @@ import pharos
 from naive import hitting as naive_hitting
 from pharos import hardness
 from pharos.errors import UndefinedMeasure
-from pharos.hardness.hitting.hitting_times import Bounds, HittingTimes
-from pharos.hardness.hitting.stochastic_diameter import _Diameter
-from pharos.hardness.hitting.travel import HubBounds
+from pharos.hardness.hitting_times import Bounds, HittingTimes
 from pharos.hardness.interval import Budget, BudgetClock
+from pharos.hardness.stochastic_diameter import HubBounds, _Diameter
 from pharos.kernels import hitting
 from pharos.mdp import ExpandedMDP, TabularMDP, random_actions, sticky_actions
 from strategies import deterministic_mdps, general_mdps, outcome_mdps
@@ -52,9 +51,9 @@ def test_diameters_are_those_of_the_explicit_matrices(mdp, restart):
 @pytest.mark.parametrize("workers", [2, 5])
 def test_results_do_not_depend_on_the_number_of_threads(workers, monkeypatch):
     mdp = random_actions(pharos.build(pharos.make("frozen_lake/8x8")).mdp(), 0.1)
-    monkeypatch.setattr("pharos.hardness.hitting.stochastic_diameter.usable_workers", lambda _: 1)
+    monkeypatch.setattr("pharos.hardness.stochastic_diameter.usable_workers", lambda _: 1)
     expected = hardness.diameter(mdp)
-    monkeypatch.setattr("pharos.hardness.hitting.stochastic_diameter.usable_workers", lambda _: workers)
+    monkeypatch.setattr("pharos.hardness.stochastic_diameter.usable_workers", lambda _: workers)
     found = hardness.diameter(mdp)
     assert (found.lower, found.upper, found.searches) == (expected.lower, expected.upper, expected.searches)
 
@@ -153,7 +152,7 @@ def test_spaces_too_large_for_a_look_at_each_target_have_the_same_diameter(mdp):
     mdp = random_actions(mdp, 0.25)
     expected, _ = naive_hitting.diameter(mdp, True)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("pharos.hardness.hitting.stochastic_diameter.MANY", -1)
+        patch.setattr("pharos.hardness.stochastic_diameter.MANY", -1)
         found = hardness.diameter(mdp)
     if math.isinf(expected):
         assert math.isinf(found.lower) and (found.exact or not found.counted)
@@ -461,7 +460,7 @@ def test_attempts_that_fail_a_million_times_take_few_sweeps():
 @pytest.mark.parametrize("next_states", [[[0, 0]], [[1, 1], [0, 0]]])
 @pytest.mark.parametrize("many", [0, 10**9])
 def test_actions_that_are_repeated_for_ever_may_all_lead_everywhere(next_states, many, monkeypatch):
-    monkeypatch.setattr("pharos.hardness.hitting.stochastic_diameter.MANY", many)
+    monkeypatch.setattr("pharos.hardness.stochastic_diameter.MANY", many)
     mdp = TabularMDP.from_arrays(np.array(next_states), np.zeros((len(next_states), 2)))
     found = hardness.diameter(sticky_actions(mdp, 1.0), restart=False)
     assert found.exact

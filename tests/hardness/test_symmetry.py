@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 import pharos
 from naive.hardness import distances
 from pharos import TabularMDP, hardness
-from pharos.hardness.distances.sum_sweep import orbits
+from pharos.hardness.sum_sweep import orbits
 from pharos.kernels import graph
 from without_end import without_end
 

@@ -15,7 +15,7 @@ import pharos
 from naive.mdp import augmented, optimal_values
 from pharos import hardness
 from pharos.errors import ParameterError, UndefinedMeasure
-from pharos.hardness.gaps.value_norm import certified_value_norm
+from pharos.hardness.value_norm import certified_value_norm
 from pharos.mdp import TabularMDP, random_actions
 from strategies import deterministic_mdps, small_mdps
 

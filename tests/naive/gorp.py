@@ -1,4 +1,4 @@
-"""GORP by enumeration: the slow twin of pharos.hardness.planning.gorp, and returns by every path that play can take."""
+"""GORP by enumeration: the slow twin of pharos.hardness.gorp, and returns by every path that play can take."""
 
 import itertools
 import math

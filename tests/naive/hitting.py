@@ -1,5 +1,5 @@
 """Least expected hitting times by value iteration on explicit matrices: the slow twin of
-pharos.hardness.hitting.stochastic_diameter."""
+pharos.hardness.stochastic_diameter."""
 
 import itertools
 import math

@@ -1,5 +1,5 @@
 """The effective horizon straight from its definition, on explicit matrices: the slow twin of
-pharos.hardness.planning.effective_horizon."""
+pharos.hardness.effective_horizon."""
 
 import math
 

@@ -13,7 +13,7 @@ import command_line
 import pharos
 from pharos import hardness, leaderboard, study
 from pharos.errors import FileFormatError, ParameterError, UndefinedMeasure
-from pharos.hardness.representation import mean_field
+from pharos.hardness import representation
 from pharos.mdp import TabularMDP
 from pharos.solvers import regret_scale, uniform_value, value_iteration, worst_value
 from pharos.training import (
@@ -233,7 +233,7 @@ def last_policy_by_place(run, world, words):
     value, values = record["result"]["final_value"], RegretCurve.read(run).values
     entry = leaderboard.submit(run, run / "entry.safetensors")
     try:
-        of_learner = mean_field.Learner(task.mdp, hardness.Schedule(steps=10), 4).regret(value)
+        of_learner = representation.Learner(task.mdp, hardness.Schedule(steps=10), 4).regret(value)
     except UndefinedMeasure:
         of_learner = math.nan
     return {

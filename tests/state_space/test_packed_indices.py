@@ -1,6 +1,7 @@
 """Indices of 40 bits: what they hold, what loops and tables read of them, and the folders that hold them."""
 
 import contextlib
+import importlib
 import json
 import shutil
 import tempfile
@@ -21,7 +22,6 @@ from test_resuming import _build_and_die_at, build, files_of, in_a_child
 import pharos
 from pharos import hardness
 from pharos.errors import StateSpaceCorrupted, StateSpaceMismatch, StateSpaceTooLarge
-from pharos.hardness.distances import lean_sweep
 from pharos.interaction import GymEnv, make_vec
 from pharos.mdp import OutcomeTable, Table, lazy_actions, random_actions, sticky_actions
 from pharos.solvers import evaluate_policy, ranked, uniform_value, value_iteration, worst_value
@@ -368,7 +368,7 @@ def test_distances_and_gaps_are_the_same(mdp, restart, is_lean):
     wide = packed(mdp)
     with pytest.MonkeyPatch.context() as patch:
         if is_lean:
-            patch.setattr(lean_sweep, "available_memory", lambda: 0)
+            patch.setattr(importlib.import_module("pharos.hardness.diameter"), "available_memory", lambda: 0)
         one, other = (hardness.diameter(each, restart=restart) for each in (mdp, wide))
         assert (one.lower, one.upper, one.method, one.searches) == (
             other.lower,

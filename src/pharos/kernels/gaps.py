@@ -1,8 +1,8 @@
-"""Suboptimality gaps of blocks of states, and their sums; hardness/gaps/gaps.py says what they mean.
+"""Suboptimality gaps of blocks of states, and their sums; hardness/gaps.py says what they mean.
 
 gap (N, A) float64 >= 0, 0 for the best actions; counted (N,) int64, how often a row counts.
 
-Proofs of ties between actions; hardness/gaps/ties.py says what is proven.
+Proofs of ties between actions; hardness/gaps.py says what is proven.
 
 gap (N, A) >= 0, 0 for the best actions; counted (N,) how often a row counts. The map from values to what comes of them:
 places (C, 3) int64, or (C, 5) where there are several previous actions, with open addressing: the bits of a value

@@ -1,12 +1,12 @@
 """Least expected hitting times on explicit choices, and bounds of them by the ways between neighbouring states.
 
-Nodes have A actions each, row n A + a of a sparse matrix (first, node, weight). hardness/hitting/hitting_times.py says
+Nodes have A actions each, row n A + a of a sparse matrix (first, node, weight). hardness/hitting_times.py says
 what is computed and why the bounds hold. `goal` (N,) bool marks the nodes of the target, `alike` (N,) bool nodes that
 all have the same rows, such as those in which episodes end: what holds for the first of them is not worked out again
 for the others.
 
 Bounds of expected times between neighbouring states, for all pairs at once, and to each target from a hub, through the
-nodes around the target, are those of hardness/hitting/travel.py. Outcomes: state x has those numbered first[x] to
+nodes around the target, are those of hardness/stochastic_diameter.py. Outcomes: state x has those numbered first[x] to
 first[x + 1]: outcome i happens with probability prob[i] when action[i] is executed (-1: any action), and leads to
 node[i]. Outcome i stands for the aim to go from x to node[i] by choosing action[i].
 """

@@ -13,10 +13,22 @@ from typing import Any
 import numpy as np
 
 from pharos.errors import ParameterError
-from pharos.hardness.representation.kernel_operator import Exact, Identity, KernelOperator, Landmarks
-from pharos.hardness.representation.mean_field import MARGIN, WORST_GREEDY, Learner, Schedule, greedy_policy
-from pharos.hardness.representation.representation import LANDMARKS, MOST_EXACT, Grouped, Representation
-from pharos.hardness.visitation.occupancy import drawn, standard_occupancy
+from pharos.hardness.representation import (
+    LANDMARKS,
+    MARGIN,
+    MOST_EXACT,
+    WORST_GREEDY,
+    Exact,
+    Grouped,
+    Identity,
+    KernelOperator,
+    Landmarks,
+    Learner,
+    Representation,
+    Schedule,
+    greedy_policy,
+)
+from pharos.hardness.visitation import drawn, standard_occupancy
 from pharos.mdp import TabularMDP, paid_outcomes, require_mdp
 from pharos.solvers import Solution
 

@@ -1,23 +1,221 @@
 """The diameter of a graph by directed ExactSumSweep, searches from many nodes at once, and the argument of clocks.
 
-Source: Borassi et al. (2015); Then et al. (2014). Clocks are an argument of ours.
+`Graph` is that of a deterministic MDP, with searches forward and backward. `Layers` are those of a graph that contains
+a clock: every edge leads from one layer of nodes to the next, and round again. `orbits` are states that cannot be told
+apart by where actions lead. Source: Borassi et al. (2015); Then et al. (2014). Clocks are an argument of ours.
 
-States that cannot be told apart by where actions lead: orbits of the symmetries of a deterministic table.
+Clocks that the restart hides: the largest distances to many states, by searches that stand in the same layer. Let H be
+the graph without the edges of states that end, and e(u) the least number of steps from u to a state that ends, and one
+more. A shortest path from the start s does not pass it again, so d(s, v) is that of H, and
+
+    d(u, v) = min(d_H(u, v), e(u) + d(s, v)).
+
+e and d(s, .) are what the searches from the start say. Where all cycles of H are multiples of P steps long, as where
+traffic goes by, all edges of H lead from one layer {v: d(s, v) = j modulo P} to the next. Searches in H backward from
+many targets then stand in one layer if each begins when that of its target has its turn (`kernels.search_in_step`):
+that one layer is read for all targets, while levels, counted from each target, are as many layers as targets have. They
+end after as many steps as the other way has. Restarts, which lead from all layers to the first, make the common length
+of cycles 1 and would spread every search over all layers; in H they do not exist.
 """
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from pharos.hardness.distances.hidden_clock import HiddenClock
-from pharos.hardness.distances.transition_graph import WIDE, Graph, Layers
 from pharos.hardness.interval import Budget, BudgetClock, Interval
 from pharos.kernels import graph as kernels
 from pharos.kernels import many_searches
+from pharos.mdp import TabularMDP
 from pharos.system.packed_indices import Indices
 from pharos.system.wording import many
+
+
+class Graph:
+    """The graph of a deterministic MDP, with restart edges and the implicit end; see `pharos.kernels.graph`.
+
+    Attributes:
+        num_nodes: N, the states and, where some transition of a state that is not terminal is -1, the end.
+        start: the node that terminal states lead to; -1: they lead nowhere.
+        pivot: a start state, where searches begin.
+    """
+
+    def __init__(self, next_states: Indices, terminal: np.ndarray, start: int, pivot: int):
+        self.next_states = next_states
+        self.ends = np.ascontiguousarray(terminal, np.bool_)
+        self.start, self.pivot = start, pivot
+        self.has_end = _leads_to_end(next_states, self.ends)
+        self.num_nodes = len(next_states) + self.has_end
+        self.dtype = np.int32 if self.num_nodes < 2**31 else np.int64
+        self.queue = np.empty(self.num_nodes, self.dtype)
+        self._reversed: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
+
+    @staticmethod
+    def of(mdp: TabularMDP, restart: bool) -> "Graph | None":
+        """The graph of `mdp`; None where a choice or a restart has several outcomes."""
+        if not mdp.chance.is_none:
+            return None
+        table = mdp.dynamics.deterministic_table()
+        if table is None:
+            return None
+        restarts = restart and (bool(mdp.terminal.any()) or _leads_to_end(table, mdp.terminal))
+        if restarts and len(mdp.start_states) > 1:
+            return None
+        pivot = int(mdp.start_states[0])
+        return Graph(table, mdp.terminal, pivot if restarts else -1, pivot)
+
+    @property
+    def backward(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(first, previous, restarting): the reversed graph, made when it is first needed."""
+        if self._reversed is None:
+            restarting = np.empty(0, self.dtype)
+            if self.start >= 0:
+                ending = np.flatnonzero(self.ends)
+                restarting = np.append(ending, [len(self.next_states)] * self.has_end).astype(self.dtype)
+            self._reversed = (*kernels.reversed_graph(self.next_states, self.ends, self.num_nodes), restarting)
+        return self._reversed
+
+    def search_forward(self, source: int, distance: np.ndarray) -> tuple[int, int, int]:
+        """distance[v] = d(source, v); (nodes found, largest distance, sum of distances)."""
+        return kernels.search_forward(self.next_states, self.ends, self.start, source, distance, self.queue)
+
+    def search_backward(self, source: int, distance: np.ndarray) -> tuple[int, int, int]:
+        """distance[v] = d(v, source); (nodes found, largest distance, sum of distances)."""
+        return kernels.search_backward(*self.backward, self.start, source, distance, self.queue)
+
+
+def _leads_to_end(table: Indices, terminal: np.ndarray) -> bool:
+    """Whether a row that is followed holds -1; in blocks, for tables that are larger than memory."""
+    block = 1 << 20
+    for low in range(0, len(table), block):
+        rows = table[low : low + block]
+        if rows.min(initial=0) >= 0:
+            continue
+        ending = (rows < 0).any(axis=1)
+        if (ending & ~np.asarray(terminal[low : low + block])).any():
+            return True
+    return False
+
+
+# Layers ---------------------------------------------------------------------------------------------------------------
+
+
+# Nodes of a layer beyond which layers are not narrow: a set of them no longer fits into a core's cache.
+WIDE = 1024
+
+
+class Layers(NamedTuple):
+    """The nodes of a graph by layer.
+
+    Attributes:
+        order: (N,) nodes by layer. first: (P + 1,) where each layer begins in it.
+        position: (N,) int32, the place of a node in its layer.
+    """
+
+    order: np.ndarray
+    first: np.ndarray
+    position: np.ndarray
+
+    @staticmethod
+    def of(layer: np.ndarray, widths: np.ndarray, dtype: Any) -> "Layers":
+        """
+        Args:
+            layer: (N,) that of each node. widths: (P,) how many nodes each has. dtype: of nodes.
+        """
+        first = np.concatenate([[0], np.cumsum(widths)])
+        order = np.argsort(layer, kind="stable").astype(dtype)
+        position = np.empty(len(layer), np.int32)
+        position[order] = np.arange(len(layer)) - np.repeat(first[:-1], widths)
+        return Layers(order, first, position)
+
+    @property
+    def number(self) -> int:
+        """P."""
+        return len(self.first) - 1
+
+    @property
+    def widest(self) -> int:
+        """Nodes of the largest layer."""
+        return int(np.diff(self.first).max())
+
+
+# Hidden clocks --------------------------------------------------------------------------------------------------------
+
+
+# Cycles shorter than this leave layers so wide that searches by levels read as little.
+_SHORTEST = 64
+# Times that searches may go round.
+_ROUNDS = 4
+
+
+class HiddenClock(NamedTuple):
+    """The layers of a graph without its restarts.
+
+    Attributes:
+        home: (N,) steps to the start; away: (N,) steps from it.
+        layers: of the nodes, by `away` modulo P.
+    """
+
+    home: np.ndarray
+    away: np.ndarray
+    layers: Layers
+
+    @staticmethod
+    def of(graph: Graph, home: np.ndarray, away: np.ndarray) -> "HiddenClock | None":
+        """The clock of a graph with restarts; None where there is none, or its layers do not pay.
+
+        Args:
+            home, away: (N,) distances to the start, and from it.
+        """
+        if graph.start < 0 or graph.has_end:
+            return None
+        # Without a cycle nothing goes round: as many layers as there are distances.
+        cycle = int(kernels.period(graph.next_states, graph.ends, -1, away, False)) or int(away.max()) + 1
+        if cycle < _SHORTEST or int(away.max()) + int(home.max()) > _ROUNDS * cycle:
+            return None
+        layer = away % cycle
+        widths = np.bincount(layer, minlength=cycle)
+        if int(widths.max()) > WIDE:
+            return None
+        return HiddenClock(home.copy(), away.copy(), Layers.of(layer, widths, graph.dtype))
+
+    def largest_to(self, graph: Graph, targets: np.ndarray, best: int) -> tuple[np.ndarray, int]:
+        """((targets,) max over u of d(u, target), or `best` where that is larger; table entries read)."""
+        cycle = self.layers.number
+        of_target = self.away[targets] % cycle
+        order = np.argsort(-of_target, kind="stable")
+        # The first is the one after the longest stretch of layers without a target.
+        gaps = (np.roll(of_target[order], 1) - of_target[order]) % cycle
+        order = np.roll(order, -int(gaps.argmax()))
+        first = int(of_target[order[0]])
+        offset = (first - of_target[order]) % cycle
+        words = -(-len(targets) // 64)
+        scratch = np.zeros((2, self.layers.widest, words), np.uint64)
+        visits = np.zeros((len(self.away), words), np.uint64)
+        largest = np.full(len(targets), best, np.int64)
+        ordered = np.ascontiguousarray(targets[order], np.int64)
+        reads = kernels.search_in_step(
+            graph.next_states,
+            graph.ends,
+            *self.layers,
+            ordered,
+            first,
+            offset.astype(np.int64),
+            self.away[ordered].astype(np.int64),
+            self.home,
+            best,
+            scratch,
+            visits,
+            largest,
+        )
+        result = np.empty_like(largest)
+        result[order] = largest
+        return result, int(reads)
+
+
+# Sum sweep ------------------------------------------------------------------------------------------------------------
+
 
 # Widths of searches from many nodes, in words of 64 sources: eight words are a cache line.
 _WORDS = (1, 8)

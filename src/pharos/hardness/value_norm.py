@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from pharos.errors import ParameterError
-from pharos.hardness.gaps.gaps import gaps_of_states, optimal_solution
+from pharos.hardness.gaps import gaps_of_states, optimal_solution
 from pharos.hardness.interval import Certified
 from pharos.mdp import Chance, TabularMDP, require_mdp
 from pharos.solvers import Solution

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from pharos.errors import ParameterError, UndefinedMeasure
-from pharos.hardness.planning.steps import TIE, FiniteHorizonValues, check_returns, steps_of
+from pharos.hardness.steps import TIE, FiniteHorizonValues, check_returns, steps_of
 from pharos.mdp import TabularMDP, require_mdp
 from pharos.system.wording import many
 

@@ -2,25 +2,281 @@
 
 What is proven. Each value is within the solution's error bound of the true one, so a gap is known to twice that. A gap
 above the tie tolerance is a gap. Below it, a tie is proven where the best action and this one pay the same and lead to
-the same states, or where `ties` shows that equal values come from equal rewards for ever; else it may be a gap of any
-size, and its reciprocal anything.
+the same states, or where equal values come from equal rewards for ever; else it may be a gap of any size, and its
+reciprocal anything. Proofs that actions of equal computed value are tied:
+
+1. Two actions that pay the same and have the same outcomes are tied, whatever the MDP.
+
+2. Deterministic dynamics, with or without sticky actions. Let x be the computed values, and let every action that is
+not among the best computed ones be surely worse (its gap exceeds the error). Call two pairs (state, previous action)
+alike where x is the same to the last bit. If all pairs that are alike, and each of the best actions there, pay the same
+and lead to pairs that are alike, then what the best actions collect is the same sequence of rewards for ever, so their
+values are the same number: any choice among them solves the same equations, one for each class of pairs. Under sticky
+actions the action that is repeated must lead on alike as well. A map from values to rewards and next values
+(`kernels.extend`) finds out in one pass.
 """
 
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from pharos.errors import ParameterError, PrecisionError
-from pharos.hardness.gaps.gap_blocks import GapBlock, weighted_gaps
-from pharos.hardness.gaps.ties import TieProof, UnresolvedTies
 from pharos.hardness.interval import Certified
 from pharos.kernels import gaps as kernels
 from pharos.mdp import BEST, BellmanEquation, TabularMDP, require_mdp
 from pharos.solvers import Solution, value_iteration
 from pharos.system.memory import large_zeros
+
+# States at once; fixed, so that sums do not depend on the machine, and so few that a block stays in the cache.
+_BLOCK = 1 << 14
+# Bytes for the values of every step, with a horizon.
+_MEMORY = 8 * 2**30
+
+
+class Step(NamedTuple):
+    """A time step, or all where there is no horizon: x (S + 1, W), what follows it; which states count, how often."""
+
+    own: np.ndarray
+    next_x: np.ndarray
+    later: np.ndarray
+    first: np.ndarray
+
+
+class GapBlock(NamedTuple):
+    """Gaps of a block of states.
+
+    Attributes:
+        step: what they belong to. number: of that step.
+        states: (N,) indices. is_whole: whether they are a range.
+        rewards, following: (N, A), what executing an action pays, and the value of what follows.
+        gap: (N, A).
+        scale: the probability that the chosen action is executed, which each gap is multiplied by.
+        weight: (N,) how many pairs (state, previous action) a row stands for.
+        counted: (N,) the same; 0 for terminal states and those that cannot be reached.
+    """
+
+    step: Step
+    number: int
+    states: np.ndarray
+    rewards: np.ndarray
+    following: np.ndarray
+    gap: np.ndarray
+    scale: float
+    weight: np.ndarray
+    counted: np.ndarray
+    is_whole: bool = True
+
+
+def weighted_gaps(mdp: TabularMDP, solution: Solution) -> Iterator[GapBlock]:
+    """The gaps of all states, in blocks."""
+    for number, step in enumerate(steps_of(mdp, solution)):
+        yield from _gaps_of_step(mdp, step, number, solution.horizon is None and not mdp.is_sticky)
+
+
+def _gaps_of_step(mdp: TabularMDP, step: Step, number: int, everywhere: bool) -> Iterator[GapBlock]:
+    """The gaps of one step, in blocks; `everywhere`: states that cannot be reached have a weight, too."""
+    chance = mdp.chance
+    for first in range(0, mdp.num_states, _BLOCK):
+        block = slice(first, min(first + _BLOCK, mdp.num_states))
+        states = np.arange(block.start, block.stop)
+        rewards = mdp.reward_table.rows(block)
+        following = mdp.dynamics.expected(step.next_x, block)
+        difference = kernels.differences(rewards, following, mdp.gamma)
+        live = ~np.asarray(mdp.terminal[block])
+        later = step.later[block].astype(np.int64)
+        weight = later + (everywhere & (later == 0))
+        arrays = (number, states, rewards, following)
+        gap = difference if chance.chosen == 1.0 else chance.chosen * difference
+        yield GapBlock(step, *arrays, gap, chance.chosen, weight, np.where(live, later, 0))
+        if step.first[block].any():
+            some = np.flatnonzero(step.first[block])
+            arrays = (number, states[some], rewards[some], following[some])
+            once = np.ones(some.size, np.int64)
+            gap = chance.first_chosen * difference[some]
+            yield GapBlock(step, *arrays, gap, chance.first_chosen, once, live[some] * once, False)
+
+
+def steps_of(mdp: TabularMDP, solution: Solution) -> Iterator[Step]:
+    """For each step t = 1, ..., T, or once: values, and how many times each state counts.
+
+    later (S,): 1 for a reachable state, under sticky actions the number of actions by which it can be
+    reached; first (S,) bool: start states, which count once more under sticky actions, without a previous action.
+    """
+    lone = mdp.lone_starts
+    if solution.horizon is None:
+        yield Step(solution.x, solution.x, mdp.nodes_within().sum(axis=1), lone)
+        return
+    all_steps = _all_steps(mdp, solution)
+    nodes = np.zeros((mdp.num_states, mdp.width), np.bool_)
+    nodes[mdp.starts[~lone[mdp.starts]]] = True
+    for step in range(1, solution.horizon + 1):
+        to_go = solution.horizon - step + 1
+        own, following = (_with_end(all_steps[n]) for n in (to_go, to_go - 1))
+        yield Step(own, following, nodes.sum(axis=1), lone)
+        nodes, lone = mdp.nodes_after(nodes, lone), np.zeros_like(lone)
+
+
+def _all_steps(mdp: TabularMDP, solution: Solution) -> np.ndarray:
+    """(T + 1, S) or (T + 1, S, A), the values with every number of steps to go."""
+    needed = 8 * ((solution.horizon or 0) + 1) * mdp.num_states * mdp.width
+    if solution.all_steps is None:
+        if needed > _MEMORY:
+            raise ParameterError(
+                f"gaps of {solution.horizon} steps of {mdp.num_states} states need {needed / 2**30:.1f} GiB; expected "
+                f"at most {_MEMORY / 2**30:.0f}: leave out the horizon, or make it or the space smaller"
+            )
+        solution = value_iteration(mdp, horizon=solution.horizon, keep_all=True)
+    assert solution.all_steps is not None
+    return solution.all_steps
+
+
+def _with_end(values: np.ndarray) -> np.ndarray:
+    """(S + 1, W), from (S,) or (S, A)."""
+    return np.concatenate([values.reshape(len(values), -1), np.zeros((1, values[0].size))])
+
+
+# Ties -----------------------------------------------------------------------------------------------------------------
+
+
+# Different values up to which the map is kept; beyond, it would take more than 200 MB, and nothing is proven.
+MOST = 1 << 21
+# Places of the map in the beginning.
+_FIRST = 1 << 12
+
+
+class TieProof:
+    """The second proof, of one block of states after the other.
+
+    Attributes:
+        holds: whether it holds for all that was looked at.
+    """
+
+    def __init__(self, mdp: TabularMDP):
+        self.holds = mdp.dynamics.is_deterministic and not mdp.is_random
+        self._step = -1
+
+    def look_at(
+        self,
+        step: int,
+        own: np.ndarray,
+        rewards: np.ndarray,
+        following: np.ndarray,
+        gap: np.ndarray,
+        counted: np.ndarray,
+    ) -> None:
+        """Take up a block of N states.
+
+        Args:
+            step: values of different steps are different; blocks of one step come together.
+            own: (N, W), the computed values of the states.
+            rewards, following: (N, A), what executing an action pays, and the computed value of what follows.
+            gap: (N, A), 0 for the best computed actions.
+            counted: (N,), 0 for states that do not matter.
+        """
+        if not self.holds:
+            return
+        if step != self._step:
+            self._step, self._filled = step, 0
+            self._map = _empty_map(_FIRST, own.shape[1])
+            ended = np.zeros((1, own.shape[1])), np.zeros_like(rewards[:1]), np.zeros_like(rewards[:1])
+            self._extend(*ended, np.zeros_like(gap[:1]), np.ones(1, np.int64))  # worth 0 for ever
+        self._extend(own, rewards, following, gap, counted)
+
+    def _extend(
+        self, own: np.ndarray, rewards: np.ndarray, following: np.ndarray, gap: np.ndarray, counted: np.ndarray
+    ) -> None:
+        own, rewards, following = (np.ascontiguousarray(each).view(np.int64) for each in (own, rewards, following))
+        begin = 0
+        while self.holds and begin < len(gap):
+            begin, self._filled = kernels.extend(own, rewards, following, gap, counted, begin, self._map, self._filled)
+            if begin < 0 or self._filled > MOST:
+                self.holds = False
+            elif begin < len(gap):
+                larger = _empty_map(4 * len(self._map), own.shape[1])
+                kernels.refill(self._map, larger)
+                self._map = larger
+
+
+def _empty_map(size: int, width: int) -> np.ndarray:
+    return np.full((size, 3 if width == 1 else 5), kernels.FREE, np.int64)
+
+
+def same_outcomes(
+    mdp: TabularMDP, states: np.ndarray, rewards: np.ndarray, action: np.ndarray, other: np.ndarray
+) -> np.ndarray:
+    """(K,) bool: the first proof, whether two actions pay the same and have the same outcomes; rewards (K, A) of the
+    states (K,)."""
+    rows = np.arange(len(states))
+    same = rewards[rows, action] == rewards[rows, other]
+    one, two = (mdp.dynamics.outcomes(states, each) for each in (action, other))
+    counts = [np.bincount(each.which, minlength=len(states)) for each in (one, two)]
+    same &= counts[0] == counts[1]
+    firsts = [np.cumsum(each) - each for each in counts]
+    for k in range(int(counts[0].max(initial=0))):
+        some = np.flatnonzero(same & (counts[0] > k))
+        here, there = firsts[0][some] + k, firsts[1][some] + k
+        same[some] = (one.states[here] == two.states[there]) & (one.probabilities[here] == two.probabilities[there])
+    return same
+
+
+class UnresolvedTies:
+    """Counts the ties that are not proven to be ties.
+
+    Attributes:
+        small: gaps that are computed as larger than 0, and no larger than the tolerance; of a tolerance that is part of
+            what is asked for, gaps that are within their error of it.
+        equal: gaps that are computed as 0, beyond the first of a state.
+    """
+
+    def __init__(self, mdp: TabularMDP, tolerance: float, error: float, is_definition: bool):
+        self.mdp, self.tolerance, self.error, self.is_definition = mdp, tolerance, error, is_definition
+        self.small = self.equal = 0
+        self.proof = TieProof(mdp)
+
+    def look_at(self, part: GapBlock, small: int, equal: int) -> None:
+        """Take up the ties of a block: how many are small, and how many equal."""
+        if part.scale == 0.0:
+            return  # nothing can be chosen: every action is worth the same
+        if self.is_definition:
+            near = np.abs(part.gap - self.tolerance) <= self.error
+            self.small += int((near.sum(axis=1) * part.counted).sum())
+            return
+        self.small += small
+        self.equal += equal
+        if not self.small and self.proof.holds:
+            own = part.step.own[part.states[0] : part.states[-1] + 1] if part.is_whole else part.step.own[part.states]
+            self.proof.look_at(part.number, own, part.rewards, part.following, part.gap, part.counted)
+
+    def unresolved(self, parts: Iterator[GapBlock]) -> int:
+        """How many are not proven; `parts` once more, where that is to be seen one by one."""
+        if self.is_definition or (not self.small and self.proof.holds):
+            return self.small
+        if self.small or not self.equal:
+            return self.small + self.equal
+        return self.equal - sum(self._alike(part) for part in parts)
+
+    def _alike(self, part: GapBlock) -> int:
+        """Equal gaps of a block between actions that have the same outcomes."""
+        if part.scale == 0.0:
+            return 0
+        zero = (part.gap == 0.0) & (part.counted > 0)[:, None]
+        several = np.flatnonzero(zero.sum(axis=1) > 1)
+        zero = zero[several]
+        best = zero.argmax(axis=1)
+        zero[np.arange(several.size), best] = False
+        row, action = np.nonzero(zero)
+        rows = several[row]
+        likely = part.following[rows, best[row]] == part.following[rows, action]
+        row, action, rows = row[likely], action[likely], rows[likely]
+        same = same_outcomes(self.mdp, part.states[rows], part.rewards[rows], best[row], action)
+        return int(part.counted[rows[same]].sum())
+
+
+# Gaps -----------------------------------------------------------------------------------------------------------------
+
 
 # Of Colosseum.
 REGULARIZER = 0.1

@@ -1,1 +1,0 @@
-"""Distances without chance: diameter and start eccentricity, by searches on the graph of transitions."""

@@ -1,1 +1,0 @@
-"""Suboptimality gaps, proofs of ties, and the value norm."""

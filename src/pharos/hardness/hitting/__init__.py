@@ -1,1 +1,0 @@
-"""Distances under chance: expected hitting times with certificates, and diameters made of them."""

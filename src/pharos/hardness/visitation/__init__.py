@@ -1,1 +1,0 @@
-"""Where policies go and how long that takes: occupancy, covering, mixing, exploration."""
