@@ -48,7 +48,6 @@ TESTED_BY = {  # path in src/pharos: weight of its faults (kernels compile again
     "mdp/tabular.py": (1.0, "test_mdp test_natural_arguments test_dynamics"),
     "mdp/tabular_arrays.py": (1.0, "test_mdp test_natural_arguments test_dynamics"),
     "solvers/fixed_point.py": (1.0, "test_error_bounds test_solvers"),
-    "solvers/linear_systems.py": (1.0, "test_error_bounds test_solvers"),
     "solvers/policy_iteration.py": (1.0, "test_error_bounds test_solvers"),
     "solvers/values.py": (1.0, "test_error_bounds test_solvers"),
     "solvers/solution.py": (1.0, "test_solvers test_error_bounds"),

@@ -9,8 +9,7 @@ from collections import defaultdict, deque
 import numpy as np
 import pytest
 
-from pharos.ranks import Rank, RankFailed
-from pharos.ranks.rank import Alone, error_of, text_of
+from pharos.ranks import Alone, Rank, RankFailed, error_of, text_of
 
 
 class _Room:

@@ -15,7 +15,7 @@ from PIL import Image
 import pharos
 from pharos import hardness, plots
 from pharos.errors import FileFormatError, ParameterError
-from pharos.plots.plane import _label
+from pharos.plots.instances import _label
 from pharos.plots.regret import _label as run_label
 from pharos.plots.regret import _labels as run_labels
 from pharos.plots.style import thousands

@@ -16,9 +16,8 @@ from naive import mdp as naive_mdp
 from pharos.errors import ParameterError, UnknownName
 from pharos.explorer import Exploration, Explorer, Learnt, exploration_of, page, write
 from pharos.explorer.exploration import Pictures
-from pharos.explorer.maps import heat_map, quantities, quantity
-from pharos.explorer.pages import contents
-from pharos.explorer.server import MOST_CONNECTIONS
+from pharos.explorer.launch import MOST_CONNECTIONS
+from pharos.explorer.pages import contents, heat_map, quantities, quantity
 from pharos.explorer.states import NumberedStates, axes_of
 from pharos.mdp import TabularMDP
 

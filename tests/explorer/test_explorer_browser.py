@@ -10,7 +10,7 @@ import pytest
 
 import headless
 from pharos.explorer import Exploration, Explorer, Learnt, exploration_of, write
-from pharos.explorer.server import QUESTIONS
+from pharos.explorer.launch import QUESTIONS
 from pharos.mdp import TabularMDP
 
 pytestmark = [

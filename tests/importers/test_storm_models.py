@@ -17,7 +17,7 @@ try:
 except ImportError:
     models = None
 
-storm = importlib.import_module("pharos.importers.storm")
+storm = importlib.import_module("pharos.importers.files")
 needs_storm = pytest.mark.skipif(models is None, reason="stormpy is not installed")
 
 

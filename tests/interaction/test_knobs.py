@@ -20,7 +20,7 @@ from pharos.agents.batched.lane import BatchedEpisodes
 from pharos.environments import Environment, Layer
 from pharos.interaction import GymEnv, VectorEnv
 from pharos.mdp import ChanceSetting, rewards_of_staying
-from pharos.policies.query import TableAnswers
+from pharos.policies.policy import TableAnswers
 from pharos.policies.value import estimate
 from pharos.rules.stepping import InterpretedStepping
 from pharos.training import Task, evaluate_agent

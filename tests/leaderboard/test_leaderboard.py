@@ -182,7 +182,7 @@ def test_names_of_code_are_refused_without_trust(entry, file, part, name):
 
 
 def test_the_version_of_the_rules_is_that_of_the_run_though_its_class_is_not_loaded(run, entry, tmp_path, monkeypatch):
-    submission = importlib.import_module("pharos.leaderboard.submission")
+    submission = importlib.import_module("pharos.leaderboard.entry")
     monkeypatch.setattr(submission, "class_called", lambda name: None)
     packed = leaderboard.read(leaderboard.submit(run, tmp_path / "again.safetensors"))
     assert packed.rules_version == entry.rules_version == pharos.make("simple_grid").version

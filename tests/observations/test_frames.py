@@ -16,8 +16,7 @@ from pharos.interaction import GymEnv, make_sb3_vec, make_vec
 from pharos.mdp import PolicyTable
 from pharos.observations import aliasing, history_aliasing, observation_classes, observe
 from pharos.policies import Evaluation
-from pharos.policies.histories import QueriedHistories
-from pharos.policies.value import estimate
+from pharos.policies.value import QueriedHistories, estimate
 from pharos.training import Task, evaluate_agent
 
 BREAKOUT = pharos.make("breakout", height=6, columns=3, brick_rows=1)

@@ -19,9 +19,7 @@ import pharos
 from pharos.errors import ParameterError, PrecisionError
 from pharos.mdp import BEST, WORST, PolicyTable, TabularMDP
 from pharos.ranks import RankFailed
-from pharos.solvers import checkpoint as checkpoints
 from pharos.solvers import evaluate_policy, ranked, uniform_value, value_iteration
-from pharos.solvers import ranked as sharing
 from pharos.solvers.ranked import DistributedOptions, shared_solution
 from rank_threads import Killed, fails_at, out_of_order, threads
 from strategies import FEW, deterministic_mdps, hard_mdps, lazy_mdps, outcome_mdps, small_mdps
@@ -41,7 +39,7 @@ def chain(num_states=300, gamma=0.9):
 
 
 def solved(mdp, size, *, select=BEST, tolerance=1e-6, horizon=None, disturb=lambda rank: None, cuts=None, **options):
-    with threads(sharing, size, disturb), pytest.MonkeyPatch.context() as patch:
+    with threads(ranked, size, disturb), pytest.MonkeyPatch.context() as patch:
         if cuts is not None:
             patch.setattr(ranked, "cuts_of", lambda num_rows, ranks: np.array(cuts))
         return shared_solution(mdp, select, tolerance, horizon, DistributedOptions("mpi", **options))
@@ -88,7 +86,7 @@ def test_evaluation_and_the_uniform_policy_are_shared(monkeypatch):
     mdp, policy = chain(), np.arange(300) % 2
     for function in (lambda **more: evaluate_policy(mdp, policy, **more), lambda **more: uniform_value(mdp, **more)):
         alone = function()
-        with threads(sharing, 3):
+        with threads(ranked, 3):
             shared = function(processes="mpi")
         assert np.abs(shared.v - alone.v).max() <= alone.error_bound + shared.error_bound
 
@@ -212,7 +210,7 @@ def test_solving_goes_on_whoever_failed_and_however_many_go_on(size, who, number
     with tempfile.TemporaryDirectory() as folder:
         options = {"horizon": horizon, "checkpoint": folder, "checkpoint_seconds": -1.0}
         with contextlib.suppress(Killed, RankFailed), pytest.MonkeyPatch.context() as patch:
-            patch.setattr(checkpoints, "_SHARE", 0)
+            patch.setattr(ranked, "_SHARE", 0)
             late, fails = out_of_order(seed), fails_at(who % size, number)
             solved(mdp, size, disturb=lambda rank: (fails(rank), late(rank)), **options)
         result = solved(mdp, then, **options)
@@ -225,7 +223,7 @@ def test_solving_goes_on_whoever_failed_and_however_many_go_on(size, who, number
 
 @pytest.mark.long
 def test_a_checkpoint_is_of_one_question(tmp_path, monkeypatch):
-    monkeypatch.setattr(checkpoints, "_SHARE", 0)
+    monkeypatch.setattr(ranked, "_SHARE", 0)
     options = {"checkpoint": tmp_path, "checkpoint_seconds": -1.0}
     with pytest.raises(Killed):
         solved(chain(), 2, disturb=fails_at(0, 20), **options)
@@ -234,7 +232,7 @@ def test_a_checkpoint_is_of_one_question(tmp_path, monkeypatch):
     paid = np.ones((300, 2)) * (np.arange(300) < 299)[:, None]
     for mdp in (chain(), chain(gamma=0.8), chain().with_rewards(paid)):
         done = []
-        with threads(sharing, 3):
+        with threads(ranked, 3):
             report = lambda sweeps, _, done=done: done.append(sweeps)  # noqa: E731
             value_iteration(mdp, processes="mpi", checkpoint=tmp_path, progress=report)
         first.append(done[0])
@@ -247,7 +245,7 @@ def test_a_checkpoint_is_of_one_question(tmp_path, monkeypatch):
 @pytest.mark.long
 @pytest.mark.parametrize("harm", ["cut", "changed", "empty"])
 def test_a_checkpoint_that_is_not_whole_is_no_checkpoint(harm, tmp_path, monkeypatch):
-    monkeypatch.setattr(checkpoints, "_SHARE", 0)
+    monkeypatch.setattr(ranked, "_SHARE", 0)
     options = {"horizon": 60, "checkpoint": tmp_path, "checkpoint_seconds": -1.0}
     with pytest.raises(Killed):
         solved(chain(), 2, disturb=fails_at(0, 25), **options)
@@ -260,12 +258,12 @@ def test_a_checkpoint_that_is_not_whole_is_no_checkpoint(harm, tmp_path, monkeyp
 
 @pytest.mark.long
 def test_a_full_disk_ends_no_solving(tmp_path, monkeypatch):
-    monkeypatch.setattr(checkpoints, "_SHARE", 0)
+    monkeypatch.setattr(ranked, "_SHARE", 0)
 
     def full(*_, **__):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(checkpoints.storage, "replacing", full)
+    monkeypatch.setattr(ranked.storage, "replacing", full)
     with pytest.warns(UserWarning, match=r"No space left on device; values are not kept any more, solving goes on"):
         result = solved(chain(), 2, checkpoint=tmp_path, checkpoint_seconds=-1.0)
     assert result.error_bound <= 1e-6
@@ -291,10 +289,10 @@ SOLVE = """
 import os, pathlib, signal, sys
 import numpy as np
 from pharos.mdp import BEST
-from pharos.solvers import checkpoint, ranked
+from pharos.solvers import ranked
 from test_ranked_values import chain
 folder, last, sweeps, first = pathlib.Path(sys.argv[1]), int(sys.argv[2]), [], []
-sweep, checkpoint._SHARE = ranked.RankedBackup.plain_sweep, 0
+sweep, ranked._SHARE = ranked.RankedBackup.plain_sweep, 0
 def dies(backup):
     sweeps.append(0)
     if backup.rank.rank == 2 and len(sweeps) == last:

@@ -17,9 +17,10 @@ from hypothesis import strategies as st
 from test_resuming import build, files_of
 
 import pharos
+from pharos import ranks
 from pharos.errors import MissingExtra, ParameterError, RuleError, StateSpaceError, StateSpaceTooLarge
 from pharos.kernels import hash_table
-from pharos.ranks import Halo, RankFailed, cuts_of, mpi, run_spmd
+from pharos.ranks import Halo, RankFailed, cuts_of, run_spmd
 from pharos.state_space import ranked_table, search
 from pharos.state_space.files import lock
 from pharos.state_space.plan import Plan
@@ -300,13 +301,13 @@ def test_numbers_of_processes_that_mean_nothing_are_refused(size, tmp_path):
 
 def test_a_command_that_cannot_be_started_by_mpiexec_is_one_line(monkeypatch):
     monkeypatch.setenv("PHAROS_STARTED", "3")
-    monkeypatch.setattr(mpi.shutil, "which", lambda *_, **__: "mpiexec")
-    monkeypatch.setattr(mpi.importlib.util, "find_spec", lambda name: name)
+    monkeypatch.setattr(ranks.shutil, "which", lambda *_, **__: "mpiexec")
+    monkeypatch.setattr(ranks.importlib.util, "find_spec", lambda name: name)
     with pytest.raises(ParameterError, match=r"write mpiexec -n 3 pharos \.\.\., with --processes mpi"):
-        mpi.start_under_mpiexec(3)
-    monkeypatch.setattr(mpi.shutil, "which", lambda *_, **__: None)
+        ranks.start_under_mpiexec(3)
+    monkeypatch.setattr(ranks.shutil, "which", lambda *_, **__: None)
     with pytest.raises(MissingExtra, match=r"--processes 3 needs mpi4py .*pharos-rl\[mpi\]"):
-        mpi.start_under_mpiexec(3)
+        ranks.start_under_mpiexec(3)
 
 
 def test_a_rank_of_mpi_that_fails_tells_the_others(monkeypatch):
@@ -352,16 +353,16 @@ def test_ranks_of_mpi_write_the_same_files_and_go_on_after_a_kill(tmp_path):
 BUILD = """
 import os, signal
 from pharos.cli import main
-from pharos.ranks import mpi
+from pharos import ranks
 from pharos.state_space import ranked_table
 ranked_table.RankedSearch.__init__.__defaults__, ranked_table.ROWS = (0,), 64
-exchange, exchanges = mpi._Mpi.exchange, []
+exchange, exchanges = ranks._Mpi.exchange, []
 def dies(rank, parts):
     exchanges.append(0)
     if rank.rank == 2 and len(exchanges) == int(os.environ["LAST_EXCHANGE"]):
         os.kill(os.getpid(), signal.SIGKILL)
     return exchange(rank, parts)
-mpi._Mpi.exchange = dies
+ranks._Mpi.exchange = dies
 main()
 """
 

@@ -12,18 +12,21 @@ if TYPE_CHECKING:
         GROUNDS,
         INK,
         NIGHT,
+        Window,
+        check_state,
+        colored_text,
         episode,
         ground_of,
         human,
         image,
         inside,
+        planes_of,
         save_gif,
         save_png,
         scenery_of,
+        text_drawing,
     )
     from pharos.drawing.shapes import SHAPES, color_of, glyph_of, shade, shape_of, sprite_of, sprite_pixels, tile
-    from pharos.drawing.text import check_state, colored_text, planes_of, text_drawing
-    from pharos.drawing.window import Window
 
 __all__ = [
     "GROUNDS",

@@ -1,28 +1,98 @@
-"""Pictures of states for people, and pictures written to files.
+"""Pictures of states for people: as text, as pixels, written to files, in a window.
 
 Everything is made from what an environment declares: `draw` says what is where (one plane of cells for each layer),
-`layers` and `look` say how it looks.
-
-What lies below all things: grounds by name, and the scenery of complex images.
-
-The look of "asphalt" and "walls" follows the Atari 2600 games (colours of its palette, wide pixels).
+`layers` and `look` say how it looks. As text: one glyph a cell, later layers cover earlier ones. Grounds, by name, lie
+below all things. The look of "asphalt" and "walls" follows the Atari 2600 games (colours of its palette, wide pixels).
 """
 
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pharos.drawing.shapes import tile
-from pharos.drawing.text import planes_of
+from pharos.drawing.shapes import color_of, glyph_of, tile
 from pharos.environments import Environment, Ground, Margin, Scenery, State
-from pharos.errors import UnknownName
+from pharos.errors import MissingExtra, ParameterError, UnknownName
 from pharos.system import storage
 
 if TYPE_CHECKING:
     from PIL.Image import Image
+    from rich.text import Text
+
+
+GROUND = "."
+
+
+def text_drawing(env: Environment, state: Sequence[int]) -> str:
+    """Return `state` drawn as text: a line for each row of `env.grid()`, a glyph for each cell.
+
+    Args:
+        state: D integers.
+    Raises:
+        ParameterError: the class declares no `grid` or `draw`, or `state` is none of its states.
+    """
+    planes = planes_of(env, state)
+    picture = np.full(planes.shape[1:], GROUND)
+    for plane, layer in zip(planes, env.layers.values(), strict=True):
+        for value, glyph in enumerate(layer.glyph, start=1):
+            picture[plane == value] = glyph
+    return "\n".join("".join(row) for row in picture)
+
+
+def colored_text(env: Environment, state: Sequence[int]) -> "Text":
+    """Return `state` as Rich text for a terminal: two columns for each cell, in the colours of the layers."""
+    from rich.text import Text
+
+    drawn = Text()
+    planes = planes_of(env, state)
+    layers = list(env.layers.values())
+    for row in range(planes.shape[1]):
+        for column in range(planes.shape[2]):
+            here = np.flatnonzero(planes[:, row, column])
+            if not here.size:
+                drawn.append(" .", style="bright_black")
+                continue
+            layer, value = layers[here[-1]], int(planes[here[-1], row, column])
+            red, green, blue = color_of(layer, value)
+            drawn.append(f" {glyph_of(layer, value)}", style=f"bold rgb({red},{green},{blue})")
+        drawn.append("\n")
+    drawn.rstrip()
+    return drawn
+
+
+# Planes ---------------------------------------------------------------------------------------------------------------
+
+
+def planes_of(env: Environment, state: Sequence[int]) -> np.ndarray:
+    """(L, rows, columns) uint8: for each layer, 0 where nothing is, 1, 2, ... where its things are.
+
+    Raises:
+        ParameterError: the class declares no `grid` or `draw`, or `state` is none of its states.
+    """
+    check_state(env, state)
+    try:
+        rows, columns = env.grid()
+        planes = np.zeros((len(env.layers), rows, columns), np.uint8)
+        env.draw(tuple(int(value) for value in state), planes)
+    except NotImplementedError as error:
+        raise ParameterError(f"{env}: cannot be drawn: {error}") from error
+    return planes
+
+
+def check_state(env: Environment, state: Sequence[int]) -> None:
+    """ParameterError unless `state` has D components, each in its declared range."""
+    components = env.components
+    if len(state) != len(components):
+        raise ParameterError(f"{env}: found a state with {len(state)} components; expected {len(components)}")
+    for name, value, low, high in zip(components.names, state, components.low, components.high, strict=True):
+        if not low <= value <= high:
+            raise ParameterError(f"{env}: state has {name} = {value}; expected {low} to {high}")
+
+
+# Pictures -------------------------------------------------------------------------------------------------------------
+
 
 HEIGHT, WIDTH = 720, 960  # pixels that a picture takes at most, where its cells are not smaller than CELLS[0] for it
 CELLS = (8, 16, 24, 32, 40, 48, 64)  # pixels of a cell; multiples of 8, so that sprites of 8 x 8 stay sharp
@@ -261,3 +331,41 @@ GROUNDS: dict[str, Ground] = {
     "walls": _walls,
 }
 """Name of a ground -> function that paints it. Classes choose by name, or bring a function of their own."""
+
+
+# Window ---------------------------------------------------------------------------------------------------------------
+
+
+class Window:
+    """Shows pictures, one after the other, `fps` a second at most; opens with the first.
+
+    Raises:
+        MissingExtra: pygame is not installed.
+    """
+
+    def __init__(self, caption: str, fps: int):
+        try:
+            import pygame
+        except ImportError as error:
+            raise MissingExtra("render_mode='human'", "pygame-ce", "play") from error
+        self._pygame, self._caption, self._fps = pygame, caption, fps
+        self._surface: Any = None
+        self._clock = pygame.time.Clock()
+
+    def show(self, picture: np.ndarray) -> None:
+        """Show (H, W, 3) uint8."""
+        pygame, size = self._pygame, (picture.shape[1], picture.shape[0])
+        if self._surface is None or self._surface.get_size() != size:
+            pygame.display.init()
+            pygame.display.set_caption(self._caption)
+            self._surface = pygame.display.set_mode(size)
+        pygame.surfarray.blit_array(self._surface, picture.swapaxes(0, 1))
+        pygame.event.pump()
+        pygame.display.flip()
+        self._clock.tick(self._fps)
+
+    def close(self) -> None:
+        """Close it; the next picture opens another."""
+        if self._surface is not None:
+            self._pygame.display.quit()
+            self._surface = None

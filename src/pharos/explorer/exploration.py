@@ -21,9 +21,17 @@ from pharos.drawing import NIGHT, ground_of, image, planes_of, tile
 from pharos.environments import Environment, Layer, State
 from pharos.errors import ParameterError
 from pharos.explorer.keys import keys_of
-from pharos.explorer.layers import Layers
-from pharos.explorer.learned_policy import LEARNT, OPTIMAL, UNIFORM, Learnt, probabilities
-from pharos.explorer.states import NumberedStates, SpaceStates, States
+from pharos.explorer.states import (
+    LEARNT,
+    OPTIMAL,
+    UNIFORM,
+    Layers,
+    Learnt,
+    NumberedStates,
+    SpaceStates,
+    States,
+    probabilities,
+)
 from pharos.hardness import discounted_visits, occupancy
 from pharos.mdp import TabularMDP
 from pharos.solvers import Solution, uniform_value, value_iteration
@@ -392,7 +400,7 @@ class Exploration:
 
     def about(self) -> dict[str, Any]:
         """Page metadata: title, sizes, policies, map axes."""
-        from pharos.explorer.maps import about_maps
+        from pharos.explorer.pages import about_maps
 
         mdp, starts = self.mdp, np.argsort(-self.mdp.start_probabilities, kind="stable")[:MOST_STARTS]
         return {

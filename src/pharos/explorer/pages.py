@@ -1,10 +1,16 @@
-"""The page: template, style and script in one text, which loads nothing; with the data of a small space inside."""
+"""The page: template, style and script in one text, which loads nothing; with the data of a small space inside.
+
+Heat maps: a quantity over two variables, the others at chosen values or at any. The states of a large space are gone
+through in blocks, so that no more than some megabytes are needed beside it.
+"""
 
 import base64
 import hashlib
 import html
 import json
 import os
+from collections.abc import Mapping
+from dataclasses import asdict
 from functools import cache
 from importlib import resources
 from pathlib import Path
@@ -12,11 +18,177 @@ from typing import Any
 
 import numpy as np
 
-from pharos.errors import ParameterError
-from pharos.explorer.exploration import Exploration
-from pharos.explorer.maps import quantities, quantity
+from pharos.errors import ParameterError, UnknownName
+from pharos.explorer.exploration import Exploration, number
+from pharos.explorer.states import OPTIMAL, Axis, axes_of, find_axis
 from pharos.mdp import TabularMDP
 from pharos.system import storage
+
+BLOCK = 1 << 18  # states that are looked at in one go
+MEAN, LEAST, MOST, SUM = "mean", "least", "most", "sum"
+HOW = (MEAN, LEAST, MOST, SUM)
+GROUPS = {"column", "x"}, {"row", "y"}  # words in the names of variables that are drawn first, across and down
+
+
+def quantities(world: Exploration) -> dict[str, str]:
+    """Name -> what it says, of all quantities of a state."""
+    names = {"value": "optimal value V*"}
+    names |= {f"value_{name}": f"value of the {name} policy" for name in world.policies if name != OPTIMAL}
+    names |= {f"regret_{name}": f"regret of the {name} policy, V* - V" for name in world.policies if name != OPTIMAL}
+    names |= {
+        "smallest_gap": "smallest gap that is no tie",
+        "largest_gap": "largest gap",
+        "best_action": "optimal action, the first among equals",
+        "layer": "breadth-first layer (depth)",
+    }
+    return names | {f"visits_{name}": f"occupancy of the {name} policy" for name in world.policies}
+
+
+def quantity(world: Exploration, name: str, states: np.ndarray) -> np.ndarray:
+    """(N,) a quantity of states; NaN where it has none, as most have in terminal states.
+
+    Raises:
+        UnknownName: there is none of this name.
+    """
+    if name not in quantities(world):
+        raise UnknownName("quantity", name, quantities(world))
+    kind, _, policy = name.partition("_")
+    if name == "layer":
+        layers = world.layers.of(states).astype(np.float64)
+        return np.where(layers < 0, np.nan, layers)
+    if kind == "visits":
+        result = world.visits.of(policy)[states]
+    elif kind == "value":
+        result = world.values(policy or OPTIMAL, states)
+    elif kind == "regret":
+        result = world.values(OPTIMAL, states) - world.values(policy, states)
+    else:
+        chosen = world.chosen_values(OPTIMAL, states)
+        gaps = chosen.max(axis=1, keepdims=True) - chosen
+        if name == "best_action":
+            result = world.best_actions(chosen).astype(np.float64)
+        elif name == "largest_gap":
+            result = gaps.max(axis=1)
+        else:
+            result = np.where(gaps > world.tie_tolerance, gaps, np.inf).min(axis=1)
+            result[np.isinf(result)] = np.nan
+    return np.where(world.mdp.terminal[states], np.nan, result)
+
+
+def heat_map(
+    world: Exploration, x: str, y: str, what: str = "value", *, fixed: Mapping[str, int] | None = None, how: str = MEAN
+) -> dict[str, Any]:
+    """A quantity over two axes.
+
+    Args:
+        x, y: names of axes, across and down.
+        what: a quantity, see `quantities`.
+        fixed: variable -> value, of the states that count; other variables may have any value.
+        how: what a cell of several states shows: "mean", "least", "most" or "sum". Of actions: the action where all
+            states have the same, else -1.
+    Returns:
+        `x`, `y`: the axes; `cells`: rows of values, None where there are none; `count`: rows of numbers of states;
+        `state`: rows of the first state of each cell, -1 where there is none; `terminal`: rows of how many are
+        terminal; `low`, `high`: of all cells; `states`: how many count.
+    Raises:
+        UnknownName: an axis, a variable or a quantity does not exist. ParameterError: `how` is none of these, or the
+            axes are the same.
+    Cost: one read of the packed states, and of what the quantity is made of.
+    """
+    axes = axes_of(world.states)
+    across, down = find_axis(axes, x), find_axis(axes, y)
+    if across is down:
+        raise ParameterError(f"both axes are {x!r}; expected two of {', '.join(axes)}")
+    if how not in HOW:
+        raise UnknownName("summary", how, HOW)
+    if what not in quantities(world):
+        raise UnknownName("quantity", what, quantities(world))
+    slices = {_variable(world, name): value for name, value in (fixed or {}).items()}
+    cells = _Cells(down.count, across.count)
+    for start in range(0, world.mdp.num_states, BLOCK):
+        block = slice(start, min(start + BLOCK, world.mdp.num_states))
+        states = np.flatnonzero(world.states.matching(slices, block))
+        if not states.size:
+            continue
+        places = [axis.places(world.states.column(axis.variable, block)[states]) for axis in (down, across)]
+        here = start + states
+        terminal = world.mdp.terminal[here]
+        cells.add(places[0] * across.count + places[1], here, quantity(world, what, here), terminal)
+    return {"x": asdict(across), "y": asdict(down), "what": what, "how": how} | cells.answer(what, how)
+
+
+def _variable(world: Exploration, name: str) -> int:
+    if name not in world.states.names:
+        raise UnknownName("variable", name, world.states.names)
+    return world.states.names.index(name)
+
+
+class _Cells:
+    """Values met in each cell so far."""
+
+    def __init__(self, rows: int, columns: int):
+        self.shape, size = (rows, columns), rows * columns
+        self.count, self.terminal, self.known = (np.zeros(size, np.int64) for _ in range(3))
+        self.sum, self.least, self.most = np.zeros(size), np.full(size, np.inf), np.full(size, -np.inf)
+        self.first = np.full(size, np.iinfo(np.int64).max)
+
+    def add(self, places: np.ndarray, states: np.ndarray, values: np.ndarray, terminal: np.ndarray) -> None:
+        size = len(self.count)
+        self.count += np.bincount(places, minlength=size)
+        self.terminal += np.bincount(places[terminal], minlength=size)
+        np.minimum.at(self.first, places, states)
+        is_known = ~np.isnan(values)
+        places, values = places[is_known], values[is_known]
+        self.known += np.bincount(places, minlength=size)
+        self.sum += np.bincount(places, values, minlength=size)
+        np.minimum.at(self.least, places, values)
+        np.maximum.at(self.most, places, values)
+
+    def answer(self, what: str, how: str) -> dict[str, Any]:
+        is_known = self.known > 0
+        if what == "best_action":
+            shown = np.where(self.least == self.most, self.least, -1.0)
+        else:
+            means = self.sum / np.maximum(self.known, 1)
+            shown = {MEAN: means, LEAST: self.least, MOST: self.most, SUM: self.sum}[how]
+        listed = [number(value) if there else None for value, there in zip(shown, is_known, strict=True)]
+        numbers = shown[is_known]
+        return {
+            "cells": self._rows(listed),
+            "count": self._rows(self.count.tolist()),
+            "terminal": self._rows(self.terminal.tolist()),
+            "state": self._rows(np.where(self.count > 0, self.first, -1).tolist()),
+            "low": number(numbers.min()) if numbers.size else None,
+            "high": number(numbers.max()) if numbers.size else None,
+            "states": int(self.count.sum()),
+        }
+
+    def _rows(self, values: list[Any]) -> list[list[Any]]:
+        rows, columns = self.shape
+        return [values[row * columns : (row + 1) * columns] for row in range(rows)]
+
+
+def about_maps(world: Exploration) -> dict[str, Any]:
+    """Choices of the page: `axes`, `quantities`, and which are drawn first, `first`: x, y."""
+    axes = axes_of(world.states)
+    return {
+        "axes": [asdict(axis) for axis in axes.values()],
+        "quantities": quantities(world),
+        "first": _first_axes(axes),
+    }
+
+
+def _first_axes(axes: Mapping[str, Axis]) -> list[str]:
+    """The axes x, y that are drawn first: what is called a column and a row, else the longest that are left."""
+    words = {name: set(name.lower().replace("[", "_").split("_")) for name in axes}
+    column, row = (next((name for name in axes if words[name] & group), None) for group in GROUPS)
+    longest = sorted(axes, key=lambda name: -axes[name].count)
+    x = column or next(name for name in longest if name != row)
+    return [x, row or next(name for name in longest if name != x)]
+
+
+# Pages ----------------------------------------------------------------------------------------------------------------
+
 
 MOST_POSITIONS = 10_000  # states, under sticky actions times previous ones, that a page of its own holds
 MOST_BYTES = 64 << 20  # of such a page

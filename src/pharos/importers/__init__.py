@@ -3,11 +3,16 @@
 Nothing here unpickles: files hold plain arrays and JSON, or are refused.
 """
 
-from pharos.importers.bridge import bridge, bridge_screens, has_screens
+from pharos.importers.files import bridge, bridge_screens, has_screens, storm, storm_recording
 from pharos.importers.folder import Outcomes, environment, is_folder, load, save
-from pharos.importers.gymnasium import gymnasium, gymnasium_outcomes, matrices
-from pharos.importers.minigrid import minigrid, minigrid_grids, minigrid_recording
-from pharos.importers.storm import storm, storm_recording
+from pharos.importers.gymnasium import (
+    gymnasium,
+    gymnasium_outcomes,
+    matrices,
+    minigrid,
+    minigrid_grids,
+    minigrid_recording,
+)
 
 __all__ = [
     "bridge",

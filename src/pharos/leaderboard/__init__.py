@@ -1,8 +1,17 @@
 """Entries of a leaderboard: what a run has learnt and what it claims, in one file that anybody can verify."""
 
 from pharos.leaderboard.board import Board, Cell, Ranking, board, reason, write_page
-from pharos.leaderboard.entry import Claim, Entry, check_values, in_file, read, read_sealed, write_sealed
-from pharos.leaderboard.submission import stored_table, submit
+from pharos.leaderboard.entry import (
+    Claim,
+    Entry,
+    check_values,
+    in_file,
+    read,
+    read_sealed,
+    stored_table,
+    submit,
+    write_sealed,
+)
 from pharos.leaderboard.verification import Check, Verdict, verify
 
 __all__ = [

@@ -4,11 +4,8 @@ Each function draws on the matplotlib axes given, or on a new figure, and return
 are told apart by colour-blind people (Okabe and Ito, 2008). Nothing opens a window or changes matplotlib's settings.
 """
 
-from pharos.plots.grid import value_map
-from pharos.plots.plane import growth, hardness_plane, states_by_depth
-from pharos.plots.policies import policies
-from pharos.plots.predictions import predictions, unseen_figures
-from pharos.plots.regret import regret
+from pharos.plots.instances import growth, hardness_plane, policies, states_by_depth, value_map
+from pharos.plots.regret import predictions, regret, unseen_figures
 from pharos.plots.style import (
     DIAGONAL,
     agent_name,

@@ -4,13 +4,18 @@ from pharos.policies.policy import (
     DeepPolicy,
     Model,
     Policy,
+    PolicyAnswers,
     PolicyLike,
+    QueriedPolicy,
+    ReachableRows,
     RecurrentPolicy,
+    Sight,
+    TableAnswers,
     TabularAgent,
     deep_policy,
     policy_function,
+    reachable_rows,
 )
-from pharos.policies.query import PolicyAnswers, QueriedPolicy, ReachableRows, Sight, TableAnswers, reachable_rows
 from pharos.policies.value import (
     Evaluation,
     ReachedSolution,

@@ -1,12 +1,22 @@
-"""Kinds of policies: a table over the states, or a function of observations that returns probabilities or actions."""
+"""Kinds of policies: a table over the states, or a function of observations that returns probabilities or actions.
+
+A policy is queried once about each state that it reaches, in batches. Two kinds of policy are queried alike: functions
+of observations (`PolicyAnswers`) and tables (`TableAnswers`).
+"""
 
 import inspect
-from collections.abc import Callable
-from typing import Any, Protocol, TypeAlias, runtime_checkable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, NamedTuple, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 
+from pharos.environments import Environment
 from pharos.errors import ParameterError
+from pharos.mdp import Rewards, TabularMDP
+from pharos.observations import ObservationInContext, observe
+from pharos.state_space import StateSpace
 
 
 @runtime_checkable
@@ -172,3 +182,328 @@ def _as_policy_sees(observations: Any, space: Any) -> Any:
     if observations.ndim == 4 and observations.shape[1:] != space.shape:
         return observations.transpose(0, 3, 1, 2)
     return observations
+
+
+# Policies asked -------------------------------------------------------------------------------------------------------
+
+
+# Observations in one query of a policy.
+BATCH = 4096
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """Observations of the states of an environment, as a policy sees them.
+
+    Attributes:
+        space: the states.
+        env: the environment that is observed.
+        observation: as `pharos.observe` takes it, with its options.
+        previous_action: whether the previously executed action is seen as well.
+        time_limit: of an episode, in steps.
+    """
+
+    space: StateSpace
+    env: Environment
+    observation: Any = "vector"
+    options: Mapping[str, Any] = field(default_factory=dict)
+    previous_action: bool = False
+    time_limit: int | None = None
+
+    @cached_property
+    def observe(self) -> ObservationInContext:
+        """Makes a batch of observations of states, their previous actions and their steps."""
+        observation = observe(self.env, self.observation, state_space=self.space, **self.options)
+        return ObservationInContext(
+            observation, previous_action=self.previous_action, remaining_time=False, limit=self.time_limit
+        )
+
+    @property
+    def frames(self) -> int:
+        """Number of states that are seen at once, the last ones of the episode."""
+        return self.observe.observation.frames
+
+
+class ReachableRows(NamedTuple):
+    """Rows that every policy reaches in which each action has a positive probability.
+
+    Attributes:
+        rows: (N,) in the order in which `QueriedPolicy.reach` meets them.
+        is_whole: whether these are all; False: there are more than `reach` was allowed to visit.
+    """
+
+    rows: np.ndarray
+    is_whole: bool
+
+
+class QueriedPolicy:
+    """Answers of a policy so far, by row: a state s, or s (A + 1) + b where the previous action b matters (A: none).
+
+    Attributes:
+        by_pairs: whether rows are pairs of state and previous action.
+        width: rows of a state, A + 1 or 1.
+    """
+
+    def __init__(self, mdp: TabularMDP, *, sees_previous_action: bool = False):
+        self.mdp, self.num_actions = mdp, mdp.num_actions
+        self.by_pairs = mdp.is_sticky or sees_previous_action
+        self.width = mdp.num_actions + 1 if self.by_pairs else 1
+        # index + 1; memory is taken where something is written
+        self._place = np.zeros(mdp.num_states * self.width, np.int32)
+        # number of filled entries of the two arrays that follow, which double when they are full
+        self._count = 0
+        self._rows, self._answers = np.empty(64, np.int64), np.empty((64, mdp.num_actions))
+
+    @property
+    def rows(self) -> np.ndarray:
+        """(N,) rows that were queried."""
+        return self._rows[: self._count]
+
+    @property
+    def probabilities(self) -> np.ndarray:
+        """(N, A) the answers."""
+        return self._answers[: self._count]
+
+    def index(self, rows: np.ndarray) -> np.ndarray:
+        """(N,) place of each row in `rows` and `probabilities`; -1 for rows that were not queried."""
+        return self._place[rows] - 1
+
+    def of(self, rows: np.ndarray) -> np.ndarray:
+        """(N, A) probabilities of distinct or repeated rows; only new ones are queried."""
+        unknown = np.unique(rows[self._place[rows] == 0])
+        if unknown.size:
+            count = self._count + unknown.size
+            if count > len(self._rows):
+                more = max(count, 2 * len(self._rows)) - len(self._rows)
+                self._rows = np.concatenate([self._rows, np.empty(more, np.int64)])
+                self._answers = np.concatenate([self._answers, np.empty((more, self.num_actions))])
+            for start in range(0, unknown.size, BATCH):
+                block = unknown[start : start + BATCH]
+                place = slice(self._count + start, self._count + start + len(block))
+                self._rows[place], self._answers[place] = block, self._query(block)
+            self._place[unknown] = np.arange(self._count, count) + 1
+            self._count = count
+        return self.probabilities[self.index(rows)]
+
+    def _query(self, rows: np.ndarray) -> np.ndarray:
+        """(N, A) probabilities in rows that are new."""
+        raise NotImplementedError
+
+    def start_rows(self) -> np.ndarray:
+        """The rows of the start states."""
+        return self.first_rows(self.mdp.start_states)
+
+    def first_rows(self, states: np.ndarray) -> np.ndarray:
+        """(N,) the rows of states in which episodes start."""
+        return states * self.width + (self.num_actions if self.by_pairs else 0)
+
+    def next_rows(self, rows: np.ndarray, executed: np.ndarray, next_states: np.ndarray) -> np.ndarray:
+        """(N,) where executing actions in rows leads that come to the states `next_states`."""
+        return self._arrivals(next_states, executed)
+
+    def reach(self, max_rows: int | None = None, steps: int | None = None) -> bool:
+        """Ask the policy in all rows that it reaches within `steps`, level by level; False beyond `max_rows` rows."""
+        mdp, width = self.mdp, self.width
+        frontier = np.unique(self.start_rows())
+        level = 0
+        while frontier.size and (steps is None or level < steps):
+            level += 1
+            probabilities = self.of(frontier)
+            if max_rows is not None and len(self.rows) > max_rows:
+                return False
+            states, previous = np.divmod(frontier, width)
+            weights = mdp.chance.weights(probabilities, previous if self.by_pairs else None)
+            which, actions = np.nonzero(weights > 0)
+            outcomes = mdp.dynamics.outcomes(states[which], actions)
+            live = outcomes.states < mdp.num_states
+            live[live] = ~np.asarray(mdp.terminal)[outcomes.states[live]]
+            rows = np.unique(self._arrivals(outcomes.states[live], actions[outcomes.which[live]]))
+            frontier = rows[self.index(rows) < 0]
+        return True
+
+    def query_all(self, reach: Callable[[], ReachableRows]) -> bool | None:
+        """Query the policy in all rows of `reach` at once; return whether these are all.
+
+        None, and nothing is stored, where an action has probability 0, so that the policy may reach less.
+        """
+        chance = self.mdp.chance
+        always = chance.uniform > 0 and chance.first_uniform > 0
+        if not always and not (self._query(self.start_rows()) > 0).all():
+            return None
+        rows, is_whole = reach()
+        blocks = [self._query(rows[start : start + BATCH]) for start in range(0, len(rows), BATCH)]
+        probabilities = np.concatenate(blocks)
+        if not always and not (probabilities > 0).all():
+            return None
+        self._rows, self._answers, self._count = rows.copy(), probabilities, len(rows)
+        self._place[rows] = np.arange(1, self._count + 1)
+        return is_whole
+
+    def _arrivals(self, states: np.ndarray, actions: np.ndarray) -> np.ndarray:
+        """(N,) the rows of states that were reached by executing these actions."""
+        return states * self.width + (actions if self.by_pairs else 0)
+
+    def reached_mdp(self) -> tuple[TabularMDP, np.ndarray]:
+        """The MDP on what is reached, and the policy on it; what is not reached has probability 0, and is the end."""
+        mdp = self.mdp
+        if not mdp.is_sticky:  # a row is a state of the new MDP
+            states, starts = self.rows // self.width, self.index(self.start_rows())
+            return self._mdp_on(
+                states, starts, lambda next_states, executed, _: self.index(self._arrivals(next_states, executed))
+            ), self.probabilities
+        states = np.unique(self.rows // self.width)
+        place = np.full(mdp.num_states, -1, np.int64)
+        place[states] = np.arange(states.size)
+        policy = np.zeros((states.size, self.width, mdp.num_actions))
+        policy[:, :, 0] = 1.0  # of pairs that are not reached
+        policy[place[self.rows // self.width], self.rows % self.width] = self.probabilities
+        return self._mdp_on(states, place[mdp.start_states], lambda next_states, *_: place[next_states]), policy
+
+    def _mdp_on(
+        self, states: np.ndarray, starts: np.ndarray, number: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+    ) -> TabularMDP:
+        """The MDP in which state i behaves as `states[i]`.
+
+        Args:
+            starts: numbers of the start states.
+            number: (next states, executed actions, numbers of the states before) -> numbers in the new MDP, -1 for the
+                end.
+        """
+        mdp, count, num_actions = self.mdp, len(states), self.mdp.num_actions
+        initial = np.zeros(count)
+        np.add.at(initial, starts, mdp.start_probabilities)
+        rewards = mdp.reward_table.rows(states)
+        setting: dict[str, Any] = {"gamma": mdp.gamma, "initial": initial, "horizon": mdp.horizon}
+        actions = np.tile(np.arange(num_actions), count)
+        outcomes = mdp.dynamics.outcomes(np.repeat(states, num_actions), actions)
+        inside = outcomes.states < mdp.num_states
+        next_states = np.full(len(inside), -1, np.int64)
+        which = outcomes.which[inside]
+        next_states[inside] = number(outcomes.states[inside], actions[which], which // num_actions)
+        if mdp.dynamics.is_deterministic:
+            reached = TabularMDP.from_arrays(next_states.reshape(count, num_actions), rewards, **setting)
+        else:
+            from scipy import sparse
+
+            stays = next_states >= 0
+            entries = (outcomes.probabilities[stays], (outcomes.which[stays], next_states[stays]))
+            reached = TabularMDP.from_matrices(
+                sparse.csr_matrix(entries, (count * num_actions, count)), rewards, **setting
+            )
+        if mdp.horizon is not None:  # every step reads them
+            reached = replace(reached, reward_table=Rewards(np.asarray(rewards, np.float64), np.empty(0)))
+        return replace(reached, chance=mdp.chance)
+
+
+class AnyAnswers(QueriedPolicy):
+    """Answers of the uniform policy, which reaches what any policy can reach."""
+
+    def _query(self, rows: np.ndarray) -> np.ndarray:
+        return np.full((len(rows), self.num_actions), 1 / self.num_actions)
+
+
+def reachable_rows(
+    mdp: TabularMDP, max_rows: int, steps: int | None, *, sees_previous_action: bool = False
+) -> ReachableRows:
+    """Rows reached within so many steps by every policy in which each action has a positive probability."""
+    answers = AnyAnswers(mdp, sees_previous_action=sees_previous_action)
+    is_whole = answers.reach(max_rows, steps)
+    return ReachableRows(answers.rows.copy(), is_whole)
+
+
+class PolicyAnswers(QueriedPolicy):
+    """Answers of a policy that sees observations.
+
+    Args:
+        policy: as `policy_function` takes it.
+        deterministic: whether the most probable action is taken.
+    Raises:
+        ParameterError: it is no policy, or was trained on other observations.
+    """
+
+    def __init__(self, policy: PolicyLike, mdp: TabularMDP, sight: Sight, *, deterministic: bool = False):
+        super().__init__(mdp, sees_previous_action=sight.previous_action)
+        self.policy, self.sight, self.deterministic = policy_function(policy), sight, deterministic
+        check_observation(policy, sight.observe.space, sight.observation)
+
+    def _query(self, rows: np.ndarray) -> np.ndarray:
+        states, previous = np.divmod(rows, self.width)
+        previous = np.where(previous == self.num_actions, -1, previous) if self.by_pairs else np.full(len(rows), -1)
+        context = self.sight.space.states(states), previous, np.zeros(len(rows), np.int64)
+        irrelevant = self.sight.observe.observation.irrelevant
+        if not irrelevant:
+            return self.answer(self.sight.observe(*context), len(rows))
+        total = np.zeros((len(rows), self.num_actions))  # coins are fair and thrown anew at each step
+        for coins in np.ndindex(*(2,) * irrelevant):
+            thrown = np.tile(np.array(coins, np.float32), (len(rows), 1))
+            total += self.answer(self.sight.observe(*context, coins=thrown), len(rows))
+        return total / 2**irrelevant
+
+    def answer(self, observations: Any, count: int = 1) -> np.ndarray:
+        """(N, A) probabilities for a batch of `count` observations."""
+        return self.checked(self.policy(observations), count)
+
+    def checked(self, answer: Any, count: int) -> np.ndarray:
+        """(N, A) probabilities of an answer to `count` observations; ParameterError for any other."""
+        answer = np.asarray(answer)
+        if answer.dtype.kind in "iu" and answer.shape == (count,):
+            if (answer < 0).any() or (answer >= self.num_actions).any():
+                raise ParameterError(
+                    f"the policy chose action {answer.min()} to {answer.max()}; expected 0 to {self.num_actions - 1}"
+                )
+            return np.eye(self.num_actions)[answer]
+        answer = answer.astype(np.float64)
+        if np.isnan(answer).any():
+            raise ParameterError(
+                f"the policy answered NaN for {count} observations; expected probabilities, or actions"
+            )
+        if answer.shape != (count, self.num_actions) or not (answer >= 0).all():
+            raise ParameterError(
+                f"the policy answered with shape {answer.shape} for {count} observations; expected "
+                f"({count}, {self.num_actions}) probabilities, or ({count},) actions"
+            )
+        total = answer.sum(axis=1, keepdims=True)
+        if not np.allclose(total, 1, atol=1e-4):
+            raise ParameterError(f"the policy's probabilities sum to {total.min():g}; expected 1")
+        if self.deterministic:
+            return np.eye(self.num_actions)[answer.argmax(axis=1)]
+        return answer / total
+
+
+class TableAnswers(QueriedPolicy):
+    """Answers of a table: (S,) actions, (S, A) probabilities, or either for each previous action.
+
+    Raises:
+        ParameterError: it has another shape.
+    """
+
+    def __init__(self, table: np.ndarray, mdp: TabularMDP, *, sees_previous_action: bool = False):
+        super().__init__(mdp, sees_previous_action=sees_previous_action)
+        states, actions = mdp.num_states, mdp.num_actions
+        shapes = [(states,), (states, actions)]
+        if self.by_pairs:
+            shapes += [(states, actions + 1), (states, actions + 1, actions)]
+        if table.shape not in shapes or (table.ndim == 2 and self.by_pairs and table.dtype.kind in "iu") != (
+            table.shape == (states, actions + 1)
+        ):
+            raise ParameterError(f"the policy has shape {table.shape}; expected one of {', '.join(map(str, shapes))}")
+        self.table = table
+
+    def _query(self, rows: np.ndarray) -> np.ndarray:
+        states, previous = np.divmod(rows, self.width)
+        by_previous = self.table.ndim == 3 or self.table.shape == (self.mdp.num_states, self.num_actions + 1)
+        answers = self.table[states, previous] if by_previous else self.table[states]
+        return np.eye(self.num_actions)[answers] if answers.ndim == 1 else np.asarray(answers, np.float64)
+
+
+def check_observation(policy: Any, space: Any, name: Any) -> None:
+    """ParameterError where a model was trained on observations of another shape."""
+    model = getattr(policy, "model", policy)
+    expected = getattr(getattr(model, "observation_space", None), "shape", None)
+    shape = space.shape
+    if expected is None or shape is None or expected in (shape, shape[2:] + shape[:2]):
+        return
+    raise ParameterError(
+        f"the model was trained on observations of shape {expected}; {name!r} gives {shape}: "
+        f"name the observation it was trained on"
+    )

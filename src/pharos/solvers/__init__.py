@@ -1,7 +1,6 @@
 """Solving: optimal values and values of given policies, each with an error bound that is proven and met."""
 
-from pharos.solvers.regret import ReferenceValues, cumulative_expected_regret, regret, regret_scale
-from pharos.solvers.solution import Solution
+from pharos.solvers.solution import ReferenceValues, Solution, cumulative_expected_regret, regret, regret_scale
 from pharos.solvers.values import (
     evaluate_apart,
     evaluate_policy,

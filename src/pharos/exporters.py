@@ -1,8 +1,7 @@
-"""Storm's explicit format DRN: https://www.stormchecker.org/documentation/background/drn.html
+"""MDPs for other programs: BRIDGE's npz, Gymnasium's `P` table, Storm's explicit DRN format.
 
-Gymnasium's `P` table.
-
-The form of the BRIDGE dataset: transitions and rewards, row 0 the start, -1 the end.
+DRN: https://www.stormchecker.org/documentation/background/drn.html. The form of the BRIDGE dataset: transitions and
+rewards, row 0 the start, -1 the end.
 """
 
 import io
@@ -15,6 +14,8 @@ import numpy as np
 from pharos.errors import ParameterError
 from pharos.mdp import TabularMDP, paid_outcomes, require_mdp
 from pharos.system import storage
+
+__all__ = ["bridge", "drn", "gym_p"]
 
 
 @require_mdp

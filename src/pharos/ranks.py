@@ -1,0 +1,416 @@
+"""Several processes that compute one thing together: ranks, and how they exchange arrays.
+
+Rank 0 is the one that the user sees: it alone reads and writes files, reports and raises the errors of all. The others
+run a function that answers it. MPI carries what they exchange (extra `mpi`: mpi4py), among ranks that `mpiexec` has
+started; tests run ranks as threads.
+
+Halos are borders of ranges of rows, one range for each rank: the rows of other ranks that a rank reads. Their values
+come in messages from those ranks alone that have some of them. They travel while the ranks compute: the values of the
+high rows of a range, all but the lowest eighth, may be sent before those of the low ones are known.
+"""
+
+import importlib.util
+import os
+import shutil
+import sys
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from typing import Any, NoReturn, TypeVar
+
+import numpy as np
+
+from pharos import errors
+from pharos.errors import MissingExtra, ParameterError, PharosError
+
+NUMBERS = 3  # that a rank tells all others in one go, at most
+_ROWS = 1 << 20  # that rank 0 sends to each in one exchange
+
+
+class RankFailed(PharosError):
+    """Another rank failed, or died; the message says which one and why."""
+
+
+class Rank(ABC):
+    """One of `size` processes.
+
+    Attributes:
+        rank: its number. size: how many there are. neighbors: how many of them are on this machine.
+        needs_progress: whether messages move on only while this process calls `progress`, or waits.
+    """
+
+    rank: int
+    size: int
+    neighbors: int
+    needs_progress: bool = False
+
+    @abstractmethod
+    def exchange(self, parts: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """Send parts[q] to each rank q, and return what each of them has sent here, in their order.
+
+        All ranks call it together; all parts have one dtype, and one shape behind the first axis.
+
+        Raises:
+            RankFailed: a rank failed or died, in place of answering.
+        """
+
+    # From one to one: arrays that move while the ranks compute -------------------------------------------------------
+
+    @abstractmethod
+    def send(self, to: int, array: np.ndarray) -> None:
+        """Begin to send an array to a rank, which begins to receive one of this shape and dtype, now or later.
+
+        Nobody changes the array before `finish`. What one rank sends to another arrives in that order.
+        """
+
+    @abstractmethod
+    def receive(self, source: int, into: np.ndarray) -> None:
+        """Begin to receive an array, C-contiguous: until `finish` nobody knows what is in it."""
+
+    def progress(self) -> None:  # noqa: B027
+        """Let what was begun move on: to be called now and then while this process computes."""
+
+    @abstractmethod
+    def finish(self) -> None:
+        """Wait until this rank has received all that it began to, and may change what it sent.
+
+        Exchanges may stand before it: after one, the others have begun to send what they began before it.
+
+        Raises:
+            RankFailed: a rank failed or died, in place of sending.
+        """
+
+    @abstractmethod
+    def fail(self, error: BaseException) -> None:
+        """Abort: every exchange and message of the other ranks, pending or later, raises."""
+
+    def scatter(self, parts: Sequence[np.ndarray] | None, like: np.ndarray) -> np.ndarray:
+        """Rank 0 sends parts[q] to each rank q, which gets it; `like` is an array of that type for the others."""
+        return self.exchange(parts or [like[:0]] * self.size)[0]
+
+    def scatter_rows(self, whole: np.ndarray | None, cuts: np.ndarray, into: np.ndarray) -> None:
+        """Rank 0 sends rank q the rows [cuts[q], cuts[q + 1]) of an array that it alone has, into its first rows."""
+        for first in range(0, int(np.diff(cuts).max()), _ROWS):
+            parts = None
+            if whole is not None:
+                stops = np.minimum(cuts[:-1] + first + _ROWS, cuts[1:])
+                parts = [np.array(whole[cuts[q] + first : max(stops[q], 0)]) for q in range(self.size)]
+            rows = self.scatter(parts, into)
+            into[first : first + len(rows)] = rows
+
+    def broadcast(self, array: np.ndarray | None, like: np.ndarray) -> np.ndarray:
+        """What rank 0 has sent."""
+        return self.scatter(None if array is None else [array] * self.size, like)
+
+    def gather(self, array: np.ndarray) -> list[np.ndarray]:
+        """At rank 0 what each rank gave, in their order; elsewhere empty arrays."""
+        return self.exchange([array if rank == 0 else array[:0] for rank in range(self.size)])
+
+    def allgather(self, array: np.ndarray) -> list[np.ndarray]:
+        """What each rank gave, in their order, at all of them."""
+        return self.exchange([array] * self.size)
+
+    def allgather_numbers(self, *numbers: float) -> np.ndarray:
+        """(P, K) float64: a few numbers (at most `NUMBERS`) of each rank, at all of them."""
+        return np.array(self.allgather(np.array(numbers, np.float64)))
+
+
+class Alone(Rank):
+    """The only rank."""
+
+    rank, size, neighbors = 0, 1, 1
+
+    def exchange(self, parts: Sequence[np.ndarray]) -> list[np.ndarray]:
+        return [part.copy() for part in parts]
+
+    def send(self, to: int, array: np.ndarray) -> None:
+        raise ValueError("there is no other rank")
+
+    def receive(self, source: int, into: np.ndarray) -> None:
+        raise ValueError("there is no other rank")
+
+    def finish(self) -> None:
+        """Nothing is on its way."""
+
+    def fail(self, error: BaseException) -> None:
+        """Nobody waits."""
+
+
+def text_of(error: BaseException) -> str:
+    """An error as text, to be sent to other ranks; see `error_of`."""
+    return f"{type(error).__name__}\n{error}"
+
+
+def error_of(text: str, rank: int) -> PharosError:
+    """The error of another rank: of the same class, where that is one of pharos.errors; a RankFailed otherwise."""
+    name, _, message = text.partition("\n")
+    kind = getattr(errors, name, None)
+    # those whose first argument is no message cannot be made of one
+    if isinstance(kind, type) and issubclass(kind, PharosError) and "__init__" not in vars(kind):
+        return kind(message)
+    return RankFailed(f"rank {rank}: {f'{name}: {message}'.strip().splitlines()[0]}")
+
+
+# Halos ----------------------------------------------------------------------------------------------------------------
+
+
+_LOW = 8  # one part in so many of a range is sent last
+
+
+def cuts_of(num_rows: int, ranks: int) -> np.ndarray:
+    """(P + 1,) int64: where the ranges of P ranks begin and end, which share the rows evenly."""
+    return np.array([num_rows * i // ranks for i in range(ranks + 1)])
+
+
+class Halo:
+    """The rows outside of a rank's range that it reads.
+
+    Attributes:
+        rows: (H,) int64, ascending.
+        of_rank: for each rank, the slice of `rows` that lies in its range.
+        wanted: for each rank, the rows of this one that it reads, int64, counted from the first row of this one.
+        low: this rank's rows before that are its low ones, counted from its first; all where nobody reads high ones.
+    """
+
+    def __init__(self, rank: Rank, rows: np.ndarray, cuts: np.ndarray):
+        """All ranks make theirs together, in one exchange."""
+        borders = np.searchsorted(rows, cuts)
+        self.rows = rows
+        self.of_rank = [slice(borders[q], borders[q + 1]) for q in range(rank.size)]
+        self.wanted = rank.exchange([rows[part] - cuts[q] for q, part in enumerate(self.of_rank)])
+        self._rank = rank
+        lows = np.diff(cuts) // _LOW
+        self.low = int(lows[rank.rank])
+        if not any((rows >= self.low).any() for rows in self.wanted):
+            self.low = int(cuts[rank.rank + 1] - cuts[rank.rank])
+        self._low_borders = np.searchsorted(rows, cuts[:-1] + lows)  # where the high rows of each rank begin in `rows`
+        self._received: np.ndarray | None = None
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def is_boundary(self, num_rows: int) -> np.ndarray:
+        """(n,) bool: whether some other rank reads a row of this one."""
+        result = np.zeros(num_rows, np.bool_)
+        for rows in self.wanted:
+            result[rows] = True
+        return result
+
+    # While messages travel: receive, then send all or high and low ones, then finish --------------------------------
+
+    def receive(self, like: np.ndarray, in_two: bool = False) -> None:
+        """Begin to receive values of the halo, rows as those of `like`; in one message from each rank, or in two."""
+        received = self._received
+        if received is None or received.dtype != like.dtype or received.shape[1:] != like.shape[1:]:
+            self._received = received = np.empty((len(self), *like.shape[1:]), like.dtype)
+        for source, part in enumerate(self.of_rank):
+            middle = int(self._low_borders[source])
+            for piece in (slice(middle, part.stop), slice(part.start, middle)) if in_two else (part,):
+                if piece.stop > piece.start:
+                    self._rank.receive(source, received[piece])
+
+    def send(self, values: np.ndarray) -> None:
+        """Begin to send what others read of the values (n or more, ...) of this rank's rows."""
+        self._send(values, 0, len(values))
+
+    def send_high(self, values: np.ndarray) -> None:
+        """The same, of the high rows alone."""
+        self._send(values, self.low, len(values))
+
+    def send_low(self, values: np.ndarray) -> None:
+        """The same, of the low rows, which come second."""
+        self._send(values, 0, self.low)
+
+    def finish(self, into: np.ndarray) -> None:
+        """Wait for the values of the halo (H, ...), where some were to be received."""
+        self._rank.finish()
+        if self._received is not None:
+            into[...] = self._received
+
+    def _send(self, values: np.ndarray, start: int, stop: int) -> None:
+        for to, rows in enumerate(self.wanted):
+            first, last = np.searchsorted(rows, [start, stop])
+            if last > first:
+                self._rank.send(to, values[rows[first:last]])
+
+
+# MPI ------------------------------------------------------------------------------------------------------------------
+
+
+# (rank, size) as launchers tell their processes: MPICH's and Intel's, Open MPI's, MVAPICH's.
+_LAUNCHERS = (
+    ("PMI_RANK", "PMI_SIZE"),
+    ("OMPI_COMM_WORLD_RANK", "OMPI_COMM_WORLD_SIZE"),
+    ("MV2_COMM_WORLD_RANK", "MV2_COMM_WORLD_SIZE"),
+)
+_FAILED = -1
+_VALUES, _NOTICE = 0, 1  # tags of messages
+_LOOKS = 100  # at messages that have not come before others get the processor
+_STARTED = "PHAROS_STARTED"  # variable of processes that pharos itself has started under mpiexec
+
+T = TypeVar("T")
+
+
+def check_processes(processes: int | str) -> None:
+    """ParameterError unless it is 1, or "mpi"."""
+    if processes != "mpi" and (processes != 1 or isinstance(processes, bool)):
+        raise ParameterError(
+            f"processes is {processes!r}; expected 1, or 'mpi' in a program that `mpiexec -n 8 python PROGRAM` starts; "
+            "`pharos build` and `pharos solve` take --processes 8"
+        )
+
+
+def check_ranks(num_states: int, ranks: int) -> None:
+    """Raise ParameterError where there are more ranks than states."""
+    if ranks > max(num_states, 1):
+        raise ParameterError(f"{ranks} processes for {num_states} states; expected at most one for each state")
+
+
+def run_spmd(processes: int | str, program: Callable[[Rank], T]) -> T:
+    """Return what `program(rank)` returns at this rank, while the others run it, too.
+
+    Args:
+        processes: 1 for this process alone; or "mpi", those that `mpiexec` has started, all of which make this call.
+    Raises:
+        Whatever the program raises on any of them.
+    """
+    check_processes(processes)
+    rank = mpi_rank() if processes == "mpi" else Alone()
+    try:
+        return program(rank)
+    except BaseException as error:
+        rank.fail(error)
+        raise
+
+
+def start_under_mpiexec(size: int) -> NoReturn:
+    """Replace this process by `mpiexec`, which starts the same program `size` times.
+
+    Raises:
+        MissingExtra: there is no mpi4py, or no `mpiexec` beside this Python or in PATH. ParameterError: this process
+        has been started so already, and does not know its number.
+    """
+    beside = os.path.dirname(sys.executable)
+    launcher = shutil.which("mpiexec", path=beside) or shutil.which("mpiexec")
+    if launcher is None or importlib.util.find_spec("mpi4py") is None:
+        raise MissingExtra(f"--processes {size}", "mpi4py and an MPI library with mpiexec", "mpi")
+    if _STARTED in os.environ:
+        raise ParameterError(
+            f"{launcher}: tells processes neither their number nor how many there are; "
+            f"write mpiexec -n {size} pharos ..., with --processes mpi"
+        )
+    os.environ[_STARTED] = str(size)
+    os.execv(launcher, [launcher, "-n", str(size), sys.executable, *sys.orig_argv[1:]])
+
+
+def launched() -> tuple[int, int]:
+    """(rank, size) of this process among those that a launcher has started; (0, 1) where none has. Nothing of MPI is
+    loaded.
+    """
+    for rank, size in _LAUNCHERS:
+        if os.environ.get(rank, "").isdigit() and os.environ.get(size, "").isdigit():
+            return int(os.environ[rank]), int(os.environ[size])
+    return 0, 1
+
+
+def mpi_rank() -> Rank:
+    """This process among those that the launcher started.
+
+    Raises:
+        MissingExtra: mpi4py is not installed. ParameterError: there is no MPI library, or another one.
+    """
+    try:
+        from mpi4py import MPI
+    except ImportError:
+        raise MissingExtra("running under mpiexec", "mpi4py and an MPI library", "mpi") from None
+    except RuntimeError as error:  # mpi4py is there, and no library
+        reason = str(error).partition("\n")[0]
+        raise ParameterError(
+            f"mpi4py: {reason}; expected an MPI library: pip install mpich, or the cluster's"
+        ) from None
+    return _Mpi(MPI)
+
+
+class _Mpi(Rank):
+    needs_progress = True
+
+    def __init__(self, library: Any):
+        self._library = library
+        self._world = library.COMM_WORLD.Dup()
+        self.rank, self.size = self._world.Get_rank(), self._world.Get_size()
+        self.neighbors = self._world.Split_type(library.COMM_TYPE_SHARED).Get_size()
+        self._is_over = False  # somebody failed: nobody waits for this rank any more
+        self._requests: list[Any] = []
+        self._kept: list[np.ndarray] = []  # what is on its way
+        size = launched()[1]
+        if size > 1 and size != self.size:
+            raise ParameterError(
+                f"mpiexec started {size} processes, and mpi4py sees {self.size}: it was built for another MPI "
+                f"library; expected mpi4py beside the library whose mpiexec is used"
+            )
+
+    def exchange(self, parts: Sequence[np.ndarray]) -> list[np.ndarray]:
+        rows = np.array([len(part) for part in parts], np.int64)
+        received = self._counts(rows)
+        width = int(np.prod(parts[0].shape[1:], dtype=np.int64))
+        sent = np.concatenate([np.ascontiguousarray(part) for part in parts])
+        into = np.empty((int(received.sum()), *parts[0].shape[1:]), sent.dtype)
+        self._world.Alltoallv([sent, rows * width], [into, received * width])
+        return np.split(into, np.cumsum(received)[:-1])
+
+    def allgather_numbers(self, *numbers: float) -> np.ndarray:
+        self._counts(np.zeros(self.size, np.int64), numbers)
+        return self._numbers[:, : len(numbers)]
+
+    def _counts(self, rows: np.ndarray, numbers: Sequence[float] = ()) -> np.ndarray:
+        """How many rows each rank sends here. All that ranks do together begins with it, so that all learn who failed.
+
+        numbers: to be told to all; theirs are `_numbers` (P, NUMBERS) then.
+        """
+        received = self._headers(rows, numbers)
+        failed = np.flatnonzero(received == _FAILED)
+        if len(failed):
+            self._is_over = True
+            raise error_of(self._world.bcast(None, root=int(failed[0])), int(failed[0]))
+        return received
+
+    def _headers(self, rows: np.ndarray, numbers: Sequence[float] = ()) -> np.ndarray:
+        sent, received = np.zeros((2, self.size, 1 + NUMBERS), np.int64)
+        sent[:, 0] = rows
+        sent[:, 1 : 1 + len(numbers)] = np.array(numbers, np.float64).view(np.int64)
+        self._world.Alltoall(sent, received)
+        self._numbers = received[:, 1:].copy().view(np.float64)
+        return received[:, 0].copy()
+
+    def send(self, to: int, array: np.ndarray) -> None:
+        self._kept.append(np.ascontiguousarray(array))
+        self._requests.append(self._world.Isend(self._kept[-1], to, _VALUES))
+
+    def receive(self, source: int, into: np.ndarray) -> None:
+        self._kept.append(into)
+        self._requests.append(self._world.Irecv(into, source, _VALUES))
+
+    def progress(self) -> None:
+        self._library.Request.Testall(self._requests)
+
+    def finish(self) -> None:
+        looks = 0
+        while not self._library.Request.Testall(self._requests):
+            looks += 1
+            if looks % _LOOKS == 0:
+                time.sleep(0)
+                if self._world.Iprobe(self._library.ANY_SOURCE, _NOTICE):
+                    self._counts(np.zeros(self.size, np.int64))  # raises: who failed comes to it, and so do the others
+        self._requests.clear()
+        self._kept.clear()
+
+    def fail(self, error: BaseException) -> None:
+        if self._is_over:
+            return
+        self._is_over = True
+        for rank in range(self.size):  # those who wait for a message of this one
+            if rank != self.rank:
+                self._requests.append(self._world.Isend(np.zeros(0), rank, _NOTICE))
+        received = self._headers(np.full(self.size, _FAILED))
+        first = min([*np.flatnonzero(received == _FAILED), self.rank])
+        self._world.bcast(text_of(error) if first == self.rank else None, root=first)
