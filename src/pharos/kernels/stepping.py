@@ -1,8 +1,8 @@
 """Knobs of interaction, for every loop that steps: executed action, laziness, outcome, start, late and noisy pay.
 
 Each knob takes its random numbers as arguments, or from a stream rng[i]: of vector environments (here and in
-rules/interaction.py), of Q-learning (learning.py, sampled_learning.py), of the batched engine (batched_worlds.py). The
-table walk of vector environments.
+rules/interaction.py), of Q-learning (learning.py), of the batched engine (batched.py). The table walk of
+vector environments.
 """
 
 from typing import NamedTuple

@@ -8,9 +8,10 @@ import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, NamedTuple, Protocol, TypeAlias, runtime_checkable
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeAlias, TypeGuard, runtime_checkable
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from pharos.environments import Environment
 from pharos.errors import ParameterError
@@ -18,12 +19,21 @@ from pharos.mdp import Rewards, TabularMDP
 from pharos.observations import ObservationInContext, observe
 from pharos.state_space import StateSpace
 
+if TYPE_CHECKING:
+    from gymnasium import Space
+    from sb3_contrib.common.recurrent.policies import RecurrentActorCriticPolicy
+    from stable_baselines3.common.distributions import CategoricalDistribution
+    from stable_baselines3.common.policies import BasePolicy
+
+Observations: TypeAlias = np.ndarray | dict[str, np.ndarray]
+"""A batch, as the environment gives them."""
+
 
 @runtime_checkable
 class Policy(Protocol):
     """Chooses actions from observations."""
 
-    def action_probabilities(self, observations: Any) -> np.ndarray:
+    def action_probabilities(self, observations: np.ndarray) -> np.ndarray:
         """(N, A) probabilities, or (N,) actions, for a batch of N observations as the environment gives them."""
 
 
@@ -39,10 +49,20 @@ class TabularAgent(Protocol):
 class Model(Protocol):
     """An algorithm of Stable-Baselines3."""
 
-    policy: Any
+    @property
+    def policy(self) -> "BasePolicy":
+        """Its networks."""
 
-    def predict(self, observation: Any, *, deterministic: bool = False) -> Any:
+    def predict(self, observation: Observations, *, deterministic: bool = False) -> tuple[np.ndarray, object]:
         """(actions, state of a recurrent policy) for a batch of observations."""
+
+
+class RecurrentModel(Protocol):
+    """An algorithm of sb3-contrib whose policy has an LSTM."""
+
+    @property
+    def policy(self) -> "RecurrentActorCriticPolicy":
+        """Its networks."""
 
 
 Arrays: TypeAlias = Any
@@ -100,12 +120,12 @@ class DeepPolicy:
         ParameterError: the policy has a memory, so that its probabilities do not belong to observations.
     """
 
-    def __init__(self, model: Any, *, deterministic: bool = False):
+    def __init__(self, model: Model, *, deterministic: bool = False):
         if _has_memory(model):
             raise _remembers(model)
         self.model, self.deterministic = model, deterministic
 
-    def action_probabilities(self, observations: Any) -> np.ndarray:
+    def action_probabilities(self, observations: Observations) -> np.ndarray:
         """(N, A) probabilities for a batch of observations as the environment gives them."""
         import torch
 
@@ -114,11 +134,13 @@ class DeepPolicy:
         batch = _as_policy_sees(observations, policy.observation_space)
         with torch.no_grad():
             tensor, _ = policy.obs_to_tensor(batch)
-            if hasattr(policy, "q_net"):
-                scores = policy.q_net(tensor).numpy()
+            q_net: Callable[..., torch.Tensor] | None = getattr(policy, "q_net", None)
+            if q_net is not None:
+                scores = q_net(tensor).numpy()
                 return np.eye(scores.shape[1])[scores.argmax(axis=1)]
-            if hasattr(policy, "get_distribution"):
-                probabilities = policy.get_distribution(tensor).distribution.probs.numpy().astype(np.float64)
+            distribution_of: Callable[..., CategoricalDistribution] | None = getattr(policy, "get_distribution", None)
+            if distribution_of is not None:
+                probabilities = distribution_of(tensor).distribution.probs.numpy().astype(np.float64)
                 if self.deterministic:
                     return np.eye(probabilities.shape[1])[probabilities.argmax(axis=1)]
                 return probabilities
@@ -132,7 +154,7 @@ class RecurrentDeepPolicy:
     Its state is that of the actor: hidden and cell states, (n, layers, size) float32 each.
     """
 
-    def __init__(self, model: Any):
+    def __init__(self, model: RecurrentModel):
         self.model = model
 
     def initial_state(self, n: int) -> tuple[np.ndarray, np.ndarray]:
@@ -141,7 +163,7 @@ class RecurrentDeepPolicy:
         return np.zeros((n, layers, size), np.float32), np.zeros((n, layers, size), np.float32)
 
     def __call__(
-        self, observations: Any, state: tuple[np.ndarray, np.ndarray], starts: np.ndarray
+        self, observations: Observations, state: tuple[np.ndarray, np.ndarray], starts: np.ndarray
     ) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
         """((N, A) probabilities, the next state) for a batch of observations as the environment gives them."""
         import torch
@@ -152,7 +174,8 @@ class RecurrentDeepPolicy:
             tensor, _ = policy.obs_to_tensor(_as_policy_sees(observations, policy.observation_space))
             hidden, cell = (torch.from_numpy(part.swapaxes(0, 1).copy()) for part in state)
             begins = torch.from_numpy(starts.astype(np.float32))
-            distribution, (hidden, cell) = policy.get_distribution(tensor, (hidden, cell), begins)
+            distribution_of: Callable[..., tuple] = policy.get_distribution
+            distribution, (hidden, cell) = distribution_of(tensor, (hidden, cell), begins)
         after = hidden.numpy().swapaxes(0, 1), cell.numpy().swapaxes(0, 1)
         return distribution.distribution.probs.numpy().astype(np.float64), after
 
@@ -162,7 +185,7 @@ def deep_policy(model: Model) -> "DeepPolicy | RecurrentDeepPolicy":
     return RecurrentDeepPolicy(model) if _has_memory(model) else DeepPolicy(model)
 
 
-def _has_memory(model: Any) -> bool:
+def _has_memory(model: Model) -> TypeGuard["RecurrentModel"]:
     distribution = getattr(model.policy, "get_distribution", None)
     return distribution is not None and "lstm_states" in inspect.signature(distribution).parameters
 
@@ -175,10 +198,17 @@ def _remembers(policy: object) -> ParameterError:
     )
 
 
-def _as_policy_sees(observations: Any, space: Any) -> Any:
+def _as_policy_sees(observations: Observations, space: "Space") -> Observations:
     """Images moved to channel first where Stable-Baselines3 has done so with those of the environment."""
     if isinstance(observations, dict):
-        return {name: _as_policy_sees(values, space.spaces[name]) for name, values in observations.items()}
+        from gymnasium.spaces import Dict
+
+        assert isinstance(space, Dict)
+        return {name: _channel_first(values, space[name]) for name, values in observations.items()}
+    return _channel_first(observations, space)
+
+
+def _channel_first(observations: np.ndarray, space: "Space") -> np.ndarray:
     if observations.ndim == 4 and observations.shape[1:] != space.shape:
         return observations.transpose(0, 3, 1, 2)
     return observations
@@ -205,7 +235,7 @@ class Sight:
 
     space: StateSpace
     env: Environment
-    observation: Any = "vector"
+    observation: object = "vector"
     options: Mapping[str, Any] = field(default_factory=dict)
     previous_action: bool = False
     time_limit: int | None = None
@@ -439,11 +469,11 @@ class PolicyAnswers(QueriedPolicy):
             total += self.answer(self.sight.observe(*context, coins=thrown), len(rows))
         return total / 2**irrelevant
 
-    def answer(self, observations: Any, count: int = 1) -> np.ndarray:
+    def answer(self, observations: Observations, count: int = 1) -> np.ndarray:
         """(N, A) probabilities for a batch of `count` observations."""
         return self.checked(self.policy(observations), count)
 
-    def checked(self, answer: Any, count: int) -> np.ndarray:
+    def checked(self, answer: ArrayLike, count: int) -> np.ndarray:
         """(N, A) probabilities of an answer to `count` observations; ParameterError for any other."""
         answer = np.asarray(answer)
         if answer.dtype.kind in "iu" and answer.shape == (count,):
@@ -496,7 +526,7 @@ class TableAnswers(QueriedPolicy):
         return np.eye(self.num_actions)[answers] if answers.ndim == 1 else np.asarray(answers, np.float64)
 
 
-def check_observation(policy: Any, space: Any, name: Any) -> None:
+def check_observation(policy: object, space: "Space", name: object) -> None:
     """ParameterError where a model was trained on observations of another shape."""
     model = getattr(policy, "model", policy)
     expected = getattr(getattr(model, "observation_space", None), "shape", None)

@@ -13,7 +13,7 @@ import hashlib
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypedDict, Unpack
 
 import numpy as np
 
@@ -168,7 +168,7 @@ class QueriedMemories(QueriedHistories):
         # of each memory but the first, which is that of the start, what is kept; `_layout` says how to read it
         self._kept: list[bytes] = [b""]
         self._memory: dict[bytes, int] = {}
-        self._layout: Any = None
+        self._layout: tuple[Arrays, list[tuple[np.dtype, tuple[int, ...]]]] | None = None
         self._after: dict[int, int] = {}  # row -> memory when the policy has been asked there
         self._answered: dict[tuple[int, bytes], tuple[np.ndarray, int]] = {}
 
@@ -219,6 +219,7 @@ class QueriedMemories(QueriedHistories):
     def _states(self, memory: np.ndarray) -> Arrays:
         """What the policy has kept, as it gave it, of memories other than the first."""
         joined = np.frombuffer(b"".join(self._kept[number] for number in memory), np.uint8).reshape(len(memory), -1)
+        assert self._layout is not None
         template, layout = self._layout
         ends = np.cumsum([dtype.itemsize * int(np.prod(shape)) for dtype, shape in layout])
         parts = np.split(joined, ends[:-1], axis=1) if layout else []
@@ -337,6 +338,14 @@ def policy_value(
     return Evaluation(value, False, width, len(answers.rows), episodes)
 
 
+class SightOptions(TypedDict, total=False):
+    """Options of policies that see observations, which `evaluate_policy` describes."""
+
+    observation_options: Mapping[str, object] | None
+    previous_action: bool
+    deterministic: bool
+
+
 @require_mdp
 def evaluate_policy(
     mdp: TabularMDP,
@@ -344,9 +353,9 @@ def evaluate_policy(
     tolerance: float = 1e-6,
     *,
     horizon: int | None = None,
-    observation: Any = None,
+    observation: object = None,
     processes: int | str = 1,
-    **seeing: Any,
+    **seeing: Unpack[SightOptions],
 ) -> Solution:
     """The values of a policy.
 
@@ -410,8 +419,8 @@ def _solution_of_reached(
     policy: PolicyLike,
     tolerance: float = 1e-6,
     *,
-    observation: Any = "vector",
-    observation_options: Mapping[str, Any] | None = None,
+    observation: object = "vector",
+    observation_options: Mapping[str, object] | None = None,
     previous_action: bool = False,
     deterministic: bool = False,
 ) -> ReachedSolution:

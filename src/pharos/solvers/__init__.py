@@ -2,6 +2,7 @@
 
 from pharos.solvers.solution import ReferenceValues, Solution, cumulative_expected_regret, regret, regret_scale
 from pharos.solvers.values import (
+    TablePolicy,
     evaluate_apart,
     evaluate_policy,
     uniform_policy,
@@ -18,5 +19,5 @@ __all__ = [
     "worst_value",
 ]
 _shared = """
-    ReferenceValues cumulative_expected_regret evaluate_apart regret regret_scale uniform_policy
+    ReferenceValues TablePolicy cumulative_expected_regret evaluate_apart regret regret_scale uniform_policy
 """

@@ -8,6 +8,7 @@ from pharos.errors import PrecisionError
 from pharos.mdp import TabularMDP
 
 if TYPE_CHECKING:
+    from pharos.mdp import Part
     from pharos.solvers.fixed_point import Backup
 
 # Sweeps that gain nothing, from values that only rounding still moves, until it is clear that it stops them.
@@ -48,7 +49,7 @@ class Convergence:
     def __init__(
         self,
         mdp: TabularMDP,
-        backup: "Backup",
+        backup: "Backup[TabularMDP] | Backup[Part]",
         tolerance: float,
         progress: Callable[[int, float], None] | None = None,
     ):

@@ -32,9 +32,10 @@ Source: Dai, Mausam, Weld and Goldsmith (2011), "Topological value iteration alg
 
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
+from numpy.typing import DTypeLike
 
 from pharos.errors import DivergenceError, PrecisionError
 from pharos.mdp import BellmanEquation, Part, PolicyTable, Selection, TabularMDP
@@ -43,6 +44,8 @@ from pharos.solvers.policy_iteration import PolicyIteration
 from pharos.system.memory import SHARE_OF_VALUES, available_memory, large_zeros
 
 _UNIT = 2.0**-53
+M = TypeVar("M", bound="TabularMDP | Part")
+Numbers = TypeVar("Numbers", float, np.ndarray)
 # Half a unit in the last place of 32 bits, for numbers from 1 to 2, and for the smallest ones.
 _UNIT32, _LEAST32 = 2.0**-24, 2.0**-150
 # Entries of x that are looked at in one go.
@@ -65,7 +68,7 @@ class FixedPoint(NamedTuple):
     sweeps: int
 
 
-class Backup:
+class Backup(Generic[M]):
     """The backup T of an MDP and of what is chosen in its states.
 
     Attributes:
@@ -73,11 +76,11 @@ class Backup:
         is_single: whether that is float32.
     """
 
-    def __init__(self, mdp: TabularMDP | Part, select: Selection, threads: int = 1, dtype: Any = np.float64):
+    def __init__(self, mdp: M, select: Selection, threads: int = 1, dtype: DTypeLike = np.float64):
         chance = mdp.chance
         self.dtype = np.dtype(dtype)
         self.is_single = self.dtype == np.float32
-        self.mdp: Any = mdp
+        self.mdp = mdp
         self.select, self.threads = select, threads
         self.equation = BellmanEquation(mdp.reward_table, mdp.gamma, chance, select)
         self.factor = self.factor_of(select.mass)
@@ -125,7 +128,7 @@ class Backup:
         """
         return float(self.rounding_of(self.largest_reward, largest)) + self.stored(largest)
 
-    def rounding_of(self, rewards: Any, largest: Any) -> Any:
+    def rounding_of(self, rewards: Numbers, largest: Numbers) -> Numbers:
         """The same for rewards up to `rewards`, in 64 bits."""
         return self.operations * (_UNIT * (rewards + largest) + 2.0**-1074)
 
@@ -158,7 +161,7 @@ def fixed_point(
     progress: Callable[[int, float], None] | None = None,
     x: np.ndarray | None = None,
     threads: int = 1,
-    dtype: Any = np.float64,
+    dtype: DTypeLike = np.float64,
 ) -> FixedPoint:
     """Sweep until the proven bound is at most the tolerance.
 
@@ -197,7 +200,7 @@ def fixed_point(
             largest = largest_of(x)
 
 
-def _in_single(backup: Backup, convergence: Convergence, x: np.ndarray) -> FixedPoint:
+def _in_single(backup: Backup[TabularMDP], convergence: Convergence, x: np.ndarray) -> FixedPoint:
     """The same for values of 32 bits, by sweeps alone; by those of 64 bits, which are stored then, where these would
     not end: near gamma = 1 rounding to 32 bits adds up over 1 / (1 - gamma) sweeps."""
     tolerance = convergence.tolerance
@@ -229,7 +232,7 @@ def backward_induction(
     backup = Backup(mdp, select)
     x = backup.zeros()
     before, bound = x, 0.0
-    steps: Any = np.zeros((horizon + 1, *x.shape)) if keep_all else None
+    steps = np.zeros((horizon + 1, *x.shape)) if keep_all else None
     largest = 0.0
     for t in range(horizon):
         before, x = x, backup(x)
@@ -269,7 +272,7 @@ def largest_of(x: np.ndarray) -> float:
 
 
 def _in_one_pass(
-    backup: Backup, tolerance: float, progress: Callable[[int, float], None] | None, x: np.ndarray | None
+    backup: Backup[TabularMDP], tolerance: float, progress: Callable[[int, float], None] | None, x: np.ndarray | None
 ) -> FixedPoint:
     """Where no state can be visited again: each is backed up once, after all that it leads to.
 

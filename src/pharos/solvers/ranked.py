@@ -119,7 +119,7 @@ class Checkpoint:
             with contextlib.suppress(OSError):
                 self._path.unlink(missing_ok=True)
 
-    def _read(self, shape: tuple[int, int]) -> tuple[np.ndarray, Any]:
+    def _read(self, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray | None]:
         """(header, values) of the file; zeros and None where there is none, or not a whole one."""
         nothing = np.zeros(_HEADER), None
         assert self._path is not None

@@ -20,9 +20,10 @@ et al. (2015), with the exact optimum in the place of a human.
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, Protocol, overload
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from pharos.errors import ParameterError
 from pharos.mdp import Selection, TabularMDP
@@ -82,7 +83,7 @@ class Solution:
         executed = self.q_of(slice(None))
         return executed if self.mdp.is_sticky else self.mdp.chance.choice(executed, executed)
 
-    def q_of(self, states: Any) -> np.ndarray:
+    def q_of(self, states: np.ndarray | slice) -> np.ndarray:
         """(N, A), the values of executing each action in some states (indices or a slice)."""
         following = self.mdp.dynamics.expected(self.next_x, states).astype(np.float64, copy=False)
         return self.mdp.reward_table.rows(states) + self.mdp.gamma * following
@@ -138,7 +139,15 @@ class Solution:
 SMALLEST_SCALE = 1e-12  # in discounted return: below it a ratio is one of rounding errors
 
 
-def regret_scale(optimal: Any, reference: Any, error_bound: float = 0.0) -> Any:
+@overload
+def regret_scale(optimal: float, reference: float, error_bound: float = 0.0) -> float: ...
+
+
+@overload
+def regret_scale(optimal: ArrayLike, reference: ArrayLike, error_bound: float = 0.0) -> float | np.ndarray: ...
+
+
+def regret_scale(optimal: ArrayLike, reference: ArrayLike, error_bound: float = 0.0) -> float | np.ndarray:
     """Return V* - V of a reference policy: divided by it, the regret of the optimum is 0, of the reference policy 1.
 
     Args:
@@ -153,6 +162,13 @@ def regret_scale(optimal: Any, reference: Any, error_bound: float = 0.0) -> Any:
     scale = np.asarray(np.asarray(optimal, np.float64) - np.asarray(reference, np.float64))
     scale = np.where(scale > max(SMALLEST_SCALE, 2 * error_bound), scale, np.nan)
     return scale if scale.ndim else float(scale)
+
+
+class HasReference(Protocol):
+    """A task, which knows the values that regret is measured against."""
+
+    @property
+    def reference(self) -> "ReferenceValues": ...
 
 
 @dataclass(frozen=True)
@@ -171,7 +187,7 @@ class ReferenceValues:
     error_bound: float = 0.0
 
     @staticmethod
-    def of(task: Any) -> "ReferenceValues":
+    def of(task: "HasReference") -> "ReferenceValues":
         """Those of a task; the space is built and solved where it is not yet."""
         return task.reference
 
@@ -186,7 +202,17 @@ class ReferenceValues:
         return regret_scale(self.optimal, getattr(self, reference), self.error_bound)
 
 
-def regret(value: Any, values: ReferenceValues, *, normalized_by: str | None = None) -> Any:
+@overload
+def regret(value: float, values: ReferenceValues, *, normalized_by: str | None = None) -> float: ...
+
+
+@overload
+def regret(value: np.ndarray, values: ReferenceValues, *, normalized_by: str | None = None) -> np.ndarray: ...
+
+
+def regret(
+    value: float | np.ndarray, values: ReferenceValues, *, normalized_by: str | None = None
+) -> float | np.ndarray:
     """The regret of a policy's value, or of an episode's return: V* - value.
 
     Args:
@@ -206,7 +232,7 @@ def regret(value: Any, values: ReferenceValues, *, normalized_by: str | None = N
     return lost if lost.ndim else float(lost)
 
 
-def cumulative_expected_regret(episodes: Any, expected: Any) -> np.ndarray:
+def cumulative_expected_regret(episodes: ArrayLike, expected: ArrayLike) -> np.ndarray:
     """Expected regret summed over episodes, when the policy is evaluated only now and then.
 
     Between two evaluations every finished episode counts with the policy of the earlier one: a step function that a

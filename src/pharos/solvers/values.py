@@ -21,9 +21,10 @@ import math
 import os
 import time
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Protocol, TypeAlias, TypedDict, Unpack, runtime_checkable
 
 import numpy as np
+from numpy.typing import ArrayLike, DTypeLike
 
 from pharos.errors import DivergenceError, ParameterError
 from pharos.mdp import BEST, WORST, PolicyTable, Selection, TabularMDP, mass_of, random_actions, require_mdp
@@ -51,6 +52,32 @@ _ROWS = 1 << 22
 _SECONDS = 600.0
 
 
+class SolvingOptions(TypedDict, total=False):
+    """Options of `value_iteration`, which it describes."""
+
+    horizon: int | None
+    keep_all: bool
+    progress: Callable[[int, float], None] | None
+    values: str | os.PathLike | None
+    processes: int | str
+    checkpoint: str | os.PathLike | None
+    threads: int
+    dtype: DTypeLike
+    blocks: int
+
+
+@runtime_checkable
+class TableAgent(Protocol):
+    """An agent with a policy over the states."""
+
+    def policy_table(self) -> np.ndarray:
+        """As `evaluate_policy` takes it."""
+
+
+TablePolicy: TypeAlias = ArrayLike | Callable[[np.ndarray], ArrayLike] | TableAgent
+"""A policy over states, as `evaluate_policy` takes it."""
+
+
 @require_mdp
 def value_iteration(  # noqa: PLR0913
     mdp: TabularMDP,
@@ -63,7 +90,7 @@ def value_iteration(  # noqa: PLR0913
     processes: int | str = 1,
     checkpoint: str | os.PathLike | None = None,
     threads: int = 1,
-    dtype: Any = "float64",
+    dtype: DTypeLike = "float64",
     blocks: int = 1,
 ) -> Solution:
     """The optimal values of an MDP.
@@ -109,19 +136,19 @@ def value_iteration(  # noqa: PLR0913
         action) times actions are up to 2 million (up to 500 MB then), or nodes are up to 3000.
     Source: Bellman (1957); in place: Puterman (1994), section 6.3.3; the sticky equation: the pharos paper, appendix A.
     """
-    storage: dict[str, Any] = {"values": values, "threads": threads, "dtype": dtype, "blocks": blocks}
-    storage |= {"processes": processes, "checkpoint": checkpoint, "progress": progress}
-    return solution_of(mdp, BEST, tolerance, horizon=horizon, keep_all=keep_all, **storage)
+    options: SolvingOptions = {"horizon": horizon, "keep_all": keep_all, "progress": progress, "values": values}
+    options |= {"processes": processes, "checkpoint": checkpoint, "threads": threads, "dtype": dtype, "blocks": blocks}
+    return solution_of(mdp, BEST, tolerance, **options)
 
 
 @require_mdp
-def worst_value(mdp: TabularMDP, tolerance: float = 1e-6, **options: Any) -> Solution:
+def worst_value(mdp: TabularMDP, tolerance: float = 1e-6, **options: Unpack[SolvingOptions]) -> Solution:
     """The values of the worst policy: as `value_iteration`, with its options, minimising."""
     return solution_of(mdp, WORST, tolerance, **options)
 
 
 @require_mdp
-def uniform_value(mdp: TabularMDP, tolerance: float = 1e-6, **options: Any) -> Solution:
+def uniform_value(mdp: TabularMDP, tolerance: float = 1e-6, **options: Unpack[SolvingOptions]) -> Solution:
     """The values of the uniformly random policy: every action is replaced by a uniform one, so nothing is chosen.
 
     The options are those of `value_iteration`.
@@ -141,7 +168,7 @@ def solution_of(  # noqa: PLR0913
     processes: int | str = 1,
     checkpoint: str | os.PathLike | None = None,
     threads: int = 1,
-    dtype: Any = "float64",
+    dtype: DTypeLike = "float64",
     blocks: int = 1,
 ) -> Solution:
     """The values of what is chosen: a fixed point, or those of backward induction where there is a horizon."""
@@ -180,7 +207,7 @@ def solution_of(  # noqa: PLR0913
     return Solution(mdp, result.bound, result.sweeps, watch.seconds, horizon, select, result.x, following, steps)
 
 
-def _kept_values(path: str | os.PathLike, shape: tuple[int, int], dtype: Any = np.float64) -> np.ndarray:
+def _kept_values(path: str | os.PathLike, shape: tuple[int, int], dtype: DTypeLike = np.float64) -> np.ndarray:
     """(S + 1, W) mapped from a file of NumPy (.npy): what is there, or zeros in a new one.
 
     A bound holds from any values on (see fixed_point.py), so a file left in the middle of a sweep is a good start.
@@ -234,7 +261,7 @@ def check_tolerance(tolerance: float) -> None:
         raise ParameterError(f"tolerance is {tolerance!r}; expected a positive number, in units of return")
 
 
-def checked_dtype(dtype: Any) -> np.dtype:
+def checked_dtype(dtype: DTypeLike) -> np.dtype:
     """float64 or float32."""
     try:
         kind = np.dtype(dtype)
@@ -268,7 +295,7 @@ def can_be_swept_by_blocks(mdp: TabularMDP) -> bool:
 
 
 def blocked_fixed_point(
-    backup: Backup,
+    backup: Backup[TabularMDP],
     tolerance: float,
     blocks: int,
     progress: Callable[[int, float], None] | None = None,
@@ -309,7 +336,7 @@ def blocked_fixed_point(
 
 
 def _swept(
-    backup: Backup, x: np.ndarray, part: tuple[int, int], largest: float, tolerance: float
+    backup: Backup[TabularMDP], x: np.ndarray, part: tuple[int, int], largest: float, tolerance: float
 ) -> tuple[float, float, int]:
     """Sweep a range some times; (by how much its values have changed in all, and in the last sweep, sweeps)."""
     total = first = change = 0.0
@@ -324,7 +351,7 @@ def _swept(
     return total, change, count
 
 
-def _bound(backup: Backup, moved: np.ndarray, largest: float) -> float:
+def _bound(backup: Backup[TabularMDP], moved: np.ndarray, largest: float) -> float:
     """The largest residual of a range whose inputs have changed so much, over 1 - rho."""
     change = float(moved.max())
     return backup.bound(change, backup.rounding(backup.size(largest + change)))
@@ -336,7 +363,7 @@ def _bound(backup: Backup, moved: np.ndarray, largest: float) -> float:
 @require_mdp
 def evaluate_policy(
     mdp: TabularMDP,
-    policy: Any,
+    policy: TablePolicy,
     tolerance: float = 1e-6,
     *,
     horizon: int | None = None,
@@ -366,7 +393,7 @@ def evaluate_policy(
     """
     check_tolerance(tolerance)
     horizon = checked_horizon(mdp, horizon)
-    if hasattr(policy, "policy_table"):
+    if isinstance(policy, TableAgent):
         policy = policy.policy_table()
     watch = Stopwatch()
     select = PolicyTable.of(mdp, policy)
