@@ -23,7 +23,7 @@ PHRASES = {
     "estimation": "stands noise of",
     "credit": "assigns credit over",
     "representation": "copes with representations that cost",
-    "memory": "remembers for",
+    "memory": "remembers",
     "scale": "scales to",
 }
 PREDICTORS = {
